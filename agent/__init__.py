@@ -1,0 +1,1 @@
+"""The mobile side: read a camera, encode each frame, publish channel symbols."""

@@ -1,0 +1,1 @@
+"""The simulated radio link: noise, fading, lost slots and frames, delay, traces."""

@@ -1,0 +1,1 @@
+"""What both ends share: images, geometry, codecs, physical layer, messages, transport."""

@@ -1,0 +1,154 @@
+"""Pinhole intrinsics with lens distortion.
+
+Pixel centres have integer coordinates: the image spans ``[-0.5, width - 0.5]``.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcast.common.errors import SourceError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intrinsics:
+    """A calibrated camera.
+
+    Attributes:
+        fx: Focal length in pixels, horizontal.
+        fy: Focal length in pixels, vertical.
+        cx: Principal point x in pixels.
+        cy: Principal point y in pixels.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        distortion: OpenCV coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``; empty means none.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check ranges.
+
+        Raises:
+            ValueError: A focal length or a side is not positive, or a value is not finite.
+        """
+        for name in ("fx", "fy"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be a positive number of pixels, got {value}")
+        for name in ("cx", "cy"):
+            if not np.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} must be finite, got {getattr(self, name)}")
+        for name in ("width", "height"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1 pixel, got {getattr(self, name)}")
+        if len(self.distortion) not in (0, 4, 5, 8) or not np.all(np.isfinite(self.distortion)):
+            raise ValueError(f"distortion must be 0, 4, 5 or 8 finite values, got {self.distortion}")
+
+    @property
+    def K(self) -> Array:
+        """3x3 calibration matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def shape_hw(self) -> tuple[int, int]:
+        """Image height and width in pixels."""
+        return self.height, self.width
+
+    def scaled_to(self, width: int, height: int) -> "Intrinsics":
+        """Return the intrinsics of the same image resized to ``width x height``.
+
+        With integer pixel centres a resize maps ``x`` to ``(x + 0.5) * s - 0.5``; the principal point
+        follows that, not ``cx * s``.
+        """
+        sx, sy = width / self.width, height / self.height
+        return Intrinsics(
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+            width=width,
+            height=height,
+            distortion=self.distortion,
+        )
+
+    def undistorted(self) -> "Intrinsics":
+        """Return the same pinhole without distortion: the camera of the undistorted image."""
+        return Intrinsics(**{**asdict(self), "distortion": ()})
+
+    def project(self, points_cam: ArrayLike) -> Array:
+        """Project ``(N, 3)`` points in the camera frame to ``(N, 2)`` pixels, without distortion.
+
+        Points at or behind the camera plane give NaN.
+        """
+        p = np.asarray(points_cam, dtype=np.float64)
+        depth = np.where(p[:, 2] > 0, p[:, 2], np.nan)
+        return np.stack([self.fx * p[:, 0] / depth + self.cx, self.fy * p[:, 1] / depth + self.cy], axis=1)
+
+    def unproject(self, keypoints_xy: ArrayLike) -> Array:
+        """Return ``(N, 3)`` rays with unit depth through ``(N, 2)`` undistorted pixels."""
+        xy = np.asarray(keypoints_xy, dtype=np.float64)
+        return np.stack(
+            [(xy[:, 0] - self.cx) / self.fx, (xy[:, 1] - self.cy) / self.fy, np.ones(len(xy))], axis=1
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a mapping that ``from_dict`` reads back."""
+        return {**asdict(self), "distortion": list(self.distortion)}
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> "Intrinsics":
+        """Build from a mapping with fx, fy, cx, cy, width, height and optionally ``distortion``.
+
+        ``distortion_coeffs`` is read as another name of ``distortion``; other keys are notes and ignored.
+
+        Raises:
+            SourceError: A key is missing or a value is out of range.
+        """
+        try:
+            return Intrinsics(
+                fx=float(values["fx"]),
+                fy=float(values["fy"]),
+                cx=float(values["cx"]),
+                cy=float(values["cy"]),
+                width=int(values["width"]),
+                height=int(values["height"]),
+                distortion=tuple(
+                    float(k) for k in values.get("distortion") or values.get("distortion_coeffs") or ()
+                ),
+            )
+        except KeyError as err:
+            raise SourceError(f"intrinsics need fx fy cx cy width height, missing {err}") from err
+        except (TypeError, ValueError) as err:
+            raise SourceError(f"intrinsics are not valid: {err}") from err
+
+    @staticmethod
+    def load(path: Path) -> "Intrinsics":
+        """Read ``intrinsics.json``.
+
+        Raises:
+            SourceError: The file is missing, not JSON, or not valid intrinsics.
+        """
+        try:
+            values = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as err:
+            raise SourceError(f"{path} can't be read as intrinsics: {err}") from err
+        if not isinstance(values, dict):
+            raise SourceError(f"{path} must hold a JSON object, got {type(values).__name__}")
+        return Intrinsics.from_dict(values)
+
+    def save(self, path: Path) -> None:
+        """Write ``intrinsics.json``."""
+        path.write_text(json.dumps(self.to_dict(), indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,98 @@
+"""The codec interface: an image becomes channel symbols at one end and an image with confidence at the other.
+
+A codec never sees pilots, fading or packets. It fills the data symbols of every slot (see
+``semcast.common.phy.slots``) and gets them back equalised, together with the SNR each slot really had.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Modulation = Literal["16qam", "analog"]
+MODULATIONS: tuple[Modulation, ...] = ("16qam", "analog")
+
+#: Effective SNR given to the decoder for a slot of which nothing arrived.
+LOST_SLOT_SNR_DB = -20.0
+
+
+@dataclass(frozen=True)
+class EncodedImage:
+    """Data symbols of one frame, before pilots.
+
+    Attributes:
+        shape_hw: Height and width of the image in pixels, before padding to whole blocks.
+        symbols: ``(num_slots, data_per_slot)`` complex64, mean ``|s|^2`` over the frame is 1. Under
+            ``"16qam"`` every symbol is a point of the Gray-mapped constellation in ``phy/qam.py``.
+        modulation: How the symbols travel.
+    """
+
+    shape_hw: tuple[int, int]
+    symbols: NDArray[np.complex64]
+    modulation: Modulation
+
+
+@dataclass(frozen=True)
+class ReceivedImage:
+    """Data symbols of one frame after equalisation.
+
+    Attributes:
+        shape_hw: Height and width of the image in pixels.
+        symbols: ``(num_slots, data_per_slot)`` complex64, the linear MMSE estimate
+            ``conj(h) y / (|h|^2 + noise_var)``: shrunk by ``snr / (1 + snr)``, zero for a lost slot.
+        effective_snr_db: ``(num_slots,)`` float32, ``|h|^2 / noise_var`` of each slot in dB as the
+            receiver estimated it, never below ``LOST_SLOT_SNR_DB``.
+        modulation: How the symbols travelled.
+    """
+
+    shape_hw: tuple[int, int]
+    symbols: NDArray[np.complex64]
+    effective_snr_db: NDArray[np.float32]
+    modulation: Modulation
+
+
+@dataclass(frozen=True)
+class DecodedImage:
+    """What the receiver hands to the geometry.
+
+    Attributes:
+        image: ``(H, W, 3)`` uint8 RGB.
+        confidence: ``(H, W)`` float32 in [0, 1], 1 is fully trusted: the paper's pixel-error target.
+        keypoint_confidence: ``(H, W)`` float32 in [0, 1] trained on keypoint displacement, or None where the
+            codec has no such head. ``displacement_px`` recovers the expected displacement from it.
+        outage: True when nothing usable arrived and ``image`` is only a filler.
+    """
+
+    image: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    keypoint_confidence: NDArray[np.float32] | None = None
+    outage: bool = False
+
+
+def confidence_from_displacement_px(displacement_px: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Map an expected keypoint displacement in pixels to a confidence: ``1 / (1 + d)``."""
+    return (1.0 / (1.0 + displacement_px)).astype(np.float32)
+
+
+def displacement_px(keypoint_confidence: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Invert ``confidence_from_displacement_px``; confidence 0 gives a large finite displacement."""
+    return (1.0 / np.maximum(keypoint_confidence, 1e-3) - 1.0).astype(np.float32)
+
+
+class Codec(Protocol):
+    """Both ends of one transceiver. Implementations own their buffers and are used from one thread."""
+
+    @property
+    def name(self) -> str:
+        """Registry name, such as ``3dcsc-lite``."""
+
+    @property
+    def digest(self) -> str:
+        """First 16 hex digits of the sha256 of the weights, or of the settings where there are none."""
+
+    def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
+        """Encode one ``(H, W, 3)`` uint8 RGB image for a link whose expected SNR is ``snr_db``."""
+
+    def decode(self, received: ReceivedImage) -> DecodedImage:
+        """Decode one frame; never raises on damaged symbols."""

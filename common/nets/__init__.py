@@ -1,0 +1,1 @@
+"""Learned transceivers: encoder, decoder, confidence branch, checkpoints."""

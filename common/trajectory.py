@@ -1,0 +1,87 @@
+"""Timed camera poses and the TUM text format."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.errors import SourceError
+from semcast.common.geometry import make_transform, quat_wxyz_from_rotation, rotation_from_quat_wxyz
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Camera poses over time.
+
+    Attributes:
+        t_s: ``(N,)`` seconds, strictly increasing.
+        T_world_cam: ``(N, 4, 4)``, camera axes x right, y down, z forward.
+    """
+
+    t_s: NDArray[np.float64]
+    T_world_cam: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        """Check shapes and order.
+
+        Raises:
+            ValueError: Shapes disagree or times do not increase.
+        """
+        if self.t_s.ndim != 1 or self.T_world_cam.shape != (len(self.t_s), 4, 4):
+            raise ValueError(
+                f"need (N,) times and (N, 4, 4) poses, got {self.t_s.shape} and {self.T_world_cam.shape}"
+            )
+        if len(self.t_s) > 1 and not np.all(np.diff(self.t_s) > 0):
+            raise ValueError("times must strictly increase")
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """``(N, 3)`` camera centres in the world frame."""
+        return np.asarray(self.T_world_cam[:, :3, 3])
+
+    @property
+    def path_length(self) -> float:
+        """Sum of the distances between consecutive camera centres, in the trajectory's own unit."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read ``t tx ty tz qx qy qz qw`` lines (camera to world); ``#`` starts a comment.
+
+    Raises:
+        SourceError: The file can't be read, a line has not eight numbers, or times do not increase.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as err:
+        raise SourceError(f"{path} can't be read: {err}") from err
+    times: list[float] = []
+    poses: list[NDArray[np.float64]] = []
+    for number, line in enumerate(lines, start=1):
+        fields = line.split("#", 1)[0].replace(",", " ").split()
+        if not fields:
+            continue
+        try:
+            t, tx, ty, tz, qx, qy, qz, qw = (float(f) for f in fields)
+            poses.append(make_transform(rotation_from_quat_wxyz((qw, qx, qy, qz)), (tx, ty, tz)))
+        except ValueError as err:
+            raise SourceError(f"{path}:{number} must be 't tx ty tz qx qy qz qw', got {line!r}") from err
+        times.append(t)
+    try:
+        return Trajectory(np.array(times), np.array(poses).reshape(-1, 4, 4))
+    except ValueError as err:
+        raise SourceError(f"{path}: {err}") from err
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write ``t tx ty tz qx qy qz qw`` lines with nanosecond times and 9-digit poses."""
+    rows = ["# t_s tx ty tz qx qy qz qw (camera to world; x right, y down, z forward)"]
+    for t_s, T_world_cam in zip(trajectory.t_s, trajectory.T_world_cam, strict=True):
+        w, x, y, z = quat_wxyz_from_rotation(T_world_cam[:3, :3])
+        numbers = " ".join(f"{v:.9f}" for v in (*T_world_cam[:3, 3], x, y, z, w))
+        rows.append(f"{t_s:.9f} {numbers}")
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")

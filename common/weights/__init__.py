@@ -1,0 +1,1 @@
+"""Shipped weights with their manifests; ``semcast.common.nets.checkpoint`` reads them."""

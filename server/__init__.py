@@ -1,0 +1,1 @@
+"""The receiving side: decode, track, map, refine, show, export."""
