@@ -1,0 +1,63 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import SourceError
+
+CAMERA = Intrinsics(fx=500.0, fy=510.0, cx=319.5, cy=239.5, width=640, height=480)
+
+
+def test_the_principal_ray_projects_to_the_principal_point():
+    np.testing.assert_allclose(CAMERA.project([[0, 0, 2.0], [1.0, 0, 2.0]]), [[319.5, 239.5], [569.5, 239.5]])
+
+
+def test_unproject_inverts_project(rng):
+    points = rng.uniform([-1, -1, 1], [1, 1, 5], size=(10, 3))
+    rays = CAMERA.unproject(CAMERA.project(points))
+    np.testing.assert_allclose(rays * points[:, 2:], points)
+
+
+def test_points_behind_the_camera_have_no_pixel():
+    assert np.isnan(CAMERA.project([[0.1, 0.1, -1.0], [0, 0, 0]])).all()
+
+
+def test_resizing_moves_pixels_and_intrinsics_alike():
+    """A bright dot found in the resized image lies where the resized intrinsics project its ray."""
+    image = np.zeros((480, 640), np.float32)
+    image[200:204, 100:104] = 1.0
+    ray = CAMERA.unproject([[101.5, 201.5]])
+    half = cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA)
+    ys, xs = np.nonzero(half > 0.5)
+    np.testing.assert_allclose(CAMERA.scaled_to(320, 240).project(ray), [[xs.mean(), ys.mean()]], atol=1e-6)
+
+
+def test_json_round_trip(tmp_path):
+    camera = Intrinsics(**{**CAMERA.to_dict(), "distortion": (0.1, -0.2, 0.0, 0.001)})
+    camera.save(tmp_path / "intrinsics.json")
+    assert Intrinsics.load(tmp_path / "intrinsics.json") == camera
+    assert camera.undistorted() == CAMERA
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": -1}, "fx must be a positive"),
+        ({"width": 0}, "width must be"),
+        ({"distortion": [1, 2]}, "distortion must be"),
+    ],
+)
+def test_bad_values_are_named(tmp_path, change, message):
+    (tmp_path / "i.json").write_text(json.dumps({**CAMERA.to_dict(), **change}))
+    with pytest.raises(SourceError, match=message):
+        Intrinsics.load(tmp_path / "i.json")
+
+
+def test_a_missing_key_or_file_is_named(tmp_path):
+    (tmp_path / "i.json").write_text('{"fx": 1}')
+    with pytest.raises(SourceError, match="missing 'fy'"):
+        Intrinsics.load(tmp_path / "i.json")
+    with pytest.raises(SourceError, match="can't be read"):
+        Intrinsics.load(tmp_path / "none.json")

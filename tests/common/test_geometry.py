@@ -1,0 +1,93 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from semcast.common import geometry as g
+
+vectors = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
+
+
+def random_transform(rng):
+    return g.make_transform(g.exp_so3(rng.normal(size=3)), rng.normal(size=3))
+
+
+def test_a_quarter_turn_about_z_maps_x_to_y():
+    R = g.exp_so3([0.0, 0.0, np.pi / 2])
+    np.testing.assert_allclose(R @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(g.quat_wxyz_from_rotation(R), [np.sqrt(0.5), 0, 0, np.sqrt(0.5)], atol=1e-12)
+    assert g.rotation_angle_deg(R) == pytest.approx(90.0)
+
+
+@given(vectors)
+def test_log_inverts_exp_below_half_a_turn(w):
+    angle = np.linalg.norm(w)
+    if angle > np.pi - 1e-3:
+        w = w * (np.pi - 1e-3) / angle
+    np.testing.assert_allclose(g.log_so3(g.exp_so3(w)), w, atol=1e-6)
+
+
+@given(vectors)
+def test_quaternions_round_trip(w):
+    R = g.exp_so3(w)
+    np.testing.assert_allclose(g.rotation_from_quat_wxyz(g.quat_wxyz_from_rotation(R)), R, atol=1e-9)
+
+
+def test_inverse_and_composition(rng):
+    T = np.stack([random_transform(rng) for _ in range(5)])
+    np.testing.assert_allclose(T @ g.invert_transform(T), np.broadcast_to(np.eye(4), T.shape), atol=1e-12)
+    points = rng.normal(size=(7, 3))
+    np.testing.assert_allclose(
+        g.transform_points(T[0] @ T[1], points), g.transform_points(T[0], g.transform_points(T[1], points))
+    )
+
+
+def test_exp_se3_is_the_flow_of_its_twist(rng):
+    xi = rng.normal(size=6)
+    half = g.exp_se3(xi / 2)
+    np.testing.assert_allclose(half @ half, g.exp_se3(xi), atol=1e-12)
+    np.testing.assert_allclose(g.exp_se3([0, 0, 0, 1, 2, 3])[:3, 3], [1, 2, 3])
+
+
+def test_skew_is_the_cross_product(rng):
+    a, b = rng.normal(size=(2, 3))
+    np.testing.assert_allclose(g.skew(a) @ b, np.cross(a, b))
+
+
+def test_projection_gives_the_nearest_rotation(rng):
+    R = g.exp_so3(rng.normal(size=3))
+    np.testing.assert_allclose(g.project_to_so3(R + 1e-6 * rng.normal(size=(3, 3))), R, atol=1e-5)
+    assert np.linalg.det(g.project_to_so3(-np.eye(3))) == pytest.approx(1.0)
+
+
+def test_angle_between_is_exact_for_tiny_angles():
+    assert g.angle_between_deg([1, 0, 0], [1, 1e-9, 0]) == pytest.approx(np.degrees(1e-9))
+    assert g.angle_between_deg([1, 0, 0], [-2, 0, 0]) == pytest.approx(180.0)
+    assert g.angle_between_deg([0, 0, 0], [1, 0, 0]) == 90.0
+
+
+def test_umeyama_recovers_a_similarity(rng):
+    R, t, scale = g.exp_so3(rng.normal(size=3)), rng.normal(size=3), 2.5
+    x = rng.normal(size=(20, 3))
+    scale_hat, R_hat, t_hat = g.align_umeyama(x, scale * x @ R.T + t)
+    assert scale_hat == pytest.approx(scale)
+    np.testing.assert_allclose(R_hat, R, atol=1e-9)
+    np.testing.assert_allclose(t_hat, t, atol=1e-9)
+
+
+def test_umeyama_never_mirrors(rng):
+    x = rng.normal(size=(20, 3))
+    _, R, _ = g.align_umeyama(x, x * [1, 1, -1])
+    assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+def test_umeyama_refuses_points_without_extent():
+    with pytest.raises(ValueError, match="must have an extent"):
+        g.align_umeyama(np.ones((4, 3)), np.ones((4, 3)))
+    with pytest.raises(ValueError, match="N >= 2"):
+        g.align_umeyama(np.ones((1, 3)), np.ones((1, 3)))
+
+
+def test_a_quaternion_without_length_is_refused():
+    with pytest.raises(ValueError, match="must have a length"):
+        g.rotation_from_quat_wxyz([0, 0, 0, 0])

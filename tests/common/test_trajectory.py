@@ -1,0 +1,35 @@
+import numpy as np
+import pytest
+
+from semcast.common.errors import SourceError
+from semcast.common.geometry import exp_so3, make_transform
+from semcast.common.trajectory import Trajectory, read_tum, write_tum
+
+
+def test_tum_round_trip(tmp_path, rng):
+    poses = np.stack([make_transform(exp_so3(rng.normal(size=3)), rng.normal(size=3)) for _ in range(4)])
+    trajectory = Trajectory(np.array([0.0, 0.1, 0.25, 1e9 + 0.5]), poses)
+    write_tum(tmp_path / "t.tum", trajectory)
+    again = read_tum(tmp_path / "t.tum")
+    np.testing.assert_allclose(again.t_s, trajectory.t_s)
+    np.testing.assert_allclose(again.T_world_cam, poses, atol=1e-8)
+
+
+def test_path_length_adds_the_steps():
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1, :3, 3] = [3, 4, 0]
+    poses[2, :3, 3] = [3, 4, 2]
+    assert Trajectory(np.arange(3.0), poses).path_length == pytest.approx(7.0)
+
+
+@pytest.mark.parametrize("line", ["1 2 3", "0 0 0 0 0 0 0 0", "0 a 0 0 0 0 0 1"])
+def test_a_bad_line_is_named(tmp_path, line):
+    (tmp_path / "t.tum").write_text(f"# head\n{line}\n")
+    with pytest.raises(SourceError, match="t.tum:2 must be"):
+        read_tum(tmp_path / "t.tum")
+
+
+def test_times_must_increase(tmp_path):
+    (tmp_path / "t.tum").write_text("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    with pytest.raises(SourceError, match="strictly increase"):
+        read_tum(tmp_path / "t.tum")

@@ -1,0 +1,90 @@
+"""Who may import whom, and where each outside library lives."""
+
+import ast
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("common", "channel", "agent", "server", "training", "evaluation")
+MAY_IMPORT = {
+    "common": {"common"},
+    "channel": {"channel", "common"},
+    "agent": {"agent", "common", "channel"},
+    "server": {"server", "common", "channel"},
+    "training": {"training", "common", "channel"},
+    "evaluation": {"evaluation", "common", "channel", "agent", "server"},
+}
+HOMES = {
+    "zenoh": {"common/transport.py"},
+    "msgpack": {"common/wire.py"},
+    "gtsam": {"server/bundle.py"},
+    "rerun": {"server/viewer.py"},
+    "mcap": {"common/recording.py"},
+}
+
+
+def python_files(folder):
+    return sorted(p for p in (ROOT / folder).rglob("*.py") if "build" not in p.parts)
+
+
+def imports_of(path):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield "." * node.level + (node.module or "")
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_imports_go_one_way(folder):
+    wrong = []
+    for path in python_files(folder):
+        for name in imports_of(path):
+            if name.startswith(".") or name.split(".")[0] in FOLDERS:
+                wrong.append(f"{path.relative_to(ROOT)} imports {name}: use semcast.<folder>")
+            parts = name.split(".")
+            if parts[0] == "semcast" and len(parts) > 1 and parts[1] not in MAY_IMPORT[folder]:
+                wrong.append(f"{path.relative_to(ROOT)} imports {name}")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("library", sorted(HOMES))
+def test_each_outside_library_has_one_home(library):
+    users = {
+        str(path.relative_to(ROOT))
+        for folder in (*FOLDERS, "src/semcast")
+        for path in python_files(folder)
+        if any(name.split(".")[0] == library for name in imports_of(path))
+    }
+    assert users <= HOMES[library], f"{library} may be imported only in {HOMES[library]}, found {users}"
+
+
+def test_torch_stays_out_of_the_light_part_of_common():
+    users = {
+        path.relative_to(ROOT / "common").parts[0]
+        for path in python_files("common")
+        if any(name.split(".")[0] == "torch" for name in imports_of(path))
+    }
+    assert users <= {"nets", "phy", "image.py"}
+
+
+def test_the_package_list_is_the_folders():
+    setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    roots = {name: ROOT / folder for name, folder in setup["package-dir"].items()}
+    found = set()
+    for name, folder in roots.items():
+        for init in folder.rglob("__init__.py"):
+            found.add(".".join((name, *init.parent.relative_to(folder).parts)))
+    assert found == set(setup["packages"])
+
+
+@pytest.mark.parametrize("folder", (*FOLDERS, "src/semcast"))
+def test_no_python_file_is_longer_than_500_lines(folder):
+    long = {
+        str(p.relative_to(ROOT)): n
+        for p in python_files(folder)
+        if (n := len(p.read_text().splitlines())) > 500
+    }
+    assert not long
