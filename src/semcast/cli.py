@@ -1,0 +1,102 @@
+"""The ``semcast`` command: finds the verb, runs it, turns errors into one line and an exit code.
+
+Verbs live in ``semcast.commands``, one module each with ``add_arguments(parser)`` and ``run(arguments)``. Only
+the chosen verb is imported, so ``semcast --help`` answers without torch, gtsam or rerun.
+"""
+
+import argparse
+import importlib
+import logging
+import sys
+import traceback
+from collections.abc import Sequence
+
+from semcast import SemcastError, __version__
+from semcast.common.config import near_match
+
+#: verb -> (module in semcast.commands, one line of help)
+VERBS: dict[str, tuple[str, str]] = {
+    "demo": ("demo", "run agent, channel and server together on a recorded sequence and watch"),
+    "agent": ("agent", "encode a camera or a recorded sequence and publish channel symbols"),
+    "channel": ("channel", "run the simulated radio link, or change it while it runs"),
+    "server": ("server", "decode, track, map and show what an agent sends"),
+    "eval": ("evaluate", "measure trajectories, frame pairs, codecs and confidence offline"),
+    "train": ("train", "train a transceiver from a settings file"),
+    "doctor": ("doctor", "check this machine and a running system, and say what to mend"),
+}
+
+EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
+
+
+def _overview() -> argparse.ArgumentParser:
+    width = max(len(verb) for verb in VERBS) + 2
+    rows = "\n".join(f"  {verb:<{width}}{text}" for verb, (_, text) in VERBS.items())
+    parser = argparse.ArgumentParser(
+        prog="semcast",
+        usage="semcast VERB [options]",
+        description="Live 3D reconstruction over a link too poor for video.",
+        epilog=f"verbs:\n{rows}\n\n'semcast VERB --help' lists the options of a verb. Exit codes: 0 good, "
+        "1 an error said in one line, 2 wrong usage, 130 stopped by Ctrl-C.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"semcast {__version__}")
+    parser.add_argument("verb", nargs="?", metavar="VERB", help=argparse.SUPPRESS)
+    return parser
+
+
+def verb_parser(verb: str) -> argparse.ArgumentParser:
+    """Return the full parser of one verb, with the options every verb has."""
+    module, text = VERBS[verb]
+    parser = argparse.ArgumentParser(prog=f"semcast {verb}", description=text[0].upper() + text[1:] + ".")
+    parser.add_argument("--debug", action="store_true", help="show tracebacks and debug messages")
+    command = importlib.import_module(f"semcast.commands.{module}")
+    command.add_arguments(parser)
+    parser.set_defaults(command=command.run)
+    return parser
+
+
+def _configure_logging(debug: bool) -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S"))
+    root = logging.getLogger("semcast")
+    root.addHandler(handler)
+    root.setLevel(logging.DEBUG if debug else logging.INFO)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    overview = _overview()
+    if not words or words[0].startswith("-"):
+        overview.parse_args(words)
+        overview.print_help()
+        return EXIT_OK if not words else EXIT_USAGE
+    verb = words[0]
+    if verb not in VERBS:
+        overview.print_usage(sys.stderr)
+        print(f"semcast: unknown verb {verb!r}{near_match(verb, list(VERBS))}", file=sys.stderr)
+        return EXIT_USAGE
+    debug = "--debug" in words
+    try:
+        arguments = verb_parser(verb).parse_args(words[1:])
+        _configure_logging(debug)
+        return int(arguments.command(arguments))
+    except SemcastError as err:
+        if debug:
+            traceback.print_exc()
+        print(f"semcast {verb}: {err}", file=sys.stderr)
+        return EXIT_ERROR
+    except ModuleNotFoundError as err:
+        if debug or (err.name or "").startswith("semcast"):
+            raise
+        print(
+            f"semcast {verb}: the package {err.name!r} is not installed; "
+            f"install semcast with the extra this verb needs, such as 'semcast[server]'",
+            file=sys.stderr,
+        )
+        return EXIT_ERROR
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()
+        return EXIT_ERROR

@@ -1,0 +1,61 @@
+"""What long-running verbs share: settings from a file and flags, and a clean stop on signals."""
+
+import argparse
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from semcast.common.config import add_flags, settings_from
+
+S = TypeVar("S")
+
+
+def add_settings(parser: argparse.ArgumentParser, cls: type, skip: frozenset[str] = frozenset()) -> None:
+    """Add ``--config`` and one flag per setting of ``cls``."""
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="TOML file with any of these settings; flags win over it"
+    )
+    add_flags(parser, cls, skip)
+
+
+def read_settings(cls: type[S], arguments: argparse.Namespace, **fixed: Any) -> S:
+    """Build the settings that ``add_settings`` declared."""
+    return settings_from(cls, arguments, arguments.config, **fixed)
+
+
+class Interrupted:
+    """Tells afterwards whether Ctrl-C (not SIGTERM) ended the run."""
+
+    def __init__(self) -> None:
+        self.by_user = False
+
+
+@contextmanager
+def stop_on_signals(stop: threading.Event) -> Iterator[Interrupted]:
+    """Set ``stop`` on SIGINT and SIGTERM; a second SIGINT raises ``KeyboardInterrupt`` as usual."""
+    interrupted = Interrupted()
+
+    def handle(number: int, frame: object) -> None:
+        if number == signal.SIGINT:
+            if interrupted.by_user:
+                raise KeyboardInterrupt
+            interrupted.by_user = True
+        stop.set()
+
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield interrupted
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def run_until_stopped(work: Callable[[threading.Event], object]) -> int:
+    """Call ``work(stop)`` with signals wired to ``stop``; exit code 130 after Ctrl-C, else 0."""
+    stop = threading.Event()
+    with stop_on_signals(stop) as interrupted:
+        work(stop)
+    return 130 if interrupted.by_user else 0
