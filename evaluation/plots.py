@@ -1,0 +1,156 @@
+"""Plots of results: pose error against SNR (Fig. 9 and 10 of the paper), trajectories, reliability.
+
+Matplotlib lives here alone and is used through its object interface, without a window or global state.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from semcast.common.errors import SemcastError
+
+_MARKERS = "os^Dv<>P*X"
+
+
+def _new_figure(width_in: float = 5.0, height_in: float = 3.6) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.grid(alpha=0.3)
+    return figure, axes
+
+
+def _save(figure: Figure, path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Without a date in the file the same result gives the same bytes.
+        metadata = {"Date": None} if path.suffix == ".svg" else None
+        figure.savefig(path, dpi=150, metadata=metadata)
+    except (OSError, ValueError) as err:
+        raise SemcastError(f"{path} can't be written as a plot: {err}") from err
+
+
+def plot_against_snr(
+    path: Path,
+    snr_db: Sequence[float],
+    curves: Mapping[str, Sequence[float | None]],
+    y_label: str,
+    *,
+    title: str = "",
+    intervals: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+) -> None:
+    """Draw one curve per name over the SNR and save it.
+
+    Args:
+        path: ``.png``, ``.svg`` or ``.pdf``.
+        snr_db: ``(N,)`` abscissae.
+        curves: Name to N values; None leaves a gap.
+        y_label: Quantity and unit.
+        title: Above the axes.
+        intervals: Name to N ``(low, high)`` bounds, drawn as a band.
+
+    Raises:
+        ValueError: A curve has another length than ``snr_db``.
+        SemcastError: The file can't be written.
+    """
+    figure, axes = _new_figure()
+    for k, (name, values) in enumerate(curves.items()):
+        if len(values) != len(snr_db):
+            raise ValueError(f"curve {name!r} must have {len(snr_db)} values, got {len(values)}")
+        y = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+        (line,) = axes.plot(snr_db, y, marker=_MARKERS[k % len(_MARKERS)], markersize=4, label=name)
+        if intervals is not None and name in intervals:
+            low, high = np.asarray(intervals[name], dtype=np.float64).T
+            axes.fill_between(snr_db, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+    axes.set(xlabel="SNR (dB)", ylabel=y_label, title=title)
+    axes.set_ylim(bottom=0.0)
+    axes.legend(fontsize="small")
+    _save(figure, path)
+
+
+def plot_pair_errors(
+    folder: Path, result: Mapping[str, Any], modes: Sequence[str] | None = None
+) -> list[Path]:
+    """Draw rotation and translation-direction error against SNR, with and without confidence.
+
+    These are Fig. 9 (``fig9_rotation.png``) and Fig. 10 (``fig10_translation_direction.png``) of the paper.
+
+    Args:
+        folder: Where the two files go.
+        result: What ``evaluate_pairs`` returned.
+        modes: Curves to show; all modes of the result by default.
+
+    Returns:
+        The files written.
+    """
+    cells = sorted(result["cells"], key=lambda cell: cell["snr_db"])
+    snr_db = [cell["snr_db"] for cell in cells]
+    modes = list(modes or cells[0]["results"])
+    paths = []
+    for name, key, label in (
+        ("fig9_rotation.png", "rot_deg_mean", "mean rotation error (deg)"),
+        ("fig10_translation_direction.png", "tdir_deg_mean", "mean translation-direction error (deg)"),
+    ):
+        curves = {mode: [cell["results"][mode][key] for cell in cells] for mode in modes}
+        plot_against_snr(folder / name, snr_db, curves, label, title=str(result.get("title", "")))
+        paths.append(folder / name)
+    return paths
+
+
+def plot_top_view(
+    path: Path,
+    trajectories: Mapping[str, NDArray[np.float64]],
+    *,
+    axes_names: tuple[str, str] = ("x", "z"),
+    title: str = "",
+    unit: str = "m",
+) -> None:
+    """Draw camera positions from above and save them.
+
+    Args:
+        path: Image file.
+        trajectories: Name to ``(N, 3)`` positions, all in one world frame.
+        axes_names: The two world axes shown, of ``x``, ``y``, ``z``; a camera-style world looks best in x, z.
+        title: Above the axes.
+        unit: Unit of the axes.
+    """
+    columns = ["xyz".index(name) for name in axes_names]
+    figure, axes = _new_figure(4.6, 4.6)
+    for name, positions in trajectories.items():
+        style = "k--" if name == "ground truth" else "-"
+        axes.plot(positions[:, columns[0]], positions[:, columns[1]], style, linewidth=1.3, label=name)
+    axes.set(xlabel=f"{axes_names[0]} ({unit})", ylabel=f"{axes_names[1]} ({unit})", title=title)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(fontsize="small")
+    _save(figure, path)
+
+
+def plot_reliability(
+    path: Path, tables: Mapping[str, Mapping[str, Sequence[float]]], title: str = ""
+) -> None:
+    """Draw reliability diagrams: observed against predicted, one curve per name.
+
+    Args:
+        path: Image file.
+        tables: Name to a mapping with ``predicted`` and ``observed``.
+        title: Above the axes.
+    """
+    figure, axes = _new_figure(4.2, 4.2)
+    axes.plot([0, 1], [0, 1], "k:", linewidth=1)
+    for k, (name, table) in enumerate(tables.items()):
+        axes.plot(
+            table["predicted"],
+            table["observed"],
+            marker=_MARKERS[k % len(_MARKERS)],
+            markersize=4,
+            label=name,
+        )
+    axes.set(xlabel="confidence", ylabel="1 - |error|", title=title, xlim=(0, 1), ylim=(0, 1))
+    axes.legend(fontsize="small")
+    _save(figure, path)

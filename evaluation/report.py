@@ -1,0 +1,153 @@
+"""Results as JSON with their provenance: command, settings, seeds, versions, commit and kind of machine."""
+
+import dataclasses
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import semcast
+from semcast.common.errors import SemcastError
+
+#: Libraries whose version can change a result.
+LIBRARIES = ("numpy", "opencv-python-headless", "torch", "gtsam", "poselib")
+#: Instruction sets that decide how fast a codec runs, widest last.
+_CPU_FLAGS = (("avx2", "AVX2"), ("avx512f", "AVX512"), ("amx_tile", "AMX"))
+
+
+def json_ready(value: Any) -> Any:
+    """Return plain JSON values: arrays as lists, NaN and infinities as None, settings as mappings.
+
+    An absolute path is cut to its last part, so a result says which sequence it used and not where a
+    machine keeps it.
+
+    Raises:
+        TypeError: A value has no JSON form.
+    """
+    if value is None or (isinstance(value, (str, bool, int)) and not isinstance(value, Enum)):
+        return value
+    if isinstance(value, Enum):
+        return json_ready(value.value)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, np.generic):
+        return json_ready(value.item())
+    if isinstance(value, np.ndarray):
+        return json_ready(value.tolist())
+    if isinstance(value, Path):
+        return value.name if value.is_absolute() else str(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: json_ready(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): json_ready(v) for k, v in value.items()}
+    if isinstance(value, Sequence):
+        return [json_ready(v) for v in value]
+    raise TypeError(f"a result can't hold {type(value).__name__}")
+
+
+def write_json(path: Path, result: Mapping[str, Any]) -> None:
+    """Write a result; the file is complete or absent, never half written.
+
+    Raises:
+        SemcastError: The folder can't be made or the file can't be written.
+    """
+    text = json.dumps(json_ready(result), indent=1, allow_nan=False) + "\n"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".part")
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as err:
+        raise SemcastError(f"{path} can't be written: {err}") from err
+
+
+def machine_kind() -> str:
+    """Return the kind of this machine, such as ``2-core x86-64, AVX2/AVX512/AMX``; never its name."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    architecture = {"x86_64": "x86-64", "AMD64": "x86-64"}.get(platform.machine(), platform.machine())
+    try:
+        flags = set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())
+    except OSError:
+        flags = set()
+    sets = "/".join(name for flag, name in _CPU_FLAGS if flag in flags)
+    return f"{cores}-core {architecture}" + (f", {sets}" if sets else "")
+
+
+def library_versions() -> dict[str, str]:
+    """Return versions of semcast, Python and the libraries a result depends on, those installed."""
+    versions = {"semcast": semcast.__version__, "python": platform.python_version()}
+    for library in LIBRARIES:
+        try:
+            versions[library] = importlib.metadata.version(library)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def source_commit() -> str:
+    """Return the git commit the running code comes from, with ``+changes`` when files differ from it.
+
+    An installed copy outside a git checkout gives ``semcast <version>``.
+    """
+    version = f"semcast {semcast.__version__}"
+    folder = Path(__file__).resolve().parent
+
+    def git(*words: str) -> str:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=10, check=True
+        )
+        return done.stdout.strip()
+
+    try:
+        if git("ls-files", "--", Path(__file__).name) == "":
+            return version
+        changed = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + ("+changes" if changed else "")
+    except (OSError, subprocess.SubprocessError):
+        return version
+
+
+def command_line(verb: str, settings: Any) -> str:
+    """Return the shell command that repeats a run: ``semcast <verb>`` with every setting off its default.
+
+    Args:
+        verb: Such as ``eval trajectory``.
+        settings: A settings dataclass; ``Path`` values are shown as in ``json_ready``.
+    """
+    words = ["semcast", *verb.split()]
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        default = field.default
+        if field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        if value is None or (default is not dataclasses.MISSING and value == default):
+            continue
+        flag = str(field.metadata.get("flag", field.name)).replace("_", "-")
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+            continue
+        items = value if isinstance(value, tuple) else (value,)
+        words += [f"--{flag}", *(str(json_ready(item)) for item in items)]
+    return shlex.join(words)
+
+
+def provenance(verb: str, settings: Any) -> dict[str, Any]:
+    """Return what a reader needs to repeat and place a result."""
+    return {
+        "command": command_line(verb, settings),
+        "settings": json_ready(settings),
+        "commit": source_commit(),
+        "machine": machine_kind(),
+        "platform": sys.platform,
+        "versions": library_versions(),
+    }

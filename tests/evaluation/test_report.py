@@ -1,0 +1,89 @@
+import json
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semcast.common.errors import SemcastError
+from semcast.evaluation.report import (
+    command_line,
+    json_ready,
+    library_versions,
+    machine_kind,
+    provenance,
+    source_commit,
+    write_json,
+)
+
+
+class Colour(StrEnum):
+    RED = "red"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    sequence: Path
+    snr_db: tuple[float, ...] = (10.0,)
+    seeds: int = field(default=1, metadata={"flag": "num_seeds"})
+    plots: bool = True
+
+
+def test_json_has_no_nan_no_arrays_and_no_absolute_path():
+    value = {
+        "a": np.array([1.0, np.nan]),
+        "b": np.float32(2),
+        "c": float("inf"),
+        "d": Path("/some/where/kitti"),
+        "e": Path("runs/x"),
+        "f": Colour.RED,
+        3: (True, None),
+    }
+    ready = json_ready(value)
+    assert ready == {
+        "a": [1.0, None],
+        "b": 2.0,
+        "c": None,
+        "d": "kitti",
+        "e": str(Path("runs/x")),
+        "f": "red",
+        "3": [True, None],
+    }
+    assert type(ready["f"]) is str
+    with pytest.raises(TypeError, match="object"):
+        json_ready(object())
+
+
+def test_written_json_reads_back_and_leaves_no_partial_file(tmp_path):
+    path = tmp_path / "new" / "result.json"
+    write_json(path, {"x": np.arange(3)})
+    assert json.loads(path.read_text()) == {"x": [0, 1, 2]}
+    assert [p.name for p in path.parent.iterdir()] == ["result.json"]
+
+
+def test_an_unwritable_place_is_one_clear_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SemcastError, match="can't be written"):
+        write_json(tmp_path / "file" / "result.json", {})
+
+
+def test_the_command_names_only_what_differs_from_the_defaults():
+    settings = Settings(sequence=Path("/data/chair orbit"), snr_db=(2.0, 6.0), seeds=3, plots=False)
+    assert (
+        command_line("eval pairs", settings)
+        == "semcast eval pairs --sequence 'chair orbit' --snr-db 2.0 6.0 --num-seeds 3 --no-plots"
+    )
+    assert command_line("eval pairs", Settings(sequence=Path("a"))) == "semcast eval pairs --sequence a"
+
+
+def test_provenance_names_kind_of_machine_commit_and_versions():
+    note = provenance("eval pairs", Settings(sequence=Path("a")))
+    assert "-core " in note["machine"]
+    assert note["machine"] == machine_kind()
+    assert note["versions"]["numpy"] == np.__version__
+    assert set(note["versions"]) >= {"semcast", "python"}
+    assert library_versions() == note["versions"]
+    commit = source_commit()
+    assert commit.startswith("semcast ") or len(commit.removesuffix("+changes")) == 40
+    json.dumps(note, allow_nan=False)
