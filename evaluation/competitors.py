@@ -1,0 +1,123 @@
+"""Confidence-free relative-pose estimators of others, run on the same matches as ours."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import cv2
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import make_transform
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompetitorSettings:
+    """Budget of a competitor.
+
+    Attributes:
+        threshold_px: Inlier threshold on the epipolar error.
+        success_prob: Confidence at which the search may stop.
+        max_iterations: Upper bound of hypotheses.
+        seed: Seed of PoseLib's sampler; OpenCV's is fixed.
+    """
+
+    threshold_px: float = 1.0
+    success_prob: float = 0.9999
+    max_iterations: int = 10_000
+    seed: int = 0
+
+
+Competitor = Callable[[Array, Array, Intrinsics, CompetitorSettings], Array | None]
+
+
+def _opencv(
+    keypoints0_xy: Array, keypoints1_xy: Array, camera: Intrinsics, settings: CompetitorSettings, method: int
+) -> Array | None:
+    """Essential matrix and cheirality by OpenCV; None for degenerate matches."""
+    if len(keypoints0_xy) < 5:
+        return None
+    K = camera.K
+    try:
+        E, inliers = cv2.findEssentialMat(
+            keypoints0_xy,
+            keypoints1_xy,
+            K,
+            method=method,
+            prob=settings.success_prob,
+            threshold=settings.threshold_px,
+            maxIters=settings.max_iterations,
+        )
+        # USAC gives None or an empty matrix when it finds nothing; the 5-point solver may stack solutions.
+        if E is None or E.ndim != 2 or E.shape[1] != 3 or len(E) < 3 or not np.isfinite(E).all():
+            return None
+        num_good, R_cam1_cam0, t_cam1_cam0, _ = cv2.recoverPose(
+            E[:3], keypoints0_xy, keypoints1_xy, K, mask=None if inliers is None else inliers.copy()
+        )
+    except cv2.error:
+        return None
+    return make_transform(R_cam1_cam0, t_cam1_cam0) if num_good > 0 else None
+
+
+def opencv_ransac(
+    keypoints0_xy: Array, keypoints1_xy: Array, camera: Intrinsics, settings: CompetitorSettings
+) -> Array | None:
+    """Plain RANSAC over the five-point solver: the estimator the paper compares with.
+
+    Args:
+        keypoints0_xy: ``(N, 2)`` pixels in the first image.
+        keypoints1_xy: ``(N, 2)`` matched pixels in the second image.
+        camera: Both images' camera, without distortion.
+        settings: Budget.
+
+    Returns:
+        ``T_cam1_cam0`` with a translation of length 1, or None when nothing was found.
+    """
+    return _opencv(keypoints0_xy, keypoints1_xy, camera, settings, cv2.RANSAC)
+
+
+def opencv_magsac(
+    keypoints0_xy: Array, keypoints1_xy: Array, camera: Intrinsics, settings: CompetitorSettings
+) -> Array | None:
+    """USAC with MAGSAC++ scoring; arguments and result as ``opencv_ransac``."""
+    return _opencv(keypoints0_xy, keypoints1_xy, camera, settings, cv2.USAC_MAGSAC)
+
+
+def poselib_lo_ransac(
+    keypoints0_xy: Array, keypoints1_xy: Array, camera: Intrinsics, settings: CompetitorSettings
+) -> Array | None:
+    """LO-RANSAC of PoseLib with its final refinement; arguments and result as ``opencv_ransac``."""
+    if len(keypoints0_xy) < 5:
+        return None
+    values = asdict(camera)
+    pinhole = {
+        "model": "PINHOLE",
+        "width": values["width"],
+        "height": values["height"],
+        "params": [values[name] for name in ("fx", "fy", "cx", "cy")],
+    }
+    options = {
+        "max_epipolar_error": settings.threshold_px,
+        "success_prob": settings.success_prob,
+        "max_iterations": settings.max_iterations,
+        "seed": settings.seed,
+    }
+    pose_cam1_cam0, info = poselib.estimate_relative_pose(
+        keypoints0_xy, keypoints1_xy, pinhole, pinhole, options, {}
+    )
+    t_cam1_cam0 = np.asarray(pose_cam1_cam0.t, dtype=np.float64)
+    length = float(np.linalg.norm(t_cam1_cam0))
+    if info["num_inliers"] < 5 or not np.isfinite(length) or length == 0.0:
+        return None
+    return make_transform(pose_cam1_cam0.R, t_cam1_cam0 / length)
+
+
+#: Name in results -> estimator.
+COMPETITORS: dict[str, Competitor] = {
+    "opencv_ransac": opencv_ransac,
+    "opencv_magsac": opencv_magsac,
+    "poselib": poselib_lo_ransac,
+}
