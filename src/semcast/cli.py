@@ -1,7 +1,7 @@
 """The ``semcast`` command: finds the verb, runs it, turns errors into one line and an exit code.
 
-Verbs live in ``semcast.commands``, one module each with ``add_arguments(parser)`` and ``run(arguments)``. Only
-the chosen verb is imported, so ``semcast --help`` answers without torch, gtsam or rerun.
+Verbs live in ``semcast.commands``, one module each with ``add_arguments(parser)`` and ``run(arguments)``.
+Only the chosen verb is imported, so ``semcast --help`` answers without torch, gtsam or rerun.
 """
 
 import argparse

@@ -1,0 +1,195 @@
+"""``semcast doctor``: check this machine and, if asked, a running system; every finding says what to do."""
+
+import argparse
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import shutil
+import socket
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from rich.table import Table
+
+Verdict = Literal["good", "note", "bad"]
+_STYLE = {"good": "green", "note": "yellow", "bad": "red"}
+
+#: package -> what cannot be done without it; the first group is needed everywhere.
+_PACKAGES = {
+    "numpy": "nothing runs",
+    "opencv-python-headless": "nothing runs",
+    "eclipse-zenoh": "nothing runs",
+    "msgpack": "nothing runs",
+    "torch": "no learned transceiver (extra 'agent' or 'server')",
+    "gtsam": "no bundle adjustment, so no server (extra 'server')",
+    "rerun-sdk": "no viewer (extra 'server')",
+    "poselib": "no two-view start, so no server (extra 'server')",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One checked fact.
+
+    Attributes:
+        what: The thing looked at.
+        verdict: ``good``, ``note`` (works with a limit) or ``bad`` (does not work).
+        text: What was seen and, unless good, what to do.
+    """
+
+    what: str
+    verdict: Verdict
+    text: str
+
+
+def check_python() -> Iterator[Finding]:
+    """Check the interpreter's version."""
+    version = platform.python_version()
+    good = sys.version_info >= (3, 11)
+    yield Finding(
+        "python", "good" if good else "bad", version if good else f"{version}: 3.11 or newer is needed"
+    )
+
+
+def check_packages() -> Iterator[Finding]:
+    """Check that each library is installed, and say what is lost without it."""
+    for package, loss in _PACKAGES.items():
+        try:
+            yield Finding(package, "good", importlib.metadata.version(package))
+        except importlib.metadata.PackageNotFoundError:
+            verdict: Verdict = "bad" if loss == "nothing runs" else "note"
+            yield Finding(package, verdict, f"not installed: {loss}")
+
+
+def check_processor() -> Iterator[Finding]:
+    """Check cores and the instructions that make bfloat16 fast."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    yield Finding(
+        "cores",
+        "good" if cores >= 2 else "note",
+        f"{cores}" if cores >= 2 else "1: agent and server need one each",
+    )
+    try:
+        flags = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        return
+    if "amx_bf16" in flags or "avx512_bf16" in flags:
+        yield Finding("bfloat16", "good", "in hardware: the networks run in bf16")
+    else:
+        yield Finding(
+            "bfloat16",
+            "note",
+            "not in hardware: fp32, 3-5 times slower; use --codec 3dcsc-lite or --resize 0.5",
+        )
+
+
+def check_weights() -> Iterator[Finding]:
+    """Load every shipped set of weights as the running system would."""
+    if importlib.util.find_spec("torch") is None:
+        return
+    from semcast import SemcastError
+    from semcast.common.codecs import available_codecs, load_codec
+
+    for name in available_codecs():
+        try:
+            yield Finding(f"codec {name}", "good", load_codec(name).digest)
+        except SemcastError as err:
+            yield Finding(f"codec {name}", "note", str(err))
+
+
+def check_viewer() -> Iterator[Finding]:
+    """Check whether a window can be opened and the viewer program is there."""
+    if importlib.util.find_spec("rerun") is None:
+        return
+    program = shutil.which("rerun") or shutil.which("rerun", path=str(Path(sys.executable).parent))
+    yield Finding(
+        "rerun program",
+        "good" if program else "note",
+        program or "not on PATH: --view native and web can't start",
+    )
+    display = os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY")
+    if sys.platform.startswith("linux") and not display:
+        yield Finding("display", "note", "none: use --view web, or --view file and open run.rrd elsewhere")
+    else:
+        yield Finding("display", "good", display or sys.platform)
+
+
+def check_port(port: int) -> Iterator[Finding]:
+    """Check that the default port on loopback is free."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+            yield Finding(f"port {port}", "good", "free")
+        except OSError:
+            yield Finding(
+                f"port {port}", "note", "in use: a system is running here, or choose another with --listen"
+            )
+
+
+def check_loopback() -> Iterator[Finding]:
+    """Send one message through a real Zenoh session pair on loopback."""
+    from semcast import TransportError
+    from semcast.common.transport import loopback_round_trip_ms
+
+    try:
+        yield Finding("zenoh loopback", "good", f"{loopback_round_trip_ms():.1f} ms there and back")
+    except TransportError as err:
+        yield Finding("zenoh loopback", "bad", str(err))
+
+
+def check_system(connect: str, agent_id: str) -> Iterator[Finding]:
+    """Ask a running system which roles are alive."""
+    from semcast import TransportError
+    from semcast.common.transport import alive_roles
+
+    try:
+        roles = alive_roles(connect, agent_id)
+    except TransportError as err:
+        yield Finding(f"system at {connect}", "bad", str(err))
+        return
+    for role in ("agent", "channel", "server"):
+        alive = role in roles
+        yield Finding(
+            f"{role} ({agent_id})",
+            "good" if alive else "note",
+            "alive" if alive else f"not seen: start it with 'semcast {role}'",
+        )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--connect", metavar="ENDPOINT", help="also check a running system, such as tcp/127.0.0.1:7447"
+    )
+    parser.add_argument(
+        "--agent-id", default="agent0", metavar="NAME", help="whose roles to look for (default agent0)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print all findings; exit code 1 when one is bad."""
+    checks = [
+        check_python(),
+        check_packages(),
+        check_processor(),
+        check_weights(),
+        check_viewer(),
+        check_port(7447),
+    ]
+    checks.append(check_loopback())
+    if arguments.connect:
+        checks.append(check_system(arguments.connect, arguments.agent_id))
+    table = Table(show_header=False, box=None, pad_edge=False)
+    bad = False
+    for check in checks:
+        for finding in check:
+            bad |= finding.verdict == "bad"
+            table.add_row(f"[{_STYLE[finding.verdict]}]{finding.verdict}[/]", finding.what, finding.text)
+    Console().print(table)
+    return 1 if bad else 0
