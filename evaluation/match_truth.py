@@ -1,0 +1,102 @@
+"""Which matches are right: distance to the true epipolar lines, and to the track in the original images."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import skew
+
+Array = NDArray[np.float64]
+
+#: Window and pyramid of the tracks that serve as truth: those of a usual KLT tracker.
+_LK_WINDOW_PX = 21
+_LK_LEVELS = 3
+
+
+def epipolar_distance_px(
+    keypoints0_xy: Array, keypoints1_xy: Array, T_cam1_cam0: Array, camera: Intrinsics
+) -> Array:
+    """Return the Sampson distance of matches to the epipolar geometry of a motion.
+
+    Args:
+        keypoints0_xy: ``(N, 2)`` pixels in the first image.
+        keypoints1_xy: ``(N, 2)`` pixels in the second image.
+        T_cam1_cam0: True motion, 4x4, with a translation.
+        camera: Both images' camera, without distortion.
+
+    Returns:
+        ``(N,)`` pixels, first order (Hartley and Zisserman, Eq. 11.9), inf where the geometry has no line.
+    """
+    K_inv = np.linalg.inv(camera.K)
+    F = K_inv.T @ skew(T_cam1_cam0[:3, 3]) @ T_cam1_cam0[:3, :3] @ K_inv
+    x0 = np.column_stack([keypoints0_xy, np.ones(len(keypoints0_xy))])
+    x1 = np.column_stack([keypoints1_xy, np.ones(len(keypoints1_xy))])
+    line1, line0 = x0 @ F.T, x1 @ F
+    algebraic = np.abs((x1 * line1).sum(axis=1))
+    gradient = np.sqrt((line1[:, :2] ** 2).sum(axis=1) + (line0[:, :2] ** 2).sum(axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance_px = algebraic / gradient
+    return np.where(gradient > 0, distance_px, np.inf)
+
+
+def track_points(
+    image0: NDArray[np.uint8], image1: NDArray[np.uint8], points_xy: Array
+) -> tuple[Array, Array]:
+    """Follow points from one RGB image to another by pyramidal Lucas-Kanade.
+
+    Args:
+        image0: ``(H, W, 3)`` uint8 RGB.
+        image1: ``(H, W, 3)`` uint8 RGB.
+        points_xy: ``(N, 2)`` pixels in ``image0``.
+
+    Returns:
+        ``(N, 2)`` pixels in ``image1`` and ``(N,)`` bool, False where the point was lost.
+    """
+    if len(points_xy) == 0:
+        return np.zeros((0, 2)), np.zeros(0, dtype=bool)
+    grey0, grey1 = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (image0, image1))
+    moved_xy, found, _ = cv2.calcOpticalFlowPyrLK(
+        grey0,
+        grey1,
+        np.ascontiguousarray(points_xy, dtype=np.float32).reshape(-1, 1, 2),
+        None,
+        winSize=[_LK_WINDOW_PX, _LK_WINDOW_PX],
+        maxLevel=_LK_LEVELS,
+    )
+    return moved_xy.reshape(-1, 2).astype(np.float64), found.ravel().astype(bool)
+
+
+def displacement_from_original_px(
+    decoded: NDArray[np.uint8], original: NDArray[np.uint8], points_xy: Array
+) -> tuple[Array, Array]:
+    """Return how far each point's surroundings lie from where they are in the original image.
+
+    Args:
+        decoded: ``(H, W, 3)`` uint8 RGB.
+        original: ``(H, W, 3)`` uint8 RGB of the same moment.
+        points_xy: ``(N, 2)`` pixels in ``decoded``.
+
+    Returns:
+        ``(N,)`` pixels, and ``(N,)`` bool: False where Lucas-Kanade lost the point.
+    """
+    moved_xy, found = track_points(decoded, original, points_xy)
+    return np.linalg.norm(moved_xy - points_xy, axis=1), found
+
+
+def track_error_px(
+    keypoints0_xy: Array, keypoints1_xy: Array, original0: NDArray[np.uint8], original1: NDArray[np.uint8]
+) -> Array:
+    """Return how far a decoded track ends from the track of the same start in the original images.
+
+    Args:
+        keypoints0_xy: ``(N, 2)`` starts of the tracks.
+        keypoints1_xy: ``(N, 2)`` ends of the tracks on decoded images.
+        original0: ``(H, W, 3)`` uint8 RGB original of the first image.
+        original1: ``(H, W, 3)`` uint8 RGB original of the second image.
+
+    Returns:
+        ``(N,)`` pixels, inf where the original track was lost.
+    """
+    ends_xy, found = track_points(original0, original1, keypoints0_xy)
+    return np.where(found, np.linalg.norm(ends_xy - keypoints1_xy, axis=1), np.inf)
