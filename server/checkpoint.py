@@ -1,0 +1,174 @@
+"""Map checkpoints: what a restarted server needs to go on with the same map.
+
+One uncompressed ``.npz`` (a zip of plain arrays with a CRC each, read without pickle), replaced atomically.
+"""
+
+import contextlib
+import json
+import logging
+import os
+import threading
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import CheckpointError
+
+logger = logging.getLogger(__name__)
+
+FORMAT = 1
+MAX_BYTES = 2 * 1024**3
+_HEADER = "header"
+_MAP = "map."
+
+
+@dataclass(frozen=True)
+class CheckpointHeader:
+    """What the map belongs to.
+
+    Attributes:
+        agent_id: The camera's name.
+        agent_epoch: Start of the agent that sent the frames; a restarted agent is another one.
+        codec_digest: Digest of the codec that decoded them.
+        camera: Intrinsics of the decoded images.
+        frame_id: Newest frame in the map; frames up to it are not processed again.
+        t_source_ns: Recorded time of that frame.
+        map_epoch: Counts new maps within one run.
+    """
+
+    agent_id: str
+    agent_epoch: int
+    codec_digest: str
+    camera: Intrinsics
+    frame_id: int
+    t_source_ns: int
+    map_epoch: int
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A map with what it belongs to; ``arrays`` is what ``Reconstruction.restore`` takes."""
+
+    header: CheckpointHeader
+    arrays: dict[str, NDArray[Any]]
+
+
+def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint so that at any moment the file is the old one or the new one, whole.
+
+    Raises:
+        CheckpointError: An array needs pickling, or the file can't be written.
+    """
+    for name, array in checkpoint.arrays.items():
+        if not isinstance(array, np.ndarray) or array.dtype.hasobject:
+            raise CheckpointError(
+                f"checkpoint array {name!r} must be a plain array, got {type(array).__name__}"
+            )
+    header = {"format": FORMAT, **asdict(checkpoint.header)}
+    header["camera"] = checkpoint.header.camera.to_dict()
+    content = {_MAP + name: array for name, array in checkpoint.arrays.items()}
+    content[_HEADER] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("wb") as file:
+            np.savez(file, allow_pickle=False, **content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as err:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise CheckpointError(f"{path} can't be written: {err}") from err
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint; never executes what is in the file.
+
+    Raises:
+        CheckpointError: The file is missing, damaged, too large or of another format.
+    """
+    try:
+        size = path.stat().st_size
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if max(size, unpacked) > MAX_BYTES:
+            raise CheckpointError(f"{path} must be at most {MAX_BYTES} bytes, got {max(size, unpacked)}")
+        with np.load(path, allow_pickle=False) as content:
+            arrays = {name: np.array(content[name]) for name in content.files}
+        header = json.loads(arrays.pop(_HEADER).tobytes())
+        if header.pop("format") != FORMAT:
+            raise CheckpointError(f"{path} is a checkpoint of another version of semcast")
+        header["camera"] = Intrinsics.from_dict(header["camera"])
+        maps = {name.removeprefix(_MAP): array for name, array in arrays.items() if name.startswith(_MAP)}
+        return Checkpoint(CheckpointHeader(**header), maps)
+    except CheckpointError:
+        raise
+    except Exception as err:  # a damaged zip or array fails in many ways
+        raise CheckpointError(f"{path} can't be read as a checkpoint: {err}") from err
+
+
+def mismatch(header: CheckpointHeader, wanted: Mapping[str, Any]) -> str | None:
+    """Return why a checkpoint does not belong to a stream, or None when it does.
+
+    Args:
+        header: Of the checkpoint.
+        wanted: Header fields with the values of the stream.
+    """
+    for name, value in wanted.items():
+        found = getattr(header, name)
+        if found != value:
+            return f"{name} is {found!r}, the stream has {value!r}"
+    return None
+
+
+class CheckpointWriter:
+    """Writes checkpoints on its own thread; of several waiting only the newest is written.
+
+    Args:
+        path: The checkpoint file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._waiting: Checkpoint | None = None
+        self._condition = threading.Condition()
+        self._closed = False
+        self.num_written = 0
+        self.num_failed = 0
+        self._thread = threading.Thread(target=self._run, name="semcast-checkpoint", daemon=True)
+        self._thread.start()
+
+    def submit(self, checkpoint: Checkpoint) -> None:
+        """Write this one next, instead of any that still waits."""
+        with self._condition:
+            self._waiting = checkpoint
+            self._condition.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._condition:
+                self._condition.wait_for(lambda: self._waiting is not None or self._closed)
+                checkpoint, self._waiting = self._waiting, None
+            if checkpoint is None:
+                return
+            try:
+                save_checkpoint(self._path, checkpoint)
+                self.num_written += 1
+            except CheckpointError as err:
+                self.num_failed += 1
+                if self.num_failed == 1:
+                    logger.warning("%s; the stream goes on without checkpoints", err)
+
+    def close(self, deadline_s: float = 10.0) -> None:
+        """Write what waits and end the thread. Idempotent."""
+        with self._condition:
+            self._closed = True
+            self._condition.notify()
+        self._thread.join(deadline_s)

@@ -1,0 +1,145 @@
+"""File formats of what a run leaves behind: PLY map, timed trajectory, JSON without NaN."""
+
+import json
+import math
+import os
+import platform
+from collections.abc import Iterable, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from semcast import __version__
+from semcast.common.errors import SourceError
+from semcast.common.trajectory import Trajectory
+
+PACKAGES = ("numpy", "torch", "opencv-python-headless", "eclipse-zenoh", "rerun-sdk", "gtsam", "poselib")
+
+PLY_VERTEX = np.dtype(
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("red", "u1"),
+        ("green", "u1"),
+        ("blue", "u1"),
+        ("confidence", "<f4"),
+    ]
+)
+_PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
+
+
+def write_ply(path: Path, xyz: ArrayLike, rgb: NDArray[np.uint8], confidence: NDArray[np.float32]) -> None:
+    """Write landmarks as binary PLY with colour and a ``confidence`` property in [0, 1].
+
+    Points with a non-finite coordinate are left out.
+
+    Args:
+        path: File to write.
+        xyz: ``(N, 3)`` in the world frame, map units; x right, y down, z forward of the first camera.
+        rgb: ``(N, 3)``.
+        confidence: ``(N,)``.
+    """
+    points = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
+    finite = np.isfinite(points).all(axis=1)
+    vertices = np.empty(int(finite.sum()), dtype=PLY_VERTEX)
+    for axis, name in enumerate(("x", "y", "z")):
+        vertices[name] = points[finite, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        vertices[name] = rgb[finite, channel]
+    vertices["confidence"] = confidence[finite]
+    properties = [f"property {_PLY_TYPES[PLY_VERTEX[name].str]} {name}" for name in PLY_VERTEX.names or ()]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment semcast map; x right, y down, z forward of the first camera; map units",
+        f"element vertex {len(vertices)}",
+        *properties,
+        "end_header",
+    ]
+    path.write_bytes("\n".join(header).encode("ascii") + b"\n" + vertices.tobytes())
+
+
+def read_ply(path: Path) -> NDArray[Any]:
+    """Read back what ``write_ply`` wrote, as an array of ``PLY_VERTEX``.
+
+    Raises:
+        SourceError: The file can't be read or has other properties.
+    """
+    try:
+        header, end, body = path.read_bytes().partition(b"end_header\n")
+    except OSError as err:
+        raise SourceError(f"{path} can't be read: {err}") from err
+    names = [
+        line.split()[-1] for line in header.decode("ascii", "replace").splitlines() if "property" in line
+    ]
+    if not end or names != list(PLY_VERTEX.names or ()) or len(body) % PLY_VERTEX.itemsize:
+        raise SourceError(f"{path} is not a map written by semcast")
+    return np.frombuffer(body, dtype=PLY_VERTEX)
+
+
+def trajectory_of(poses: Mapping[int, NDArray[np.float64]], t_source_ns: Mapping[int, int]) -> Trajectory:
+    """Order poses by frame id and give them the source's times; equal or falling times are left out.
+
+    Args:
+        poses: Frame id to ``T_world_cam``.
+        t_source_ns: Frame id to recorded time.
+    """
+    times_s: list[float] = []
+    kept: list[NDArray[np.float64]] = []
+    for frame_id in sorted(poses):
+        if frame_id not in t_source_ns:
+            continue
+        t_s = t_source_ns[frame_id] * 1e-9
+        if times_s and t_s <= times_s[-1]:
+            continue
+        times_s.append(t_s)
+        kept.append(poses[frame_id])
+    return Trajectory(np.array(times_s), np.array(kept, dtype=np.float64).reshape(-1, 4, 4))
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON knows it: numpy becomes Python, NaN and infinity become None."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write JSON without NaN, whole or not at all."""
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(json.dumps(plain(value), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def percentiles(values_ms: Iterable[float]) -> dict[str, float] | None:
+    """Return p50, p95 and max, None without values."""
+    values = np.fromiter((v for v in values_ms if math.isfinite(v)), dtype=np.float64)
+    if len(values) == 0:
+        return None
+    p50, p95 = np.percentile(values, [50, 95])
+    return {"p50": float(p50), "p95": float(p95), "max": float(values.max())}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions a figure depends on; packages that are not installed are left out."""
+    found = {"semcast": __version__, "python": platform.python_version(), "machine": platform.machine()}
+    for package in PACKAGES:
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
