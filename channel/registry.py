@@ -1,0 +1,183 @@
+"""Channel models by name. A model draws, for one frame, what happens to each of its slots.
+
+Models keep no random state: a frame's draw depends on seed, frame number and time alone, so losing a frame or
+restarting the channel changes nothing about the others.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.channel.awgn import noise_variance
+from semcast.channel.erasure import gilbert_elliott, independent_losses
+from semcast.channel.fading import clarke_gains, rayleigh_gains, rician_gains
+from semcast.channel.settings import ChannelSettings
+from semcast.channel.trace import ConstantTrace, RandomWalkTrace, SnrTrace, ramp, read_trace_csv
+from semcast.common.config import near_match
+from semcast.common.errors import ConfigError
+
+__all__ = ["ChannelModel", "ChannelSettings", "SlotDraw", "build_channel", "channel_names"]
+
+_FADING_STREAM = 0xFAD
+_SIGHT_STREAM = 0x105
+
+
+@dataclass(frozen=True)
+class SlotDraw:
+    """What happens to the slots of one frame.
+
+    Attributes:
+        snr_db: SNR set for this moment, before fading, bursts and losses.
+        h: ``(num_slots,)`` complex64 gains.
+        noise_var: ``(num_slots,)`` float32 complex noise variances.
+        lost: ``(num_slots,)`` bool, slots of which nothing arrives.
+    """
+
+    snr_db: float
+    h: NDArray[np.complex64]
+    noise_var: NDArray[np.float32]
+    lost: NDArray[np.bool_]
+
+
+class ChannelModel(Protocol):
+    """One kind of channel."""
+
+    def draw(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> SlotDraw:
+        """Draw one frame.
+
+        Args:
+            num_slots: Slots of the frame.
+            elapsed_s: Time since the first frame.
+            rng: Randomness of this frame alone.
+        """
+
+    def update(self, settings: ChannelSettings) -> None:
+        """Take new settings from the next frame on.
+
+        Raises:
+            ConfigError: The settings name another channel or a trace that can't be read.
+        """
+
+
+class _Model:
+    """AWGN; the other models change parts of its draw."""
+
+    def __init__(self, settings: ChannelSettings, seed: int) -> None:
+        self._settings = settings
+        self._seed = seed
+
+    def update(self, settings: ChannelSettings) -> None:
+        if settings.channel != self._settings.channel:
+            raise ConfigError(
+                f"channel must stay {self._settings.channel!r} in an update, got {settings.channel!r}"
+            )
+        self._settings = settings
+
+    def _snr_db(self, elapsed_s: float) -> float:
+        del elapsed_s
+        return self._settings.snr_db
+
+    def _gains(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> NDArray[np.complex64]:
+        del elapsed_s, rng
+        return np.ones(num_slots, dtype=np.complex64)
+
+    def _noise_raise(self, num_slots: int, rng: np.random.Generator) -> NDArray[np.float32]:
+        del rng
+        return np.ones(num_slots, dtype=np.float32)
+
+    def _lost(self, num_slots: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+        del rng
+        return np.zeros(num_slots, dtype=bool)
+
+    def draw(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> SlotDraw:
+        snr_db = self._snr_db(elapsed_s)
+        return SlotDraw(
+            snr_db=snr_db,
+            h=self._gains(num_slots, elapsed_s, rng),
+            noise_var=np.float32(noise_variance(snr_db)) * self._noise_raise(num_slots, rng),
+            lost=self._lost(num_slots, rng),
+        )
+
+
+class _Rayleigh(_Model):
+    def _gains(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> NDArray[np.complex64]:
+        settings = self._settings
+        if settings.doppler_hz <= 0.0:
+            return rayleigh_gains(num_slots, rng)
+        times_s = elapsed_s + 1e-3 * settings.slot_ms * np.arange(num_slots)
+        waves = np.random.default_rng((self._seed, _FADING_STREAM))
+        return clarke_gains(times_s, settings.doppler_hz, waves)
+
+
+class _Rician(_Rayleigh):
+    def _gains(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> NDArray[np.complex64]:
+        scattered = super()._gains(num_slots, elapsed_s, rng)
+        phase_rad = 2.0 * np.pi * np.random.default_rng((self._seed, _SIGHT_STREAM)).random()
+        return rician_gains(scattered, self._settings.rician_k_db, phase_rad)
+
+
+class _Erasure(_Model):
+    def _lost(self, num_slots: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+        return independent_losses(num_slots, self._settings.slot_loss, rng)
+
+
+class _Burst(_Model):
+    def _noise_raise(self, num_slots: int, rng: np.random.Generator) -> NDArray[np.float32]:
+        settings = self._settings
+        hit = gilbert_elliott(num_slots, settings.slot_loss, settings.burst_slots, rng)
+        return np.where(hit, 10.0 ** (settings.burst_noise_db / 10.0), 1.0).astype(np.float32)
+
+
+class _Trace(_Model):
+    def __init__(self, settings: ChannelSettings, seed: int) -> None:
+        super().__init__(settings, seed)
+        self._trace = self._build(settings)
+
+    def _build(self, settings: ChannelSettings) -> SnrTrace:
+        if settings.trace == "ramp":
+            return ramp(settings.snr_db, settings.trace_end_db, settings.trace_s)
+        if settings.trace == "walk":
+            return RandomWalkTrace(settings.snr_db, settings.trace_step_db, self._seed)
+        if settings.trace == "file" and settings.trace_file is not None:
+            return read_trace_csv(settings.trace_file)
+        return ConstantTrace(settings.snr_db)
+
+    def update(self, settings: ChannelSettings) -> None:
+        trace = self._build(settings)
+        super().update(settings)
+        self._trace = trace
+
+    def _snr_db(self, elapsed_s: float) -> float:
+        return self._trace.snr_db(elapsed_s)
+
+
+def _registry() -> dict[str, Callable[[ChannelSettings, int], ChannelModel]]:
+    return {
+        "awgn": _Model,
+        "rayleigh": _Rayleigh,
+        "rician": _Rician,
+        "erasure": _Erasure,
+        "burst": _Burst,
+        "trace": _Trace,
+    }
+
+
+def channel_names() -> list[str]:
+    """Return the names ``build_channel`` knows."""
+    return list(_registry())
+
+
+def build_channel(settings: ChannelSettings, seed: int) -> ChannelModel:
+    """Build the model that ``settings.channel`` names.
+
+    Raises:
+        ConfigError: The name is unknown or a trace can't be read.
+    """
+    registry = _registry()
+    if settings.channel not in registry:
+        hint = near_match(settings.channel, list(registry))
+        raise ConfigError(f"channel must be one of {', '.join(registry)}, got {settings.channel!r}{hint}")
+    return registry[settings.channel](settings, seed)

@@ -1,0 +1,88 @@
+"""What can be set about a channel, in one flat set of values that may change while it runs."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from semcast.channel.trace import SNR_RANGE_DB
+
+ChannelName = Literal["awgn", "rayleigh", "rician", "erasure", "burst", "trace"]
+TraceName = Literal["constant", "ramp", "walk", "file"]
+
+
+def _check_range(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise ValueError(f"{name} must be in [{low:g}, {high:g}], got {value:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelSettings:
+    """Settings of the channel between agent and server.
+
+    Raises:
+        ValueError: A value is out of range, or values contradict each other.
+    """
+
+    channel: ChannelName = field(
+        default="awgn",
+        metadata={
+            "help": "awgn; rayleigh, rician: one random gain per slot; erasure: slots lost one by one; "
+            "burst: noise raised for several slots in a row; trace: SNR changes over time"
+        },
+    )
+    snr_db: float = field(default=10.0, metadata={"help": "mean Es/N0 per complex symbol in dB"})
+    slot_loss: float = field(
+        default=0.2, metadata={"help": "share of slots lost (erasure) or hit by a burst (burst)"}
+    )
+    frame_loss: float = field(default=0.0, metadata={"help": "share of whole frames lost, on any channel"})
+    burst_slots: float = field(default=4.0, metadata={"help": "mean length of a burst in slots"})
+    burst_noise_db: float = field(default=20.0, metadata={"help": "how far a burst raises the noise, in dB"})
+    rician_k_db: float = field(
+        default=6.0, metadata={"help": "line of sight over scattered power in dB (rician)"}
+    )
+    doppler_hz: float = field(
+        default=0.0,
+        metadata={"help": "Doppler shift of rayleigh and rician; 0 draws each slot independently"},
+    )
+    slot_ms: float = field(default=1.0, metadata={"help": "duration of a slot in ms, for Doppler"})
+    trace: TraceName = field(default="ramp", metadata={"help": "shape of the SNR over time (trace)"})
+    trace_end_db: float = field(default=2.0, metadata={"help": "SNR at the end of the ramp in dB"})
+    trace_s: float = field(default=5.0, metadata={"help": "duration of the ramp in seconds"})
+    trace_step_db: float = field(
+        default=1.0, metadata={"help": "standard deviation of a random walk's step each half second, in dB"}
+    )
+    trace_file: Path | None = field(
+        default=None, metadata={"help": "CSV file with the columns t_s,snr_db (trace file)"}
+    )
+    delay_ms: float = field(default=0.0, metadata={"help": "delay of every frame in ms"})
+    jitter_ms: float = field(default=0.0, metadata={"help": "mean of the random extra delay in ms"})
+
+    def __post_init__(self) -> None:
+        for name, value, allowed in (
+            ("channel", self.channel, ChannelName),
+            ("trace", self.trace, TraceName),
+        ):
+            words = allowed.__args__
+            if value not in words:
+                raise ValueError(f"{name} must be one of {', '.join(words)}, got {value!r}")
+        _check_range("snr_db", self.snr_db, *SNR_RANGE_DB)
+        _check_range("trace_end_db", self.trace_end_db, *SNR_RANGE_DB)
+        _check_range("slot_loss", self.slot_loss, 0.0, 0.99)
+        _check_range("frame_loss", self.frame_loss, 0.0, 1.0)
+        _check_range("burst_slots", self.burst_slots, 1.0, 1000.0)
+        _check_range("burst_noise_db", self.burst_noise_db, 0.0, 60.0)
+        _check_range("rician_k_db", self.rician_k_db, -20.0, 40.0)
+        _check_range("doppler_hz", self.doppler_hz, 0.0, 2000.0)
+        _check_range("slot_ms", self.slot_ms, 0.001, 1000.0)
+        _check_range("trace_s", self.trace_s, 0.01, 86400.0)
+        _check_range("trace_step_db", self.trace_step_db, 0.0, 10.0)
+        _check_range("delay_ms", self.delay_ms, 0.0, 10000.0)
+        _check_range("jitter_ms", self.jitter_ms, 0.0, 10000.0)
+        least = self.slot_loss / (1.0 - self.slot_loss)
+        if self.channel == "burst" and self.burst_slots < least:
+            raise ValueError(
+                f"burst_slots must be at least {least:g} for a slot_loss of {self.slot_loss:g}, "
+                f"got {self.burst_slots:g}"
+            )
+        if self.channel == "trace" and self.trace == "file" and self.trace_file is None:
+            raise ValueError("trace_file must be given for trace 'file', got None")
