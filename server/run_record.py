@@ -1,0 +1,206 @@
+"""One row per frame, written as it happens, and the summary of a run made from them."""
+
+import contextlib
+import json
+import logging
+import os
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from semcast.common.errors import SemcastError
+from semcast.common.trajectory import Trajectory
+from semcast.common.trajectory_error import trajectory_summary
+from semcast.server.export import percentiles, plain
+
+logger = logging.getLogger(__name__)
+
+FILE_NAME = "frames.jsonl"
+MAX_ROWS_IN_MEMORY = 20_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameRow:
+    """What is known about one frame that reached the tracker. None means unknown.
+
+    Attributes:
+        frame_id: Index in the source.
+        t_source_ns: Recorded time of the frame.
+        state: Tracking state after the frame.
+        posed: Whether it had a pose at once; frames posed later count in the trajectory.
+        num_tracked: Keypoints followed into the frame.
+        num_inliers: Of them, those that agree with the pose.
+        reprojection_error_px: Median over inliers.
+        is_keyframe: Whether it became a keyframe.
+        map_epoch: Map it belongs to.
+        snr_set_db: What the channel node says it applies.
+        snr_estimated_db: What the receiver estimated from the pilots.
+        psnr_db: Of the decoded image, where the original is known.
+        confidence_mean: Mean of the confidence map.
+        age_ms: From arrival at the server to the pose.
+        stage_ms: Duration of each stage.
+    """
+
+    frame_id: int
+    t_source_ns: int
+    state: str
+    posed: bool
+    num_tracked: int
+    num_inliers: int
+    reprojection_error_px: float | None
+    is_keyframe: bool
+    map_epoch: int
+    snr_set_db: float | None
+    snr_estimated_db: float | None
+    psnr_db: float | None
+    confidence_mean: float | None
+    age_ms: float
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+
+class RunRecord:
+    """Appends rows to ``frames.jsonl``, which survives a kill; without a folder keeps the newest in memory.
+
+    Args:
+        folder: Where the file goes, or None.
+        resume: Go on behind the rows that are there; otherwise they are replaced.
+
+    Raises:
+        SemcastError: The file can't be written, or what is there can't be read.
+    """
+
+    def __init__(self, folder: Path | None, *, resume: bool = False) -> None:
+        self._memory: deque[FrameRow] = deque(maxlen=MAX_ROWS_IN_MEMORY)
+        self._path = folder / FILE_NAME if folder is not None else None
+        self._file: TextIO | None = None
+        if self._path is None:
+            return
+        try:
+            kept = read_rows(self._path) if resume else []
+            temporary = self._path.with_name(FILE_NAME + ".tmp")
+            temporary.write_text("".join(_line(row) for row in kept), encoding="utf-8")
+            os.replace(temporary, self._path)
+            self._file = self._path.open("a", encoding="utf-8")
+        except OSError as err:
+            raise SemcastError(f"{self._path} can't be written: {err}") from err
+
+    def add(self, row: FrameRow) -> None:
+        """Append a row. A full disk is reported once; later rows stay in memory and the stream goes on."""
+        if self._file is not None:
+            try:
+                self._file.write(_line(row))
+                self._file.flush()
+                return
+            except OSError as err:
+                logger.warning("%s can't be written: %s; rows are kept in memory now", self._path, err)
+                self.close()
+        self._memory.append(row)
+
+    def rows(self) -> list[FrameRow]:
+        """Return all rows, also those of a run this one resumed."""
+        on_disk = read_rows(self._path) if self._path is not None else []
+        return [*on_disk, *self._memory]
+
+    def close(self) -> None:
+        """Close the file. Idempotent."""
+        file, self._file = self._file, None
+        if file is not None:
+            with contextlib.suppress(OSError):
+                file.close()
+
+
+def _line(row: FrameRow) -> str:
+    return json.dumps(plain(asdict(row)), allow_nan=False) + "\n"
+
+
+def read_rows(path: Path) -> list[FrameRow]:
+    """Read ``frames.jsonl`` up to its last whole line; none where there is no file.
+
+    Raises:
+        SemcastError: A line before the last one is not a row.
+    """
+    if not path.exists():
+        return []
+    rows: list[FrameRow] = []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
+    for number, line in enumerate(lines, start=1):
+        try:
+            rows.append(FrameRow(**json.loads(line)))
+        except (ValueError, TypeError) as err:
+            if number == len(lines):
+                break
+            raise SemcastError(f"{path}:{number} is not a frame row: {err}") from err
+    return rows
+
+
+def unposed_ranges(frame_ids: list[int], posed: set[int]) -> list[tuple[int, int]]:
+    """Return first and last frame id of each run of frames without a pose, in order."""
+    ranges: list[tuple[int, int]] = []
+    first: int | None = None
+    last = 0
+    for frame_id in frame_ids:
+        if frame_id not in posed:
+            first = frame_id if first is None else first
+            last = frame_id
+        elif first is not None:
+            ranges.append((first, last))
+            first = None
+    return ranges if first is None else [*ranges, (first, last)]
+
+
+def summarise(
+    rows: list[FrameRow],
+    trajectory: Trajectory,
+    posed_ids: set[int],
+    truth: Trajectory | None,
+    num_frames: int | None,
+    drops: Mapping[str, int],
+) -> dict[str, Any]:
+    """Return the figures of a run; None where one has no meaning.
+
+    Args:
+        rows: One per frame that reached the tracker.
+        trajectory: All posed frames after the last correction.
+        posed_ids: Their frame ids.
+        truth: Reference poses in metres, or None.
+        num_frames: Frames the source had up to the end of the run; None takes the span of frame ids seen.
+        drops: Frames that never reached the tracker, by reason.
+    """
+    frame_ids = sorted(row.frame_id for row in rows)
+    if num_frames is None:
+        num_frames = frame_ids[-1] - frame_ids[0] + 1 if frame_ids else 0
+    num_frames = max(num_frames, len(posed_ids))
+    psnr_db = np.array([row.psnr_db for row in rows if row.psnr_db is not None and np.isfinite(row.psnr_db)])
+    stages = sorted({stage for row in rows for stage in row.stage_ms})
+    stage_ms = {s: percentiles(row.stage_ms[s] for row in rows if s in row.stage_ms) for s in stages}
+    stage_ms["arrival_to_pose"] = percentiles(row.age_ms for row in rows)
+    span_s = (rows[-1].t_source_ns - rows[0].t_source_ns) * 1e-9 if len(rows) > 1 else 0.0
+    return {
+        **trajectory_summary(trajectory, truth, num_frames),
+        "psnr_db": float(psnr_db.mean()) if len(psnr_db) else None,
+        "psnr_p50_db": float(np.median(psnr_db)) if len(psnr_db) else None,
+        "snr_estimated_db": _mean(row.snr_estimated_db for row in rows),
+        "confidence_mean": _mean(row.confidence_mean for row in rows),
+        "num_inliers_p50": float(np.median([row.num_inliers for row in rows])) if rows else None,
+        "reprojection_error_px": _mean(row.reprojection_error_px for row in rows),
+        "stage_ms": {name: value for name, value in stage_ms.items() if value is not None},
+        "frames": {
+            "source": num_frames,
+            "tracked": len(rows),
+            "posed": len(posed_ids),
+            "keyframes": sum(row.is_keyframe for row in rows),
+        },
+        "frame_rate_hz": (len(rows) - 1) / span_s if span_s > 0 else None,
+        "drops": dict(drops),
+        "states": dict(Counter(row.state for row in rows)),
+        "unposed_frames": unposed_ranges(frame_ids, posed_ids),
+    }
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if known else None

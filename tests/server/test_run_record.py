@@ -1,0 +1,120 @@
+"""Rows survive a kill, and the summary says what happened."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semcast.common.errors import SemcastError
+from semcast.common.trajectory import Trajectory
+from semcast.server.export import write_json
+from semcast.server.run_record import FILE_NAME, FrameRow, RunRecord, read_rows, summarise, unposed_ranges
+
+
+def row(frame_id, posed=True, psnr_db=30.0, **changes):
+    values = {
+        "frame_id": frame_id,
+        "t_source_ns": frame_id * 100_000_000,
+        "state": "tracking" if posed else "lost",
+        "posed": posed,
+        "num_tracked": 120,
+        "num_inliers": 100,
+        "reprojection_error_px": 0.5,
+        "is_keyframe": frame_id % 5 == 0,
+        "map_epoch": 0,
+        "snr_set_db": 10.0,
+        "snr_estimated_db": 9.5,
+        "psnr_db": psnr_db,
+        "confidence_mean": 0.9,
+        "age_ms": 50.0,
+        "stage_ms": {"decode": 20.0 + frame_id, "track": 10.0},
+    }
+    return FrameRow(**{**values, **changes})
+
+
+def line_trajectory(frame_ids):
+    poses = np.tile(np.eye(4), (len(frame_ids), 1, 1))
+    poses[:, 2, 3] = frame_ids
+    return Trajectory(np.array(frame_ids) * 0.1, poses)
+
+
+def test_rows_are_on_disk_at_once_and_a_torn_last_line_is_left_out(tmp_path):
+    record = RunRecord(tmp_path)
+    record.add(row(0))
+    record.add(row(1, posed=False, psnr_db=float("nan")))
+    path = tmp_path / FILE_NAME
+    assert [r.frame_id for r in read_rows(path)] == [0, 1]
+    assert read_rows(path)[1].psnr_db is None
+    path.write_text(path.read_text() + '{"frame_id": 2, "t_sou')
+    assert [r.frame_id for r in read_rows(path)] == [0, 1]
+    record.close()
+
+
+def test_a_resumed_run_goes_on_behind_its_rows_and_a_new_run_does_not(tmp_path):
+    for resume, expected in ((False, [0]), (True, [0, 0]), (False, [0])):
+        record = RunRecord(tmp_path, resume=resume)
+        record.add(row(0))
+        record.close()
+        record.close()
+        assert [r.frame_id for r in record.rows()] == expected
+
+
+def test_damage_in_the_middle_is_an_error_with_its_line(tmp_path):
+    (tmp_path / FILE_NAME).write_text('{"frame_id": 1}\n{"frame_id": 2}\n')
+    with pytest.raises(SemcastError, match=r"frames.jsonl:1 "):
+        read_rows(tmp_path / FILE_NAME)
+
+
+def test_without_a_folder_rows_stay_in_memory():
+    record = RunRecord(None)
+    record.add(row(3))
+    assert [r.frame_id for r in record.rows()] == [3]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_does_not_stop_the_stream(tmp_path, caplog):
+    record = RunRecord(tmp_path)
+    record.add(row(0))
+
+    record._file.close()
+    record._file = Path("/dev/full").open("w")
+    with caplog.at_level("WARNING"):
+        record.add(row(1))
+        record.add(row(2))
+    assert caplog.text.count("No space left") == 1
+    assert [r.frame_id for r in record.rows()] == [0, 1, 2]
+
+
+def test_unposed_ranges_by_hand():
+    assert unposed_ranges([0, 1, 2, 3, 5, 6, 9], {2, 6}) == [(0, 1), (3, 5), (9, 9)]
+    assert unposed_ranges([0, 1], {0, 1}) == []
+    assert unposed_ranges([], set()) == []
+
+
+def test_the_summary_has_the_promised_keys_and_values(tmp_path):
+    rows = [row(k, posed=k != 3, psnr_db=30.0 + k) for k in range(10)]
+    rows.append(row(10, psnr_db=float("inf")))
+    kept = [k for k in range(11) if k != 3]
+    summary = summarise(
+        rows, line_trajectory(kept), set(kept), line_trajectory(range(20)), 20, {"superseded": 2}
+    )
+    assert summary["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+    assert summary["completeness"] == 10 / 20
+    assert summary["psnr_db"] == pytest.approx(34.5)
+    assert summary["stage_ms"]["decode"]["p50"] == pytest.approx(25.0)
+    assert summary["stage_ms"]["decode"]["p95"] == pytest.approx(29.5)
+    assert summary["drops"] == {"superseded": 2}
+    assert summary["unposed_frames"] == [(3, 3)]
+    assert summary["frame_rate_hz"] == pytest.approx(10.0)
+    assert {"ate_percent", "rpe_trans_percent", "rpe_rot_deg"} <= set(summary)
+    write_json(tmp_path / "summary.json", summary)
+    json.loads((tmp_path / "summary.json").read_text(), parse_constant=pytest.fail)
+
+
+def test_a_run_without_frames_has_a_summary_too():
+    summary = summarise([], line_trajectory([]), set(), None, None, {})
+    assert summary["completeness"] == 0.0
+    assert summary["ate_rmse_m"] is None
+    assert summary["psnr_db"] is None
+    assert summary["stage_ms"] == {}
