@@ -101,7 +101,7 @@ def _pool_noise(per_slot: NDArray[np.float64], dof: int) -> tuple[NDArray[np.flo
     """Replace the noise estimates of all slots that agree by their mean.
 
     Each estimate is ``noise_var * Gamma(dof) / dof``. The Wilson-Hilferty cube root makes it normal, so one
-    threshold serves few pilots and many. The search starts at the lower quartile: bursts only raise the noise,
+    threshold serves few pilots and many. The search starts at the lower quartile: bursts only raise noise,
     so the quiet slots are the floor even when most slots are hit.
 
     Args:
