@@ -32,6 +32,10 @@ SERIES = {
     "tracking/tracked": ("tracked", (130, 140, 160)),
     "tracking/inliers": ("inliers", (80, 230, 120)),
     "error/reprojection_error_px": ("reprojection error", (255, 120, 90)),
+    "latency/decode_ms": ("decode", (90, 170, 255)),
+    "latency/track_ms": ("track", (80, 230, 120)),
+    "latency/map_ms": ("map", (200, 130, 255)),
+    "latency/arrival_to_pose_ms": ("arrival to pose", (255, 170, 40)),
 }
 
 
@@ -46,7 +50,6 @@ class Delivery(Enum):
 def blueprint(has_truth: bool, has_confidence: bool) -> rrb.Blueprint:
     """Return the layout: the scene at the left, images at the right, plots below."""
     dark = rrb.Background(color=BACKGROUND)
-    plot_background = rrb.archetypes.PlotBackground(color=BACKGROUND, show_grid=True)
     scene = rrb.Spatial3DView(
         name="Camera and map" + (" (grey: ground truth)" if has_truth else ""),
         origin="/world",
@@ -67,7 +70,6 @@ def blueprint(has_truth: bool, has_confidence: bool) -> rrb.Blueprint:
         rrb.TimeSeriesView(
             name=name,
             origin=f"/plots/{origin}",
-            background=plot_background,
             plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
             axis_y=rrb.ScalarAxis(zoom_lock=False),
         )

@@ -78,7 +78,7 @@ def test_a_full_disk_does_not_stop_the_stream(tmp_path, caplog):
     record.add(row(0))
 
     record._file.close()
-    record._file = Path("/dev/full").open("w")
+    record._file = Path("/dev/full").open("w")  # noqa: SIM115
     with caplog.at_level("WARNING"):
         record.add(row(1))
         record.add(row(2))
