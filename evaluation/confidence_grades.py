@@ -14,7 +14,7 @@ from semcast.common.codec import LOST_SLOT_SNR_DB, DecodedImage, displacement_px
 from semcast.common.phy.slots import BLOCK_PX as SLOT_PX
 from semcast.evaluation.calibration import normalised_ause, reliability
 from semcast.evaluation.match_truth import displacement_from_original_px
-from semcast.evaluation.statistics import spearman
+from semcast.evaluation.statistics import finite_mean, spearman
 from semcast.evaluation.uncertainty_maps import (
     absolute_error,
     block_means,
@@ -33,11 +33,6 @@ _CORNER_DISTANCE_PX = 8
 #: A corner that Lucas-Kanade finds further away than this was not found but confused with another.
 _MAX_DISPLACEMENT_PX = 10.0
 _NUM_QUANTILES = 8
-
-
-def _mean(values: list[float | None]) -> float | None:
-    defined = [v for v in values if v is not None]
-    return float(np.mean(defined)) if defined else None
 
 
 class PixelGrader:
@@ -82,7 +77,7 @@ class PixelGrader:
             np.clip(np.concatenate(self._predicted), 0.0, 1.0), np.concatenate(self._observed)
         )
         maps = {
-            name: {key: _mean(values) for key, values in grades.items()}
+            name: {key: finite_mean(values) for key, values in grades.items()}
             for name, grades in self._grades.items()
         }
         return {"ece": table.ece, "reliability": table, "maps": maps}
@@ -175,8 +170,8 @@ class SlotGrader:
     def result(self) -> dict[str, float | int | None]:
         """Return ``confidence_lost``, ``confidence_received`` (None without such slots) and counts."""
         return {
-            "confidence_lost": _mean(list(self._lost)),
-            "confidence_received": _mean(list(self._received)),
+            "confidence_lost": finite_mean(self._lost),
+            "confidence_received": finite_mean(self._received),
             "num_lost": len(self._lost),
             "num_received": len(self._received),
         }

@@ -124,9 +124,17 @@ def command_line(verb: str, settings: Any) -> str:
         verb: Such as ``eval trajectory``.
         settings: A settings dataclass; ``Path`` values are shown as in ``json_ready``.
     """
-    words = ["semcast", *verb.split()]
+    return shlex.join(["semcast", *verb.split(), *_flags(settings)])
+
+
+def _flags(settings: Any) -> list[str]:
+    """Return the flags of all settings off their default, those of nested settings in place."""
+    words: list[str] = []
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            words += _flags(value)
+            continue
         default = field.default
         if field.default_factory is not dataclasses.MISSING:
             default = field.default_factory()
@@ -138,7 +146,7 @@ def command_line(verb: str, settings: Any) -> str:
             continue
         items = value if isinstance(value, tuple) else (value,)
         words += [f"--{flag}", *(str(json_ready(item)) for item in items)]
-    return shlex.join(words)
+    return words
 
 
 def provenance(verb: str, settings: Any) -> dict[str, Any]:

@@ -97,6 +97,12 @@ def pose_auc_percent(errors_deg: ArrayLike, threshold_deg: float) -> float | Non
     return float(100.0 * np.sum(np.diff(e) * (r[1:] + r[:-1]) / 2) / threshold_deg)
 
 
+def finite_mean(values: Sequence[float | None]) -> float | None:
+    """Return the mean of the values that are there and finite, or None when there are none."""
+    known = [v for v in values if v is not None and np.isfinite(v)]
+    return float(np.mean(known)) if known else None
+
+
 def percentiles(values: ArrayLike, which: Sequence[int] = (50, 95)) -> dict[str, float | None]:
     """Return ``{"p50": ..., "p95": ...}`` of ``(N,)`` values; None each when there are none."""
     x = np.asarray(values, dtype=np.float64).ravel()

@@ -23,8 +23,14 @@ class Colour(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LinkSettings:
+    loss: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class Settings:
     sequence: Path
+    link: LinkSettings = LinkSettings()
     snr_db: tuple[float, ...] = (10.0,)
     seeds: int = field(default=1, metadata={"flag": "num_seeds"})
     plots: bool = True
@@ -75,6 +81,8 @@ def test_the_command_names_only_what_differs_from_the_defaults():
         == "semcast eval pairs --sequence 'chair orbit' --snr-db 2.0 6.0 --num-seeds 3 --no-plots"
     )
     assert command_line("eval pairs", Settings(sequence=Path("a"))) == "semcast eval pairs --sequence a"
+    nested = Settings(sequence=Path("a"), link=LinkSettings(loss=0.2))
+    assert command_line("eval pairs", nested) == "semcast eval pairs --sequence a --loss 0.2"
 
 
 def test_provenance_names_kind_of_machine_commit_and_versions():

@@ -5,6 +5,7 @@ import scipy.stats
 from semcast.evaluation.statistics import (
     auroc,
     average_ranks,
+    finite_mean,
     paired_bootstrap,
     percentiles,
     pose_auc_percent,
@@ -80,6 +81,11 @@ def test_percentiles_and_stages():
     stages = stage_percentiles([{"track": 1.0}, {"track": 3.0, "map": 7.0}])
     assert stages["track"]["p50"] == 2.0
     assert stages["map"] == {"p50": 7.0, "p95": 7.0}
+
+
+def test_finite_mean_leaves_out_what_is_not_known():
+    assert finite_mean([1.0, None, np.inf, 3.0]) == 2.0
+    assert finite_mean([None, np.nan]) is None
 
 
 def test_bootstrap_of_a_constant_difference_has_no_width(rng):
