@@ -1,0 +1,290 @@
+"""The folder a run leaves behind (``--out``) and the reconstruction in it that other tools are fed from.
+
+===================== =================================================================================
+``trajectory.tum``    poses of all frames, ``t tx ty tz qx qy qz qw``, camera to world
+``map.ply``           landmarks with colour and confidence
+``summary.json``      figures of the run
+``settings.toml``     resolved settings
+``frames.jsonl``      one row per frame: state, SNR, PSNR, inliers, stage times
+``run.rrd``           what the viewer showed
+``reconstruction.npz`` what ``semcast export`` needs, see ``RunData``
+``images/``           decoded images, ``<frame id, six digits>.jpg``, of keyframes or of all frames
+===================== =================================================================================
+
+The server fills ``RunData`` from ``Reconstruction``: intrinsics of the decoded (undistorted) images, frame ids,
+times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks()``, and ``observations()`` as
+(landmark id, keyframe id, x, y). It calls ``write_run`` once at the end and feeds an ``ImageWriter`` on the way.
+"""
+
+import contextlib
+import json
+import logging
+import os
+import queue
+import threading
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import SourceError
+from semcast.common.shapes import check_shape
+
+logger = logging.getLogger(__name__)
+
+TRAJECTORY_NAME = "trajectory.tum"
+MAP_NAME = "map.ply"
+SUMMARY_NAME = "summary.json"
+SETTINGS_NAME = "settings.toml"
+FRAMES_NAME = "frames.jsonl"
+VIEWER_NAME = "run.rrd"
+RECONSTRUCTION_NAME = "reconstruction.npz"
+IMAGES_NAME = "images"
+
+FORMAT = 1
+MAX_UNPACKED_BYTES = 4 * 1024**3
+_HEADER = "header"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunData:
+    """A finished reconstruction.
+
+    Attributes:
+        intrinsics: Camera of the decoded images, without distortion.
+        frame_ids: ``(F,)`` int64, strictly increasing, all posed frames.
+        t_source_ns: ``(F,)`` int64, recorded time of each.
+        T_world_cam: ``(F, 4, 4)`` float64.
+        keyframe_ids: ``(K,)`` int64, a subset of ``frame_ids``.
+        landmark_ids: ``(N,)`` int64, unique.
+        xyz: ``(N, 3)`` float64 in the world frame, map units.
+        rgb: ``(N, 3)`` uint8.
+        confidence: ``(N,)`` float32 in [0, 1].
+        observed_landmark_ids: ``(M,)`` int64, each in ``landmark_ids``.
+        observed_keyframe_ids: ``(M,)`` int64, each in ``keyframe_ids``.
+        observed_xy: ``(M, 2)`` float32, pixels, integer values at pixel centres.
+    """
+
+    intrinsics: Intrinsics
+    frame_ids: NDArray[np.int64]
+    t_source_ns: NDArray[np.int64]
+    T_world_cam: NDArray[np.float64]
+    keyframe_ids: NDArray[np.int64]
+    landmark_ids: NDArray[np.int64]
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    observed_landmark_ids: NDArray[np.int64]
+    observed_keyframe_ids: NDArray[np.int64]
+    observed_xy: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        """Convert to the dtypes above, check shapes and references.
+
+        Raises:
+            ValueError: Shapes disagree, ids repeat or refer to nothing, or a pose is not finite.
+        """
+        for name, (dtype, pattern) in _ARRAYS.items():
+            array = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            check_shape(array, pattern, name)
+            object.__setattr__(self, name, array)
+        for first, *others in (
+            ("frame_ids", "t_source_ns", "T_world_cam"),
+            ("landmark_ids", "xyz", "rgb", "confidence"),
+            ("observed_landmark_ids", "observed_keyframe_ids", "observed_xy"),
+        ):
+            for other in others:
+                if len(getattr(self, other)) != len(getattr(self, first)):
+                    raise ValueError(
+                        f"{other} must have {len(getattr(self, first))} rows as {first} has, "
+                        f"got {len(getattr(self, other))}"
+                    )
+        if np.any(np.diff(self.frame_ids) <= 0):
+            raise ValueError("frame_ids must strictly increase")
+        if len(np.unique(self.landmark_ids)) != len(self.landmark_ids):
+            raise ValueError("landmark_ids must be unique")
+        if not np.all(np.isfinite(self.T_world_cam)):
+            raise ValueError("T_world_cam must be finite")
+        for name, owner in (
+            ("keyframe_ids", "frame_ids"),
+            ("observed_keyframe_ids", "keyframe_ids"),
+            ("observed_landmark_ids", "landmark_ids"),
+        ):
+            unknown = np.setdiff1d(getattr(self, name), getattr(self, owner))
+            if len(unknown):
+                raise ValueError(f"{name} must be in {owner}, got {unknown[:3].tolist()}")
+
+
+#: Array of ``RunData`` -> its dtype in the file and its shape.
+_ARRAYS: dict[str, tuple[Any, str]] = {
+    "frame_ids": (np.int64, "F"),
+    "t_source_ns": (np.int64, "F"),
+    "T_world_cam": (np.float64, "F 4 4"),
+    "keyframe_ids": (np.int64, "K"),
+    "landmark_ids": (np.int64, "N"),
+    "xyz": (np.float64, "N 3"),
+    "rgb": (np.uint8, "N 3"),
+    "confidence": (np.float32, "N"),
+    "observed_landmark_ids": (np.int64, "M"),
+    "observed_keyframe_ids": (np.int64, "M"),
+    "observed_xy": (np.float32, "M 2"),
+}
+assert {*_ARRAYS, "intrinsics"} == {f.name for f in fields(RunData)}
+
+
+def write_run(folder: Path, data: RunData) -> None:
+    """Write ``reconstruction.npz`` into a run folder, whole or not at all.
+
+    Raises:
+        SourceError: The folder can't be made or the file can't be written.
+    """
+    header = json.dumps({"format": FORMAT, "intrinsics": data.intrinsics.to_dict()}).encode()
+    content: dict[str, Any] = {name: getattr(data, name) for name in _ARRAYS}
+    content[_HEADER] = np.frombuffer(header, dtype=np.uint8)
+    path = folder / RECONSTRUCTION_NAME
+    partial = path.with_name(path.name + ".part")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with partial.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **content)
+        os.replace(partial, path)
+    except OSError as err:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        raise SourceError(f"{path} can't be written: {err}") from err
+
+
+def read_run(folder: Path) -> RunData:
+    """Read ``reconstruction.npz`` of a run folder; never executes what is in the file.
+
+    Raises:
+        SourceError: There is no such run, or the file is damaged or of another version.
+    """
+    path = folder / RECONSTRUCTION_NAME
+    if not folder.is_dir():
+        raise SourceError(f"{folder} is not a folder; give the folder that --out wrote")
+    if not path.is_file():
+        raise SourceError(
+            f"{folder} holds no {RECONSTRUCTION_NAME}; a run writes it when it ends, and only with a map"
+        )
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > MAX_UNPACKED_BYTES:
+            raise SourceError(f"{path} must unpack to at most {MAX_UNPACKED_BYTES} bytes, got {unpacked}")
+        with np.load(path, allow_pickle=False) as content:
+            arrays = {name: np.array(content[name]) for name in (_HEADER, *_ARRAYS)}
+        header = json.loads(arrays.pop(_HEADER).tobytes())
+        if header.get("format") != FORMAT:
+            raise SourceError(f"{path} has format {header.get('format')}, this semcast reads {FORMAT}")
+        return RunData(intrinsics=Intrinsics.from_dict(header["intrinsics"]), **arrays)
+    except SourceError:
+        raise
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        EOFError,
+        zipfile.BadZipFile,
+        zipfile.LargeZipFile,
+    ) as err:
+        raise SourceError(f"{path} is damaged: {err}") from err
+
+
+def image_name(frame_id: int) -> str:
+    """Return the file name of a frame's decoded image."""
+    return f"{frame_id:06d}.jpg"
+
+
+def read_image_paths(folder: Path) -> dict[int, Path]:
+    """Return frame id to path of the decoded images a run kept; empty where it kept none."""
+    images = folder / IMAGES_NAME
+    if not images.is_dir():
+        return {}
+    return {int(p.stem): p for p in sorted(images.glob("*.jpg")) if p.stem.isdigit()}
+
+
+class ImageWriter:
+    """Writes decoded images into ``images/`` on its own thread, so that tracking does not wait for the disk.
+
+    Images of an earlier run in the same folder are removed first. A full disk is reported once; the stream
+    goes on without images.
+
+    Args:
+        folder: The run folder.
+        lossless: Wait when the queue is full; otherwise the image is dropped and counted.
+        quality: JPEG quality.
+        capacity: Images that may wait.
+
+    Raises:
+        SourceError: The folder can't be made.
+    """
+
+    def __init__(self, folder: Path, *, lossless: bool, quality: int = 95, capacity: int = 8) -> None:
+        self._images = folder / IMAGES_NAME
+        self._lossless = lossless
+        self._quality = quality
+        self._queue: queue.Queue[tuple[int, NDArray[np.uint8]] | None] = queue.Queue(capacity)
+        self.num_written = 0
+        self.num_dropped = 0
+        try:
+            self._images.mkdir(parents=True, exist_ok=True)
+            for old in read_image_paths(folder).values():
+                old.unlink()
+        except OSError as err:
+            raise SourceError(f"{self._images} can't be written: {err}") from err
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="semcast-images", daemon=True)
+        self._thread.start()
+
+    def put(self, frame_id: int, image: NDArray[np.uint8]) -> None:
+        """Queue one ``(H, W, 3)`` uint8 RGB image; the caller must not change it afterwards."""
+        if self._closed:
+            return
+        if self._lossless:
+            self._queue.put((frame_id, image))
+            return
+        try:
+            self._queue.put_nowait((frame_id, image))
+        except queue.Full:
+            self.num_dropped += 1
+
+    def _run(self) -> None:
+        failed = False
+        while (item := self._queue.get()) is not None:
+            frame_id, image = item
+            if failed:
+                self.num_dropped += 1
+                continue
+            try:
+                good, data = cv2.imencode(
+                    ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, self._quality]
+                )
+                if not good:
+                    raise OSError("OpenCV could not encode the image")
+                (self._images / image_name(frame_id)).write_bytes(data.tobytes())
+                self.num_written += 1
+            except (OSError, cv2.error) as err:
+                failed = True
+                self.num_dropped += 1
+                logger.warning("%s can't be written: %s; the run goes on without images", self._images, err)
+
+    def close(self, deadline_s: float = 30.0) -> None:
+        """Write what waits and end the thread. Idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        self._queue.put(None)
+        self._thread.join(deadline_s)
+
+    def __enter__(self) -> "ImageWriter":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()

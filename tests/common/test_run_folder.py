@@ -1,0 +1,129 @@
+import dataclasses
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast import SourceError
+from semcast.common.camera import Intrinsics
+from semcast.common.run_folder import (
+    RECONSTRUCTION_NAME,
+    ImageWriter,
+    RunData,
+    read_image_paths,
+    read_run,
+    write_run,
+)
+
+
+def tiny_run(**changes):
+    values = {
+        "intrinsics": Intrinsics(fx=100, fy=90, cx=31.5, cy=23.5, width=64, height=48),
+        "frame_ids": [0, 2, 5],
+        "t_source_ns": [0, 200_000_000, 500_000_000],
+        "T_world_cam": np.stack([np.eye(4)] * 3),
+        "keyframe_ids": [0, 5],
+        "landmark_ids": [7, 9],
+        "xyz": [[0, 0, 4], [1, 0, 5]],
+        "rgb": [[255, 0, 1], [2, 3, 4]],
+        "confidence": [0.5, 1.0],
+        "observed_landmark_ids": [7, 7, 9],
+        "observed_keyframe_ids": [0, 5, 5],
+        "observed_xy": [[31.5, 23.5], [30, 20], [51.5, 23.5]],
+        **changes,
+    }
+    return RunData(**values)
+
+
+def test_what_was_written_is_read_back_exactly(tmp_path):
+    data = tiny_run()
+    write_run(tmp_path / "run", data)
+    again = read_run(tmp_path / "run")
+    for field in dataclasses.fields(RunData):
+        a, b = getattr(data, field.name), getattr(again, field.name)
+        if isinstance(a, np.ndarray):
+            assert a.dtype == b.dtype
+            np.testing.assert_array_equal(a, b)
+        else:
+            assert a == b
+    assert [p.name for p in (tmp_path / "run").iterdir()] == [RECONSTRUCTION_NAME]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"t_source_ns": [0, 1]}, "t_source_ns must have 3 rows"),
+        ({"frame_ids": [0, 5, 5]}, "strictly increase"),
+        ({"keyframe_ids": [0, 5, 6]}, r"keyframe_ids must be in frame_ids, got \[6\]"),
+        ({"landmark_ids": [7, 7]}, "unique"),
+        ({"observed_landmark_ids": [7, 7, 8]}, "must be in landmark_ids"),
+        ({"observed_xy": [[0, 0, 0]] * 3}, r"shape \(M 2\)"),
+        ({"T_world_cam": np.full((3, 4, 4), np.nan)}, "finite"),
+    ],
+)
+def test_arrays_that_do_not_fit_together_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        tiny_run(**changes)
+
+
+def test_a_missing_run_says_what_to_give(tmp_path):
+    with pytest.raises(SourceError, match="--out"):
+        read_run(tmp_path / "nowhere")
+    with pytest.raises(SourceError, match="holds no reconstruction.npz"):
+        read_run(tmp_path)
+
+
+def test_damaged_files_are_source_errors(tmp_path):
+    write_run(tmp_path, tiny_run())
+    path = tmp_path / RECONSTRUCTION_NAME
+    whole = path.read_bytes()
+    rng = np.random.default_rng(1)
+    for size in rng.integers(0, len(whole), 40):
+        path.write_bytes(whole[:size])
+        with pytest.raises(SourceError):
+            read_run(tmp_path)
+    for _ in range(60):
+        damaged = bytearray(whole)
+        damaged[rng.integers(len(whole))] ^= 0xFF
+        path.write_bytes(bytes(damaged))
+        try:
+            read_run(tmp_path)
+        except SourceError:
+            continue
+
+
+def test_a_pickle_inside_is_not_executed(tmp_path):
+    write_run(tmp_path, tiny_run())
+    path = tmp_path / RECONSTRUCTION_NAME
+    with np.load(path) as content:
+        arrays = {name: content[name] for name in content.files}
+    arrays["xyz"] = np.array([object(), object()], dtype=object)
+    np.savez(path, **arrays)
+    with pytest.raises(SourceError, match="damaged"):
+        read_run(tmp_path)
+    with zipfile.ZipFile(path) as archive:
+        assert "xyz.npy" in archive.namelist()
+
+
+def test_images_are_written_by_frame_id_and_old_ones_removed(tmp_path):
+    for run in range(2):
+        with ImageWriter(tmp_path, lossless=True, capacity=1) as writer:
+            for k in range(4 - run):
+                writer.put(10 * k, np.full((16, 24, 3), (200, 40 * k, 20), dtype=np.uint8))
+        assert writer.num_written == 4 - run
+    paths = read_image_paths(tmp_path)
+    assert list(paths) == [0, 10, 20]
+    rgb = cv2.cvtColor(cv2.imread(str(paths[20])), cv2.COLOR_BGR2RGB)
+    assert rgb.shape == (16, 24, 3)
+    np.testing.assert_allclose(rgb.reshape(-1, 3).mean(axis=0), (200, 80, 20), atol=3)
+
+
+def test_a_folder_that_vanishes_is_counted_and_does_not_raise(tmp_path):
+    writer = ImageWriter(tmp_path / "run", lossless=True)
+    (tmp_path / "run" / "images").rmdir()
+    for k in range(3):
+        writer.put(k, np.zeros((8, 8, 3), dtype=np.uint8))
+    writer.close()
+    writer.close()
+    assert (writer.num_written, writer.num_dropped) == (0, 3)
