@@ -11,9 +11,9 @@
 ``images/``           decoded images, ``<frame id, six digits>.jpg``, of keyframes or of all frames
 ===================== =================================================================================
 
-The server fills ``RunData`` from ``Reconstruction``: intrinsics of the decoded (undistorted) images, frame ids,
-times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks()``, and ``observations()`` as
-(landmark id, keyframe id, x, y). It calls ``write_run`` once at the end and feeds an ``ImageWriter`` on the way.
+The server fills ``RunData`` from ``Reconstruction``: intrinsics of the decoded (undistorted) images, frame
+ids, times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks()``, and ``observations()``
+as (landmark id, keyframe id, x, y). It calls ``write_run`` once at the end and feeds an ``ImageWriter``.
 """
 
 import contextlib
@@ -185,15 +185,7 @@ def read_run(folder: Path) -> RunData:
         return RunData(intrinsics=Intrinsics.from_dict(header["intrinsics"]), **arrays)
     except SourceError:
         raise
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        EOFError,
-        zipfile.BadZipFile,
-        zipfile.LargeZipFile,
-    ) as err:
+    except Exception as err:  # a damaged zip or array fails in many ways
         raise SourceError(f"{path} is damaged: {err}") from err
 
 
