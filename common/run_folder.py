@@ -11,8 +11,8 @@
 ``images/``           decoded images, ``<frame id, six digits>.jpg``, of keyframes or of all frames
 ===================== =================================================================================
 
-The server fills ``RunData`` from ``Reconstruction``: intrinsics of the decoded (undistorted) images, frame
-ids, times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks()``, and ``observations()``
+The server fills ``RunData`` from ``Reconstruction``: intrinsics of decoded (undistorted) images, frame ids,
+times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks()``, and ``observations()``
 as (landmark id, keyframe id, x, y). It calls ``write_run`` once at the end and feeds an ``ImageWriter``.
 """
 
