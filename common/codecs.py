@@ -1,0 +1,70 @@
+"""All codecs by name, learned and conventional: the one way to get a codec."""
+
+from pathlib import Path
+from typing import get_args
+
+from semcast.common.codec import MODULATIONS, Codec, Modulation
+from semcast.common.config import near_match
+from semcast.common.conventional_source import ImageFormat
+from semcast.common.errors import ConfigError
+
+#: Learned transceivers; their networks are in ``semcast.common.nets.registry``.
+LEARNED_CODECS = ("3dcsc", "3dcsc-lite", "cnn", "vit", "mae")
+
+
+def _conventional_names() -> dict[str, tuple[ImageFormat, bool]]:
+    """Return name to (format, adaptive) of what this OpenCV can do."""
+    from semcast.common.conventional_source import supported
+
+    formats: tuple[ImageFormat, ...] = get_args(ImageFormat)
+    names = {f"{name}-ldpc": (name, False) for name in formats if supported(name)}
+    names.update({f"{name}-amc": (name, True) for name in formats if supported(name)})
+    return names
+
+
+def available_codecs() -> list[str]:
+    """Return the names ``load_codec`` knows, learned ones first; loads no network."""
+    return [*LEARNED_CODECS, *_conventional_names()]
+
+
+def load_codec(
+    name: str,
+    *,
+    modulation: Modulation = "16qam",
+    num_threads: int | None = None,
+    device: str = "auto",
+    weights: Path | None = None,
+) -> Codec:
+    """Load a codec, ready for use.
+
+    Args:
+        name: One of ``available_codecs()``.
+        modulation: ``"16qam"`` or ``"analog"``.
+        num_threads: CPU threads of a learned codec; None leaves the library's choice.
+        device: ``"auto"``, ``"cpu"`` or ``"cuda"``, for learned codecs.
+        weights: File to take instead of the shipped weights of a learned codec.
+
+    Raises:
+        ConfigError: The name or modulation is unknown, or weights were given for a codec without any.
+        CheckpointError: The weights are missing or damaged.
+    """
+    if modulation not in MODULATIONS:
+        hint = near_match(modulation, list(MODULATIONS))
+        raise ConfigError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}{hint}")
+    if name in LEARNED_CODECS:
+        from semcast.common.nets.codec import NeuralCodec
+
+        codec: Codec = NeuralCodec.load(
+            name, modulation=modulation, num_threads=num_threads, device=device, weights=weights
+        )
+        return codec
+    conventional = _conventional_names()
+    if name not in conventional:
+        names = available_codecs()
+        raise ConfigError(f"codec must be one of {', '.join(names)}, got {name!r}{near_match(name, names)}")
+    if weights is not None:
+        raise ConfigError(f"codec {name!r} has no weights, got {weights}")
+    from semcast.common.conventional import ConventionalCodec
+
+    image_format, adaptive = conventional[name]
+    return ConventionalCodec(image_format, adaptive=adaptive, modulation=modulation)
