@@ -1,0 +1,85 @@
+"""Decodes one frame ahead of the tracker on a thread of its own, so that two cores work; order is kept."""
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from semcast.common.errors import SemcastError
+
+logger = logging.getLogger(__name__)
+
+In = TypeVar("In")
+Out = TypeVar("Out")
+
+POLL_S = 0.1
+
+
+class DecodeAhead(Generic[In, Out]):
+    """One slot between decoder and tracker.
+
+    The next message is taken only when the slot is free: while the tracker is busy, frames wait (or are
+    superseded) where they arrive, and the tracker never gets one older than its own last frame took.
+
+    Args:
+        take: Waits up to the given seconds for a message; None when there was none.
+        decode: Turns a message into what the tracker takes.
+        on_failure: Is told the message and ``codec`` (the sender uses another codec or a message makes no
+            sense) or ``decode`` (the decoder failed); the stream goes on.
+    """
+
+    def __init__(
+        self,
+        take: Callable[[float], In | None],
+        decode: Callable[[In], Out],
+        on_failure: Callable[[In, str], None],
+    ) -> None:
+        self._take = take
+        self._decode = decode
+        self._on_failure = on_failure
+        self._slot: Out | None = None
+        self._condition = threading.Condition()
+        self._stopping = threading.Event()
+        self._reported: set[str] = set()
+        self._thread = threading.Thread(target=self._run, name="semcast-decode", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            with self._condition:
+                if not self._condition.wait_for(lambda: self._slot is None, POLL_S):
+                    continue
+            message = self._take(POLL_S)
+            if message is None:
+                continue
+            try:
+                decoded = self._decode(message)
+            except SemcastError as err:
+                if str(err) not in self._reported and len(self._reported) < 100:
+                    self._reported.add(str(err))
+                    logger.warning("%s", err)
+                self._on_failure(message, "codec")
+                continue
+            except Exception:
+                logger.exception("a frame could not be decoded and is left out")
+                self._on_failure(message, "decode")
+                continue
+            with self._condition:
+                self._slot = decoded
+                self._condition.notify_all()
+
+    def get(self, timeout_s: float) -> Out | None:
+        """Return the next decoded frame, None when there was none in time."""
+        with self._condition:
+            self._condition.wait_for(lambda: self._slot is not None, timeout_s)
+            decoded, self._slot = self._slot, None
+            self._condition.notify_all()
+        return decoded
+
+    def close(self, deadline_s: float = 10.0) -> None:
+        """End the thread; a decoded frame still in the slot is dropped. Idempotent."""
+        self._stopping.set()
+        with self._condition:
+            self._slot = None
+            self._condition.notify_all()
+        self._thread.join(deadline_s)

@@ -1,0 +1,76 @@
+"""Decoding ahead keeps the order, never runs away, and survives what can't be decoded."""
+
+import threading
+import time
+
+from semcast.common.errors import ProtocolError
+from semcast.server.decode_ahead import DecodeAhead
+
+
+class Inbox:
+    """Hands out 0, 1, 2, ... and remembers how far it was emptied."""
+
+    def __init__(self, num):
+        self.taken = 0
+        self._num = num
+
+    def take(self, timeout_s):
+        if self.taken == self._num:
+            threading.Event().wait(min(timeout_s, 0.01))
+            return None
+        self.taken += 1
+        return self.taken - 1
+
+
+def drain(ahead, num):
+    got, deadline = [], time.monotonic() + 10
+    while len(got) < num and time.monotonic() < deadline:
+        item = ahead.get(0.1)
+        if item is not None:
+            got.append(item)
+    return got
+
+
+def test_every_frame_comes_out_once_and_in_order():
+    inbox = Inbox(200)
+    ahead = DecodeAhead(inbox.take, lambda x: x * 10, lambda m, r: None)
+    assert drain(ahead, 200) == [10 * k for k in range(200)]
+    assert ahead.get(0.0) is None
+    ahead.close()
+    ahead.close()
+
+
+def test_no_more_than_one_frame_is_taken_ahead_of_the_tracker():
+    inbox, decoded = Inbox(50), threading.Event()
+
+    def decode(x):
+        decoded.set()
+        return (x,)
+
+    ahead = DecodeAhead(inbox.take, decode, lambda m, r: None)
+    assert decoded.wait(10)
+    assert ahead.get(10.0) == (0,)
+    # One may now be decoded and wait; a second one must not have been taken for it.
+    deadline = time.monotonic() + 0.3
+    while time.monotonic() < deadline:
+        assert inbox.taken <= 2
+    ahead.close()
+
+
+def test_one_bad_frame_never_stops_the_stream(caplog):
+    failures = []
+
+    def decode(x):
+        if x in (1, 2):
+            raise ProtocolError("the samples don't fit")
+        if x == 3:
+            raise ZeroDivisionError
+        return x + 100
+
+    inbox = Inbox(6)
+    ahead = DecodeAhead(inbox.take, decode, lambda m, r: failures.append((m, r)))
+    with caplog.at_level("WARNING"):
+        assert drain(ahead, 3) == [100, 104, 105]
+    ahead.close()
+    assert failures == [(1, "codec"), (2, "codec"), (3, "decode")]
+    assert caplog.text.count("the samples don't fit") == 1
