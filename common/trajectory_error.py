@@ -64,7 +64,9 @@ class RpeResult:
     rot_deg: float
 
 
-def match_times(estimate_s: Array, truth_s: Array, max_gap_s: float | None = None) -> tuple[Array, Array]:
+def match_times(
+    estimate_s: Array, truth_s: Array, max_gap_s: float | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pair every estimated time with the nearest true time, each true time at most once.
 
     Args:
@@ -89,7 +91,7 @@ def match_times(estimate_s: Array, truth_s: Array, max_gap_s: float | None = Non
     order = np.lexsort((gap_s[estimate_idx], nearest[estimate_idx]))
     _, first = np.unique(nearest[estimate_idx][order], return_index=True)
     kept = np.sort(estimate_idx[order[first]])
-    return kept, nearest[kept]
+    return kept.astype(np.int64), nearest[kept].astype(np.int64)
 
 
 def ate(estimate: Trajectory, truth: Trajectory, max_gap_s: float | None = None) -> AteResult | None:
