@@ -32,16 +32,24 @@ PLY_VERTEX = np.dtype(
 _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
 
-def write_ply(path: Path, xyz: ArrayLike, rgb: NDArray[np.uint8], confidence: NDArray[np.float32]) -> None:
+def write_ply(
+    path: Path,
+    xyz: ArrayLike,
+    rgb: NDArray[np.uint8],
+    confidence: NDArray[np.float32],
+    *,
+    axes: str = "x right, y down, z forward of the first camera",
+) -> None:
     """Write landmarks as binary PLY with colour and a ``confidence`` property in [0, 1].
 
     Points with a non-finite coordinate are left out.
 
     Args:
         path: File to write.
-        xyz: ``(N, 3)`` in the world frame, map units; x right, y down, z forward of the first camera.
+        xyz: ``(N, 3)`` in the world frame, map units.
         rgb: ``(N, 3)``.
         confidence: ``(N,)``.
+        axes: What the world's axes are, for the comment in the file.
     """
     points = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
     finite = np.isfinite(points).all(axis=1)
@@ -55,7 +63,7 @@ def write_ply(path: Path, xyz: ArrayLike, rgb: NDArray[np.uint8], confidence: ND
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        "comment semcast map; x right, y down, z forward of the first camera; map units",
+        f"comment semcast map; {axes}; map units",
         f"element vertex {len(vertices)}",
         *properties,
         "end_header",

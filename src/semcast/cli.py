@@ -20,6 +20,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "agent": ("agent", "encode a camera or a recorded sequence and publish channel symbols"),
     "channel": ("channel", "run the simulated radio link, or change it while it runs"),
     "server": ("server", "decode, track, map and show what an agent sends"),
+    "export": ("export", "write a run in the format of COLMAP, nerfstudio, evo, Rerun or as points"),
     "eval": ("evaluate", "measure trajectories, frame pairs, codecs and confidence offline"),
     "train": ("train", "train a transceiver from a settings file"),
     "doctor": ("doctor", "check this machine and a running system, and say what to mend"),

@@ -1,0 +1,37 @@
+"""Trajectories as text: TUM with times, KITTI odometry without."""
+
+from pathlib import Path
+
+import numpy as np
+
+from semcast.common.run_folder import RunData
+from semcast.common.trajectory import Trajectory, write_tum
+
+
+def write_run_tum(path: Path, data: RunData) -> list[Path]:
+    """Write ``t tx ty tz qx qy qz qw`` of all posed frames; returns the file.
+
+    Frames whose time does not increase are left out: the format is ordered by time.
+    """
+    times_ns = data.t_source_ns
+    rising = np.concatenate([[True], times_ns[1:] > np.maximum.accumulate(times_ns)[:-1]])[: len(times_ns)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_tum(path, Trajectory(times_ns[rising] * 1e-9, data.T_world_cam[rising]))
+    return [path]
+
+
+def write_run_kitti(path: Path, data: RunData) -> list[Path]:
+    """Write the upper 3x4 of ``T_world_cam``, row by row, one line a posed frame.
+
+    The format has neither times nor frame numbers: ``<name>.times.txt`` (seconds) and ``<name>.frames.txt``
+    (frame ids) go beside it. Returns the files.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    times, frames = (path.with_name(f"{path.stem}.{what}.txt") for what in ("times", "frames"))
+    poses = data.T_world_cam[:, :3].reshape(-1, 12)
+    path.write_text(
+        "".join(" ".join(f"{v:.12e}" for v in row) + "\n" for row in poses.tolist()), encoding="ascii"
+    )
+    times.write_text("".join(f"{t * 1e-9:.9f}\n" for t in data.t_source_ns.tolist()), encoding="ascii")
+    frames.write_text("".join(f"{k}\n" for k in data.frame_ids.tolist()), encoding="ascii")
+    return [path, times, frames]

@@ -1,0 +1,40 @@
+"""``semcast export``: a run in the format of another tool."""
+
+import argparse
+import sys
+from pathlib import Path
+
+#: Kept here so that ``--help`` loads neither numpy nor OpenCV; a test holds it equal to the server's list.
+FORMATS = ("tum", "kitti", "ply", "colmap", "nerfstudio", "rrd")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "run", type=Path, metavar="RUN", help="folder that --out of demo, server or replay wrote"
+    )
+    parser.add_argument(
+        "--format",
+        choices=FORMATS,
+        required=True,
+        help="tum, kitti: poses; ply: points; colmap, nerfstudio: a folder with poses, points and images; "
+        "rrd: for the Rerun viewer",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="PATH", help="file or folder to write")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the export and name its files on stdout."""
+    from semcast.common.run_folder import read_run
+    from semcast.server.export_run import export_run
+
+    files = export_run(arguments.run, arguments.format, arguments.out)
+    data = read_run(arguments.run)
+    print(
+        f"{len(data.frame_ids)} posed frames, {len(data.keyframe_ids)} keyframes, "
+        f"{len(data.landmark_ids)} landmarks",
+        file=sys.stderr,
+    )
+    for file in files:
+        print(file)
+    return 0

@@ -1,0 +1,66 @@
+"""A small exact run: cameras on an arc that look at random points, observations without error."""
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, invert_transform, make_transform
+from semcast.common.run_folder import ImageWriter, RunData, write_run
+
+
+def make_arc_run(num_frames=9, num_points=60, noise_px=0.0, seed=0):
+    """Every second frame is a keyframe; frame ids start at 3 and skip one."""
+    rng = np.random.default_rng(seed)
+    camera = Intrinsics(fx=120, fy=110, cx=79.0, cy=61.5, width=160, height=120)
+    xyz = rng.uniform((-3, -2, 5), (3, 2, 9), (num_points, 3))
+    frame_ids = 3 + np.delete(np.arange(num_frames + 1), 4)
+    poses = []
+    for k in range(num_frames):
+        a = 0.04 * (k - num_frames / 2)
+        poses.append(make_transform(exp_so3((0.3 * a, -a, 0.2 * a)), (6 * a, 0.5 * a, 0.1 * k)))
+    T_world_cam = np.array(poses)
+    keyframes = frame_ids[::2]
+    seen_by, seen, seen_xy = [], [], []
+    for frame_id, T in zip(frame_ids, T_world_cam, strict=True):
+        if frame_id not in keyframes:
+            continue
+        T_cam_world = invert_transform(T)
+        xy = camera.project(xyz @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
+        inside = np.all((xy > 0) & (xy < (camera.width - 1, camera.height - 1)), axis=1)
+        seen.append(np.flatnonzero(inside) + 100)
+        seen_by.append(np.full(inside.sum(), frame_id))
+        seen_xy.append(xy[inside] + noise_px * rng.standard_normal((inside.sum(), 2)))
+    return RunData(
+        intrinsics=camera,
+        frame_ids=frame_ids,
+        t_source_ns=frame_ids * 100_000_000,
+        T_world_cam=T_world_cam,
+        keyframe_ids=keyframes,
+        landmark_ids=np.arange(num_points) + 100,
+        xyz=xyz,
+        rgb=rng.integers(0, 256, (num_points, 3)),
+        confidence=rng.uniform(0, 1, num_points),
+        observed_landmark_ids=np.concatenate(seen),
+        observed_keyframe_ids=np.concatenate(seen_by),
+        observed_xy=np.concatenate(seen_xy),
+    )
+
+
+def write_arc_run_to(folder, data, keep="keyframes"):
+    write_run(folder, data)
+    shape = (*data.intrinsics.shape_hw, 3)
+    with ImageWriter(folder, lossless=True) as writer:
+        for frame_id in (data.keyframe_ids if keep == "keyframes" else data.frame_ids).tolist():
+            writer.put(frame_id, np.full(shape, 10 * frame_id, dtype=np.uint8))
+
+
+@pytest.fixture
+def arc_run():
+    """Makes a run; see ``make_arc_run``."""
+    return make_arc_run
+
+
+@pytest.fixture
+def write_arc_run():
+    """Writes a run and images of one grey level a frame; see ``write_arc_run_to``."""
+    return write_arc_run_to
