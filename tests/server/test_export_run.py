@@ -233,8 +233,7 @@ def test_without_one_a_rerun_recording_is_made_of_poses_images_and_points(tmp_pa
     import rerun as rr
 
     entities = {
-        str(chunk.entity_path): 0
-        for chunk in rr.chunk.RrdReader(tmp_path / "made.rrd").stream().to_chunks()
+        str(chunk.entity_path): 0 for chunk in rr.chunk.RrdReader(tmp_path / "made.rrd").stream().to_chunks()
     }
     assert {"/world/camera", "/world/camera/image", "/world/map_colour/0000"} <= set(entities)
 
