@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.channel.awgn import complex_noise
-from semcast.channel.power import normalise_power
+from semcast.channel.power import mean_power, normalise_power
 from semcast.channel.registry import build_channel
 from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import EncodedImage, ReceivedImage
@@ -97,8 +97,8 @@ class Link:
         self._next_frame = frame_id + 1
         if self._start_s is None:
             self._start_s = t_s
-        power = float(np.vdot(slots, slots).real) / slots.size
         sent = normalise_power(slots)
+        power = mean_power(slots)
         rng = np.random.default_rng((self._seed, _FRAME_STREAM, frame_id))
         frame_lost = bool(rng.random() < self._settings.frame_loss)
         draw = self._model.draw(slots.shape[0], t_s - self._start_s, rng)

@@ -57,13 +57,13 @@ FIXED_MODE = Mode(bits_per_symbol=4, rate=0.5, min_snr_db=7.0)
 #: Ascending in bits per channel use. The receiver learns the position in this table.
 ADAPTIVE_MODES = (
     Mode(bits_per_symbol=2, rate=0.25, min_snr_db=-20.0),
-    Mode(bits_per_symbol=2, rate=0.5, min_snr_db=2.0),
-    Mode(bits_per_symbol=2, rate=0.65, min_snr_db=3.8),
-    Mode(bits_per_symbol=4, rate=0.4, min_snr_db=5.5),
+    Mode(bits_per_symbol=2, rate=0.5, min_snr_db=1.6),
+    Mode(bits_per_symbol=2, rate=0.65, min_snr_db=3.6),
+    Mode(bits_per_symbol=4, rate=0.4, min_snr_db=5.6),
     Mode(bits_per_symbol=4, rate=0.5, min_snr_db=7.0),
-    Mode(bits_per_symbol=4, rate=0.65, min_snr_db=9.2),
-    Mode(bits_per_symbol=6, rate=0.55, min_snr_db=11.4),
-    Mode(bits_per_symbol=6, rate=0.7, min_snr_db=14.5),
+    Mode(bits_per_symbol=4, rate=0.65, min_snr_db=9.3),
+    Mode(bits_per_symbol=4, rate=0.8, min_snr_db=11.7),
+    Mode(bits_per_symbol=6, rate=0.7, min_snr_db=15.4),
 )
 
 

@@ -224,7 +224,9 @@ def equalise(
     np.multiply(data_rx, gain[:, None], out=symbols, where=channel.arrived[:, None])
     floor_ratio = 10.0 ** (LOST_SLOT_SNR_DB / 10.0)
     ratio = np.where(channel.arrived, power / noise_var, 0.0)
-    effective_snr_db = (10.0 * np.log10(np.maximum(ratio, floor_ratio))).astype(np.float32)
+    effective_snr_db = np.maximum(
+        10.0 * np.log10(np.maximum(ratio, floor_ratio)).astype(np.float32), np.float32(LOST_SLOT_SNR_DB)
+    )
     received = ReceivedImage(
         shape_hw=shape_hw, symbols=symbols, effective_snr_db=effective_snr_db, modulation=modulation
     )

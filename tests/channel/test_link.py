@@ -1,0 +1,162 @@
+import math
+
+import numpy as np
+import pytest
+
+from semcast.channel.link import Link
+from semcast.channel.settings import ChannelSettings
+from semcast.common.codec import LOST_SLOT_SNR_DB, EncodedImage
+from semcast.common.errors import ConfigError
+from semcast.common.phy.pilots import insert_pilots
+from semcast.common.phy.qam import indices_to_symbols
+
+
+@pytest.fixture
+def encoded(rng):
+    indices = rng.integers(0, 16, (12, 47 * 20)).astype(np.uint8)
+    return EncodedImage(shape_hw=(192, 320), symbols=indices_to_symbols(indices), modulation="16qam")
+
+
+@pytest.fixture
+def slots(encoded):
+    return insert_pilots(encoded.symbols)
+
+
+@pytest.mark.parametrize("snr_db", [2.0, 10.0])
+def test_awgn_adds_exactly_the_noise_that_was_set(slots, snr_db):
+    link = Link(ChannelSettings(snr_db=snr_db), 1)
+    out = link.transmit(slots, 0.0)
+    scale = np.sqrt(np.mean(np.abs(slots) ** 2))
+    noise = out.slots_rx - slots / scale
+    expected = 10 ** (-snr_db / 10)
+    assert abs(np.mean(np.abs(noise) ** 2) - expected) < 4 * expected / math.sqrt(noise.size)
+    assert out.slots_rx.dtype == np.complex64
+    assert out.snr_db_set == snr_db
+    assert not out.slot_lost.any()
+    assert not out.frame_lost
+
+
+def test_a_louder_codec_gains_nothing(slots):
+    quiet = Link(ChannelSettings(), 1).transmit(slots, 0.0)
+    loud = Link(ChannelSettings(), 1).transmit(7 * slots, 0.0)
+    np.testing.assert_allclose(loud.slots_rx, quiet.slots_rx, atol=1e-5)
+    np.testing.assert_allclose(loud.truth.h * 7, quiet.truth.h, rtol=1e-5)
+
+
+@pytest.mark.parametrize("channel", ["awgn", "rayleigh", "rician", "erasure", "burst", "trace"])
+def test_a_frame_is_the_same_after_lost_frames_and_restarts(channel, slots):
+    settings = ChannelSettings(channel=channel, trace="walk")
+    whole = Link(settings, 5)
+    frames = [whole.transmit(slots, 0.1 * k, k) for k in range(4)]
+    gaps = Link(settings, 5)
+    gaps.transmit(slots, 0.0, 0)
+    np.testing.assert_array_equal(gaps.transmit(slots, 0.1 * 3, 3).slots_rx, frames[3].slots_rx)
+    counted = Link(settings, 5)
+    again = [counted.transmit(slots, 0.1 * k) for k in range(4)]
+    np.testing.assert_array_equal(again[2].slots_rx, frames[2].slots_rx)
+    assert not np.array_equal(frames[1].slots_rx, frames[2].slots_rx)
+    assert not np.array_equal(Link(settings, 6).transmit(slots, 0.0, 0).slots_rx, frames[0].slots_rx)
+
+
+def test_rayleigh_gains_are_what_the_receiver_estimates(slots, encoded):
+    link = Link(ChannelSettings(channel="rayleigh", snr_db=25.0), 2)
+    truth = link.transmit(slots, 0.0, 0).truth
+    estimate = link.receive(encoded, 0.0, 0).channel
+    np.testing.assert_allclose(estimate.h, truth.h, atol=0.06)
+
+
+def test_doppler_keeps_neighbouring_slots_alike(slots):
+    slow = ChannelSettings(channel="rayleigh", doppler_hz=5.0, slot_ms=1.0)
+    gains = Link(slow, 2).transmit(slots, 0.0).truth.h
+    assert np.abs(np.diff(gains)).max() < 0.15
+    independent = Link(ChannelSettings(channel="rayleigh"), 2).transmit(slots, 0.0).truth.h
+    assert np.abs(np.diff(independent)).max() > 0.5
+
+
+def test_erasure_loses_a_fifth_of_the_slots_and_says_which(slots):
+    link = Link(ChannelSettings(channel="erasure"), 0)
+    lost = np.array([link.transmit(slots, 0.0, k).slot_lost for k in range(400)])
+    assert abs(lost.mean() - 0.2) < 4 * math.sqrt(0.16 / lost.size)
+    out = link.transmit(slots, 0.0, 7)
+    assert not out.slots_rx[out.slot_lost].any()
+    assert (np.abs(out.slots_rx[~out.slot_lost]) > 0).all()
+
+
+def test_a_burst_raises_the_noise_and_is_not_announced(slots, encoded):
+    link = Link(ChannelSettings(channel="burst", snr_db=10.0, burst_noise_db=20.0), 3)
+    frame_id = next(k for k in range(50) if 2 < np.sum(link.transmit(slots, 0, k).truth.noise_var > 1) < 8)
+    out = link.transmit(slots, 0.0, frame_id)
+    assert not out.slot_lost.any()
+    hit = out.truth.noise_var > 1
+    np.testing.assert_allclose(out.truth.noise_var, np.where(hit, 10.0, 0.1), rtol=1e-4)
+    effective = link.carry(encoded, 0.0, frame_id).effective_snr_db
+    assert effective[hit].max() < 0.0 < 8.0 < effective[~hit].min()
+
+
+def test_lost_frames_have_their_rate_and_carry_nothing(slots, encoded):
+    link = Link(ChannelSettings(frame_loss=0.3), 0)
+    out = [link.transmit(slots, 0.0, k) for k in range(600)]
+    rate = np.mean([o.frame_lost for o in out])
+    assert abs(rate - 0.3) < 4 * math.sqrt(0.21 / 600)
+    lost = next(k for k, o in enumerate(out) if o.frame_lost)
+    assert not out[lost].slots_rx.any()
+    assert out[lost].slot_lost.all()
+    assert link.carry(encoded, 0.0, lost) is None
+
+
+def test_frame_loss_does_not_shift_the_noise_of_the_others(slots):
+    lossy = Link(ChannelSettings(frame_loss=0.3), 0)
+    clean = Link(ChannelSettings(), 0)
+    kept = next(k for k in range(20) if not lossy.transmit(slots, 0.0, k).frame_lost)
+    np.testing.assert_array_equal(
+        lossy.transmit(slots, 0.0, kept).slots_rx, clean.transmit(slots, 0.0, kept).slots_rx
+    )
+
+
+def test_carry_returns_symbols_and_honest_snr(encoded):
+    received = Link(ChannelSettings(snr_db=12.0), 0).carry(encoded, 0.0)
+    assert received.shape_hw == encoded.shape_hw
+    assert received.modulation == "16qam"
+    np.testing.assert_allclose(received.effective_snr_db, 12.0, atol=1.5)
+    perfect = Link(ChannelSettings(snr_db=12.0), 0).carry(encoded, 0.0, perfect_csi=True)
+    power = np.mean(np.abs(insert_pilots(encoded.symbols)) ** 2)
+    np.testing.assert_allclose(perfect.effective_snr_db, 12.0 - 10 * np.log10(power), atol=1e-3)
+
+
+def test_lost_slots_reach_the_decoder_as_lost(encoded):
+    received = Link(ChannelSettings(channel="erasure", slot_loss=0.5), 0).carry(encoded, 0.0)
+    lost = received.effective_snr_db == LOST_SLOT_SNR_DB
+    assert 0 < lost.sum() < 12
+    assert not received.symbols[lost].any()
+
+
+def test_settings_change_between_frames(slots, tmp_path):
+    link = Link(ChannelSettings(snr_db=10.0), 0)
+    assert link.transmit(slots, 0.0).snr_db_set == 10.0
+    link.update(ChannelSettings(snr_db=4.0))
+    assert link.transmit(slots, 0.1).snr_db_set == 4.0
+    link.update(ChannelSettings(channel="trace", snr_db=9.0, trace_end_db=1.0, trace_s=4.0))
+    assert link.transmit(slots, 2.0).snr_db_set == pytest.approx(5.0)
+    missing = ChannelSettings(channel="trace", trace="file", trace_file=tmp_path / "no.csv")
+    with pytest.raises(ConfigError, match="can't be read"):
+        link.update(missing)
+    assert link.settings.trace == "ramp"
+    assert link.transmit(slots, 4.0).snr_db_set == pytest.approx(1.0)
+
+
+def test_a_trace_starts_with_the_first_frame(slots):
+    link = Link(ChannelSettings(channel="trace", snr_db=10.0, trace_end_db=0.0, trace_s=10.0), 0)
+    assert link.transmit(slots, 1234.5).snr_db_set == 10.0
+    assert link.transmit(slots, 1239.5).snr_db_set == pytest.approx(5.0)
+
+
+def test_bad_input_is_named(slots):
+    link = Link(ChannelSettings(), 0)
+    with pytest.raises(ValueError, match="must have power above 0"):
+        link.transmit(np.zeros((2, 48), np.complex64), 0.0)
+    with pytest.raises(ValueError, match="frame_id must be at least 0, got -1"):
+        link.transmit(slots, 0.0, -1)
+    with pytest.raises(ValueError, match="seed must be at least 0, got -3"):
+        Link(ChannelSettings(), -3)
+    with pytest.raises(ValueError, match=r"slots must have shape \(S U\)"):
+        link.transmit(np.zeros(48, np.complex64), 0.0)

@@ -1,0 +1,50 @@
+import math
+
+import pytest
+
+from semcast.channel.registry import build_channel, channel_names
+from semcast.channel.settings import ChannelSettings
+from semcast.common.config import build_settings, to_toml
+from semcast.common.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"snr_db": 42.0}, r"snr_db must be in \[-5, 30\], got 42"),
+        ({"snr_db": math.nan}, r"snr_db must be in \[-5, 30\], got nan"),
+        ({"slot_loss": 1.0}, r"slot_loss must be in \[0, 0.99\], got 1"),
+        ({"frame_loss": -0.1}, r"frame_loss must be in \[0, 1\], got -0.1"),
+        ({"jitter_ms": -1.0}, r"jitter_ms must be in \[0, 10000\], got -1"),
+        ({"trace_s": 0.0}, r"trace_s must be in \[0.01, 86400\], got 0"),
+        ({"channel": "wire"}, "channel must be one of awgn, rayleigh, rician, .* got 'wire'"),
+        ({"trace": "hill"}, "trace must be one of constant, ramp, walk, file, got 'hill'"),
+        (
+            {"channel": "burst", "slot_loss": 0.9, "burst_slots": 2.0},
+            "burst_slots must be at least 9 .* got 2",
+        ),
+        ({"channel": "trace", "trace": "file"}, "trace_file must be given for trace 'file', got None"),
+    ],
+)
+def test_bad_settings_name_field_value_and_range(values, message):
+    with pytest.raises(ValueError, match=message):
+        ChannelSettings(**values)
+
+
+def test_settings_are_read_from_toml_values():
+    settings = build_settings(ChannelSettings, {"channel": "erasure", "snr_db": 4})
+    assert (settings.channel, settings.snr_db, settings.slot_loss) == ("erasure", 4.0, 0.2)
+    assert 'channel = "erasure"' in to_toml(settings)
+    with pytest.raises(ConfigError, match="did you mean 'snr_db'"):
+        build_settings(ChannelSettings, {"snr": 3.0})
+
+
+def test_every_channel_name_builds_a_model():
+    for name in channel_names():
+        build_channel(ChannelSettings(channel=name), 0)
+
+
+def test_a_model_refuses_to_become_another():
+    model = build_channel(ChannelSettings(channel="awgn"), 0)
+    with pytest.raises(ConfigError, match="channel must stay 'awgn' in an update, got 'rayleigh'"):
+        model.update(ChannelSettings(channel="rayleigh"))
