@@ -21,6 +21,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "channel": ("channel", "run the simulated radio link, or change it while it runs"),
     "server": ("server", "decode, track, map and show what an agent sends"),
     "export": ("export", "write a run in the format of COLMAP, nerfstudio, evo, Rerun or as points"),
+    "calibrate": ("calibrate", "find a camera's intrinsics from pictures of a chessboard or live"),
     "eval": ("evaluate", "measure trajectories, frame pairs, codecs and confidence offline"),
     "train": ("train", "train a transceiver from a settings file"),
     "doctor": ("doctor", "check this machine and a running system, and say what to mend"),

@@ -1,0 +1,215 @@
+"""``semcast calibrate``: a camera's intrinsics from pictures of a chessboard or from the live camera."""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import Progress
+
+from semcast.common.errors import ConfigError, SemcastError, SourceError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from semcast.agent.calibrate import BoardView
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
+#: A live view is tried every this many frames: finding the board takes longer than a frame.
+LIVE_STRIDE = 5
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "images", type=Path, nargs="*", metavar="PATH", help="pictures of the board, or folders of them"
+    )
+    parser.add_argument("--camera", metavar="N|URL", help="take views from this live camera instead")
+    parser.add_argument(
+        "--board",
+        default="9x6",
+        metavar="CxR",
+        help="inner corners of the chessboard, columns x rows: one less than its squares (default 9x6)",
+    )
+    parser.add_argument(
+        "--distortion",
+        choices=("radtan5", "radtan4", "none"),
+        default="radtan5",
+        help="lens model: k1 k2 p1 p2 k3, without k3, or none (default radtan5)",
+    )
+    parser.add_argument(
+        "--views", type=int, default=20, metavar="N", help="views to take from a live camera (default 20)"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("intrinsics.json"),
+        metavar="FILE",
+        help="result (default intrinsics.json)",
+    )
+    parser.add_argument(
+        "--picture", type=Path, metavar="FILE", help="picture to judge the result by (default beside --out)"
+    )
+
+
+def parse_board(text: str) -> tuple[int, int]:
+    """Read ``9x6``.
+
+    Raises:
+        ConfigError: It is not two numbers of at least 3.
+    """
+    columns, _, rows = text.lower().partition("x")
+    try:
+        board = (int(columns), int(rows))
+    except ValueError as err:
+        raise ConfigError(f"board must look like 9x6, got {text!r}") from err
+    if min(board) < 3:
+        raise ConfigError(f"board must have at least 3 inner corners a side, got {text!r}")
+    return board
+
+
+def image_files(paths: list[Path]) -> list[Path]:
+    """Return the pictures among files and folders.
+
+    Raises:
+        SourceError: A path does not exist, or there is no picture.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            files += sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+        elif path.is_file():
+            files.append(path)
+        else:
+            raise SourceError(f"{path} does not exist")
+    if not files:
+        raise SourceError("there is no picture; give pictures of a chessboard, a folder of them, or --camera")
+    return files
+
+
+def read_pictures(files: list[Path]) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
+    """Yield name and RGB image of each file; all must have one size.
+
+    Raises:
+        SourceError: A file is no picture, or sizes differ.
+    """
+    import cv2
+    import numpy as np
+
+    size = None
+    for file in files:
+        bgr = cv2.imread(str(file), cv2.IMREAD_COLOR)
+        if bgr is None:
+            raise SourceError(f"{file} can't be read as a picture")
+        if size is not None and bgr.shape[:2] != size:
+            raise SourceError(
+                f"{file} is {bgr.shape[1]}x{bgr.shape[0]}, the ones before are {size[1]}x{size[0]}: "
+                "all pictures must come from one camera held one way"
+            )
+        size = bgr.shape[:2]
+        yield file.name, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def camera_pictures(camera: str) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
+    """Yield every few frames of a live camera until it ends.
+
+    Raises:
+        SourceError: The camera can't be opened or stops.
+    """
+    import cv2
+    import numpy as np
+
+    capture = cv2.VideoCapture(int(camera) if camera.isdigit() else camera)
+    try:
+        if not capture.isOpened():
+            raise SourceError(f"camera {camera!r} can't be opened")
+        for number in range(sys.maxsize):
+            if not capture.grab():
+                if number == 0:
+                    raise SourceError(f"camera {camera!r} gives no picture")
+                return
+            if number % LIVE_STRIDE == 0:
+                good, bgr = capture.retrieve()
+                if good:
+                    yield f"frame {number}", np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    finally:
+        capture.release()
+
+
+def _collect(
+    arguments: argparse.Namespace, board: tuple[int, int]
+) -> tuple[list["BoardView"], "NDArray[np.uint8]"]:
+    from semcast.agent.calibrate import BoardView, find_board, is_new_view
+
+    views: list[BoardView] = []
+    sample = None
+    num_seen = 0
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        if arguments.camera is not None:
+            total, pictures = arguments.views, camera_pictures(arguments.camera)
+            what = "show the board from all sides, tilted too (Ctrl-C: enough)"
+        else:
+            files = image_files(arguments.images)
+            total, pictures = len(files), read_pictures(files)
+            what = "looking for the board"
+        task = progress.add_task(what, total=total)
+        try:
+            for name, image in pictures:
+                num_seen += 1
+                corners_xy = find_board(image, board)
+                live = arguments.camera is not None
+                if corners_xy is not None and (not live or is_new_view(corners_xy, views, image.shape[1])):
+                    views.append(BoardView(name, corners_xy))
+                    sample = image
+                elif not live:
+                    progress.console.print(f"no {board[0]}x{board[1]} board found in {name}")
+                progress.update(task, completed=len(views) if live else num_seen)
+                if live and len(views) >= arguments.views:
+                    break
+        except KeyboardInterrupt:
+            if arguments.camera is None:
+                raise
+    if sample is None:
+        raise SourceError(
+            f"no board with {board[0]}x{board[1]} inner corners was found in {num_seen} pictures: count inner"
+            " corners (a board of 10x7 squares is --board 9x6), show all of it with a white border"
+        )
+    return views, sample
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Calibrate, write intrinsics and picture, and print the result."""
+    board = parse_board(arguments.board)
+    if (arguments.camera is None) == (not arguments.images):
+        raise ConfigError("give either pictures of a chessboard or --camera")
+    if arguments.views < 4:
+        raise ConfigError(f"views must be at least 4, got {arguments.views}")
+    import cv2
+
+    from semcast.agent.calibrate import calibrate, calibration_picture
+
+    views, sample = _collect(arguments, board)
+    result = calibrate(views, board, (sample.shape[1], sample.shape[0]), arguments.distortion)
+    picture = arguments.picture or arguments.out.with_suffix(".png")
+    try:
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        result.intrinsics.save(arguments.out)
+        good = cv2.imwrite(str(picture), cv2.cvtColor(calibration_picture(result, sample), cv2.COLOR_RGB2BGR))
+    except (OSError, cv2.error) as err:
+        raise SemcastError(f"the result can't be written: {err}") from err
+    if not good:
+        raise SemcastError(f"{picture} can't be written")
+    c, deviation = result.intrinsics, result.deviations
+    print(f"{c.width}x{c.height}, {len(result.views)} views, reprojection error {result.rms_px:.3f} px rms")
+    print(f"fx {c.fx:.2f} +- {deviation[0]:.2f}, fy {c.fy:.2f} +- {deviation[1]:.2f}")
+    print(f"cx {c.cx:.2f} +- {deviation[2]:.2f}, cy {c.cy:.2f} +- {deviation[3]:.2f}")
+    print("distortion " + (" ".join(f"{k:.5f}" for k in c.distortion) or "none"))
+    print(f"{arguments.out}\n{picture}")
+    for name in result.rejected:
+        print(f"left out: {name} fits far worse than the other views", file=sys.stderr)
+    for warning in result.warnings():
+        print(f"doubtful: {warning}", file=sys.stderr)
+    return 0
