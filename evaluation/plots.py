@@ -44,6 +44,7 @@ def plot_against_snr(
     *,
     title: str = "",
     intervals: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    from_zero: bool = True,
 ) -> None:
     """Draw one curve per name over the SNR and save it.
 
@@ -54,6 +55,7 @@ def plot_against_snr(
         y_label: Quantity and unit.
         title: Above the axes.
         intervals: Name to N ``(low, high)`` bounds, drawn as a band.
+        from_zero: Start the ordinate at 0, right for errors and wrong for decibels.
 
     Raises:
         ValueError: A curve has another length than ``snr_db``.
@@ -69,7 +71,8 @@ def plot_against_snr(
             low, high = np.asarray(intervals[name], dtype=np.float64).T
             axes.fill_between(snr_db, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
     axes.set(xlabel="SNR (dB)", ylabel=y_label, title=title)
-    axes.set_ylim(bottom=0.0)
+    if from_zero:
+        axes.set_ylim(bottom=0.0)
     axes.legend(fontsize="small")
     _save(figure, path)
 

@@ -1,0 +1,264 @@
+"""``semcast eval codec``: image quality of codecs over a link, all on the same images and the same channel.
+
+Codecs take turns on every image, so slow drifts of the machine hit all alike, and image k sees the same noise
+under every codec.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.channel.link import Link
+from semcast.channel.settings import ChannelSettings
+from semcast.channel.trace import SNR_RANGE_DB
+from semcast.common.codec import Codec, DecodedImage, Modulation
+from semcast.common.codecs import load_codec
+from semcast.common.errors import SourceError
+from semcast.common.image import psnr_db
+from semcast.common.phy.slots import channel_bandwidth_ratio
+from semcast.evaluation.calibration import reliability
+from semcast.evaluation.image_quality import ms_ssim, ssim
+from semcast.evaluation.picture_strip import write_picture_strip
+from semcast.evaluation.plots import plot_against_snr
+from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.statistics import finite_mean, percentiles, spearman
+from semcast.evaluation.uncertainty_maps import block_means, pixel_label
+
+VERB = "eval codec"
+#: Fields of ``CodecSettings.link`` that have no meaning here: the SNR is a list, nothing is delayed.
+UNUSED_LINK_FIELDS = frozenset({"link.snr_db", "link.delay_ms", "link.jitter_ms"})
+#: Sensitivity of the pixel label that confidence is trained on.
+LABEL_ALPHA = 30.0
+#: What a receiver shows when a whole frame is lost.
+_LOST_GREY = 128
+_IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm"})
+_STRIP_SNR_DB = 10.0
+_STRIP_IMAGES = 2
+_FRAME_INTERVAL_S = 0.1
+#: Every third pixel of a map is graded.
+_PIXEL_STEP = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class CodecSettings:
+    """Settings of ``evaluate_codec``.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    images: Path = field(metadata={"help": "folder of images, used in the order of their names"})
+    codec: tuple[str, ...] = field(
+        default=("3dcsc", "jpeg-ldpc"), metadata={"help": "codecs by name, one or more"}
+    )
+    snr_db: tuple[float, ...] = field(
+        default=(2.0, 4.0, 6.0, 8.0, 10.0, 12.0), metadata={"help": "SNRs in dB, one or more"}
+    )
+    modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    link: ChannelSettings = field(default=ChannelSettings(), metadata={"help": "the channel"})
+    perfect_csi: bool = field(
+        default=False, metadata={"help": "tell the receiver the true channel instead of estimating it"}
+    )
+    seed: int = field(default=0, metadata={"help": "seed of the channel"})
+    max_images: int | None = field(default=None, metadata={"help": "images used at most"})
+    threads: int = field(default=2, metadata={"help": "threads of a learned codec"})
+    json: Path | None = field(default=None, metadata={"help": "file for the result"})
+    out: Path | None = field(
+        default=None, metadata={"help": "folder for PSNR and SSIM curves and a strip of pictures"}
+    )
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        low, high = SNR_RANGE_DB
+        if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
+            raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
+        if not self.codec or len(set(self.codec)) != len(self.codec):
+            raise ValueError(f"codec must be one or more different names, got {self.codec}")
+        for name, least in (("seed", 0), ("threads", 1), ("max_images", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}")
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """One image through one codec at one SNR."""
+
+    figures: dict[str, float | None]
+    confidence: dict[str, float | None]
+    times_ms: dict[str, float]
+    decoded: DecodedImage
+
+
+def read_images(folder: Path, max_images: int | None = None) -> dict[str, NDArray[np.uint8]]:
+    """Read the images of a folder.
+
+    Returns:
+        File name to ``(H, W, 3)`` uint8 RGB, in the order of the names.
+
+    Raises:
+        SourceError: The folder can't be read, holds no image, or a file is no image.
+    """
+    try:
+        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
+    except OSError as err:
+        raise SourceError(f"{folder} can't be read as a folder of images: {err}") from err
+    if not paths:
+        raise SourceError(f"{folder} holds no images ({', '.join(sorted(_IMAGE_SUFFIXES))})")
+    images = {}
+    for path in paths[:max_images]:
+        image_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if image_bgr is None:
+            raise SourceError(f"{path} can't be read as an image")
+        images[path.name] = np.asarray(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    return images
+
+
+def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = None) -> dict[str, Any]:
+    """Send every image through every codec at every SNR and measure what arrives.
+
+    A lost frame or an outage counts with the grey picture the receiver shows then, and in ``outage``.
+
+    Args:
+        settings: What to measure.
+        codecs: Used instead of the codecs that ``settings.codec`` names.
+
+    Returns:
+        Provenance and ``results``: one row per codec and SNR with means over the images of ``psnr_db``,
+        ``ssim``, ``ms_ssim`` (None for images below 176 pixels) and ``cbr``, pilots included; the share
+        of ``outage``; ``snr_db_estimate`` of the receiver; ``encode_ms`` and ``decode_ms`` (p50, p95);
+        ``confidence`` with ``mean``, ``ece`` against the pixel label and ``spearman_blocks``; and
+        ``images``, one row per image. Written to ``settings.json`` and drawn into ``settings.out`` where
+        given.
+
+    Raises:
+        SourceError: The images can't be read.
+        ConfigError: A codec is unknown.
+        SemcastError: A result can't be written.
+    """
+    images = read_images(settings.images, settings.max_images)
+    if codecs is None:
+        codecs = [
+            load_codec(name, modulation=settings.modulation, num_threads=settings.threads)
+            for name in settings.codec
+        ]
+    _warm_up(codecs, next(iter(images.values())))
+    strip_snr_db = min(settings.snr_db, key=lambda snr_db: abs(snr_db - _STRIP_SNR_DB))
+    strip: list[dict[str, NDArray[np.uint8]]] = []
+    results = []
+    for snr_db in settings.snr_db:
+        samples: dict[str, list[_Sample]] = {codec.name: [] for codec in codecs}
+        for k, (name, image) in enumerate(images.items()):
+            for codec in codecs:
+                samples[codec.name].append(
+                    _run(codec, image, replace(settings.link, snr_db=snr_db), k, settings)
+                )
+            if snr_db == strip_snr_db and len(strip) < _STRIP_IMAGES:
+                strip.append(_strip_row(name, image, {n: s[-1] for n, s in samples.items()}))
+        results += [_row(name, snr_db, list(images), rows) for name, rows in samples.items()]
+    report = json_ready({**provenance(VERB, settings), "num_images": len(images), "results": results})
+    if settings.json is not None:
+        write_json(settings.json, report)
+    if settings.out is not None:
+        _draw(settings.out, settings.snr_db, results)
+        write_picture_strip(settings.out / f"pictures_{strip_snr_db:g}db.png", strip)
+    return dict(report)
+
+
+def _warm_up(codecs: Sequence[Codec], image: NDArray[np.uint8]) -> None:
+    """Let every codec build what it builds at its first image, outside the measured times."""
+    for codec in codecs:
+        received = Link(ChannelSettings(snr_db=15.0), 0).carry(codec.encode(image, 15.0), 0.0)
+        if received is not None:
+            codec.decode(received)
+
+
+def _run(
+    codec: Codec, image: NDArray[np.uint8], channel: ChannelSettings, k: int, settings: CodecSettings
+) -> _Sample:
+    # A link of its own per image: traces and fading see the time of the image and not of the run.
+    link = Link(channel, settings.seed)
+    start_ns = time.perf_counter_ns()
+    encoded = codec.encode(image, channel.snr_db)
+    encode_ms = (time.perf_counter_ns() - start_ns) * 1e-6
+    equalised = link.receive(encoded, k * _FRAME_INTERVAL_S, k, perfect_csi=settings.perfect_csi)
+    times_ms = {"encode": encode_ms}
+    if equalised is None:
+        decoded = DecodedImage(
+            image=np.full_like(image, _LOST_GREY),
+            confidence=np.zeros(image.shape[:2], dtype=np.float32),
+            outage=True,
+        )
+    else:
+        start_ns = time.perf_counter_ns()
+        decoded = codec.decode(equalised.received)
+        times_ms["decode"] = (time.perf_counter_ns() - start_ns) * 1e-6
+    big_enough = min(image.shape[:2]) >= 11
+    figures = {
+        "psnr_db": psnr_db(decoded.image, image),
+        "ssim": ssim(decoded.image, image) if big_enough else None,
+        "ms_ssim": ms_ssim(decoded.image, image) if big_enough else None,
+        "cbr": channel_bandwidth_ratio((image.shape[0], image.shape[1])),
+        "outage": float(decoded.outage),
+        "snr_db_estimate": None if equalised is None else equalised.snr_db,
+    }
+    return _Sample(figures, _grade_confidence(decoded, image), times_ms, decoded)
+
+
+def _grade_confidence(decoded: DecodedImage, image: NDArray[np.uint8]) -> dict[str, float | None]:
+    label = pixel_label(decoded.image, image, LABEL_ALPHA)
+    step = np.s_[1::_PIXEL_STEP, 1::_PIXEL_STEP]
+    return {
+        "mean": float(decoded.confidence.mean()),
+        "ece": reliability(decoded.confidence[step], label[step]).ece if label[step].size else None,
+        "spearman_blocks": spearman(block_means(decoded.confidence), block_means(label)),
+    }
+
+
+def _row(codec: str, snr_db: float, names: list[str], samples: list[_Sample]) -> dict[str, Any]:
+    return {
+        "codec": codec,
+        "snr_db": snr_db,
+        **{key: finite_mean([s.figures[key] for s in samples]) for key in samples[0].figures},
+        "encode_ms": percentiles([s.times_ms["encode"] for s in samples]),
+        "decode_ms": percentiles([s.times_ms["decode"] for s in samples if "decode" in s.times_ms]),
+        "confidence": {
+            key: finite_mean([s.confidence[key] for s in samples]) for key in samples[0].confidence
+        },
+        "images": [
+            {"image": name, **{key: s.figures[key] for key in ("psnr_db", "ssim", "outage")}}
+            for name, s in zip(names, samples, strict=True)
+        ],
+    }
+
+
+def _strip_row(
+    name: str, image: NDArray[np.uint8], samples: dict[str, _Sample]
+) -> dict[str, NDArray[np.uint8]]:
+    row = {f"original ({name})": image}
+    for codec, sample in samples.items():
+        psnr, similarity = sample.figures["psnr_db"], sample.figures["ssim"]
+        label = f"{codec}: {psnr:.2f} dB" + ("" if similarity is None else f" / {similarity:.3f}")
+        row[label] = sample.decoded.image
+    return row
+
+
+def _draw(folder: Path, snr_db: Sequence[float], results: list[dict[str, Any]]) -> None:
+    """Draw PSNR and SSIM over SNR (Fig. 7 and 8 of the paper)."""
+    order = sorted(snr_db)
+    names = list(dict.fromkeys(row["codec"] for row in results))
+    for key, file_name, label in (
+        ("psnr_db", "fig7_psnr.png", "PSNR (dB)"),
+        ("ssim", "fig8_ssim.png", "SSIM"),
+        ("ms_ssim", "ms_ssim.png", "MS-SSIM"),
+    ):
+        values = {(row["codec"], row["snr_db"]): row[key] for row in results}
+        curves = {name: [values[name, s] for s in order] for name in names}
+        if any(v is not None for curve in curves.values() for v in curve):
+            plot_against_snr(folder / file_name, order, curves, label, from_zero=False)

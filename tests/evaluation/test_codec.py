@@ -1,0 +1,144 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast.channel.settings import ChannelSettings
+from semcast.common.errors import ConfigError, SourceError
+from semcast.evaluation.codec import CodecSettings, evaluate_codec, read_images
+from semcast.evaluation.picture_strip import picture_strip, write_picture_strip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("images")
+    rng = np.random.default_rng(0)
+    for k in range(3):
+        image = cv2.GaussianBlur(rng.uniform(0, 255, (176, 192, 3)), (0, 0), 4.0)
+        image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+        cv2.imwrite(str(folder / f"image{k}.png"), image)
+    (folder / "notes.txt").write_text("not an image")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    settings = CodecSettings(
+        images=folder,
+        codec=("jpeg-ldpc", "jpeg-amc"),
+        snr_db=(3.0, 10.0),
+        json=out / "result.json",
+        out=out,
+        max_images=2,
+    )
+    return settings, evaluate_codec(settings)
+
+
+def rows(report):
+    return {(row["codec"], row["snr_db"]): row for row in report["results"]}
+
+
+def test_every_codec_and_snr_has_one_row_with_the_promised_keys(report):
+    by_cell = rows(report[1])
+    assert set(by_cell) == {(c, s) for c in ("jpeg-ldpc", "jpeg-amc") for s in (3.0, 10.0)}
+    row = by_cell["jpeg-ldpc", 10.0]
+    assert {"psnr_db", "ssim", "ms_ssim", "cbr", "outage", "encode_ms", "decode_ms", "confidence"} <= set(row)
+    assert row["cbr"] == pytest.approx(1 / 16)
+    assert [image["image"] for image in row["images"]] == ["image0.png", "image1.png"]
+    assert row["psnr_db"] == pytest.approx(np.mean([image["psnr_db"] for image in row["images"]]))
+    assert row["snr_db_estimate"] == pytest.approx(10.0, abs=1.0)
+
+
+def test_the_cliff_of_the_fixed_code_and_the_adaptive_one_beyond_it(report):
+    by_cell = rows(report[1])
+    assert by_cell["jpeg-ldpc", 3.0]["outage"] == 1.0
+    assert by_cell["jpeg-ldpc", 3.0]["psnr_db"] < 20.0
+    assert by_cell["jpeg-ldpc", 10.0]["outage"] == by_cell["jpeg-amc", 3.0]["outage"] == 0.0
+    grey_db = by_cell["jpeg-ldpc", 3.0]["psnr_db"]
+    assert by_cell["jpeg-ldpc", 10.0]["psnr_db"] > by_cell["jpeg-amc", 3.0]["psnr_db"] > grey_db + 3.0
+    assert by_cell["jpeg-ldpc", 10.0]["confidence"]["ece"] < 0.05
+
+
+def test_result_curves_and_pictures_are_written(report):
+    settings, result = report
+    assert json.loads(settings.json.read_text()) == result
+    assert result["command"].startswith("semcast eval codec --images")
+    for name in ("fig7_psnr.png", "fig8_ssim.png", "ms_ssim.png"):
+        assert cv2.imread(str(settings.out / name)) is not None
+    strip = cv2.imread(str(settings.out / "pictures_10db.png"))
+    assert strip.shape[1] == 3 * 384 + 2 * 4
+
+
+def test_the_same_seed_gives_the_same_figures(folder, report):
+    again = evaluate_codec(
+        CodecSettings(images=folder, codec=("jpeg-amc",), snr_db=(3.0,), max_images=2, seed=0)
+    )
+    assert again["results"][0]["images"] == rows(report[1])["jpeg-amc", 3.0]["images"]
+
+
+def test_a_lost_frame_counts_as_an_outage(folder):
+    result = evaluate_codec(
+        CodecSettings(
+            images=folder, codec=("jpeg-ldpc",), snr_db=(12.0,), link=ChannelSettings(frame_loss=1.0)
+        )
+    )
+    row = result["results"][0]
+    assert row["outage"] == 1.0
+    assert row["decode_ms"] == {"p50": None, "p95": None}
+    assert row["snr_db_estimate"] is None
+
+
+def test_perfect_csi_reaches_the_equaliser(folder):
+    row = evaluate_codec(
+        CodecSettings(images=folder, codec=("jpeg-ldpc",), snr_db=(9.0,), max_images=1, perfect_csi=True)
+    )["results"][0]
+    assert row["snr_db_estimate"] == pytest.approx(9.0, abs=0.2)
+
+
+def test_image_folders_are_checked(folder, tmp_path):
+    assert list(read_images(folder, 2)) == ["image0.png", "image1.png"]
+    with pytest.raises(SourceError, match="can't be read as a folder"):
+        read_images(tmp_path / "missing")
+    with pytest.raises(SourceError, match="holds no images"):
+        read_images(tmp_path)
+    (tmp_path / "broken.png").write_bytes(b"nothing")
+    with pytest.raises(SourceError, match=r"broken\.png can't be read as an image"):
+        read_images(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"snr_db": (99.0,)}, r"snr_db must be one or more values in \[-5, 30\], got \(99.0,\)"),
+        ({"snr_db": ()}, "snr_db must be one or more values"),
+        ({"codec": ("a", "a")}, "codec must be one or more different names"),
+        ({"max_images": 0}, "max_images must be at least 1, got 0"),
+        ({"threads": 0}, "threads must be at least 1, got 0"),
+        ({"seed": -1}, "seed must be at least 0, got -1"),
+    ],
+)
+def test_bad_settings_are_named(tmp_path, values, message):
+    with pytest.raises(ValueError, match=message):
+        CodecSettings(images=tmp_path, **values)
+
+
+def test_an_unknown_codec_is_named(folder):
+    with pytest.raises(ConfigError, match="got 'jpeg'"):
+        evaluate_codec(CodecSettings(images=folder, codec=("jpeg",)))
+
+
+def test_a_strip_holds_every_image_once(tmp_path):
+    red = np.full((60, 120, 3), (200, 0, 0), np.uint8)
+    blue = np.full((60, 120, 3), (0, 0, 200), np.uint8)
+    strip = picture_strip([{"a": red, "b": blue}, {"a": blue}])
+    # Cells of 384 pixels: 192 of picture under 26 of label, gaps of 4.
+    assert strip.shape == (2 * (192 + 26) + 4, 2 * 384 + 4, 3)
+    assert strip[100, 100].tolist() == [200, 0, 0]
+    assert strip[100, 500].tolist() == strip[350, 100].tolist() == [0, 0, 200]
+    assert strip[350, 500].tolist() == [255, 255, 255]
+    write_picture_strip(tmp_path / "new" / "strip.png", [{"a": red}])
+    assert (tmp_path / "new" / "strip.png").stat().st_size > 0
+    with pytest.raises(ValueError, match="at least one image in each row"):
+        picture_strip([])
