@@ -107,7 +107,7 @@ class _Rayleigh(_Model):
         settings = self._settings
         if settings.doppler_hz <= 0.0:
             return rayleigh_gains(num_slots, rng)
-        times_s = elapsed_s + 1e-3 * settings.slot_ms * np.arange(num_slots)
+        times_s = elapsed_s + 1e-3 * settings.slot_ms * np.arange(num_slots, dtype=np.float64)
         waves = np.random.default_rng((self._seed, _FADING_STREAM))
         return clarke_gains(times_s, settings.doppler_hz, waves)
 

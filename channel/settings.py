@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from semcast.channel.trace import SNR_RANGE_DB
 
@@ -62,7 +62,7 @@ class ChannelSettings:
             ("channel", self.channel, ChannelName),
             ("trace", self.trace, TraceName),
         ):
-            words = allowed.__args__
+            words = get_args(allowed)
             if value not in words:
                 raise ValueError(f"{name} must be one of {', '.join(words)}, got {value!r}")
         _check_range("snr_db", self.snr_db, *SNR_RANGE_DB)

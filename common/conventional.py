@@ -206,7 +206,7 @@ class ConventionalCodec:
         shape = (len(self._modes), layout.num_slots, self._header_per_slot(layout))
         quadrant = (hash_words(int(np.prod(shape)), _MODE_KEY) >> np.uint64(62)).astype(np.int8)
         points = ((1 - 2 * (quadrant & 1)) + 1j * (1 - 2 * (quadrant >> 1))) / np.sqrt(2.0)
-        return points.astype(np.complex64).reshape(shape)
+        return np.asarray(points, dtype=np.complex64).reshape(shape)
 
     def _choose_mode(self, layout: SlotLayout, snr_db: float) -> int:
         """Return the fastest mode that works at the expected SNR and has room for a block at all."""

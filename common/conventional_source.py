@@ -96,14 +96,14 @@ def compress_to_fit(
         quality is poor, of the image at a fraction of its size if that comes closer to the original. None
         when nothing fits.
     """
-    image_bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    image_bgr = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), dtype=np.uint8)
     shape_hw = (image.shape[0], image.shape[1])
     best: tuple[float, int, bytes] | None = None
     for scale in _SCALES:
         smaller = image_bgr
         if scale < 1.0:
             size_wh = (max(1, round(shape_hw[1] * scale)), max(1, round(shape_hw[0] * scale)))
-            smaller = cv2.resize(image_bgr, size_wh, interpolation=cv2.INTER_AREA)
+            smaller = np.asarray(cv2.resize(image_bgr, size_wh, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         found = _best_quality(smaller, image_format, budget_bytes, hint)
         if found is not None:
             quality, data = found

@@ -58,8 +58,8 @@ def ssim(a: _Image, b: _Image) -> float:
 def ms_ssim(a: _Image, b: _Image) -> float | None:
     """Return the multi-scale structural similarity over five scales, each half the size of the one before.
 
-    Negative similarities of a scale count as 0. None when the smaller side is below 176 pixels, where the window
-    doesn't fit the coarsest scale.
+    Negative similarities of a scale count as 0. None when the smaller side is below 176 pixels, where the
+    window doesn't fit the coarsest scale.
 
     Raises:
         ValueError: See ``ssim``.

@@ -201,14 +201,15 @@ def equalise(
     if slot_lost is not None:
         check_shape(slot_lost, f"{layout.num_slots}", "slot_lost")
     pilots_rx, data_rx = split(slots_rx)
-    damaged = ~np.isfinite(data_rx).all(axis=1)
-    lost = damaged if slot_lost is None else damaged | slot_lost
+    lost = np.asarray(~np.isfinite(data_rx).all(axis=1), dtype=np.bool_)
+    if slot_lost is not None:
+        lost |= slot_lost
     if knowledge is None:
         channel = estimate_channel(pilots_rx, lost)
     else:
         check_shape(knowledge.h, f"{layout.num_slots}", "knowledge.h")
         check_shape(knowledge.noise_var, f"{layout.num_slots}", "knowledge.noise_var")
-        arrived = ~lost
+        arrived = np.logical_not(lost)
         floor = float(np.median(knowledge.noise_var[arrived])) if arrived.any() else 1.0
         channel = ChannelEstimate(
             h=np.where(arrived, knowledge.h, np.complex64(0)),

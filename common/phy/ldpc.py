@@ -172,7 +172,7 @@ def _failed(belief: NDArray[np.float32], rows: tuple[tuple[tuple[int, int], ...]
         for column, shift in row:
             _xor_shifted(syndrome, hard[column], shift)
         failed |= syndrome
-    return failed.any(axis=0)
+    return np.asarray(failed.any(axis=0), dtype=np.bool_)
 
 
 def decode(plan: BlockPlan, llr: NDArray[np.float32], max_iterations: int = 30) -> DecodedBlocks:

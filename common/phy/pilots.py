@@ -14,7 +14,7 @@ def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Hash 64-bit integers (the finaliser of SplitMix64, Steele et al. 2014)."""
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
+    return np.asarray(x ^ (x >> np.uint64(31)), dtype=np.uint64)
 
 
 def pilot_symbols(layout: SlotLayout) -> NDArray[np.complex64]:
@@ -25,7 +25,7 @@ def pilot_symbols(layout: SlotLayout) -> NDArray[np.complex64]:
     quadrant = (hashed >> np.uint64(62)).astype(np.int8)
     real = 1 - 2 * (quadrant & 1)
     imag = 1 - 2 * (quadrant >> 1)
-    return ((real + 1j * imag) / np.sqrt(2.0)).astype(np.complex64)
+    return np.asarray((real + 1j * imag) / np.sqrt(2.0), dtype=np.complex64)
 
 
 def _layout_of(num_slots: int, width: int, per_block: int, what: str) -> SlotLayout:

@@ -29,7 +29,7 @@ def pam_levels(bits_per_symbol: int = BITS_PER_SYMBOL_16QAM) -> NDArray[np.float
 
 
 def _gray(level: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return level ^ (level >> 1)
+    return np.asarray(level ^ (level >> 1), dtype=np.uint8)
 
 
 def constellation(bits_per_symbol: int = BITS_PER_SYMBOL_16QAM) -> NDArray[np.complex64]:
@@ -59,7 +59,7 @@ def indices_to_symbols(
 def _nearest_level(values: NDArray[np.float32], bits_per_symbol: int) -> NDArray[np.uint8]:
     levels = pam_levels(bits_per_symbol)
     scaled = (values - levels[0]) * np.float32(1.0 / (levels[1] - levels[0]))
-    return np.clip(np.rint(scaled), 0, levels.size - 1).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(scaled), 0, levels.size - 1), dtype=np.uint8)
 
 
 def symbols_to_indices(
@@ -85,7 +85,7 @@ def bits_to_indices(
         raise ValueError(f"number of bits must be a multiple of {bits_per_symbol}, got {bits.shape[-1]}")
     groups = bits.reshape(*bits.shape[:-1], -1, bits_per_symbol)
     weights = (1 << np.arange(bits_per_symbol - 1, -1, -1)).astype(np.uint8)
-    return (groups * weights).sum(axis=-1, dtype=np.uint8)
+    return np.asarray((groups * weights).sum(axis=-1, dtype=np.uint8))
 
 
 def indices_to_bits(

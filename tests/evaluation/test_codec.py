@@ -15,7 +15,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("images")
     rng = np.random.default_rng(0)
     for k in range(3):
-        image = cv2.GaussianBlur(rng.uniform(0, 255, (176, 192, 3)), (0, 0), 4.0)
+        image = cv2.GaussianBlur(rng.uniform(0, 255, (256, 320, 3)), (0, 0), 6.0)
         image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
         cv2.imwrite(str(folder / f"image{k}.png"), image)
     (folder / "notes.txt").write_text("not an image")
