@@ -1,0 +1,289 @@
+"""A recorded image sequence with random access: images as the codec gets them, times, camera, true path."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.camera_settings import HOW_TO_GIVE, CameraSettings
+from semcast.common.errors import SourceError
+from semcast.common.geometry import exp_so3, log_so3, make_transform
+from semcast.common.sequence_layouts import Layout, SequenceFiles, read_layout
+from semcast.common.trajectory import Trajectory
+
+#: Poses further apart than this many frames are not interpolated between.
+_MAX_GAP_FRAMES = 2.0
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Read an image file as ``(H, W, 3)`` uint8 RGB.
+
+    Grey is repeated, 16-bit is cut to 8, transparency is laid on white. Orientation notes of cameras are
+    not applied: a calibration belongs to the pixels as stored.
+
+    Raises:
+        SourceError: The file is missing or damaged.
+    """
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError as err:
+        raise SourceError(f"{path} can't be read: {err.strerror or err}") from err
+    raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    if raw is None:
+        raise SourceError(f"{path} is not a readable image (damaged, or of an unknown format)")
+    return as_rgb(raw)
+
+
+def as_rgb(raw: NDArray) -> NDArray[np.uint8]:
+    """Turn what OpenCV reads (grey, BGR or BGRA, 8 or 16 bit) into ``(H, W, 3)`` uint8 RGB."""
+    if raw.dtype == np.uint16:
+        raw = (raw >> 8).astype(np.uint8)
+    elif raw.dtype != np.uint8:
+        raw = np.clip(np.asarray(raw, dtype=np.float64) * 255.0, 0, 255).astype(np.uint8)
+    if raw.ndim == 2 or raw.shape[2] == 1:
+        return np.asarray(cv2.cvtColor(raw, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
+    if raw.shape[2] == 4:
+        alpha = raw[:, :, 3:].astype(np.uint16)
+        laid = (raw[:, :, 2::-1].astype(np.uint16) * alpha + 255 * (255 - alpha) + 127) // 255
+        return laid.astype(np.uint8)
+    return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+class ImageRectifier:
+    """Removes distortion and resizes: from a camera's images to those of a pinhole of another size.
+
+    Args:
+        camera: Of the images that go in; None when it is unknown and only the size changes.
+        size_wh: Size that comes out.
+
+    The border that undistortion uncovers is black. Shrinking averages over areas.
+    """
+
+    def __init__(self, camera: Intrinsics | None, size_wh: tuple[int, int]) -> None:
+        self._size_wh = size_wh
+        self._maps: tuple[NDArray, NDArray] | None = None
+        if camera is not None and camera.distortion:
+            K = camera.K
+            x, y = cv2.initUndistortRectifyMap(
+                K, np.array(camera.distortion), None, K, (camera.width, camera.height), cv2.CV_16SC2
+            )
+            self._maps = (x, y)
+
+    def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the image undistorted and resized; the same object when there is nothing to do."""
+        if self._maps is not None:
+            image = np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
+        return resized(image, self._size_wh)
+
+
+def resized(image: NDArray[np.uint8], size_wh: tuple[int, int]) -> NDArray[np.uint8]:
+    """Resize by area averaging (bilinear where it grows); the same object when the size is right."""
+    height, width = image.shape[:2]
+    if (width, height) == size_wh:
+        return image
+    shrinks = size_wh[0] <= width and size_wh[1] <= height
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size_wh, interpolation=how), dtype=np.uint8)
+
+
+def resized_wh(width: int, height: int, factor: float) -> tuple[int, int]:
+    """Return the size after a resize by ``factor``, rounded to whole pixels.
+
+    Raises:
+        ValueError: The factor is not in [0.05, 1].
+    """
+    if not 0.05 <= factor <= 1.0:
+        raise ValueError(f"resize must be in [0.05, 1], got {factor:g}")
+    return max(1, round(width * factor)), max(1, round(height * factor))
+
+
+class Sequence:
+    """A recording, opened by ``open_sequence``. Safe to read from several threads.
+
+    Attributes:
+        name: Folder name.
+        frame_ids: ``(N,)`` int64, the index of each frame in the whole recording: ``arange(N)`` unless a
+            stride was asked for.
+        times_ns: ``(N,)`` int64, recorded time of each frame, strictly increasing.
+    """
+
+    def __init__(
+        self,
+        files: SequenceFiles,
+        camera: Intrinsics | None,
+        size_wh: tuple[int, int],
+        resize: float,
+        kept: slice,
+    ) -> None:
+        """Take files and camera as read; see ``open_sequence``."""
+        self.name = files.name
+        self.frame_ids: NDArray[np.int64] = np.arange(len(files.image_paths), dtype=np.int64)[kept]
+        self.times_ns: NDArray[np.int64] = files.times_ns[kept]
+        self._paths = files.image_paths[kept]
+        self._stored_wh = size_wh
+        self._size_wh = resized_wh(*size_wh, resize)
+        self._camera = camera.undistorted().scaled_to(*self._size_wh) if camera is not None else None
+        self._rectify = ImageRectifier(camera, self._size_wh)
+        self._truth = (
+            truth_at_frames(files.groundtruth, self.times_ns, _frame_period_s(files.times_ns))
+            if files.groundtruth is not None
+            else None
+        )
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    @property
+    def size_wh(self) -> tuple[int, int]:
+        """Width and height of the images that ``image`` returns."""
+        return self._size_wh
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Pinhole, without distortion, of the images that ``image`` returns.
+
+        Raises:
+            SourceError: The recording says nothing about its camera and none was given.
+        """
+        if self._camera is None:
+            raise SourceError(f"the camera of {self.name} is unknown: {HOW_TO_GIVE}")
+        return self._camera
+
+    def image(self, index: int, camera: Intrinsics | None = None) -> NDArray[np.uint8]:
+        """Return frame ``index`` as ``(H, W, 3)`` uint8 RGB, undistorted and resized.
+
+        Args:
+            index: In [0, len): a position in this sequence, not a ``frame_id`` where there is a stride.
+            camera: Bring the image to the size of this camera, which must see the same field of view.
+
+        Raises:
+            IndexError: There is no such frame.
+            SourceError: The file is missing, damaged or of another size than the first one.
+            ValueError: ``camera`` is not a resized version of this one.
+        """
+        if not 0 <= index < len(self._paths):
+            raise IndexError(f"frame must be in [0, {len(self._paths) - 1}], got {index}")
+        raw = read_image(self._paths[index])
+        if (raw.shape[1], raw.shape[0]) != self._stored_wh:
+            raise SourceError(
+                f"{self._paths[index]} is {raw.shape[1]}x{raw.shape[0]}, "
+                f"the first image of the sequence is {self._stored_wh[0]}x{self._stored_wh[1]}"
+            )
+        image = self._rectify(raw)
+        if camera is None or (camera.width, camera.height) == self._size_wh:
+            return image
+        if self._camera is not None:
+            same = self._camera.scaled_to(camera.width, camera.height)
+            if not np.allclose(same.K, camera.K, rtol=0.01, atol=1.0):
+                raise ValueError(f"camera must be {self.name}'s own at another size, {same}, got {camera}")
+        return resized(image, (camera.width, camera.height))
+
+    def groundtruth(self) -> Trajectory | None:
+        """Return the true camera poses, None where there are none.
+
+        Times are exactly ``times_ns * 1e-9`` of the frames; frames without a true pose nearby are absent.
+        """
+        return self._truth
+
+
+def _frame_period_s(times_ns: NDArray[np.int64]) -> float:
+    return float(np.median(np.diff(times_ns))) * 1e-9 if len(times_ns) > 1 else 0.1
+
+
+def truth_at_frames(truth: Trajectory, times_ns: NDArray[np.int64], period_s: float) -> Trajectory | None:
+    """Bring true poses to the times of frames.
+
+    A pose within a thousandth of a frame is taken as it is. Between two poses that are at most two frames
+    apart, of which the nearer one is within half a frame, position is interpolated linearly and rotation
+    along the geodesic. All other frames get none.
+
+    Args:
+        truth: Poses at their own times.
+        times_ns: ``(N,)`` frame times, strictly increasing.
+        period_s: Usual time between two frames of the recording.
+
+    Returns:
+        Poses at the times of those frames that have one; None when no frame has.
+    """
+    times_s = times_ns * 1e-9
+    if len(truth) == 0:
+        return None
+    right = np.clip(np.searchsorted(truth.t_s, times_s), 1, max(1, len(truth) - 1))
+    left = np.clip(right - 1, 0, len(truth) - 1)
+    right = np.minimum(right, len(truth) - 1)
+    kept: list[int] = []
+    poses: list[NDArray[np.float64]] = []
+    for k, t in enumerate(times_s):
+        a, b = int(left[k]), int(right[k])
+        nearest = a if abs(truth.t_s[a] - t) <= abs(truth.t_s[b] - t) else b
+        distance_s = abs(float(truth.t_s[nearest]) - t)
+        gap_s = float(truth.t_s[b] - truth.t_s[a])
+        # Epoch times of 1e9 s have a float resolution of 2e-7 s.
+        if distance_s <= max(1e-3 * period_s, 1e-6):
+            poses.append(truth.T_world_cam[nearest])
+        elif (
+            truth.t_s[a] < t < truth.t_s[b]
+            and gap_s <= _MAX_GAP_FRAMES * period_s
+            and distance_s <= 0.5 * period_s
+        ):
+            share = (t - float(truth.t_s[a])) / gap_s
+            poses.append(_interpolate(truth.T_world_cam[a], truth.T_world_cam[b], share))
+        else:
+            continue
+        kept.append(k)
+    return Trajectory(times_s[kept], np.array(poses)) if kept else None
+
+
+def _interpolate(
+    T_world_a: NDArray[np.float64], T_world_b: NDArray[np.float64], share: float
+) -> NDArray[np.float64]:
+    R_a = T_world_a[:3, :3]
+    R = R_a @ exp_so3(share * log_so3(R_a.T @ T_world_b[:3, :3]))
+    return make_transform(R, (1.0 - share) * T_world_a[:3, 3] + share * T_world_b[:3, 3])
+
+
+def open_sequence(
+    path: Path,
+    intrinsics: Intrinsics | CameraSettings | None = None,
+    layout: Layout = "auto",
+    resize: float = 1.0,
+    stride: int = 1,
+    max_frames: int | None = None,
+    rate_hz: float = 10.0,
+) -> Sequence:
+    """Open a recorded sequence.
+
+    Args:
+        path: Folder in the native, TUM, KITTI odometry, EuRoC or NeRF layout, a folder of images, or a
+            ``transforms*.json`` file.
+        intrinsics: Camera to use instead of what the recording says, for the images as stored.
+        layout: Layout to read; ``auto`` looks.
+        resize: Factor on the image size, intrinsics follow.
+        stride: Use every n-th frame.
+        max_frames: Use at most so many.
+        rate_hz: Frame rate of layouts that record no times.
+
+    Raises:
+        SourceError: Something is missing, damaged or contradicts itself; the message says what.
+        ValueError: An argument is out of range.
+    """
+    if stride < 1:
+        raise ValueError(f"stride must be at least 1, got {stride}")
+    if max_frames is not None and max_frames < 1:
+        raise ValueError(f"max_frames must be at least 1, got {max_frames}")
+    if not rate_hz > 0:
+        raise ValueError(f"rate_hz must be positive, got {rate_hz:g}")
+    files = read_layout(Path(path), layout, rate_hz)
+    height, width = read_image(files.image_paths[0]).shape[:2]
+    camera = intrinsics.resolve(width, height) if isinstance(intrinsics, CameraSettings) else intrinsics
+    if camera is None:
+        camera = files.camera(width, height)
+    if camera is not None and (camera.width, camera.height) != (width, height):
+        raise SourceError(
+            f"intrinsics of {files.name} are for {camera.width}x{camera.height} images, "
+            f"its images are {width}x{height}"
+        )
+    stop = None if max_frames is None else max_frames * stride
+    return Sequence(files, camera, (width, height), resize, slice(None, stop, stride))

@@ -1,0 +1,379 @@
+"""What a recorded sequence consists of, read from the folder layouts in use: which files, when, which camera.
+
+Images are not opened here. Poses are brought to ``T_world_cam`` of the camera whose images are used.
+"""
+
+import json
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transform_from_yaml
+from semcast.common.errors import SourceError
+from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
+from semcast.common.trajectory import Trajectory, read_tum
+
+Layout = Literal["auto", "native", "tum", "kitti", "euroc", "transforms", "folder"]
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
+_TRANSFORMS_NAMES = ("transforms.json", "transforms_test.json", "transforms_train.json")
+_CALIBRATION_NAMES = ("intrinsics.json", "intrinsics.yaml", "camera.yaml", "calibration.yaml", "sensor.yaml")
+_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+#: Calibration published with the TUM RGB-D benchmark (Sturm et al. 2012), which its folders don't hold.
+_TUM_CAMERAS = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7, (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6, ()),
+}
+
+
+@dataclass(frozen=True)
+class SequenceFiles:
+    """A recording on disk.
+
+    Attributes:
+        name: Folder name, for people.
+        image_paths: One file per frame, in order of time.
+        times_ns: ``(N,)`` int64, strictly increasing.
+        camera: Returns the intrinsics, distortion included, of images of a given width and height, or None
+            where the layout says nothing.
+        groundtruth: Poses of this camera at their own times, or None.
+    """
+
+    name: str
+    image_paths: tuple[Path, ...]
+    times_ns: NDArray[np.int64]
+    camera: Callable[[int, int], Intrinsics | None]
+    groundtruth: Trajectory | None
+
+
+def natural_key(name: str) -> list[tuple[int, int | str]]:
+    """Sort key by which ``r_2`` comes before ``r_10``."""
+    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", name) if part]
+
+
+def seconds_to_ns(text: str) -> int:
+    """Convert decimal seconds to nanoseconds without passing through a float.
+
+    Raises:
+        ValueError: Not a finite number.
+    """
+    try:
+        return int((Decimal(text) * 1_000_000_000).to_integral_value())
+    except (InvalidOperation, OverflowError, ValueError) as err:
+        raise ValueError(f"time must be a number of seconds, got {text!r}") from err
+
+
+def find_layout(path: Path) -> Layout:
+    """Tell the layout of a folder or transforms file.
+
+    Raises:
+        SourceError: There is no such folder, or it holds nothing known.
+    """
+    if path.is_file() and path.suffix.lower() == ".json":
+        return "transforms"
+    if not path.is_dir():
+        raise SourceError(f"no sequence at {path}: there is no such folder")
+    if _euroc_camera_folder(path) is not None:
+        return "euroc"
+    if (path / "rgb.txt").is_file():
+        return "tum"
+    if _kitti_camera(path) is not None:
+        return "kitti"
+    has_transforms = any((path / name).is_file() for name in _TRANSFORMS_NAMES)
+    if (path / "images").is_dir() and ((path / "intrinsics.json").is_file() or not has_transforms):
+        return "native"
+    if has_transforms:
+        return "transforms"
+    if _images_in(path):
+        return "folder"
+    raise SourceError(
+        f"no sequence at {path}: expected images/ (native), rgb.txt (TUM), image_2/ or image_0/ (KITTI), "
+        "mav0/cam0/ (EuRoC), transforms.json (NeRF), or image files"
+    )
+
+
+def read_layout(path: Path, layout: Layout, rate_hz: float) -> SequenceFiles:
+    """Read a recording's files.
+
+    Args:
+        path: Folder, or a transforms file.
+        layout: One of ``Layout``; ``auto`` looks.
+        rate_hz: Frame rate of layouts that record no times.
+
+    Raises:
+        SourceError: A part is missing or damaged.
+    """
+    readers: dict[str, Callable[[Path, float], SequenceFiles]] = {
+        "native": _read_native,
+        "tum": _read_tum_folder,
+        "kitti": _read_kitti,
+        "euroc": _read_euroc,
+        "transforms": _read_transforms,
+        "folder": _read_folder,
+    }
+    if not path.exists():
+        raise SourceError(f"no sequence at {path}: there is no such folder")
+    files = readers[find_layout(path) if layout == "auto" else layout](path, rate_hz)
+    if not files.image_paths:
+        raise SourceError(f"no images in {path}")
+    if len(files.image_paths) != len(files.times_ns):
+        raise SourceError(
+            f"{path} must have one time per image, got {len(files.times_ns)} times "
+            f"and {len(files.image_paths)} images"
+        )
+    if np.any(np.diff(files.times_ns) <= 0):
+        raise SourceError(f"times of {path} must strictly increase")
+    return files
+
+
+def _images_in(folder: Path) -> tuple[Path, ...]:
+    try:
+        found = [
+            p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
+        ]
+    except OSError as err:
+        raise SourceError(f"{folder} can't be read: {err}") from err
+    return tuple(sorted(found, key=lambda p: natural_key(p.name)))
+
+
+def _nominal_times_ns(count: int, rate_hz: float) -> NDArray[np.int64]:
+    return np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+
+
+def _fields(path: Path, at_least: int) -> Iterable[list[str]]:
+    """Yield the blank- or comma-separated fields of each line that is no comment."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as err:
+        raise SourceError(f"{path} can't be read: {err}") from err
+    for number, line in enumerate(lines, start=1):
+        fields = line.split("#", 1)[0].replace(",", " ").split()
+        if not fields:
+            continue
+        if len(fields) < at_least:
+            raise SourceError(f"{path}:{number} must have {at_least} fields, got {line!r}")
+        yield fields
+
+
+def _read_times_ns(path: Path) -> NDArray[np.int64]:
+    try:
+        return np.array([seconds_to_ns(fields[0]) for fields in _fields(path, 1)], dtype=np.int64)
+    except ValueError as err:
+        raise SourceError(f"{path}: {err}") from err
+
+
+def _calibration_beside(folder: Path) -> Callable[[int, int], Intrinsics | None]:
+    found = [folder / name for name in _CALIBRATION_NAMES if (folder / name).is_file()]
+    return lambda width, height: read_intrinsics(found[0]) if found else None
+
+
+def _truth_beside(folder: Path) -> Trajectory | None:
+    path = folder / "groundtruth.txt"
+    return read_tum(path) if path.is_file() else None
+
+
+def _read_native(path: Path, rate_hz: float) -> SequenceFiles:
+    images = _images_in(path / "images")
+    times_path = path / "times.txt"
+    times_ns = _read_times_ns(times_path) if times_path.is_file() else _nominal_times_ns(len(images), rate_hz)
+    return SequenceFiles(
+        path.resolve().name, images, times_ns, _calibration_beside(path), _truth_beside(path)
+    )
+
+
+def _read_folder(path: Path, rate_hz: float) -> SequenceFiles:
+    images = _images_in(path)
+    times_ns = _nominal_times_ns(len(images), rate_hz)
+    return SequenceFiles(
+        path.resolve().name, images, times_ns, _calibration_beside(path), _truth_beside(path)
+    )
+
+
+def _read_tum_folder(path: Path, rate_hz: float) -> SequenceFiles:
+    del rate_hz
+    try:
+        rows = [(seconds_to_ns(t), path / name) for t, name, *_ in _fields(path / "rgb.txt", 2)]
+    except ValueError as err:
+        raise SourceError(f"{path / 'rgb.txt'}: {err}") from err
+    beside = _calibration_beside(path)
+    name = path.resolve().name
+
+    def camera(width: int, height: int) -> Intrinsics | None:
+        own = beside(width, height)
+        known = next((values for key, values in _TUM_CAMERAS.items() if key in name), None)
+        if own is not None or known is None:
+            return own
+        fx, fy, cx, cy, distortion = known
+        return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=640, height=480, distortion=distortion)
+
+    return SequenceFiles(
+        name,
+        tuple(image for _, image in rows),
+        np.array([t for t, _ in rows], dtype=np.int64),
+        camera,
+        _truth_beside(path),
+    )
+
+
+def _kitti_camera(path: Path) -> int | None:
+    return next((k for k in (2, 0, 3, 1) if (path / f"image_{k}").is_dir()), None)
+
+
+def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
+    """Read KITTI odometry; poses are of camera 0 and are moved to the camera used by its baseline."""
+    camera_idx = _kitti_camera(path)
+    if camera_idx is None:
+        raise SourceError(f"{path} must have image_2 or image_0 to be a KITTI sequence")
+    images = _images_in(path / f"image_{camera_idx}")
+    times_path = path / "times.txt"
+    times_ns = _read_times_ns(times_path) if times_path.is_file() else _nominal_times_ns(len(images), rate_hz)
+    projection = _kitti_projection(path / "calib.txt", camera_idx)
+    name = path.resolve().name
+    places = (path / "poses.txt", path / f"{name}.txt", path.resolve().parents[1] / "poses" / f"{name}.txt")
+    poses_path = next((place for place in places if place.is_file()), None)
+    truth = None
+    if poses_path is not None:
+        poses = _kitti_poses(poses_path)
+        if projection is not None:
+            t_cam_cam0 = np.linalg.solve(projection[:, :3], projection[:, 3])
+            poses = poses @ make_transform(np.eye(3), -t_cam_cam0)
+        # The first poses of a cut recording are still those of its images.
+        if len(poses) < len(times_ns):
+            raise SourceError(f"{poses_path} must have a pose per image, got {len(poses)} of {len(times_ns)}")
+        truth = Trajectory(times_ns * 1e-9, poses[: len(times_ns)])
+
+    def camera(width: int, height: int) -> Intrinsics | None:
+        if projection is None:
+            return _calibration_beside(path)(width, height)
+        fx, fy, cx, cy = projection[0, 0], projection[1, 1], projection[0, 2], projection[1, 2]
+        return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
+
+    return SequenceFiles(name, images, times_ns, camera, truth)
+
+
+def _kitti_projection(path: Path, camera_idx: int) -> NDArray[np.float64] | None:
+    if not path.is_file():
+        return None
+    for label, *numbers in _fields(path, 2):
+        if label.rstrip(":") == f"P{camera_idx}":
+            try:
+                return np.array([float(n) for n in numbers]).reshape(3, 4)
+            except ValueError as err:
+                raise SourceError(f"{path}: P{camera_idx} must have 12 numbers, got {len(numbers)}") from err
+    raise SourceError(f"{path} has no line P{camera_idx}")
+
+
+def _kitti_poses(path: Path) -> NDArray[np.float64]:
+    try:
+        rows = np.array([[float(n) for n in fields] for fields in _fields(path, 12)]).reshape(-1, 3, 4)
+    except ValueError as err:
+        raise SourceError(f"{path}: every line must have 12 numbers: {err}") from err
+    return np.array([make_transform(project_to_so3(row[:, :3]), row[:, 3]) for row in rows]).reshape(-1, 4, 4)
+
+
+def _euroc_camera_folder(path: Path) -> Path | None:
+    places = (path / "mav0" / "cam0", path / "cam0", path)
+    return next((p for p in places if (p / "data.csv").is_file() and (p / "data").is_dir()), None)
+
+
+def _read_euroc(path: Path, rate_hz: float) -> SequenceFiles:
+    del rate_hz
+    folder = _euroc_camera_folder(path)
+    if folder is None:
+        raise SourceError(f"{path} must have mav0/cam0/data.csv and mav0/cam0/data to be a EuRoC sequence")
+    try:
+        rows = [(int(t), folder / "data" / name) for t, name, *_ in _fields(folder / "data.csv", 2)]
+    except ValueError as err:
+        raise SourceError(f"{folder / 'data.csv'}: times must be whole nanoseconds: {err}") from err
+    sensor = folder / "sensor.yaml"
+    name = path.resolve().name
+    return SequenceFiles(
+        name if name != "mav0" else path.resolve().parent.name,
+        tuple(image for _, image in rows),
+        np.array([t for t, _ in rows], dtype=np.int64),
+        lambda width, height: read_intrinsics(sensor) if sensor.is_file() else None,
+        _euroc_truth(folder.parent / "state_groundtruth_estimate0" / "data.csv", sensor),
+    )
+
+
+def _euroc_truth(path: Path, sensor: Path) -> Trajectory | None:
+    """Return camera poses: body poses of the estimate times the camera's ``T_BS``."""
+    if not path.is_file() or not sensor.is_file():
+        return None
+    try:
+        T_body_cam = transform_from_yaml(read_flat_yaml(sensor), "T_BS")
+        if T_body_cam is None:
+            raise ValueError(f"{sensor} has no T_BS")
+        times_s: list[float] = []
+        poses: list[NDArray[np.float64]] = []
+        for t_ns, *numbers in _fields(path, 8):
+            px, py, pz, qw, qx, qy, qz = (float(n) for n in numbers[:7])
+            T_world_body = make_transform(rotation_from_quat_wxyz((qw, qx, qy, qz)), (px, py, pz))
+            times_s.append(int(t_ns) * 1e-9)
+            poses.append(T_world_body @ T_body_cam)
+        return Trajectory(np.array(times_s), np.array(poses).reshape(-1, 4, 4))
+    except ValueError as err:
+        raise SourceError(f"{path} can't be used as ground truth: {err}") from err
+
+
+def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
+    """Read NeRF-synthetic or nerfstudio ``transforms.json``: OpenGL axes, x right, y up, z backward."""
+    if path.is_dir():
+        found = next((path / name for name in _TRANSFORMS_NAMES if (path / name).is_file()), None)
+        if found is None:
+            raise SourceError(f"{path} has no transforms.json, transforms_test.json or transforms_train.json")
+        path = found
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        frames = sorted(document["frames"], key=lambda f: natural_key(str(f["file_path"])))
+        images = tuple(_transforms_image(path.parent, str(frame["file_path"])) for frame in frames)
+        T_world_gl = np.array([f["transform_matrix"] for f in frames], dtype=np.float64).reshape(-1, 4, 4)
+    except (OSError, ValueError, KeyError, TypeError) as err:
+        raise SourceError(f"{path} can't be used as transforms.json: {err}") from err
+    for T in T_world_gl:
+        T[:3, :3] = project_to_so3(T[:3, :3])
+    times_ns = _nominal_times_ns(len(images), rate_hz)
+    truth = Trajectory(times_ns * 1e-9, T_world_gl @ _OPENGL_TO_OPENCV)
+
+    def camera(width: int, height: int) -> Intrinsics | None:
+        try:
+            return _transforms_camera({**frames[0], **document}, width, height)
+        except (ValueError, TypeError) as err:
+            raise SourceError(f"{path} holds no usable intrinsics: {err}") from err
+
+    return SequenceFiles(path.resolve().parent.name, images, times_ns, camera, truth)
+
+
+def _transforms_image(folder: Path, name: str) -> Path:
+    place = folder / name
+    return place if place.suffix.lower() in IMAGE_SUFFIXES else place.with_name(place.name + ".png")
+
+
+def _transforms_camera(values: dict[str, Any], width: int, height: int) -> Intrinsics | None:
+    """Read the pinhole; these files count pixels from their corners, so principal points move by half."""
+    width, height = int(values.get("w", width)), int(values.get("h", height))
+    if "fl_x" in values:
+        fx = float(values["fl_x"])
+    elif "camera_angle_x" in values:
+        fx = 0.5 * width / float(np.tan(0.5 * float(values["camera_angle_x"])))
+    else:
+        return None
+    names = ("k1", "k2", "p1", "p2", "k3") if values.get("k3") else ("k1", "k2", "p1", "p2")
+    distortion = tuple(float(values.get(name, 0.0)) for name in names)
+    return Intrinsics(
+        fx=fx,
+        fy=float(values.get("fl_y", fx)),
+        cx=float(values.get("cx", width / 2)) - 0.5,
+        cy=float(values.get("cy", height / 2)) - 0.5,
+        width=width,
+        height=height,
+        distortion=distortion if any(distortion) else (),
+    )
