@@ -1,0 +1,95 @@
+"""``semcast eval confidence``: grade the confidence maps of a codec on real images over a real link."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from semcast.common.codec import Codec
+from semcast.common.errors import ConfigError
+from semcast.common.image import psnr_db
+from semcast.common.sequence import Sequence as RecordedSequence
+from semcast.evaluation.confidence_grades import KeypointGrader, PixelGrader, SlotGrader
+from semcast.evaluation.pipeline import CLEAN, FrameRun, StreamSettings, open_stream, selected_frame_ids
+from semcast.evaluation.plots import plot_reliability
+from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.statistics import finite_mean
+
+VERB = "eval confidence"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfidenceSettings(StreamSettings):
+    """Settings of ``evaluate_confidence``; ``sequence`` may be a plain folder of images of one size.
+
+    Raises:
+        ValueError: A value is out of range, or there is no codec to grade.
+    """
+
+    pixel_alpha: float = field(
+        default=30.0, metadata={"help": "alpha of the label 1 - tanh(alpha |error|) the codec was trained on"}
+    )
+    out: Path | None = field(default=None, metadata={"help": "folder for reliability diagrams"})
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        super().__post_init__()
+        if self.codec == CLEAN:
+            raise ValueError(f"codec must have a confidence to grade, got {CLEAN!r}")
+        if not self.pixel_alpha > 0:
+            raise ValueError(f"pixel_alpha must be positive, got {self.pixel_alpha:g}")
+
+
+def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None) -> dict[str, Any]:
+    """Grade pixel, keypoint and slot confidence at each SNR, over all seeds together.
+
+    Args:
+        settings: What to grade.
+        codec: Used instead of the codec that ``settings.codec`` names.
+
+    Returns:
+        Provenance and ``results``, one entry per SNR with ``psnr_db``, ``pixel``, ``keypoint`` and ``slots``:
+        see ``confidence_grades``. Written to ``settings.json`` and plotted into ``settings.out`` where given.
+
+    Raises:
+        SourceError: The sequence can't be read.
+        ConfigError: The codec is unknown or no frame was received.
+    """
+    sequence, codec = open_stream(settings, codec)
+    results = [_grade_at(settings, sequence, codec, snr_db) for snr_db in settings.snr_db]
+    report = {**provenance(VERB, settings), "results": json_ready(results)}
+    if settings.json is not None:
+        write_json(settings.json, report)
+    if settings.out is not None:
+        tables = {f"{r['snr_db']:g} dB": r["pixel"]["reliability"] for r in report["results"]}
+        plot_reliability(settings.out / "reliability.png", tables, f"{settings.codec}, {sequence.name}")
+    return report
+
+
+def _grade_at(
+    settings: ConfidenceSettings, sequence: RecordedSequence, codec: Codec | None, snr_db: float
+) -> dict[str, Any]:
+    pixel, keypoint, slots = PixelGrader(settings.pixel_alpha), KeypointGrader(), SlotGrader()
+    quality_db: list[float] = []
+    num_lost = 0
+    frame_ids = selected_frame_ids(sequence, settings)
+    for seed in settings.all_seeds:
+        run = FrameRun(sequence, frame_ids, codec, settings.link_at(snr_db), seed, cache_bytes=0)
+        for frame in run:
+            if frame.decoded is None or frame.effective_snr_db is None:
+                num_lost += 1
+                continue
+            quality_db.append(psnr_db(frame.original, frame.decoded.image))
+            pixel.add(frame.decoded, frame.original)
+            keypoint.add(frame.decoded, frame.original)
+            slots.add(frame.decoded, frame.effective_snr_db)
+    if num_lost == len(frame_ids) * settings.seeds:
+        raise ConfigError(f"no frame was received at snr_db {snr_db:g}: there is no confidence to grade")
+    return {
+        "snr_db": snr_db,
+        "num_frames": len(frame_ids) * settings.seeds,
+        "num_frames_lost": num_lost,
+        "psnr_db": finite_mean(quality_db),
+        "pixel": pixel.result(),
+        "keypoint": keypoint.result(),
+        "slots": slots.result(),
+    }

@@ -1,0 +1,270 @@
+"""Frames from a recording through codec and link to the decoded image, in one process and without a network.
+
+Lossless and deterministic: every frame is sent, in order, and a frame's channel depends on the seed and the
+frame number alone. It is the same codec, link and equaliser the processes run.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.channel.link import Link
+from semcast.channel.settings import ChannelSettings
+from semcast.channel.trace import SNR_RANGE_DB
+from semcast.common.camera_settings import CameraSettings
+from semcast.common.codec import Codec, DecodedImage, Modulation
+from semcast.common.codecs import load_codec
+from semcast.common.errors import ConfigError
+from semcast.common.phy.equaliser import equalise
+from semcast.common.phy.pilots import insert_pilots
+from semcast.common.sequence import Sequence as RecordedSequence
+from semcast.common.sequence import open_sequence
+
+#: Name under which the original images are used as they are: the best any codec and link could do.
+CLEAN = "none"
+#: Fields of ``StreamSettings.link`` that have no meaning here: the SNR is a list, time does not pass.
+UNUSED_LINK_FIELDS = frozenset({"link.snr_db", "link.delay_ms", "link.jitter_ms"})
+
+#: Decoded frames kept for further passes; beyond it frames are sent and decoded again.
+CACHE_BYTES = 2 * 1024**3
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamSettings:
+    """What every evaluation has in common: which frames travel how.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    sequence: Path = field(
+        metadata={"help": "recorded sequence: native, TUM, KITTI, EuRoC or transforms.json"}
+    )
+    camera: CameraSettings = field(
+        default=CameraSettings(), metadata={"help": "intrinsics, where the recording has none"}
+    )
+    codec: str = field(
+        default="3dcsc", metadata={"help": f"codec by name; {CLEAN} takes the original images, confidence 1"}
+    )
+    modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    snr_db: tuple[float, ...] = field(default=(10.0,), metadata={"help": "SNRs in dB, one or more"})
+    link: ChannelSettings = field(default=ChannelSettings(), metadata={"help": "the channel"})
+    seed: int = field(default=0, metadata={"help": "first seed of channel and estimation"})
+    seeds: int = field(default=1, metadata={"help": "number of seeds, from --seed upwards"})
+    start: int = field(default=0, metadata={"help": "index of the first frame"})
+    max_frames: int | None = field(default=None, metadata={"help": "frames used at most"})
+    stride: int = field(default=1, metadata={"help": "use every n-th frame"})
+    resize: float = field(default=1.0, metadata={"help": "factor on the image size, at most 1"})
+    threads: int = field(default=2, metadata={"help": "threads of the codec"})
+    json: Path | None = field(default=None, metadata={"help": "file for the result"})
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        low, high = SNR_RANGE_DB
+        if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
+            raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
+        for name, least in (("seed", 0), ("seeds", 1), ("start", 0), ("stride", 1), ("threads", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if self.max_frames is not None and self.max_frames < 1:
+            raise ValueError(f"max_frames must be at least 1, got {self.max_frames}")
+        if not 0.05 <= self.resize <= 1.0:
+            raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
+
+    @property
+    def all_seeds(self) -> range:
+        """The seeds of the run."""
+        return range(self.seed, self.seed + self.seeds)
+
+    def link_at(self, snr_db: float) -> ChannelSettings:
+        """Return the channel settings for one of the SNRs."""
+        return replace(self.link, snr_db=snr_db)
+
+
+@dataclass(frozen=True)
+class LinkedFrame:
+    """One frame at both ends of the link.
+
+    Attributes:
+        frame_id: Index in the recording, whatever the stride.
+        t_source_ns: Recorded time.
+        original: ``(H, W, 3)`` uint8 RGB.
+        decoded: What the receiver has; None when the frame was lost or nothing usable arrived.
+        effective_snr_db: ``(num_slots,)`` at the receiver; None for clean or lost frames.
+        snr_db_estimate: The receiver's estimate of the link SNR; None for clean or lost frames.
+        stage_ms: Duration of ``encode``, ``channel``, ``equalise`` and ``decode``, as far as run.
+    """
+
+    frame_id: int
+    t_source_ns: int
+    original: NDArray[np.uint8]
+    decoded: DecodedImage | None
+    effective_snr_db: NDArray[np.float32] | None
+    snr_db_estimate: float | None
+    stage_ms: dict[str, float]
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the arrays."""
+        total = self.original.nbytes
+        if self.decoded is not None:
+            total += self.decoded.image.nbytes + self.decoded.confidence.nbytes
+            if self.decoded.keypoint_confidence is not None:
+                total += self.decoded.keypoint_confidence.nbytes
+        return total
+
+
+def _elapsed_ms(since_ns: int) -> float:
+    return (time.perf_counter_ns() - since_ns) * 1e-6
+
+
+def selected_frame_ids(sequence: RecordedSequence, settings: StreamSettings) -> list[int]:
+    """Return the indices that ``start``, ``stride`` and ``max_frames`` choose.
+
+    Raises:
+        ConfigError: None is left.
+    """
+    ids = list(range(settings.start, len(sequence), settings.stride))
+    if not ids:
+        raise ConfigError(
+            f"start must be below the {len(sequence)} frames of the sequence, got {settings.start}"
+        )
+    return ids if settings.max_frames is None else ids[: settings.max_frames]
+
+
+def run_frames(
+    sequence: RecordedSequence, frame_ids: Sequence[int], codec: Codec | None, link: Link | None
+) -> Iterator[LinkedFrame]:
+    """Send frames of a recording through a codec and a link, one after the other.
+
+    The encoder is told what the agent would be told: the receiver's SNR estimate of the last frame that
+    arrived; before the first one, the SNR the link is set to.
+
+    Args:
+        sequence: The recording.
+        frame_ids: Frames to send, increasing.
+        codec: Both ends; None together with ``link`` gives the originals with confidence 1.
+        link: The channel.
+
+    Raises:
+        ValueError: Only one of ``codec`` and ``link`` is given.
+        SourceError: A frame can't be read.
+    """
+    if (codec is None) != (link is None):
+        raise ValueError("codec and link must be given both or neither")
+    feedback_db = link.settings.snr_db if link is not None else 0.0
+    for frame_id in frame_ids:
+        original = sequence.image(frame_id)
+        t_source_ns = int(sequence.times_ns[frame_id])
+        if codec is None or link is None:
+            clean = DecodedImage(original, np.ones(original.shape[:2], dtype=np.float32))
+            yield LinkedFrame(frame_id, t_source_ns, original, clean, None, None, {})
+            continue
+        stage_ms: dict[str, float] = {}
+        since = time.perf_counter_ns()
+        encoded = codec.encode(original, feedback_db)
+        stage_ms["encode"] = _elapsed_ms(since)
+        since = time.perf_counter_ns()
+        sent = link.transmit(insert_pilots(encoded.symbols), t_source_ns * 1e-9, frame_id)
+        stage_ms["channel"] = _elapsed_ms(since)
+        if sent.frame_lost:
+            yield LinkedFrame(frame_id, t_source_ns, original, None, None, None, stage_ms)
+            continue
+        since = time.perf_counter_ns()
+        equalised = equalise(sent.slots_rx, encoded.shape_hw, encoded.modulation, slot_lost=sent.slot_lost)
+        stage_ms["equalise"] = _elapsed_ms(since)
+        feedback_db = equalised.snr_db
+        since = time.perf_counter_ns()
+        decoded = codec.decode(equalised.received)
+        stage_ms["decode"] = _elapsed_ms(since)
+        yield LinkedFrame(
+            frame_id,
+            t_source_ns,
+            original,
+            None if decoded.outage else decoded,
+            equalised.received.effective_snr_db,
+            equalised.snr_db,
+            stage_ms,
+        )
+
+
+class FrameRun:
+    """The frames of one SNR and seed, iterated as often as needed.
+
+    The first complete pass is kept in memory up to a budget, so that several ways of estimation see the very
+    same decoded images without decoding again. Above the budget each pass sends and decodes anew, with the
+    same result.
+
+    Args:
+        sequence: The recording.
+        frame_ids: Frames to send.
+        codec: Both ends, or None for clean originals.
+        link: Settings of the channel.
+        seed: Seed of the channel.
+        cache_bytes: Memory budget; 0 keeps nothing.
+    """
+
+    def __init__(
+        self,
+        sequence: RecordedSequence,
+        frame_ids: Sequence[int],
+        codec: Codec | None,
+        link: ChannelSettings,
+        seed: int,
+        *,
+        cache_bytes: int = CACHE_BYTES,
+    ) -> None:
+        self._sequence = sequence
+        self._frame_ids = list(frame_ids)
+        self._codec = codec
+        self._link = link
+        self._seed = seed
+        self._cache_bytes = cache_bytes
+        self._kept: list[LinkedFrame] | None = None
+
+    def __len__(self) -> int:
+        return len(self._frame_ids)
+
+    def __iter__(self) -> Iterator[LinkedFrame]:
+        """Yield the frames in order."""
+        if self._kept is not None:
+            yield from self._kept
+            return
+        link = Link(self._link, self._seed) if self._codec is not None else None
+        kept: list[LinkedFrame] | None = []
+        num_bytes = 0
+        for frame in run_frames(self._sequence, self._frame_ids, self._codec, link):
+            num_bytes += frame.num_bytes
+            if num_bytes > self._cache_bytes:
+                kept = None
+            if kept is not None:
+                kept.append(frame)
+            yield frame
+        self._kept = kept
+
+
+def open_stream(
+    settings: StreamSettings, codec: Codec | None = None
+) -> tuple[RecordedSequence, Codec | None]:
+    """Open the recording and load the codec that settings name.
+
+    Args:
+        settings: What to run.
+        codec: Used instead of the codec that ``settings.codec`` names.
+
+    Returns:
+        The recording, and the codec or None for ``codec = "none"``.
+
+    Raises:
+        SourceError: The recording can't be read.
+        ConfigError: The codec is unknown.
+        CheckpointError: Its weights are missing or damaged.
+    """
+    sequence = open_sequence(settings.sequence, settings.camera, resize=settings.resize)
+    if codec is None and settings.codec != CLEAN:
+        codec = load_codec(settings.codec, modulation=settings.modulation, num_threads=settings.threads)
+    return sequence, codec
