@@ -1,0 +1,104 @@
+"""What goes into the reconstruction, what comes out of it, and the states it can be in."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class TrackingState(str, Enum):
+    """Where the tracker stands after a frame."""
+
+    INITIALIZING = "initializing"
+    TRACKING = "tracking"
+    LOST = "lost"
+
+
+@dataclass(frozen=True)
+class DecodedFrame:
+    """One received frame.
+
+    Attributes:
+        frame_id: Index in the source; gaps are frames that were lost.
+        t_source_ns: Recorded time of the frame.
+        image: ``(H, W, 3)`` uint8 RGB without distortion.
+        confidence: ``(H, W)`` float32 in [0, 1], or None where the codec gives none.
+        keypoint_confidence: ``(H, W)`` float32 in [0, 1] trained on keypoint displacement, or None.
+        slot_snr_db: ``(num_slots,)`` effective SNR of each 16-pixel band, or None.
+    """
+
+    frame_id: int
+    t_source_ns: int
+    image: NDArray[np.uint8]
+    confidence: NDArray[np.float32] | None = None
+    keypoint_confidence: NDArray[np.float32] | None = None
+    slot_snr_db: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What one frame led to.
+
+    Attributes:
+        frame_id: As received.
+        t_source_ns: As received.
+        state: After the frame.
+        T_world_cam: ``(4, 4)``, or None where the frame has no pose (yet).
+        num_tracked: Keypoints followed into the frame.
+        num_inliers: Landmark observations that agree with the pose.
+        reprojection_error_px: Median over inliers, or None without a pose.
+        covariance: ``(6, 6)`` of the pose in the camera frame, rotation before translation (gtsam's order),
+            or None.
+        is_keyframe: Whether it became a keyframe.
+        map_epoch: Counts maps; it grows when a new map is begun.
+        keypoints_xy: ``(N, 2)`` float32 pixels.
+        keypoint_inlier: ``(N,)`` bool, agrees with the pose.
+        keypoint_confidence: ``(N,)`` float32 in [0, 1], the confidence its weight is made of.
+        backfilled: ``(frame_id, t_source_ns, T_world_cam)`` of earlier frames that got their pose only now.
+        stage_ms: Duration of each stage that ran.
+    """
+
+    frame_id: int
+    t_source_ns: int
+    state: TrackingState
+    T_world_cam: Array | None
+    num_tracked: int
+    num_inliers: int
+    reprojection_error_px: float | None
+    covariance: Array | None
+    is_keyframe: bool
+    map_epoch: int
+    keypoints_xy: NDArray[np.float32]
+    keypoint_inlier: NDArray[np.bool_]
+    keypoint_confidence: NDArray[np.float32]
+    backfilled: tuple[tuple[int, int, Array], ...] = ()
+    stage_ms: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MapUpdate:
+    """What changed in the map since the last update was taken.
+
+    Attributes:
+        map_epoch: Of the map.
+        ids: ``(N,)`` int64, landmarks added or moved.
+        xyz: ``(N, 3)`` their positions in the world frame.
+        rgb: ``(N, 3)`` uint8 colours.
+        confidence: ``(N,)`` float32 in [0, 1].
+        removed: ``(M,)`` int64, landmarks that are gone.
+        keyframe_ids: ``(K,)`` int64 frame ids of keyframes added or moved.
+        keyframe_poses: ``(K, 4, 4)`` their ``T_world_cam``.
+    """
+
+    map_epoch: int
+    ids: NDArray[np.int64]
+    xyz: Array
+    rgb: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    removed: NDArray[np.int64]
+    keyframe_ids: NDArray[np.int64]
+    keyframe_poses: Array
