@@ -1,7 +1,10 @@
 """Settings of the server process."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
+
+from semcast.server.reconstruction_settings import ReconstructionSettings
 
 View = Literal["auto", "native", "web", "file", "none"]
 
@@ -53,3 +56,80 @@ class ViewSettings:
             raise ValueError(f"image_rate_hz must be in [0.1, 60], got {self.image_rate_hz}")
         if not 10 <= self.jpeg_quality <= 100:
             raise ValueError(f"jpeg_quality must be in [10, 100], got {self.jpeg_quality}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerSettings:
+    """The server process.
+
+    Attributes:
+        agent_id: Camera to serve; ``*`` takes the first that is there.
+        mode: ``live`` takes the newest frame and drops the others; ``replay`` loses none and repeats exactly.
+        out: Folder for outputs, or None.
+        threads: CPU threads of the decoder.
+        device: Where the decoder runs.
+        reference: The recorded sequence the agent sends, for PSNR and true path.
+        bundle: Where bundle adjustment runs: a process of its own, or inline.
+        checkpoint_interval_s: How much of the map a killed server may lose.
+        resume: Go on with the map in ``out`` when it belongs to the same stream.
+        save_images: Which decoded images to keep in ``out``, for exports.
+        keep_running: Go on after the source's last frame and wait for the next agent.
+        idle_timeout_s: End when nothing arrives for so long after the first frame.
+        duration_s: End after so long.
+        reconstruction: Tracking and mapping.
+        view: Viewer.
+    """
+
+    agent_id: str = field(default="cam0", metadata={"flag": "agent", "help": "name of the camera to serve"})
+    mode: Literal["live", "replay"] = field(
+        default="live",
+        metadata={"help": "live: newest frame wins, drops are counted; replay: no frame lost, deterministic"},
+    )
+    out: Path | None = field(default=None, metadata={"help": "folder for trajectory, map, summary, run.rrd"})
+    threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})
+    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "device of the decoder"})
+    reference: Path | None = field(
+        default=None, metadata={"help": "recorded sequence the agent sends: gives PSNR and ground truth"}
+    )
+    bundle: Literal["process", "inline"] = field(
+        default="process", metadata={"help": "bundle adjustment in a process of its own, or between frames"}
+    )
+    checkpoint_interval_s: float = field(
+        default=4.0, metadata={"help": "seconds between checkpoints of the map in the output folder"}
+    )
+    resume: bool = field(
+        default=True, metadata={"help": "go on with the map in the output folder if it is of the same stream"}
+    )
+    save_images: Literal["none", "keyframes", "all"] = field(
+        default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
+    )
+    keep_running: bool = field(
+        default=False, metadata={"help": "wait for the next agent after the source's last frame"}
+    )
+    idle_timeout_s: float | None = field(
+        default=None, metadata={"help": "end when nothing arrived for so many seconds after the first frame"}
+    )
+    duration_s: float | None = field(default=None, metadata={"help": "end after so many seconds"})
+    reconstruction: ReconstructionSettings = field(
+        default=ReconstructionSettings(), metadata={"help": "tracking and mapping"}
+    )
+    view: ViewSettings = field(default=ViewSettings(), metadata={"help": "viewer"})
+
+    def __post_init__(self) -> None:
+        """Check ranges.
+
+        Raises:
+            ValueError: A value is out of range.
+        """
+        if self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}")
+        if not 0.1 <= self.checkpoint_interval_s <= 3600:
+            raise ValueError(
+                f"checkpoint_interval_s must be in [0.1, 3600], got {self.checkpoint_interval_s}"
+            )
+        for name in ("idle_timeout_s", "duration_s"):
+            value = getattr(self, name)
+            if value is not None and value <= 0:
+                raise ValueError(f"{name} must be positive, got {value}")
+        if self.save_images != "none" and self.out is None:
+            raise ValueError(f"save_images needs out, got save_images={self.save_images!r} without a folder")

@@ -11,18 +11,16 @@ import threading
 import time
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError
 from semcast.common.trajectory import Trajectory
 from semcast.server.scene import Cursor, FrameView, Scene, compress_picture
 from semcast.server.settings import ViewSettings
+from semcast.server.state import MapUpdate
 from semcast.server.viewer import Delivery, RerunStream
 from semcast.server.viewer_process import ViewerProcess, is_listening
-
-if TYPE_CHECKING:
-    from semcast.server.state import MapUpdate
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +107,7 @@ class ViewerFeed:
         """Where the live viewer is, None without one."""
         return self._process.url if self._process is not None else None
 
-    def submit(self, view: FrameView, update: "MapUpdate | None" = None, *, new_map: bool = False) -> None:
+    def submit(self, view: FrameView, update: MapUpdate | None = None, *, new_map: bool = False) -> None:
         """Show a frame and what changed in the map before it. Returns at once.
 
         Of images waiting to be shown only the newest is kept; poses, plot values and map changes all are.
