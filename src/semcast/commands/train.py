@@ -1,0 +1,37 @@
+"""``semcast train``: train a transceiver, resume where it stopped."""
+
+import argparse
+import threading
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from semcast.commands.running import add_settings, read_settings, run_until_stopped
+from semcast.training.loop import Progress as Step
+from semcast.training.loop import train
+from semcast.training.settings import TrainSettings
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_settings(parser, TrainSettings)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train until done or stopped; Ctrl-C leaves a checkpoint to go on from."""
+    settings = read_settings(TrainSettings, arguments)
+    talk = Console(stderr=True)
+
+    def work(stop: threading.Event) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
+        with Progress(*columns, TimeRemainingColumn(), console=talk) as bar:
+            task = bar.add_task(settings.architecture, total=settings.steps)
+
+            def show(step: Step) -> None:
+                figures = " ".join(f"{name} {value:.4g}" for name, value in step.values.items())
+                bar.update(task, completed=step.step, description=figures)
+
+            result = train(settings, show, stop.is_set)
+        print(f"{result.weights}: {result.steps} steps in {result.elapsed_s / 60:.0f} min")
+
+    return run_until_stopped(work)
