@@ -1,5 +1,6 @@
 """All codecs by name, learned and conventional: the one way to get a codec."""
 
+from importlib import resources
 from pathlib import Path
 from typing import get_args
 
@@ -8,8 +9,16 @@ from semcast.common.config import near_match
 from semcast.common.conventional_source import ImageFormat
 from semcast.common.errors import ConfigError
 
-#: Learned transceivers; their networks are in ``semcast.common.nets.registry``.
+#: Learned transceivers in the order they are listed; their networks are in ``semcast.common.nets.registry``.
 LEARNED_CODECS = ("3dcsc", "3dcsc-lite", "cnn", "vit", "mae")
+
+
+def _shipped_weights() -> list[str]:
+    """Return the names of the weights that come with the package, known architectures first."""
+    folder = resources.files("semcast.common.weights")
+    suffix = ".safetensors"
+    names = [item.name.removesuffix(suffix) for item in folder.iterdir() if item.name.endswith(suffix)]
+    return sorted(names, key=lambda n: (LEARNED_CODECS.index(n) if n in LEARNED_CODECS else 99, n))
 
 
 def _conventional_names() -> dict[str, tuple[ImageFormat, bool]]:
@@ -23,8 +32,8 @@ def _conventional_names() -> dict[str, tuple[ImageFormat, bool]]:
 
 
 def available_codecs() -> list[str]:
-    """Return the names ``load_codec`` knows, learned ones first; loads no network."""
-    return [*LEARNED_CODECS, *_conventional_names()]
+    """Return the codecs that can be used as installed, learned ones with weights first; loads no network."""
+    return [*_shipped_weights(), *_conventional_names()]
 
 
 def load_codec(
@@ -38,7 +47,7 @@ def load_codec(
     """Load a codec, ready for use.
 
     Args:
-        name: One of ``available_codecs()``.
+        name: One of ``available_codecs()``, or a learned architecture together with ``weights``.
         modulation: ``"16qam"`` or ``"analog"``.
         num_threads: CPU threads of a learned codec; None leaves the library's choice.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``, for learned codecs.
@@ -51,12 +60,11 @@ def load_codec(
     if modulation not in MODULATIONS:
         hint = near_match(modulation, list(MODULATIONS))
         raise ConfigError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}{hint}")
-    if name in LEARNED_CODECS:
+    if name in LEARNED_CODECS or name in _shipped_weights():
         from semcast.common.nets.codec import NeuralCodec
 
-        codec: Codec = NeuralCodec.load(
-            name, modulation=modulation, num_threads=num_threads, device=device, weights=weights
-        )
+        source = name if weights is None else weights
+        codec: Codec = NeuralCodec.load(source, modulation=modulation, num_threads=num_threads, device=device)
         return codec
     conventional = _conventional_names()
     if name not in conventional:
