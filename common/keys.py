@@ -1,0 +1,100 @@
+"""Key expressions. Nobody else builds them."""
+
+import re
+
+from semcast.common.messages import AGENT_ID_PATTERN, ROLES
+
+_ROOT = "semcast"
+
+
+def check_agent_id(agent_id: str) -> str:
+    """Return the agent's name, which is one part of every key.
+
+    Raises:
+        ValueError: It has other characters than letters, digits, ``-`` and ``_``, or more than 64.
+    """
+    if re.fullmatch(AGENT_ID_PATTERN, agent_id) is None:
+        raise ValueError(
+            f"agent_id must be 1 to 64 letters, digits, '-' or '_', starting with no sign, got {agent_id!r}"
+        )
+    return agent_id
+
+
+def _check_role(role: str) -> str:
+    if role not in ROLES:
+        raise ValueError(f"role must be one of {', '.join(ROLES)}, got {role!r}")
+    return role
+
+
+def _key(agent_id: str, rest: str) -> str:
+    return f"{_ROOT}/{check_agent_id(agent_id)}/{rest}"
+
+
+def camera_key(agent_id: str) -> str:
+    """``CameraInfo``: put at the agent's start, and a queryable for whoever comes later."""
+    return _key(agent_id, "camera")
+
+
+def tx_key(agent_id: str) -> str:
+    """``SymbolFrame`` from agent to channel."""
+    return _key(agent_id, "tx/symbols")
+
+
+def rx_key(agent_id: str) -> str:
+    """``SymbolFrame`` from channel to server."""
+    return _key(agent_id, "rx/symbols")
+
+
+def link_key(agent_id: str) -> str:
+    """``LinkReport`` from server to agent."""
+    return _key(agent_id, "link")
+
+
+def flow_key(agent_id: str) -> str:
+    """``FlowMessage`` from server to agent."""
+    return _key(agent_id, "flow")
+
+
+def channel_key(agent_id: str) -> str:
+    """``ChannelReport`` from channel to viewers."""
+    return _key(agent_id, "channel")
+
+
+def pose_key(agent_id: str) -> str:
+    """``PoseMessage``."""
+    return _key(agent_id, "pose")
+
+
+def map_key(agent_id: str) -> str:
+    """``MapMessage``."""
+    return _key(agent_id, "map")
+
+
+def status_key(agent_id: str, role: str) -> str:
+    """``StatusMessage`` of one role."""
+    return _key(agent_id, f"status/{_check_role(role)}")
+
+
+def control_key(agent_id: str, role: str) -> str:
+    """Queryable of one role: ``ControlRequest`` and ``ControlReply``."""
+    return _key(agent_id, f"control/{_check_role(role)}")
+
+
+def alive_key(agent_id: str, role: str) -> str:
+    """Liveliness token of one role."""
+    return _key(agent_id, f"alive/{_check_role(role)}")
+
+
+def alive_keys(agent_id: str) -> str:
+    """Key expression that matches the liveliness tokens of all roles."""
+    return _key(agent_id, "alive/*")
+
+
+def all_keys(agent_id: str) -> str:
+    """Key expression that matches everything of one agent but liveliness, for recording."""
+    return _key(agent_id, "**")
+
+
+def role_of(alive: str) -> str:
+    """Return the role in a key that ``alive_key`` made."""
+    return alive.rsplit("/", 1)[-1]

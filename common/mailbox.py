@@ -1,0 +1,90 @@
+"""Bounded queues between threads, each with a named policy for what happens when it is full."""
+
+import threading
+from collections import deque
+from typing import Generic, Literal, TypeVar
+
+T = TypeVar("T")
+
+Policy = Literal["newest", "all"]
+
+
+class Mailbox(Generic[T]):
+    """A queue of at most ``capacity`` items.
+
+    Args:
+        capacity: At least 1.
+        policy: ``newest``: a full box throws its oldest item away and counts it; ``all``: ``put`` waits.
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+
+    def __init__(self, capacity: int, policy: Policy) -> None:
+        if capacity < 1:
+            raise ValueError(f"capacity must be at least 1, got {capacity}")
+        if policy not in ("newest", "all"):
+            raise ValueError(f"policy must be newest or all, got {policy!r}")
+        self._capacity = capacity
+        self._policy = policy
+        self._items: deque[T] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._dropped = 0
+
+    @property
+    def dropped(self) -> int:
+        """Items thrown away because newer ones came."""
+        with self._changed:
+            return self._dropped
+
+    def __len__(self) -> int:
+        with self._changed:
+            return len(self._items)
+
+    def put(self, item: T, timeout_s: float | None = None) -> bool:
+        """Add an item.
+
+        Args:
+            item: What to add.
+            timeout_s: How long to wait for room under ``all``; None for as long as it takes.
+
+        Returns:
+            False when the box is closed, or was full for the whole time; the item is not in it then.
+        """
+        with self._changed:
+            if self._policy == "newest":
+                if self._closed:
+                    return False
+                if len(self._items) == self._capacity:
+                    self._items.popleft()
+                    self._dropped += 1
+            else:
+                self._changed.wait_for(lambda: self._closed or len(self._items) < self._capacity, timeout_s)
+                if self._closed or len(self._items) >= self._capacity:
+                    return False
+            self._items.append(item)
+            self._changed.notify_all()
+            return True
+
+    def get(self, timeout_s: float | None = None) -> T | None:
+        """Take the oldest item; None when there was none in time, or the box is closed and empty."""
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._items) or self._closed, timeout_s)
+            if not self._items:
+                return None
+            item = self._items.popleft()
+            self._changed.notify_all()
+            return item
+
+    def close(self) -> None:
+        """Refuse further items and wake everybody who waits; what is inside can still be taken. Idempotent."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    @property
+    def closed(self) -> bool:
+        """Whether ``close`` was called."""
+        with self._changed:
+            return self._closed

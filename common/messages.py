@@ -1,0 +1,350 @@
+"""Everything that travels between the processes, as frozen dataclasses.
+
+Each field carries its check (see ``message_fields``); ``wire`` applies them in both directions, and the ones
+across fields in ``consistent``. Times: ``t_capture_ns`` is the agent's monotonic clock and means nothing on
+another host without an offset; ``t_source_ns`` is the recorded time, equal to it for live cameras.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.codec import MODULATIONS, Modulation
+from semcast.common.message_fields import (
+    Array,
+    Bytes,
+    Choice,
+    FieldError,
+    Flag,
+    Many,
+    Maybe,
+    Named,
+    Number,
+    Setting,
+    Text,
+    WholeNumber,
+    rule,
+)
+from semcast.common.phy.slots import SlotLayout, layout_for
+
+PROTOCOL_VERSION = 1
+MAX_PAYLOAD_BYTES = 16 * 1024**2
+MAX_SIDE_PX = 8192
+ROLES = ("agent", "channel", "server")
+PAYLOAD_FORMATS = ("qam16", "iq16", "lost")
+TRACKING_STATES = ("initializing", "tracking", "lost")
+
+PayloadFormat = Literal["qam16", "iq16", "lost"]
+AGENT_ID_PATTERN = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
+
+_VERSION = rule(WholeNumber(PROTOCOL_VERSION, PROTOCOL_VERSION))
+_AGENT_ID = rule(Text(64, AGENT_ID_PATTERN))
+_COUNT = rule(WholeNumber())
+_TIME_NS = rule(WholeNumber(-(2**63)))
+_NAME = rule(Text(64, "[A-Za-z0-9_.+-]{1,64}"))
+_DIGEST = rule(Text(64, "[0-9a-f]{0,64}"))
+_SIZE = rule(Many(WholeNumber(1, MAX_SIDE_PX), count=2))
+_PIXELS = rule(Number(-1e5, 1e5))
+_FOCAL_PX = rule(Number(1e-3, 1e6))
+_DB = rule(Number(-100.0, 100.0))
+
+
+def _kind(name: str) -> Any:
+    return field(default=name, metadata=rule(Choice((name,))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraInfo:
+    """What a receiver must know before the first frame; the decoded images are undistorted.
+
+    Attributes:
+        agent_id: Name of the agent.
+        agent_epoch: Wall time of the agent's start in ns; a restart is a new, higher one.
+        fx: Focal length in pixels, of the images sent.
+        fy: Focal length in pixels.
+        cx: Principal point in pixels.
+        cy: Principal point in pixels.
+        image_wh: Width and height in pixels.
+        nominal_rate_hz: Frames per second the agent aims at; 0 where it has no rate of its own.
+        codec: Codec name.
+        digest: Its digest.
+        modulation: How symbols travel.
+        source_name: What the frames come from, for people.
+        num_frames: Frames of a finite source, or None.
+        lossless: Replay service (every frame, in order) instead of live (newest wins).
+    """
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("camera")
+    agent_id: str = field(metadata=_AGENT_ID)
+    agent_epoch: int = field(metadata=_COUNT)
+    fx: float = field(metadata=_FOCAL_PX)
+    fy: float = field(metadata=_FOCAL_PX)
+    cx: float = field(metadata=_PIXELS)
+    cy: float = field(metadata=_PIXELS)
+    image_wh: tuple[int, int] = field(metadata=_SIZE)
+    nominal_rate_hz: float = field(metadata=rule(Number(0.0, 10000.0)))
+    codec: str = field(metadata=_NAME)
+    digest: str = field(metadata=_DIGEST)
+    modulation: Modulation = field(metadata=rule(Choice(MODULATIONS)))
+    source_name: str = field(metadata=rule(Text(200)))
+    num_frames: int | None = field(metadata=rule(Maybe(WholeNumber())))
+    lossless: bool = field(metadata=rule(Flag()))
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Pinhole of the decoded images."""
+        width, height = self.image_wh
+        return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, width=width, height=height)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SymbolFrame:
+    """Channel symbols of one frame, before (``tx``) or behind (``rx``) the channel.
+
+    Attributes:
+        agent_epoch: See ``CameraInfo``.
+        seq: Frames sent in this epoch before this one: consecutive, so gaps are losses.
+        base_seq: Lossless service: the first frame the receiver has not confirmed yet. 0 in live service.
+        frame_id: Index in the recording, or count of frames grabbed; increasing, but not consecutive.
+        t_capture_ns: When the frame was grabbed.
+        t_source_ns: Recorded time.
+        codec: Codec name.
+        digest: Its digest.
+        image_hw: Height and width in pixels; it fixes the slot grid.
+        modulation: How symbols travel.
+        num_slots: Of the grid.
+        uses_per_slot: Of the grid, pilots included.
+        direction: ``tx`` carries data symbols only, ``rx`` pilots and data as received.
+        payload_format: ``qam16``: 4-bit indices of the data symbols, two to a byte; ``iq16``: float16 I and
+            Q; ``lost``: nothing arrived (lossless service only, so that the receiver can go on).
+        payload: See ``symbol_payload``.
+        slot_lost: One bit per slot, first slot highest, 1 where nothing arrived; empty on ``tx``.
+        lossless: See ``CameraInfo``.
+        final: Last frame of a finite source.
+    """
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("symbols")
+    agent_epoch: int = field(metadata=_COUNT)
+    seq: int = field(metadata=_COUNT)
+    base_seq: int = field(default=0, metadata=_COUNT)
+    frame_id: int = field(metadata=_COUNT)
+    t_capture_ns: int = field(metadata=_TIME_NS)
+    t_source_ns: int = field(metadata=_TIME_NS)
+    codec: str = field(metadata=_NAME)
+    digest: str = field(metadata=_DIGEST)
+    image_hw: tuple[int, int] = field(metadata=_SIZE)
+    modulation: Modulation = field(metadata=rule(Choice(MODULATIONS)))
+    num_slots: int = field(metadata=rule(WholeNumber(1, MAX_SIDE_PX)))
+    uses_per_slot: int = field(metadata=rule(WholeNumber(1, 48 * MAX_SIDE_PX)))
+    direction: Literal["tx", "rx"] = field(metadata=rule(Choice(("tx", "rx"))))
+    payload_format: PayloadFormat = field(metadata=rule(Choice(PAYLOAD_FORMATS)))
+    payload: bytes = field(metadata=rule(Bytes(MAX_PAYLOAD_BYTES)))
+    slot_lost: bytes = field(default=b"", metadata=rule(Bytes(MAX_SIDE_PX // 8)))
+    lossless: bool = field(default=False, metadata=rule(Flag()))
+    final: bool = field(default=False, metadata=rule(Flag()))
+
+    @property
+    def layout(self) -> SlotLayout:
+        """The slot grid."""
+        return layout_for(self.image_hw)
+
+    def consistent(self) -> None:
+        """Check that grid, payload and loss mask belong together.
+
+        Raises:
+            FieldError: They don't.
+        """
+        layout = self.layout
+        if (self.num_slots, self.uses_per_slot) != (layout.num_slots, layout.uses_per_slot):
+            raise FieldError(
+                "shape",
+                f"slots of a {self.image_hw} image must be {layout.num_slots}x{layout.uses_per_slot}, "
+                f"got {self.num_slots}x{self.uses_per_slot}",
+            )
+        if self.direction == "tx":
+            symbols = layout.num_slots * layout.data_per_slot
+            sizes = {"qam16": (symbols + 1) // 2, "iq16": 4 * symbols}
+        else:
+            sizes = {"iq16": 4 * layout.num_uses, "lost": 0}
+        if self.payload_format not in sizes:
+            raise FieldError("range", f"payload_format {self.payload_format} is not for {self.direction}")
+        if len(self.payload) != sizes[self.payload_format]:
+            raise FieldError(
+                "shape", f"payload must have {sizes[self.payload_format]} bytes, got {len(self.payload)}"
+            )
+        expected = (layout.num_slots + 7) // 8 if self.direction == "rx" else 0
+        if len(self.slot_lost) != expected:
+            raise FieldError("shape", f"slot_lost must have {expected} bytes, got {len(self.slot_lost)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinkReport:
+    """Receiver to agent: how good the link was for a frame, with the agent's own capture time for the age."""
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("link")
+    agent_epoch: int = field(metadata=_COUNT)
+    frame_id: int = field(metadata=_COUNT)
+    snr_db_estimate: float = field(metadata=_DB)
+    t_capture_ns: int = field(metadata=_TIME_NS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlowMessage:
+    """Receiver to agent in lossless service: frames up to here are done, so many more may be under way.
+
+    Attributes:
+        agent_epoch: Whose frames; 0 when the receiver has seen none yet.
+        next_seq: First frame not taken yet.
+        window: Frames that may be sent from ``next_seq`` on.
+    """
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("flow")
+    agent_epoch: int = field(metadata=_COUNT)
+    next_seq: int = field(metadata=_COUNT)
+    window: int = field(metadata=rule(WholeNumber(1, 1000)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelReport:
+    """Channel node to viewers: what was done to a frame. The receiver never decodes with it."""
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("channel")
+    agent_epoch: int = field(metadata=_COUNT)
+    frame_id: int = field(metadata=_COUNT)
+    channel: str = field(metadata=_NAME)
+    snr_db_set: float = field(metadata=_DB)
+    num_slots: int = field(metadata=_COUNT)
+    num_slots_lost: int = field(metadata=_COUNT)
+    frame_lost: bool = field(metadata=rule(Flag()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseMessage:
+    """The camera's pose for one frame.
+
+    Attributes:
+        T_world_cam: 4x4, row by row, or None while it is not known.
+        state: Of the tracker.
+        covariance: 6x6, row by row, rotation before translation, or None.
+        map_epoch: Counts map resets; poses of two epochs have unrelated world frames.
+    """
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("pose")
+    agent_epoch: int = field(metadata=_COUNT)
+    frame_id: int = field(metadata=_COUNT)
+    t_capture_ns: int = field(metadata=_TIME_NS)
+    t_source_ns: int = field(metadata=_TIME_NS)
+    T_world_cam: tuple[float, ...] | None = field(metadata=rule(Maybe(Many(Number(), count=16))))
+    state: str = field(metadata=rule(Choice(TRACKING_STATES)))
+    num_inliers: int = field(metadata=_COUNT)
+    covariance: tuple[float, ...] | None = field(metadata=rule(Maybe(Many(Number(), count=36))))
+    map_epoch: int = field(metadata=_COUNT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapMessage:
+    """What changed in the map.
+
+    Attributes:
+        ids: ``(N,)`` int64 landmarks that are new or moved.
+        xyz: ``(N, 3)`` float32 in the world frame, map units.
+        rgb: ``(N, 3)`` uint8.
+        confidence: ``(N,)`` float32 in [0, 1].
+        removed: ``(M,)`` int64 landmarks that are gone.
+        keyframe_ids: ``(K,)`` int64 keyframes that are new or moved.
+        keyframe_poses: ``(K, 4, 4)`` float64 ``T_world_cam``.
+    """
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("map")
+    agent_epoch: int = field(metadata=_COUNT)
+    map_epoch: int = field(metadata=_COUNT)
+    ids: NDArray[np.int64] = field(metadata=rule(Array("int64", (None,))))
+    xyz: NDArray[np.float32] = field(metadata=rule(Array("float32", (None, 3))))
+    rgb: NDArray[np.uint8] = field(metadata=rule(Array("uint8", (None, 3))))
+    confidence: NDArray[np.float32] = field(metadata=rule(Array("float32", (None,))))
+    removed: NDArray[np.int64] = field(metadata=rule(Array("int64", (None,))))
+    keyframe_ids: NDArray[np.int64] = field(metadata=rule(Array("int64", (None,))))
+    keyframe_poses: NDArray[np.float64] = field(metadata=rule(Array("float64", (None, 4, 4))))
+
+    def consistent(self) -> None:
+        """Check that the arrays have one row per landmark and keyframe.
+
+        Raises:
+            FieldError: They don't.
+        """
+        if not len(self.ids) == len(self.xyz) == len(self.rgb) == len(self.confidence):
+            raise FieldError("shape", "ids, xyz, rgb and confidence must have one row per landmark")
+        if len(self.keyframe_ids) != len(self.keyframe_poses):
+            raise FieldError("shape", "keyframe_ids and keyframe_poses must have one row per keyframe")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatusMessage:
+    """How a process is doing, once a second.
+
+    Attributes:
+        role: Of the process.
+        agent_epoch: Of the stream it works on, 0 while there is none.
+        uptime_s: Since it started.
+        rates_hz: Events per second over the last seconds, by name.
+        counts: Events since the start, by name.
+        drops: Frames dropped since the start, by reason.
+        stages_ms: Stage to (p50, p95, max) over the last frames.
+        last_error: One line, empty when there was none.
+    """
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("status")
+    role: str = field(metadata=rule(Choice(ROLES)))
+    agent_epoch: int = field(metadata=_COUNT)
+    uptime_s: float = field(metadata=rule(Number(0.0)))
+    rates_hz: dict[str, float] = field(metadata=rule(Named(Number(0.0))))
+    counts: dict[str, int] = field(metadata=rule(Named(WholeNumber())))
+    drops: dict[str, int] = field(metadata=rule(Named(WholeNumber())))
+    stages_ms: dict[str, tuple[float, ...]] = field(metadata=rule(Named(Many(Number(0.0), count=3))))
+    last_error: str = field(metadata=rule(Text(1000)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlRequest:
+    """Asks a process to do something: ``get``, ``set``, ``reset``, ``save``, ..."""
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("request")
+    op: str = field(metadata=_NAME)
+    settings: dict[str, Any] = field(default_factory=dict, metadata=rule(Named(Setting())))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlReply:
+    """Answer to a ``ControlRequest``: the settings now in force, or one line of what was wrong."""
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("reply")
+    ok: bool = field(metadata=rule(Flag()))
+    error: str = field(default="", metadata=rule(Text(1000)))
+    settings: dict[str, Any] = field(default_factory=dict, metadata=rule(Named(Setting())))
+
+
+Message = (
+    CameraInfo
+    | SymbolFrame
+    | LinkReport
+    | FlowMessage
+    | ChannelReport
+    | PoseMessage
+    | MapMessage
+    | StatusMessage
+    | ControlRequest
+    | ControlReply
+)
