@@ -38,8 +38,8 @@ class PairMatches:
         confidence1: ``(N,)`` at the second end.
         keypoint_confidence0: ``(N,)`` the codec's keypoint confidence at the first end, or None.
         keypoint_confidence1: ``(N,)`` at the second end, or None.
-        corner_strength0: ``(N,)`` smaller eigenvalue of the structure tensor at the first end, grey^2.
-        corner_strength1: ``(N,)`` at the second end.
+        gradient_grey2: ``(N,)`` smaller eigenvalue of the structure tensor, mean per pixel: of the tracked
+            window for KLT, of the worse end for descriptors.
         forward_backward_px: ``(N,)`` way there and back of a KLT track; None for descriptors.
         photometric_grey: ``(N,)`` difference of the windows of a KLT track; None for descriptors.
     """
@@ -50,8 +50,7 @@ class PairMatches:
     confidence1: Array
     keypoint_confidence0: Array | None
     keypoint_confidence1: Array | None
-    corner_strength0: Array
-    corner_strength1: Array
+    gradient_grey2: Array
     forward_backward_px: Array | None
     photometric_grey: Array | None
 
@@ -69,16 +68,22 @@ class PairMatches:
         return fuse_confidence(self.confidence0, self.confidence1)
 
     @property
+    def keypoint_confidence(self) -> Array | None:
+        """``(N,)`` fused keypoint confidence, or None."""
+        if self.keypoint_confidence0 is None or self.keypoint_confidence1 is None:
+            return None
+        return fuse_confidence(self.keypoint_confidence0, self.keypoint_confidence1)
+
+    @property
     def cues(self) -> dict[str, NDArray[np.float32]]:
         """Return what may tell right matches from wrong ones, higher for right."""
         cues = {
             "confidence": self.confidence,
-            "corner_strength": np.minimum(self.corner_strength0, self.corner_strength1),
+            "corner_strength": self.gradient_grey2,
         }
-        if self.keypoint_confidence0 is not None and self.keypoint_confidence1 is not None:
-            cues["keypoint_confidence"] = fuse_confidence(
-                self.keypoint_confidence0, self.keypoint_confidence1
-            )
+        keypoint_confidence = self.keypoint_confidence
+        if keypoint_confidence is not None:
+            cues["keypoint_confidence"] = keypoint_confidence
         if self.forward_backward_px is not None:
             cues["forward_backward"] = -self.forward_backward_px
         if self.photometric_grey is not None:
@@ -107,11 +112,13 @@ def match_pair(
         tracked = track_points(grey0, grey1, corners, corners)
         found = np.flatnonzero(tracked.ok)
         xy0, xy1 = corners[found], tracked.xy[found]
+        gradient_grey2 = tracked.gradient_grey2[found]
         forward_backward_px = tracked.forward_backward_px[found]
         photometric_grey = tracked.photometric_grey[found]
     else:
         xy0, xy1 = _match_descriptors(grey0, grey1, features, max_features)
-    strength0, strength1 = corner_strength(grey0), corner_strength(grey1)
+        strength0, strength1 = (corner_strength(grey) for grey in (grey0, grey1))
+        gradient_grey2 = np.minimum(sample_map(strength0, xy0), sample_map(strength1, xy1))
     c0, c1 = decoded0.keypoint_confidence, decoded1.keypoint_confidence
     has_keypoint_confidence = c0 is not None and c1 is not None
     matches = PairMatches(
@@ -121,8 +128,7 @@ def match_pair(
         confidence1=sample_map(decoded1.confidence, xy1),
         keypoint_confidence0=sample_map(c0, xy0) if has_keypoint_confidence and c0 is not None else None,
         keypoint_confidence1=sample_map(c1, xy1) if has_keypoint_confidence and c1 is not None else None,
-        corner_strength0=sample_map(strength0, xy0),
-        corner_strength1=sample_map(strength1, xy1),
+        gradient_grey2=gradient_grey2,
         forward_backward_px=forward_backward_px,
         photometric_grey=photometric_grey,
     )

@@ -1,0 +1,77 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, make_transform, transform_points
+from semcast.evaluation.competitors import COMPETITORS
+from semcast.evaluation.pair_matches import PairMatches
+from semcast.evaluation.pair_methods import competitor_estimator, confidence_estimator, match_confidence
+from semcast.evaluation.pose_error import relative_pose_error
+
+CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
+T_CAM1_CAM0 = make_transform(exp_so3([0.02, 0.05, -0.01]), [0.5, 0.1, 0.05])
+MODES = ("robust", "paper", "off", "constant", "shuffled", "inverted")
+
+
+@pytest.fixture
+def matches(rng):
+    points = rng.uniform([-3, -2, 4], [3, 2, 10], (150, 3))
+    xy0 = CAMERA.project(points)
+    xy1 = CAMERA.project(transform_points(T_CAM1_CAM0, points)) + rng.normal(0, 0.3, (150, 2))
+    return PairMatches(
+        keypoints0_xy=xy0,
+        keypoints1_xy=xy1,
+        confidence0=rng.random(150),
+        confidence1=rng.random(150),
+        keypoint_confidence0=None,
+        keypoint_confidence1=None,
+        gradient_grey2=rng.uniform(10, 200, 150),
+        forward_backward_px=rng.exponential(0.2, 150),
+        photometric_grey=rng.uniform(1, 5, 150),
+    )
+
+
+def test_each_mode_gets_its_own_confidence(matches):
+    c = {mode: match_confidence(mode, matches, seed=0) for mode in MODES}
+    np.testing.assert_array_equal(c["off"], 1.0)
+    np.testing.assert_array_equal(c["paper"], np.minimum(matches.confidence0, matches.confidence1))
+    assert np.ptp(c["robust"]) > 0.1
+    np.testing.assert_allclose(c["constant"], c["robust"].mean())
+    np.testing.assert_array_equal(np.sort(c["shuffled"]), np.sort(c["robust"]))
+    assert (c["shuffled"] != c["robust"]).any()
+    np.testing.assert_allclose(c["inverted"], 1 - c["robust"])
+
+
+def test_shuffling_depends_on_the_seed_alone(matches):
+    first, again, other = (match_confidence("shuffled", matches, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_descriptor_matches_have_a_confidence_too(matches):
+    bare = replace(matches, forward_backward_px=None, photometric_grey=None)
+    c = match_confidence("robust", bare, seed=0)
+    assert c.shape == (150,)
+    assert np.mean(c >= match_confidence("robust", matches, seed=0)) > 0.99
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_mode_finds_the_pose(mode, matches):
+    estimate = confidence_estimator(mode)(matches, CAMERA, 1.0, 0)
+    error = relative_pose_error(estimate, T_CAM1_CAM0)
+    assert error.rot_deg < 1.0
+    assert error.tdir_deg < 10.0
+
+
+@pytest.mark.parametrize("name", COMPETITORS)
+def test_competitors_see_the_same_matches(name, matches):
+    error = relative_pose_error(competitor_estimator(name)(matches, CAMERA, 1.0, 0), T_CAM1_CAM0)
+    assert error.rot_deg < 1.0
+
+
+def test_too_few_matches_give_no_pose(matches):
+    few = matches.take(np.arange(4))
+    for mode in MODES:
+        assert confidence_estimator(mode)(few, CAMERA, 1.0, 0) is None

@@ -1,0 +1,130 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast.channel.settings import ChannelSettings
+from semcast.common.errors import ConfigError
+from semcast.common.sequence import open_sequence
+from semcast.evaluation.pairs import PairSettings, evaluate_pairs, true_motions
+from semcast.evaluation.pipeline import selected_frame_ids
+
+KEYS = {
+    "rot_deg_mean",
+    "rot_deg_median",
+    "tdir_deg_mean",
+    "tdir_deg_median",
+    "auc5",
+    "auc10",
+    "auc20",
+    "num_pairs",
+    "num_failed",
+    "elapsed_ms",
+}
+METHODS = {"robust", "paper", "off", "opencv_ransac", "opencv_magsac", "poselib"}
+
+
+def settings(room, **values):
+    base = {"sequence": room, "codec": "phase", "gap": 4, "max_frames": 7, "snr_db": (20.0,)}
+    return PairSettings(**{**base, **values})
+
+
+def test_all_methods_are_measured_on_the_same_pairs(room, phase_codec, tmp_path):
+    wanted = settings(room, snr_db=(6.0, 20.0), json=tmp_path / "p.json", out=tmp_path)
+    report = evaluate_pairs(wanted, phase_codec)
+    assert json.loads(wanted.json.read_text()) == report
+    assert set(report["results"]) == METHODS
+    assert all(set(result) == KEYS for result in report["results"].values())
+    low, high = report["cells"]
+    assert {r["num_pairs"] for r in high["results"].values()} == {3}
+    assert report["results"]["off"]["num_pairs"] == 6
+    for method in METHODS:
+        assert high["results"][method]["rot_deg_median"] < 2.0
+    assert low["psnr_db"] < high["psnr_db"]
+    assert low["true_inlier_share"]["epipolar"] < high["true_inlier_share"]["epipolar"]
+    assert 0 <= report["auroc_confidence"] <= 1
+    assert report["auroc_confidence"] == report["auroc"]["epipolar"]["confidence"]
+    assert "track" in report["auroc"]
+    against = {(c["mode"], c["against"]) for c in high["comparisons"]}
+    assert {("robust", "off"), ("paper", "poselib"), ("off", "opencv_ransac")} <= against
+    assert cv2.imread(str(tmp_path / "fig9_rotation.png")) is not None
+
+
+@pytest.mark.parametrize("features", ["orb", "sift"])
+def test_descriptor_matches_work_too(room, features):
+    report = evaluate_pairs(settings(room, codec="none", features=features, confidence=("robust", "off")))
+    assert report["results"]["robust"]["rot_deg_median"] < 2.0
+    assert report["cells"][0]["num_matches"]["p50"] > 30
+    assert set(report["auroc"]) == {"epipolar"}
+
+
+def test_thinning_leaves_so_many_matches_to_everyone(room, phase_codec):
+    report = evaluate_pairs(
+        settings(room, max_matches=40, confidence=("off",), competitors=False), phase_codec
+    )
+    assert report["cells"][0]["num_matches"] == {"p5": 40.0, "p50": 40.0}
+    assert set(report["results"]) == {"off"}
+
+
+def test_the_result_is_the_same_every_time(room, phase_codec):
+    def run():
+        report = evaluate_pairs(settings(room, seeds=2, max_matches=60, max_frames=6), phase_codec)
+        for results in (report["results"], report["cells"][0]["results"]):
+            for result in results.values():
+                result.pop("elapsed_ms")
+        return {key: report[key] for key in ("results", "auroc", "cells")}
+
+    assert run() == run()
+
+
+def test_ablations_run_on_the_same_matches(room, phase_codec):
+    modes = ("off", "constant", "shuffled", "inverted")
+    report = evaluate_pairs(settings(room, confidence=modes, competitors=False), phase_codec)
+    assert set(report["results"]) == set(modes)
+    assert report["results"]["constant"]["num_failed"] == 0
+
+
+def test_pairs_with_a_lost_frame_fail_under_every_method(room, phase_codec):
+    wanted = settings(
+        room, max_frames=20, link=ChannelSettings(frame_loss=0.3), confidence=("off",), competitors=False
+    )
+    report = evaluate_pairs(wanted, phase_codec)
+    lost = report["cells"][0]["num_pairs_lost"]
+    assert 0 < lost < 16
+    assert report["results"]["off"]["num_failed"] >= lost
+    assert report["results"]["off"]["num_pairs"] == 16
+
+
+def test_true_motion_maps_the_first_camera_to_the_second(room):
+    sequence = open_sequence(room)
+    wanted = settings(room)
+    motions = true_motions(sequence, selected_frame_ids(sequence, wanted), wanted)
+    assert list(motions) == [(k, k + 4) for k in range(3)]
+    truth = sequence.groundtruth().T_world_cam
+    np.testing.assert_allclose(truth[4] @ motions[0, 4], truth[0], atol=1e-7)
+
+
+def test_short_baselines_are_left_out(room):
+    sequence = open_sequence(room)
+    wanted = settings(room, min_baseline_m=10.0)
+    with pytest.raises(ConfigError, match="larger --gap"):
+        true_motions(sequence, selected_frame_ids(sequence, wanted), wanted)
+    shared = settings(room, min_baseline_share=0.9)
+    with pytest.raises(ConfigError, match="baseline"):
+        true_motions(sequence, selected_frame_ids(sequence, shared), shared)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"gap": 0}, "gap"),
+        ({"max_matches": 4}, "max_matches"),
+        ({"threshold_px": 0.0}, "threshold_px"),
+        ({"min_baseline_share": 1.0}, "min_baseline_share"),
+        ({"confidence": ()}, "confidence"),
+    ],
+)
+def test_settings_out_of_range_are_refused(room, values, message):
+    with pytest.raises(ValueError, match=message):
+        settings(room, **values)
