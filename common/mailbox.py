@@ -42,6 +42,18 @@ class Mailbox(Generic[T]):
         with self._changed:
             return len(self._items)
 
+    def resize(self, capacity: int) -> None:
+        """Change the capacity; items beyond it leave with the next ``put``.
+
+        Raises:
+            ValueError: The capacity is not at least 1.
+        """
+        if capacity < 1:
+            raise ValueError(f"capacity must be at least 1, got {capacity}")
+        with self._changed:
+            self._capacity = capacity
+            self._changed.notify_all()
+
     def put(self, item: T, timeout_s: float | None = None) -> bool:
         """Add an item.
 
@@ -56,7 +68,7 @@ class Mailbox(Generic[T]):
             if self._policy == "newest":
                 if self._closed:
                     return False
-                if len(self._items) == self._capacity:
+                while len(self._items) >= self._capacity:
                     self._items.popleft()
                     self._dropped += 1
             else:
@@ -77,8 +89,16 @@ class Mailbox(Generic[T]):
             self._changed.notify_all()
             return item
 
+    def clear(self) -> int:
+        """Throw everything away and return how many items that were; they don't count as ``dropped``."""
+        with self._changed:
+            count = len(self._items)
+            self._items.clear()
+            self._changed.notify_all()
+            return count
+
     def close(self) -> None:
-        """Refuse further items and wake everybody who waits; what is inside can still be taken. Idempotent."""
+        """Refuse further items and wake all who wait; what is inside can still be taken. Idempotent."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()

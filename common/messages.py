@@ -196,11 +196,12 @@ class LinkReport:
 
 @dataclass(frozen=True, kw_only=True)
 class FlowMessage:
-    """Receiver to agent in lossless service: frames up to here are done, so many more may be under way.
+    """Receiver to agent in lossless service: how far it is, and how many frames may be under way.
 
     Attributes:
         agent_epoch: Whose frames; 0 when the receiver has seen none yet.
-        next_seq: First frame not taken yet.
+        next_seq: First frame the consumer has not taken yet; earlier ones need not be kept.
+        arrived_seq: First frame that has not arrived yet; earlier ones need not be sent again.
         window: Frames that may be sent from ``next_seq`` on.
     """
 
@@ -208,6 +209,7 @@ class FlowMessage:
     kind: str = _kind("flow")
     agent_epoch: int = field(metadata=_COUNT)
     next_seq: int = field(metadata=_COUNT)
+    arrived_seq: int = field(metadata=_COUNT)
     window: int = field(metadata=rule(WholeNumber(1, 1000)))
 
 

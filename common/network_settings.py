@@ -1,0 +1,63 @@
+"""Where a process meets the others. One of them, the hub, listens; the others connect to it.
+
+The hub is the server by default. It runs as a Zenoh router, the others as clients of it: so every process can
+be killed and started again in any order, and only one port is open, on loopback. Peers that meet through a
+common peer would not see each other, and a peer by default listens on all interfaces.
+"""
+
+import re
+from dataclasses import dataclass, field
+
+from semcast.common.keys import check_agent_id
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+_ENDPOINT = re.compile(r"(tcp|udp|quic|tls|ws|unixsock-stream)/\S+")
+_LOOPBACK = re.compile(r"\w+/(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+.*|unixsock-stream/.*")
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Tell whether an endpoint is reachable from this machine only."""
+    return _LOOPBACK.fullmatch(endpoint) is not None
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkSettings:
+    """How a process that connects to the hub finds it.
+
+    Raises:
+        ValueError: An endpoint or the agent's name is not well formed, or there is no endpoint at all.
+    """
+
+    agent_id: str = field(default="agent0", metadata={"help": "name of the agent whose stream this is"})
+    listen: tuple[str, ...] = field(
+        default=(),
+        metadata={
+            "help": f"be the hub the others connect to, on these endpoints, such as {DEFAULT_ENDPOINT}"
+        },
+    )
+    connect: tuple[str, ...] = field(
+        default=(DEFAULT_ENDPOINT,), metadata={"help": "endpoints of the hub to connect to"}
+    )
+
+    def __post_init__(self) -> None:
+        check_agent_id(self.agent_id)
+        for name in ("listen", "connect"):
+            for endpoint in getattr(self, name):
+                if _ENDPOINT.fullmatch(endpoint) is None:
+                    raise ValueError(
+                        f"{name} must be an endpoint such as {DEFAULT_ENDPOINT}, got {endpoint!r}"
+                    )
+        if not self.listen and not self.connect:
+            raise ValueError("listen or connect must name an endpoint, got neither")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HubSettings(NetworkSettings):
+    """The same for the process that is the hub unless told otherwise: the server."""
+
+    listen: tuple[str, ...] = field(
+        default=(DEFAULT_ENDPOINT,), metadata={"help": "endpoints agent and channel connect to"}
+    )
+    connect: tuple[str, ...] = field(
+        default=(), metadata={"help": "endpoints of another Zenoh router to join"}
+    )

@@ -1,0 +1,425 @@
+"""Zenoh sessions: who connects to whom, and the two services. The only home of ``zenoh``.
+
+*Newest wins* for symbols and feedback: the sender drops under congestion, the receiver keeps the last few in
+a ring that no Python code has to empty. *Every one* for poses, map, camera and lossless symbols: reliable, in
+order, the sender waits. All payloads are bytes; what they mean is ``wire``'s business.
+"""
+
+import contextlib
+import json
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import zenoh
+
+from semcast.common.errors import TransportError
+from semcast.common.keys import alive_key, alive_keys, role_of
+from semcast.common.messages import ROLES
+from semcast.common.network_settings import NetworkSettings, is_loopback
+from semcast.common.wire import MAX_MESSAGE_BYTES
+
+logger = logging.getLogger(__name__)
+
+Service = Literal["newest", "every"]
+
+#: A frozen or unreachable peer is noticed after this long.
+LEASE_MS = 2000
+RING_CAPACITY = 2
+_FIFO_CAPACITY = 64
+_CONNECT_TRY_MS = 300
+_JOIN_S = 2.0
+
+
+def zenoh_config(network: NetworkSettings) -> zenoh.Config:
+    """Return the configuration of a session: a router where it listens, else a client.
+
+    Nothing is discovered or opened beyond the endpoints that are named.
+    """
+    config = zenoh.Config()
+    hub = bool(network.listen)
+    values: dict[str, Any] = {
+        "mode": "router" if hub else "client",
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "listen/endpoints": list(network.listen),
+        "connect/endpoints": list(network.connect),
+        # A client tries for a moment and reports failure, so that the caller can be stopped in between; once
+        # connected it reconnects by itself. A hub goes on without the routers it was told of.
+        "connect/timeout_ms": -1 if hub else _CONNECT_TRY_MS,
+        "connect/exit_on_failure": not hub,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/rx/max_message_size": 2 * MAX_MESSAGE_BYTES,
+        "transport/shared_memory/enabled": False,
+    }
+    for key, value in values.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Publisher:
+    """Sends to one key."""
+
+    def __init__(self, publisher: Any, key: str) -> None:
+        self._publisher = publisher
+        self._key = key
+
+    def put(self, payload: bytes) -> None:
+        """Send; without a connection the payload is lost, and the next ones go through again.
+
+        Raises:
+            TransportError: The session is closed.
+        """
+        try:
+            self._publisher.put(payload)
+        except zenoh.ZError as err:
+            raise TransportError(f"{self._key} can't be sent: {err}") from err
+
+    @property
+    def has_receiver(self) -> bool:
+        """Whether anybody subscribes to the key now."""
+        try:
+            return bool(self._publisher.matching_status.matching)
+        except zenoh.ZError:
+            return False
+
+
+class _Pump:
+    """A thread that hands over what a Zenoh channel holds, until the channel is closed."""
+
+    def __init__(self, entity: Any, deliver: Callable[[Any], None], name: str) -> None:
+        self._entity = entity
+        # The entity itself must not be borrowed by the thread, or it could not be undeclared.
+        self._handler = entity.handler
+        self._deliver = deliver
+        self._thread = threading.Thread(target=self._run, name=f"semcast-{name}", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                item = self._handler.recv()
+            except zenoh.ZError:
+                return
+            try:
+                self._deliver(item)
+            except Exception:
+                logger.exception("a message could not be handled and is left out")
+
+    def close(self) -> None:
+        with contextlib.suppress(zenoh.ZError):
+            self._entity.undeclare()
+        if self._thread is not threading.current_thread():
+            self._thread.join(_JOIN_S)
+
+
+class Session:
+    """A connection to the hub, or the hub itself. Closing ends all that was declared on it."""
+
+    def __init__(self, session: Any) -> None:
+        """Take an open Zenoh session; use ``open_session``."""
+        self._session = session
+        self._pumps: list[_Pump] = []
+        self._tokens: list[Any] = []
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _declare(self, declare: Callable[[], Any], what: str) -> Any:
+        try:
+            return declare()
+        except zenoh.ZError as err:
+            raise TransportError(f"{what} failed: {err}") from err
+
+    def publisher(self, key: str, service: Service) -> Publisher:
+        """Return a sender.
+
+        Args:
+            key: Where to.
+            service: ``newest`` drops under congestion, ``every`` waits.
+
+        Raises:
+            TransportError: The session is closed.
+        """
+        control = zenoh.CongestionControl.DROP if service == "newest" else zenoh.CongestionControl.BLOCK
+        declared = self._declare(
+            lambda: self._session.declare_publisher(key, congestion_control=control, express=True),
+            f"publishing {key}",
+        )
+        return Publisher(declared, key)
+
+    def subscribe(
+        self, key: str, service: Service, deliver: Callable[[bytes], None], capacity: int = RING_CAPACITY
+    ) -> None:
+        """Call ``deliver(payload)`` for what arrives, on a thread of its own, one at a time.
+
+        Args:
+            key: Key expression.
+            service: ``newest``: while ``deliver`` is busy only the last ``capacity`` are kept. ``every``:
+                all are kept; a ``deliver`` that takes long makes the sender wait.
+            deliver: What it raises is logged, and the message left out.
+            capacity: Messages that wait for ``deliver``.
+
+        Raises:
+            TransportError: The session is closed.
+        """
+        self._subscribe(key, service, lambda sample: deliver(sample.payload.to_bytes()), capacity)
+
+    def subscribe_keyed(self, key: str, service: Service, deliver: Callable[[str, bytes], None]) -> None:
+        """Do as ``subscribe``, with the key of each message: for expressions that match several."""
+        self._subscribe(
+            key,
+            service,
+            lambda sample: deliver(str(sample.key_expr), sample.payload.to_bytes()),
+            _FIFO_CAPACITY,
+        )
+
+    def _subscribe(self, key: str, service: Service, deliver: Callable[[Any], None], capacity: int) -> None:
+        channel = (
+            zenoh.handlers.RingChannel(capacity)
+            if service == "newest"
+            else zenoh.handlers.FifoChannel(max(capacity, _FIFO_CAPACITY))
+        )
+        declared = self._declare(
+            lambda: self._session.declare_subscriber(key, channel), f"subscribing to {key}"
+        )
+        self._add(_Pump(declared, deliver, f"sub-{key.rsplit('/', 1)[-1]}"))
+
+    def answer(self, key: str, handle: Callable[[bytes], bytes]) -> None:
+        """Answer requests on a key with ``handle(payload)``, on a thread of its own.
+
+        Raises:
+            TransportError: The session is closed.
+        """
+
+        def reply(query: Any) -> None:
+            with query:
+                query.reply(key, handle(query.payload.to_bytes() if query.payload is not None else b""))
+
+        declared = self._declare(
+            lambda: self._session.declare_queryable(key, zenoh.handlers.FifoChannel(_FIFO_CAPACITY)),
+            f"answering on {key}",
+        )
+        self._add(_Pump(declared, reply, f"answer-{key.rsplit('/', 1)[-1]}"))
+
+    def request(self, key: str, payload: bytes, timeout_s: float) -> bytes | None:
+        """Return the first answer to a request, None when nobody answered in time.
+
+        Raises:
+            TransportError: The session is closed.
+        """
+        try:
+            for reply in self._session.get(key, payload=payload, timeout=timeout_s):
+                if reply.ok is not None:
+                    return bytes(reply.ok.payload.to_bytes())
+        except zenoh.ZError as err:
+            raise TransportError(f"request to {key} failed: {err}") from err
+        return None
+
+    def declare_alive(self, agent_id: str, role: str) -> None:
+        """Show that a role is alive, until the session is closed or its process dies.
+
+        Raises:
+            TransportError: The session is closed.
+        """
+        key = alive_key(agent_id, role)
+        self._tokens.append(self._declare(lambda: self._session.liveliness().declare_token(key), key))
+
+    def watch_alive(self, agent_id: str, on_change: Callable[[str, bool], None]) -> None:
+        """Call ``on_change(role, alive)`` for every role alive now and for each that comes or goes.
+
+        Raises:
+            TransportError: The session is closed.
+        """
+        declared = self._declare(
+            lambda: self._session.liveliness().declare_subscriber(
+                alive_keys(agent_id), zenoh.handlers.FifoChannel(_FIFO_CAPACITY), history=True
+            ),
+            f"watching {agent_id}",
+        )
+
+        def deliver(sample: Any) -> None:
+            on_change(role_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
+
+        self._add(_Pump(declared, deliver, "alive"))
+
+    def alive_roles(self, agent_id: str, timeout_s: float = 1.0) -> set[str]:
+        """Return the roles that are alive now.
+
+        Raises:
+            TransportError: The session is closed.
+        """
+        try:
+            replies = self._session.liveliness().get(alive_keys(agent_id), timeout=timeout_s)
+            found = {role_of(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
+        except zenoh.ZError as err:
+            raise TransportError(f"asking who is alive failed: {err}") from err
+        return found & set(ROLES)
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a link to the hub, or to anybody where this is the hub."""
+        try:
+            return bool(self._session.info.routers_zid() or self._session.info.peers_zid())
+        except zenoh.ZError:
+            return False
+
+    def _add(self, pump: _Pump) -> None:
+        with self._lock:
+            if not self._closed:
+                self._pumps.append(pump)
+                return
+        pump.close()
+
+    def close(self) -> None:
+        """End threads, declarations and connections; ports are free again. Idempotent."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            pumps, self._pumps = self._pumps, []
+        for pump in pumps:
+            pump.close()
+        with contextlib.suppress(zenoh.ZError):
+            self._session.close()
+
+
+def open_session(
+    network: NetworkSettings, stop: threading.Event | None = None, deadline_s: float | None = None
+) -> Session | None:
+    """Open a session; a client waits until its hub is there.
+
+    Args:
+        network: Endpoints.
+        stop: Ends the waiting.
+        deadline_s: Ends the waiting with an error; None waits for ever.
+
+    Returns:
+        None when ``stop`` was set before there was a connection.
+
+    Raises:
+        TransportError: The port is taken, or no hub was found in time.
+    """
+    for endpoint in network.listen:
+        if not is_loopback(endpoint):
+            logger.warning("listening on %s: whoever reaches it can send and receive", endpoint)
+    config = zenoh_config(network)
+    if network.listen:
+        try:
+            return Session(zenoh.open(config))
+        except zenoh.ZError as err:
+            where = ", ".join(network.listen)
+            raise TransportError(
+                f"can't listen on {where}, perhaps something already does: {_first_line(err)}"
+            ) from err
+    started_s = time.monotonic()
+    told = False
+    while stop is None or not stop.is_set():
+        try:
+            return Session(zenoh.open(config))
+        except zenoh.ZError as err:
+            if deadline_s is not None and time.monotonic() - started_s >= deadline_s:
+                raise TransportError(
+                    f"nothing answers at {', '.join(network.connect)} within {deadline_s:g} s: is "
+                    f"'semcast server' running there? ({_first_line(err)})"
+                ) from err
+            if not told:
+                logger.info("waiting for the server at %s", ", ".join(network.connect))
+                told = True
+            _pause(stop)
+    return None
+
+
+def _pause(stop: threading.Event | None) -> None:
+    if stop is None:
+        time.sleep(0.1)
+    else:
+        stop.wait(0.1)
+
+
+def _first_line(err: Exception) -> str:
+    return str(err).split(" at /", 1)[0].splitlines()[0]
+
+
+def free_endpoint() -> str:
+    """Return a loopback endpoint with a port that was free a moment ago, for tests and demonstrations."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def open_hub(agent_id: str = "agent0", attempts: int = 5) -> tuple[Session, str]:
+    """Open a hub on a free loopback port, and return it with its endpoint.
+
+    Raises:
+        TransportError: No port could be opened.
+    """
+    for attempt in range(attempts):
+        endpoint = free_endpoint()
+        try:
+            session = open_session(NetworkSettings(agent_id=agent_id, listen=(endpoint,), connect=()))
+        except TransportError:
+            if attempt == attempts - 1:
+                raise
+            continue
+        assert session is not None, "a hub does not wait"
+        return session, endpoint
+    raise TransportError(f"attempts must be at least 1, got {attempts}")
+
+
+def open_client(network: NetworkSettings, deadline_s: float) -> Session:
+    """Open a session that connects to a hub, for a short errand.
+
+    Raises:
+        TransportError: No hub was found in time.
+    """
+    session = open_session(network, deadline_s=deadline_s)
+    assert session is not None, "without a stop event there is a session or an error"
+    return session
+
+
+def loopback_round_trip_ms(timeout_s: float = 3.0) -> float:
+    """Send a request through a hub and back, all in this process, and return how long it took.
+
+    Raises:
+        TransportError: It did not come back.
+    """
+    hub, endpoint = open_hub()
+    with hub:
+        network = NetworkSettings(connect=(endpoint,))
+        asking = open_client(network, timeout_s)
+        answering = open_client(network, timeout_s)
+        with asking, answering:
+            answering.answer("semcast/doctor/echo", lambda payload: payload)
+            deadline_s = time.monotonic() + timeout_s
+            while time.monotonic() < deadline_s:
+                started_ns = time.perf_counter_ns()
+                if asking.request("semcast/doctor/echo", b"there and back", 0.5) == b"there and back":
+                    return (time.perf_counter_ns() - started_ns) * 1e-6
+    raise TransportError(f"a request over loopback did not come back within {timeout_s:g} s")
+
+
+def alive_roles(connect: str, agent_id: str, timeout_s: float = 2.0) -> set[str]:
+    """Connect to a hub and return which of agent, channel and server are alive.
+
+    Raises:
+        TransportError: Nothing answers there.
+    """
+    try:
+        network = NetworkSettings(agent_id=agent_id, connect=(connect,))
+    except ValueError as err:
+        raise TransportError(str(err)) from err
+    with open_client(network, timeout_s) as session:
+        return session.alive_roles(agent_id, timeout_s)
