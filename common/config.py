@@ -120,7 +120,7 @@ def _flag_options(annotation: Any) -> dict[str, Any]:
     return {"type": plain, "metavar": {int: "N", float: "X", Path: "PATH", str: "NAME"}.get(plain, "VALUE")}
 
 
-def _default_text(field: dataclasses.Field) -> str:
+def _default_text(field: "dataclasses.Field[Any]") -> str:
     default = field.default
     if default is dataclasses.MISSING and field.default_factory is not dataclasses.MISSING:
         default = field.default_factory()

@@ -1,0 +1,83 @@
+"""``semcast demo``: the whole system on one machine, ending in a table of figures."""
+
+import argparse
+import shutil
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from semcast.commands.running import add_settings, read_settings, run_until_stopped
+from semcast.common.sequence import open_sequence
+from semcast.demo import DemoSettings, default_sequence, run_demo
+
+#: Rows of the final table: key of the summary, name, format.
+_FIGURES = (
+    ("completeness", "frames with a pose", "{:.1%}"),
+    ("ate_rmse_m", "position error (ATE RMSE after Sim(3))", "{:.2f} m"),
+    ("ate_percent", "  in percent of the path", "{:.2f} %"),
+    ("rpe_trans_percent", "step error, translation", "{:.2f} %"),
+    ("rpe_rot_deg", "step error, rotation", "{:.3f} deg"),
+    ("psnr_db", "image quality (PSNR)", "{:.2f} dB"),
+    ("num_landmarks", "landmarks", "{:d}"),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_settings(parser, DemoSettings)
+
+
+def summary_table(summary: Mapping[str, Any]) -> Table:
+    """Return the figures of a run as a table."""
+    table = Table(title="what came out", show_header=False, title_justify="left")
+    for key, name, form in _FIGURES:
+        value = summary.get(key)
+        if isinstance(value, Mapping):
+            value = value.get("p50", value.get("mean"))
+        table.add_row(name, "-" if value is None else form.format(value))
+    for reason, count in (summary.get("drops") or {}).items():
+        table.add_row(f"frames dropped: {reason}", str(count))
+    for stage, figures in (summary.get("stage_ms") or {}).items():
+        if figures.get("p50") is not None:
+            table.add_row(f"{stage}, p50 / p95", f"{figures['p50']:.1f} / {figures['p95']:.1f} ms")
+    return table
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the demo; exit code 1 when no frame got a pose."""
+    settings = read_settings(DemoSettings, arguments)
+    talk = Console(stderr=True)
+    frames = len(open_sequence(settings.sequence or default_sequence()))
+    result: dict[str, Any] = {}
+
+    def work(stop: threading.Event) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        with Progress(*columns, console=talk) as bar:
+            task = bar.add_task("starting server, channel and agent", total=frames)
+
+            def show(row: Mapping[str, Any]) -> None:
+                psnr = row.get("psnr_db")
+                quality = "" if psnr is None else f"  {psnr:.1f} dB"
+                text = f"{row['state']:<12} {row['num_inliers']:>4} inliers{quality}"
+                bar.update(task, completed=row["frame_id"] + 1, description=text)
+
+            summary = run_demo(
+                settings, stop, lambda line: talk.print(line, highlight=False, soft_wrap=True), show
+            )
+            result.update(summary or {})
+
+    code = run_until_stopped(work)
+    if not result:
+        talk.print("no summary was written; the logs of the three processes say why:", settings.out / "logs")
+        return code or 1
+    Console().print(summary_table(result))
+    files = ("trajectory.tum", "map.ply", "run.rrd", "summary.json", "settings.toml")
+    there = ", ".join(name for name in files if (settings.out / name).exists())
+    print(f"in {settings.out}: {there}; look again with: rerun {settings.out / 'run.rrd'}")
+    if settings.json is not None:
+        shutil.copyfile(settings.out / "summary.json", settings.json)
+    return code or (0 if result.get("completeness") else 1)

@@ -1,0 +1,256 @@
+"""The demo: server, channel and agent as three real processes on loopback, until the sequence ends."""
+
+import json
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from semcast.common.codec import Modulation
+from semcast.common.errors import ConfigError, SemcastError, TransportError
+from semcast.common.network_settings import NetworkSettings
+from semcast.common.transport import free_endpoint, open_session
+
+#: How long a role may take from its start until it is seen: imports and weights on a slow machine.
+START_DEADLINE_S = 60.0
+#: How long a role may take to write everything after it was asked to stop.
+STOP_DEADLINE_S = 15.0
+AGENT_ID = "demo"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoSettings:
+    """What the demo runs.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    sequence: Path | None = field(
+        default=None, metadata={"help": "recorded sequence; without it the one shipped with semcast"}
+    )
+    codec: str = field(default="3dcsc-lite", metadata={"help": "codec by name, such as jpeg-ldpc"})
+    modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    snr_db: float = field(default=10.0, metadata={"help": "Es/N0 of the link in dB"})
+    channel: str = field(
+        default="awgn",
+        metadata={"help": "awgn, rayleigh, rician, erasure (20 percent of slots lost), burst, trace"},
+    )
+    confidence: Literal["robust", "paper", "off"] = field(
+        default="robust", metadata={"help": "how the geometry uses confidence"}
+    )
+    view: Literal["auto", "native", "web", "file", "none"] = field(
+        default="auto", metadata={"help": "viewer: a window, the browser, only run.rrd, or none"}
+    )
+    resize: float = field(default=1.0, metadata={"help": "factor on the image size, for slow machines"})
+    seed: int = field(default=0, metadata={"help": "seed of channel and estimation"})
+    out: Path = field(default=Path("runs/demo"), metadata={"help": "folder for all outputs"})
+    json: Path | None = field(default=None, metadata={"help": "also write the summary to this file"})
+    record: Path | None = field(
+        default=None, metadata={"help": "record everything that crossed the link (MCAP)"}
+    )
+
+    def __post_init__(self) -> None:
+        """Check ranges that the three processes would only notice after their start."""
+        if not -5.0 <= self.snr_db <= 30.0:
+            raise ValueError(f"snr_db must be in [-5, 30], got {self.snr_db:g}")
+        if not 0.05 <= self.resize <= 1.0:
+            raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
+
+
+def default_sequence() -> Path:
+    """Return the demo sequence of the source checkout.
+
+    Raises:
+        ConfigError: semcast was installed without its checkout.
+    """
+    for root in (Path(__file__).resolve().parents[2], Path.cwd()):
+        folder = root / "deploy" / "demo" / "kitti_06"
+        if folder.is_dir():
+            return folder
+    raise ConfigError(
+        "the demo sequence comes with the source checkout only; name your own with --sequence DIR"
+    )
+
+
+def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict[str, list[str]]:
+    """Return the command line of each role, in the order they are started."""
+    program = [sys.executable, "-m", "semcast"]
+    meet = ["--agent-id", AGENT_ID, "--connect", endpoint]
+    server = [*program, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
+    server += ["--reference", str(sequence), "--confidence", settings.confidence, "--view", settings.view]
+    server += ["--seed", str(settings.seed)]
+    channel = [*program, "channel", *meet, "--channel", settings.channel, "--snr-db", f"{settings.snr_db:g}"]
+    channel += ["--seed", str(settings.seed)]
+    agent = [*program, "agent", *meet, "--source", str(sequence), "--codec", settings.codec]
+    agent += ["--modulation", settings.modulation, "--resize", f"{settings.resize:g}"]
+    if settings.record is not None:
+        server += ["--record", str(settings.record)]
+    return {"server": server, "channel": channel, "agent": agent}
+
+
+class Role:
+    """One child process with its log file."""
+
+    def __init__(self, name: str, command: list[str], log: Path) -> None:
+        self.name, self.command, self.log = name, command, log
+        self._process: subprocess.Popen[bytes] | None = None
+        self.told = False
+
+    def start(self) -> None:
+        """Start the process in a group of its own, so that Ctrl-C reaches it only through us."""
+        with self.log.open("wb") as log:
+            self._process = subprocess.Popen(
+                self.command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+            )
+
+    @property
+    def returncode(self) -> int | None:
+        """Exit code, negative for a signal; None while it runs."""
+        return None if self._process is None else self._process.poll()
+
+    def last_words(self) -> str:
+        """Return the last line of the log."""
+        lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return lines[-1] if lines else "no output"
+
+    def stop(self) -> None:
+        """Ask the process to end; kill it when it does not in time."""
+        if self._process is None or self._process.poll() is not None:
+            return
+        self._process.send_signal(signal.SIGTERM)
+        try:
+            self._process.wait(STOP_DEADLINE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+@dataclass
+class Alive:
+    """Which roles are there, as their liveliness tokens say; restarts by hand count like ours."""
+
+    roles: set[str]
+    changed: threading.Condition
+
+    def on_change(self, role: str, alive: bool) -> None:
+        """Take one change."""
+        with self.changed:
+            (self.roles.add if alive else self.roles.discard)(role)
+            self.changed.notify_all()
+
+    def wait_for(self, role: str, child: Role, stop: threading.Event) -> None:
+        """Wait until a role is there.
+
+        Raises:
+            SemcastError: Its process ended, or the deadline passed.
+        """
+        deadline = time.monotonic() + START_DEADLINE_S
+        with self.changed:
+            while role not in self.roles and not stop.is_set():
+                if child.returncode is not None:
+                    raise SemcastError(f"{role} did not start: {child.last_words()}")
+                if time.monotonic() > deadline:
+                    raise SemcastError(f"{role} was not ready within {START_DEADLINE_S:g} s, see {child.log}")
+                self.changed.wait(0.1)
+
+
+def run_demo(
+    settings: DemoSettings,
+    stop: threading.Event,
+    tell: Callable[[str], None],
+    progress: Callable[[Mapping[str, Any]], None],
+) -> dict[str, Any] | None:
+    """Run the three processes until the server has written its summary, or until ``stop``.
+
+    A process that dies does not end the demo: its command line is told, so that it can be started again by
+    hand, and the stream goes on when it is.
+
+    Args:
+        settings: What to run.
+        stop: Ends the run early; outputs are still written.
+        tell: Takes one line of text for the user.
+        progress: Takes the newest row of ``frames.jsonl``.
+
+    Returns:
+        The server's summary, or None when it never wrote one.
+
+    Raises:
+        SemcastError: A process could not be started.
+    """
+    sequence = settings.sequence or default_sequence()
+    settings.out.mkdir(parents=True, exist_ok=True)
+    summary_file = settings.out / "summary.json"
+    for stale in (summary_file, settings.out / "checkpoint.npz", settings.out / "frames.jsonl"):
+        stale.unlink(missing_ok=True)
+    logs = settings.out / "logs"
+    logs.mkdir(exist_ok=True)
+    endpoint = free_endpoint()
+    commands = role_commands(settings, sequence, endpoint)
+    children = {name: Role(name, command, logs / f"{name}.log") for name, command in commands.items()}
+    alive = Alive(set(), threading.Condition())
+    try:
+        children["server"].start()
+        network = NetworkSettings(agent_id=AGENT_ID, connect=(endpoint,))
+        session = open_session(network, stop, START_DEADLINE_S)
+        if session is None:
+            return None
+        with session:
+            session.watch_alive(AGENT_ID, alive.on_change)
+            for name, child in children.items():
+                if name != "server":
+                    child.start()
+                alive.wait_for(name, child, stop)
+                tell(f"{name} is up: {shlex.join(child.command)}")
+            _watch(settings.out, children, alive, summary_file, stop, tell, progress)
+    except TransportError as err:
+        if children["server"].returncode is not None:
+            raise SemcastError(f"server did not start: {children['server'].last_words()}") from err
+        raise
+    finally:
+        for name in ("agent", "channel", "server"):
+            children[name].stop()
+    return json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
+
+
+def _watch(
+    out: Path,
+    children: Mapping[str, Role],
+    alive: Alive,
+    summary_file: Path,
+    stop: threading.Event,
+    tell: Callable[[str], None],
+    progress: Callable[[Mapping[str, Any]], None],
+) -> None:
+    """Follow the rows the server writes until its summary is there."""
+    rows = out / "frames.jsonl"
+    read_bytes = 0
+    while not stop.is_set() and not summary_file.exists():
+        for child in children.values():
+            code = child.returncode
+            if code and not child.told:
+                child.told = True
+                how = (
+                    f"was killed by signal {-code}"
+                    if code < 0
+                    else f"ended with code {code}: {child.last_words()}"
+                )
+                tell(f"{child.name} {how}; start it again with: {shlex.join(child.command)}")
+        if rows.exists():
+            size = rows.stat().st_size
+            if size < read_bytes:
+                read_bytes = 0
+            with rows.open("rb") as file:
+                file.seek(read_bytes)
+                complete = file.read(size - read_bytes).rpartition(b"\n")[0]
+            read_bytes += len(complete) + bool(complete)
+            for line in complete.splitlines():
+                progress(json.loads(line))
+        with alive.changed:
+            alive.changed.wait(0.1)
