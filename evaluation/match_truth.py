@@ -42,7 +42,7 @@ def epipolar_distance_px(
 
 def track_points(
     image0: NDArray[np.uint8], image1: NDArray[np.uint8], points_xy: Array
-) -> tuple[Array, Array]:
+) -> tuple[Array, NDArray[np.bool_]]:
     """Follow points from one RGB image to another by pyramidal Lucas-Kanade.
 
     Args:
@@ -56,20 +56,23 @@ def track_points(
     if len(points_xy) == 0:
         return np.zeros((0, 2)), np.zeros(0, dtype=bool)
     grey0, grey1 = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (image0, image1))
+    start = np.ascontiguousarray(points_xy, dtype=np.float32).reshape(-1, 1, 2)
     moved_xy, found, _ = cv2.calcOpticalFlowPyrLK(
         grey0,
         grey1,
-        np.ascontiguousarray(points_xy, dtype=np.float32).reshape(-1, 1, 2),
-        None,
-        winSize=[_LK_WINDOW_PX, _LK_WINDOW_PX],
+        start,
+        start.copy(),
+        winSize=(_LK_WINDOW_PX, _LK_WINDOW_PX),
         maxLevel=_LK_LEVELS,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
+    moved_xy, found = np.asarray(moved_xy), np.asarray(found)
     return moved_xy.reshape(-1, 2).astype(np.float64), found.ravel().astype(bool)
 
 
 def displacement_from_original_px(
     decoded: NDArray[np.uint8], original: NDArray[np.uint8], points_xy: Array
-) -> tuple[Array, Array]:
+) -> tuple[Array, NDArray[np.bool_]]:
     """Return how far each point's surroundings lie from where they are in the original image.
 
     Args:

@@ -1,7 +1,7 @@
 """Matched points of two decoded images, with everything that may speak of their reliability."""
 
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -59,7 +59,7 @@ class PairMatches:
 
     def take(self, idx: NDArray[np.intp]) -> "PairMatches":
         """Return the matches with these indices."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         return PairMatches(**{k: None if v is None else v[idx] for k, v in values.items()})
 
     @property
@@ -141,9 +141,9 @@ def _match_descriptors(
 ) -> tuple[Array, Array]:
     """Detect, describe and match; best first."""
     detector = (
-        cv2.ORB_create(nfeatures=max_features)
+        cv2.ORB.create(nfeatures=max_features)
         if features == "orb"
-        else cv2.SIFT_create(nfeatures=max_features)
+        else cv2.SIFT.create(nfeatures=max_features)
     )
     keypoints0, descriptors0 = detector.detectAndCompute(grey0, None)
     keypoints1, descriptors1 = detector.detectAndCompute(grey1, None)
