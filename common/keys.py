@@ -6,6 +6,8 @@ from semcast.common.messages import AGENT_ID_PATTERN, ROLES
 
 _ROOT = "semcast"
 
+DEFAULT_AGENT_ID = "agent0"
+
 
 def check_agent_id(agent_id: str) -> str:
     """Return the agent's name, which is one part of every key.
@@ -88,6 +90,16 @@ def alive_key(agent_id: str, role: str) -> str:
 def alive_keys(agent_id: str) -> str:
     """Key expression that matches the liveliness tokens of all roles."""
     return _key(agent_id, "alive/*")
+
+
+def alive_agents() -> str:
+    """Key expression that matches the liveliness tokens of all agents."""
+    return f"{_ROOT}/*/alive/agent"
+
+
+def agent_of(key: str) -> str:
+    """Return the agent's name in any key."""
+    return key.split("/")[1]
 
 
 def all_keys(agent_id: str) -> str:

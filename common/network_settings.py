@@ -8,8 +8,6 @@ common peer would not see each other, and a peer by default listens on all inter
 import re
 from dataclasses import dataclass, field
 
-from semcast.common.keys import check_agent_id
-
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _ENDPOINT = re.compile(r"(tcp|udp|quic|tls|ws|unixsock-stream)/\S+")
 _LOOPBACK = re.compile(r"\w+/(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+.*|unixsock-stream/.*")
@@ -25,10 +23,9 @@ class NetworkSettings:
     """How a process that connects to the hub finds it.
 
     Raises:
-        ValueError: An endpoint or the agent's name is not well formed, or there is no endpoint at all.
+        ValueError: An endpoint is not well formed, or there is none at all.
     """
 
-    agent_id: str = field(default="agent0", metadata={"help": "name of the agent whose stream this is"})
     listen: tuple[str, ...] = field(
         default=(),
         metadata={
@@ -40,7 +37,6 @@ class NetworkSettings:
     )
 
     def __post_init__(self) -> None:
-        check_agent_id(self.agent_id)
         for name in ("listen", "connect"):
             for endpoint in getattr(self, name):
                 if _ENDPOINT.fullmatch(endpoint) is None:

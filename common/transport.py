@@ -18,7 +18,7 @@ from typing import Any, Literal, Self
 import zenoh
 
 from semcast.common.errors import TransportError
-from semcast.common.keys import alive_key, alive_keys, role_of
+from semcast.common.keys import agent_of, alive_agents, alive_key, alive_keys, role_of
 from semcast.common.messages import ROLES
 from semcast.common.network_settings import NetworkSettings, is_loopback
 from semcast.common.wire import MAX_MESSAGE_BYTES
@@ -261,12 +261,22 @@ class Session:
         Raises:
             TransportError: The session is closed.
         """
+        return {role_of(key) for key in self._alive(alive_keys(agent_id), timeout_s)} & set(ROLES)
+
+    def alive_agents(self, timeout_s: float = 1.0) -> list[str]:
+        """Return the names of all agents that are alive now, sorted.
+
+        Raises:
+            TransportError: The session is closed.
+        """
+        return sorted({agent_of(key) for key in self._alive(alive_agents(), timeout_s)})
+
+    def _alive(self, keys: str, timeout_s: float) -> list[str]:
         try:
-            replies = self._session.liveliness().get(alive_keys(agent_id), timeout=timeout_s)
-            found = {role_of(str(reply.ok.key_expr)) for reply in replies if reply.ok is not None}
+            replies = self._session.liveliness().get(keys, timeout=timeout_s)
+            return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
         except zenoh.ZError as err:
             raise TransportError(f"asking who is alive failed: {err}") from err
-        return found & set(ROLES)
 
     @property
     def connected(self) -> bool:
@@ -360,7 +370,7 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def open_hub(agent_id: str = "agent0", attempts: int = 5) -> tuple[Session, str]:
+def open_hub(attempts: int = 5) -> tuple[Session, str]:
     """Open a hub on a free loopback port, and return it with its endpoint.
 
     Raises:
@@ -369,7 +379,7 @@ def open_hub(agent_id: str = "agent0", attempts: int = 5) -> tuple[Session, str]
     for attempt in range(attempts):
         endpoint = free_endpoint()
         try:
-            session = open_session(NetworkSettings(agent_id=agent_id, listen=(endpoint,), connect=()))
+            session = open_session(NetworkSettings(listen=(endpoint,), connect=()))
         except TransportError:
             if attempt == attempts - 1:
                 raise
@@ -418,7 +428,7 @@ def alive_roles(connect: str, agent_id: str, timeout_s: float = 2.0) -> set[str]
         TransportError: Nothing answers there.
     """
     try:
-        network = NetworkSettings(agent_id=agent_id, connect=(connect,))
+        network = NetworkSettings(connect=(connect,))
     except ValueError as err:
         raise TransportError(str(err)) from err
     with open_client(network, timeout_s) as session:

@@ -1,0 +1,115 @@
+"""Which of the frames that arrive count: agent epochs, duplicates, order, gaps, and how old a frame is."""
+
+from collections import deque
+from collections.abc import Callable
+
+from semcast.common.messages import SymbolFrame
+
+#: An agent that was silent this long may come back with a clock set to the past.
+_SILENCE_NS = 3_000_000_000
+_OFFSET_WINDOW_NS = 10_000_000_000
+_REMEMBERED = 256
+
+
+class CaptureAge:
+    """How old frames are, without a common clock.
+
+    The offset between the two clocks plus the fastest way is the smallest ``arrival - capture`` of the last
+    10 to 20 seconds; what a frame took more than that is its age.
+    """
+
+    def __init__(self) -> None:
+        self._current_ns: int | None = None
+        self._previous_ns: int | None = None
+        self._since_ns = 0
+
+    def arrived(self, t_capture_ns: int, t_arrival_ns: int) -> None:
+        """Learn from a frame."""
+        offset_ns = t_arrival_ns - t_capture_ns
+        if self._current_ns is None or t_arrival_ns - self._since_ns > _OFFSET_WINDOW_NS:
+            self._previous_ns, self._current_ns = self._current_ns, offset_ns
+            self._since_ns = t_arrival_ns
+        self._current_ns = min(self._current_ns, offset_ns)
+
+    def age_ms(self, t_capture_ns: int, now_ns: int) -> float:
+        """Return the age of a frame; 0 before anything arrived."""
+        known = [offset for offset in (self._current_ns, self._previous_ns) if offset is not None]
+        return max(0.0, (now_ns - t_capture_ns - min(known)) * 1e-6) if known else 0.0
+
+
+class Arrivals:
+    """State of one stream at the receiver. Not synchronised.
+
+    Live: the newest frame seen sets the pace. Reasons of drops: ``duplicate``, ``stale`` (older than one that
+    came before it), ``epoch`` (of an agent that was restarted since), ``missing`` (never arrived: seen by the
+    gap in ``seq``; taken back if the frame turns up late).
+
+    Lossless: only the frame that follows the last one is taken. Reasons: ``duplicate``, ``epoch``, ``gap``
+    (one before it is missing; the agent will send both again).
+
+    Args:
+        lossless: Which of the two.
+        drop: Is told reason and count.
+
+    Attributes:
+        epoch: Of the newest agent, 0 before the first frame.
+        arrived_seq: First frame that has not arrived.
+        next_seq: Lossless: first frame that was not taken by the consumer.
+    """
+
+    def __init__(self, *, lossless: bool, drop: Callable[[str, int], None]) -> None:
+        self.epoch = 0
+        self.arrived_seq = 0
+        self.next_seq = 0
+        self._lossless = lossless
+        self._drop = drop
+        self._last_ns = 0
+        self._recent: deque[int] = deque(maxlen=_REMEMBERED)
+        self._age = CaptureAge()
+
+    def accept(self, frame: SymbolFrame, arrival_ns: int) -> bool:
+        """Tell whether a frame counts, and count it under its reason where it does not."""
+        if frame.agent_epoch != self.epoch:
+            silent = arrival_ns - self._last_ns > _SILENCE_NS
+            if frame.agent_epoch < self.epoch and not silent:
+                self._drop("epoch", 1)
+                return False
+            self._start(frame)
+        self._last_ns = arrival_ns
+        if self._lossless:
+            if frame.seq != self.arrived_seq:
+                self._drop("duplicate" if frame.seq < self.arrived_seq else "gap", 1)
+                return False
+        elif frame.seq in self._recent:
+            self._drop("duplicate", 1)
+            return False
+        elif frame.seq < self.arrived_seq:
+            # It was counted as missing when a later one came, unless that was before this receiver's time.
+            if self._recent and frame.seq > self._recent[0]:
+                self._drop("missing", -1)
+            self._recent.append(frame.seq)
+            self._drop("stale", 1)
+            return False
+        else:
+            self._drop("missing", frame.seq - self.arrived_seq)
+        self.arrived_seq = frame.seq + 1
+        self._recent.append(frame.seq)
+        self._age.arrived(frame.t_capture_ns, arrival_ns)
+        return True
+
+    def _start(self, frame: SymbolFrame) -> None:
+        """Take up a stream, from its first unconfirmed frame, or where it is now."""
+        self.epoch = frame.agent_epoch
+        self.arrived_seq = frame.base_seq if self._lossless else frame.seq
+        self.next_seq = self.arrived_seq
+        self._recent.clear()
+        self._age = CaptureAge()
+
+    def took(self, frame: SymbolFrame) -> None:
+        """Note that the consumer has a frame."""
+        if frame.agent_epoch == self.epoch:
+            self.next_seq = max(self.next_seq, frame.seq + 1)
+
+    def age_ms(self, frame: SymbolFrame, now_ns: int) -> float:
+        """Return how old a frame is; 0 for one of a former epoch."""
+        return self._age.age_ms(frame.t_capture_ns, now_ns) if frame.agent_epoch == self.epoch else 0.0

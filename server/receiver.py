@@ -1,0 +1,334 @@
+"""The receiving end of a stream: which frames count, in which order, equalised and ready for the decoder."""
+
+import logging
+import threading
+import time
+from collections import OrderedDict
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.codec import ReceivedImage
+from semcast.common.errors import TransportError
+from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
+from semcast.common.mailbox import Mailbox
+from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
+from semcast.common.metrics import Metrics
+from semcast.common.phy.equaliser import equalise
+from semcast.common.symbol_payload import lost_slots_of, slots_of
+from semcast.common.transport import Session
+from semcast.common.wire import WireError, pack, unpack
+from semcast.server.arrival import Arrivals
+
+logger = logging.getLogger(__name__)
+
+Mode = Literal["live", "replay"]
+
+#: Frames under way at most in replay: enough to keep agent, channel and decoder busy at once.
+WINDOW = 4
+FLOW_INTERVAL_S = 0.2
+_RING_CAPACITY = 16
+_CAMERA_TIMEOUT_S = 0.5
+_KEPT_REPORTS = 256
+
+
+@dataclass(frozen=True)
+class ReceivedFrame:
+    """One frame behind the equaliser.
+
+    Attributes:
+        message: What arrived: ids, times, codec.
+        camera: Of the agent that sent it.
+        received: What the codec decodes; None when the whole frame was lost on the air, of which the receiver
+            learns in replay only.
+        snr_db: The receiver's estimate of the link's SNR, None with ``received``.
+        snr_db_set: What the channel node says it applied, for plots only; None where it says nothing.
+        t_arrival_ns: ``perf_counter_ns`` when the message arrived.
+        age_ms: Time from capture until now, over that of the fastest recent frame.
+        equalise_ms: Duration of the equaliser.
+    """
+
+    message: SymbolFrame
+    camera: CameraInfo
+    received: ReceivedImage | None
+    snr_db: float | None
+    snr_db_set: float | None
+    t_arrival_ns: int
+    age_ms: float
+    equalise_ms: float
+
+    @property
+    def slot_snr_db(self) -> NDArray[np.float32] | None:
+        """``(num_slots,)`` effective SNR of each slot, None when the frame was lost."""
+        return self.received.effective_snr_db if self.received is not None else None
+
+
+class Receiver:
+    """Takes the frames of one agent from the network. ``next`` belongs to one thread.
+
+    In ``live`` mode the newest frame wins; in ``replay`` every frame is delivered once and in order, and the
+    agent is told how many it may send. Frames of the other kind are dropped as ``mode``. What does not get to
+    ``next`` is counted in ``metrics`` by reason, see ``Arrivals``; further reasons are ``camera`` (nobody
+    says what the camera is), ``too_old`` and ``protocol``.
+
+    Args:
+        session: An open session.
+        agent_id: Whose frames.
+        mode: Service.
+        metrics: Where to count.
+        max_age_ms: Live frames older than this are dropped.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        agent_id: str,
+        mode: Mode,
+        metrics: Metrics,
+        max_age_ms: float = 1000.0,
+    ) -> None:
+        if mode not in ("live", "replay"):
+            raise ValueError(f"mode must be live or replay, got {mode!r}")
+        if not max_age_ms > 0:
+            raise ValueError(f"max_age_ms must be positive, got {max_age_ms:g}")
+        self._session = session
+        self._agent_id = agent_id
+        self._mode = mode
+        self._metrics = metrics
+        self._max_age_ms = max_age_ms
+        self._lock = threading.Lock()
+        self._arrivals = Arrivals(lossless=mode == "replay", drop=metrics.drop)
+        self._box: Mailbox[tuple[SymbolFrame, int]] = Mailbox(1 if mode == "live" else 4 * WINDOW, "newest")
+        self._held: tuple[SymbolFrame, int] | None = None
+        self._cameras: dict[int, CameraInfo] = {}
+        self._snr_set: OrderedDict[tuple[int, int], float] = OrderedDict()
+        self._roles: set[str] = set()
+        self._told: set[str] = set()
+        self._link = session.publisher(link_key(agent_id), "newest")
+        self._flow = session.publisher(flow_key(agent_id), "newest")
+        self._stopping = threading.Event()
+        session.subscribe(camera_key(agent_id), "every", self._on_camera)
+        session.subscribe(channel_key(agent_id), "newest", self._on_report, _RING_CAPACITY)
+        session.watch_alive(agent_id, self._on_alive)
+        session.subscribe(rx_key(agent_id), "newest", self._on_symbols, _RING_CAPACITY)
+        self._thread: threading.Thread | None = None
+        if mode == "replay":
+            self._thread = threading.Thread(target=self._beat, name="semcast-flow", daemon=True)
+            self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def roles_alive(self) -> frozenset[str]:
+        """Roles of this stream that are alive now."""
+        with self._lock:
+            return frozenset(self._roles)
+
+    @property
+    def agent_epoch(self) -> int:
+        """Epoch of the newest agent heard, 0 before the first frame."""
+        with self._lock:
+            return self._arrivals.epoch
+
+    def _tell_once(self, text: str) -> None:
+        if text not in self._told and len(self._told) < 100:
+            self._told.add(text)
+            logger.warning("%s", text)
+
+    def _on_alive(self, role: str, alive: bool) -> None:
+        with self._lock:
+            known = role in self._roles
+            (self._roles.add if alive else self._roles.discard)(role)
+        if known != alive and role != "server":
+            logger.info("%s %s", role, "is there" if alive else "is gone")
+
+    def _on_camera(self, payload: bytes) -> None:
+        try:
+            camera = unpack(payload, CameraInfo)
+        except WireError as err:
+            self._refuse(err)
+            return
+        with self._lock:
+            self._cameras[camera.agent_epoch] = camera
+            while len(self._cameras) > 16:
+                del self._cameras[min(self._cameras)]
+
+    def _on_report(self, payload: bytes) -> None:
+        try:
+            report = unpack(payload, ChannelReport)
+        except WireError as err:
+            self._refuse(err)
+            return
+        with self._lock:
+            self._snr_set[(report.agent_epoch, report.frame_id)] = report.snr_db_set
+            while len(self._snr_set) > _KEPT_REPORTS:
+                self._snr_set.popitem(last=False)
+
+    def _refuse(self, err: WireError) -> None:
+        self._metrics.drop("protocol")
+        self._metrics.count(f"protocol_{err.reason}")
+        self._tell_once(f"a message was refused: {err}")
+
+    def _on_symbols(self, payload: bytes) -> None:
+        arrival_ns = time.perf_counter_ns()
+        try:
+            frame = unpack(payload, SymbolFrame)
+            if frame.direction != "rx":
+                raise WireError("kind", f"frame must be rx, got {frame.direction}")
+        except WireError as err:
+            self._refuse(err)
+            return
+        self._metrics.count("received")
+        if frame.lossless != (self._mode == "replay"):
+            self._metrics.drop("mode")
+            there = "replay" if frame.lossless else "live"
+            self._tell_once(
+                f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
+            )
+            return
+        with self._lock:
+            new_epoch = frame.agent_epoch != self._arrivals.epoch
+            taken = self._arrivals.accept(frame, arrival_ns)
+            if taken and new_epoch:
+                dropped = self._box.clear()
+                self._metrics.drop("epoch", dropped)
+            if taken:
+                before = self._box.dropped
+                self._box.put((frame, arrival_ns))
+                self._metrics.drop("superseded", self._box.dropped - before)
+        if self._mode == "replay":
+            self._send_flow()
+
+    def _beat(self) -> None:
+        while not self._stopping.wait(FLOW_INTERVAL_S):
+            self._send_flow()
+
+    def _send_flow(self) -> None:
+        with self._lock:
+            arrivals = self._arrivals
+            flow = FlowMessage(
+                agent_epoch=arrivals.epoch,
+                next_seq=arrivals.next_seq,
+                arrived_seq=arrivals.arrived_seq,
+                window=WINDOW,
+            )
+        try:
+            self._flow.put(pack(flow))
+        except TransportError as err:
+            logger.debug("flow not sent: %s", err)
+
+    def next(self, timeout_s: float) -> ReceivedFrame | None:
+        """Return the next frame, None when there is none in time.
+
+        In replay, taking a frame is what lets the agent send another.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while not self._stopping.is_set():
+            entry = (
+                self._held
+                if self._held is not None
+                else self._box.get(max(0.0, deadline_s - time.monotonic()))
+            )
+            if entry is None:
+                return None
+            self._held = None
+            frame = self._prepare(*entry)
+            if frame is not None:
+                return frame
+            if self._held is not None and time.monotonic() >= deadline_s:
+                return None
+        return None
+
+    def _prepare(self, message: SymbolFrame, arrival_ns: int) -> ReceivedFrame | None:
+        age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
+        live = self._mode == "live"
+        if live and age_ms > self._max_age_ms:
+            self._metrics.drop("too_old")
+            return None
+        camera = self._camera_of(message.agent_epoch)
+        if camera is None:
+            self._tell_once("frames arrive, but the agent does not say what its camera is")
+            if live:
+                self._metrics.drop("camera")
+            else:
+                self._held = (message, arrival_ns)
+            return None
+        received, snr_db, equalise_ms = None, None, 0.0
+        if message.payload_format == "lost":
+            self._metrics.count("lost_on_air")
+        elif camera.image_wh != (message.image_hw[1], message.image_hw[0]):
+            self._metrics.drop("protocol")
+            self._tell_once(f"frames are {message.image_hw} but the camera is {camera.image_wh}")
+            self._took(message)
+            return None
+        else:
+            started_ns = time.perf_counter_ns()
+            equalised = equalise(
+                slots_of(message), message.image_hw, message.modulation, slot_lost=lost_slots_of(message)
+            )
+            equalise_ms = (time.perf_counter_ns() - started_ns) * 1e-6
+            received, snr_db = equalised.received, float(equalised.snr_db)
+            self._metrics.observe("equalise", equalise_ms)
+            self._report(message, snr_db)
+        self._took(message)
+        self._metrics.count("delivered")
+        with self._lock:
+            snr_db_set = self._snr_set.get((message.agent_epoch, message.frame_id))
+        return ReceivedFrame(
+            message=message,
+            camera=camera,
+            received=received,
+            snr_db=snr_db,
+            snr_db_set=snr_db_set,
+            t_arrival_ns=arrival_ns,
+            age_ms=age_ms,
+            equalise_ms=equalise_ms,
+        )
+
+    def _took(self, message: SymbolFrame) -> None:
+        with self._lock:
+            self._arrivals.took(message)
+        if self._mode == "replay":
+            self._send_flow()
+
+    def _camera_of(self, epoch: int) -> CameraInfo | None:
+        with self._lock:
+            camera = self._cameras.get(epoch)
+        if camera is not None:
+            return camera
+        try:
+            answer = self._session.request(camera_key(self._agent_id), b"", _CAMERA_TIMEOUT_S)
+        except TransportError:
+            return None
+        if answer is not None:
+            self._on_camera(answer)
+        with self._lock:
+            return self._cameras.get(epoch)
+
+    def _report(self, message: SymbolFrame, snr_db: float) -> None:
+        report = LinkReport(
+            agent_epoch=message.agent_epoch,
+            frame_id=message.frame_id,
+            snr_db_estimate=float(np.clip(snr_db, -100.0, 100.0)),
+            t_capture_ns=message.t_capture_ns,
+        )
+        try:
+            self._link.put(pack(report))
+        except TransportError as err:
+            logger.debug("link report not sent: %s", err)
+
+    def close(self) -> None:
+        """Take no more frames. Idempotent; subscriptions end with the session."""
+        self._stopping.set()
+        self._box.close()
+        if self._thread is not None:
+            self._thread.join(2.0)
