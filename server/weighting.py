@@ -76,3 +76,165 @@ class NoiseModel:
         """
         sigma = np.minimum(self.sigma_px(confidence), 3.0 * self.sigma0_px)
         return np.asarray(GATE_SIGMAS * sigma)
+
+
+def fit_noise(
+    confidence: Array,
+    residual_px: Array,
+    *,
+    num_bins: int = 8,
+    min_per_bin: int = 12,
+    max_beta: float = BETA_RANGE[1],
+    significance: float = 2.0,
+) -> NoiseModel | None:
+    """Fit ``log sigma^2 = log sigma0^2 + beta (1 - c)`` to residuals, robustly.
+
+    Residuals are grouped by quantiles of confidence, each group's spread is its median absolute value, and a
+    line goes through the groups. A slope that is not clearly positive becomes 0.
+
+    Args:
+        confidence: ``(N,)`` in [0, 1].
+        residual_px: ``(N,)`` residuals per coordinate, sign of no matter.
+        num_bins: Groups at most.
+        min_per_bin: Residuals a group needs.
+        max_beta: Upper end of beta.
+        significance: Standard errors the slope must exceed to count.
+
+    Returns:
+        The model, or None with fewer residuals than one group needs.
+    """
+    count = len(confidence)
+    if count < min_per_bin:
+        return None
+    size = np.abs(residual_px)
+    flat = NoiseModel(_clip_sigma0(float(np.median(size)) * _MAD_TO_SIGMA), 0.0)
+    bins = min(num_bins, count // min_per_bin)
+    if bins < 3 or float(np.ptp(confidence)) < 1e-3:
+        return flat
+    order = np.argsort(confidence, kind="stable")
+    groups = np.array_split(order, bins)
+    doubt = np.array([1.0 - float(np.mean(confidence[g])) for g in groups])
+    spread = np.array([float(np.median(size[g])) for g in groups]) * _MAD_TO_SIGMA
+    log_variance = 2.0 * np.log(np.maximum(spread, 1e-3))
+    # The standard error of log sigma^2 from a median of n absolute values is about 2.33 / sqrt(n).
+    precision = np.array([len(g) for g in groups]) / 2.33**2
+    mean_doubt = float((precision * doubt).sum() / precision.sum())
+    mean_log = float((precision * log_variance).sum() / precision.sum())
+    spread_of_doubt = float((precision * (doubt - mean_doubt) ** 2).sum())
+    if spread_of_doubt < 1e-9:
+        return flat
+    slope = float((precision * (doubt - mean_doubt) * (log_variance - mean_log)).sum()) / spread_of_doubt
+    scatter = log_variance - mean_log - slope * (doubt - mean_doubt)
+    misfit = max(1.0, float((precision * scatter**2).sum()) / max(1, bins - 2))
+    if slope < significance * np.sqrt(misfit / spread_of_doubt):
+        return flat
+    beta = min(slope, max_beta)
+    return NoiseModel(_clip_sigma0(float(np.exp(0.5 * (mean_log - beta * mean_doubt)))), beta)
+
+
+def _clip_sigma0(sigma0_px: float) -> float:
+    return float(np.clip(sigma0_px, *SIGMA0_RANGE_PX))
+
+
+class OnlineNoise:
+    """The noise model in use, fitted again to the residuals of each bundle adjustment.
+
+    Args:
+        mode: ``paper`` keeps what is given; ``off`` and ``constant`` fit sigma0 alone.
+        sigma0_px: Start.
+        beta: In mode ``paper``; the others start at 0 and fit.
+        fit: False keeps the start in every mode.
+    """
+
+    def __init__(self, mode: ConfidenceMode, sigma0_px: float, beta: float, fit: bool) -> None:
+        self._mode = mode
+        self._fit = fit and mode != "paper"
+        start_beta = beta if mode == "paper" or (not fit and mode != "off") else 0.0
+        self.model = NoiseModel(sigma0_px, start_beta)
+        self._recent: deque[tuple[Array, Array]] = deque(maxlen=8)
+
+    def add(self, confidence: Array, residual_px: Array) -> None:
+        """Take the residuals per coordinate of one adjustment, inliers and mild outliers, and fit again.
+
+        The model moves half of the way, so that one bad window does not overturn it.
+        """
+        if not self._fit or len(confidence) == 0:
+            return
+        self._recent.append((confidence, residual_px))
+        fitted = fit_noise(
+            np.concatenate([c for c, _ in self._recent]), np.concatenate([r for _, r in self._recent])
+        )
+        if fitted is None:
+            return
+        beta = 0.0 if self._mode == "off" else 0.5 * (self.model.beta + fitted.beta)
+        sigma0 = float(np.sqrt(self.model.sigma0_px * fitted.sigma0_px))
+        self.model = NoiseModel(_clip_sigma0(sigma0), beta if beta > 0.02 else 0.0)
+
+    def state(self) -> Array:
+        """Parameters for a checkpoint: ``[sigma0_px, beta]``."""
+        return np.array([self.model.sigma0_px, self.model.beta])
+
+    def restore(self, state: Array) -> None:
+        """Go on from ``state``."""
+        self.model = NoiseModel(float(state[0]), float(state[1]))
+        self._recent.clear()
+
+
+@dataclass(frozen=True)
+class KeypointCues:
+    """All that is known about the localisation of keypoints in one image.
+
+    Attributes:
+        pixel_confidence: ``(N,)`` the codec's confidence at the keypoint, or None.
+        keypoint_confidence: ``(N,)`` its displacement head at the keypoint, or None.
+        gradient_grey2: ``(N,)`` smaller eigenvalue of the structure tensor, mean over the window per pixel.
+        forward_backward_px: ``(N,)`` distance of tracking there and back.
+        photometric_grey: ``(N,)`` mean absolute difference of the tracked windows.
+    """
+
+    pixel_confidence: Array | None
+    keypoint_confidence: Array | None
+    gradient_grey2: Array
+    forward_backward_px: Array
+    photometric_grey: Array
+
+
+def geometric_confidence(cues: KeypointCues) -> Array:
+    """Confidence in a keypoint's *position*: ``1 / (1 + d)`` of the displacement ``d`` that is expected.
+
+    Pixel confidence alone misleads: pixel errors are largest on strong edges, where localisation is best. So the
+    image noise it stands for is divided by the structure tensor (the localisation bound), and what the
+    displacement head and the tracker itself say is added as independent variance.
+    """
+    noise_grey = np.full(len(cues.gradient_grey2), 2.0)
+    if cues.pixel_confidence is not None:
+        noise_grey = np.maximum(noise_grey, 255.0 * (1.0 - np.clip(cues.pixel_confidence, 0.0, 1.0)))
+    noise_grey = np.maximum(noise_grey, cues.photometric_grey)
+    # Noise of decoded images is correlated over blocks: a window holds about 16 independent values.
+    bound_px2 = noise_grey**2 / (16.0 * np.maximum(cues.gradient_grey2, 0.5))
+    variance_px2 = bound_px2 + cues.forward_backward_px**2
+    if cues.keypoint_confidence is not None:
+        head_px = displacement_px(np.clip(cues.keypoint_confidence, 0.0, 1.0).astype(np.float32))
+        variance_px2 = variance_px2 + np.minimum(head_px.astype(np.float64), 20.0) ** 2
+    return np.asarray(1.0 / (1.0 + np.sqrt(variance_px2)))
+
+
+def observation_confidence(mode: ConfidenceMode, cues: KeypointCues, rng: np.random.Generator) -> Array:
+    """The ``c`` of each keypoint that the noise model is given in a mode, ``(N,)`` in [0, 1].
+
+    ``off`` is 1 everywhere. ``constant``, ``shuffled`` and ``inverted`` damage the confidence of ``robust``:
+    by its mean, by mixing it among the keypoints, and by turning it round.
+    """
+    count = len(cues.gradient_grey2)
+    if mode == "off":
+        return np.ones(count)
+    if mode == "paper":
+        return np.ones(count) if cues.pixel_confidence is None else np.clip(cues.pixel_confidence, 0.0, 1.0)
+    c = geometric_confidence(cues)
+    if mode == "constant":
+        return np.full(count, float(c.mean()) if count else 1.0)
+    if mode == "shuffled":
+        return np.asarray(rng.permutation(c))
+    if mode == "inverted":
+        return np.asarray(1.0 - c)
+    return c

@@ -1,0 +1,240 @@
+"""Keypoints: corners spread over the image, tracking from frame to frame, descriptors on keyframes."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+#: Side of the KLT window.
+KLT_WINDOW_PX = 21
+#: Points nearer to the border have no whole window.
+BORDER_PX = 8
+#: OpenCV's KLT gives the smaller eigenvalue of the mean structure tensor in units of 32^2 / 2^20 grey^2.
+_EIGEN_UNIT = 1024.0
+#: Corners weaker than this mean gradient energy (grey levels^2 per pixel) are noise.
+_MIN_EIGEN_GREY2 = 2.0
+_ORB_SCALE = 1.2
+
+
+def to_grey(image: NDArray[np.uint8]) -> Grey:
+    """Return the ``(H, W)`` uint8 grey image of an ``(H, W, 3)`` RGB image."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+
+
+def corner_strength(grey: Grey, block_px: int = 5) -> NDArray[np.float32]:
+    """Smaller eigenvalue of the structure tensor, mean over the block, in grey levels^2 per pixel^2."""
+    scaled = cv2.cornerMinEigenVal(grey, block_px, ksize=3)
+    return np.asarray(scaled * np.float32(255.0**2 / 4.0), dtype=np.float32)
+
+
+def detect_corners(
+    grey: Grey,
+    num_wanted: int,
+    occupied_xy: Array | None = None,
+    usable: NDArray[np.bool_] | None = None,
+    cell_px: int = 48,
+) -> NDArray[np.float32]:
+    """Find corners, spread over the image by taking the strongest of every cell.
+
+    Args:
+        grey: ``(H, W)``.
+        num_wanted: At most so many.
+        occupied_xy: ``(M, 2)`` keypoints that are there already: their neighbourhood is left out and
+            counts for its cell.
+        usable: ``(H, W)`` bool, False where no corner may be taken (lost bands).
+        cell_px: Side of a cell.
+
+    Returns:
+        ``(N, 2)`` float32 pixels, strongest first within each round over the cells.
+    """
+    height, width = grey.shape
+    if num_wanted <= 0 or height <= 2 * BORDER_PX or width <= 2 * BORDER_PX:
+        return np.zeros((0, 2), np.float32)
+    strength = corner_strength(grey)
+    peak = (strength >= cv2.dilate(strength, np.ones((7, 7), np.uint8))) & (strength > _MIN_EIGEN_GREY2)
+    peak[:BORDER_PX] = peak[-BORDER_PX:] = False
+    peak[:, :BORDER_PX] = peak[:, -BORDER_PX:] = False
+    if usable is not None:
+        peak &= usable
+    columns = -(-width // cell_px)
+    num_cells = columns * -(-height // cell_px)
+    counts = np.zeros(num_cells, np.int64)
+    if occupied_xy is not None and len(occupied_xy):
+        x = np.clip(np.rint(occupied_xy[:, 0]).astype(int), 0, width - 1)
+        y = np.clip(np.rint(occupied_xy[:, 1]).astype(int), 0, height - 1)
+        near = np.zeros((height, width), np.uint8)
+        near[y, x] = 1
+        peak &= cv2.dilate(near, np.ones((15, 15), np.uint8)) == 0
+        counts = np.bincount(y // cell_px * columns + x // cell_px, minlength=num_cells)
+    ys, xs = np.nonzero(peak)
+    if len(xs) == 0:
+        return np.zeros((0, 2), np.float32)
+    value = strength[ys, xs]
+    cell = ys // cell_px * columns + xs // cell_px
+    order = np.lexsort((-value, cell))
+    cell, value, xs, ys = cell[order], value[order], xs[order], ys[order]
+    first = np.searchsorted(cell, cell)
+    turn = np.arange(len(cell)) - first + counts[cell]
+    chosen = np.lexsort((-value, turn))[:num_wanted]
+    corners = np.stack([xs[chosen], ys[chosen]], axis=1).astype(np.float32)
+    refined = cv2.cornerSubPix(
+        grey, corners.reshape(-1, 1, 2).copy(), (3, 3), (-1, -1), (cv2.TERM_CRITERIA_COUNT, 5, 0.03)
+    ).reshape(-1, 2)
+    far = ~(np.abs(refined - corners).max(axis=1) <= 3.0)
+    refined[far] = corners[far]
+    return np.asarray(refined, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class TrackedPoints:
+    """Where points went.
+
+    Attributes:
+        xy: ``(N, 2)`` float64 pixels in the second image.
+        ok: ``(N,)`` bool: found, inside, and found again backwards.
+        forward_backward_px: ``(N,)`` distance of the way there and back from its start.
+        photometric_grey: ``(N,)`` mean absolute difference of the windows in grey levels.
+        gradient_grey2: ``(N,)`` smaller eigenvalue of the second window's structure tensor, mean per pixel.
+    """
+
+    xy: Array
+    ok: NDArray[np.bool_]
+    forward_backward_px: Array
+    photometric_grey: Array
+    gradient_grey2: Array
+
+    @staticmethod
+    def none(count: int) -> "TrackedPoints":
+        """No point was found."""
+        return TrackedPoints(
+            np.zeros((count, 2)), np.zeros(count, bool), np.full(count, 9.0), np.zeros(count), np.zeros(count)
+        )
+
+
+def track_points(
+    grey0: Grey,
+    grey1: Grey,
+    xy0: Array,
+    guess1_xy: Array,
+    *,
+    max_forward_backward_px: float = 1.5,
+    max_level: int = 3,
+    window_px: int = KLT_WINDOW_PX,
+) -> TrackedPoints:
+    """Follow points by Lucas-Kanade, there and back.
+
+    Args:
+        grey0: Image the points are known in.
+        grey1: Image they are looked for in.
+        xy0: ``(N, 2)`` pixels in ``grey0``.
+        guess1_xy: ``(N, 2)`` where they are expected in ``grey1``.
+        max_forward_backward_px: Points that come back further off are not ``ok``.
+        max_level: Pyramid levels above the full image.
+        window_px: Side of the window.
+    """
+    count = len(xy0)
+    if count == 0 or grey0.shape != grey1.shape:
+        return TrackedPoints.none(count)
+    height, width = grey1.shape
+    start = np.ascontiguousarray(xy0, dtype=np.float32)
+    guess = np.clip(np.nan_to_num(guess1_xy), (0, 0), (width - 1, height - 1)).astype(np.float32)
+    window = (window_px, window_px)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
+    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    found, status, error = cv2.calcOpticalFlowPyrLK(
+        grey0, grey1, start, guess.copy(), None, None, window, max_level, criteria, flags, 1e-4
+    )
+    found = np.nan_to_num(found.reshape(-1, 2), nan=-1e4, posinf=-1e4, neginf=-1e4)
+    inside = (found[:, 0] >= 1) & (found[:, 1] >= 1) & (found[:, 0] < width - 2) & (found[:, 1] < height - 2)
+    ok = inside & (status.ravel() == 1)
+    backward_guess = (start + (guess - found)).astype(np.float32)
+    backward_guess = np.clip(backward_guess, start - 20.0, start + 20.0)
+    back, back_status, eigen = cv2.calcOpticalFlowPyrLK(
+        grey1,
+        grey0,
+        np.ascontiguousarray(np.clip(found, 0, (width - 1, height - 1)), dtype=np.float32),
+        backward_guess,
+        None,
+        None,
+        window,
+        min(2, max_level),
+        criteria,
+        flags | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS,
+        1e-4,
+    )
+    distance = np.linalg.norm(back.reshape(-1, 2).astype(np.float64) - start, axis=1)
+    distance = np.where((back_status.ravel() == 1) & np.isfinite(distance), distance, 99.0)
+    ok &= distance <= max_forward_backward_px
+    return TrackedPoints(
+        xy=found.astype(np.float64),
+        ok=ok,
+        forward_backward_px=distance,
+        photometric_grey=np.nan_to_num(error.ravel().astype(np.float64)),
+        gradient_grey2=np.maximum(eigen.ravel().astype(np.float64) * _EIGEN_UNIT, 0.0),
+    )
+
+
+def sample_map(values: NDArray[np.float32], keypoints_xy: Array) -> Array:
+    """Value of the nearest pixel of an ``(H, W)`` map at ``(N, 2)`` pixels; NaN counts as 0."""
+    height, width = values.shape
+    xy = np.nan_to_num(keypoints_xy)
+    x = np.clip(np.rint(xy[:, 0]), 0, width - 1).astype(np.intp)
+    y = np.clip(np.rint(xy[:, 1]), 0, height - 1).astype(np.intp)
+    return np.nan_to_num(values[y, x].astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
+
+
+def deduplicate(keypoints_xy: Array, cell_px: float = 4.0) -> NDArray[np.bool_]:
+    """Mark the first of all points that share a cell."""
+    key = np.floor(keypoints_xy / cell_px).astype(np.int64)
+    _, first = np.unique(key[:, 0] * 1_000_003 + key[:, 1], return_index=True)
+    keep = np.zeros(len(keypoints_xy), bool)
+    keep[first] = True
+    return keep
+
+
+class Describer:
+    """Binary descriptors (ORB, upright) of given points, and their matching."""
+
+    def __init__(self) -> None:
+        self._orb = cv2.ORB_create(
+            nfeatures=5000, scaleFactor=_ORB_SCALE, nlevels=5, edgeThreshold=16, patchSize=31
+        )
+
+    def describe(
+        self, grey: Grey, keypoints_xy: Array, octaves: tuple[int, ...] = (0,)
+    ) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
+        """Describe points, each at every given octave of a pyramid with factor 1.2.
+
+        Returns:
+            ``(M,)`` row of each descriptor's point and ``(M, 32)`` uint8 descriptors; points near the
+            border have none.
+        """
+        keypoints = [
+            cv2.KeyPoint(float(x), float(y), 31.0 * _ORB_SCALE**octave, 0.0, 1.0, octave, row)
+            for octave in octaves
+            for row, (x, y) in enumerate(keypoints_xy)
+        ]
+        if not keypoints or min(grey.shape) < 64:
+            return np.zeros(0, np.intp), np.zeros((0, 32), np.uint8)
+        kept, descriptors = self._orb.compute(grey, keypoints)
+        if descriptors is None or not len(kept):
+            return np.zeros(0, np.intp), np.zeros((0, 32), np.uint8)
+        return np.array([k.class_id for k in kept], dtype=np.intp), descriptors
+
+
+def match_descriptors(
+    descriptors0: NDArray[np.uint8], descriptors1: NDArray[np.uint8], max_distance: int = 64
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Match descriptors that are each other's nearest; rows into both, best first."""
+    if len(descriptors0) == 0 or len(descriptors1) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors0, descriptors1)
+    matches = sorted((m for m in matches if m.distance <= max_distance), key=lambda m: m.distance)
+    return (
+        np.array([m.queryIdx for m in matches], dtype=np.intp),
+        np.array([m.trainIdx for m in matches], dtype=np.intp),
+    )

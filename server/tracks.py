@@ -1,0 +1,223 @@
+"""Keypoint tracks: points followed from image to image, with the confidence of their newest position."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.phy.slots import BLOCK_PX
+from semcast.server.features import (
+    KLT_WINDOW_PX,
+    Grey,
+    corner_strength,
+    deduplicate,
+    detect_corners,
+    sample_map,
+    track_points,
+)
+from semcast.server.state import DecodedFrame
+from semcast.server.weighting import ConfidenceMode, KeypointCues, observation_confidence
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Slots at or below this SNR hold nothing of the image (a lost slot is at -20 dB).
+LOST_SLOT_DB = -15.0
+#: A track may be out of sight for so many frames, as long as the image is what is missing.
+MAX_COAST = 3
+#: Share of tracks that must be found again; below, the frame counts as damaged and all tracks coast.
+_MIN_FOUND_SHARE = 0.35
+
+
+def usable_rows(frame: DecodedFrame, height: int) -> NDArray[np.bool_]:
+    """Which rows of the image arrived, ``(H,)``; all where nothing is known about slots."""
+    usable = np.ones(height, bool)
+    if frame.slot_snr_db is not None:
+        snr = np.nan_to_num(np.asarray(frame.slot_snr_db, dtype=np.float64), nan=-99.0)
+        lost = np.repeat(snr <= LOST_SLOT_DB, BLOCK_PX)[:height]
+        usable[: len(lost)] = ~lost
+    return usable
+
+
+@dataclass(frozen=True)
+class Sight:
+    """An image as the tracks see it.
+
+    Attributes:
+        frame: As received.
+        grey: ``(H, W)``.
+        usable: ``(H,)`` bool, rows that arrived.
+    """
+
+    frame: DecodedFrame
+    grey: Grey
+    usable: NDArray[np.bool_]
+
+    def near_lost(self, xy: Array, margin_px: int) -> NDArray[np.bool_]:
+        """Which points have a lost row within the margin."""
+        if self.usable.all():
+            return np.zeros(len(xy), bool)
+        reach = np.convolve(~self.usable, np.ones(2 * margin_px + 1, int), mode="same") > 0
+        y = np.clip(np.rint(np.nan_to_num(xy[:, 1])), 0, len(self.usable) - 1).astype(np.intp)
+        return np.asarray(reach[y])
+
+
+class TrackTable:
+    """All tracks that are alive.
+
+    Attributes:
+        ids: ``(N,)`` int64, ascending.
+        xy: ``(N, 2)`` newest position, in the image of its last sight.
+        velocity: ``(N, 2)`` pixels per frame at the last sight.
+        confidence: ``(N,)`` of the newest position.
+        age: ``(N,)`` int64, frames it was seen in.
+        missed: ``(N,)`` int64, frames since its last sight; 0 is visible now.
+    """
+
+    def __init__(self, mode: ConfidenceMode, max_features: int, seed: int) -> None:
+        self._mode: ConfidenceMode = mode
+        self._max_features = max_features
+        self._rng = np.random.default_rng(seed)
+        self._next_id = 0
+        self._greys: list[Grey] = []
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all tracks; ids go on."""
+        self.ids: Ids = np.zeros(0, np.int64)
+        self.xy: Array = np.zeros((0, 2))
+        self.velocity: Array = np.zeros((0, 2))
+        self.confidence: Array = np.zeros(0)
+        self.age: Ids = np.zeros(0, np.int64)
+        self.missed: Ids = np.zeros(0, np.int64)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def next_id(self) -> int:
+        """Id of the next track."""
+        return self._next_id
+
+    @next_id.setter
+    def next_id(self, value: int) -> None:
+        self._next_id = value
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        """Tracks seen in the newest image."""
+        return self.missed == 0
+
+    def keep(self, mask: NDArray[np.bool_]) -> None:
+        """Forget tracks outside the mask."""
+        for name in ("ids", "xy", "velocity", "confidence", "age", "missed"):
+            setattr(self, name, getattr(self, name)[mask])
+
+    def adopt(self, ids: Ids, xy: Array, confidence: float) -> None:
+        """Replace all tracks by points of the newest image, as after relocalisation.
+
+        Ids that occur twice are taken once.
+        """
+        self.ids, first = np.unique(ids, return_index=True)
+        self.xy = xy[first].copy()
+        count = len(first)
+        self.velocity = np.zeros((count, 2))
+        self.confidence = np.full(count, confidence)
+        self.age = np.ones(count, np.int64)
+        self.missed = np.zeros(count, np.int64)
+
+    def follow(self, sight: Sight, guess_xy: Array, max_level: int = 3) -> None:
+        """Look for every track in a new image.
+
+        A track that runs into rows that did not arrive coasts: it is looked for again from the image it was
+        last seen in. So do all tracks when hardly any is found, because then the image is at fault.
+
+        Args:
+            sight: The new image.
+            guess_xy: ``(N, 2)`` expected positions.
+            max_level: KLT pyramid levels.
+        """
+        count = len(self)
+        found = np.zeros(count, bool)
+        xy, forward_backward = self.xy.copy(), np.full(count, 9.0)
+        photometric, gradient = np.zeros(count), np.zeros(count)
+        for back in range(min(len(self._greys), MAX_COAST + 1)):
+            rows = np.flatnonzero(self.missed == back)
+            if len(rows) == 0:
+                continue
+            points = track_points(
+                self._greys[-1 - back], sight.grey, self.xy[rows], guess_xy[rows], max_level=max_level
+            )
+            found[rows] = points.ok
+            xy[rows] = points.xy
+            forward_backward[rows] = points.forward_backward_px
+            photometric[rows] = points.photometric_grey
+            gradient[rows] = points.gradient_grey2
+        expected = np.where(found[:, None], xy, guess_xy)
+        hidden = sight.near_lost(expected, KLT_WINDOW_PX // 2 - 2)
+        found &= ~hidden
+        seen_share = found.sum() / max(1, count - int(hidden.sum()))
+        coasting = ~found & (hidden | (seen_share < _MIN_FOUND_SHARE))
+        steps = (self.missed + 1)[:, None]
+        self.velocity = np.where(found[:, None], (xy - self.xy) / steps, self.velocity)
+        self.xy = np.where(found[:, None], xy, self.xy)
+        self.age = self.age + found
+        self.missed = np.where(found, 0, self.missed + 1)
+        cues = self._cues(sight, xy[found], forward_backward[found], photometric[found], gradient[found])
+        self.confidence[found] = observation_confidence(self._mode, cues, self._rng)
+        alive = found | (coasting & (self.missed <= MAX_COAST))
+        alive[found] &= deduplicate(self.xy[found])
+        self.keep(alive)
+        self.remember(sight)
+
+    def remember(self, sight: Sight) -> None:
+        """Keep the image for tracks that are looked for in later ones."""
+        self._greys = [*self._greys[-MAX_COAST:], sight.grey]
+
+    def refill(self, sight: Sight) -> int:
+        """Start new tracks where there are none; the number started.
+
+        ``remember`` or ``follow`` must have taken the image before.
+        """
+        wanted = self._max_features - int(self.visible.sum())
+        if wanted < self._max_features // 20:
+            return 0
+        usable = None
+        if not sight.usable.all():
+            rows = np.convolve(~sight.usable, np.ones(KLT_WINDOW_PX, int), mode="same") == 0
+            usable = np.repeat(rows[:, None], sight.grey.shape[1], axis=1)
+        height, width = sight.grey.shape
+        cell_px = int(np.clip(np.sqrt(height * width / max(1.0, self._max_features / 2.5)), 16, 96))
+        corners = detect_corners(sight.grey, wanted, self.xy[self.visible], usable, cell_px).astype(
+            np.float64
+        )
+        count = len(corners)
+        if count == 0:
+            return 0
+        strength = sample_map(corner_strength(sight.grey), corners)
+        cues = self._cues(sight, corners, np.full(count, 0.1), np.zeros(count), strength)
+        self.ids = np.concatenate([self.ids, self._next_id + np.arange(count, dtype=np.int64)])
+        self._next_id += count
+        around = self.velocity[self.visible]
+        velocity = np.median(around, axis=0) if len(around) else np.zeros(2)
+        self.xy = np.concatenate([self.xy, corners])
+        self.velocity = np.concatenate([self.velocity, np.tile(velocity, (count, 1))])
+        self.confidence = np.concatenate(
+            [self.confidence, observation_confidence(self._mode, cues, self._rng)]
+        )
+        self.age = np.concatenate([self.age, np.ones(count, np.int64)])
+        self.missed = np.concatenate([self.missed, np.zeros(count, np.int64)])
+        return count
+
+    @staticmethod
+    def _cues(
+        sight: Sight, xy: Array, forward_backward: Array, photometric: Array, gradient: Array
+    ) -> KeypointCues:
+        pixel, keypoint = sight.frame.confidence, sight.frame.keypoint_confidence
+        return KeypointCues(
+            pixel_confidence=None if pixel is None else sample_map(pixel, xy),
+            keypoint_confidence=None if keypoint is None else sample_map(keypoint, xy),
+            gradient_grey2=gradient,
+            forward_backward_px=forward_backward,
+            photometric_grey=photometric,
+        )

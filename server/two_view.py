@@ -1,0 +1,219 @@
+"""Relative pose of two images from matches.
+
+``robust``: PoseLib's LO-RANSAC twice, once drawing uniformly and once the trusted matches first, judged by a
+score that does not know confidence; then a refinement whose weights are fitted to this pair's own residuals,
+kept only where it fits better. A misleading confidence can therefore cost time, not accuracy.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import make_transform, project_to_so3
+from semcast.server.epipolar import (
+    depths,
+    fit_rotation,
+    fundamental_matrix,
+    msac_score,
+    rays_angle_deg,
+    refine_relative_pose,
+    rotation_residual_px,
+    sampson_px,
+)
+from semcast.server.pnp import poselib_camera
+from semcast.server.ransac import confidence_ransac, in_front
+from semcast.server.weighting import ConfidenceMode, fit_noise
+
+Array = NDArray[np.float64]
+
+MIN_MATCHES = 8
+Model = Literal["essential", "homography", "rotation"]
+
+
+@dataclass(frozen=True)
+class TwoViewResult:
+    """Relative pose of two images.
+
+    Attributes:
+        T_cam1_cam0: ``(4, 4)``, translation of length 1 (of no meaning for ``rotation``).
+        inliers: ``(N,)`` bool: near the epipolar geometry and in front of both cameras.
+        score: Confidence-free MSAC score of all matches, 0 is perfect.
+        model: ``rotation`` when turning alone explains the matches, ``homography`` when the pose came from
+            one plane, else ``essential``.
+        parallax_deg: Median angle between the rays of inliers.
+    """
+
+    T_cam1_cam0: Array
+    inliers: NDArray[np.bool_]
+    score: float
+    model: Model
+    parallax_deg: float
+
+
+def estimate_two_view(
+    camera: Intrinsics,
+    keypoints0_xy: Array,
+    keypoints1_xy: Array,
+    confidence: Array | None = None,
+    *,
+    mode: ConfidenceMode = "robust",
+    threshold_px: float = 1.0,
+    seed: int = 0,
+    max_iterations: int = 10_000,
+    min_iterations: int = 1000,
+    choose_model: bool = False,
+) -> TwoViewResult | None:
+    """Estimate the relative pose of two images.
+
+    Args:
+        camera: Of both images, without distortion.
+        keypoints0_xy: ``(N, 2)`` pixels.
+        keypoints1_xy: ``(N, 2)`` pixels, matched row by row.
+        confidence: ``(N,)`` in [0, 1], from ``weighting``; None is the same as mode ``off``.
+        mode: ``paper`` is the paper's RANSAC; ``off`` searches uniformly and refines without weights; all
+            others search twice and refine with fitted weights.
+        threshold_px: Inlier threshold on the Sampson distance.
+        seed: Of the searches.
+        max_iterations: Hypotheses of one search at most.
+        min_iterations: Hypotheses of one search at least.
+        choose_model: Also try a plane and a pure rotation, as a start of a map needs it.
+
+    Returns:
+        The result, or None with fewer than 8 matches or when nothing was found.
+    """
+    xy0 = np.ascontiguousarray(keypoints0_xy, dtype=np.float64)
+    xy1 = np.ascontiguousarray(keypoints1_xy, dtype=np.float64)
+    if len(xy0) < MIN_MATCHES or not (np.isfinite(xy0).all() and np.isfinite(xy1).all()):
+        return None
+    if mode == "paper" and confidence is not None:
+        found = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
+        if found is None:
+            return None
+        score = msac_score(sampson_px(fundamental_matrix(camera, found.T_cam1_cam0), xy0, xy1), threshold_px)
+        return _result(camera, found.T_cam1_cam0, xy0, xy1, threshold_px, score, choose_model)
+    budget = (threshold_px, seed, max_iterations, min_iterations)
+    candidates = [_search(camera, xy0, xy1, None, *budget)]
+    informative = mode != "off" and confidence is not None and float(np.ptp(confidence)) > 1e-6
+    if informative and confidence is not None:
+        candidates.append(_search(camera, xy0, xy1, np.argsort(-confidence, kind="stable"), *budget))
+    if choose_model:
+        candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
+    scored = [
+        (msac_score(sampson_px(fundamental_matrix(camera, T), xy0, xy1), threshold_px), k, T)
+        for k, T in enumerate(candidates)
+        if T is not None
+    ]
+    if not scored:
+        return None
+    # A later candidate must be better by more than the score's own noise to displace the first.
+    score, _, T = min(scored, key=lambda item: (item[0] * (1.0 if item[1] == 0 else 1.0 + 1e-3), item[1]))
+    if informative and confidence is not None:
+        T = _refine_with_confidence(camera, T, xy0, xy1, confidence, threshold_px)
+    return _result(camera, T, xy0, xy1, threshold_px, score, choose_model)
+
+
+def _search(
+    camera: Intrinsics,
+    xy0: Array,
+    xy1: Array,
+    order: NDArray[np.intp] | None,
+    threshold_px: float,
+    seed: int,
+    max_iterations: int,
+    min_iterations: int,
+) -> Array | None:
+    """PoseLib's LO-RANSAC; with an order its first matches are drawn first."""
+    options = {
+        "max_epipolar_error": threshold_px,
+        "success_prob": 0.9999,
+        "max_iterations": max_iterations,
+        "min_iterations": min_iterations,
+        "seed": seed,
+        "progressive_sampling": order is not None,
+    }
+    pinhole = poselib_camera(camera)
+    a, b = (xy0, xy1) if order is None else (xy0[order], xy1[order])
+    pose, info = poselib.estimate_relative_pose(a, b, pinhole, pinhole, options, {})
+    t = np.asarray(pose.t, dtype=np.float64)
+    length = float(np.linalg.norm(t))
+    R = np.asarray(pose.R, dtype=np.float64)
+    if info["num_inliers"] < 5 or not (np.isfinite(length) and np.isfinite(R).all()) or length == 0.0:
+        return None
+    return make_transform(project_to_so3(R), t / length)
+
+
+def _from_plane(
+    camera: Intrinsics, xy0: Array, xy1: Array, threshold_px: float, seed: int
+) -> list[Array | None]:
+    """Poses of the plane most matches lie on; none where no plane stands out."""
+    options = {"max_reproj_error": 2.0 * threshold_px, "max_iterations": 500, "seed": seed}
+    H, info = poselib.estimate_homography(xy0, xy1, options, {})
+    if info["num_inliers"] < max(MIN_MATCHES, 0.5 * len(xy0)) or not np.isfinite(H).all():
+        return []
+    on_plane = np.asarray(info["inliers"], dtype=bool)
+    K = camera.K
+    poses, _ = poselib.motion_from_homography(np.linalg.inv(K) @ np.asarray(H) @ K)
+    found: list[Array | None] = []
+    sigma_px = np.full(len(xy0), 0.5 * threshold_px)
+    for pose in poses:
+        t = np.asarray(pose.t, dtype=np.float64)
+        length = float(np.linalg.norm(t))
+        if not np.isfinite(length) or length < 1e-9 or not np.isfinite(pose.R).all():
+            continue
+        T = make_transform(project_to_so3(pose.R), t / length)
+        T = in_front(camera, T, xy0[on_plane], xy1[on_plane])
+        found.append(refine_relative_pose(camera, T, xy0, xy1, sigma_px))
+    return found
+
+
+def _refine_with_confidence(
+    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, confidence: Array, threshold_px: float
+) -> Array:
+    """Refine with the noise model fitted to this pair; unchanged where confidence tells nothing."""
+    residual = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
+    near = residual < 3.0 * threshold_px
+    model = fit_noise(confidence[near], residual[near])
+    if model is None or model.beta == 0.0:
+        return T
+    sigma = model.sigma_px(confidence)
+    refined = refine_relative_pose(camera, T, xy0, xy1, sigma)
+    return refined
+
+
+def _result(
+    camera: Intrinsics,
+    T: Array,
+    xy0: Array,
+    xy1: Array,
+    threshold_px: float,
+    score: float,
+    choose_model: bool,
+) -> TwoViewResult:
+    residual = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
+    near = residual < 2.0 * threshold_px
+    T = in_front_sign(camera, T, xy0[near], xy1[near])
+    depth0, depth1 = depths(camera, T, xy0, xy1)
+    inliers = near & (depth0 > 0) & (depth1 > 0)
+    angle = rays_angle_deg(camera, T, xy0, xy1)
+    model: Model = "essential"
+    if choose_model and near.any():
+        R = fit_rotation(camera, xy0[near], xy1[near])
+        turned = rotation_residual_px(camera, R, xy0[near], xy1[near]) < 3.0 * threshold_px
+        if turned.mean() > 0.8:
+            model = "rotation"
+    parallax = float(np.median(angle[inliers])) if inliers.any() else 0.0
+    return TwoViewResult(T, inliers, score, model, parallax)
+
+
+def in_front_sign(camera: Intrinsics, T: Array, xy0: Array, xy1: Array) -> Array:
+    """Turn the translation round when that puts more points in front of both cameras."""
+    turned = make_transform(T[:3, :3], -T[:3, 3])
+    counts = []
+    for candidate in (T, turned):
+        depth0, depth1 = depths(camera, candidate, xy0, xy1)
+        counts.append(int(((depth0 > 0) & (depth1 > 0)).sum()))
+    return turned if counts[1] > counts[0] else T

@@ -1,0 +1,333 @@
+"""The map: landmarks as arrays, keyframes with their observations, bounded in size."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.geometry import invert_transform
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+
+class Landmarks:
+    """Landmarks by id, ids ascending; an id is that of the track the landmark was made from.
+
+    Attributes:
+        ids: ``(N,)`` int64, ascending.
+        xyz: ``(N, 3)`` world frame.
+        rgb: ``(N, 3)`` uint8.
+        confidence: ``(N,)`` float32 in [0, 1], mean over the observations so far.
+        submap: ``(N,)`` int64.
+        born: ``(N,)`` int64, frame id of the keyframe that made it.
+        last_seen: ``(N,)`` int64, frame id of the last frame it was seen in.
+        num_missed: ``(N,)`` int64, observations in a row that did not agree with it.
+    """
+
+    _COLUMNS = ("ids", "xyz", "rgb", "confidence", "submap", "born", "last_seen", "num_missed")
+
+    def __init__(self) -> None:
+        self.ids: Ids = np.zeros(0, np.int64)
+        self.xyz: Array = np.zeros((0, 3))
+        self.rgb: NDArray[np.uint8] = np.zeros((0, 3), np.uint8)
+        self.confidence: NDArray[np.float32] = np.zeros(0, np.float32)
+        self.submap: Ids = np.zeros(0, np.int64)
+        self.born: Ids = np.zeros(0, np.int64)
+        self.last_seen: Ids = np.zeros(0, np.int64)
+        self.num_missed: Ids = np.zeros(0, np.int64)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def rows(self, ids: Ids) -> NDArray[np.intp]:
+        """Row of each id, -1 for one that is not there."""
+        if len(self.ids) == 0:
+            return np.full(len(ids), -1, dtype=np.intp)
+        row = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return np.asarray(np.where(self.ids[row] == ids, row, -1), dtype=np.intp)
+
+    def add(
+        self,
+        ids: Ids,
+        xyz: Array,
+        rgb: NDArray[np.uint8],
+        confidence: NDArray,
+        submap: int,
+        frame_id: int,
+    ) -> None:
+        """Add landmarks whose ids are new."""
+        if len(ids) == 0:
+            return
+        columns = {
+            "ids": ids,
+            "xyz": xyz,
+            "rgb": rgb,
+            "confidence": confidence.astype(np.float32),
+            "submap": np.full(len(ids), submap, np.int64),
+            "born": np.full(len(ids), frame_id, np.int64),
+            "last_seen": np.full(len(ids), frame_id, np.int64),
+            "num_missed": np.zeros(len(ids), np.int64),
+        }
+        order = np.argsort(np.concatenate([self.ids, ids]), kind="stable")
+        for name, values in columns.items():
+            setattr(self, name, np.concatenate([getattr(self, name), values])[order])
+
+    def keep(self, mask: NDArray[np.bool_]) -> None:
+        """Forget all landmarks outside the mask."""
+        for name in self._COLUMNS:
+            setattr(self, name, getattr(self, name)[mask])
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Columns for a checkpoint."""
+        return {f"landmarks.{name}": getattr(self, name).copy() for name in self._COLUMNS}
+
+    def restore(self, arrays: dict[str, NDArray]) -> None:
+        """Take the columns of a checkpoint."""
+        for name in self._COLUMNS:
+            setattr(self, name, np.array(arrays[f"landmarks.{name}"]))
+
+
+@dataclass
+class Keyframe:
+    """A frame the map rests on.
+
+    Attributes:
+        frame_id: Of the frame.
+        t_source_ns: Of the frame.
+        T_world_cam: ``(4, 4)``, moved by bundle adjustment.
+        submap: Which part of the map it belongs to.
+        ids: ``(M,)`` int64 tracks seen, ascending.
+        xy: ``(M, 2)`` where.
+        confidence: ``(M,)`` of each observation.
+        descriptor_ids: ``(D,)`` int64 tracks that have a descriptor.
+        descriptors: ``(D, 32)`` uint8.
+    """
+
+    frame_id: int
+    t_source_ns: int
+    T_world_cam: Array
+    submap: int
+    ids: Ids
+    xy: Array
+    confidence: Array
+    descriptor_ids: Ids
+    descriptors: NDArray[np.uint8]
+
+    def drop_observations(self, bad: NDArray[np.bool_]) -> None:
+        """Forget the observations in the mask."""
+        self.ids, self.xy, self.confidence = self.ids[~bad], self.xy[~bad], self.confidence[~bad]
+
+
+_KEYFRAME_PARTS = ("ids", "xy", "confidence", "descriptor_ids", "descriptors")
+
+
+class WorldMap:
+    """Landmarks, keyframes and the poses of all frames relative to keyframes.
+
+    Attributes:
+        landmarks: The points.
+        keyframes: In order of time, those with observations.
+        poses: Frame id of a keyframe -> ``T_world_cam``, also of keyframes thinned out since.
+        submap_of: Frame id of a keyframe -> its submap.
+        frames: Frame id -> (keyframe's frame id, ``T_keyframe_cam``).
+    """
+
+    def __init__(self) -> None:
+        self.landmarks = Landmarks()
+        self.keyframes: list[Keyframe] = []
+        self.poses: dict[int, Array] = {}
+        self.submap_of: dict[int, int] = {}
+        self.frames: dict[int, tuple[int, Array]] = {}
+        self._changed: set[int] = set()
+        self._moved_keyframes: set[int] = set()
+        self._removed: set[int] = set()
+
+    def add_keyframe(self, keyframe: Keyframe) -> None:
+        """Append a keyframe."""
+        self.keyframes.append(keyframe)
+        self.poses[keyframe.frame_id] = keyframe.T_world_cam
+        self.submap_of[keyframe.frame_id] = keyframe.submap
+        self.frames[keyframe.frame_id] = (keyframe.frame_id, np.eye(4))
+        self._moved_keyframes.add(keyframe.frame_id)
+
+    def add_landmarks(
+        self, ids: Ids, xyz: Array, rgb: NDArray[np.uint8], confidence: NDArray, submap: int, frame_id: int
+    ) -> None:
+        """Add new landmarks and note the change."""
+        self.landmarks.add(ids, xyz, rgb, confidence, submap, frame_id)
+        self._changed.update(ids.tolist())
+
+    def move_landmarks(self, ids: Ids, xyz: Array) -> None:
+        """Set positions of landmarks that are still there."""
+        row = self.landmarks.rows(ids)
+        there = row >= 0
+        self.landmarks.xyz[row[there]] = xyz[there]
+        self._changed.update(ids[there].tolist())
+
+    def remove_landmarks(self, bad: NDArray[np.bool_]) -> None:
+        """Forget the landmarks in the mask over rows."""
+        if bad.any():
+            self._removed.update(self.landmarks.ids[bad].tolist())
+            self.landmarks.keep(~bad)
+
+    def move_keyframe(self, frame_id: int, T_world_cam: Array) -> None:
+        """Set the pose of a keyframe, thinned out or not."""
+        if frame_id in self.poses:
+            self.poses[frame_id] = T_world_cam
+            self._moved_keyframes.add(frame_id)
+            for keyframe in reversed(self.keyframes):
+                if keyframe.frame_id == frame_id:
+                    keyframe.T_world_cam = T_world_cam
+                    return
+
+    def add_frame(self, frame_id: int, keyframe_id: int, T_world_cam: Array) -> None:
+        """Note a frame's pose relative to a keyframe."""
+        self.frames[frame_id] = (keyframe_id, invert_transform(self.poses[keyframe_id]) @ T_world_cam)
+
+    def transform_submap(self, submap: int, into: int, scale: float, T_new_old: Array) -> None:
+        """Move a submap by a similarity ``x' = T (s x)`` and make it part of another."""
+        mine = self.landmarks.submap == submap
+        xyz = scale * self.landmarks.xyz[mine]
+        self.landmarks.xyz[mine] = xyz @ T_new_old[:3, :3].T + T_new_old[:3, 3]
+        self.landmarks.submap[mine] = into
+        self._changed.update(self.landmarks.ids[mine].tolist())
+        moved = {k for k, s in self.submap_of.items() if s == submap}
+        for frame_id in moved:
+            T = self.poses[frame_id].copy()
+            T[:3, 3] *= scale
+            self.move_keyframe(frame_id, T_new_old @ T)
+            self.submap_of[frame_id] = into
+        for keyframe in self.keyframes:
+            if keyframe.submap == submap:
+                keyframe.submap = into
+        for frame_id, (keyframe_id, T_keyframe_cam) in self.frames.items():
+            if keyframe_id in moved:
+                T = T_keyframe_cam.copy()
+                T[:3, 3] *= scale
+                self.frames[frame_id] = (keyframe_id, T)
+
+    def bound(self, max_landmarks: int, max_keyframes: int, recent: int) -> None:
+        """Keep the map within its size: longest unseen landmarks and every second old keyframe go."""
+        excess = len(self.landmarks) - max_landmarks
+        if excess > 0:
+            # A tenth more than needed, so that this does not run on every keyframe.
+            count = min(len(self.landmarks), excess + max_landmarks // 10)
+            oldest = np.argsort(self.landmarks.last_seen, kind="stable")[:count]
+            bad = np.zeros(len(self.landmarks), bool)
+            bad[oldest] = True
+            self.remove_landmarks(bad)
+        if len(self.keyframes) > max_keyframes:
+            old, young = self.keyframes[:-recent], self.keyframes[-recent:]
+            self.keyframes = old[1::2] + young
+
+    def pose_of_frame(self, frame_id: int) -> Array | None:
+        """Best current ``T_world_cam`` of a frame, None where it has none."""
+        if frame_id not in self.frames:
+            return None
+        keyframe_id, T_keyframe_cam = self.frames[frame_id]
+        return np.asarray(self.poses[keyframe_id] @ T_keyframe_cam)
+
+    def trajectory(self) -> dict[int, Array]:
+        """Best current ``T_world_cam`` of every posed frame, by frame id ascending."""
+        return {
+            frame_id: self.poses[self.frames[frame_id][0]] @ self.frames[frame_id][1]
+            for frame_id in sorted(self.frames)
+        }
+
+    def observations(self) -> tuple[Ids, Ids, Array]:
+        """Landmark id, keyframe's frame id and pixel of every observation of a landmark."""
+        ids, frames, xy = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+        for keyframe in self.keyframes:
+            seen = self.landmarks.rows(keyframe.ids) >= 0
+            ids.append(keyframe.ids[seen])
+            frames.append(np.full(int(seen.sum()), keyframe.frame_id, np.int64))
+            xy.append(keyframe.xy[seen])
+        return np.concatenate(ids), np.concatenate(frames), np.concatenate(xy)
+
+    def take_changes(self) -> tuple[Ids, Ids, Ids]:
+        """Ids of landmarks that were added or moved, of those removed, and keyframes added or moved."""
+        removed = np.array(sorted(self._removed), dtype=np.int64)
+        removed = removed[self.landmarks.rows(removed) < 0]
+        changed = np.array(sorted(self._changed), dtype=np.int64)
+        changed = changed[self.landmarks.rows(changed) >= 0]
+        moved = np.array(sorted(self._moved_keyframes), dtype=np.int64)
+        self._changed, self._removed, self._moved_keyframes = set(), set(), set()
+        return changed, removed, moved
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Everything as plain arrays, for a checkpoint."""
+        lengths = [[len(getattr(k, part)) for part in _KEYFRAME_PARTS] for k in self.keyframes]
+        frames = sorted(self.frames)
+        posed = sorted(self.poses)
+        return {
+            **self.landmarks.arrays(),
+            "keyframes.frame_id": np.array([k.frame_id for k in self.keyframes], dtype=np.int64),
+            "keyframes.t_source_ns": np.array([k.t_source_ns for k in self.keyframes], dtype=np.int64),
+            "keyframes.length": np.array(lengths, dtype=np.int64).reshape(-1, len(_KEYFRAME_PARTS)),
+            **{
+                f"keyframes.{p}": _joined([getattr(k, p) for k in self.keyframes], p) for p in _KEYFRAME_PARTS
+            },
+            "poses.frame_id": np.array(posed, dtype=np.int64),
+            "poses.T_world_cam": np.array([self.poses[k] for k in posed]).reshape(-1, 4, 4),
+            "poses.submap": np.array([self.submap_of[k] for k in posed], dtype=np.int64),
+            "frames.frame_id": np.array(frames, dtype=np.int64),
+            "frames.keyframe_id": np.array([self.frames[k][0] for k in frames], dtype=np.int64),
+            "frames.T_keyframe_cam": np.array([self.frames[k][1] for k in frames]).reshape(-1, 4, 4),
+        }
+
+    def restore(self, arrays: dict[str, NDArray]) -> None:
+        """Take what ``arrays`` gave.
+
+        Raises:
+            KeyError: An array is missing.
+            ValueError: Arrays contradict each other.
+        """
+        self.__init__()  # type: ignore[misc]
+        self.landmarks.restore(arrays)
+        for frame_id, T, submap in zip(
+            arrays["poses.frame_id"].tolist(),
+            arrays["poses.T_world_cam"],
+            arrays["poses.submap"],
+            strict=True,
+        ):
+            self.poses[frame_id], self.submap_of[frame_id] = np.array(T), int(submap)
+        for frame_id, keyframe_id, T in zip(
+            arrays["frames.frame_id"].tolist(),
+            arrays["frames.keyframe_id"].tolist(),
+            arrays["frames.T_keyframe_cam"],
+            strict=True,
+        ):
+            if keyframe_id not in self.poses:
+                raise ValueError(f"frame {frame_id} refers to keyframe {keyframe_id}, which is not there")
+            self.frames[frame_id] = (keyframe_id, np.array(T))
+        ends = np.cumsum(arrays["keyframes.length"], axis=0)
+        starts = ends - arrays["keyframes.length"]
+        for k, frame_id in enumerate(arrays["keyframes.frame_id"].tolist()):
+            parts = {
+                part: np.array(arrays[f"keyframes.{part}"][starts[k, j] : ends[k, j]])
+                for j, part in enumerate(_KEYFRAME_PARTS)
+            }
+            self.keyframes.append(
+                Keyframe(
+                    frame_id=frame_id,
+                    t_source_ns=int(arrays["keyframes.t_source_ns"][k]),
+                    T_world_cam=self.poses[frame_id],
+                    submap=self.submap_of[frame_id],
+                    **parts,
+                )
+            )
+        self._changed = set(self.landmarks.ids.tolist())
+        self._moved_keyframes = set(self.poses)
+
+
+def _joined(parts: Iterable[NDArray], name: str) -> NDArray:
+    empty = {
+        "ids": np.zeros(0, np.int64),
+        "xy": np.zeros((0, 2)),
+        "confidence": np.zeros(0),
+        "descriptor_ids": np.zeros(0, np.int64),
+        "descriptors": np.zeros((0, 32), np.uint8),
+    }[name]
+    return np.concatenate([empty, *parts])
