@@ -1,0 +1,134 @@
+"""Reconstruct the frames of one run: tracking, mapping and bundle adjustment in this thread."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from semcast.common.camera import Intrinsics
+from semcast.common.image import psnr_db
+from semcast.common.trajectory import Trajectory
+from semcast.common.trajectory_error import ate, match_times
+from semcast.evaluation.pipeline import LinkedFrame
+from semcast.server.bundle import InlineBundle
+from semcast.server.export import trajectory_of
+from semcast.server.reconstruction import Reconstruction
+from semcast.server.reconstruction_settings import ReconstructionSettings
+from semcast.server.run_record import FrameRow, summarise
+from semcast.server.state import DecodedFrame, FrameResult, MapUpdate
+
+#: Called after each processed frame; may add stages of its own to the row's ``stage_ms``.
+FrameHook = Callable[[DecodedFrame, FrameResult, FrameRow, MapUpdate | None], None]
+
+#: Stages that don't count towards a pose's age: before the receiver, or asked for by an earlier frame.
+_NOT_BEFORE_POSE = frozenset({"encode", "channel", "bundle"})
+
+
+@dataclass(frozen=True)
+class ReconstructedRun:
+    """What came out of one pass over the frames.
+
+    Attributes:
+        summary: The figures ``semcast demo`` reports: ``ate_rmse_m``, ``stage_ms`` and so on.
+        rows: One mapping per frame that reached the tracker, with ``error_m`` after alignment where known.
+        trajectory: All posed frames in the map's frame and unit.
+        num_landmarks: Landmarks at the end.
+    """
+
+    summary: dict[str, Any]
+    rows: list[dict[str, Any]]
+    trajectory: Trajectory
+    num_landmarks: int
+
+
+def reconstruct(
+    frames: Iterable[LinkedFrame],
+    camera: Intrinsics,
+    settings: ReconstructionSettings,
+    truth: Trajectory | None,
+    on_frame: FrameHook | None = None,
+) -> ReconstructedRun:
+    """Feed received frames to the server's reconstruction and sum up.
+
+    Frames that were lost, or of which nothing usable arrived, never reach the tracker; they count against
+    completeness.
+
+    Args:
+        frames: Frames in order.
+        camera: Camera of the decoded images, without distortion.
+        settings: How to reconstruct.
+        truth: Reference poses in metres, or None.
+        on_frame: Sees each processed frame, such as a viewer.
+    """
+    rows: list[FrameRow] = []
+    frame_times_ns: dict[int, int] = {}
+    num_lost = 0
+    reconstruction = Reconstruction(camera, settings, InlineBundle())
+    try:
+        for frame in frames:
+            frame_times_ns[frame.frame_id] = frame.t_source_ns
+            if frame.decoded is None:
+                num_lost += 1
+                continue
+            rows.append(_process(reconstruction, frame, on_frame))
+        poses = reconstruction.final_trajectory()
+        num_landmarks = len(reconstruction.landmarks()[0])
+    finally:
+        reconstruction.close()
+    trajectory = trajectory_of(poses, frame_times_ns)
+    truth = cut_to_frames(truth, frame_times_ns) if truth is not None else None
+    drops = {"lost": num_lost} if num_lost else {}
+    summary = summarise(rows, trajectory, set(poses), truth, len(frame_times_ns), drops)
+    return ReconstructedRun(summary, _plain_rows(rows, trajectory, truth), trajectory, num_landmarks)
+
+
+def _process(reconstruction: Reconstruction, frame: LinkedFrame, on_frame: FrameHook | None) -> FrameRow:
+    decoded = frame.decoded
+    assert decoded is not None
+    received = DecodedFrame(
+        frame_id=frame.frame_id,
+        t_source_ns=frame.t_source_ns,
+        image=decoded.image,
+        confidence=decoded.confidence,
+        keypoint_confidence=decoded.keypoint_confidence,
+        slot_snr_db=frame.effective_snr_db,
+    )
+    result = reconstruction.process(received)
+    stage_ms = {**frame.stage_ms, **result.stage_ms}
+    row = FrameRow(
+        frame_id=frame.frame_id,
+        t_source_ns=frame.t_source_ns,
+        state=result.state.value,
+        posed=result.T_world_cam is not None,
+        num_tracked=result.num_tracked,
+        num_inliers=result.num_inliers,
+        reprojection_error_px=result.reprojection_error_px,
+        is_keyframe=result.is_keyframe,
+        map_epoch=result.map_epoch,
+        snr_set_db=None,
+        snr_estimated_db=frame.snr_db_estimate,
+        # A clean original equals itself: that says nothing about a codec.
+        psnr_db=None if frame.effective_snr_db is None else psnr_db(frame.original, decoded.image),
+        confidence_mean=float(decoded.confidence.mean()),
+        age_ms=sum(ms for stage, ms in stage_ms.items() if stage not in _NOT_BEFORE_POSE),
+        stage_ms=stage_ms,
+    )
+    if on_frame is not None:
+        on_frame(received, result, row, reconstruction.take_map_update())
+    return row
+
+
+def cut_to_frames(truth: Trajectory, frame_times_ns: dict[int, int]) -> Trajectory:
+    """Return the true poses of the frames that were sent: the path that errors are a percentage of."""
+    times_s = np.array(sorted(frame_times_ns.values()), dtype=np.float64) * 1e-9
+    _, kept = match_times(times_s, truth.t_s)
+    return Trajectory(truth.t_s[kept], truth.T_world_cam[kept])
+
+
+def _plain_rows(
+    rows: list[FrameRow], trajectory: Trajectory, truth: Trajectory | None
+) -> list[dict[str, Any]]:
+    absolute = ate(trajectory, truth) if truth is not None else None
+    error_m = dict(zip(absolute.t_s, absolute.error_m, strict=True)) if absolute is not None else {}
+    return [{**vars(row), "error_m": error_m.get(row.t_source_ns * 1e-9)} for row in rows]

@@ -1,0 +1,170 @@
+"""``semcast eval trajectory``: reconstruct a recording over a link, compare the path with the truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semcast.common.codec import Codec
+from semcast.common.errors import SemcastError
+from semcast.common.trajectory import Trajectory, write_tum
+from semcast.common.trajectory_error import ate
+from semcast.evaluation.pipeline import CLEAN, FrameRun, StreamSettings, open_stream, selected_frame_ids
+from semcast.evaluation.plots import plot_top_view
+from semcast.evaluation.reconstruct import ReconstructedRun, reconstruct
+from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.statistics import paired_bootstrap
+from semcast.server.reconstruction_settings import ReconstructionSettings
+from semcast.server.weighting import ConfidenceMode
+
+VERB = "eval trajectory"
+#: Flags that this verb sets itself: the mode is a list here, the seed is that of the run.
+UNUSED_FIELDS = frozenset({"reconstruction.confidence", "reconstruction.seed"})
+#: Figures of a run that are summarised over seeds.
+FIGURES = ("ate_rmse_m", "ate_percent", "completeness", "rpe_trans_percent", "rpe_rot_deg", "psnr_db")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrajectorySettings(StreamSettings):
+    """Settings of ``evaluate_trajectory``.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    confidence: tuple[ConfidenceMode, ...] = field(
+        default=("robust",), metadata={"help": "ways to use confidence, all on the same decoded images"}
+    )
+    reconstruction: ReconstructionSettings = field(
+        default=ReconstructionSettings(), metadata={"help": "the server's estimation"}
+    )
+    rows: bool = field(default=True, metadata={"help": "keep one row per frame in the result"})
+    out: Path | None = field(
+        default=None, metadata={"help": "folder for trajectories (TUM) and top views of the first seed"}
+    )
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        super().__post_init__()
+        if not self.confidence or len(set(self.confidence)) != len(self.confidence):
+            raise ValueError(f"confidence must be one or more different modes, got {self.confidence}")
+
+
+def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None) -> dict[str, Any]:
+    """Reconstruct the recording for every SNR, seed and confidence mode.
+
+    Args:
+        settings: What to run.
+        codec: Used instead of the codec that ``settings.codec`` names.
+
+    Returns:
+        Provenance and ``cells``: one entry per SNR and mode with the median over seeds of each figure in
+        ``FIGURES``, ``num_failed`` (runs without a trajectory error), and ``runs``, the full summary of each
+        seed. ``comparisons`` holds, per SNR, the paired difference in ATE of each mode to the mode ``off``
+        where that was run. With one cell its figures and ``stage_ms`` also stand at the top level.
+
+    Raises:
+        SourceError: The recording can't be read.
+        ConfigError: The codec is unknown.
+        SemcastError: A result file can't be written.
+    """
+    sequence, codec = open_stream(settings, codec)
+    truth = sequence.groundtruth()
+    frame_ids = selected_frame_ids(sequence, settings)
+    # Without a link neither SNR nor channel seed changes an image: one SNR stands for all.
+    snrs_db = settings.snr_db if codec is not None else settings.snr_db[:1]
+    cells = []
+    for snr_db in snrs_db:
+        runs: dict[str, list[dict[str, Any]]] = {mode: [] for mode in settings.confidence}
+        for seed in settings.all_seeds:
+            frames = FrameRun(sequence, frame_ids, codec, settings.link_at(snr_db), seed)
+            for mode in settings.confidence:
+                how = replace(settings.reconstruction, confidence=mode, seed=seed)
+                run = reconstruct(frames, sequence.intrinsics, how, truth)
+                runs[mode].append(_run_entry(run, seed, settings.rows))
+                if settings.out is not None and seed == settings.seed:
+                    label = CLEAN if codec is None else f"{snr_db:g}db"
+                    _write_files(settings.out, f"{label}_{mode}", run, truth)
+        cells += [_cell(None if codec is None else snr_db, mode, runs[mode]) for mode in settings.confidence]
+    report = {
+        **provenance(VERB, settings),
+        "sequence": sequence.name,
+        "num_frames": len(frame_ids),
+        "cells": cells,
+        "comparisons": _comparisons(cells, settings.seed),
+    }
+    if len(cells) == 1:
+        report |= {key: value for key, value in cells[0].items() if key != "runs"}
+        report["stage_ms"] = cells[0]["runs"][0]["stage_ms"]
+    report = json_ready(report)
+    if settings.json is not None:
+        write_json(settings.json, report)
+    return dict(report)
+
+
+def _run_entry(run: ReconstructedRun, seed: int, with_rows: bool) -> dict[str, Any]:
+    entry = {"seed": seed, **run.summary, "num_landmarks": run.num_landmarks}
+    return {**entry, "rows": run.rows} if with_rows else entry
+
+
+def median_or_none(values: Sequence[float | None]) -> float | None:
+    """Return the median with None counted as worse than any number; None when that is the median."""
+    median = float(np.median([np.inf if v is None else v for v in values])) if len(values) else np.inf
+    return median if np.isfinite(median) else None
+
+
+def _cell(snr_db: float | None, mode: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "snr_db": snr_db,
+        "confidence": mode,
+        "seeds": [run["seed"] for run in runs],
+        **{name: median_or_none([run[name] for run in runs]) for name in FIGURES},
+        "num_failed": sum(run["ate_rmse_m"] is None for run in runs),
+        "runs": runs,
+    }
+
+
+def _comparisons(cells: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]:
+    """Pair each mode with ``off`` over the seeds in which both have an error."""
+    found = []
+    for cell in cells:
+        rival = next((c for c in cells if c["snr_db"] == cell["snr_db"] and c["confidence"] == "off"), None)
+        if rival is None or cell is rival:
+            continue
+        pairs = [
+            (a["ate_rmse_m"], b["ate_rmse_m"])
+            for a, b in zip(cell["runs"], rival["runs"], strict=True)
+            if a["ate_rmse_m"] is not None and b["ate_rmse_m"] is not None
+        ]
+        ours, theirs = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
+        found.append(
+            {
+                "snr_db": cell["snr_db"],
+                "confidence": cell["confidence"],
+                "against": "off",
+                "figure": "ate_rmse_m",
+                "paired": paired_bootstrap(ours, theirs, np.random.default_rng(seed)),
+            }
+        )
+    return found
+
+
+def _write_files(folder: Path, label: str, run: ReconstructedRun, truth: Trajectory | None) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_tum(folder / f"trajectory_{label}.tum", run.trajectory)
+    except OSError as err:
+        raise SemcastError(f"{folder} can't be written: {err}") from err
+    absolute = ate(run.trajectory, truth) if truth is not None else None
+    if absolute is None or truth is None:
+        return
+    aligned = absolute.scale * run.trajectory.positions @ absolute.R_truth_map.T + absolute.t_truth_map
+    widest = np.sort(np.argsort(np.ptp(truth.positions, axis=0))[1:])
+    plot_top_view(
+        folder / f"top_view_{label}.png",
+        {"ground truth": truth.positions, "semcast": aligned},
+        axes_names=("xyz"[widest[0]], "xyz"[widest[1]]),
+        title=f"ATE {absolute.rmse_m:.3g} m ({absolute.percent:.2g} %)",
+    )

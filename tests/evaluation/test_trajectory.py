@@ -1,0 +1,122 @@
+import json
+
+import cv2
+import pytest
+
+from semcast.channel.settings import ChannelSettings
+from semcast.common.trajectory import read_tum
+from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory, median_or_none
+
+PROMISED = (
+    "ate_rmse_m",
+    "ate_percent",
+    "completeness",
+    "rpe_trans_percent",
+    "rpe_rot_deg",
+    "psnr_db",
+    "stage_ms",
+    "settings",
+    "versions",
+    "commit",
+    "machine",
+    "command",
+)
+
+
+def without_times(report):
+    text = json.dumps(report)
+    report = json.loads(text)
+    for key in ("stage_ms", "commit", "settings", "command"):
+        report.pop(key, None)
+    for cell in report["cells"]:
+        for run in cell["runs"]:
+            run.pop("stage_ms")
+            for row in run.get("rows", []):
+                row.pop("stage_ms")
+                row.pop("age_ms")
+    return report
+
+
+def test_one_run_has_the_promised_keys_and_files(room, phase_codec, tmp_path):
+    settings = TrajectorySettings(
+        sequence=room, codec="phase", snr_db=(20.0,), json=tmp_path / "t.json", out=tmp_path
+    )
+    report = evaluate_trajectory(settings, phase_codec)
+    assert json.loads(settings.json.read_text()) == report
+    assert all(report[key] is not None for key in PROMISED)
+    assert set(report["stage_ms"]["decode"]) >= {"p50", "p95"}
+    assert report["completeness"] >= 0.9
+    assert report["ate_percent"] < 5
+    (cell,) = report["cells"]
+    assert cell["confidence"] == "robust"
+    assert len(cell["runs"][0]["rows"]) == 24
+    posed = read_tum(tmp_path / "trajectory_20db_robust.tum")
+    assert len(posed) == cell["runs"][0]["num_posed"]
+    assert cv2.imread(str(tmp_path / "top_view_20db_robust.png")) is not None
+
+
+def test_the_same_settings_give_the_same_trajectory_bit_for_bit(room, phase_codec, tmp_path):
+    def run(folder):
+        settings = TrajectorySettings(
+            sequence=room, codec="phase", snr_db=(12.0,), max_frames=16, out=tmp_path / folder
+        )
+        report = evaluate_trajectory(settings, phase_codec)
+        return without_times(report), (tmp_path / folder / "trajectory_12db_robust.tum").read_bytes()
+
+    assert run("a") == run("b")
+
+
+def test_modes_and_seeds_share_decoded_images_and_are_compared(room, phase_codec):
+    settings = TrajectorySettings(
+        sequence=room,
+        codec="phase",
+        snr_db=(15.0,),
+        seeds=2,
+        max_frames=14,
+        rows=False,
+        confidence=("robust", "off"),
+    )
+    report = evaluate_trajectory(settings, phase_codec)
+    assert phase_codec.num_decoded == 2 * 14
+    assert [c["confidence"] for c in report["cells"]] == ["robust", "off"]
+    robust, off = report["cells"]
+    assert robust["psnr_db"] == off["psnr_db"]
+    assert [run["seed"] for run in robust["runs"]] == [0, 1]
+    assert "ate_rmse_m" not in report
+    assert "rows" not in robust["runs"][0]
+    (comparison,) = report["comparisons"]
+    assert (comparison["confidence"], comparison["against"]) == ("robust", "off")
+    assert comparison["paired"]["num_samples"] == 2
+    mean = [sum(run["ate_rmse_m"] for run in cell["runs"]) / 2 for cell in (robust, off)]
+    assert comparison["paired"]["difference"] == pytest.approx(mean[0] - mean[1])
+
+
+def test_clean_originals_need_no_link(room):
+    settings = TrajectorySettings(sequence=room, codec="none", snr_db=(2.0, 4.0), max_frames=14)
+    report = evaluate_trajectory(settings)
+    assert report["snr_db"] is None
+    assert report["psnr_db"] is None
+    assert report["ate_percent"] < 3
+
+
+def test_a_dead_link_gives_no_error_figure_and_says_so(room, phase_codec):
+    settings = TrajectorySettings(
+        sequence=room, codec="phase", max_frames=4, link=ChannelSettings(frame_loss=1.0)
+    )
+    report = evaluate_trajectory(settings, phase_codec)
+    assert report["ate_rmse_m"] is None
+    assert report["num_failed"] == 1
+    assert report["completeness"] == 0.0
+
+
+def test_a_failed_run_counts_as_worse_than_any_number():
+    assert median_or_none([1.0, None, 2.0]) == 2.0
+    assert median_or_none([1.0, None, None]) is None
+    assert median_or_none([]) is None
+
+
+def test_modes_must_be_some_and_different(room):
+    with pytest.raises(ValueError, match="confidence"):
+        TrajectorySettings(sequence=room, confidence=())
+    with pytest.raises(ValueError, match="different"):
+        TrajectorySettings(sequence=room, confidence=("off", "off"))
