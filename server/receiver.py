@@ -72,7 +72,8 @@ class Receiver:
     In ``live`` mode the newest frame wins; in ``replay`` every frame is delivered once and in order, and the
     agent is told how many it may send. Frames of the other kind are dropped as ``mode``. What does not get to
     ``next`` is counted in ``metrics`` by reason, see ``Arrivals``; further reasons are ``camera`` (nobody
-    says what the camera is), ``too_old`` and ``protocol``.
+    says what the camera is), ``too_old`` and ``protocol``. The role ``server`` is alive from here on: agents
+    wait for that, so make the receiver when the decoder is ready.
 
     Args:
         session: An open session.
@@ -114,6 +115,7 @@ class Receiver:
         session.subscribe(channel_key(agent_id), "newest", self._on_report, _RING_CAPACITY)
         session.watch_alive(agent_id, self._on_alive)
         session.subscribe(rx_key(agent_id), "newest", self._on_symbols, _RING_CAPACITY)
+        session.declare_alive(agent_id, "server")
         self._thread: threading.Thread | None = None
         if mode == "replay":
             self._thread = threading.Thread(target=self._beat, name="semcast-flow", daemon=True)

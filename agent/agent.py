@@ -1,0 +1,244 @@
+"""The agent process: captures, encodes and publishes, in live or lossless service."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from semcast.agent.capture import Capture
+from semcast.agent.encoder import FrameEncoder, LinkFeedback
+from semcast.agent.replay_window import ReplayWindow
+from semcast.agent.settings import AgentSettings
+from semcast.agent.source import Source, SourceFrame, open_source
+from semcast.common.codec import Codec
+from semcast.common.codecs import load_codec
+from semcast.common.errors import TransportError
+from semcast.common.keys import camera_key, flow_key, link_key, tx_key
+from semcast.common.messages import CameraInfo, FlowMessage, LinkReport, SymbolFrame
+from semcast.common.metrics import Metrics
+from semcast.common.status_beat import StatusBeat
+from semcast.common.transport import Session, open_session
+from semcast.common.wire import WireError, pack, unpack
+
+logger = logging.getLogger(__name__)
+
+ROLE = "agent"
+_POLL_S = 0.1
+_FLOW_POLL_S = 0.05
+_BUSY_POLL_S = 0.005
+#: Live: the last frame is repeated until the receiver reports on it, for at most so long.
+_FAREWELL_S = 2.0
+_REPEAT_S = 0.2
+
+
+def camera_info(settings: AgentSettings, source: Source, codec: Codec, agent_epoch: int) -> CameraInfo:
+    """Return what a receiver must know about this agent."""
+    camera = source.intrinsics
+    return CameraInfo(
+        agent_id=settings.agent_id,
+        agent_epoch=agent_epoch,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        image_wh=(camera.width, camera.height),
+        nominal_rate_hz=source.rate_hz,
+        codec=codec.name,
+        digest=codec.digest,
+        modulation=settings.modulation,
+        source_name=source.name[:200],
+        num_frames=source.num_frames,
+        lossless=settings.mode == "replay",
+    )
+
+
+class _Sending:
+    """What both services share: one start of the agent on an open session."""
+
+    def __init__(
+        self, session: Session, settings: AgentSettings, source: Source, codec: Codec, metrics: Metrics
+    ) -> None:
+        self.agent_epoch = time.time_ns()
+        self.metrics = metrics
+        self.lossless = settings.mode == "replay"
+        self.feedback = LinkFeedback(self.agent_epoch, settings.snr_db, settings.feedback_max_age_s)
+        self._settings = settings
+        self._encoder = FrameEncoder(codec, self.agent_epoch, self.lossless)
+        agent_id = settings.agent_id
+        camera = pack(camera_info(settings, source, codec, self.agent_epoch))
+        session.answer(camera_key(agent_id), lambda request: camera)
+        session.subscribe(link_key(agent_id), "newest", self._on_link)
+        self._symbols = session.publisher(tx_key(agent_id), "every" if self.lossless else "newest")
+        session.publisher(camera_key(agent_id), "every").put(camera)
+
+    def _on_link(self, payload: bytes) -> None:
+        try:
+            report = unpack(payload, LinkReport)
+        except WireError as err:
+            self.refuse(err)
+            return
+        self.feedback.update(report)
+        self.metrics.count("link_reports")
+
+    def refuse(self, err: WireError) -> None:
+        """Count a message that is not valid."""
+        self.metrics.drop("protocol")
+        self.metrics.error(str(err))
+
+    def encode(self, frame: SourceFrame) -> SymbolFrame:
+        """Encode for the link as it is now; in replay for a fixed SNR, so that runs repeat exactly."""
+        snr_db = self._settings.snr_db if self.lossless else self.feedback.snr_db()
+        with self.metrics.stage("encode"):
+            return self._encoder.encode(frame, snr_db)
+
+    def send(self, message: SymbolFrame) -> None:
+        """Publish a frame."""
+        with self.metrics.stage("send"):
+            self._symbols.put(pack(message))
+        self.metrics.count("sent")
+        self.metrics.observe("capture_to_sent", (time.monotonic_ns() - message.t_capture_ns) * 1e-6)
+
+
+def _send_live(sending: _Sending, capture: Capture, stop: threading.Event) -> None:
+    """Send the newest frame, over and over."""
+    last: SymbolFrame | None = None
+    while not stop.is_set() and not capture.ended:
+        frame = capture.get(_POLL_S)
+        if frame is not None:
+            last = sending.encode(frame)
+            sending.send(last)
+    if last is None or not last.final:
+        return
+    until_s = time.monotonic() + _FAREWELL_S
+    while not stop.wait(_REPEAT_S) and time.monotonic() < until_s:
+        if sending.feedback.reported_frame_id >= last.frame_id:
+            return
+        sending.send(last)
+
+
+def _send_lossless(
+    sending: _Sending,
+    capture: Capture,
+    session: Session,
+    agent_id: str,
+    stop: threading.Event,
+) -> None:
+    """Send every frame when the receiver wants it, until it has all of them."""
+    window = ReplayWindow(sending.agent_epoch)
+    changed = threading.Condition()
+
+    def on_flow(payload: bytes) -> None:
+        try:
+            flow = unpack(payload, FlowMessage)
+        except WireError as err:
+            sending.refuse(err)
+            return
+        with changed:
+            window.on_flow(flow)
+            changed.notify()
+
+    session.subscribe(flow_key(agent_id), "newest", on_flow)
+    encoded: SymbolFrame | None = None
+    while not stop.is_set():
+        if encoded is None and not capture.ended:
+            # While the receiver is busy, one frame is encoded ahead.
+            frame = capture.get(_FLOW_POLL_S if window.all_taken else _BUSY_POLL_S)
+            encoded = sending.encode(frame) if frame is not None else None
+        with changed:
+            if encoded is not None and window.has_room:
+                window.add(encoded)
+                encoded = None
+            due = window.due()
+            if not due and (encoded is not None or capture.ended):
+                changed.wait(_FLOW_POLL_S)
+            done = capture.ended and encoded is None and window.all_taken
+        for message in due:
+            sending.send(message)
+        if done:
+            return
+
+
+def _wait_for_peers(session: Session, agent_id: str, stop: threading.Event) -> None:
+    """Wait until channel and server are alive, or ``stop`` is set."""
+    missing = {"channel", "server"}
+    both = threading.Event()
+
+    def on_change(role: str, alive: bool) -> None:
+        if alive:
+            missing.discard(role)
+        if not missing:
+            both.set()
+
+    session.watch_alive(agent_id, on_change)
+    if not both.wait(0.5):
+        logger.info("waiting for %s", " and ".join(sorted(missing)))
+    while not stop.is_set() and not both.wait(_POLL_S):
+        pass
+
+
+def run_agent(
+    settings: AgentSettings,
+    stop: threading.Event,
+    codec: Codec | None = None,
+    on_source: Callable[[Source], None] | None = None,
+) -> dict[str, Any]:
+    """Run the agent process until its source ends or ``stop`` is set.
+
+    Args:
+        settings: Of the process.
+        stop: Ends it.
+        codec: Used instead of the one ``settings`` names.
+        on_source: Is told the source once it is open.
+
+    Returns:
+        Counts, drops by reason and stage times, with ``agent_epoch``, ``source`` and ``complete``.
+
+    Raises:
+        SourceError: The source can't be read.
+        ConfigError: The codec is unknown.
+        CheckpointError: Its weights are missing or damaged.
+        TransportError: Its port is taken, where it is the hub.
+    """
+    metrics = Metrics(ROLE)
+    source = open_source(settings.source)
+    try:
+        if on_source is not None:
+            on_source(source)
+        if codec is None:
+            codec = load_codec(
+                settings.codec,
+                modulation=settings.modulation,
+                num_threads=settings.threads,
+                device=settings.device,
+                weights=settings.weights,
+            )
+        session = open_session(settings.network, stop)
+    except BaseException:
+        source.close()
+        raise
+    summary: dict[str, Any] = {"agent_epoch": 0, "source": source.name, "complete": False}
+    if session is None:
+        source.close()
+        return {**metrics.summary(), **summary}
+    with session:
+        sending = _Sending(session, settings, source, codec, metrics)
+        beat = StatusBeat(session, settings.agent_id, ROLE, metrics, lambda: sending.agent_epoch)
+        session.declare_alive(settings.agent_id, ROLE)
+        if settings.wait:
+            _wait_for_peers(session, settings.agent_id, stop)
+        logger.info("sending %s with %s, %s", source.name, codec.name, settings.mode)
+        capture = Capture(source, "all" if sending.lossless else "newest", metrics)
+        try:
+            if sending.lossless:
+                _send_lossless(sending, capture, session, settings.agent_id, stop)
+            else:
+                _send_live(sending, capture, stop)
+            summary.update(agent_epoch=sending.agent_epoch, complete=capture.ended and not stop.is_set())
+        except TransportError as err:
+            metrics.error(str(err))
+            raise
+        finally:
+            capture.close()
+            beat.close()
+    return {**metrics.summary(), **summary}

@@ -1,0 +1,70 @@
+"""Reads the source on a thread of its own, so that capturing and encoding overlap."""
+
+import logging
+import threading
+
+from semcast.agent.source import Source, SourceFrame
+from semcast.common.errors import SourceError
+from semcast.common.mailbox import Mailbox, Policy
+from semcast.common.metrics import Metrics
+
+logger = logging.getLogger(__name__)
+
+
+class Capture:
+    """Frames of a source, ahead of the encoder.
+
+    Args:
+        source: Is read by the thread alone, until ``close``.
+        policy: ``newest`` keeps one frame and counts what it replaces as ``superseded``; ``all`` waits.
+        metrics: Where to count.
+    """
+
+    def __init__(self, source: Source, policy: Policy, metrics: Metrics) -> None:
+        self._source = source
+        self._metrics = metrics
+        self._box: Mailbox[SourceFrame] = Mailbox(1, policy)
+        self._stopping = threading.Event()
+        self._error: SourceError | None = None
+        self._thread = threading.Thread(target=self._run, name="semcast-capture", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            for frame in self._source.frames(self._stopping):
+                self._metrics.count("captured")
+                before = self._box.dropped
+                self._box.put(frame)
+                self._metrics.drop("superseded", self._box.dropped - before)
+                if self._stopping.is_set():
+                    return
+        except SourceError as err:
+            self._error = err
+        except Exception as err:
+            logger.exception("the source failed")
+            self._error = SourceError(f"the source failed: {err}")
+        finally:
+            self._box.close()
+
+    @property
+    def ended(self) -> bool:
+        """Whether the source is at its end and everything was taken."""
+        return self._box.closed and len(self._box) == 0
+
+    def get(self, timeout_s: float) -> SourceFrame | None:
+        """Return the next frame, None when there was none in time or the source has ended.
+
+        Raises:
+            SourceError: The source failed, and all frames before that were taken.
+        """
+        frame = self._box.get(timeout_s)
+        if frame is None and self._error is not None:
+            raise self._error
+        return frame
+
+    def close(self) -> None:
+        """End the thread and free the source. Idempotent."""
+        self._stopping.set()
+        self._box.close()
+        self._thread.join(5.0)
+        self._source.close()

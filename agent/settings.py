@@ -1,0 +1,58 @@
+"""Settings of the agent process."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from semcast.agent.source_settings import SourceSettings
+from semcast.channel.trace import SNR_RANGE_DB
+from semcast.common.codec import Modulation
+from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
+from semcast.common.network_settings import NetworkSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentSettings:
+    """The agent process: what it sends, encoded how, and to whom.
+
+    Raises:
+        ValueError: A value is out of range, or values contradict each other.
+    """
+
+    agent_id: str = field(default=DEFAULT_AGENT_ID, metadata={"help": "name of this agent"})
+    mode: Literal["live", "replay"] = field(
+        default="live",
+        metadata={"help": "live: newest frame wins; replay: every frame, in order, when the server takes it"},
+    )
+    source: SourceSettings = field(metadata={"help": "where frames come from"})
+    codec: str = field(default="3dcsc", metadata={"help": "codec by name"})
+    modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    weights: Path | None = field(default=None, metadata={"help": "weights instead of the shipped ones"})
+    threads: int = field(default=1, metadata={"help": "CPU threads of the encoder"})
+    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "device of the encoder"})
+    snr_db: float = field(
+        default=10.0,
+        metadata={
+            "flag": "expect_snr_db",
+            "help": "SNR in dB to encode for in replay, and in live until the server reports the link's",
+        },
+    )
+    feedback_max_age_s: float = field(
+        default=2.0, metadata={"help": "a report about the link counts for so many seconds"}
+    )
+    wait: bool = field(
+        default=True, metadata={"help": "send nothing until channel and server are there for the first time"}
+    )
+    network: NetworkSettings = field(default=NetworkSettings(), metadata={"help": "where the hub is"})
+
+    def __post_init__(self) -> None:
+        check_agent_id(self.agent_id)
+        if self.mode == "live" and self.source.pace == "receiver":
+            raise ValueError("pace 'receiver' needs mode 'replay', got mode 'live'")
+        if self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}")
+        low, high = SNR_RANGE_DB
+        if not low <= self.snr_db <= high:
+            raise ValueError(f"snr_db must be in [{low:g}, {high:g}], got {self.snr_db:g}")
+        if not 0.0 < self.feedback_max_age_s <= 3600.0:
+            raise ValueError(f"feedback_max_age_s must be in (0, 3600], got {self.feedback_max_age_s:g}")

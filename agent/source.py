@@ -1,0 +1,234 @@
+"""Frames for the agent: one interface over recorded sequences, video files and live cameras."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.agent.source_settings import SourceSettings
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import SourceError
+from semcast.common.sequence import Sequence, open_sequence
+from semcast.common.trajectory import Trajectory
+
+logger = logging.getLogger(__name__)
+
+#: So many unreadable images in a row end a source; fewer are left out.
+MAX_BAD_IN_A_ROW = 10
+
+
+@dataclass(frozen=True)
+class SourceFrame:
+    """One frame on its way to the encoder.
+
+    Attributes:
+        frame_id: Index in the recording, or count of frames grabbed; strictly increasing.
+        t_source_ns: Recorded time; that of capture for live cameras.
+        t_capture_ns: ``time.monotonic_ns`` when it was due or grabbed.
+        image: ``(H, W, 3)`` uint8 RGB, undistorted and resized.
+        final: Last frame of a finite source.
+    """
+
+    frame_id: int
+    t_source_ns: int
+    t_capture_ns: int
+    image: NDArray[np.uint8]
+    final: bool = False
+
+
+class Source(Protocol):
+    """Where frames come from. ``frames`` belongs to one thread."""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of the frames, without distortion."""
+
+    @property
+    def num_frames(self) -> int | None:
+        """Of a finite source whose length is known."""
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second it aims at; 0 where the receiver sets the pace."""
+
+    def groundtruth(self) -> Trajectory | None:
+        """Return true poses of the frames, where there are any."""
+
+    def frames(self, stop: threading.Event) -> Iterator[SourceFrame]:
+        """Yield frames when they are due, until the end or until ``stop`` is set.
+
+        Raises:
+            SourceError: Nothing can be read any more.
+        """
+
+    def close(self) -> None:
+        """Free the camera or file. Idempotent."""
+
+
+class Pacer:
+    """Waits until a frame is due.
+
+    Args:
+        settings: ``pace`` and ``rate_hz``.
+        clock_s: Monotonic clock.
+        wait: Waits so many seconds; True ends the waiting for good.
+    """
+
+    def __init__(
+        self,
+        settings: SourceSettings,
+        wait: Callable[[float], bool],
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._settings = settings
+        self._wait = wait
+        self._clock_s = clock_s
+        self._start_s: float | None = None
+        self._first_ns = 0
+        self._count = 0
+
+    def until_due(self, t_source_ns: int) -> bool:
+        """Wait for the time of the next frame; False when stopped. The first frame is due at once."""
+        settings = self._settings
+        if self._start_s is None:
+            self._start_s, self._first_ns = self._clock_s(), t_source_ns
+        due_s = self._start_s
+        if settings.pace == "rate" and settings.rate_hz is not None:
+            due_s += self._count / settings.rate_hz
+        elif settings.pace == "recorded":
+            due_s += (t_source_ns - self._first_ns) * 1e-9
+        self._count += 1
+        remaining_s = due_s - self._clock_s()
+        return not self._wait(max(0.0, remaining_s))
+
+
+def playback_order(num_frames: int, repeat: str) -> Iterator[int]:
+    """Yield positions in a recording: once, over and over, or forth and back for ever."""
+    yield from range(num_frames)
+    while repeat == "loop":
+        yield from range(num_frames)
+    while repeat == "swing":
+        yield from range(num_frames - 2, -1, -1) if num_frames > 1 else (0,)
+        yield from range(1, num_frames)
+
+
+class RecordedSource:
+    """A recorded sequence, played in time.
+
+    The first pass has the ids and times of the recording; further ones count both on.
+
+    Args:
+        sequence: What to play.
+        settings: Pace and repetition.
+    """
+
+    def __init__(self, sequence: Sequence, settings: SourceSettings) -> None:
+        self._sequence = sequence
+        self._settings = settings
+        self._intrinsics = sequence.intrinsics
+
+    @property
+    def name(self) -> str:
+        """Folder name."""
+        return self._sequence.name
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of the frames, without distortion."""
+        return self._intrinsics
+
+    @property
+    def num_frames(self) -> int | None:
+        """Frames of one pass; None when it is repeated for ever."""
+        return len(self._sequence) if self._settings.repeat == "once" else None
+
+    @property
+    def rate_hz(self) -> float:
+        """Usual frames per second at this pace."""
+        if self._settings.pace == "receiver":
+            return 0.0
+        if self._settings.pace == "rate" and self._settings.rate_hz is not None:
+            return self._settings.rate_hz
+        return 1e9 / self._period_ns()
+
+    def _period_ns(self) -> float:
+        times_ns = self._sequence.times_ns
+        return float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 1e8
+
+    def groundtruth(self) -> Trajectory | None:
+        """Return true poses of the first pass."""
+        return self._sequence.groundtruth()
+
+    def frames(self, stop: threading.Event) -> Iterator[SourceFrame]:
+        """Yield frames when they are due; unreadable ones are left out.
+
+        Raises:
+            SourceError: ``MAX_BAD_IN_A_ROW`` images in a row, or the last one, can't be read.
+        """
+        pacer = Pacer(self._settings, stop.wait)
+        times_ns = self._sequence.times_ns
+        last = len(self._sequence) - 1
+        period_ns = round(self._period_ns())
+        frame_id, t_source_ns, previous, bad = -1, 0, -1, 0
+        for count, index in enumerate(playback_order(len(self._sequence), self._settings.repeat)):
+            if count <= last:
+                frame_id, t_source_ns = int(self._sequence.frame_ids[index]), int(times_ns[index])
+            else:
+                step_ns = abs(int(times_ns[index] - times_ns[previous])) if abs(index - previous) == 1 else 0
+                frame_id, t_source_ns = frame_id + 1, t_source_ns + (step_ns or period_ns)
+            previous = index
+            final = count == last and self._settings.repeat == "once"
+            try:
+                image = self._sequence.image(index)
+            except SourceError as err:
+                bad += 1
+                if bad >= MAX_BAD_IN_A_ROW or final:
+                    raise
+                logger.warning("frame %d is left out: %s", frame_id, err)
+                continue
+            bad = 0
+            if not pacer.until_due(t_source_ns):
+                return
+            yield SourceFrame(frame_id, t_source_ns, time.monotonic_ns(), image, final)
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+
+def open_source(settings: SourceSettings) -> Source:
+    """Open what ``settings.source`` names.
+
+    A number is a camera, something with ``://`` an address, a folder or ``.json`` file a recording, any other
+    file a video.
+
+    Raises:
+        SourceError: It can't be opened, or its camera is unknown.
+    """
+    from semcast.agent.video import LiveSource, VideoSource
+
+    text = settings.source
+    if text.isdigit() or "://" in text:
+        return LiveSource(settings)
+    path = Path(text)
+    if path.is_file() and path.suffix.lower() != ".json":
+        return VideoSource(settings)
+    sequence = open_sequence(
+        path,
+        settings.camera,
+        settings.layout,
+        settings.resize,
+        settings.stride,
+        settings.max_frames,
+        settings.rate_hz or 10.0,
+    )
+    return RecordedSource(sequence, settings)

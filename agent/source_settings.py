@@ -1,0 +1,62 @@
+"""Which frames an agent sends, and how fast."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from semcast.common.camera_settings import CameraSettings
+from semcast.common.sequence_layouts import Layout
+
+Pace = Literal["recorded", "rate", "receiver"]
+Repeat = Literal["once", "loop", "swing"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceSettings:
+    """Where frames come from.
+
+    Raises:
+        ValueError: A value is out of range, or values contradict each other.
+    """
+
+    source: str = field(
+        metadata={
+            "help": "folder of a recorded sequence or of images, video file, number of a camera, "
+            "or address of a network camera such as rtsp://host/stream"
+        }
+    )
+    layout: Layout = field(
+        default="auto",
+        metadata={"help": "layout of the folder: native, tum, kitti, euroc, transforms, folder"},
+    )
+    camera: CameraSettings = field(default=CameraSettings(), metadata={"help": "intrinsics"})
+    resize: float = field(default=1.0, metadata={"help": "factor on the image size; intrinsics follow"})
+    stride: int = field(default=1, metadata={"help": "send every n-th frame"})
+    max_frames: int | None = field(default=None, metadata={"help": "send at most so many frames"})
+    pace: Pace = field(
+        default="recorded",
+        metadata={
+            "help": "recorded: at recorded times, or as the camera gives them; rate: at --rate-hz; "
+            "receiver: as fast as the receiver takes them (replay mode)"
+        },
+    )
+    rate_hz: float | None = field(
+        default=None,
+        metadata={"help": "frames per second for --pace rate, and for folders that record no times"},
+    )
+    repeat: Repeat = field(
+        default="once", metadata={"help": "at the end: stop, start again (loop), or go back (swing)"}
+    )
+
+    def __post_init__(self) -> None:
+        if not self.source:
+            raise ValueError("source must name a folder, a video, a camera or an address, got nothing")
+        if not 0.05 <= self.resize <= 1.0:
+            raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
+        if self.stride < 1:
+            raise ValueError(f"stride must be at least 1, got {self.stride}")
+        if self.max_frames is not None and self.max_frames < 1:
+            raise ValueError(f"max_frames must be at least 1, got {self.max_frames}")
+        if self.rate_hz is not None and not 0.01 <= self.rate_hz <= 1000.0:
+            raise ValueError(f"rate_hz must be in [0.01, 1000], got {self.rate_hz:g}")
+        if self.pace == "rate" and self.rate_hz is None:
+            raise ValueError("rate_hz must be given for pace 'rate', got None")

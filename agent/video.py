@@ -1,0 +1,261 @@
+"""Video files, webcams and network cameras, read by OpenCV."""
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.agent.source import Pacer, SourceFrame
+from semcast.agent.source_settings import SourceSettings
+from semcast.common.camera import Intrinsics
+from semcast.common.camera_settings import HOW_TO_GIVE
+from semcast.common.errors import SourceError
+from semcast.common.sequence import ImageRectifier, as_rgb, resized_wh
+from semcast.common.trajectory import Trajectory
+
+logger = logging.getLogger(__name__)
+
+_REOPEN_AFTER_S = 1.0
+_OPEN_TIMEOUT_MS = 5000
+
+
+def public_name(source: str) -> str:
+    """Return a source's name without the password an address may hold."""
+    if "://" not in source:
+        return source
+    scheme, rest = source.split("://", 1)
+    return f"{scheme}://{rest.rsplit('@', 1)[-1]}"
+
+
+def _open(source: str, live: bool) -> cv2.VideoCapture:
+    if not live:
+        capture = cv2.VideoCapture(source)
+    elif source.isdigit():
+        capture = cv2.VideoCapture(int(source))
+    else:
+        # Without limits a camera that is switched off holds the thread for half a minute.
+        limits = [
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+            _OPEN_TIMEOUT_MS,
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+            _OPEN_TIMEOUT_MS,
+        ]
+        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, limits)
+    if not capture.isOpened():
+        capture.release()
+        what = "camera" if live else "video"
+        raise SourceError(f"{what} {public_name(source)} can't be opened")
+    return capture
+
+
+def _read(capture: cv2.VideoCapture) -> NDArray[np.uint8] | None:
+    good, image = capture.read()
+    return as_rgb(image) if good and image is not None else None
+
+
+class _Captured:
+    """What video files and live cameras share: the capture, the camera model, the way to a frame."""
+
+    def __init__(self, settings: SourceSettings, live: bool, beside: Path | None) -> None:
+        self._settings = settings
+        self._live = live
+        self._capture: cv2.VideoCapture | None = _open(settings.source, live)
+        name = public_name(settings.source)
+        try:
+            first = _read(self._capture)
+            if first is None:
+                raise SourceError(f"{name} gives no images")
+            height, width = first.shape[:2]
+            camera = settings.camera.resolve(width, height)
+            if camera is None and beside is not None:
+                camera = Intrinsics.load(beside)
+            if camera is None:
+                raise SourceError(f"the camera of {name} is unknown: {HOW_TO_GIVE}")
+            if (camera.width, camera.height) != (width, height):
+                raise SourceError(
+                    f"intrinsics are for {camera.width}x{camera.height} images, {name} gives {width}x{height}"
+                )
+            self._size_wh = resized_wh(width, height, settings.resize)
+        except SourceError:
+            self.close()
+            raise
+        self._stored_wh = (width, height)
+        self._intrinsics = camera.undistorted().scaled_to(*self._size_wh)
+        self._rectify = ImageRectifier(camera, self._size_wh)
+        self._first: NDArray[np.uint8] | None = first
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of the frames, without distortion."""
+        return self._intrinsics
+
+    def groundtruth(self) -> Trajectory | None:
+        """None: a camera knows no truth."""
+        return None
+
+    def _usable(self, image: NDArray[np.uint8]) -> bool:
+        return (image.shape[1], image.shape[0]) == self._stored_wh
+
+    def close(self) -> None:
+        """Free the camera or file. Idempotent."""
+        if self._capture is not None:
+            self._capture.release()
+            self._capture = None
+
+
+class VideoSource(_Captured):
+    """A video file, played in time; intrinsics may lie beside it as ``<name>.json`` or ``intrinsics.json``.
+
+    Raises:
+        SourceError: It can't be read, its camera is unknown, or it is to be played backwards.
+    """
+
+    def __init__(self, settings: SourceSettings) -> None:
+        path = Path(settings.source)
+        if settings.repeat == "swing":
+            raise SourceError("a video can't be played backwards: use repeat 'once' or 'loop'")
+        beside = next(
+            (p for p in (path.with_suffix(".json"), path.parent / "intrinsics.json") if p.is_file()), None
+        )
+        super().__init__(settings, live=False, beside=beside)
+        assert self._capture is not None
+        fps = float(self._capture.get(cv2.CAP_PROP_FPS))
+        self._fps = fps if np.isfinite(fps) and 0.1 <= fps <= 1000 else settings.rate_hz or 30.0
+        count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self._stored_frames = count if count > 0 else None
+
+    @property
+    def name(self) -> str:
+        """File name."""
+        return Path(self._settings.source).name
+
+    @property
+    def num_frames(self) -> int | None:
+        """Frames that will be sent, as far as the file says how many it has."""
+        if self._settings.repeat != "once" or self._stored_frames is None:
+            return None
+        count = -(-self._stored_frames // self._settings.stride)
+        most = self._settings.max_frames
+        return count if most is None else min(count, most)
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second at this pace."""
+        if self._settings.pace == "receiver":
+            return 0.0
+        if self._settings.pace == "rate" and self._settings.rate_hz is not None:
+            return self._settings.rate_hz
+        return self._fps / self._settings.stride
+
+    def _one_pass(self) -> Iterator[NDArray[np.uint8]]:
+        """Yield what is left in the file."""
+        image, self._first = self._first, None
+        while self._capture is not None:
+            if image is None:
+                image = _read(self._capture)
+            if image is None:
+                return
+            yield image
+            image = None
+
+    def _images(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield the frames that are to be sent, over all passes, with a running index."""
+        index, sent, most = 0, 0, self._settings.max_frames
+        while True:
+            before = index
+            for image in self._one_pass():
+                if index % self._settings.stride == 0:
+                    if most is not None and sent == most:
+                        return
+                    sent += 1
+                    yield index, image
+                index += 1
+            if self._settings.repeat != "loop" or self._capture is None or index == before:
+                return
+            self._capture.release()
+            self._capture = _open(self._settings.source, live=False)
+
+    def frames(self, stop: threading.Event) -> Iterator[SourceFrame]:
+        """Yield frames when they are due. One is read ahead, to know which is the last."""
+        pacer = Pacer(self._settings, stop.wait)
+        images = self._images()
+        ahead = next(images, None)
+        while ahead is not None and not stop.is_set():
+            index, image = ahead
+            ahead = next(images, None)
+            t_source_ns = round(index * 1e9 / self._fps)
+            rectified = self._rectify(image)
+            if not pacer.until_due(t_source_ns):
+                return
+            yield SourceFrame(index, t_source_ns, time.monotonic_ns(), rectified, ahead is None)
+
+
+class LiveSource(_Captured):
+    """A webcam or network camera. When it stops giving images it is opened again until it answers.
+
+    Raises:
+        SourceError: It can't be opened, or its camera is unknown.
+    """
+
+    def __init__(self, settings: SourceSettings) -> None:
+        super().__init__(settings, live=True, beside=None)
+        assert self._capture is not None
+        # The driver's queue only makes frames older.
+        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        fps = float(self._capture.get(cv2.CAP_PROP_FPS))
+        self._fps = fps if np.isfinite(fps) and 0.1 <= fps <= 1000 else 30.0
+
+    @property
+    def name(self) -> str:
+        """Camera number, or the address without a password."""
+        text = self._settings.source
+        return public_name(text) if "://" in text else f"camera {text}"
+
+    @property
+    def num_frames(self) -> int | None:
+        """As many as were asked for, or None: no end."""
+        return self._settings.max_frames
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second at most."""
+        given_hz = self._fps / self._settings.stride
+        wanted_hz = self._settings.rate_hz if self._settings.pace == "rate" else None
+        return given_hz if wanted_hz is None else min(given_hz, wanted_hz)
+
+    def frames(self, stop: threading.Event) -> Iterator[SourceFrame]:
+        """Yield frames as they are grabbed, at most ``rate_hz`` a second with pace ``rate``."""
+        grabbed, sent, due_ns = -1, 0, 0
+        interval_ns = 0
+        if self._settings.pace == "rate" and self._settings.rate_hz is not None:
+            interval_ns = round(1e9 / self._settings.rate_hz)
+        most = self._settings.max_frames
+        while not stop.is_set() and (most is None or sent < most):
+            image = _read(self._capture) if self._capture is not None else None
+            now_ns = time.monotonic_ns()
+            if image is None or not self._usable(image):
+                self._reopen(stop)
+                continue
+            grabbed += 1
+            if grabbed % self._settings.stride or now_ns < due_ns:
+                continue
+            due_ns = max(due_ns + interval_ns, now_ns - interval_ns)
+            sent += 1
+            yield SourceFrame(grabbed, now_ns, now_ns, self._rectify(image), sent == most)
+
+    def _reopen(self, stop: threading.Event) -> None:
+        if self._capture is not None:
+            logger.warning("%s gives no images any more, trying again", self.name)
+            self.close()
+        if stop.wait(_REOPEN_AFTER_S):
+            return
+        try:
+            self._capture = _open(self._settings.source, live=True)
+        except SourceError:
+            return
+        logger.info("%s gives images again", self.name)

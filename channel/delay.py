@@ -1,0 +1,76 @@
+"""Holds packets back for the delay and jitter of a link; they leave in the order they came."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+#: Ten seconds of delay at 50 frames per second.
+CAPACITY = 512
+
+
+class DelayLine:
+    """Calls ``send`` for each packet when its time has come, on a thread of its own when it must wait.
+
+    Jitter is exponential. A radio link doesn't reorder: a packet leaves no sooner than the one before it.
+
+    Args:
+        send: Gets the packet.
+        rng: Randomness of the jitter.
+    """
+
+    def __init__(self, send: Callable[[bytes, bool], None], rng: np.random.Generator) -> None:
+        self._send = send
+        self._rng = rng
+        self._waiting: deque[tuple[float, bytes, bool]] = deque()
+        self._changed = threading.Condition()
+        self._sending = False
+        self._last_due_s = 0.0
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="semcast-delay", daemon=True)
+        self._thread.start()
+
+    def put(self, packet: bytes, lossless: bool, delay_ms: float, jitter_ms: float) -> bool:
+        """Take a packet; without any delay it is sent at once, by the caller.
+
+        Returns:
+            False when too many packets wait already; it is dropped then.
+        """
+        extra_ms = float(self._rng.exponential(jitter_ms)) if jitter_ms > 0 else 0.0
+        due_s = time.monotonic() + 1e-3 * (delay_ms + extra_ms)
+        with self._changed:
+            at_once = delay_ms + extra_ms == 0.0 and not self._waiting and not self._sending
+            if not at_once:
+                if len(self._waiting) >= CAPACITY:
+                    return False
+                self._last_due_s = max(self._last_due_s, due_s)
+                self._waiting.append((self._last_due_s, packet, lossless))
+                self._changed.notify_all()
+        if at_once:
+            self._send(packet, lossless)
+        return True
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._sending = False
+                self._changed.wait_for(lambda: bool(self._waiting) or self._closed)
+                if self._closed:
+                    return
+                due_s, packet, lossless = self._waiting[0]
+                remaining_s = due_s - time.monotonic()
+                if remaining_s > 0:
+                    self._changed.wait(remaining_s)
+                    continue
+                self._waiting.popleft()
+                self._sending = True
+            self._send(packet, lossless)
+
+    def close(self) -> None:
+        """Drop what still waits and end the thread. Idempotent."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(2.0)

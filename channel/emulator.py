@@ -1,0 +1,236 @@
+"""The channel process: takes the agent's symbols, does to them what a radio link does, passes them on."""
+
+import logging
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from semcast.channel.delay import DelayLine
+from semcast.channel.emulator_settings import EmulatorSettings
+from semcast.channel.link import Link
+from semcast.channel.settings import ChannelSettings
+from semcast.common.config import build_settings, settings_to_dict
+from semcast.common.errors import ConfigError, SemcastError, TransportError
+from semcast.common.keys import channel_key, control_key, rx_key, tx_key
+from semcast.common.mailbox import Mailbox
+from semcast.common.messages import ChannelReport, ControlReply, ControlRequest, SymbolFrame
+from semcast.common.metrics import Metrics
+from semcast.common.network_settings import NetworkSettings
+from semcast.common.phy.pilots import insert_pilots
+from semcast.common.status_beat import StatusBeat
+from semcast.common.symbol_payload import data_symbols, pack_iq, pack_lost
+from semcast.common.transport import Session, open_client, open_session
+from semcast.common.wire import WireError, pack, unpack
+
+logger = logging.getLogger(__name__)
+
+ROLE = "channel"
+_POLL_S = 0.1
+_RING_CAPACITY = 16
+_REPLAY_CAPACITY = 64
+_JITTER_STREAM = 0x717
+
+
+class Emulator:
+    """One stream's channel on a session. ``work`` runs in one thread, settings change from any.
+
+    Args:
+        session: Open.
+        settings: Of the process.
+        metrics: Where to count. Drops: ``superseded`` by a newer frame while busy, ``lost`` on the air,
+            ``missing`` (never arrived from the agent), ``protocol``, ``overflow`` (too many are delayed).
+    """
+
+    def __init__(self, session: Session, settings: EmulatorSettings, metrics: Metrics) -> None:
+        self._settings = settings
+        self._metrics = metrics
+        self._link = Link(settings.link, settings.seed)
+        self._link_lock = threading.Lock()
+        self._box: Mailbox[SymbolFrame] = Mailbox(1, "newest")
+        self._epoch = 0
+        self._arrived_epoch = 0
+        self._arrived_seq = 0
+        agent_id = settings.agent_id
+        self._live = session.publisher(rx_key(agent_id), "newest")
+        self._lossless = session.publisher(rx_key(agent_id), "every")
+        self._reports = session.publisher(channel_key(agent_id), "newest")
+        self._delay = DelayLine(self._send, np.random.default_rng((settings.seed, _JITTER_STREAM)))
+        session.answer(control_key(agent_id, ROLE), self._on_request)
+        session.subscribe(tx_key(agent_id), "newest", self._on_symbols, _RING_CAPACITY)
+
+    @property
+    def agent_epoch(self) -> int:
+        """Epoch of the last frame, 0 before the first."""
+        return self._epoch
+
+    def _on_symbols(self, payload: bytes) -> None:
+        try:
+            frame = unpack(payload, SymbolFrame)
+            if frame.direction != "tx":
+                raise WireError("kind", f"frame must be tx, got {frame.direction}")
+        except WireError as err:
+            self._metrics.drop("protocol")
+            self._metrics.count(f"protocol_{err.reason}")
+            self._metrics.error(str(err))
+            return
+        self._metrics.count("received")
+        if frame.agent_epoch == self._arrived_epoch and frame.seq > self._arrived_seq:
+            self._metrics.drop("missing", frame.seq - self._arrived_seq)
+        self._arrived_epoch, self._arrived_seq = frame.agent_epoch, frame.seq + 1
+        # A lossless agent never has more frames under way than this; a live one is served its newest.
+        self._box.resize(_REPLAY_CAPACITY if frame.lossless else 1)
+        before = self._box.dropped
+        self._box.put(frame)
+        self._metrics.drop("superseded", self._box.dropped - before)
+
+    def work(self, stop: threading.Event) -> None:
+        """Carry frames until ``stop`` is set."""
+        while not stop.is_set():
+            frame = self._box.get(_POLL_S)
+            if frame is None:
+                continue
+            try:
+                with self._metrics.stage("channel"):
+                    self._carry(frame)
+            except (ValueError, SemcastError) as err:
+                self._metrics.drop("protocol")
+                self._metrics.error(f"frame {frame.frame_id}: {err}")
+                logger.debug("frame %d left out: %s", frame.frame_id, err)
+
+    def _carry(self, frame: SymbolFrame) -> None:
+        self._follow(frame)
+        symbols = data_symbols(frame)
+        with self._link_lock:
+            settings = self._link.settings
+            sent = self._link.transmit(insert_pilots(symbols), frame.t_source_ns * 1e-9, frame.frame_id)
+        self._reports.put(
+            pack(
+                ChannelReport(
+                    agent_epoch=frame.agent_epoch,
+                    frame_id=frame.frame_id,
+                    channel=settings.channel,
+                    snr_db_set=float(sent.snr_db_set),
+                    num_slots=frame.num_slots,
+                    num_slots_lost=int(sent.slot_lost.sum()),
+                    frame_lost=sent.frame_lost,
+                )
+            )
+        )
+        if sent.frame_lost:
+            self._metrics.drop("lost")
+            if not frame.lossless:
+                return
+        received = replace(
+            frame,
+            direction="rx",
+            payload_format="lost" if sent.frame_lost else "iq16",
+            payload=b"" if sent.frame_lost else pack_iq(sent.slots_rx),
+            slot_lost=pack_lost(sent.slot_lost),
+        )
+        if self._delay.put(pack(received), frame.lossless, settings.delay_ms, settings.jitter_ms):
+            self._metrics.count("carried")
+        else:
+            self._metrics.drop("overflow")
+
+    def _follow(self, frame: SymbolFrame) -> None:
+        """Start anew for a restarted agent."""
+        if frame.agent_epoch != self._epoch:
+            self._epoch = frame.agent_epoch
+            with self._link_lock:
+                # Time starts anew with the stream, and with it fading and SNR traces.
+                self._link = Link(self._link.settings, self._settings.seed)
+
+    def _send(self, packet: bytes, lossless: bool) -> None:
+        try:
+            (self._lossless if lossless else self._live).put(packet)
+        except TransportError as err:
+            logger.debug("not sent: %s", err)
+
+    def _on_request(self, payload: bytes) -> bytes:
+        try:
+            request = unpack(payload, ControlRequest)
+            return pack(ControlReply(ok=True, settings=self._control(request)))
+        except SemcastError as err:
+            return pack(ControlReply(ok=False, error=str(err)[:1000]))
+
+    def _control(self, request: ControlRequest) -> dict[str, Any]:
+        if request.op not in ("get", "set"):
+            raise ConfigError(f"op must be get or set, got {request.op!r}")
+        with self._link_lock:
+            if request.op == "set":
+                current = settings_to_dict(self._link.settings)
+                changed = build_settings(ChannelSettings, {**current, **request.settings})
+                self._link.update(changed)
+                logger.info("channel set: %s", ", ".join(f"{k}={v}" for k, v in request.settings.items()))
+            return settings_to_dict(self._link.settings)
+
+    def close(self) -> None:
+        """End the delay line's thread. Idempotent."""
+        self._box.close()
+        self._delay.close()
+
+
+def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, Any]:
+    """Run the channel process until ``stop`` is set.
+
+    Args:
+        settings: Of the process.
+        stop: Ends it.
+
+    Returns:
+        Counts, drops by reason and stage times.
+
+    Raises:
+        ConfigError: A trace can't be read.
+        TransportError: Its port is taken, where it is the hub.
+    """
+    metrics = Metrics(ROLE)
+    session = open_session(settings.network, stop)
+    if session is None:
+        return metrics.summary()
+    with session:
+        emulator = Emulator(session, settings, metrics)
+        beat = StatusBeat(session, settings.agent_id, ROLE, metrics, lambda: emulator.agent_epoch)
+        session.declare_alive(settings.agent_id, ROLE)
+        logger.info("channel %s at %g dB", settings.link.channel, settings.link.snr_db)
+        try:
+            emulator.work(stop)
+        finally:
+            emulator.close()
+            beat.close()
+    return metrics.summary()
+
+
+def set_channel(
+    network: NetworkSettings, agent_id: str, changes: Mapping[str, Any], timeout_s: float = 3.0
+) -> dict[str, Any]:
+    """Change the settings of a running channel, or read them with no changes.
+
+    Args:
+        network: Where the hub is.
+        agent_id: Whose channel.
+        changes: Fields of ``ChannelSettings`` and their new values.
+        timeout_s: For connecting and for the answer.
+
+    Returns:
+        All settings now in force.
+
+    Raises:
+        ConfigError: The channel refused; the message is its own.
+        TransportError: No hub or no channel answered.
+    """
+    op = "set" if changes else "get"
+    plain = {name: str(value) if hasattr(value, "__fspath__") else value for name, value in changes.items()}
+    with open_client(network, timeout_s) as session:
+        answer = session.request(
+            control_key(agent_id, ROLE), pack(ControlRequest(op=op, settings=plain)), timeout_s
+        )
+    if answer is None:
+        raise TransportError(f"no channel of {agent_id} answers: is 'semcast channel' running?")
+    reply = unpack(answer, ControlReply)
+    if not reply.ok:
+        raise ConfigError(reply.error)
+    return reply.settings
