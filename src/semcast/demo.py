@@ -197,7 +197,7 @@ def run_demo(
     alive = Alive(set(), threading.Condition())
     try:
         children["server"].start()
-        network = NetworkSettings(agent_id=AGENT_ID, connect=(endpoint,))
+        network = NetworkSettings(connect=(endpoint,))
         session = open_session(network, stop, START_DEADLINE_S)
         if session is None:
             return None

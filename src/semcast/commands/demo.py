@@ -77,7 +77,10 @@ def run(arguments: argparse.Namespace) -> int:
     Console().print(summary_table(result))
     files = ("trajectory.tum", "map.ply", "run.rrd", "summary.json", "settings.toml")
     there = ", ".join(name for name in files if (settings.out / name).exists())
-    print(f"in {settings.out}: {there}; look again with: rerun {settings.out / 'run.rrd'}")
+    again = (
+        f"; look again with: rerun {settings.out / 'run.rrd'}" if (settings.out / "run.rrd").exists() else ""
+    )
+    print(f"in {settings.out}: {there}{again}")
     if settings.json is not None:
         shutil.copyfile(settings.out / "summary.json", settings.json)
     return code or (0 if result.get("completeness") else 1)

@@ -1,0 +1,18 @@
+"""``semcast server``: decode, track, map and show what an agent sends."""
+
+import argparse
+
+from semcast.commands.running import add_settings, read_settings, run_until_stopped
+from semcast.server.server import run_server
+from semcast.server.settings import ServerSettings
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_settings(parser, ServerSettings)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve until the source ends or the process is stopped; outputs are always written."""
+    settings = read_settings(ServerSettings, arguments)
+    return run_until_stopped(lambda stop: run_server(settings, stop))
