@@ -1,0 +1,18 @@
+"""An agent must start where neither gtsam nor rerun nor poselib is installed."""
+
+import subprocess
+import sys
+
+import pytest
+
+BLOCKED = ("gtsam", "rerun", "poselib", "mcap", "matplotlib")
+
+
+@pytest.mark.parametrize("module", ["semcast.commands.agent", "semcast.commands.channel"])
+def test_it_imports_without_the_servers_libraries(module):
+    code = (
+        f"import sys\nfor name in {BLOCKED!r}: sys.modules[name] = None\n"
+        f"import importlib; importlib.import_module({module!r})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
