@@ -146,11 +146,7 @@ def evaluate_latency(settings: LatencySettings, codec: Codec | None = None) -> d
             run = reconstruct(frames, sequence.intrinsics, settings.reconstruction, truth, view)
         finally:
             view.close()
-    # The bundle runs in line: waiting for its submission is the run itself, which ``bundle`` already counts.
-    rows = [
-        {**row, "stage_ms": {k: ms for k, ms in row["stage_ms"].items() if k != "bundle_submit"}}
-        for row in run.rows[settings.warmup :]
-    ]
+    rows = run.rows[settings.warmup :]
     if not rows:
         raise ConfigError(f"warmup must leave frames to time, got {settings.warmup} of {len(run.rows)}")
     report = json_ready(
