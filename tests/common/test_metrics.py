@@ -1,0 +1,83 @@
+import pytest
+
+from semcast.common.messages import StatusMessage
+from semcast.common.metrics import WINDOW, Metrics
+from semcast.common.wire import pack, unpack
+
+
+class Clock:
+    def __init__(self):
+        self.now_ns = 10**12
+
+    def __call__(self):
+        return self.now_ns
+
+    def advance(self, seconds):
+        self.now_ns += round(seconds * 1e9)
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def metrics(clock):
+    return Metrics("agent", clock)
+
+
+def test_rates_are_over_the_last_five_seconds(metrics, clock):
+    for _ in range(40):
+        metrics.count("sent")
+        clock.advance(0.1)
+    assert metrics.rates_hz()["sent"] == pytest.approx(10.0)  # 40 in the 4 s since the start
+    clock.advance(3.0)
+    assert metrics.rates_hz()["sent"] == pytest.approx(20 / 5, abs=0.21)
+    clock.advance(10.0)
+    assert metrics.rates_hz()["sent"] == 0.0
+    assert metrics.counts == {"sent": 40}
+
+
+def test_stage_times_are_percentiles_of_the_last_runs(metrics, clock):
+    for k in range(1, 101):
+        metrics.observe("encode", float(k))
+    assert metrics.stages_ms()["encode"] == pytest.approx((50.5, 95.05, 100.0))
+    for _ in range(WINDOW):
+        metrics.observe("encode", 2.0)
+    assert metrics.stages_ms()["encode"] == (2.0, 2.0, 2.0)
+
+    def run_and_fail():
+        with metrics.stage("broken"):
+            clock.advance(0.25)
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        run_and_fail()
+    assert metrics.stages_ms()["broken"] == pytest.approx((250.0, 250.0, 250.0))
+
+
+def test_drops_are_counted_by_reason_and_can_be_taken_back(metrics):
+    metrics.drop("missing", 3)
+    metrics.drop("missing", -1)
+    metrics.drop("stale")
+    metrics.drop("superseded", 0)
+    assert metrics.drops == {"missing": 2, "stale": 1}
+
+
+def test_the_status_travels(metrics, clock):
+    metrics.count("sent", 3)
+    metrics.drop("stale")
+    metrics.observe("encode", 4.0)
+    metrics.error("it broke")
+    clock.advance(2.0)
+    status = unpack(pack(metrics.status(7)), StatusMessage)
+    assert (status.role, status.agent_epoch, status.uptime_s, status.last_error) == (
+        "agent",
+        7,
+        2.0,
+        "it broke",
+    )
+    assert status.counts == {"sent": 3, "errors": 1}
+    assert status.drops == {"stale": 1}
+    assert status.stages_ms == {"encode": (4.0, 4.0, 4.0)}
+    assert metrics.summary()["stage_ms"]["encode"] == {"p50": 4.0, "p95": 4.0, "max": 4.0}
