@@ -152,6 +152,15 @@ def unposed_ranges(frame_ids: list[int], posed: set[int]) -> list[tuple[int, int
     return ranges if first is None else [*ranges, (first, last)]
 
 
+def sent_frame_ids(frame_ids: list[int]) -> list[int]:
+    """Return all ids between the first and last one that were seen, at their common stride."""
+    seen = np.unique(np.array(frame_ids, dtype=np.int64))
+    if len(seen) < 2:
+        return [int(k) for k in seen]
+    stride = int(np.gcd.reduce(np.diff(seen)))
+    return list(range(int(seen[0]), int(seen[-1]) + 1, stride))
+
+
 def summarise(
     rows: list[FrameRow],
     trajectory: Trajectory,
@@ -167,13 +176,11 @@ def summarise(
         trajectory: All posed frames after the last correction.
         posed_ids: Their frame ids.
         truth: Reference poses in metres, or None.
-        num_frames: Frames the source had up to the end of the run; None takes the span of frame ids seen.
+        num_frames: Frames the source had; None takes what frame ids up to the newest one imply.
         drops: Frames that never reached the tracker, by reason.
     """
-    frame_ids = sorted(row.frame_id for row in rows)
-    if num_frames is None:
-        num_frames = frame_ids[-1] - frame_ids[0] + 1 if frame_ids else 0
-    num_frames = max(num_frames, len(posed_ids))
+    frame_ids = sent_frame_ids([row.frame_id for row in rows])
+    num_frames = max(num_frames if num_frames is not None else len(frame_ids), len(posed_ids))
     psnr_db = np.array([row.psnr_db for row in rows if row.psnr_db is not None and np.isfinite(row.psnr_db)])
     stages = sorted({stage for row in rows for stage in row.stage_ms})
     stage_ms = {s: percentiles(row.stage_ms[s] for row in rows if s in row.stage_ms) for s in stages}

@@ -4,6 +4,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from semcast.common.codec import Modulation
+from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
+from semcast.common.network_settings import HubSettings
 from semcast.server.reconstruction_settings import ReconstructionSettings
 
 View = Literal["auto", "native", "web", "file", "none"]
@@ -63,9 +66,13 @@ class ServerSettings:
     """The server process.
 
     Attributes:
-        agent_id: Camera to serve; ``*`` takes the first that is there.
+        agent_id: Whose stream.
+        network: Where the processes meet.
         mode: ``live`` takes the newest frame and drops the others; ``replay`` loses none and repeats exactly.
+        max_age_ms: Live frames older than this are dropped.
         out: Folder for outputs, or None.
+        codec: Codec to load before the server reports itself ready; others are loaded when they arrive.
+        modulation: Of that codec.
         threads: CPU threads of the decoder.
         device: Where the decoder runs.
         reference: The recorded sequence the agent sends, for PSNR and true path.
@@ -80,12 +87,20 @@ class ServerSettings:
         view: Viewer.
     """
 
-    agent_id: str = field(default="cam0", metadata={"flag": "agent", "help": "name of the camera to serve"})
+    agent_id: str = field(default=DEFAULT_AGENT_ID, metadata={"help": "name of the agent to serve"})
+    network: HubSettings = field(default=HubSettings(), metadata={"help": "where the processes meet"})
     mode: Literal["live", "replay"] = field(
         default="live",
         metadata={"help": "live: newest frame wins, drops are counted; replay: no frame lost, deterministic"},
     )
+    max_age_ms: float = field(
+        default=1000.0, metadata={"help": "live frames older than this are dropped, in milliseconds"}
+    )
     out: Path | None = field(default=None, metadata={"help": "folder for trajectory, map, summary, run.rrd"})
+    codec: str | None = field(
+        default=None, metadata={"help": "codec to have ready at once; any other is loaded when it arrives"}
+    )
+    modulation: Modulation = field(default="16qam", metadata={"help": "modulation of that codec"})
     threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})
     device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "device of the decoder"})
     reference: Path | None = field(
@@ -121,13 +136,14 @@ class ServerSettings:
         Raises:
             ValueError: A value is out of range.
         """
+        check_agent_id(self.agent_id)
         if self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
         if not 0.1 <= self.checkpoint_interval_s <= 3600:
             raise ValueError(
                 f"checkpoint_interval_s must be in [0.1, 3600], got {self.checkpoint_interval_s}"
             )
-        for name in ("idle_timeout_s", "duration_s"):
+        for name in ("idle_timeout_s", "duration_s", "max_age_ms"):
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise ValueError(f"{name} must be positive, got {value}")

@@ -1,0 +1,120 @@
+"""From equalised symbols to an image with confidence, by the codec each message names."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from semcast.common.codec import LOST_SLOT_SNR_DB, Codec, Modulation, ReceivedImage
+from semcast.common.errors import CheckpointError
+from semcast.common.phy.slots import layout_for
+from semcast.server.receiver import ReceivedFrame
+from semcast.server.state import DecodedFrame
+
+logger = logging.getLogger(__name__)
+
+CodecLoader = Callable[[str, Modulation], Codec]
+
+
+@dataclass(frozen=True)
+class DecodedArrival:
+    """A received frame and, unless it was lost on the air, its image.
+
+    Attributes:
+        arrival: As received.
+        frame: Ready for the tracker; None when nothing arrived or nothing usable did.
+        decode_ms: Duration of the decoder.
+    """
+
+    arrival: ReceivedFrame
+    frame: DecodedFrame | None
+    decode_ms: float
+
+
+class FrameDecoder:
+    """Decodes frames; codecs are loaded once. Safe to use from several threads, one at a time.
+
+    Args:
+        load: Returns the codec of a name and modulation, as ``common.codecs.load_codec`` does.
+    """
+
+    def __init__(self, load: CodecLoader) -> None:
+        self._load = load
+        self._codecs: dict[tuple[str, Modulation], Codec] = {}
+        self._lock = threading.Lock()
+
+    def load(self, name: str, modulation: Modulation) -> Codec:
+        """Return a codec, loading it the first time.
+
+        Raises:
+            CheckpointError: Its weights are missing or damaged.
+            ConfigError: There is no such codec.
+        """
+        key = (name, modulation)
+        if key not in self._codecs:
+            started_ns = time.perf_counter_ns()
+            self._codecs[key] = self._load(name, modulation)
+            logger.info("codec %s (%s) loaded in %.1f s", *key, (time.perf_counter_ns() - started_ns) * 1e-9)
+        return self._codecs[key]
+
+    def codec_for(self, name: str, modulation: Modulation, digest: str) -> Codec:
+        """Return the codec of a stream.
+
+        Raises:
+            CheckpointError: The sender's weights are not the ones installed here.
+            ConfigError: There is no such codec.
+        """
+        codec = self.load(name, modulation)
+        if codec.digest != digest:
+            raise CheckpointError(
+                f"codec {name} has digest {codec.digest} here but {digest} at the agent: "
+                "install the same version of semcast at both ends"
+            )
+        return codec
+
+    def warm_up(self, name: str, modulation: Modulation, digest: str, shape_hw: tuple[int, int]) -> None:
+        """Load a stream's codec and run it once on nothing, which is slower than all later frames.
+
+        Raises:
+            CheckpointError: See ``codec_for``.
+            ConfigError: See ``codec_for``.
+        """
+        layout = layout_for(shape_hw)
+        nothing = ReceivedImage(
+            shape_hw=shape_hw,
+            symbols=np.zeros((layout.num_slots, layout.data_per_slot), dtype=np.complex64),
+            effective_snr_db=np.full(layout.num_slots, LOST_SLOT_SNR_DB, dtype=np.float32),
+            modulation=modulation,
+        )
+        with self._lock:
+            self.codec_for(name, modulation, digest).decode(nothing)
+
+    def decode(self, arrival: ReceivedFrame) -> DecodedArrival:
+        """Decode one frame.
+
+        Raises:
+            CheckpointError: See ``codec_for``.
+            ConfigError: See ``codec_for``.
+        """
+        message = arrival.message
+        if arrival.received is None:
+            return DecodedArrival(arrival, None, 0.0)
+        with self._lock:
+            codec = self.codec_for(message.codec, message.modulation, message.digest)
+            started_ns = time.perf_counter_ns()
+            decoded = codec.decode(arrival.received)
+        decode_ms = (time.perf_counter_ns() - started_ns) * 1e-6
+        if decoded.outage:
+            return DecodedArrival(arrival, None, decode_ms)
+        frame = DecodedFrame(
+            frame_id=message.frame_id,
+            t_source_ns=message.t_source_ns,
+            image=decoded.image,
+            confidence=decoded.confidence,
+            keypoint_confidence=decoded.keypoint_confidence,
+            slot_snr_db=arrival.slot_snr_db,
+        )
+        return DecodedArrival(arrival, frame, decode_ms)

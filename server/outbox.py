@@ -1,0 +1,115 @@
+"""Publishes what the server finds on a thread of its own: a slow subscriber never holds the tracker up."""
+
+import logging
+import threading
+from collections import OrderedDict
+
+import numpy as np
+
+from semcast.common.errors import SemcastError
+from semcast.common.keys import map_key, pose_key
+from semcast.common.mailbox import Mailbox
+from semcast.common.messages import MapMessage, PoseMessage
+from semcast.common.metrics import Metrics
+from semcast.common.transport import Publisher, Session
+from semcast.common.wire import pack
+from semcast.server.receiver import ReceivedFrame
+from semcast.server.state import FrameResult, MapUpdate
+
+logger = logging.getLogger(__name__)
+
+#: Messages that wait for slow subscribers; beyond it the oldest are dropped as ``outbox``.
+CAPACITY = 1024
+
+
+class Outbox:
+    """Sends poses and map changes of one agent.
+
+    Args:
+        session: An open session.
+        agent_id: Whose stream it is.
+        metrics: Where to count.
+    """
+
+    def __init__(self, session: Session, agent_id: str, metrics: Metrics) -> None:
+        self._pose = session.publisher(pose_key(agent_id), "every")
+        self._map = session.publisher(map_key(agent_id), "every")
+        self._metrics = metrics
+        self._box: Mailbox[tuple[Publisher, PoseMessage | MapMessage]] = Mailbox(CAPACITY, "newest")
+        self._t_capture_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
+        self._thread = threading.Thread(target=self._run, name="semcast-outbox", daemon=True)
+        self._thread.start()
+
+    def put(self, arrival: ReceivedFrame, result: FrameResult, update: MapUpdate | None) -> None:
+        """Send one frame's outcome, and the poses it gave to earlier frames before its own."""
+        epoch = arrival.message.agent_epoch
+        before = self._box.dropped
+        if update is not None:
+            self._box.put((self._map, map_message(epoch, update)))
+        self._t_capture_ns[(epoch, result.frame_id)] = arrival.message.t_capture_ns
+        while len(self._t_capture_ns) > CAPACITY:
+            self._t_capture_ns.popitem(last=False)
+        for frame_id, t_source_ns, T_world_cam in result.backfilled:
+            t_capture_ns = self._t_capture_ns.get((epoch, frame_id))
+            if t_capture_ns is None:
+                continue
+            message = PoseMessage(
+                agent_epoch=epoch,
+                frame_id=frame_id,
+                t_capture_ns=t_capture_ns,
+                t_source_ns=t_source_ns,
+                T_world_cam=tuple(T_world_cam.ravel().tolist()),
+                state=result.state.value,
+                num_inliers=0,
+                covariance=None,
+                map_epoch=result.map_epoch,
+            )
+            self._box.put((self._pose, message))
+        self._box.put((self._pose, pose_message(arrival, result)))
+        self._metrics.drop("outbox", self._box.dropped - before)
+
+    def _run(self) -> None:
+        while (entry := self._box.get()) is not None:
+            publisher, message = entry
+            try:
+                publisher.put(pack(message))
+            except SemcastError as err:
+                self._metrics.drop("unsent")
+                logger.debug("not sent: %s", err)
+
+    def close(self, deadline_s: float = 2.0) -> None:
+        """Send what waits and end the thread. Idempotent."""
+        self._box.close()
+        self._thread.join(deadline_s)
+
+
+def pose_message(arrival: ReceivedFrame, result: FrameResult) -> PoseMessage:
+    """Return the message of a frame's pose."""
+    T, covariance = result.T_world_cam, result.covariance
+    known = covariance is not None and bool(np.isfinite(covariance).all())
+    return PoseMessage(
+        agent_epoch=arrival.message.agent_epoch,
+        frame_id=result.frame_id,
+        t_capture_ns=arrival.message.t_capture_ns,
+        t_source_ns=result.t_source_ns,
+        T_world_cam=tuple(T.ravel().tolist()) if T is not None else None,
+        state=result.state.value,
+        num_inliers=result.num_inliers,
+        covariance=tuple(covariance.ravel().tolist()) if covariance is not None and known else None,
+        map_epoch=result.map_epoch,
+    )
+
+
+def map_message(agent_epoch: int, update: MapUpdate) -> MapMessage:
+    """Return the message of a map change."""
+    return MapMessage(
+        agent_epoch=agent_epoch,
+        map_epoch=update.map_epoch,
+        ids=update.ids,
+        xyz=update.xyz.astype(np.float32),
+        rgb=update.rgb,
+        confidence=update.confidence,
+        removed=update.removed,
+        keyframe_ids=update.keyframe_ids,
+        keyframe_poses=update.keyframe_poses,
+    )

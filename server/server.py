@@ -1,0 +1,390 @@
+"""The server process: receives, decodes, tracks and maps one stream, shows it and keeps the results."""
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from semcast.common.codec import Codec, Modulation
+from semcast.common.codecs import load_codec
+from semcast.common.errors import SemcastError
+from semcast.common.keys import camera_key, control_key
+from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
+from semcast.common.metrics import Metrics
+from semcast.common.run_folder import VIEWER_NAME
+from semcast.common.status_beat import StatusBeat
+from semcast.common.transport import Session as NetworkSession
+from semcast.common.transport import open_session
+from semcast.common.wire import WireError, pack, unpack
+from semcast.server.decode_ahead import DecodeAhead
+from semcast.server.decoder import DecodedArrival, FrameDecoder
+from semcast.server.outbox import Outbox
+from semcast.server.receiver import ReceivedFrame, Receiver
+from semcast.server.reference import Reference
+from semcast.server.session import Arrival, Outcome, Session, StreamIdentity
+from semcast.server.settings import ServerSettings
+
+if TYPE_CHECKING:  # Rerun is imported only when something is shown or recorded
+    from semcast.server.viewer_feed import ViewerFeed
+
+logger = logging.getLogger(__name__)
+
+POLL_S = 0.1
+CAMERA_TIMEOUT_S = 0.5
+#: How long stragglers are waited for after the source's last frame.
+FINAL_IDLE_S = 0.5
+#: The last frame may be lost on the air: so many frames from the end count as the end once the agent is gone.
+NEARLY_FINAL_FRAMES = 10
+AGENT_GONE_S = 2.0
+
+
+class Server:
+    """Serves one agent. Build, ``run`` once, ``close``.
+
+    A restarted agent begins a new map in the same folder; what the former one left is moved to
+    ``previous-<n>/``. A restarted server goes on with the map of its checkpoint if the agent is the same.
+
+    Args:
+        settings: What to do.
+        session: An open network session, which the server declares itself on.
+        load: Returns a codec by name and modulation; None takes the installed ones.
+    """
+
+    def __init__(
+        self,
+        settings: ServerSettings,
+        session: NetworkSession,
+        load: Callable[[str, Modulation], Codec] | None = None,
+    ) -> None:
+        self._settings = settings
+        self._agent_id = settings.agent_id
+        self._metrics = Metrics("server")
+        self._decoder = FrameDecoder(load if load is not None else self._load_codec)
+        self._session: Session | None = None
+        self._viewer: ViewerFeed | None = None
+        self._reference: Reference | None = None
+        self._requests: set[str] = set()
+        self._announced: CameraInfo | None = None
+        self._inbox_lock = threading.Lock()
+        self._drops_before: dict[str, int] = {}
+        self._complete = False
+        self._nearly_final = False
+        self._new_map = False
+        self._resources = contextlib.ExitStack()
+        with contextlib.ExitStack() as stack:
+            self._receiver = stack.enter_context(
+                Receiver(session, self._agent_id, settings.mode, self._metrics, settings.max_age_ms)
+            )
+            self._outbox = Outbox(session, self._agent_id, self._metrics)
+            stack.callback(self._outbox.close)
+            beat = StatusBeat(
+                session, self._agent_id, "server", self._metrics, lambda: self._receiver.agent_epoch
+            )
+            stack.callback(beat.close)
+            session.answer(control_key(self._agent_id, "server"), self._answer)
+            if settings.codec is not None:
+                self._decoder.load(settings.codec, settings.modulation)
+            session.subscribe(camera_key(self._agent_id), "every", self._on_camera)
+            self._ask_for_camera(session)
+            self._ahead = DecodeAhead(self._receiver.next, self._decoder.decode, self._on_failure)
+            stack.callback(self._ahead.close)
+            session.declare_alive(self._agent_id, "server")
+            self._resources = stack.pop_all()
+
+    def _load_codec(self, name: str, modulation: Modulation) -> Codec:
+        return load_codec(
+            name,
+            modulation=modulation,
+            num_threads=self._settings.threads,
+            device=self._settings.device,
+        )
+
+    def _ask_for_camera(self, session: NetworkSession) -> None:
+        """Learn at once of an agent that is already there."""
+        if "agent" in session.alive_roles(self._agent_id, CAMERA_TIMEOUT_S):
+            answer = session.request(camera_key(self._agent_id), b"", CAMERA_TIMEOUT_S)
+            if answer is not None:
+                self._on_camera(answer)
+
+    def _on_camera(self, payload: bytes) -> None:
+        """Note an announced stream; the receiver counts and reports what is not valid."""
+        with contextlib.suppress(WireError):
+            camera = unpack(payload, CameraInfo)
+            with self._inbox_lock:
+                if self._announced is None or camera.agent_epoch > self._announced.agent_epoch:
+                    self._announced = camera
+
+    def _on_failure(self, arrival: ReceivedFrame, reason: str) -> None:
+        self._metrics.drop(reason)
+        self._metrics.error(f"frame {arrival.message.frame_id} dropped: {reason}")
+
+    def _answer(self, payload: bytes) -> bytes:
+        """Answer a control request: ``reset`` begins a new map, ``save`` writes all outputs now."""
+        try:
+            request = unpack(payload, ControlRequest)
+        except WireError as err:
+            return pack(ControlReply(ok=False, error=str(err)))
+        if request.op not in ("get", "reset", "save"):
+            return pack(ControlReply(ok=False, error=f"op must be get, reset or save, got {request.op}"))
+        if request.op != "get":
+            with self._inbox_lock:
+                self._requests.add(request.op)
+        values = {"mode": self._settings.mode, "view": self._settings.view.view}
+        return pack(ControlReply(ok=True, settings=values))
+
+    def run(self, stop: threading.Event) -> dict[str, Any]:
+        """Serve until the source ends, ``stop`` is set or a time limit passes; outputs are always written.
+
+        Returns:
+            The summary of the newest stream, which is also in ``summary.json``.
+
+        Raises:
+            ConfigError: The viewer can't be started.
+            SourceError: The reference can't be read.
+        """
+        started_s = last_frame_s = time.monotonic()
+        try:
+            while not stop.is_set():
+                decoded = self._ahead.get(POLL_S)
+                now_s = time.monotonic()
+                self._serve_requests()
+                self._prepare()
+                if decoded is not None:
+                    last_frame_s = now_s
+                    self._take(decoded)
+                elif self._ended(now_s - last_frame_s):
+                    break
+                if self._settings.duration_s is not None and now_s - started_s >= self._settings.duration_s:
+                    break
+        finally:
+            summary = self._finish()
+        return summary
+
+    def _ended(self, idle_s: float) -> bool:
+        """Tell whether nothing more is to come, after a pause of ``idle_s``."""
+        if self._session is None or self._settings.keep_running:
+            return False
+        if self._complete and idle_s >= FINAL_IDLE_S:
+            return True
+        gone = "agent" not in self._receiver.roles_alive
+        if self._nearly_final and gone and idle_s >= AGENT_GONE_S:
+            self._complete = True
+            return True
+        limit_s = self._settings.idle_timeout_s
+        return limit_s is not None and idle_s >= limit_s
+
+    def _serve_requests(self) -> None:
+        with self._inbox_lock:
+            requests, self._requests = self._requests, set()
+        if self._session is None:
+            return
+        if "reset" in requests:
+            logger.info("map reset on request")
+            self._session.restart_map()
+            self._new_map = True
+        if "save" in requests:
+            self._session.save_checkpoint()
+            self._session.write_results(self._settings.out)
+
+    def _prepare(self) -> None:
+        """Begin on an announced stream, so that codec, viewer and map are ready for its first frame."""
+        with self._inbox_lock:
+            camera, self._announced = self._announced, None
+        if camera is None or (
+            self._session is not None and camera.agent_epoch <= self._session.identity.agent_epoch
+        ):
+            return
+        self._begin(camera)
+        width, height = camera.image_wh
+        try:
+            self._decoder.warm_up(camera.codec, camera.modulation, camera.digest, (height, width))
+        except SemcastError as err:
+            logger.warning("%s", err)
+
+    def _take(self, decoded: DecodedArrival) -> None:
+        """Track one frame, send and show what came of it. One bad frame never stops the stream."""
+        message = decoded.arrival.message
+        session = self._session
+        if session is None or session.identity.agent_epoch != message.agent_epoch:
+            session = self._begin(decoded.arrival.camera)
+        self._complete = message.final
+        num_frames = decoded.arrival.camera.num_frames
+        self._nearly_final = num_frames is not None and message.frame_id >= num_frames - NEARLY_FINAL_FRAMES
+        if decoded.frame is None:
+            self._metrics.drop("lost_on_air" if decoded.arrival.received is None else "outage")
+            return
+        if message.frame_id <= session.last_frame_id:
+            self._metrics.drop("processed")
+            return
+        try:
+            outcome = session.process(decoded.frame, self._arrival_of(decoded))
+        except Exception as err:
+            logger.exception("frame %d could not be tracked and is left out", message.frame_id)
+            self._metrics.drop("track")
+            self._metrics.error(f"frame {message.frame_id}: {err}")
+            return
+        self._spread(decoded, outcome)
+
+    def _arrival_of(self, decoded: DecodedArrival) -> Arrival:
+        arrival = decoded.arrival
+        return Arrival(
+            snr_set_db=arrival.snr_db_set,
+            snr_estimated_db=arrival.snr_db,
+            t_arrival_ns=arrival.t_arrival_ns,
+            stage_ms={"equalise": arrival.equalise_ms, "decode": decoded.decode_ms},
+            drops=self._metrics.drops,
+        )
+
+    def _spread(self, decoded: DecodedArrival, outcome: Outcome) -> None:
+        """Publish, show and count what a frame led to."""
+        result = outcome.result
+        self._outbox.put(decoded.arrival, result, outcome.update)
+        self._metrics.count("tracked")
+        if result.T_world_cam is not None:
+            self._metrics.count("posed")
+        for stage, duration_ms in (("decode", decoded.decode_ms), *result.stage_ms.items()):
+            self._metrics.observe(stage, duration_ms)
+        if self._viewer is not None:
+            started_ns = time.perf_counter_ns()
+            self._viewer.submit(outcome.view, outcome.update, new_map=self._new_map)
+            self._metrics.observe("view", (time.perf_counter_ns() - started_ns) * 1e-6)
+        self._new_map = False
+
+    def _begin(self, camera: CameraInfo) -> Session:
+        """Start on the stream of an agent heard for the first time, ending that of the one before."""
+        identity = StreamIdentity(
+            agent_id=self._agent_id,
+            agent_epoch=camera.agent_epoch,
+            codec=camera.codec,
+            digest=camera.digest,
+            camera=camera.intrinsics,
+            num_frames=camera.num_frames,
+        )
+        former, self._session = self._session, None
+        if former is not None:
+            logger.info("the agent was started again: a new map is begun")
+            self._end(former, self._folder_for_former())
+        self._complete = self._nearly_final = False
+        if self._settings.reference is not None and self._reference is None:
+            self._reference = Reference(self._settings.reference, identity.camera)
+        self._session = Session(self._settings, identity, self._settings.out, self._reference)
+        self._drops_before = self._metrics.drops if former is not None else {}
+        if former is not None and former.identity.camera != identity.camera:
+            self._close_viewer()
+        if self._viewer is None:
+            self._open_viewer(identity, self._session.resumed)
+        else:
+            self._new_map = True
+        width, height = camera.image_wh
+        logger.info(
+            "stream of %s (%s): %dx%d, codec %s, %s mode",
+            *(self._agent_id, camera.source_name, width, height, camera.codec, self._settings.mode),
+        )
+        return self._session
+
+    def _open_viewer(self, identity: StreamIdentity, resumed: bool) -> None:
+        view, out = self._settings.view.view, self._settings.out
+        if view == "none":
+            return
+        from semcast.server.viewer_feed import ViewerFeed, resolve_view
+
+        if view == "auto" and resolve_view(view) == "file" and out is None:
+            return
+        file = out / VIEWER_NAME if out is not None else None
+        if file is not None and resumed:
+            keep_former(file)
+        self._viewer = ViewerFeed(
+            self._settings.view,
+            identity.camera,
+            f"{identity.agent_id}-{identity.agent_epoch}",
+            truth=self._reference.truth if self._reference is not None else None,
+            file=file,
+        )
+        if self._viewer.url is not None:
+            logger.info("viewer: %s", self._viewer.url)
+
+    def _close_viewer(self) -> None:
+        viewer, self._viewer = self._viewer, None
+        if viewer is not None:
+            viewer.close()
+
+    def _drops(self) -> dict[str, int]:
+        """Drops since the present stream began."""
+        now = self._metrics.drops
+        return {reason: n for reason in now if (n := now[reason] - self._drops_before.get(reason, 0)) > 0}
+
+    def _folder_for_former(self) -> Path | None:
+        out = self._settings.out
+        if out is None:
+            return None
+        n = 1
+        while (out / f"previous-{n}").exists():
+            n += 1
+        return out / f"previous-{n}"
+
+    def _end(self, session: Session, folder: Path | None) -> dict[str, Any]:
+        """Write what a stream leaves behind into a folder and release it."""
+        try:
+            if not self._complete:
+                session.save_checkpoint()
+            summary = session.write_outputs(folder, self._drops(), complete=self._complete)
+        finally:
+            session.close()
+        if folder is not None and folder != self._settings.out:
+            session.move_records(folder)
+        return summary
+
+    def _finish(self) -> dict[str, Any]:
+        """End the present stream; a server that heard of none has an empty summary."""
+        session, self._session = self._session, None
+        if session is None:
+            return {}
+        summary = self._end(session, self._settings.out)
+        if self._settings.out is not None:
+            logger.info("outputs are in %s", self._settings.out)
+        return summary
+
+    def close(self) -> None:
+        """Release threads, processes and ports. Idempotent."""
+        self._resources.close()
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()
+        self._close_viewer()
+        reference, self._reference = self._reference, None
+        if reference is not None:
+            reference.close()
+
+
+def keep_former(file: Path) -> None:
+    """Rename an existing file to ``<stem>-<n><suffix>`` so that it is not overwritten."""
+    n = 1
+    while (former := file.with_name(f"{file.stem}-{n}{file.suffix}")).exists():
+        n += 1
+    with contextlib.suppress(FileNotFoundError):
+        file.rename(former)
+
+
+def run_server(settings: ServerSettings, stop_event: threading.Event) -> dict[str, Any]:
+    """Serve one agent until its source ends, ``stop_event`` is set or a time limit passes.
+
+    Args:
+        settings: What to do.
+        stop_event: Ends the run early; outputs are written all the same.
+
+    Returns:
+        The summary, which is also in ``summary.json``; empty when no stream was heard.
+
+    Raises:
+        TransportError: The port is taken, or no hub was found.
+        ConfigError: The viewer can't be started or a codec is unknown.
+        SourceError: The reference can't be read.
+    """
+    network = open_session(settings.network, stop_event)
+    if network is None:
+        return {}
+    with network, contextlib.closing(Server(settings, network)) as server:
+        return server.run(stop_event)

@@ -1,0 +1,375 @@
+"""Everything that belongs to one start of one agent: its map, its rows, its checkpoint and its outputs."""
+
+import contextlib
+import logging
+import time
+from collections.abc import Mapping
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.config import settings_to_dict, to_toml
+from semcast.common.errors import CheckpointError, SemcastError
+from semcast.common.run_folder import (
+    FRAMES_NAME,
+    IMAGES_NAME,
+    MAP_NAME,
+    SETTINGS_NAME,
+    SUMMARY_NAME,
+    TRAJECTORY_NAME,
+    ImageWriter,
+    RunData,
+    write_run,
+)
+from semcast.common.trajectory import Trajectory, write_tum
+from semcast.server.bundle import InlineBundle
+from semcast.server.bundle_process import ProcessBundle
+from semcast.server.checkpoint import (
+    Checkpoint,
+    CheckpointHeader,
+    CheckpointWriter,
+    load_checkpoint,
+    mismatch,
+)
+from semcast.server.export import trajectory_of, versions, write_json, write_ply
+from semcast.server.reconstruction import Reconstruction
+from semcast.server.reference import Reference
+from semcast.server.run_record import FrameRow, RunRecord, summarise
+from semcast.server.scene import FrameView
+from semcast.server.settings import ServerSettings
+from semcast.server.state import DecodedFrame, FrameResult, MapUpdate
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+CHECKPOINT_NAME = "checkpoint.npz"
+#: How long a live frame waits for its PSNR; in replay it waits until it is there.
+LIVE_PSNR_WAIT_S = 0.05
+
+
+@dataclass(frozen=True)
+class StreamIdentity:
+    """What a map belongs to.
+
+    Attributes:
+        agent_id: The camera's name.
+        agent_epoch: Start of the agent, nanoseconds.
+        codec: Codec name.
+        digest: Its digest.
+        camera: Intrinsics of the decoded images.
+        num_frames: Frames of a finite source, or None.
+    """
+
+    agent_id: str
+    agent_epoch: int
+    codec: str
+    digest: str
+    camera: Intrinsics
+    num_frames: int | None
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """What is known about a frame besides its image.
+
+    Attributes:
+        snr_set_db: What the channel node says it applies, None where it says nothing.
+        snr_estimated_db: What the receiver estimated.
+        t_arrival_ns: Server clock (``perf_counter_ns``) when the frame arrived.
+        stage_ms: Stages before the tracker.
+        drops: Frames that did not get this far, by reason, up to now.
+    """
+
+    snr_set_db: float | None
+    snr_estimated_db: float | None
+    t_arrival_ns: int
+    stage_ms: Mapping[str, float]
+    drops: Mapping[str, int]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one frame led to."""
+
+    result: FrameResult
+    update: MapUpdate | None
+    view: FrameView
+
+
+class Session:
+    """Tracks and maps one agent epoch and writes what it leaves behind. Used from one thread.
+
+    Args:
+        settings: Of the server.
+        identity: What the map belongs to.
+        folder: Where outputs go, or None.
+        reference: Originals and truth, or None.
+    """
+
+    def __init__(
+        self,
+        settings: ServerSettings,
+        identity: StreamIdentity,
+        folder: Path | None,
+        reference: Reference | None,
+    ) -> None:
+        self._settings = settings
+        self.identity = identity
+        self._folder = folder
+        self._reference = reference
+        lossless = settings.mode == "replay"
+        bundle = InlineBundle() if settings.bundle == "inline" else ProcessBundle(lossless=lossless)
+        self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
+        self._t_source_ns: dict[int, int] = {}
+        self._map_epoch = 0
+        self._last_frame_id = -1
+        self._last_checkpoint_s = time.monotonic()
+        self._checkpoints: CheckpointWriter | None = None
+        self._images: ImageWriter | None = None
+        self.resumed = False
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            self.resumed = settings.resume and self._restore(folder / CHECKPOINT_NAME)
+            self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME)
+            if settings.save_images != "none":
+                self._images = ImageWriter(folder, lossless=lossless)
+        self._record = RunRecord(folder, resume=self.resumed)
+        self._t_source_ns.update((row.frame_id, row.t_source_ns) for row in self._record.rows())
+        #: Poses of a restored map that the viewer has not seen yet.
+        self._restored = self._reconstruction.final_trajectory() if self.resumed else {}
+
+    @property
+    def last_frame_id(self) -> int:
+        """Newest frame that was processed, -1 before the first."""
+        return self._last_frame_id
+
+    def _restore(self, path: Path) -> bool:
+        """Take the map of a checkpoint that belongs to this stream; say so when there is none."""
+        if not path.exists():
+            return False
+        try:
+            checkpoint = load_checkpoint(path)
+            wanted = {
+                "agent_id": self.identity.agent_id,
+                "agent_epoch": self.identity.agent_epoch,
+                "codec_digest": self.identity.digest,
+                "camera": self.identity.camera,
+            }
+            reason = mismatch(checkpoint.header, wanted)
+            if reason is not None:
+                logger.info("a new map is started, the checkpoint is of another stream: %s", reason)
+                return False
+            self._reconstruction.restore(checkpoint.arrays)
+        except (CheckpointError, ValueError, KeyError) as err:
+            logger.warning("a new map is started, the checkpoint can't be used: %s", err)
+            self._reconstruction.reset()
+            return False
+        self._last_frame_id = checkpoint.header.frame_id
+        self._map_epoch = checkpoint.header.map_epoch
+        logger.info("map restored from the checkpoint, up to frame %d", self._last_frame_id)
+        return True
+
+    def process(self, frame: DecodedFrame, arrival: Arrival) -> Outcome:
+        """Track a frame, extend the map and write the frame's row."""
+        quality = (
+            self._reference.psnr_db(frame.frame_id, frame.image) if self._reference is not None else None
+        )
+        result = self._reconstruction.process(frame)
+        update = self._reconstruction.take_map_update()
+        tracked_ns = time.perf_counter_ns()
+        self._last_frame_id = frame.frame_id
+        self._t_source_ns[frame.frame_id] = frame.t_source_ns
+        for frame_id, t_source_ns, _ in result.backfilled:
+            self._t_source_ns.setdefault(frame_id, t_source_ns)
+        psnr = self._await(quality)
+        row = FrameRow(
+            frame_id=frame.frame_id,
+            t_source_ns=frame.t_source_ns,
+            state=result.state.value,
+            posed=result.T_world_cam is not None,
+            num_tracked=result.num_tracked,
+            num_inliers=result.num_inliers,
+            reprojection_error_px=result.reprojection_error_px,
+            is_keyframe=result.is_keyframe,
+            map_epoch=result.map_epoch,
+            snr_set_db=arrival.snr_set_db,
+            snr_estimated_db=arrival.snr_estimated_db,
+            psnr_db=psnr,
+            confidence_mean=float(frame.confidence.mean()) if frame.confidence is not None else None,
+            age_ms=(tracked_ns - arrival.t_arrival_ns) * 1e-6,
+            stage_ms={**arrival.stage_ms, **result.stage_ms},
+        )
+        self._record.add(row)
+        if self._images is not None and (result.is_keyframe or self._settings.save_images == "all"):
+            self._images.put(frame.frame_id, frame.image)
+        self._map_epoch = result.map_epoch
+        if time.monotonic() - self._last_checkpoint_s >= self._settings.checkpoint_interval_s:
+            self.save_checkpoint()
+        view = frame_view(frame, result, row, arrival.drops)
+        if self._restored:
+            restored = [(k, self._t_source_ns.get(k, 0), T) for k, T in sorted(self._restored.items())]
+            view = replace(view, backfilled=(*restored, *view.backfilled))
+            self._restored = {}
+        return Outcome(result, update, view)
+
+    def _await(self, quality: "Future[float | None] | None") -> float | None:
+        if quality is None:
+            return None
+        try:
+            return quality.result(timeout=None if self._settings.mode == "replay" else LIVE_PSNR_WAIT_S)
+        except FutureTimeoutError:
+            return None
+
+    def save_checkpoint(self) -> None:
+        """Hand the map to the checkpoint writer; a no-op without a folder or before the first frame."""
+        self._last_checkpoint_s = time.monotonic()
+        if self._checkpoints is None or self._last_frame_id < 0:
+            return
+        header = CheckpointHeader(
+            agent_id=self.identity.agent_id,
+            agent_epoch=self.identity.agent_epoch,
+            codec_digest=self.identity.digest,
+            camera=self.identity.camera,
+            frame_id=self._last_frame_id,
+            t_source_ns=self._t_source_ns.get(self._last_frame_id, 0),
+            map_epoch=self._map_epoch,
+        )
+        self._checkpoints.submit(Checkpoint(header, self._reconstruction.snapshot()))
+
+    def restart_map(self) -> None:
+        """Forget the map, as the control request ``reset`` asks."""
+        self._reconstruction.reset()
+
+    def write_outputs(
+        self, folder: Path | None, drops: Mapping[str, int], *, complete: bool
+    ) -> dict[str, Any]:
+        """Write trajectory, map, reconstruction and summary, and return the summary.
+
+        Args:
+            folder: Where to, or None to only make the summary.
+            drops: Frames that never reached the tracker, by reason.
+            complete: The source came to its end, so all its frames count for completeness.
+        """
+        poses, trajectory, num_landmarks = self.write_results(folder)
+        truth = self._reference.truth if self._reference is not None else None
+        summary = summarise(
+            self._record.rows(),
+            trajectory,
+            set(poses),
+            truth,
+            self.identity.num_frames if complete else None,
+            drops,
+        )
+        summary["num_landmarks"] = num_landmarks
+        summary["stream"] = {
+            "agent_id": self.identity.agent_id,
+            "codec": self.identity.codec,
+            "digest": self.identity.digest,
+            "image_wh": [self.identity.camera.width, self.identity.camera.height],
+        }
+        summary["resumed"] = self.resumed
+        summary["versions"] = versions()
+        summary["settings"] = settings_to_dict(self._settings)
+        if folder is not None:
+            write_json(folder / SUMMARY_NAME, summary)
+        return summary
+
+    def write_results(self, folder: Path | None) -> tuple[Mapping[int, Array], Trajectory, int]:
+        """Write trajectory, map and reconstruction; return poses, trajectory and number of landmarks."""
+        poses = self._reconstruction.final_trajectory()
+        trajectory = trajectory_of(poses, self._t_source_ns)
+        ids, xyz, rgb, confidence = self._reconstruction.landmarks()
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / SETTINGS_NAME).write_text(to_toml(self._settings), encoding="utf-8")
+            write_tum(folder / TRAJECTORY_NAME, trajectory)
+            write_ply(folder / MAP_NAME, xyz, rgb, confidence)
+            self._write_run(folder, poses, ids, xyz, rgb, confidence)
+        return poses, trajectory, len(ids)
+
+    def move_records(self, folder: Path) -> None:
+        """Move what was written on the way to another folder, after ``close``."""
+        if self._folder is None:
+            return
+        for name in (FRAMES_NAME, IMAGES_NAME, CHECKPOINT_NAME):
+            with contextlib.suppress(FileNotFoundError):
+                (self._folder / name).rename(folder / name)
+
+    def _write_run(
+        self,
+        folder: Path,
+        poses: Mapping[int, Array],
+        ids: NDArray[np.int64],
+        xyz: Array,
+        rgb: NDArray[np.uint8],
+        confidence: NDArray[np.float32],
+    ) -> None:
+        """Write what exports to other tools are made from; failing to is reported, not fatal."""
+        timed = sorted(frame_id for frame_id in poses if frame_id in self._t_source_ns)
+        landmark_ids, keyframe_ids, xy = self._reconstruction.observations()
+        used = np.isin(landmark_ids, ids) & np.isin(keyframe_ids, timed)
+        try:
+            write_run(
+                folder,
+                RunData(
+                    intrinsics=self.identity.camera,
+                    frame_ids=np.array(timed, dtype=np.int64),
+                    t_source_ns=np.array([self._t_source_ns[k] for k in timed], dtype=np.int64),
+                    T_world_cam=np.array([poses[k] for k in timed]).reshape(-1, 4, 4),
+                    keyframe_ids=np.unique(keyframe_ids[used]),
+                    landmark_ids=ids,
+                    xyz=xyz,
+                    rgb=rgb,
+                    confidence=confidence,
+                    observed_landmark_ids=landmark_ids[used],
+                    observed_keyframe_ids=keyframe_ids[used],
+                    observed_xy=xy[used],
+                ),
+            )
+        except (SemcastError, ValueError) as err:
+            logger.warning("the reconstruction can't be written for export: %s", err)
+
+    def close(self) -> None:
+        """End threads and processes. Idempotent; outputs are written by ``write_outputs`` before."""
+        if self._checkpoints is not None:
+            self._checkpoints.close()
+        if self._images is not None:
+            self._images.close()
+        self._record.close()
+        self._reconstruction.close()
+
+
+def frame_view(
+    frame: DecodedFrame, result: FrameResult, row: FrameRow, drops: Mapping[str, int]
+) -> FrameView:
+    """Return what the viewer shows of a frame; unknown values have no point in the plots."""
+    scalars: dict[str, float | None] = {
+        "link/snr_set_db": row.snr_set_db,
+        "link/snr_estimated_db": row.snr_estimated_db,
+        "link/psnr_db": row.psnr_db,
+        "tracking/tracked": float(row.num_tracked),
+        "tracking/inliers": float(row.num_inliers),
+        "error/reprojection_error_px": row.reprojection_error_px,
+        "latency/arrival_to_pose_ms": row.age_ms,
+        **{f"latency/{stage}_ms": value for stage, value in row.stage_ms.items()},
+        **{f"drops/{reason}": float(count) for reason, count in drops.items()},
+    }
+    return FrameView(
+        frame_id=frame.frame_id,
+        t_source_ns=frame.t_source_ns,
+        T_world_cam=result.T_world_cam,
+        state=result.state.value,
+        scalars={path: value for path, value in scalars.items() if value is not None and np.isfinite(value)},
+        image=frame.image,
+        confidence=frame.confidence,
+        keypoints_xy=result.keypoints_xy,
+        keypoint_inlier=result.keypoint_inlier,
+        backfilled=result.backfilled,
+    )
