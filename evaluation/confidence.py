@@ -9,12 +9,21 @@ from semcast.common.errors import ConfigError
 from semcast.common.image import psnr_db
 from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.evaluation.confidence_grades import KeypointGrader, PixelGrader, SlotGrader
-from semcast.evaluation.pipeline import CLEAN, FrameRun, StreamSettings, open_stream, selected_frame_ids
+from semcast.evaluation.pipeline import (
+    CLEAN,
+    UNUSED_LINK_FIELDS,
+    FrameRun,
+    StreamSettings,
+    open_stream,
+    selected_frame_ids,
+)
 from semcast.evaluation.plots import plot_reliability
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.statistics import finite_mean
 
 VERB = "eval confidence"
+#: Flags that have no meaning here.
+UNUSED_FIELDS = UNUSED_LINK_FIELDS
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,13 @@ from semcast.common.camera import Intrinsics
 from semcast.common.codec import Codec
 from semcast.common.errors import ConfigError
 from semcast.common.trajectory import Trajectory
-from semcast.evaluation.pipeline import FrameRun, StreamSettings, open_stream, selected_frame_ids
+from semcast.evaluation.pipeline import (
+    UNUSED_LINK_FIELDS,
+    FrameRun,
+    StreamSettings,
+    open_stream,
+    selected_frame_ids,
+)
 from semcast.evaluation.reconstruct import reconstruct
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.server.reconstruction_settings import ReconstructionSettings
@@ -24,7 +30,8 @@ from semcast.server.state import DecodedFrame, FrameResult, MapUpdate
 from semcast.server.viewer import RerunStream
 
 VERB = "eval latency"
-UNUSED_FIELDS = frozenset({"reconstruction.seed"})
+#: Flags that have no meaning here: one run, whose seed is also that of the search.
+UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.seed", "seeds"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,10 +147,11 @@ def evaluate_latency(settings: LatencySettings, codec: Codec | None = None) -> d
         cache_bytes=0,
     )
     truth = sequence.groundtruth()
+    how = replace(settings.reconstruction, seed=settings.seed)
     with tempfile.TemporaryDirectory(prefix="semcast-") as folder:
         view = ViewStage(Path(folder) / "run.rrd", sequence.intrinsics, truth)
         try:
-            run = reconstruct(frames, sequence.intrinsics, settings.reconstruction, truth, view)
+            run = reconstruct(frames, sequence.intrinsics, how, truth, view)
         finally:
             view.close()
     rows = run.rows[settings.warmup :]

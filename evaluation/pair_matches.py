@@ -60,7 +60,8 @@ class PairMatches:
     def take(self, idx: NDArray[np.intp]) -> "PairMatches":
         """Return the matches with these indices."""
         values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        return PairMatches(**{k: None if v is None else v[idx] for k, v in values.items()})
+        taken: dict[str, Any] = {k: None if v is None else v[idx] for k, v in values.items()}
+        return PairMatches(**taken)
 
     @property
     def confidence(self) -> Array:

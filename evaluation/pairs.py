@@ -27,6 +27,7 @@ from semcast.evaluation.pair_methods import (
     match_confidence,
 )
 from semcast.evaluation.pipeline import (
+    UNUSED_LINK_FIELDS,
     FrameRun,
     LinkedFrame,
     StreamSettings,
@@ -42,6 +43,8 @@ from semcast.server.weighting import ConfidenceMode
 Array = NDArray[np.float64]
 
 VERB = "eval pairs"
+#: Flags that have no meaning here.
+UNUSED_FIELDS = UNUSED_LINK_FIELDS
 _THINNING_STREAM = 0x7417
 
 

@@ -11,7 +11,14 @@ from semcast.common.codec import Codec
 from semcast.common.errors import SemcastError
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.trajectory_error import ate
-from semcast.evaluation.pipeline import CLEAN, FrameRun, StreamSettings, open_stream, selected_frame_ids
+from semcast.evaluation.pipeline import (
+    CLEAN,
+    UNUSED_LINK_FIELDS,
+    FrameRun,
+    StreamSettings,
+    open_stream,
+    selected_frame_ids,
+)
 from semcast.evaluation.plots import plot_top_view
 from semcast.evaluation.reconstruct import ReconstructedRun, reconstruct
 from semcast.evaluation.report import json_ready, provenance, write_json
@@ -21,7 +28,7 @@ from semcast.server.weighting import ConfidenceMode
 
 VERB = "eval trajectory"
 #: Flags that this verb sets itself: the mode is a list here, the seed is that of the run.
-UNUSED_FIELDS = frozenset({"reconstruction.confidence", "reconstruction.seed"})
+UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.confidence", "reconstruction.seed"}
 #: Figures of a run that are summarised over seeds.
 FIGURES = ("ate_rmse_m", "ate_percent", "completeness", "rpe_trans_percent", "rpe_rot_deg", "psnr_db")
 
