@@ -53,6 +53,9 @@ def zenoh_config(network: NetworkSettings) -> zenoh.Config:
         "connect/timeout_ms": -1 if hub else _CONNECT_TRY_MS,
         "connect/exit_on_failure": not hub,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+        # Nothing is scouted, so opening need not wait half a second for what scouting finds.
+        "open/return_conditions/connect_scouted": False,
+        "scouting/delay": 0,
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/rx/max_message_size": 2 * MAX_MESSAGE_BYTES,
         "transport/shared_memory/enabled": False,

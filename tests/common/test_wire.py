@@ -48,8 +48,9 @@ def examples():
             frame_lost=False,
         ),
         PoseMessage(
-            agent_epoch=1, frame_id=2, t_capture_ns=3, t_source_ns=4, T_world_cam=tuple(np.eye(4).ravel().tolist()),
-            state="tracking", num_inliers=80, covariance=None, map_epoch=0,
+            agent_epoch=1, frame_id=2, t_capture_ns=3, t_source_ns=4,
+            T_world_cam=tuple(np.eye(4).ravel().tolist()), state="tracking",
+            num_inliers=80, covariance=None, map_epoch=0,
         ),
         MapMessage(
             agent_epoch=1, map_epoch=2, ids=np.arange(n), xyz=np.ones((n, 3), np.float32),

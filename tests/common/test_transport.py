@@ -1,0 +1,253 @@
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from semcast.common.errors import TransportError
+from semcast.common.network_settings import HubSettings, NetworkSettings, is_loopback
+from semcast.common.transport import (
+    alive_roles,
+    free_endpoint,
+    loopback_round_trip_ms,
+    open_client,
+    open_hub,
+    open_session,
+    zenoh_config,
+)
+
+HUB_PROGRAM = """
+import sys, threading
+from semcast.common.network_settings import NetworkSettings
+from semcast.common.transport import open_session
+session = open_session(NetworkSettings(listen=(sys.argv[1],), connect=()))
+print("up", flush=True)
+threading.Event().wait()
+"""
+
+
+def until(condition, deadline_s=10.0):
+    """Wait for a condition; the interval only bounds how late it is noticed."""
+    end_s = time.monotonic() + deadline_s
+    tick = threading.Event()
+    while not condition():
+        assert time.monotonic() < end_s, "the condition did not come true in time"
+        tick.wait(0.005)
+
+
+@pytest.fixture
+def hub():
+    session, endpoint = open_hub()
+    with session:
+        yield session, endpoint
+
+
+@pytest.fixture
+def pair(hub):
+    network = NetworkSettings(connect=(hub[1],))
+    with open_client(network, 5) as one, open_client(network, 5) as other:
+        yield one, other
+
+
+def test_two_clients_of_a_hub_reach_each_other_in_order(pair):
+    sender, receiver = pair
+    received = []
+    receiver.subscribe("semcast/a/map", "every", received.append)
+    publisher = sender.publisher("semcast/a/map", "every")
+    until(lambda: publisher.has_receiver)
+    sent = [bytes([k % 256]) * 1000 for k in range(300)]
+    for payload in sent:
+        publisher.put(payload)
+    until(lambda: len(received) == 300)
+    assert received == sent
+
+
+def test_newest_wins_while_the_receiver_is_busy(pair):
+    sender, receiver = pair
+    received = []
+    busy, go_on = threading.Event(), threading.Event()
+
+    def deliver(payload):
+        received.append(payload)
+        busy.set()
+        go_on.wait(10)
+
+    receiver.subscribe("semcast/a/rx/symbols", "newest", deliver)
+    arrived = []
+    receiver.subscribe("semcast/a/rx/symbols", "every", arrived.append)
+    publisher = sender.publisher("semcast/a/rx/symbols", "every")
+    until(lambda: publisher.has_receiver)
+    publisher.put(b"0")
+    assert busy.wait(10)
+    for k in range(1, 50):
+        publisher.put(b"%d" % k)
+    until(lambda: len(arrived) == 50)
+    go_on.set()
+    until(lambda: len(received) == 3)
+    assert received == [b"0", b"48", b"49"]
+
+
+def test_a_failing_handler_loses_its_message_only(pair, caplog):
+    sender, receiver = pair
+    received = []
+
+    def deliver(payload):
+        if payload == b"bad":
+            raise ValueError("no good")
+        received.append(payload)
+
+    receiver.subscribe("semcast/a/pose", "every", deliver)
+    publisher = sender.publisher("semcast/a/pose", "every")
+    until(lambda: publisher.has_receiver)
+    for payload in (b"bad", b"good"):
+        publisher.put(payload)
+    until(lambda: received == [b"good"])
+    assert "a message could not be handled" in caplog.text
+
+
+def test_requests_are_answered_or_time_out(pair):
+    asking, answering = pair
+    answering.answer("semcast/a/camera", lambda payload: payload.upper())
+    until(lambda: asking.request("semcast/a/camera", b"hello", 1.0) == b"HELLO")
+    started_s = time.monotonic()
+    assert asking.request("semcast/b/camera", b"hello", 0.5) is None
+    assert time.monotonic() - started_s < 2.0
+
+
+def test_presence_is_seen_from_anywhere_and_ends_with_the_session(hub, pair):
+    one, other = pair
+    changes = []
+    other.watch_alive("a", lambda role, alive: changes.append((role, alive)))
+    hub[0].declare_alive("a", "server")
+    with open_client(NetworkSettings(connect=(hub[1],)), 5) as third:
+        third.declare_alive("a", "agent")
+        until(lambda: one.alive_roles("a") == {"agent", "server"})
+        assert one.alive_agents() == ["a"]
+        assert alive_roles(hub[1], "a") == {"agent", "server"}
+        assert alive_roles(hub[1], "b") == set()
+    until(lambda: ("agent", False) in changes)
+    assert alive_roles(hub[1], "a") == {"server"}
+
+
+def test_clients_survive_a_hub_that_is_killed():
+    endpoint = free_endpoint()
+    network = NetworkSettings(connect=(endpoint,))
+
+    def start():
+        process = subprocess.Popen(
+            [sys.executable, "-c", HUB_PROGRAM, endpoint], stdout=subprocess.PIPE, text=True
+        )
+        with process.stdout:
+            assert process.stdout.readline() == "up\n"
+        return process
+
+    process = start()
+    try:
+        with open_client(network, 5) as sender, open_client(network, 5) as receiver:
+            received = []
+            receiver.subscribe("semcast/a/rx/symbols", "newest", received.append)
+            sender.declare_alive("a", "agent")
+            publisher = sender.publisher("semcast/a/rx/symbols", "newest")
+
+            def passes():
+                publisher.put(b"x")
+                return bool(received)
+
+            until(passes)
+            process.kill()
+            process.wait(10)
+            until(lambda: not sender.connected)
+            received.clear()
+            publisher.put(b"into the void")
+            process = start()
+            started_s = time.monotonic()
+            until(passes)
+            assert time.monotonic() - started_s < 2.0
+            assert alive_roles(endpoint, "a") == {"agent"}
+    finally:
+        process.kill()
+        process.wait(10)
+
+
+def test_a_client_waits_for_its_hub_until_it_is_stopped():
+    stop = threading.Event()
+    result = []
+    network = NetworkSettings(connect=(free_endpoint(),))
+    thread = threading.Thread(target=lambda: result.append(open_session(network, stop)))
+    thread.start()
+    stop.set()
+    thread.join(5)
+    assert result == [None]
+
+
+def test_a_client_started_first_finds_a_hub_started_later():
+    endpoint = free_endpoint()
+    result = []
+    thread = threading.Thread(
+        target=lambda: result.append(open_session(NetworkSettings(connect=(endpoint,)), deadline_s=20))
+    )
+    thread.start()
+    with open_session(NetworkSettings(listen=(endpoint,), connect=())):
+        thread.join(10)
+        assert result[0].connected
+        result[0].close()
+
+
+def test_nobody_there_and_a_port_in_use_are_said(hub):
+    with pytest.raises(TransportError, match=r"nothing answers at tcp/127.0.0.1:\d+ within 0.2 s"):
+        open_client(NetworkSettings(connect=(free_endpoint(),)), 0.2)
+    with pytest.raises(TransportError, match=r"can't listen on tcp/.*perhaps something already does"):
+        open_session(NetworkSettings(listen=(hub[1],), connect=()))
+
+
+def test_closing_frees_port_and_threads():
+    before = threading.active_count()
+    session, endpoint = open_hub()
+    session.subscribe("semcast/a/pose", "every", lambda payload: None)
+    session.answer("semcast/a/camera", lambda payload: payload)
+    session.watch_alive("a", lambda role, alive: None)
+    assert threading.active_count() > before
+    session.close()
+    session.close()
+    until(lambda: threading.active_count() == before)
+    with pytest.raises(TransportError):
+        session.publisher("semcast/a/pose", "every")
+    with open_session(NetworkSettings(listen=(endpoint,), connect=())):
+        pass
+
+
+def test_sessions_open_nothing_beyond_what_is_named():
+    client = zenoh_config(NetworkSettings())
+    assert client.get_json("mode") == '"client"'
+    assert client.get_json("connect/endpoints") == '["tcp/127.0.0.1:7447"]'
+    hub = zenoh_config(HubSettings())
+    assert hub.get_json("mode") == '"router"'
+    assert hub.get_json("listen/endpoints") == '["tcp/127.0.0.1:7447"]'
+    for config in (client, hub):
+        assert config.get_json("scouting/multicast/enabled") == "false"
+        assert config.get_json("scouting/gossip/enabled") == "false"
+        assert config.get_json("transport/link/tx/lease") == "2000"
+        assert config.get_json("transport/shared_memory/enabled") == "false"
+
+
+def test_endpoints_are_checked():
+    with pytest.raises(
+        ValueError, match="connect must be an endpoint such as tcp/127.0.0.1:7447, got 'local"
+    ):
+        NetworkSettings(connect=("localhost:7447",))
+    with pytest.raises(ValueError, match="listen or connect must name an endpoint"):
+        NetworkSettings(connect=())
+    assert all(map(is_loopback, ("tcp/127.0.0.1:1", "tcp/localhost:1", "tcp/[::1]:1", "tls/127.3.2.1:5")))
+    assert not any(
+        map(is_loopback, ("tcp/0.0.0.0:1", "tcp/192.168.0.1:1", "tcp/[::]:1", "tcp/127.0.0.1.x:1"))
+    )
+
+
+def test_listening_beyond_loopback_is_warned_about(caplog):
+    with open_session(NetworkSettings(listen=(free_endpoint().replace("127.0.0.1", "0.0.0.0"),), connect=())):
+        assert "whoever reaches it can send and receive" in caplog.text
+
+
+def test_a_round_trip_over_loopback_takes_milliseconds():
+    assert 0.0 < loopback_round_trip_ms() < 500.0
