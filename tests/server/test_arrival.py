@@ -1,0 +1,105 @@
+from dataclasses import replace
+
+import pytest
+
+from semcast.common.messages import SymbolFrame
+from semcast.common.metrics import Metrics
+from semcast.server.arrival import Arrivals, CaptureAge
+
+MS = 1_000_000
+
+
+def frame(seq, epoch=1, base_seq=0, lossless=False):
+    return SymbolFrame(
+        agent_epoch=epoch, seq=seq, base_seq=base_seq, frame_id=seq, t_capture_ns=seq * MS, t_source_ns=0,
+        codec="x", digest="", image_hw=(16, 16), modulation="16qam", num_slots=1, uses_per_slot=48,
+        direction="rx", payload_format="iq16", payload=bytes(192), slot_lost=b"\0", lossless=lossless,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def metrics():
+    return Metrics("server")
+
+
+def accepted(arrivals, frames, arrival_ns=1):
+    return [f.seq for f in frames if arrivals.accept(f, arrival_ns)]
+
+
+def test_live_takes_only_what_is_newer_and_counts_the_rest(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    assert accepted(arrivals, [frame(k) for k in (5, 6, 6, 9, 7, 7, 10, 5)]) == [5, 6, 9, 10]
+    # 8 never came; 7 came late; 6, 7 and 5 came twice.
+    assert metrics.drops == {"duplicate": 3, "missing": 1, "stale": 1}
+
+
+def test_every_live_frame_is_accounted_for_exactly(metrics, rng):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    sent = list(range(200))
+    arrives = [k for k in sent[1:-1] if rng.random() > 0.2]
+    order = [0, *sorted(arrives, key=lambda k: k + rng.normal(0, 2)), 199]
+    taken = accepted(arrivals, [frame(k) for k in order])
+    assert taken == sorted(taken)
+    assert len(taken) + metrics.drops["missing"] + metrics.drops["stale"] == len(sent)
+    assert metrics.drops["missing"] == len(sent) - len(order)
+
+
+def test_frames_before_the_first_one_seen_are_not_missing(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    assert accepted(arrivals, [frame(1000), frame(999), frame(1001)]) == [1000, 1001]
+    assert metrics.drops == {"stale": 1}
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_a_restarted_agent_is_followed_and_its_former_frames_are_refused(metrics, lossless):
+    arrivals = Arrivals(lossless=lossless, drop=metrics.drop)
+    frames = [frame(0, 1), frame(1, 1), frame(0, 2), frame(2, 1), frame(1, 2)]
+    taken = [(f.agent_epoch, f.seq) for f in frames if arrivals.accept(replace(f, lossless=lossless), 1)]
+    assert taken == [(1, 0), (1, 1), (2, 0), (2, 1)]
+    assert metrics.drops == {"epoch": 1}
+
+
+def test_an_agent_whose_clock_went_back_is_followed_after_a_silence(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    assert arrivals.accept(frame(0, epoch=100), 0)
+    assert not arrivals.accept(frame(0, epoch=50), 1000 * MS)
+    assert arrivals.accept(frame(1, epoch=50), 5000 * MS)
+    assert arrivals.epoch == 50
+
+
+def test_lossless_takes_each_frame_once_and_in_order(metrics):
+    arrivals = Arrivals(lossless=True, drop=metrics.drop)
+    order = [0, 1, 3, 4, 2, 2, 3, 4, 1]
+    assert accepted(arrivals, [frame(k, lossless=True) for k in order]) == [0, 1, 2, 3, 4]
+    assert metrics.drops == {"gap": 2, "duplicate": 2}
+    assert (arrivals.arrived_seq, arrivals.next_seq) == (5, 0)
+    arrivals.took(frame(0))
+    arrivals.took(frame(1))
+    assert arrivals.next_seq == 2
+
+
+def test_a_lossless_receiver_joins_at_the_first_unconfirmed_frame(metrics):
+    arrivals = Arrivals(lossless=True, drop=metrics.drop)
+    # 7 was lost on its way to the new receiver: 8 must not be taken before it.
+    order = [frame(8, base_seq=7, lossless=True), frame(7, base_seq=7, lossless=True)]
+    assert accepted(arrivals, order) == [7]
+    assert metrics.drops == {"gap": 1}
+
+
+def test_age_needs_no_common_clock():
+    age = CaptureAge()
+    offset_ns = 123456789 * MS
+    for k in range(10):
+        way_ms = 5 if k != 4 else 2
+        age.arrived(k * 100 * MS, k * 100 * MS + offset_ns + way_ms * MS)
+    now_ns = 900 * MS + offset_ns + 30 * MS
+    assert age.age_ms(900 * MS, now_ns) == pytest.approx(28.0)
+    assert CaptureAge().age_ms(0, 5) == 0.0
+
+
+def test_age_adapts_to_a_link_that_became_slower():
+    age = CaptureAge()
+    for k in range(400):
+        way_ms = 2 if k < 100 else 700
+        age.arrived(k * 100 * MS, k * 100 * MS + way_ms * MS)
+    assert age.age_ms(40_000 * MS, 40_700 * MS) == pytest.approx(0.0)

@@ -1,0 +1,293 @@
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from semcast.channel.awgn import complex_noise
+from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
+from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
+from semcast.common.metrics import Metrics
+from semcast.common.network_settings import NetworkSettings
+from semcast.common.phy.pilots import insert_pilots
+from semcast.common.phy.qam import constellation
+from semcast.common.symbol_payload import pack_iq, pack_lost
+from semcast.common.transport import open_client, open_hub
+from semcast.common.wire import pack, unpack
+from semcast.server.receiver import WINDOW, Receiver
+
+HW = (64, 128)
+EPOCH = 10**18
+
+
+def until(condition, deadline_s=10.0):
+    end_s = time.monotonic() + deadline_s
+    tick = threading.Event()
+    while not condition():
+        assert time.monotonic() < end_s, "the condition did not come true in time"
+        tick.wait(0.005)
+
+
+def camera(epoch=EPOCH, lossless=False):
+    return CameraInfo(
+        agent_id="a", agent_epoch=epoch, fx=100.0, fy=100.0, cx=64.0, cy=32.0, image_wh=(128, 64),
+        nominal_rate_hz=30.0, codec="x", digest="", modulation="16qam", source_name="s", num_frames=None,
+        lossless=lossless,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def sent():
+    rng = np.random.default_rng(1)
+    symbols = constellation()[rng.integers(0, 16, (4, 47 * 8))]
+    slots = insert_pilots(symbols)
+    noise = complex_noise(slots.shape, np.full((4, 1), 0.01, np.float32), rng)
+    return symbols, slots + noise
+
+
+@pytest.fixture
+def make(sent):
+    def make_frame(seq, epoch=EPOCH, lost=(), **changes):
+        mask = np.isin(np.arange(4), lost)
+        values = {
+            "agent_epoch": epoch, "seq": seq, "frame_id": 2 * seq, "t_capture_ns": time.monotonic_ns(),
+            "t_source_ns": seq * 10**8, "codec": "x", "digest": "", "image_hw": HW, "modulation": "16qam",
+            "num_slots": 4, "uses_per_slot": 48 * 8, "direction": "rx", "payload_format": "iq16",
+            "payload": pack_iq(np.where(mask[:, None], 0, sent[1])), "slot_lost": pack_lost(mask),
+        }  # fmt: skip
+        return SymbolFrame(**{**values, **changes})
+
+    return make_frame
+
+
+class Ends:
+    """A receiver on a hub, and a client that plays agent and channel."""
+
+    def __init__(self, mode, **changes):
+        self.hub, self.endpoint = open_hub()
+        self.metrics = Metrics("server")
+        self.receiver = Receiver(self.hub, "a", mode, self.metrics, **changes)
+        self.client = open_client(NetworkSettings(connect=(self.endpoint,)), 5)
+        self.rx = self.client.publisher(rx_key("a"), "every")
+        until(lambda: self.rx.has_receiver)
+
+    def put(self, *frames):
+        for frame in frames:
+            self.rx.put(pack(frame))
+
+    def answer_camera(self, info):
+        data = pack(info)
+        self.client.answer(camera_key("a"), lambda request: data)
+
+    def close(self):
+        self.receiver.close()
+        self.client.close()
+        self.hub.close()
+
+
+@pytest.fixture
+def ends():
+    opened = []
+
+    def open_ends(mode="live", **changes):
+        opened.append(Ends(mode, **changes))
+        return opened[-1]
+
+    yield open_ends
+    for one in opened:
+        one.close()
+
+
+def test_a_frame_is_equalised_and_reported(ends, make, sent):
+    e = ends()
+    e.answer_camera(camera())
+    reports = []
+    e.client.subscribe(link_key("a"), "newest", reports.append)
+    channel = e.client.publisher(channel_key("a"), "every")
+    until(lambda: channel.has_receiver)
+    channel.put(pack(ChannelReport(
+        agent_epoch=EPOCH, frame_id=6, channel="awgn", snr_db_set=20.0, num_slots=4, num_slots_lost=1,
+        frame_lost=False,
+    )))  # fmt: skip
+    until(lambda: e.receiver._snr_set)
+    message = make(3, lost=[2])
+    e.put(message)
+    frame = e.receiver.next(5)
+    assert frame.message == message
+    assert frame.camera == camera()
+    assert frame.snr_db == pytest.approx(20.0, abs=1.5)
+    assert frame.snr_db_set == 20.0
+    arrived = np.array([True, True, False, True])
+    np.testing.assert_allclose(frame.received.symbols[arrived], sent[0][arrived], atol=0.6)
+    assert not frame.received.symbols[2].any()
+    assert frame.slot_snr_db[2] == -20.0
+    until(lambda: reports)
+    report = unpack(reports[0], LinkReport)
+    assert (report.frame_id, report.t_capture_ns) == (6, message.t_capture_ns)
+    assert report.snr_db_estimate == pytest.approx(frame.snr_db)
+    assert e.receiver.agent_epoch == EPOCH
+    assert e.receiver.next(0.0) is None
+
+
+def test_a_slow_live_consumer_gets_the_newest_and_drops_are_counted_exactly(ends, make):
+    e = ends()
+    e.answer_camera(camera())
+    ids = []
+    for burst in range(4):
+        e.put(*(make(25 * burst + k) for k in range(25)))
+        until(lambda burst=burst: e.metrics.counts.get("received") == 25 * (burst + 1))
+        ids.append(e.receiver.next(5).message.seq)
+    assert ids == [24, 49, 74, 99]
+    assert e.metrics.counts["delivered"] + e.metrics.drops["superseded"] == 100
+    assert set(e.metrics.drops) == {"superseded"}
+
+
+def test_age_stays_within_two_frames_behind_a_consumer_five_times_too_slow(ends, make):
+    e = ends()
+    e.answer_camera(camera())
+    period_s = 0.01
+    stop = threading.Event()
+
+    def send():
+        seq = 0
+        while not stop.wait(period_s):
+            e.put(make(seq))
+            seq += 1
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    ages_ms = []
+    busy = threading.Event()
+    try:
+        while len(ages_ms) < 12:
+            frame = e.receiver.next(5)
+            ages_ms.append((time.monotonic_ns() - frame.message.t_capture_ns) * 1e-6)
+            busy.wait(5 * period_s)
+    finally:
+        stop.set()
+        sender.join(5)
+    assert np.percentile(ages_ms[1:], 75) <= 2 * period_s * 1e3 + 30
+    assert e.metrics.drops["superseded"] > 20
+
+
+def test_old_live_frames_are_dropped(ends, make):
+    e = ends(max_age_ms=200.0)
+    e.answer_camera(camera())
+    e.put(make(0))
+    assert e.receiver.next(5).message.seq == 0
+    e.put(make(1, t_capture_ns=time.monotonic_ns() - 10**9), make(2))
+    until(lambda: e.metrics.counts["received"] == 3)
+    assert e.receiver.next(5).message.seq == 2
+    e.put(make(3, t_capture_ns=time.monotonic_ns() - 10**9))
+    assert e.receiver.next(0.2) is None
+    assert e.metrics.drops["too_old"] == 1
+
+
+def test_a_late_receiver_learns_the_camera_by_asking(ends, make):
+    e = ends()
+    e.put(make(0))
+    assert e.receiver.next(0.0) is None, "nobody answers yet"
+    assert e.metrics.drops == {"camera": 1}
+    e.answer_camera(camera())
+    until(lambda: (e.put(make(e.metrics.counts["received"])), e.receiver.next(0.1))[1] is not None)
+
+
+def test_no_frame_is_delivered_twice_and_a_new_agent_is_followed(ends, make):
+    e = ends()
+    publisher = e.client.publisher(camera_key("a"), "every")
+    until(lambda: publisher.has_receiver)
+    for epoch in (EPOCH, EPOCH + 1):
+        publisher.put(pack(camera(epoch)))
+    until(lambda: len(e.receiver._cameras) == 2)
+    seen = []
+    script = [(0, 0), (1, 0), (1, 0), (0, 0), (4, 0), (3, 0), (0, 1), (5, 0), (1, 1)]
+    for count, (seq, epoch) in enumerate(script, start=1):
+        e.put(make(seq, epoch=EPOCH + epoch))
+        until(lambda count=count: e.metrics.counts.get("received") == count)
+        frame = e.receiver.next(0.0)
+        if frame is not None:
+            seen.append((frame.message.seq, frame.message.agent_epoch - EPOCH))
+    assert seen == [(0, 0), (1, 0), (4, 0), (0, 1), (1, 1)]
+    assert e.metrics.drops == {"duplicate": 2, "missing": 1, "stale": 1, "epoch": 1}
+
+
+def test_bad_messages_are_counted_and_do_no_harm(ends, make):
+    e = ends()
+    e.answer_camera(camera())
+    good = pack(make(0))
+    for bad in (b"", b"junk", good[:-1], good + b"x", pack(camera()), pack(replace_tx(make(0)))):
+        e.rx.put(bad)
+    nan = make(0, payload=np.full(4 * 48 * 8 * 2, np.nan, "<f2").tobytes())
+    e.put(make(1, image_hw=(64, 112), uses_per_slot=48 * 7, payload=bytes(4 * 4 * 48 * 7)))
+    until(lambda: e.metrics.drops.get("protocol") == 6)
+    assert e.receiver.next(0.2) is None, "the image is not of the camera's size"
+    assert e.metrics.drops["protocol"] == 7
+    e.put(replace(nan, seq=2))
+    frame = e.receiver.next(5)
+    assert not frame.received.symbols.any()
+    assert (frame.slot_snr_db == -20.0).all(), "samples that are no numbers count as not arrived"
+    assert {k for k in e.metrics.counts if k.startswith("protocol_")} == {"protocol_syntax", "protocol_kind"}
+
+
+def replace_tx(frame):
+    return replace(
+        frame, direction="tx", slot_lost=b"", payload_format="qam16", payload=bytes(4 * 47 * 8 // 2)
+    )
+
+
+def test_the_two_services_are_not_mixed(ends, make, caplog):
+    e = ends("live")
+    e.put(make(0, lossless=True), make(1, lossless=True))
+    until(lambda: e.metrics.drops.get("mode") == 2)
+    assert caplog.text.count("the agent runs in replay mode, this server in live") == 1
+
+
+def test_replay_delivers_in_order_and_says_how_far_it_is(ends, make):
+    e = ends("replay")
+    e.answer_camera(camera(lossless=True))
+    flows = []
+    e.client.subscribe(flow_key("a"), "every", lambda payload: flows.append(unpack(payload, FlowMessage)))
+    until(lambda: flows)
+    assert flows[0] == FlowMessage(agent_epoch=0, next_seq=0, arrived_seq=0, window=WINDOW)
+    e.put(*(make(k, lossless=True) for k in (0, 2, 1, 1, 2)))
+    until(lambda: flows[-1].arrived_seq == 3)
+    assert flows[-1].next_seq == 0, "nothing was taken yet"
+    assert [e.receiver.next(5).message.seq for _ in range(3)] == [0, 1, 2]
+    until(lambda: flows[-1].next_seq == 3)
+    assert e.metrics.drops == {"gap": 1, "duplicate": 1}
+
+
+def test_a_frame_lost_on_the_air_still_counts_as_delivered_in_replay(ends, make):
+    e = ends("replay")
+    e.answer_camera(camera(lossless=True))
+    e.put(make(0, lossless=True, payload_format="lost", payload=b"", lost=range(4)), make(1, lossless=True))
+    first, second = e.receiver.next(5), e.receiver.next(5)
+    assert (first.received, first.snr_db, first.slot_snr_db) == (None, None, None)
+    assert second.received is not None
+    assert e.metrics.counts["lost_on_air"] == 1
+
+
+def test_replay_keeps_a_frame_until_the_camera_is_known(ends, make):
+    e = ends("replay")
+    e.put(make(0, lossless=True))
+    assert e.receiver.next(0.05) is None
+    e.answer_camera(camera(lossless=True))
+    assert e.receiver.next(5).message.seq == 0
+    assert e.metrics.drops == {}
+
+
+def test_presence_of_the_others_is_known(ends):
+    e = ends()
+    e.client.declare_alive("a", "agent")
+    until(lambda: e.receiver.roles_alive == {"agent", "server"})
+    e.client.close()
+    until(lambda: e.receiver.roles_alive == {"server"})
+
+
+def test_bad_arguments_are_refused(ends):
+    e = ends()
+    with pytest.raises(ValueError, match="mode must be live or replay, got 'fast'"):
+        Receiver(e.hub, "a", "fast", e.metrics)
+    with pytest.raises(ValueError, match="max_age_ms must be positive, got 0"):
+        Receiver(e.hub, "a", "live", e.metrics, max_age_ms=0)
