@@ -17,6 +17,8 @@ BORDER_PX = 8
 _EIGEN_UNIT = 1024.0
 #: Corners weaker than this mean gradient energy (grey levels^2 per pixel) are noise.
 _MIN_EIGEN_GREY2 = 2.0
+#: Nor are corners weaker than this share of the strongest worth following.
+_MIN_EIGEN_SHARE = 0.004
 _ORB_SCALE = 1.2
 
 
@@ -55,7 +57,8 @@ def detect_corners(
     if num_wanted <= 0 or height <= 2 * BORDER_PX or width <= 2 * BORDER_PX:
         return np.zeros((0, 2), np.float32)
     strength = corner_strength(grey)
-    peak = (strength >= cv2.dilate(strength, np.ones((7, 7), np.uint8))) & (strength > _MIN_EIGEN_GREY2)
+    floor = max(_MIN_EIGEN_GREY2, _MIN_EIGEN_SHARE * float(strength.max()))
+    peak = (strength >= cv2.dilate(strength, np.ones((7, 7), np.uint8))) & (strength > floor)
     peak[:BORDER_PX] = peak[-BORDER_PX:] = False
     peak[:, :BORDER_PX] = peak[:, -BORDER_PX:] = False
     if usable is not None:
@@ -173,9 +176,15 @@ def track_points(
         xy=found.astype(np.float64),
         ok=ok,
         forward_backward_px=distance,
-        photometric_grey=np.nan_to_num(error.ravel().astype(np.float64)),
-        gradient_grey2=np.maximum(eigen.ravel().astype(np.float64) * _EIGEN_UNIT, 0.0),
+        photometric_grey=_where_found(error, status),
+        gradient_grey2=_where_found(eigen, back_status) * _EIGEN_UNIT,
     )
+
+
+def _where_found(values: NDArray[np.float32], status: NDArray[np.uint8]) -> Array:
+    """KLT's error column; 0 for points that were not found, where it is not initialised."""
+    usable = (status.ravel() == 1) & np.isfinite(values.ravel())
+    return np.where(usable, values.ravel(), np.float32(0.0)).astype(np.float64)
 
 
 def sample_map(values: NDArray[np.float32], keypoints_xy: Array) -> Array:

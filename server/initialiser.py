@@ -237,10 +237,11 @@ def pose_of(
     if len(row) < min_inliers:
         return None
     sigma = noise.sigma_px(observed.confidence[row_o])
-    estimate = refine_pose(camera, invert_transform(T_world_guess), xyz[row], observed.xy[row_o], sigma)
+    gate = noise.threshold_px(observed.confidence[row_o])
+    estimate = refine_pose(camera, invert_transform(T_world_guess), xyz[row], observed.xy[row_o], sigma, gate)
     if estimate.num_inliers < 0.5 * len(row):
         searched = search_pose(
-            camera, xyz[row], observed.xy[row_o], sigma, seed=seed, min_inliers=min_inliers
+            camera, xyz[row], observed.xy[row_o], sigma, gate, seed=seed, min_inliers=min_inliers
         )
         if searched is not None and searched.num_inliers > estimate.num_inliers:
             estimate = searched

@@ -9,7 +9,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.bundle_problem import BundleProblem, BundleResult
 from semcast.server.triangulation import triangulate
-from semcast.server.weighting import GATE_SIGMAS, NoiseModel, OnlineNoise
+from semcast.server.weighting import NoiseModel, OnlineNoise
 from semcast.server.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
@@ -278,7 +278,7 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
     shrink = _shrinkage(problem, int(known.sum()))
     mild = known & (size < 12.0 * problem.sigma_px)
     noise.add(np.repeat(problem.confidence[mild], 2), np.abs(result.residual_px[mild]).ravel() / shrink)
-    bad = ~known | (size > (GATE_SIGMAS + 1.0) * problem.sigma_px)
+    bad = ~known | (size > 1.3 * noise.model.threshold_px(problem.confidence))
     _drop(world, problem, bad)
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, make_transform, project_to_so3
-from semcast.server.weighting import GATE_SIGMAS, HUBER_K
+from semcast.server.weighting import HUBER_K
 
 Array = NDArray[np.float64]
 
@@ -85,6 +85,7 @@ def refine_pose(
     points_world: Array,
     keypoints_xy: Array,
     sigma_px: Array,
+    gate_px: Array,
     *,
     iterations: int = 10,
     prior_information: Array | None = None,
@@ -97,6 +98,7 @@ def refine_pose(
         points_world: ``(N, 3)`` landmarks.
         keypoints_xy: ``(N, 2)`` their observations.
         sigma_px: ``(N,)`` standard deviation of each observation per coordinate.
+        gate_px: ``(N,)`` reprojection error up to which an observation is an inlier.
         iterations: Steps at most; the last two without points outside the gate.
         prior_information: ``(6, 6)`` that pulls towards the start, or None.
 
@@ -107,7 +109,6 @@ def refine_pose(
     T = T_start.copy()
     weight = sigma_px**-2.0
     hessian = np.zeros((6, 6))
-    gate_px = GATE_SIGMAS * sigma_px
     offset = np.zeros(6)
     for iteration in range(iterations):
         points_cam = points_world @ T[:3, :3].T + T[:3, 3]
@@ -175,6 +176,7 @@ def search_pose(
     points_world: Array,
     keypoints_xy: Array,
     sigma_px: Array,
+    gate_px: Array,
     *,
     seed: int,
     min_inliers: int = 12,
@@ -190,7 +192,7 @@ def search_pose(
     if len(points_world) < max(4, min_inliers):
         return None
     order = np.argsort(sigma_px, kind="stable")
-    threshold_px = float(np.clip(GATE_SIGMAS * np.median(sigma_px), 2.0, 8.0))
+    threshold_px = float(np.clip(np.median(gate_px), 2.0, 8.0))
     options = {
         "max_reproj_error": threshold_px,
         "max_iterations": max_iterations,
@@ -205,5 +207,5 @@ def search_pose(
     if info["num_inliers"] < min_inliers or not (np.isfinite(R).all() and np.isfinite(t).all()):
         return None
     start = make_transform(project_to_so3(R), t)
-    estimate = refine_pose(camera, start, points_world, keypoints_xy, sigma_px)
+    estimate = refine_pose(camera, start, points_world, keypoints_xy, sigma_px, gate_px)
     return estimate if estimate.num_inliers >= min_inliers else None

@@ -226,10 +226,12 @@ class Reconstruction:
                 logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
                 self._state = TrackingState.INITIALIZING
                 self._map.begin_submap()
+                tracks.renew(self._map.world.landmarks.rows(tracks.ids) >= 0)
                 self._map_epoch += 1
         since = time.perf_counter_ns()
         tracks.refill(sight)
-        visible = tracks.visible
+        # Tracks of old landmarks serve to find back, not to start anew: a landmark has one id.
+        visible = tracks.visible & (self._map.world.landmarks.rows(tracks.ids) < 0)
         observed = Observed(
             frame.frame_id,
             frame.t_source_ns,

@@ -10,7 +10,7 @@ from semcast.common.geometry import invert_transform
 from semcast.server.features import Describer, Grey, detect_corners, match_descriptors
 from semcast.server.pnp import search_pose
 from semcast.server.tracks import Sight
-from semcast.server.weighting import NoiseModel
+from semcast.server.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
@@ -97,6 +97,7 @@ class Relocaliser:
                 points,
                 xy,
                 np.full(len(xy), sigma_px),
+                np.full(len(xy), GATE_SIGMAS * sigma_px),
                 seed=self._seed,
                 min_inliers=MIN_INLIERS,
             )

@@ -120,12 +120,12 @@ def track_pose(
     if int(known.sum()) < min_inliers:
         return None
     points, observed = world.landmarks.xyz[row[known]], xy[known]
-    sigma = noise.sigma_px(confidence[known])
+    sigma, gate = noise.sigma_px(confidence[known]), noise.threshold_px(confidence[known])
     best: PoseEstimate | None = None
     if T_world_guess is not None:
-        best = refine_pose(camera, invert_transform(T_world_guess), points, observed, sigma)
+        best = refine_pose(camera, invert_transform(T_world_guess), points, observed, sigma, gate)
     if best is None or best.num_inliers < max(min_inliers, _MIN_INLIER_SHARE * len(points)):
-        searched = search_pose(camera, points, observed, sigma, seed=seed, min_inliers=min_inliers)
+        searched = search_pose(camera, points, observed, sigma, gate, seed=seed, min_inliers=min_inliers)
         if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
             best = searched
     if best is None or best.num_inliers < min_inliers or not np.isfinite(best.T_cam_world).all():

@@ -126,6 +126,16 @@ class TrackTable:
         self.age = np.ones(count, np.int64)
         self.missed = np.zeros(count, np.int64)
 
+    def renew(self, mask: NDArray[np.bool_]) -> None:
+        """Give the tracks in the mask new ids, as if they began now."""
+        count = int(mask.sum())
+        self.ids = self.ids.copy()
+        self.ids[mask] = self._next_id + np.arange(count, dtype=np.int64)
+        self._next_id += count
+        order = np.argsort(self.ids, kind="stable")
+        for name in ("ids", "xy", "velocity", "confidence", "age", "missed"):
+            setattr(self, name, getattr(self, name)[order])
+
     def follow(self, sight: Sight, guess_xy: Array, max_level: int = 3) -> None:
         """Look for every track in a new image.
 

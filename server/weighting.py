@@ -27,7 +27,10 @@ HUBER_K = 1.345
 GATE_SIGMAS = 3.035
 #: Range of beta the fit may give.
 BETA_RANGE = (0.0, 8.0)
-SIGMA0_RANGE_PX = (0.15, 6.0)
+SIGMA0_RANGE_PX = (0.25, 6.0)
+#: A gate is never narrower than that of this sigma: landmarks have errors of their own, and a gate that
+#: follows the residuals it lets through would close by itself.
+_MIN_GATE_SIGMA_PX = 0.6
 #: Median of |x| / sigma under normal noise.
 _MAD_TO_SIGMA = 1.0 / 0.67449
 
@@ -70,12 +73,12 @@ class NoiseModel:
         return self.sigma_px(confidence) ** -2
 
     def threshold_px(self, confidence: NDArray) -> Array:
-        """Gate on a residual's length: 3 sigma, at most three times that of a fully trusted point.
+        """Gate on a residual's length in 2D: 3 sigma, at most three times that of a fully trusted point.
 
         The clamp keeps a point nobody trusts from being an inlier of everything.
         """
         sigma = np.minimum(self.sigma_px(confidence), 3.0 * self.sigma0_px)
-        return np.asarray(GATE_SIGMAS * sigma)
+        return np.asarray(GATE_SIGMAS * np.maximum(sigma, _MIN_GATE_SIGMA_PX))
 
 
 def fit_noise(
