@@ -1,0 +1,257 @@
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from semcast.channel.emulator import run_channel, set_channel
+from semcast.channel.emulator_settings import EmulatorSettings
+from semcast.channel.link import Link
+from semcast.channel.settings import ChannelSettings
+from semcast.common.codec import EncodedImage
+from semcast.common.errors import ConfigError, TransportError
+from semcast.common.keys import channel_key, rx_key, status_key, tx_key
+from semcast.common.messages import ChannelReport, StatusMessage, SymbolFrame
+from semcast.common.network_settings import NetworkSettings
+from semcast.common.phy.pilots import insert_pilots
+from semcast.common.phy.qam import constellation
+from semcast.common.symbol_payload import lost_slots_of, pack_data_symbols, slots_of
+from semcast.common.transport import open_hub
+from semcast.common.wire import pack, unpack
+
+HW = (64, 128)
+PROGRAM = """
+import sys, threading, signal
+from semcast.channel.emulator import run_channel
+from semcast.channel.emulator_settings import EmulatorSettings
+from semcast.common.network_settings import NetworkSettings
+stop = threading.Event()
+signal.signal(signal.SIGTERM, lambda *_: stop.set())
+summary = run_channel(EmulatorSettings(agent_id="a", network=NetworkSettings(connect=(sys.argv[1],))), stop)
+print(summary["counts"].get("carried", 0))
+"""
+
+
+def until(condition, deadline_s=15.0):
+    end_s = time.monotonic() + deadline_s
+    tick = threading.Event()
+    while not condition():
+        assert time.monotonic() < end_s, "the condition did not come true in time"
+        tick.wait(0.005)
+
+
+@pytest.fixture(scope="module")
+def symbols():
+    return constellation()[np.random.default_rng(3).integers(0, 16, (4, 47 * 8))]
+
+
+@pytest.fixture(scope="module")
+def make(symbols):
+    payload_format, payload = pack_data_symbols(EncodedImage(HW, symbols, "16qam"))
+
+    def make_frame(seq, epoch=1, **changes):
+        values = {
+            "agent_epoch": epoch, "seq": seq, "frame_id": seq, "t_capture_ns": 0, "t_source_ns": seq * 10**8,
+            "codec": "x", "digest": "", "image_hw": HW, "modulation": "16qam", "num_slots": 4,
+            "uses_per_slot": 48 * 8, "direction": "tx", "payload_format": payload_format, "payload": payload,
+        }  # fmt: skip
+        return SymbolFrame(**{**values, **changes})
+
+    return make_frame
+
+
+class Ends:
+    """A channel process in a thread, and what agent and server see of it."""
+
+    def __init__(self, link, seed=0):
+        self.hub, endpoint = open_hub()
+        self.network = NetworkSettings(connect=(endpoint,))
+        self.received, self.reports, self.status = [], [], []
+        self.hub.subscribe(rx_key("a"), "every", lambda p: self.received.append(unpack(p, SymbolFrame)))
+        self.hub.subscribe(channel_key("a"), "every", lambda p: self.reports.append(unpack(p, ChannelReport)))
+        self.hub.subscribe(
+            status_key("a", "channel"), "every", lambda p: self.status.append(unpack(p, StatusMessage))
+        )
+        self.tx = self.hub.publisher(tx_key("a"), "every")
+        self.stop = threading.Event()
+        settings = EmulatorSettings(agent_id="a", seed=seed, link=link, network=self.network)
+        self.summary = {}
+        self.thread = threading.Thread(target=lambda: self.summary.update(run_channel(settings, self.stop)))
+        self.thread.start()
+        until(lambda: "channel" in self.hub.alive_roles("a") and self.tx.has_receiver)
+
+    def pass_one(self, frame):
+        """Send a frame and wait until the channel reports on it."""
+        before = len(self.reports)
+        self.tx.put(pack(frame))
+        until(lambda: len(self.reports) > before)
+
+    def close(self):
+        self.stop.set()
+        self.thread.join(10)
+        self.hub.close()
+
+
+@pytest.fixture
+def ends():
+    opened = []
+
+    def open_ends(seed=0, **link):
+        opened.append(Ends(ChannelSettings(**link), seed))
+        return opened[-1]
+
+    yield open_ends
+    for one in opened:
+        one.close()
+
+
+def test_frames_come_out_as_the_link_model_makes_them(ends, make, symbols):
+    e = ends(channel="erasure", snr_db=6.0, slot_loss=0.4, seed=7)
+    for k in range(5):
+        e.pass_one(make(k))
+    until(lambda: len(e.received) == 5)
+    link = Link(ChannelSettings(channel="erasure", snr_db=6.0, slot_loss=0.4), seed=7)
+    some_lost = 0
+    for k, frame in enumerate(e.received):
+        expected = link.transmit(insert_pilots(symbols), k * 0.1, k)
+        np.testing.assert_allclose(slots_of(frame), expected.slots_rx, atol=5e-3)
+        np.testing.assert_array_equal(lost_slots_of(frame), expected.slot_lost)
+        some_lost += int(expected.slot_lost.sum())
+        assert (frame.direction, frame.frame_id, frame.seq) == ("rx", k, k)
+        assert e.reports[k].num_slots_lost == expected.slot_lost.sum()
+    assert some_lost > 0
+    assert (e.reports[0].snr_db_set, e.reports[0].channel) == (6.0, "erasure")
+
+
+def test_settings_change_while_it_runs_and_bad_ones_are_refused(ends, make):
+    e = ends(snr_db=10.0)
+    e.pass_one(make(0))
+    assert set_channel(e.network, "a", {"snr_db": 4.0})["snr_db"] == 4.0
+    e.pass_one(make(1))
+    assert [r.snr_db_set for r in e.reports] == [10.0, 4.0]
+    for changes, message in (
+        ({"snr_db": 99.0}, r"snr_db must be in \[.*\], got 99"),
+        ({"snr_bd": 3.0}, "unknown setting 'snr_bd', did you mean 'snr_db'"),
+        ({"channel": "awgm"}, "channel must be one of .*did you mean 'awgn'"),
+        ({"channel": "trace", "trace": "file", "trace_file": "/nowhere.csv"}, "nowhere.csv"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            set_channel(e.network, "a", changes)
+    now = set_channel(e.network, "a", {})
+    assert (now["snr_db"], now["channel"]) == (4.0, "awgn")
+    assert set_channel(e.network, "a", {"channel": "rayleigh"})["channel"] == "rayleigh"
+    e.pass_one(make(2))
+    assert e.reports[-1].channel == "rayleigh"
+
+
+def test_nobody_to_set_is_said(ends):
+    e = ends()
+    with pytest.raises(TransportError, match="no channel of other answers"):
+        set_channel(e.network, "other", {"snr_db": 4.0}, timeout_s=0.5)
+
+
+def test_lost_frames_never_arrive_live_but_are_announced_in_replay(ends, make):
+    e = ends(frame_loss=1.0)
+    e.pass_one(make(0))
+    e.pass_one(make(0, epoch=2, lossless=True))
+    until(lambda: e.received)
+    assert [(f.agent_epoch, f.payload_format, f.payload) for f in e.received] == [(2, "lost", b"")]
+    assert lost_slots_of(e.received[0]).all()
+    assert all(r.frame_lost for r in e.reports)
+
+
+def test_replay_loses_nothing_even_in_a_burst_and_live_counts_what_it_drops(ends, make):
+    e = ends()
+    for k in range(10):
+        e.tx.put(pack(make(k, lossless=True)))
+    until(lambda: len(e.received) == 10)
+    assert [f.seq for f in e.received] == list(range(10))
+    for k in range(200):
+        e.tx.put(pack(make(k, epoch=2)))
+    until(lambda: e.received[-1].seq == 199)
+    carried = sum(f.agent_epoch == 2 for f in e.received)
+    e.close()
+    drops = e.summary["drops"]
+    assert carried + drops.get("superseded", 0) + drops.get("missing", 0) == 200
+    assert e.summary["counts"]["carried"] == 10 + carried
+
+
+def test_delay_is_added(ends, make):
+    e = ends(delay_ms=150.0)
+    started_s = time.monotonic()
+    e.tx.put(pack(make(0)))
+    until(lambda: e.received)
+    assert 0.15 <= time.monotonic() - started_s < 2.0
+
+
+def test_bad_messages_are_counted_and_do_no_harm(ends, make):
+    e = ends()
+    nan = make(0, payload_format="iq16", payload=b"\x00\x7e" * (2 * 4 * 47 * 8))
+    for bad in (b"", b"junk", pack(make(0))[:-2], pack(nan)):
+        e.tx.put(bad)
+    silent = make(1, epoch=3, payload_format="iq16", payload=bytes(4 * 4 * 47 * 8))
+    e.pass_one(silent)
+    e.pass_one(make(0, epoch=4))
+    until(lambda: e.status and e.status[-1].drops.get("protocol") == 4)
+    assert e.status[-1].role == "channel"
+    assert [f.agent_epoch for f in e.received] == [3, 4]
+
+
+def test_a_process_ends_cleanly_on_sigterm_and_another_takes_over_after_a_kill(make):
+    hub, endpoint = open_hub()
+    received = []
+    hub.subscribe(rx_key("a"), "every", received.append)
+    tx = hub.publisher(tx_key("a"), "every")
+
+    def start():
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        return subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, endpoint],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        )  # fmt: skip
+
+    def passes():
+        tx.put(pack(make(0)))
+        return bool(received)
+
+    processes = [start()]
+    try:
+        with hub:
+            until(passes)
+            processes[0].kill()
+            until(lambda: "channel" not in hub.alive_roles("a"))
+            received.clear()
+            processes.append(start())
+            until(passes)
+            processes[1].send_signal(signal.SIGTERM)
+            out, err = processes[1].communicate(timeout=10)
+            assert (processes[1].returncode, err) == (0, "")
+            assert int(out) >= 1
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+
+
+def test_a_channel_without_a_hub_can_be_stopped():
+    stop = threading.Event()
+    network = NetworkSettings(connect=("tcp/127.0.0.1:9",))
+    summary = []
+    thread = threading.Thread(
+        target=lambda: summary.append(run_channel(EmulatorSettings(network=network), stop))
+    )
+    thread.start()
+    stop.set()
+    thread.join(10)
+    assert summary == [{"counts": {}, "drops": {}, "stage_ms": {}}]
+
+
+def test_settings_are_checked():
+    with pytest.raises(ValueError, match="seed must be at least 0, got -1"):
+        EmulatorSettings(seed=-1)
+    with pytest.raises(ValueError, match="agent_id must be"):
+        EmulatorSettings(agent_id="a/b")
