@@ -1,0 +1,190 @@
+import shutil
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from semcast.agent.source import MAX_BAD_IN_A_ROW, Pacer, open_source, playback_order
+from semcast.agent.source_settings import SourceSettings
+from semcast.agent.video import public_name
+from semcast.common.camera_settings import CameraSettings
+from semcast.common.errors import SourceError
+
+PINHOLE = CameraSettings(fx=50.0, fy=50.0, cx=31.5, cy=23.5)
+
+
+def fast(path, **changes):
+    return SourceSettings(source=str(path), **{"pace": "receiver", **changes})
+
+
+def play(settings, most=100):
+    source = open_source(settings)
+    frames = []
+    for frame in source.frames(threading.Event()):
+        frames.append(frame)
+        if len(frames) == most:
+            break
+    source.close()
+    return source, frames
+
+
+class Clock:
+    """Time that passes only while somebody waits."""
+
+    def __init__(self):
+        self.now_s = 100.0
+        self.waits_s = []
+
+    def __call__(self):
+        return self.now_s
+
+    def wait(self, seconds):
+        self.waits_s.append(seconds)
+        self.now_s += seconds
+        return False
+
+
+def test_a_recording_is_played_with_its_ids_and_times(recording):
+    source, frames = play(fast(recording))
+    assert [f.frame_id for f in frames] == list(range(12))
+    assert [f.t_source_ns for f in frames] == [5_000_000_000 + 20_000_000 * k for k in range(12)]
+    assert [int(f.image[0, 0, 0]) for f in frames] == [20 * k for k in range(12)]
+    assert [f.final for f in frames] == [False] * 11 + [True]
+    assert (source.name, source.num_frames, source.rate_hz) == ("steps", 12, 0.0)
+    assert frames[0].image.shape == (48, 64, 3)
+
+
+def test_stride_size_and_length_can_be_chosen(recording):
+    source, frames = play(fast(recording, stride=3, max_frames=2, resize=0.5))
+    assert [f.frame_id for f in frames] == [0, 3]
+    assert frames[1].final
+    assert frames[0].image.shape == (24, 32, 3)
+    assert (source.intrinsics.fx, source.intrinsics.cx, source.num_frames) == (25.0, 15.5, 2)
+
+
+def test_repeated_playing_counts_ids_and_times_on(recording):
+    source, frames = play(fast(recording, max_frames=3, repeat="loop"), most=7)
+    assert [int(f.image[0, 0, 0]) for f in frames] == [0, 20, 40, 0, 20, 40, 0]
+    assert [f.frame_id for f in frames] == list(range(7))
+    assert np.diff([f.t_source_ns for f in frames]).tolist() == [20_000_000] * 6
+    assert source.num_frames is None
+    _, frames = play(fast(recording, max_frames=3, repeat="swing"), most=8)
+    assert [int(f.image[0, 0, 0]) for f in frames] == [0, 20, 40, 20, 0, 20, 40, 20]
+    assert np.diff([f.t_source_ns for f in frames]).tolist() == [20_000_000] * 7
+    assert not any(f.final for f in frames)
+
+
+def test_a_swing_over_one_frame_stays_there():
+    order = playback_order(1, "swing")
+    assert [next(order) for _ in range(4)] == [0, 0, 0, 0]
+
+
+def test_pacing_follows_the_recording_or_the_rate():
+    clock = Clock()
+    pacer = Pacer(SourceSettings(source="x"), clock.wait, clock)
+    times_ns = [7_000_000_000, 7_100_000_000, 7_400_000_000]
+    assert all(pacer.until_due(t) for t in times_ns)
+    np.testing.assert_allclose(clock.waits_s, [0.0, 0.1, 0.3], atol=1e-9)
+    clock = Clock()
+    pacer = Pacer(SourceSettings(source="x", pace="rate", rate_hz=4.0), clock.wait, clock)
+    assert all(pacer.until_due(t) for t in times_ns)
+    np.testing.assert_allclose(clock.waits_s, [0.0, 0.25, 0.25], atol=1e-9)
+    clock.now_s += 10.0
+    assert pacer.until_due(0)
+    assert clock.waits_s[-1] == 0.0, "a late frame is due at once"
+    assert not Pacer(SourceSettings(source="x"), lambda s: True, clock).until_due(0)
+
+
+def test_recorded_pace_takes_the_recorded_time(recording):
+    started_s = time.monotonic()
+    _, frames = play(SourceSettings(source=str(recording)))
+    assert len(frames) == 12
+    assert time.monotonic() - started_s >= 11 * 0.02 - 0.001
+
+
+def test_stopping_ends_the_waiting(recording):
+    source = open_source(SourceSettings(source=str(recording), pace="rate", rate_hz=0.01))
+    stop = threading.Event()
+    frames = source.frames(stop)
+    next(frames)
+    threading.Timer(0.05, stop.set).start()
+    assert list(frames) == []
+
+
+def test_a_damaged_image_is_left_out_and_many_end_the_source(recording, tmp_path, caplog):
+    folder = tmp_path / "damaged"
+    shutil.copytree(recording, folder)
+    (folder / "images" / "000004.png").write_bytes(b"broken")
+    _, frames = play(fast(folder))
+    assert [f.frame_id for f in frames] == [0, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11]
+    assert "frame 4 is left out" in caplog.text
+    for k in range(1, 1 + MAX_BAD_IN_A_ROW):
+        (folder / "images" / f"{k:06d}.png").write_bytes(b"broken")
+    with pytest.raises(SourceError, match="000010.png is not a readable image"):
+        play(fast(folder))
+
+
+def test_a_video_file_is_played(video):
+    source, frames = play(fast(video, camera=PINHOLE, stride=2))
+    assert [f.frame_id for f in frames] == [0, 2, 4, 6, 8]
+    assert [f.t_source_ns for f in frames] == [40_000_000 * k for k in range(5)]
+    np.testing.assert_allclose([f.image.mean() for f in frames], [0, 40, 80, 120, 160], atol=3)
+    assert [f.final for f in frames] == [False] * 4 + [True]
+    assert (source.num_frames, source.intrinsics.fx, source.groundtruth()) == (5, 50.0, None)
+
+
+def test_a_video_can_be_cut_and_repeated(video):
+    _, frames = play(fast(video, camera=PINHOLE, max_frames=3))
+    assert [(f.frame_id, f.final) for f in frames] == [(0, False), (1, False), (2, True)]
+    source, frames = play(fast(video, camera=PINHOLE, repeat="loop"), most=20)
+    assert [f.frame_id for f in frames] == list(range(20))
+    np.testing.assert_allclose(frames[9].image.mean(), 0, atol=3)
+    assert source.num_frames is None
+    with pytest.raises(SourceError, match="can't be played backwards"):
+        open_source(fast(video, camera=PINHOLE, repeat="swing"))
+
+
+def test_a_video_needs_a_camera_that_fits(video, tmp_path):
+    with pytest.raises(SourceError, match="camera of .* is unknown: put intrinsics.json"):
+        open_source(fast(video))
+    beside = tmp_path / "steps.avi"
+    shutil.copy(video, beside)
+    (tmp_path / "intrinsics.json").write_text(
+        '{"fx": 50, "fy": 50, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48}'
+    )
+    assert open_source(fast(beside)).intrinsics.fx == 50.0
+    (tmp_path / "intrinsics.json").write_text(
+        '{"fx": 50, "fy": 50, "cx": 31.5, "cy": 23.5, "width": 640, "height": 480}'
+    )
+    with pytest.raises(SourceError, match="intrinsics are for 640x480 images, .* gives 64x48"):
+        open_source(fast(beside))
+
+
+def test_what_can_not_be_opened_is_said(tmp_path):
+    (tmp_path / "notes.txt").write_text("no video")
+    with pytest.raises(SourceError, match=r"video .*notes.txt can't be opened"):
+        open_source(fast(tmp_path / "notes.txt", camera=PINHOLE))
+    with pytest.raises(SourceError, match="there is no such folder"):
+        open_source(fast(tmp_path / "nowhere"))
+
+
+def test_an_address_is_shown_without_its_password():
+    assert public_name("rtsp://user:secret@10.0.0.7/stream") == "rtsp://10.0.0.7/stream"
+    assert public_name("clip@home.mp4") == "clip@home.mp4"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"source": ""}, "source must name"),
+        ({"resize": 2.0}, r"resize must be in \[0.05, 1\], got 2"),
+        ({"stride": 0}, "stride must be at least 1, got 0"),
+        ({"max_frames": 0}, "max_frames must be at least 1, got 0"),
+        ({"rate_hz": 0.0}, r"rate_hz must be in \[0.01, 1000\], got 0"),
+        ({"pace": "rate"}, "rate_hz must be given for pace 'rate'"),
+    ],
+)
+def test_settings_are_checked(changes, message):
+    with pytest.raises(ValueError, match=message):
+        SourceSettings(**{"source": "x", **changes})
