@@ -1,0 +1,57 @@
+"""What the documentation says about the command line is what the command line takes."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from semcast.cli import VERBS, verb_parser
+from semcast.reference import reference
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+BLOCK = re.compile(r"```(?:sh|bash|console)?\n(.*?)```", re.DOTALL)
+LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
+
+
+def commands(page):
+    for block in BLOCK.findall(page.read_text(encoding="utf-8")):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True) if "semcast " in line else []
+            if "semcast" in words:
+                yield words[words.index("semcast") + 1 :]
+
+
+def known_flags(parser, words):
+    flags = set()
+    while True:
+        flags |= set(parser._option_string_actions)
+        children = [
+            a.choices for a in parser._actions if hasattr(a, "choices") and isinstance(a.choices, dict)
+        ]
+        if not children or not words or words[0] not in children[0]:
+            return flags
+        parser, words = children[0][words[0]], words[1:]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_every_command_in_the_docs_is_one_the_parser_knows(page):
+    for words in commands(page):
+        if not words or words[0].startswith("-"):
+            continue
+        assert words[0] in VERBS, f"{page.name}: semcast {words[0]}"
+        known = known_flags(verb_parser(words[0]), words[1:])
+        given = {w.split("=")[0] for w in words[1:] if w.startswith("--")}
+        assert given <= known, f"{page.name}: semcast {' '.join(words)}: {given - known}"
+
+
+def test_the_reference_page_is_up_to_date():
+    assert (ROOT / "docs/commands.md").read_text(encoding="utf-8") == reference(), "run make docs"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_between_pages_lead_somewhere(page):
+    for target in LINK.findall(page.read_text(encoding="utf-8")):
+        if "://" not in target:
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
