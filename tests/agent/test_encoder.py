@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+
+from semcast.agent.encoder import FrameEncoder, LinkFeedback
+from semcast.agent.source import SourceFrame
+from semcast.common.messages import LinkReport
+from semcast.common.symbol_payload import data_symbols
+from semcast.common.wire import pack
+
+
+class Clock:
+    now_ns = 10**12
+
+    def __call__(self):
+        return self.now_ns
+
+
+def report(frame_id, snr_db, t_capture_ns=10**12, epoch=1):
+    return LinkReport(agent_epoch=epoch, frame_id=frame_id, snr_db_estimate=snr_db, t_capture_ns=t_capture_ns)
+
+
+def test_the_newest_report_counts_while_it_is_fresh():
+    clock = Clock()
+    feedback = LinkFeedback(1, fallback_db=10.0, max_age_s=2.0, clock_ns=clock)
+    assert (feedback.snr_db(), feedback.age_s, feedback.reported_frame_id) == (10.0, None, -1)
+    feedback.update(report(5, 3.0))
+    feedback.update(report(4, 8.0))
+    feedback.update(report(9, 20.0, epoch=2))
+    assert (feedback.snr_db(), feedback.reported_frame_id) == (3.0, 5)
+    clock.now_ns += 1_900_000_000
+    assert feedback.snr_db() == 3.0
+    assert feedback.age_s == pytest.approx(1.9)
+    clock.now_ns += 200_000_000
+    assert feedback.snr_db() == 10.0
+    feedback.update(report(6, 4.0, t_capture_ns=10**15))
+    assert feedback.snr_db() == 10.0, "a report about the future is none"
+
+
+def test_messages_carry_the_symbols_and_are_numbered(codec):
+    encoder = FrameEncoder(codec, agent_epoch=3, lossless=True)
+    image = np.full((40, 50, 3), 200, np.uint8)
+    messages = [
+        encoder.encode(SourceFrame(frame_id, 7, 8, image, final=frame_id == 9), 5.0) for frame_id in (4, 9)
+    ]
+    assert [(m.seq, m.frame_id, m.final) for m in messages] == [(0, 4, False), (1, 9, True)]
+    first = messages[0]
+    assert (first.agent_epoch, first.t_source_ns, first.t_capture_ns) == (3, 7, 8)
+    assert (first.codec, first.digest, first.image_hw) == ("tiny", "0123", (40, 50))
+    assert (first.num_slots, first.uses_per_slot, first.direction) == (3, 192, "tx")
+    assert (first.modulation, first.payload_format, first.lossless) == ("analog", "iq16", True)
+    np.testing.assert_allclose(data_symbols(first), codec.encode(image, 5.0).symbols, atol=1e-3)
+    assert codec.snrs_db == [5.0, 5.0, 5.0]
+    assert len(pack(first)) > 4 * 3 * 47 * 4
+
+
+def test_symbols_that_do_not_fit_the_grid_are_refused_and_not_numbered(codec):
+    encoder = FrameEncoder(codec, agent_epoch=3, lossless=False)
+    good = SourceFrame(0, 0, 0, np.zeros((16, 16, 3), np.uint8))
+
+    class Broken(type(codec)):
+        def encode(self, image, snr_db):
+            encoded = super().encode(image, snr_db)
+            return type(encoded)(encoded.shape_hw, encoded.symbols[:, :-1], encoded.modulation)
+
+    with pytest.raises(ValueError, match="symbols must have shape"):
+        FrameEncoder(Broken(), 3, False).encode(good, 5.0)
+    assert encoder.encode(good, 5.0).seq == 0

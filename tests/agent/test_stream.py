@@ -1,0 +1,332 @@
+"""Agent, channel and receiver together over loopback, started, slowed down, killed and restarted."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from semcast.agent.agent import run_agent
+from semcast.agent.settings import AgentSettings
+from semcast.agent.source_settings import SourceSettings
+from semcast.channel.emulator import run_channel
+from semcast.channel.emulator_settings import EmulatorSettings
+from semcast.channel.settings import ChannelSettings
+from semcast.common.keys import status_key
+from semcast.common.messages import StatusMessage
+from semcast.common.metrics import Metrics
+from semcast.common.network_settings import NetworkSettings
+from semcast.common.transport import free_endpoint, open_hub, open_session
+from semcast.common.wire import unpack
+from semcast.server.receiver import Receiver
+
+PROGRAM = """
+import dataclasses, signal, sys, threading
+stop = threading.Event()
+signal.signal(signal.SIGTERM, lambda *_: stop.set())
+from semcast.common.network_settings import NetworkSettings
+network = NetworkSettings(connect=(sys.argv[2],))
+if sys.argv[1] == "agent":
+    from semcast.agent.agent import run_agent
+    from semcast.agent.settings import AgentSettings
+    from semcast.agent.source_settings import SourceSettings
+    source = SourceSettings(source=sys.argv[3], repeat="loop")
+    run_agent(AgentSettings(source=source, codec="jpeg-ldpc", network=network), stop)
+else:
+    from semcast.channel.emulator import run_channel
+    from semcast.channel.emulator_settings import EmulatorSettings
+    run_channel(EmulatorSettings(network=network), stop)
+print("ended", flush=True)
+"""
+
+
+class Thread(threading.Thread):
+    """A process function in a thread, with its own stop event and its result."""
+
+    def __init__(self, work):
+        super().__init__()
+        self.stop = threading.Event()
+        self.result = None
+        self.error = None
+        self._work = work
+        self.start()
+
+    def run(self):
+        try:
+            self.result = self._work(self.stop)
+        except Exception as err:
+            self.error = err
+
+    def end(self):
+        self.stop.set()
+        self.join(10)
+        assert not self.is_alive()
+
+
+class Bench:
+    """A hub with agents and channels in threads."""
+
+    def __init__(self, recording, codec):
+        self.recording, self.codec = recording, codec
+        self.hub, self.endpoint = open_hub()
+        self.network = NetworkSettings(connect=(self.endpoint,))
+        self.metrics = Metrics("server")
+        self.threads = []
+        self.receivers = []
+
+    def agent(self, mode="live", source=None, **changes):
+        pace = {"pace": "receiver"} if mode == "replay" else {}
+        source = SourceSettings(source=str(self.recording), **{**pace, **(source or {})})
+        settings = AgentSettings(source=source, mode=mode, network=self.network, **changes)
+        return self._thread(lambda stop: run_agent(settings, stop, self.codec))
+
+    def channel(self, **link):
+        settings = EmulatorSettings(link=ChannelSettings(**link), network=self.network)
+        return self._thread(lambda stop: run_channel(settings, stop))
+
+    def _thread(self, work):
+        self.threads.append(Thread(work))
+        return self.threads[-1]
+
+    def receiver(self, mode="live"):
+        self.receivers.append(Receiver(self.hub, "agent0", mode, self.metrics))
+        return self.receivers[-1]
+
+    def close(self):
+        for thread in self.threads:
+            thread.end()
+        for receiver in self.receivers:
+            receiver.close()
+        self.hub.close()
+
+
+@pytest.fixture
+def bench(recording, codec):
+    opened = Bench(recording, codec)
+    yield opened
+    opened.close()
+
+
+def take(receiver, count=None, deadline_s=20.0, pause_s=0.0):
+    """Take frames until the final one, or so many."""
+    frames = []
+    end_s = time.monotonic() + deadline_s
+    tick = threading.Event()
+    while time.monotonic() < end_s:
+        frame = receiver.next(0.2)
+        if frame is not None:
+            frames.append(frame)
+            if frame.message.final or len(frames) == count:
+                return frames
+            tick.wait(pause_s)
+    raise AssertionError(f"only {len(frames)} frames came: {[f.message.frame_id for f in frames]}")
+
+
+def test_images_cross_the_link_and_feedback_comes_back(bench):
+    channel = bench.channel(snr_db=20.0)
+    receiver = bench.receiver()
+    agent = bench.agent(source={"repeat": "loop"})
+    frames = take(receiver, count=20)
+    agent.end()
+    channel.end()
+    for frame in frames:
+        decoded = bench.codec.decode(frame.received)
+        assert abs(float(decoded.image.mean()) - 20 * (frame.message.frame_id % 12)) < 6
+        assert frame.camera.image_wh == (64, 48)
+        assert frame.camera.codec == "tiny"
+    assert np.mean([f.snr_db for f in frames]) == pytest.approx(20.0, abs=2.0)
+    assert bench.codec.snrs_db[0] == 10.0, "nothing is known before the first report"
+    assert np.median(bench.codec.snrs_db[5:]) == pytest.approx(20.0, abs=3.0)
+    assert agent.result["counts"]["link_reports"] > 10
+    assert (agent.result["source"], agent.result["complete"]) == ("steps", False)
+
+
+def test_a_finite_live_source_ends_when_its_last_frame_was_seen(bench):
+    bench.channel()
+    receiver = bench.receiver()
+    agent = bench.agent()
+    frames = take(receiver)
+    agent.join(10)
+    assert agent.result["complete"]
+    assert frames[-1].message.frame_id == 11
+    taken = len(frames) + sum(v for k, v in bench.metrics.drops.items() if k != "duplicate")
+    assert taken + agent.result["drops"].get("superseded", 0) == 12
+
+
+def test_replay_delivers_every_frame_to_a_slow_consumer(bench):
+    bench.channel(channel="erasure", frame_loss=0.3)
+    receiver = bench.receiver("replay")
+    agent = bench.agent("replay")
+    frames = take(receiver, pause_s=0.03)
+    assert [f.message.frame_id for f in frames] == list(range(12))
+    assert 0 < sum(f.received is None for f in frames) < 12
+    agent.join(10)
+    assert (agent.result["complete"], agent.result["counts"]["sent"]) == (True, 12)
+    assert bench.metrics.drops == {}
+    assert bench.codec.snrs_db == [10.0] * 12, "what the encoder is told does not depend on timing"
+
+
+def test_replay_is_the_same_every_time(bench):
+    channel = bench.channel(channel="rayleigh", snr_db=5.0, frame_loss=0.2)
+    receiver = bench.receiver("replay")
+    runs = []
+    for _ in range(2):
+        agent = bench.agent("replay")
+        runs.append([None if f.received is None else f.received.symbols for f in take(receiver)])
+        agent.join(10)
+    channel.end()
+    assert len(runs[0]) == 12
+    for one, other in zip(*runs, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_replay_goes_on_without_a_gap_when_channel_or_server_are_restarted(bench):
+    channel = bench.channel()
+    receiver = bench.receiver("replay")
+    agent = bench.agent("replay")
+    frames = take(receiver, count=4)
+    channel.end()
+    bench.channel()
+    frames += take(receiver, count=3)
+    # A new server knows nothing of the stream, and some frames had reached the old one untaken.
+    receiver.close()
+    bench.hub.close()
+    bench.hub = open_session(NetworkSettings(listen=(bench.endpoint,), connect=()))
+    frames += take(bench.receiver("replay"))
+    ids = [f.message.frame_id for f in frames]
+    assert sorted(set(ids)) == list(range(12))
+    assert ids[:7] == list(range(7))
+    assert len(ids) - 12 <= 1, "at most the frame whose taking was not heard of comes twice"
+    agent.join(10)
+    assert agent.result["complete"]
+
+
+def test_a_restarted_agent_is_followed_at_once(bench, until):
+    bench.channel()
+    receiver = bench.receiver()
+    first = bench.agent(source={"repeat": "loop"})
+    before = take(receiver, count=5)
+    first.end()
+    second = bench.agent(source={"repeat": "loop"})
+    until(lambda: take(receiver, count=1)[0].message.agent_epoch > before[-1].message.agent_epoch)
+    after = take(receiver, count=5)
+    assert len({f.message.agent_epoch for f in after}) == 1
+    assert [f.message.seq for f in after] == sorted({f.message.seq for f in after})
+    second.end()
+    assert second.result["agent_epoch"] == after[0].message.agent_epoch
+
+
+def test_an_agent_waits_for_the_others_unless_told_not_to(bench, until):
+    waiting = bench.agent(source={"repeat": "loop"})
+    until(lambda: "agent" in bench.hub.alive_roles("agent0"))
+    channel = bench.channel()
+    until(lambda: "channel" in bench.hub.alive_roles("agent0"))
+    assert bench.codec.snrs_db == []
+    receiver = bench.receiver()
+    assert take(receiver, count=1)[0].message.seq == 0
+    waiting.end()
+    channel.end()
+    bench.codec.snrs_db.clear()
+    eager = bench.agent(wait=False)
+    until(lambda: len(bench.codec.snrs_db) >= 3)
+    eager.end()
+
+
+def test_status_comes_once_a_second_and_at_the_end(bench, until):
+    statuses = []
+    bench.hub.subscribe(
+        status_key("agent0", "agent"), "every", lambda p: statuses.append(unpack(p, StatusMessage))
+    )
+    bench.channel()
+    receiver = bench.receiver()
+    agent = bench.agent(source={"repeat": "loop"})
+    take(receiver, count=5)
+    agent.end()
+    until(lambda: statuses)
+    last = statuses[-1]
+    assert (last.role, last.agent_epoch) == ("agent", agent.result["agent_epoch"])
+    assert last.counts["sent"] == agent.result["counts"]["sent"] >= 5
+    assert last.stages_ms["encode"][2] > 0
+
+
+def test_a_source_that_fails_ends_the_agent_with_its_error(bench, tmp_path):
+    settings = AgentSettings(source=SourceSettings(source=str(tmp_path / "nowhere")), network=bench.network)
+    failing = bench._thread(lambda stop: run_agent(settings, stop, bench.codec))
+    failing.join(10)
+    assert "there is no such folder" in str(failing.error)
+
+
+def test_an_agent_without_a_hub_can_be_stopped(recording, codec):
+    settings = AgentSettings(
+        source=SourceSettings(source=str(recording)), network=NetworkSettings(connect=(free_endpoint(),))
+    )
+    agent = Thread(lambda stop: run_agent(settings, stop, codec))
+    agent.end()
+    assert agent.error is None
+    assert (agent.result["counts"], agent.result["complete"]) == ({}, False)
+
+
+def test_real_processes_survive_each_others_death_in_any_order(recording, until):
+    endpoint = free_endpoint()
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    running = {}
+
+    def start(role):
+        running[role] = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, role, endpoint, str(recording)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        )  # fmt: skip
+
+    def serve():
+        hub = open_session(NetworkSettings(listen=(endpoint,), connect=()))
+        return hub, Receiver(hub, "agent0", "live", Metrics("server"))
+
+    try:
+        # The server comes last, and is still found.
+        start("agent")
+        start("channel")
+        hub, receiver = serve()
+        epoch = take(receiver, count=3)[-1].message.agent_epoch
+        for role in ("channel", "agent"):
+            running[role].kill()
+            running[role].communicate(timeout=10)
+            until(lambda role=role: role not in receiver.roles_alive)
+            start(role)
+            until(lambda role=role: role in receiver.roles_alive)
+            frames = take(receiver, count=3)
+        assert frames[-1].message.agent_epoch > epoch
+        receiver.close()
+        hub.close()
+        hub, receiver = serve()
+        started_s = time.monotonic()
+        take(receiver, count=1)
+        assert time.monotonic() - started_s < 3.0
+        for process in running.values():
+            process.send_signal(signal.SIGTERM)
+            assert process.communicate(timeout=10) == ("ended\n", "")
+            assert process.returncode == 0
+        receiver.close()
+        hub.close()
+    finally:
+        for process in running.values():
+            process.kill()
+            process.communicate()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"source": SourceSettings(source="x", pace="receiver")}, "pace 'receiver' needs mode 'replay'"),
+        ({"threads": 0}, "threads must be at least 1, got 0"),
+        ({"snr_db": 500.0}, r"snr_db must be in \[.*\], got 500"),
+        ({"feedback_max_age_s": 0.0}, r"feedback_max_age_s must be in \(0, 3600\], got 0"),
+        ({"agent_id": "a/b"}, "agent_id must be"),
+    ],
+)
+def test_settings_are_checked(changes, message):
+    with pytest.raises(ValueError, match=message):
+        AgentSettings(**{"source": SourceSettings(source="x"), **changes})
