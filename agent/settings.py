@@ -6,7 +6,7 @@ from typing import Literal
 
 from semcast.agent.source_settings import SourceSettings
 from semcast.channel.trace import SNR_RANGE_DB
-from semcast.common.codec import Modulation
+from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import NetworkSettings
 
@@ -25,7 +25,7 @@ class AgentSettings:
         metadata={"help": "live: newest frame wins; replay: every frame, in order, when the server takes it"},
     )
     source: SourceSettings = field(metadata={"help": "where frames come from"})
-    codec: str = field(default="3dcsc", metadata={"help": "codec by name"})
+    codec: str = field(default=DEFAULT_CODEC, metadata={"help": "codec by name"})
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
     weights: Path | None = field(default=None, metadata={"help": "weights instead of the shipped ones"})
     threads: int = field(default=1, metadata={"help": "CPU threads of the encoder"})

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 Modulation = Literal["16qam", "analog"]
 MODULATIONS: tuple[Modulation, ...] = ("16qam", "analog")
 
+#: Codec of every command that is not told another.
+DEFAULT_CODEC = "3dcsc-lite"
+
 #: Effective SNR given to the decoder for a slot of which nothing arrived.
 LOST_SLOT_SNR_DB = -20.0
 

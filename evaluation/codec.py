@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.channel.trace import SNR_RANGE_DB
-from semcast.common.codec import Codec, DecodedImage, Modulation
+from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
 from semcast.common.codecs import load_codec
 from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
@@ -55,7 +55,7 @@ class CodecSettings:
 
     images: Path = field(metadata={"help": "folder of images, used in the order of their names"})
     codec: tuple[str, ...] = field(
-        default=("3dcsc", "jpeg-ldpc"), metadata={"help": "codecs by name, one or more"}
+        default=(DEFAULT_CODEC, "jpeg-ldpc"), metadata={"help": "codecs by name, one or more"}
     )
     snr_db: tuple[float, ...] = field(
         default=(2.0, 4.0, 6.0, 8.0, 10.0, 12.0), metadata={"help": "SNRs in dB, one or more"}

@@ -16,7 +16,7 @@ from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.codec import Codec, DecodedImage, Modulation
+from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
 from semcast.common.codecs import load_codec
 from semcast.common.errors import ConfigError
 from semcast.common.phy.equaliser import equalise
@@ -48,7 +48,8 @@ class StreamSettings:
         default=CameraSettings(), metadata={"help": "intrinsics, where the recording has none"}
     )
     codec: str = field(
-        default="3dcsc", metadata={"help": f"codec by name; {CLEAN} takes the original images, confidence 1"}
+        default=DEFAULT_CODEC,
+        metadata={"help": f"codec by name; {CLEAN} takes the original images, confidence 1"},
     )
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
     snr_db: tuple[float, ...] = field(default=(10.0,), metadata={"help": "SNRs in dB, one or more"})

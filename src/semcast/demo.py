@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from semcast.common.codec import Modulation
+from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.transport import free_endpoint, open_session
@@ -35,7 +35,7 @@ class DemoSettings:
     sequence: Path | None = field(
         default=None, metadata={"help": "recorded sequence; without it the one shipped with semcast"}
     )
-    codec: str = field(default="3dcsc-lite", metadata={"help": "codec by name, such as jpeg-ldpc"})
+    codec: str = field(default=DEFAULT_CODEC, metadata={"help": "codec by name, such as jpeg-ldpc"})
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
     snr_db: float = field(default=10.0, metadata={"help": "Es/N0 of the link in dB"})
     channel: str = field(
