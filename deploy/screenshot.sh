@@ -2,18 +2,20 @@
 # Take a picture of a recording in the Rerun viewer, without a display.
 #   deploy/screenshot.sh native RUN.rrd OUT.png     the window, under Xvfb with software Vulkan
 #   deploy/screenshot.sh web RUN.rrd OUT.png        the web page, in headless Chromium
+#   deploy/screenshot.sh window PORT OUT.png        the window of a running `semcast ... --view native`
 #   deploy/screenshot.sh page URL OUT.png           the page of a running `semcast ... --view web`
 # Debian or Ubuntu: apt-get install xvfb mesa-vulkan-drivers chromium
-# Environment: SIZE=1600x960, RERUN=rerun (the viewer), CHROMIUM=chromium, WAIT_S=25 (seconds, web).
+# Environment: SIZE=1600x960, RERUN=rerun, PYTHON=python3, CHROMIUM=chromium, WAIT_S=25 (seconds until the picture).
 set -eu
 
 if [ $# -ne 3 ]; then
-  sed -n '2,7s/^# \{0,1\}//p' "$0" >&2
+  sed -n '2,8s/^# \{0,1\}//p' "$0" >&2
   exit 2
 fi
 mode=$1 run=$2 out=$3
 size=${SIZE:-1600x960}
 rerun=${RERUN:-$([ -x .venv/bin/rerun ] && echo .venv/bin/rerun || echo rerun)}
+python=${PYTHON:-$([ -x .venv/bin/python ] && echo .venv/bin/python || echo python3)}
 wait_s=${WAIT_S:-25}
 scratch=$(mktemp -d)
 viewer=
@@ -32,14 +34,26 @@ photograph_page() {
   python3 "$(dirname "$0")/photograph_page.py" "$1" "$out" "$size" "$wait_s"
 }
 
+photograph_window() {
+  "$python" - "$1" "$(realpath -m "$out")" <<'END'
+import sys
+from rerun.experimental import ViewerClient
+ViewerClient.connect(f"rerun+http://127.0.0.1:{sys.argv[1]}/proxy").save_screenshot(sys.argv[2])
+END
+}
+
 case $mode in
 native)
   icd=$(ls /usr/share/vulkan/icd.d/lvp_icd*.json 2>/dev/null | head -n 1)
   [ -n "$icd" ] || { echo "no software Vulkan found: apt-get install mesa-vulkan-drivers" >&2; exit 1; }
+  port=$(free_port)
   # A screen larger than the window keeps the pointer, which starts in its middle, off the picture.
-  VK_ICD_FILENAMES=$icd XDG_RUNTIME_DIR=$scratch xvfb-run -a -s "-screen 0 4000x2400x24" \
-    timeout 120 "$rerun" --bind 127.0.0.1 --port auto "$run" --window-size "$size" --screenshot-to "$out" \
-    >"$scratch/rerun.log" 2>&1 || { tail -5 "$scratch/rerun.log" >&2; exit 1; }
+  VK_ICD_FILENAMES=$icd XDG_RUNTIME_DIR=$scratch WINIT_X11_SCALE_FACTOR=1 \
+    setsid xvfb-run -a -s "-screen 0 4096x2400x24" \
+    "$rerun" --bind 127.0.0.1 --port "$port" "$run" --window-size "$size" >"$scratch/rerun.log" 2>&1 &
+  viewer=$!
+  sleep "$wait_s"
+  photograph_window "$port" || { tail -5 "$scratch/rerun.log" >&2; exit 1; }
   ;;
 web)
   port=$(free_port) web_port=$(free_port)
@@ -54,11 +68,14 @@ web)
   done
   photograph_page "http://127.0.0.1:$web_port/?url=rerun%2Bhttp://127.0.0.1:$port/proxy&renderer=webgl"
   ;;
+window)
+  photograph_window "$run"
+  ;;
 page)
   photograph_page "$run&renderer=webgl"
   ;;
 *)
-  echo "the mode must be native, web or page, got '$mode'" >&2
+  echo "the mode must be native, web, window or page, got '$mode'" >&2
   exit 2
   ;;
 esac

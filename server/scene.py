@@ -26,6 +26,8 @@ MAX_ROWS = 20_000
 MAX_KEYPOINTS = 1500
 #: Depth of the drawn frustum as share of the median landmark distance.
 FRUSTUM_SHARE = 0.15
+#: From confidence 0 to 1 in equal steps; bright at both ends, for points on a dark background.
+CONFIDENCE_COLOURS = ((165, 30, 75), (235, 95, 60), (250, 205, 90), (90, 220, 160), (40, 200, 220))
 
 
 @dataclass(frozen=True)
@@ -362,7 +364,7 @@ def compress_picture(view: FrameView, quality: int) -> Picture:
     image_jpeg = cv2.imencode(".jpg", bgr, options)[1].tobytes()
     confidence_jpeg = None
     if view.confidence is not None:
-        heat = cv2.applyColorMap(confidence_levels(view.confidence), cv2.COLORMAP_VIRIDIS)
+        heat = cv2.cvtColor(confidence_colours(view.confidence), cv2.COLOR_RGB2BGR)
         confidence_jpeg = cv2.imencode(".jpg", heat, options)[1].tobytes()
     step = -(-max(len(view.keypoints_xy), 1) // MAX_KEYPOINTS)
     return Picture(
@@ -375,7 +377,15 @@ def compress_picture(view: FrameView, quality: int) -> Picture:
     )
 
 
-def confidence_levels(confidence: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Map confidence to 0..255 for display, squared so that the crowded end near 1 spreads out."""
-    c = np.clip(np.nan_to_num(confidence, nan=0.0), 0.0, 1.0)
-    return (c * c * 255.0).astype(np.uint8)
+def confidence_colours(confidence: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Colour confidences of any shape: red is not trusted, yellow half, turquoise fully; NaN counts as 0.
+
+    Returns:
+        uint8 RGB with one more axis, of length 3.
+    """
+    levels = (np.clip(np.nan_to_num(confidence, nan=0.0), 0.0, 1.0) * 255.0).astype(np.uint8)
+    stops = np.linspace(0.0, 255.0, len(CONFIDENCE_COLOURS))
+    table = np.stack(
+        [np.interp(np.arange(256), stops, channel) for channel in np.transpose(CONFIDENCE_COLOURS)], axis=1
+    )
+    return np.rint(table).astype(np.uint8)[levels]

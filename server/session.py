@@ -52,6 +52,8 @@ Array = NDArray[np.float64]
 CHECKPOINT_NAME = "checkpoint.npz"
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
+#: Stages in the viewer's plot; all of them are in ``frames.jsonl`` and the summary.
+PLOTTED_STAGES = ("decode", "track", "map", "bundle")
 
 
 @dataclass(frozen=True)
@@ -358,7 +360,8 @@ def frame_view(
         "tracking/inliers": float(row.num_inliers),
         "error/reprojection_error_px": row.reprojection_error_px,
         "latency/arrival_to_pose_ms": row.age_ms,
-        **{f"latency/{stage}_ms": value for stage, value in row.stage_ms.items()},
+        **{f"latency/{stage}_ms": row.stage_ms.get(stage) for stage in PLOTTED_STAGES},
+        "drops/all": float(sum(drops.values())),
         **{f"drops/{reason}": float(count) for reason, count in drops.items()},
     }
     return FrameView(

@@ -8,8 +8,8 @@ from semcast.common.geometry import make_transform
 Array = NDArray[np.float64]
 
 #: Place of the eye and of what it looks at, in camera axes and median landmark distances.
-EYE_OFFSET = np.array([-0.25, -0.45, -0.9])
-TARGET_OFFSET = np.array([0.0, 0.0, 0.45])
+EYE_OFFSET = np.array([-0.35, -0.55, -1.15])
+TARGET_OFFSET = np.array([0.1, 0.1, 0.6])
 #: Share of the way to its new place the eye goes with each frame.
 FOLLOW_GAIN = 0.15
 

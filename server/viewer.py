@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.server.scene import Changes, Picture, PointChunk, Row, confidence_levels
+from semcast.server.scene import Changes, Picture, PointChunk, Row, confidence_colours
 
 logger = logging.getLogger(__name__)
 
@@ -20,9 +19,9 @@ APPLICATION_ID = "semcast"
 
 BACKGROUND = (14, 17, 23)
 PATH_COLOUR = (255, 170, 40)
-TRUTH_COLOUR = (120, 130, 150)
+TRUTH_COLOUR = (150, 160, 180)
 INLIER_COLOUR = (80, 230, 120)
-OUTLIER_COLOUR = (240, 70, 70)
+OTHER_COLOUR = (240, 120, 70)
 
 #: Plot path to (name in the legend, colour); other paths get a colour of Rerun's choice.
 SERIES = {
@@ -32,6 +31,7 @@ SERIES = {
     "tracking/tracked": ("tracked", (130, 140, 160)),
     "tracking/inliers": ("inliers", (80, 230, 120)),
     "error/reprojection_error_px": ("reprojection error", (255, 120, 90)),
+    "drops/all": ("all", (240, 120, 70)),
     "latency/decode_ms": ("decode", (90, 170, 255)),
     "latency/track_ms": ("track", (80, 230, 120)),
     "latency/map_ms": ("map", (200, 130, 255)),
@@ -60,11 +60,17 @@ def blueprint(has_truth: bool, has_confidence: bool) -> rrb.Blueprint:
         eye_controls=rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, tracking_entity="/world/spectator"),
     )
     pictures: list[rrb.Spatial2DView] = [
-        rrb.Spatial2DView(name="Received image and keypoints", origin="/world/camera/image", background=dark)
+        rrb.Spatial2DView(
+            name="Received image (green: keypoints that carry the pose)",
+            origin="/world/camera/image",
+            background=dark,
+        )
     ]
     if has_confidence:
         pictures.append(
-            rrb.Spatial2DView(name="Confidence (yellow: trusted)", origin="/confidence", background=dark)
+            rrb.Spatial2DView(
+                name="Confidence (turquoise: trusted, red: not)", origin="/confidence", background=dark
+            )
         )
     plots = [
         rrb.TimeSeriesView(
@@ -212,7 +218,7 @@ class RerunStream:
         self._open().log(f"plots/{path}", rr.SeriesLines(names=name, colors=colour, widths=1.8), static=True)
 
     def _write_points(self, chunk: PointChunk) -> None:
-        radius = rr.Radius.ui_points(1.8)
+        radius = rr.Radius.ui_points(2.2)
         by_confidence = confidence_colours(chunk.confidence)
         for path, colours in (("map_confidence", by_confidence), ("map_colour", chunk.rgb)):
             self._open().log(
@@ -226,7 +232,7 @@ class RerunStream:
         stream.log(
             "world/camera/image", rr.EncodedImage(contents=picture.image_jpeg, media_type="image/jpeg")
         )
-        colours = np.where(picture.keypoint_inlier[:, None], INLIER_COLOUR, OUTLIER_COLOUR).astype(np.uint8)
+        colours = np.where(picture.keypoint_inlier[:, None], INLIER_COLOUR, OTHER_COLOUR).astype(np.uint8)
         stream.log(
             "world/camera/image/keypoints",
             rr.Points2D(picture.keypoints_xy + 0.5, colors=colours, radii=rr.Radius.ui_points(2.0)),
@@ -272,19 +278,6 @@ class RerunStream:
             rr.unregister_shutdown()
             return False
         return True
-
-
-def confidence_colours(confidence: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Colour ``(N,)`` confidences like the heat map; returns ``(N, 3)`` uint8 RGB."""
-    return viridis()[confidence_levels(confidence)]
-
-
-def viridis() -> NDArray[np.uint8]:
-    """Return the ``(256, 3)`` RGB table of the heat map."""
-    import cv2
-
-    ramp = np.arange(256, dtype=np.uint8)[:, None]
-    return np.ascontiguousarray(cv2.applyColorMap(ramp, cv2.COLORMAP_VIRIDIS)[:, 0, ::-1])
 
 
 def _time_columns(rows: list[Row]) -> list[rr.TimeColumn]:

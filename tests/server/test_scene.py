@@ -13,7 +13,7 @@ from semcast.server.scene import (
     Scene,
     align_poses,
     compress_picture,
-    confidence_levels,
+    confidence_colours,
 )
 from semcast.server.spectator import Spectator, look_at
 
@@ -197,7 +197,8 @@ def test_pictures_are_jpeg_and_bad_confidence_is_shown_as_none():
     picture = compress_picture(view(0), 80)
     assert picture.image_jpeg[:2] == picture.confidence_jpeg[:2] == b"\xff\xd8"
     assert picture.keypoint_inlier.tolist() == [True, False, True]
-    levels = confidence_levels(np.array([0.0, 0.5, 1.0, 2.0, np.nan], np.float32))
-    assert levels.tolist() == [0, 63, 255, 255, 0]
+    colours = confidence_colours(np.array([[0.0, 1.0], [2.0, np.nan]], np.float32))
+    assert colours[0].tolist() == [[165, 30, 75], [40, 200, 220]]
+    assert colours[1].tolist() == [[40, 200, 220], [165, 30, 75]]
     with pytest.raises(ValueError, match="must have an image"):
         compress_picture(view(0).without_image(), 80)
