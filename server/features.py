@@ -235,15 +235,39 @@ class Describer:
         return np.array([k.class_id for k in kept], dtype=np.intp), descriptors
 
 
+def hamming(descriptors0: NDArray[np.uint8], descriptors1: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Number of different bits of descriptors, row by row, ``(N,)``."""
+    return np.bitwise_count(descriptors0 ^ descriptors1).sum(axis=1, dtype=np.int64)
+
+
 def match_descriptors(
-    descriptors0: NDArray[np.uint8], descriptors1: NDArray[np.uint8], max_distance: int = 64
+    descriptors0: NDArray[np.uint8],
+    descriptors1: NDArray[np.uint8],
+    max_distance: int = 64,
+    max_ratio: float = 0.9,
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Match descriptors that are each other's nearest; rows into both, best first."""
-    if len(descriptors0) == 0 or len(descriptors1) == 0:
+    """Match descriptors that are each other's nearest, and clearly so; rows into both, best first.
+
+    Args:
+        descriptors0: ``(N, 32)``; several may describe the same point (other octaves).
+        descriptors1: ``(M, 32)``, each of another point.
+        max_distance: Bits that may differ.
+        max_ratio: Distance over that to the second nearest of ``descriptors1``.
+    """
+    if len(descriptors0) == 0 or len(descriptors1) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors0, descriptors1)
-    matches = sorted((m for m in matches if m.distance <= max_distance), key=lambda m: m.distance)
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+    nearest0 = np.full(len(descriptors1), -1, np.intp)
+    for match in matcher.match(descriptors1, descriptors0):
+        nearest0[match.queryIdx] = match.trainIdx
+    found = [
+        (first.distance, first.queryIdx, first.trainIdx)
+        for first, second in matcher.knnMatch(descriptors0, descriptors1, k=2)
+        if first.distance <= min(max_distance, max_ratio * second.distance)
+        and nearest0[first.trainIdx] == first.queryIdx
+    ]
+    found.sort()
     return (
-        np.array([m.queryIdx for m in matches], dtype=np.intp),
-        np.array([m.trainIdx for m in matches], dtype=np.intp),
+        np.array([m[1] for m in found], dtype=np.intp),
+        np.array([m[2] for m in found], dtype=np.intp),
     )

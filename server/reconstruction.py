@@ -32,6 +32,8 @@ _MIN_USABLE_SHARE = 0.5
 #: Keyframes between two attempts to recognise an older submap.
 _JOIN_INTERVAL = 3
 _START_LEVELS = 5
+#: Tracks a frame must have to count towards a new map.
+_MIN_TRACKS_TO_GIVE_UP = 50
 
 
 class Reconstruction:
@@ -221,7 +223,8 @@ class Reconstruction:
             return self._accept(sight, found)
         frame, tracks = sight.frame, self._tracks
         if self._state is TrackingState.LOST:
-            self._frames_lost += 1
+            # An empty image is no sign of another place: only frames with something to follow count.
+            self._frames_lost += int(len(tracks) >= _MIN_TRACKS_TO_GIVE_UP)
             if self._frames_lost >= self._settings.lost_after_frames:
                 logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
                 self._state = TrackingState.INITIALIZING

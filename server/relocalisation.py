@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
-from semcast.server.features import Describer, Grey, detect_corners, match_descriptors
-from semcast.server.pnp import search_pose
+from semcast.server.features import Describer, Grey, detect_corners, hamming, match_descriptors
+from semcast.server.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.tracks import Sight
 from semcast.server.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.world_map import Keyframe, WorldMap
@@ -18,8 +18,14 @@ Ids = NDArray[np.int64]
 
 #: Keyframes tried per frame; those not tried now get their turn on later frames.
 MAX_CANDIDATES = 4
-#: Agreeing landmarks that prove a place.
+#: Agreeing matches that are worth a closer look, and agreeing landmarks that prove a place.
+_MIN_FIRST = 9
 MIN_INLIERS = 20
+#: Keyframes around the recognised one whose landmarks are looked for.
+_NEIGHBOURS = 5
+_GUIDED_RADIUS_PX = 14.0
+_GUIDED_MAX_BITS = 70
+_MIN_GUIDED_SHARE = 0.35
 #: Octaves of the query, so that a view from nearer or further still matches.
 _OCTAVES = (0, 2, 4)
 #: Binary descriptors do not know the noise model: a match is good to about this.
@@ -81,37 +87,72 @@ class Relocaliser:
         usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
         corners = detect_corners(sight.grey, 800, None, usable, cell_px=40).astype(np.float64)
         rows, descriptors = self._describer.describe(sight.grey, corners, _OCTAVES)
-        if len(rows) < MIN_INLIERS:
+        if len(rows) < _MIN_FIRST:
             return None
         sigma_px = max(_MATCH_SIGMA_PX, noise.sigma0_px)
         for keyframe in candidates:
-            known = world.landmarks.rows(keyframe.descriptor_ids) >= 0
-            ids = keyframe.descriptor_ids[known]
-            mine, theirs = match_descriptors(descriptors, keyframe.descriptors[known])
-            if len(mine) < MIN_INLIERS:
+            ids, known = _pool(world, [keyframe])
+            mine, theirs = match_descriptors(descriptors, known)
+            found = self._search(world, ids[theirs], corners[rows[mine]], sigma_px)
+            if found is None:
                 continue
-            xy, matched = corners[rows[mine]], ids[theirs]
-            points = world.landmarks.xyz[world.landmarks.rows(matched)]
-            found = search_pose(
-                self._camera,
-                points,
-                xy,
-                np.full(len(xy), sigma_px),
-                np.full(len(xy), GATE_SIGMAS * sigma_px),
-                seed=self._seed,
-                min_inliers=MIN_INLIERS,
-            )
-            if found is None or found.num_inliers < 0.25 * len(xy):
-                continue
-            good = found.inliers
-            return Place(
-                invert_transform(found.T_cam_world),
-                keyframe.frame_id,
-                matched[good],
-                xy[good],
-                keyframe.submap,
-            )
+            place = self._confirm(world, keyframe, found, corners[rows], descriptors, sigma_px)
+            if place is not None:
+                return place
         return None
+
+    def _search(self, world: WorldMap, ids: Ids, xy: Array, sigma_px: float) -> PoseEstimate | None:
+        sigma = np.full(len(xy), sigma_px)
+        points = world.landmarks.xyz[world.landmarks.rows(ids)]
+        return search_pose(
+            self._camera, points, xy, sigma, GATE_SIGMAS * sigma, seed=self._seed, min_inliers=_MIN_FIRST
+        )
+
+    def _confirm(
+        self,
+        world: WorldMap,
+        keyframe: Keyframe,
+        found: PoseEstimate,
+        xy: Array,
+        descriptors: NDArray[np.uint8],
+        sigma_px: float,
+    ) -> Place | None:
+        """Look for more landmarks where the pose expects them; a wrong pose finds few."""
+        near = sorted(
+            (k for k in world.keyframes if k.submap == keyframe.submap),
+            key=lambda k: abs(k.frame_id - keyframe.frame_id),
+        )[:_NEIGHBOURS]
+        ids, known = _pool(world, near)
+        points = world.landmarks.xyz[world.landmarks.rows(ids)]
+        T = found.T_cam_world
+        expected = self._camera.project(points @ T[:3, :3].T + T[:3, 3])
+        size = (self._camera.width, self._camera.height)
+        in_view = ((expected >= 0) & (expected < size)).all(axis=1)
+        ids, known, points, expected = ids[in_view], known[in_view], points[in_view], expected[in_view]
+        square = ((expected[:, None] - xy[None]) ** 2).sum(axis=2)
+        point, row = np.nonzero(square < _GUIDED_RADIUS_PX**2)
+        if len(point) < MIN_INLIERS:
+            return None
+        distance = hamming(known[point], descriptors[row])
+        order = np.lexsort((row, distance, point))
+        first = np.unique(point[order], return_index=True)[1]
+        best = order[first]
+        best = best[distance[best] <= _GUIDED_MAX_BITS]
+        point, row = point[best], row[best]
+        if len(point) < MIN_INLIERS:
+            return None
+        sigma = np.full(len(point), sigma_px)
+        refined = refine_pose(self._camera, T, points[point], xy[row], sigma, GATE_SIGMAS * sigma)
+        if refined.num_inliers < max(MIN_INLIERS, _MIN_GUIDED_SHARE * len(point)):
+            return None
+        good = refined.inliers
+        return Place(
+            invert_transform(refined.T_cam_world),
+            keyframe.frame_id,
+            ids[point][good],
+            xy[row][good],
+            keyframe.submap,
+        )
 
     def _candidates(self, world: WorldMap, submaps: set[int] | None) -> list[Keyframe]:
         known = [k for k in world.keyframes if submaps is None or k.submap in submaps]
@@ -121,6 +162,15 @@ class Relocaliser:
         turn = [older[-1 - (self._turn + k) % len(older)] for k in range(count)]
         self._turn = (self._turn + count) % max(1, len(older))
         return [*reversed(newest), *turn]
+
+
+def _pool(world: WorldMap, keyframes: list[Keyframe]) -> tuple[Ids, NDArray[np.uint8]]:
+    """Ids and descriptors of all landmarks in keyframes, of several descriptors the first."""
+    ids = np.concatenate([k.descriptor_ids for k in keyframes])
+    descriptors = np.concatenate([k.descriptors for k in keyframes])
+    known = np.flatnonzero(world.landmarks.rows(ids) >= 0)
+    unique, first = np.unique(ids[known], return_index=True)
+    return unique, descriptors[known[first]]
 
 
 def submap_similarity(
