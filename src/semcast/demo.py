@@ -1,6 +1,7 @@
 """The demo: server, channel and agent as three real processes on loopback, until the sequence ends."""
 
 import json
+import math
 import shlex
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from typing import Any, Literal
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.network_settings import NetworkSettings
+from semcast.common.sequence import open_sequence
 from semcast.common.transport import free_endpoint, open_session
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
@@ -22,6 +24,8 @@ START_DEADLINE_S = 60.0
 #: How long a role may take to write everything after it was asked to stop.
 STOP_DEADLINE_S = 15.0
 AGENT_ID = "demo"
+#: Image size at which agent, channel, server and viewer together keep up at 10 Hz on two cores.
+REAL_TIME_PIXELS = 250_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +52,12 @@ class DemoSettings:
     view: Literal["auto", "native", "web", "file", "none"] = field(
         default="auto", metadata={"help": "viewer: a window, the browser, only run.rrd, or none"}
     )
-    resize: float = field(default=1.0, metadata={"help": "factor on the image size, for slow machines"})
+    resize: float | None = field(
+        default=None,
+        metadata={
+            "help": "factor on the image size; by default what two cores can serve at 10 frames a second"
+        },
+    )
     seed: int = field(default=0, metadata={"help": "seed of channel and estimation"})
     out: Path = field(default=Path("runs/demo"), metadata={"help": "folder for all outputs"})
     json: Path | None = field(default=None, metadata={"help": "also write the summary to this file"})
@@ -60,7 +69,7 @@ class DemoSettings:
         """Check ranges that the three processes would only notice after their start."""
         if not -5.0 <= self.snr_db <= 30.0:
             raise ValueError(f"snr_db must be in [-5, 30], got {self.snr_db:g}")
-        if not 0.05 <= self.resize <= 1.0:
+        if self.resize is not None and not 0.05 <= self.resize <= 1.0:
             raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
 
 
@@ -79,7 +88,15 @@ def default_sequence() -> Path:
     )
 
 
-def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict[str, list[str]]:
+def real_time_resize(shape_hw: tuple[int, int]) -> float:
+    """Return the factor, at most 1, that brings an image down to ``REAL_TIME_PIXELS``."""
+    height, width = shape_hw
+    return min(1.0, round(math.sqrt(REAL_TIME_PIXELS / (height * width)), 2))
+
+
+def role_commands(
+    settings: DemoSettings, sequence: Path, resize: float, endpoint: str
+) -> dict[str, list[str]]:
     """Return the command line of each role, in the order they are started."""
     program = [sys.executable, "-m", "semcast"]
     meet = ["--agent-id", AGENT_ID, "--connect", endpoint]
@@ -89,7 +106,7 @@ def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict
     channel = [*program, "channel", *meet, "--channel", settings.channel, "--snr-db", f"{settings.snr_db:g}"]
     channel += ["--seed", str(settings.seed)]
     agent = [*program, "agent", *meet, "--source", str(sequence), "--codec", settings.codec]
-    agent += ["--modulation", settings.modulation, "--resize", f"{settings.resize:g}"]
+    agent += ["--modulation", settings.modulation, "--resize", f"{resize:g}"]
     if settings.record is not None:
         server += ["--record", str(settings.record)]
     return {"server": server, "channel": channel, "agent": agent}
@@ -192,7 +209,8 @@ def run_demo(
     logs = settings.out / "logs"
     logs.mkdir(exist_ok=True)
     endpoint = free_endpoint()
-    commands = role_commands(settings, sequence, endpoint)
+    resize = settings.resize or real_time_resize(open_sequence(sequence).intrinsics.shape_hw)
+    commands = role_commands(settings, sequence, resize, endpoint)
     children = {name: Role(name, command, logs / f"{name}.log") for name, command in commands.items()}
     alive = Alive(set(), threading.Condition())
     try:
