@@ -1,0 +1,177 @@
+"""Weights on disk: half-precision safetensors and a manifest beside it that says what they are."""
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from semcast.common.errors import CheckpointError
+from semcast.common.nets.registry import build, sizes_to_dict
+from semcast.common.nets.transceiver import Transceiver
+
+MAX_BYTES = 16 * 1024 * 1024
+FORMAT = 1
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """What a file of weights is and how it came about.
+
+    Attributes:
+        format: Version of this manifest.
+        architecture: Name in the registry.
+        sizes: Sizes of the network.
+        sha256: Of the weights file.
+        cbr: Complex channel uses for each source value, pilots included.
+        snr_range_db: SNR drawn in training.
+        modulations: What the weights can be used with.
+        made_by: Settings, data, steps, samples, wall time, seed, commit.
+        measured: Quality on test images, with the command that measured it.
+    """
+
+    format: int = FORMAT
+    architecture: str
+    sizes: dict[str, Any]
+    sha256: str
+    cbr: float
+    snr_range_db: tuple[float, float]
+    modulations: tuple[str, ...]
+    made_by: dict[str, Any]
+    measured: dict[str, Any]
+
+
+def manifest_path(weights: Path) -> Path:
+    """Return the path of the manifest that belongs to a weights file."""
+    return weights.with_suffix(".json")
+
+
+def weights_path(name_or_path: str | Path) -> Path:
+    """Return the weights file of a shipped name or of a path.
+
+    Raises:
+        CheckpointError: There is no such file.
+    """
+    path = Path(name_or_path)
+    if path.suffix == ".safetensors":
+        if not path.is_file():
+            raise CheckpointError(f"weights {path} do not exist")
+        return path
+    folder = Path(__file__).resolve().parent.parent / "weights"
+    shipped = folder / f"{name_or_path}.safetensors"
+    if not shipped.is_file():
+        known = sorted(p.stem for p in folder.glob("*.safetensors"))
+        raise CheckpointError(
+            f"no trained weights for {str(name_or_path)!r}; shipped are: {', '.join(known) or 'none'}"
+        )
+    return shipped
+
+
+def file_sha256(path: Path) -> str:
+    """Return the sha256 of a file as 64 hex digits."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def read_manifest(weights: Path) -> Manifest:
+    """Read and check the manifest of a weights file.
+
+    Raises:
+        CheckpointError: It is missing, damaged, of another format, or its sha256 is not that of the weights.
+    """
+    path = manifest_path(weights)
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as err:
+        raise CheckpointError(f"manifest {path} can't be read: {err}") from err
+    if not isinstance(raw, dict) or raw.get("format") != FORMAT:
+        seen = raw.get("format") if isinstance(raw, dict) else type(raw).__name__
+        raise CheckpointError(f"manifest {path} must have format {FORMAT}, got {seen}")
+    wanted = {f.name for f in dataclasses.fields(Manifest)}
+    if set(raw) != wanted:
+        raise CheckpointError(f"manifest {path} must have the keys {sorted(wanted)}, got {sorted(raw)}")
+    raw["snr_range_db"] = tuple(raw["snr_range_db"])
+    raw["modulations"] = tuple(raw["modulations"])
+    manifest = Manifest(**raw)
+    digest = file_sha256(weights)
+    if digest != manifest.sha256:
+        raise CheckpointError(
+            f"weights {weights} have sha256 {digest[:16]}, the manifest says {manifest.sha256[:16]}"
+        )
+    return manifest
+
+
+def load_transceiver(weights: Path) -> tuple[Transceiver, Manifest]:
+    """Build the network a manifest describes and load its weights strictly.
+
+    Raises:
+        CheckpointError: Anything does not fit; the message says what.
+    """
+    manifest = read_manifest(weights)
+    with torch.device("meta"):
+        model = build(manifest.architecture, manifest.sizes)
+    try:
+        tensors = load_file(weights)
+    except (OSError, SafetensorError) as err:
+        raise CheckpointError(f"weights {weights} can't be read: {err}") from err
+    wanted = model.state_dict()
+    if set(tensors) != set(wanted):
+        odd = sorted(set(tensors) ^ set(wanted))
+        raise CheckpointError(
+            f"weights {weights} do not fit {manifest.architecture}: {len(odd)} names differ, {odd[0]}"
+        )
+    for name, tensor in tensors.items():
+        if tensor.shape != wanted[name].shape:
+            raise CheckpointError(
+                f"weights {weights} do not fit {manifest.architecture}: {name} must have shape "
+                f"{tuple(wanted[name].shape)}, got {tuple(tensor.shape)}"
+            )
+        if not bool(torch.isfinite(tensor).all()):
+            raise CheckpointError(f"weights {weights} are damaged: {name} is not finite")
+    model.load_state_dict({k: v.float() for k, v in tensors.items()}, strict=True, assign=True)
+    return model.eval(), manifest
+
+
+def save_transceiver(
+    model: Transceiver,
+    weights: Path,
+    *,
+    architecture: str,
+    sizes: Any,
+    cbr: float,
+    snr_range_db: tuple[float, float],
+    made_by: dict[str, Any],
+    measured: dict[str, Any] | None = None,
+) -> Manifest:
+    """Write weights in half precision and their manifest.
+
+    Raises:
+        CheckpointError: The file would be larger than ``MAX_BYTES``.
+    """
+    tensors = {k: v.detach().cpu().half().contiguous() for k, v in model.state_dict().items()}
+    num_bytes = sum(t.numel() * t.element_size() for t in tensors.values())
+    if num_bytes > MAX_BYTES:
+        raise CheckpointError(f"weights must be <= {MAX_BYTES} bytes, got {num_bytes}")
+    weights.parent.mkdir(parents=True, exist_ok=True)
+    save_file(tensors, weights)
+    manifest = Manifest(
+        architecture=architecture,
+        sizes=sizes_to_dict(sizes),
+        sha256=file_sha256(weights),
+        cbr=cbr,
+        snr_range_db=snr_range_db,
+        modulations=("16qam", "analog"),
+        made_by=made_by,
+        measured=measured or {},
+    )
+    write_manifest(manifest, weights)
+    return manifest
+
+
+def write_manifest(manifest: Manifest, weights: Path) -> None:
+    """Write the manifest beside its weights."""
+    text = json.dumps(dataclasses.asdict(manifest), indent=1) + "\n"
+    manifest_path(weights).write_text(text, encoding="utf-8")

@@ -1,0 +1,208 @@
+"""A trained transceiver behind the codec interface: numpy in, numpy out, on CPU or GPU."""
+
+import logging
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from semcast.common.codec import (
+    LOST_SLOT_SNR_DB,
+    MODULATIONS,
+    DecodedImage,
+    EncodedImage,
+    Modulation,
+    ReceivedImage,
+    confidence_from_displacement_px,
+)
+from semcast.common.nets.checkpoint import Manifest, load_transceiver, weights_path
+from semcast.common.nets.latent import latent_from_symbols, symbols_from_latent
+from semcast.common.nets.transceiver import Transceiver
+from semcast.common.phy.slots import BLOCK_PX, layout_for
+from semcast.common.shapes import check_shape
+
+logger = logging.getLogger(__name__)
+
+#: No honest equaliser gives larger values; anything above is damage.
+_MAX_SYMBOL = 16.0
+
+
+def has_fast_bfloat16() -> bool:
+    """Tell whether this CPU multiplies bfloat16 in hardware (AVX512-BF16 or AMX)."""
+    probe = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return bool(probe()) if probe is not None else False
+
+
+class NeuralCodec:
+    """Encoder and decoder of one learned transceiver.
+
+    Images are padded to whole 16x16 blocks by repeating the border and cropped back. The same input gives the
+    same bits out on the same machine with the same number of threads.
+
+    Args:
+        model: A trained transceiver.
+        manifest: Of its weights.
+        modulation: How symbols travel.
+        device: Where to compute.
+    """
+
+    def __init__(
+        self, model: Transceiver, manifest: Manifest, modulation: Modulation, device: torch.device
+    ) -> None:
+        if modulation not in MODULATIONS:
+            raise ValueError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}")
+        self.manifest = manifest
+        self._modulation: Modulation = modulation
+        self._device = device
+        self._half = device.type == "cuda" or has_fast_bfloat16()
+        self._model = model.to(device, memory_format=torch.channels_last).eval().requires_grad_(False)
+        self._is_qam = (
+            torch.ones(1, device=device) if modulation == "16qam" else torch.zeros(1, device=device)
+        )
+
+    @classmethod
+    def load(
+        cls,
+        name_or_path: str | Path = "3dcsc-lite",
+        modulation: Modulation = "16qam",
+        num_threads: int | None = None,
+        device: Literal["auto", "cpu", "cuda"] = "auto",
+    ) -> "NeuralCodec":
+        """Load shipped weights by name, or any weights file with its manifest beside it.
+
+        Args:
+            name_or_path: Such as ``3dcsc-lite`` or ``checkpoints/3dcsc-lite/3dcsc-lite.safetensors``.
+            modulation: How symbols travel.
+            num_threads: Threads of torch in this process; None leaves them as they are.
+            device: ``auto`` takes a GPU where there is one.
+
+        Raises:
+            CheckpointError: There are no such weights, or they do not fit their manifest.
+            ValueError: The modulation, number of threads or device is not usable.
+        """
+        if num_threads is not None:
+            if num_threads < 1:
+                raise ValueError(f"num_threads must be >= 1, got {num_threads}")
+            torch.set_num_threads(num_threads)
+        if device == "cuda" and not torch.cuda.is_available():
+            raise ValueError("device must be auto or cpu on this machine, got 'cuda'")
+        use_cuda = device == "cuda" or (device == "auto" and torch.cuda.is_available())
+        model, manifest = load_transceiver(weights_path(name_or_path))
+        return cls(model, manifest, modulation, torch.device("cuda" if use_cuda else "cpu"))
+
+    @property
+    def name(self) -> str:
+        """Registry name of the architecture."""
+        return self.manifest.architecture
+
+    @property
+    def digest(self) -> str:
+        """First 16 hex digits of the sha256 of the weights."""
+        return self.manifest.sha256[:16]
+
+    @property
+    def modulation(self) -> Modulation:
+        """How this codec's symbols travel."""
+        return self._modulation
+
+    def warm_up(self, shape_hw: tuple[int, int]) -> None:
+        """Encode and decode one empty frame, so that the first real one is not slow."""
+        encoded = self.encode(np.zeros((*shape_hw, 3), dtype=np.uint8), 10.0)
+        snr_db = np.full(encoded.symbols.shape[0], 10.0, dtype=np.float32)
+        self.decode(ReceivedImage(shape_hw, encoded.symbols, snr_db, encoded.modulation))
+
+    def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
+        """Encode one image for a link whose expected SNR is ``snr_db``.
+
+        Args:
+            image: ``(H, W, 3)`` uint8 RGB.
+            snr_db: Expected SNR in dB; values outside the trained range are clipped to it.
+
+        Raises:
+            ValueError: The image is not of that shape and type.
+        """
+        sizes = check_shape(image, "H W 3", "image")
+        if image.dtype != np.uint8:
+            raise ValueError(f"image must be uint8, got {image.dtype}")
+        low, high = self.manifest.snr_range_db
+        expected = float(np.clip(snr_db, low, high)) if np.isfinite(snr_db) else low
+        bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX
+        if bottom or right:
+            image = np.pad(image, ((0, bottom), (0, right), (0, 0)), mode="edge")
+        with self._precision():
+            pixels = torch.from_numpy(np.ascontiguousarray(image)).to(self._device)
+            # (1, 3, H, W) in channels_last: the memory of the image as it is.
+            x = pixels[None].permute(0, 3, 1, 2).float().mul_(1.0 / 255.0)
+            latent = self._model.latent(x, torch.full((1,), expected, device=self._device), self._is_qam)
+            symbols = self._model.transmit(latent, self._is_qam)[0]
+        return EncodedImage(
+            shape_hw=(sizes["H"], sizes["W"]),
+            symbols=symbols_from_latent(symbols.cpu().numpy()),
+            modulation=self._modulation,
+        )
+
+    def decode(self, received: ReceivedImage) -> DecodedImage:
+        """Decode one frame with its two confidence maps.
+
+        Values that are not finite count as lost. Where everything is lost the image is the network's guess of
+        nothing and ``outage`` is set.
+
+        Args:
+            received: Equalised symbols; their number must fit the image's shape.
+
+        Raises:
+            ValueError: Sizes contradict each other, or the modulation is not this codec's.
+        """
+        layout = layout_for(received.shape_hw)
+        check_shape(received.symbols, f"{layout.num_slots} {layout.data_per_slot}", "symbols")
+        check_shape(received.effective_snr_db, f"{layout.num_slots}", "effective_snr_db")
+        if received.modulation != self._modulation:
+            raise ValueError(f"modulation must be {self._modulation!r}, got {received.modulation!r}")
+        snr_db = np.nan_to_num(
+            received.effective_snr_db.astype(np.float32),
+            nan=LOST_SLOT_SNR_DB,
+            posinf=30.0,
+            neginf=LOST_SLOT_SNR_DB,
+        ).clip(LOST_SLOT_SNR_DB, 30.0)
+        latent = latent_from_symbols(received.symbols)
+        if not np.isfinite(latent).all():
+            latent = np.nan_to_num(latent, nan=0.0, posinf=0.0, neginf=0.0)
+        latent = latent.clip(-_MAX_SYMBOL, _MAX_SYMBOL)
+        height, width = received.shape_hw
+        with self._precision():
+            y_rx = torch.from_numpy(latent)[None].to(self._device, memory_format=torch.channels_last)
+            plane = torch.from_numpy(snr_db).to(self._device).view(1, 1, -1, 1)
+            plane = plane.expand(1, 1, -1, layout.blocks_per_slot)
+            x_hat, features = self._model.receive(y_rx, plane, self._is_qam)
+            logit, displacement = self._model.judge(features, x_hat)
+            pixels = x_hat[0].float().clamp_(0.0, 1.0).mul_(255.0).round_().to(torch.uint8).permute(1, 2, 0)
+            image = pixels[:height, :width].contiguous().cpu().numpy()
+            confidence = torch.sigmoid(logit[0, 0, :height, :width]).contiguous().cpu().numpy()
+            moved_px = displacement[0, 0, :height, :width].contiguous().cpu().numpy()
+        return DecodedImage(
+            image=image,
+            confidence=confidence,
+            keypoint_confidence=confidence_from_displacement_px(moved_px),
+            outage=bool((snr_db <= LOST_SLOT_SNR_DB).all()),
+        )
+
+    def _precision(self) -> "_Inference":
+        return _Inference(self._device.type, self._half)
+
+
+class _Inference:
+    """``inference_mode`` and, where it pays, bfloat16 autocast, as one context."""
+
+    def __init__(self, device_type: str, half: bool) -> None:
+        self._no_grad = torch.inference_mode()
+        self._cast = torch.autocast(device_type, torch.bfloat16, enabled=half)
+
+    def __enter__(self) -> None:
+        self._no_grad.__enter__()
+        self._cast.__enter__()
+
+    def __exit__(self, *error: object) -> None:
+        self._cast.__exit__(*error)  # type: ignore[arg-type]
+        self._no_grad.__exit__(*error)  # type: ignore[arg-type]

@@ -1,0 +1,52 @@
+"""The semantic encoder of 3DC-SC: channel attention and residual units over four 2x reductions."""
+
+from torch import Tensor, nn
+
+from semcast.common.nets.blocks import Stage, condition_vector
+from semcast.common.nets.linear import BlockAnalysis
+from semcast.common.phy.slots import LATENT_CHANNELS
+
+
+class Encoder(nn.Module):
+    """Image to latent: a locally scaled block transform plus what the network adds to it.
+
+    The first two of the four reductions are one lossless pixel-unshuffle: convolutions at half resolution are
+    bound by memory on a CPU and bring little.
+
+    Args:
+        widths: Channels at 1/4, 1/8 and 1/16 of the resolution.
+        units: Residual units at the same three resolutions.
+    """
+
+    def __init__(self, widths: tuple[int, int, int], units: tuple[int, int, int]) -> None:
+        super().__init__()
+        quarter, eighth, sixteenth = widths
+        self.linear = BlockAnalysis()
+        self.fold = nn.PixelUnshuffle(4)
+        self.stem = nn.Conv2d(48, quarter, 3, padding=1)
+        self.stage4 = Stage(quarter, units[0])
+        self.down8 = nn.Conv2d(quarter, eighth, 3, stride=2, padding=1)
+        self.stage8 = Stage(eighth, units[1])
+        self.down16 = nn.Conv2d(eighth, sixteenth, 3, stride=2, padding=1)
+        self.stage16 = Stage(sixteenth, units[2])
+        #: What is added to the linear latent, and the log gains of the linear coefficients.
+        self.head = nn.Conv2d(sixteenth, 2 * LATENT_CHANNELS, 1)
+        nn.init.zeros_(self.head.weight)
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+
+    def forward(self, x: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+        """Map ``(B, 3, H, W)`` in [0, 1] to the latent ``(B, 94, H/16, W/16)`` before modulation.
+
+        Args:
+            x: Image, sides multiples of 16.
+            snr_db: ``(B,)`` SNR in dB the transmitter expects.
+            is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
+        """
+        condition = condition_vector(snr_db, is_qam)
+        x = x - 0.5
+        f = self.stem(self.fold(x)).relu()  # (B, C4, H/4, W/4)
+        f = self.down8(self.stage4(f, condition)).relu()
+        f = self.down16(self.stage8(f, condition)).relu()
+        f = self.stage16(f, condition)
+        added, log_gain = self.head(f.relu()).chunk(2, dim=1)
+        return self.linear(x, log_gain).float() + added.float()

@@ -1,0 +1,80 @@
+"""The linear heart of the transceiver: a block transform, mixing, and a Wiener filter at the receiver.
+
+Optimal linear analog transmission gives coefficient i of a Karhunen-Loeve transform a power proportional to
+the square root of its variance; an orthogonal mixing then spreads the coefficients so that every channel use
+carries the same power (SoftCast, Jakubczak & Katabi 2011). Training starts from this solution
+(``semcast.training.klt``) and the convolutional networks learn what has to be added to it. All layers stay
+trainable.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
+
+_BLOCK_VALUES = 3 * BLOCK_PX * BLOCK_PX
+
+
+#: Local gains stay within a factor of about 20.
+_MAX_LOG_GAIN = 3.0
+
+
+class BlockAnalysis(nn.Module):
+    """Transform every 16x16 RGB block, scale its coefficients by local gains, mix them into the latent."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fold = nn.PixelUnshuffle(BLOCK_PX)
+        self.transform = nn.Conv2d(_BLOCK_VALUES, LATENT_CHANNELS, 1)
+        self.mix = nn.Conv2d(LATENT_CHANNELS, LATENT_CHANNELS, 1, bias=False)
+
+    def forward(self, x: Tensor, log_gain: Tensor) -> Tensor:
+        """Map an image ``(B, 3, H, W)`` to ``(B, 94, H/16, W/16)``.
+
+        Args:
+            x: Image around zero.
+            log_gain: ``(B, 94, H/16, W/16)`` from the network: flat blocks may be sent louder than busy ones.
+        """
+        gain = torch.exp(log_gain.float().clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN))
+        mixed: Tensor = self.mix(self.transform(self.fold(x)) * gain)
+        return mixed
+
+
+class BlockSynthesis(nn.Module):
+    """Unmix the received latent, weight each coefficient by its Wiener gain, and return to pixels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.unmix = nn.Conv2d(LATENT_CHANNELS, LATENT_CHANNELS, 1)
+        self.log_power = nn.Parameter(torch.zeros(LATENT_CHANNELS))
+        #: Log variance of what the receiver can't undo, under analog and under 16-QAM (it rounds).
+        self.log_distortion = nn.Parameter(torch.tensor([math.log(0.01), math.log(0.13)]))
+        self.transform = nn.Conv2d(LATENT_CHANNELS, _BLOCK_VALUES, 1)
+        self.unfold = nn.PixelShuffle(BLOCK_PX)
+
+    def forward(self, y: Tensor, shrink: Tensor, scale: Tensor, is_qam: Tensor, adapt: Tensor) -> Tensor:
+        """Estimate the image linearly.
+
+        Args:
+            y: ``(B, 94, h, w)`` latent, each slot still shrunk by ``shrink``.
+            shrink: ``(B, 1, h, w)``, ``snr / (1 + snr)``.
+            scale: ``(B, 1, 1, 1)`` factor by which an analog frame was scaled back; it scales the noise too.
+            is_qam: ``(B,)``.
+            adapt: ``(B, 188, h, w)`` from the network: what to add to the log prior power of each
+                coefficient, and the log gain that undoes the transmitter's local one.
+
+        Returns:
+            ``(B, 3, 16 h, 16 w)``.
+        """
+        shrink = shrink.clamp_min(1e-2)
+        noise = (1.0 - shrink) / shrink * scale.square()  # noise variance for unit power
+        flag = is_qam.view(-1, 1, 1, 1)
+        log_distortion = self.log_distortion[0] * (1.0 - flag) + self.log_distortion[1] * flag
+        more_power, log_gain = adapt.float().chunk(2, dim=1)
+        coefficients = self.unmix(y).float() / shrink
+        log_noise = torch.log(noise + torch.exp(log_distortion))
+        wiener = torch.sigmoid(self.log_power.view(1, -1, 1, 1) + more_power - log_noise)
+        gain = wiener * torch.exp(log_gain.clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN))
+        return self.unfold(self.transform(coefficients * gain))

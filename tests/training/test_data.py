@@ -1,0 +1,67 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from semcast.common.errors import SourceError
+from semcast.training.data import Batches, CropSettings, random_crop, read_images
+
+
+def photo(height=80, width=100, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, size=(height, width, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def batches():
+    made = Batches([photo(seed=k) for k in range(3)], CropSettings(size_px=32), 4, seed=7)
+    yield made
+    made.close()
+
+
+def test_the_batch_of_a_step_does_not_depend_on_the_steps_before(batches):
+    in_order = [batches.get(step) for step in range(3)]
+    torch.testing.assert_close(batches.make(2), in_order[2])
+    torch.testing.assert_close(batches.get(1), in_order[1])
+    assert in_order[0].shape == (4, 3, 32, 32)
+    assert not torch.equal(in_order[0], in_order[1])
+
+
+def test_ranks_see_different_crops():
+    images = [photo(seed=k) for k in range(3)]
+    both = [Batches(images, CropSettings(size_px=32), 4, seed=7, rank=rank) for rank in (0, 1)]
+    assert not torch.equal(both[0].make(0), both[1].make(0))
+    for made in both:
+        made.close()
+
+
+def test_a_photo_smaller_than_the_crop_is_enlarged():
+    crop = random_crop(photo(20, 30), CropSettings(size_px=64), np.random.default_rng(0))
+    assert crop.shape == (64, 64, 3)
+
+
+def test_grey_crops_have_equal_channels():
+    crop = random_crop(photo(), CropSettings(size_px=32, share_grey=1.0), np.random.default_rng(0))
+    np.testing.assert_array_equal(crop[..., 0], crop[..., 2])
+
+
+def test_images_are_read_by_name_as_rgb(tmp_path):
+    red = np.zeros((8, 8, 3), np.uint8)
+    red[..., 2] = 255  # BGR for cv2
+    cv2.imwrite(str(tmp_path / "b.png"), red)
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "notes.txt").write_text("no image")
+    images = read_images(tmp_path)
+    assert len(images) == 2
+    assert images[1][0, 0].tolist() == [255, 0, 0]
+
+
+def test_a_folder_without_images_is_an_error(tmp_path):
+    with pytest.raises(SourceError, match="no readable image"):
+        read_images(tmp_path)
+
+
+def test_crop_settings_are_checked():
+    with pytest.raises(ValueError, match="size_px must be a positive multiple of 16, got 100"):
+        CropSettings(size_px=100)
+    with pytest.raises(ValueError, match="scale_min and scale_max"):
+        CropSettings(scale_min=0.9, scale_max=0.5)

@@ -1,0 +1,50 @@
+import numpy as np
+import pytest
+import torch
+
+from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.training.klt import block_statistics, start_from_klt
+
+TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
+
+
+def smooth_photos():
+    rng = np.random.default_rng(0)
+    row, column = np.mgrid[0:192, 0:192] / 192.0
+    photos = []
+    for _ in range(6):
+        waves = [
+            rng.uniform(10, 40) * np.sin(2 * np.pi * (rng.uniform(-6, 6) * row + rng.uniform(-6, 6) * column))
+            for _ in range(4)
+        ]
+        tint = rng.uniform(0.6, 1.2, size=3)
+        photos.append(np.clip((128 + sum(waves))[:, :, None] * tint, 0, 255).astype(np.uint8))
+    return photos
+
+
+def test_statistics_of_constant_images_are_their_colour():
+    image = np.full((64, 64, 3), (0, 128, 255), np.uint8)
+    mean, covariance = block_statistics([image])
+    np.testing.assert_allclose(mean[:256], -0.5, atol=1e-6)
+    np.testing.assert_allclose(mean[512:], 0.5, atol=1e-6)
+    np.testing.assert_allclose(covariance, 0.0, atol=1e-6)
+
+
+def test_images_without_a_block_are_refused():
+    with pytest.raises(ValueError, match="whole 16x16 block"):
+        block_statistics([np.zeros((16, 16, 3), np.uint8)])
+
+
+@pytest.mark.parametrize("flag", [0.0, 1.0])
+def test_before_any_training_the_link_already_carries_the_image(flag):
+    torch.manual_seed(0)
+    photos = smooth_photos()
+    model = build_3dcsc(TINY).eval()
+    start_from_klt(model, photos, torch.Generator().manual_seed(0))
+    x = torch.from_numpy(photos[0][::2, ::2].copy()).permute(2, 0, 1)[None] / 255.0
+    snr_db, is_qam = torch.full((1,), 20.0), torch.full((1,), flag)
+    with torch.inference_mode():
+        latent = model.latent(x, snr_db, is_qam)
+        symbols = model.transmit(latent, is_qam) * (100 / 101)
+        x_hat, _ = model.receive(symbols, torch.full((1, 1, 6, 6), 20.0), is_qam)
+    assert -10 * torch.log10((x_hat - x).square().mean()) > 20.0

@@ -1,0 +1,190 @@
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import semcast.common.nets.registry as registry
+from semcast.common.config import build_settings, read_toml
+from semcast.common.errors import CheckpointError
+from semcast.common.nets.codec import NeuralCodec
+from semcast.common.nets.registry import architectures
+from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.training.data import CropSettings
+from semcast.training.loop import train
+from semcast.training.losses import LossSettings
+from semcast.training.optimisers import rate_factor
+from semcast.training.settings import TrainSettings
+
+TINY = registry.Architecture("3dcsc", Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8), build_3dcsc)
+
+
+@pytest.fixture
+def photos(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(4):
+        small = rng.integers(0, 256, size=(12, 16, 3), dtype=np.uint8)
+        cv2.imwrite(str(folder / f"{k}.png"), cv2.resize(small, (128, 96), interpolation=cv2.INTER_CUBIC))
+    return folder
+
+
+@pytest.fixture
+def tiny_network(monkeypatch):
+    """Register the smallest real network under the name of the main one."""
+    monkeypatch.setattr(registry, "_entries", lambda: (TINY,))
+
+
+def settings_for(photos, out, **changes):
+    values = {
+        "architecture": "3dcsc",
+        "data": photos,
+        "out": out,
+        "batch": 2,
+        "steps": 6,
+        "warmup_steps": 2,
+        "head_every": 2,
+        "log_every": 2,
+        "save_every": 3,
+        "bf16": False,
+        "device": "cpu",
+        "crop": CropSettings(size_px=32),
+    }
+    return TrainSettings(**(values | changes))
+
+
+def final_state(out):
+    return torch.load(out / "last.pt", weights_only=True)
+
+
+def test_a_run_leaves_weights_the_codec_can_use(tiny_network, photos, tmp_path):
+    reports = []
+    result = train(settings_for(photos, tmp_path / "run", valid=photos), reports.append)
+    assert result.steps == 6
+    assert [r.step for r in reports] == [2, 4, 6]
+    assert {"psnr_2db", "psnr_6db", "psnr_10db", "power"} == set(result.valid)
+    codec = NeuralCodec.load(result.weights)
+    assert codec.encode(np.zeros((32, 32, 3), np.uint8), 10.0).symbols.shape == (2, 94)
+    assert codec.manifest.made_by["steps"] == 6
+    assert codec.manifest.made_by["samples"] == 12
+    assert str(tmp_path) not in json.dumps(codec.manifest.made_by)
+    rows = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows if "loss" in row] == [2, 4, 6]
+
+
+def test_a_resumed_run_equals_one_without_a_break(tiny_network, photos, tmp_path):
+    train(settings_for(photos, tmp_path / "whole"))
+    asked = iter([False, False, False, True])
+    first = train(settings_for(photos, tmp_path / "broken"), should_stop=lambda: next(asked))
+    assert first.steps == 3
+    train(settings_for(photos, tmp_path / "broken"))
+    whole, broken = final_state(tmp_path / "whole"), final_state(tmp_path / "broken")
+    for part in ("model", "average"):
+        for name, tensor in whole[part].items():
+            torch.testing.assert_close(broken[part][name], tensor, rtol=0, atol=0, msg=name)
+
+
+def test_the_weights_change_and_the_seed_decides_how(tiny_network, photos, tmp_path):
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        train(settings_for(photos, tmp_path / name, steps=2, seed=seed))
+    a, b, c = (final_state(tmp_path / name)["model"]["decoder.stem.weight"] for name in "abc")
+    torch.testing.assert_close(a, b, rtol=0, atol=0)
+    assert not torch.equal(a, c)
+
+
+def test_training_lowers_the_loss_on_the_images_it_sees(tiny_network, photos, tmp_path):
+    reports = []
+    rates = {"lr": 1e-2, "lr_linear": 1e-2, "clip": 1.0}
+    train(
+        settings_for(photos, tmp_path / "run", steps=80, log_every=20, start="random", **rates),
+        reports.append,
+    )
+    assert reports[-1].values["mse"] < 0.8 * reports[0].values["mse"]
+
+
+@pytest.mark.parametrize("changes", [{"optimiser": "adamw"}, {"loss": LossSettings(descriptor=0.01)}])
+def test_other_optimisers_and_terms_run(tiny_network, photos, tmp_path, changes):
+    assert train(settings_for(photos, tmp_path / "run", steps=2, **changes)).steps == 2
+
+
+def test_a_checkpoint_of_another_architecture_is_refused(tiny_network, photos, tmp_path, monkeypatch):
+    train(settings_for(photos, tmp_path / "run", steps=1))
+    other = registry.Architecture("other", TINY.sizes, TINY.build)
+    monkeypatch.setattr(registry, "_entries", lambda: (TINY, other))
+    with pytest.raises(CheckpointError, match="is of 3dcsc, not other"):
+        train(settings_for(photos, tmp_path / "run", architecture="other"))
+
+
+def test_a_damaged_checkpoint_is_refused(tiny_network, photos, tmp_path):
+    (tmp_path / "last.pt").write_bytes(b"nothing")
+    with pytest.raises(CheckpointError, match="can't be read"):
+        train(settings_for(photos, tmp_path))
+
+
+def test_the_rate_warms_up_stays_and_falls_to_zero():
+    settings = TrainSettings(warmup_steps=10, decay_share=0.25)
+    assert rate_factor(0.0, 0, settings) == pytest.approx(0.1)
+    assert rate_factor(0.5, 500, settings) == 1.0
+    assert rate_factor(0.875, 500, settings) == pytest.approx(0.5)
+    assert rate_factor(1.0, 500, settings) == 0.0
+
+
+def test_settings_are_checked():
+    with pytest.raises(ValueError, match="batch must be >= 1, got 0"):
+        TrainSettings(batch=0)
+    with pytest.raises(ValueError, match="lr must be > 0"):
+        TrainSettings(lr=0.0)
+
+
+def test_every_shipped_settings_file_is_valid():
+    folder = Path(registry.__file__).resolve().parents[2] / "training"
+    files = sorted(folder.glob("*.toml"))
+    assert "3dcsc-lite" in {f.stem for f in files}
+    for file in files:
+        settings = build_settings(TrainSettings, read_toml(file))
+        assert settings.architecture == file.stem
+        assert settings.architecture in architectures()
+
+
+_WORKER = """
+import sys
+from pathlib import Path
+import torch
+import semcast.common.nets.registry as registry
+from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.training.data import CropSettings
+from semcast.training.loop import train
+from semcast.training.settings import TrainSettings
+torch.set_num_threads(1)
+sizes = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
+registry._entries = lambda: (registry.Architecture("3dcsc", sizes, build_3dcsc),)
+train(TrainSettings(architecture="3dcsc", data=Path(sys.argv[1]), out=Path(sys.argv[2]), batch=2, steps=2,
+                    bf16=False, device="cpu", crop=CropSettings(size_px=32)))
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_train_one_model(photos, tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    link = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2", "OMP_NUM_THREADS": "1"}
+    out = tmp_path / "run"
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", _WORKER, str(photos), str(out)],
+            env=os.environ | link | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
+        )
+        for rank in (0, 1)
+    ]
+    assert [process.wait(timeout=120) for process in started] == [0, 0]
+    manifest = json.loads((out / "3dcsc.json").read_text())
+    assert manifest["made_by"]["processes"] == 2
+    assert manifest["made_by"]["samples"] == 8

@@ -1,0 +1,123 @@
+"""Training images: decoded once, held in memory, cut and changed at random but repeatably."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from semcast.common.errors import SourceError
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CropSettings:
+    """How a crop is made.
+
+    Attributes:
+        size_px: Side of the crop, a multiple of 16.
+        scale_min: Smallest factor a photo is reduced by first: it hides the traces of JPEG.
+        scale_max: Largest.
+        share_grey: Share of crops turned grey, since many cameras are.
+    """
+
+    size_px: int = 128
+    scale_min: float = 0.5
+    scale_max: float = 0.9
+    share_grey: float = 0.18
+
+    def __post_init__(self) -> None:
+        if self.size_px < 16 or self.size_px % 16:
+            raise ValueError(f"size_px must be a positive multiple of 16, got {self.size_px}")
+        if not 0.0 < self.scale_min <= self.scale_max <= 1.0:
+            raise ValueError(
+                "scale_min and scale_max must be in (0, 1] and ordered, "
+                f"got {self.scale_min}, {self.scale_max}"
+            )
+
+
+def read_images(folder: Path) -> list[NDArray[np.uint8]]:
+    """Read all images of a folder as ``(H, W, 3)`` uint8 RGB, by name.
+
+    Raises:
+        SourceError: The folder holds no readable image.
+    """
+    images = []
+    for path in sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES):
+        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if bgr is not None:
+            images.append(np.ascontiguousarray(bgr[:, :, ::-1]))
+    if not images:
+        raise SourceError(f"{folder} holds no readable image ({', '.join(SUFFIXES)})")
+    return images
+
+
+def random_crop(
+    image: NDArray[np.uint8], settings: CropSettings, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Reduce, cut, mirror, turn, and sometimes change contrast or colour; ``(size, size, 3)`` uint8."""
+    size = settings.size_px
+    smallest = size / min(image.shape[:2])
+    scale = max(smallest, rng.uniform(settings.scale_min, settings.scale_max))
+    source = min(round(size / scale), *image.shape[:2])
+    row = int(rng.integers(image.shape[0] - source + 1))
+    column = int(rng.integers(image.shape[1] - source + 1))
+    cut = image[row : row + source, column : column + source]
+    crop = cv2.resize(cut, (size, size), interpolation=cv2.INTER_AREA) if source != size else cut
+    crop = np.rot90(crop, int(rng.integers(4)))
+    if rng.random() < 0.5:
+        crop = crop[:, ::-1]
+    if rng.random() < settings.share_grey:
+        crop = np.repeat(cv2.cvtColor(np.ascontiguousarray(crop), cv2.COLOR_RGB2GRAY)[:, :, None], 3, axis=2)
+    if rng.random() < 0.3:
+        contrast, brightness = rng.uniform(0.7, 1.25), rng.uniform(-25.0, 25.0)
+        crop = np.clip((crop.astype(np.float32) - 128.0) * contrast + 128.0 + brightness, 0, 255).astype(
+            np.uint8
+        )
+    return np.ascontiguousarray(crop, dtype=np.uint8)
+
+
+class Batches:
+    """The batch of every step, a function of seed, step and rank alone, prepared one step ahead.
+
+    Args:
+        images: From ``read_images``.
+        settings: How crops are made.
+        batch: Crops in a batch.
+        seed: Of the whole run.
+        rank: Of this process.
+    """
+
+    def __init__(
+        self, images: list[NDArray[np.uint8]], settings: CropSettings, batch: int, seed: int, rank: int = 0
+    ) -> None:
+        self._images = images
+        self._settings = settings
+        self._batch = batch
+        self._key = (seed, rank)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="batches")
+        self._ahead_step = -1
+        self._ahead = self._pool.submit(lambda: torch.empty(0))
+
+    def make(self, step: int) -> Tensor:
+        """Return the batch of a step, ``(B, 3, size, size)`` uint8."""
+        rng = np.random.default_rng((*self._key, step))
+        chosen = rng.integers(len(self._images), size=self._batch)
+        crops = [random_crop(self._images[k], self._settings, rng) for k in chosen]
+        return torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2)
+
+    def get(self, step: int) -> Tensor:
+        """Return the batch of a step and start on the next one."""
+        batch = self._ahead.result() if self._ahead_step == step else self.make(step)
+        self._ahead_step = step + 1
+        self._ahead = self._pool.submit(self.make, step + 1)
+        return batch
+
+    def close(self) -> None:
+        """Stop the thread that prepares batches."""
+        self._pool.shutdown(cancel_futures=True)

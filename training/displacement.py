@@ -1,0 +1,55 @@
+"""Label of the keypoint head: how far one Lucas-Kanade step moves a point of the original."""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, conv2d
+
+MAX_DISPLACEMENT_PX = 8.0
+_LUMA = (0.299, 0.587, 0.114)
+
+
+def grey(x: Tensor) -> Tensor:
+    """Return the luma ``(B, 1, H, W)`` of ``(B, 3, H, W)``."""
+    weights = torch.tensor(_LUMA, device=x.device, dtype=x.dtype).view(1, 3, 1, 1)
+    return (x * weights).sum(dim=1, keepdim=True)
+
+
+def gradients(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Return x and y derivatives for each pixel of ``(B, 1, H, W)`` (Scharr, edges replicated)."""
+    smooth = torch.tensor([3.0, 10.0, 3.0], device=image.device, dtype=image.dtype) / 16.0
+    slope = torch.tensor([-0.5, 0.0, 0.5], device=image.device, dtype=image.dtype)
+    kernel_x = torch.outer(smooth, slope)
+    kernels = torch.stack((kernel_x, kernel_x.T))[:, None]
+    padded = torch.nn.functional.pad(image, (1, 1, 1, 1), mode="replicate")
+    both = conv2d(padded, kernels)
+    return both[:, :1], both[:, 1:]
+
+
+def lucas_kanade_step(original: Tensor, decoded: Tensor, window_px: int = 9) -> tuple[Tensor, Tensor]:
+    """Take one Lucas-Kanade step at every pixel.
+
+    Args:
+        original: ``(B, 1, H, W)`` grey image in [0, 1].
+        decoded: Its decoded version.
+        window_px: Side of the square window, odd.
+
+    Returns:
+        The length of the step in px, clipped to ``MAX_DISPLACEMENT_PX``, and the corner strength: the smaller
+        eigenvalue of the mean structure tensor, both ``(B, 1, H, W)``.
+    """
+
+    def window(values: Tensor) -> Tensor:
+        return avg_pool2d(values, window_px, stride=1, padding=window_px // 2, count_include_pad=False)
+
+    ix, iy = gradients(original)
+    it = decoded - original
+    moments = window(torch.cat((ix * ix, ix * iy, iy * iy, ix * it, iy * it), dim=1))
+    a, b, c, ex, ey = moments.split(1, dim=1)
+    half_trace, spread = (a + c) / 2, (((a - c) / 2).square() + b.square()).sqrt()
+    strength = (half_trace - spread).clamp_min(0.0)
+    damping = 1e-5
+    determinant = (a + damping) * (c + damping) - b * b
+    dx = (b * ey - (c + damping) * ex) / determinant
+    dy = (b * ex - (a + damping) * ey) / determinant
+    length = (dx.square() + dy.square()).sqrt().clamp(max=MAX_DISPLACEMENT_PX)
+    return length, strength

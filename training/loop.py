@@ -1,0 +1,330 @@
+"""The training loop: one process or several under torchrun, on CPU or GPU, resumable at any step."""
+
+import copy
+import json
+import logging
+import os
+import pickle
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from semcast.common.errors import CheckpointError
+from semcast.common.nets.checkpoint import save_transceiver
+from semcast.common.nets.registry import architecture
+from semcast.common.nets.transceiver import Transceiver
+from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS, channel_bandwidth_ratio
+from semcast.training.channel import LinkDraw, draw_links
+from semcast.training.data import Batches, read_images
+from semcast.training.klt import start_from_klt
+from semcast.training.losses import transceiver_loss
+from semcast.training.optimisers import build_optimisers, rate_factor, set_rate
+from semcast.training.settings import TrainSettings
+from semcast.training.validation import validate
+
+logger = logging.getLogger(__name__)
+
+_VALID_IMAGES = 16
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a run reports while it goes on.
+
+    Attributes:
+        step: Steps done.
+        elapsed_s: Training time over all resumed parts.
+        share: Share of the run that is done.
+        values: Means since the last report: loss, PSNR of crops, and so on.
+    """
+
+    step: int
+    elapsed_s: float
+    share: float
+    values: dict[str, float]
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """How a run ended.
+
+    Attributes:
+        steps: Steps done.
+        elapsed_s: Training time over all resumed parts.
+        weights: The file of averaged weights.
+        valid: Last validation, empty without validation images.
+    """
+
+    steps: int
+    elapsed_s: float
+    weights: Path
+    valid: dict[str, float]
+
+
+class Run:
+    """State of one run: model, average, optimisers, step."""
+
+    def __init__(self, settings: TrainSettings, rank: int, world: int) -> None:
+        self.settings, self.rank, self.world = settings, rank, world
+        use_cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
+        local = int(os.environ.get("LOCAL_RANK", "0"))
+        self.device = torch.device("cuda", local) if use_cuda else torch.device("cpu")
+        entry = architecture(settings.architecture)
+        torch.manual_seed(settings.seed)  # layers draw their first weights from the global generator
+        model: Transceiver = entry.build(entry.sizes)
+        self.images = read_images(settings.data)
+        self.valid_images = read_images(settings.valid)[:_VALID_IMAGES] if settings.valid else []
+        self.step, self.elapsed_s = 0, 0.0
+        self.agreed_s = 0.0  # elapsed time all processes agree on, since the schedule depends on it
+        checkpoint = self._read_checkpoint()
+        if checkpoint is None and settings.start == "klt":
+            start_from_klt(model, self.images, torch.Generator().manual_seed(settings.seed))
+        self.model = model.to(self.device, memory_format=torch.channels_last)
+        self.average = copy.deepcopy(self.model).eval()
+        self.optimisers = build_optimisers(self.model, settings)
+        if checkpoint is not None:
+            self._restore(checkpoint)
+        self.batches = Batches(self.images, settings.crop, settings.batch, settings.seed, rank)
+        self.loss = torch.compile(transceiver_loss) if settings.compile else transceiver_loss
+
+    @property
+    def checkpoint_path(self) -> Path:
+        """Where everything needed to go on is kept."""
+        return self.settings.out / "last.pt"
+
+    def _read_checkpoint(self) -> dict[str, Any] | None:
+        if not self.settings.resume or not self.checkpoint_path.is_file():
+            return None
+        try:
+            state: dict[str, Any] = torch.load(self.checkpoint_path, map_location="cpu", weights_only=True)
+        except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as err:
+            raise CheckpointError(
+                f"checkpoint {self.checkpoint_path} can't be read: {type(err).__name__}"
+            ) from err
+        if state["architecture"] != self.settings.architecture:
+            raise CheckpointError(
+                f"checkpoint {self.checkpoint_path} is of {state['architecture']}, "
+                f"not {self.settings.architecture}"
+            )
+        return state
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        try:
+            self.model.load_state_dict(state["model"])
+            self.average.load_state_dict(state["average"])
+        except RuntimeError as err:
+            raise CheckpointError(f"checkpoint {self.checkpoint_path} does not fit: {err}") from err
+        fresh = [[group["full_lr"] for group in o.param_groups] for o in self.optimisers]
+        for optimiser, saved, rates in zip(self.optimisers, state["optimisers"], fresh, strict=True):
+            optimiser.load_state_dict(saved)
+            for group, rate in zip(optimiser.param_groups, rates, strict=True):
+                group["full_lr"] = rate
+        self.step, self.elapsed_s = state["step"], state["elapsed_s"]
+        self.agreed_s = self.elapsed_s
+
+    def save(self) -> None:
+        """Write the checkpoint and the averaged weights; a crash while writing leaves the old ones."""
+        if self.rank:
+            return
+        self.settings.out.mkdir(parents=True, exist_ok=True)
+        state = {
+            "architecture": self.settings.architecture,
+            "model": self.model.state_dict(),
+            "average": self.average.state_dict(),
+            "optimisers": [o.state_dict() for o in self.optimisers],
+            "step": self.step,
+            "elapsed_s": self.elapsed_s,
+        }
+        partial = self.checkpoint_path.with_suffix(".partial")
+        torch.save(state, partial)
+        partial.replace(self.checkpoint_path)
+
+    def export(self, valid: dict[str, float]) -> Path:
+        """Write the averaged weights in half precision with their manifest."""
+        settings = self.settings
+        weights = settings.out / f"{settings.architecture}.safetensors"
+        plain = json.loads(json.dumps(asdict(settings), default=str))
+        for folder in ("data", "valid", "out"):
+            plain.pop(folder)
+        save_transceiver(
+            self.average,
+            weights,
+            architecture=settings.architecture,
+            sizes=architecture(settings.architecture).sizes,
+            cbr=channel_bandwidth_ratio((BLOCK_PX, BLOCK_PX)),
+            snr_range_db=(settings.channel.snr_min_db, settings.channel.snr_max_db),
+            made_by={
+                "settings": plain,
+                "images": len(self.images),
+                "steps": self.step,
+                "samples": self.step * settings.batch * self.world,
+                "wall_time_s": round(self.elapsed_s),
+                "processes": self.world,
+                "device": self.device.type,
+                "seed": settings.seed,
+                "commit": _commit(),
+                "torch": torch.__version__,
+            },
+            measured={"validation": valid} if valid else {},
+        )
+        return weights
+
+    def share_done(self) -> float:
+        """Return the share of the run that is done, by steps or by time, whichever is further."""
+        share = self.step / self.settings.steps
+        if self.settings.minutes > 0.0:
+            share = max(share, self.agreed_s / (60.0 * self.settings.minutes))
+        return min(1.0, share)
+
+    def one_step(self) -> dict[str, torch.Tensor]:
+        """Draw a batch and its links, and update the weights once."""
+        settings, share = self.settings, self.share_done()
+        x = self.batches.get(self.step).to(self.device).float() / 255.0
+        x = x.contiguous(memory_format=torch.channels_last)
+        seed = (settings.seed * 1_000_003 + self.step) * 64 + self.rank
+        generator = torch.Generator().manual_seed(seed)
+        blocks = settings.crop.size_px // BLOCK_PX
+        draw = draw_links(settings.channel, settings.batch, blocks, generator)
+        draw = LinkDraw(*(t.to(self.device) for t in vars(draw).values()))
+        noise = torch.randn(settings.batch, LATENT_CHANNELS, blocks, blocks, generator=generator).to(
+            self.device
+        )
+        in_decay = share >= 1.0 - settings.decay_share
+        with_heads = in_decay or self.step % settings.head_every == 0
+        set_rate(self.optimisers, rate_factor(share, self.step, settings))
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=settings.bf16):
+            loss, logs = self.loss(self.model, x, draw, noise, settings.loss, with_heads)
+        loss.backward()
+        self._share_gradients()
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip)
+        if bool(torch.isfinite(norm)):
+            for optimiser in self.optimisers:
+                optimiser.step()
+        for optimiser in self.optimisers:
+            optimiser.zero_grad(set_to_none=True)
+        self.step += 1
+        self._update_average()
+        return logs | {"loss": loss.detach(), "grad_norm": norm.detach()}
+
+    def _share_gradients(self) -> None:
+        if self.world == 1:
+            self.agreed_s = self.elapsed_s
+            return
+        # Heads have no gradient in some steps, the same ones in every process.
+        grads = [p.grad for p in self.model.parameters() if p.grad is not None]
+        clock = torch.tensor([self.elapsed_s], device=self.device)
+        flat = torch.cat([*(g.reshape(-1) for g in grads), clock])
+        dist.all_reduce(flat)
+        flat /= self.world
+        self.agreed_s = float(flat[-1])
+        start = 0
+        for grad in grads:
+            grad.copy_(flat[start : start + grad.numel()].view_as(grad))
+            start += grad.numel()
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        keep = min(self.settings.ema, (1.0 + self.step) / (10.0 + self.step))
+        averaged = list(self.average.parameters())
+        torch._foreach_lerp_(averaged, [p.detach() for p in self.model.parameters()], 1.0 - keep)
+
+
+def _commit() -> str:
+    here = Path(__file__).resolve().parent
+    try:
+        done = subprocess.run(
+            ["git", "rev-parse", "--short=12", "HEAD"], cwd=here, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return done.stdout.strip()
+
+
+def _append(path: Path, row: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+def _mean_logs(rows: list[dict[str, torch.Tensor]]) -> dict[str, float]:
+    names = {name for row in rows for name in row}
+    means = {
+        n: float(torch.stack([row[n].float().cpu() for row in rows if n in row]).mean())
+        for n in sorted(names)
+    }
+    means["psnr_db"] = -10.0 * float(torch.log10(torch.tensor(max(means["mse"], 1e-10))))
+    return means
+
+
+def train(
+    settings: TrainSettings,
+    on_progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> TrainResult:
+    """Train until the steps or the minutes are done, or until asked to stop; always ends with a checkpoint.
+
+    Under torchrun every process takes its own crops and gradients are averaged. ``out`` receives ``last.pt``
+    (everything needed to go on), ``log.jsonl`` (the curve) and the averaged weights with their manifest.
+
+    Args:
+        settings: Of the run.
+        on_progress: Called every ``log_every`` steps in the first process.
+        should_stop: Asked after every step; with several processes all must answer alike.
+
+    Raises:
+        SourceError: There are no images.
+        CheckpointError: The checkpoint in ``out`` belongs to another architecture or is damaged.
+    """
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    joined = world > 1 and not dist.is_initialized()
+    if joined:
+        use_cuda = settings.device != "cpu" and torch.cuda.is_available()
+        dist.init_process_group("nccl" if use_cuda else "gloo")
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    try:
+        return _train(Run(settings, dist.get_rank() if world > 1 else 0, world), on_progress, should_stop)
+    finally:
+        if joined:
+            dist.destroy_process_group()
+
+
+def _train(
+    run: Run, on_progress: Callable[[Progress], None] | None, should_stop: Callable[[], bool] | None
+) -> TrainResult:
+    settings, log = run.settings, run.settings.out / "log.jsonl"
+    rows: list[dict[str, torch.Tensor]] = []
+    valid: dict[str, float] = {}
+    logger.info("training %s from step %d on %s", settings.architecture, run.step, run.device)
+    try:
+        while run.share_done() < 1.0 and not (should_stop is not None and should_stop()):
+            start_s = time.perf_counter()
+            rows.append(run.one_step())
+            run.elapsed_s += time.perf_counter() - start_s
+            if run.step % settings.log_every == 0 and run.rank == 0:
+                report = Progress(run.step, run.elapsed_s, run.share_done(), _mean_logs(rows))
+                rows.clear()
+                _append(log, {"step": report.step, "elapsed_s": round(report.elapsed_s, 1), **report.values})
+                if on_progress is not None:
+                    on_progress(report)
+            if run.step % settings.valid_every == 0 and run.valid_images and run.rank == 0:
+                valid = validate(run.average, run.valid_images, run.device, settings.bf16)
+                _append(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
+            if run.step % settings.save_every == 0:
+                run.save()
+    finally:
+        run.batches.close()
+        run.save()
+    if run.rank == 0 and run.valid_images:
+        valid = validate(run.average, run.valid_images, run.device, settings.bf16)
+        _append(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
+    weights = settings.out / f"{settings.architecture}.safetensors"
+    if run.rank == 0:
+        weights = run.export(valid)
+    return TrainResult(run.step, run.elapsed_s, weights, valid)

@@ -1,0 +1,128 @@
+"""The loss terms: reconstruction, descriptor consistency, confidence, and a cap on the symbols' power."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from semcast.common.nets.modulation import CLIP
+from semcast.common.nets.transceiver import Transceiver
+from semcast.training.channel import LinkDraw, through_link
+from semcast.training.descriptors import descriptor_loss
+from semcast.training.displacement import grey, lucas_kanade_step
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossSettings:
+    """Weights and shapes of the loss terms; a weight of 0 switches a term off.
+
+    Attributes:
+        mse: Weight of the reconstruction error (lambda 1 of the paper).
+        descriptor: Weight of the descriptor consistency (lambda 2).
+        confidence: Weight of both confidence heads (lambda 3); their gradient never reaches the image path.
+        mse_knee: An image's squared error counts as ``knee * log(1 + mse / knee)``: PSNR is a mean of
+            logarithms, and without the knee a few hard crops would own the gradient. 0 is the plain mean.
+        confidence_sharpness: alpha of the label ``1 - tanh(alpha * |x_hat - x|)``.
+        confidence_loss: ``bce``, or ``l1`` as in the paper.
+        power: Weight of the penalty on 16-QAM frames whose mean power is not 1 or whose latent leaves the
+            levels.
+    """
+
+    mse: float = 1.0
+    descriptor: float = 0.0
+    confidence: float = 0.01
+    mse_knee: float = 1e-3
+    confidence_sharpness: float = 30.0
+    confidence_loss: Literal["bce", "l1"] = "bce"
+    power: float = 0.002
+
+    def __post_init__(self) -> None:
+        for name in ("mse", "descriptor", "confidence", "mse_knee", "power"):
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
+        if self.confidence_sharpness <= 0.0:
+            raise ValueError(f"confidence_sharpness must be > 0, got {self.confidence_sharpness}")
+
+
+def reconstruction_loss(x_hat: Tensor, x: Tensor, knee: float) -> tuple[Tensor, Tensor]:
+    """Return the loss and the plain squared error of each image, ``(B,)``."""
+    mse = (x_hat - x).square().mean(dim=(1, 2, 3))
+    loss = (knee * torch.log1p(mse / knee)).mean() if knee > 0.0 else mse.mean()
+    return loss, mse.detach()
+
+
+def confidence_label(x_hat: Tensor, x: Tensor, sharpness: float) -> Tensor:
+    """Return the paper's pseudo-label (Eq. 9), ``(B, 1, H, W)``, from the mean error over colour."""
+    error = (x_hat.detach().clamp(0.0, 1.0) - x).abs().mean(dim=1, keepdim=True)
+    return 1.0 - torch.tanh(sharpness * error)
+
+
+def confidence_loss(logit: Tensor, label: Tensor, kind: Literal["bce", "l1"]) -> Tensor:
+    """Compare predicted confidence with its label."""
+    if kind == "l1":
+        return (torch.sigmoid(logit) - label).abs().mean()
+    return binary_cross_entropy_with_logits(logit, label)
+
+
+def displacement_loss(predicted_px: Tensor, label_px: Tensor, strength: Tensor) -> Tensor:
+    """Return the Laplace negative log-likelihood of displacements, weighted to strong corners.
+
+    The expected length ``d`` is the scale of the law: ``log d + label / d`` is least where ``d`` is the mean
+    label.
+    """
+    scale = predicted_px + 0.02
+    weight = (strength / strength.mean(dim=(1, 2, 3), keepdim=True).clamp_min(1e-9)).clamp(max=8.0) + 0.05
+    return (weight * (torch.log(scale) + label_px / scale)).sum() / weight.sum()
+
+
+def transceiver_loss(
+    model: Transceiver, x: Tensor, draw: LinkDraw, noise: Tensor, settings: LossSettings, with_heads: bool
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Run one batch through the whole link and sum the loss terms.
+
+    Args:
+        model: The transceiver.
+        x: ``(B, 3, H, W)`` images in [0, 1].
+        draw: The links of the batch.
+        noise: Standard normal values of the latent's shape.
+        settings: Weights of the terms.
+        with_heads: Compute the confidence heads in this step.
+
+    Returns:
+        The loss and detached scalars for the log.
+    """
+    latent = model.latent(x, draw.expected_snr_db, draw.is_qam)
+    symbols = model.transmit(latent, draw.is_qam)
+    y_rx, snr_db = through_link(symbols, draw, noise)
+    x_hat, features = model.receive(y_rx, snr_db, draw.is_qam)
+    x_hat = x_hat.float()
+    reconstruction, mse = reconstruction_loss(x_hat, x, settings.mse_knee)
+    loss = settings.mse * reconstruction
+    power = 2.0 * symbols.square().mean(dim=(1, 2, 3))
+    # Beyond the clipping range a value has no gradient from the image and would drift.
+    drift = (latent.abs() - CLIP).clamp_min(0.0).mean(dim=(1, 2, 3))
+    # Straight-through gradients shrink the latent, which wastes power; this holds it at what is allowed.
+    loss = loss + settings.power * ((drift + (power - 1.0).abs()) * draw.is_qam).mean()
+    logs = {
+        "mse": mse.mean(),
+        "power": (power * draw.is_qam).sum().detach() / draw.is_qam.sum().clamp_min(1.0),
+    }
+    if settings.descriptor > 0.0:
+        descriptor = descriptor_loss(grey(x), grey(x_hat))
+        loss = loss + settings.descriptor * descriptor
+        logs["descriptor"] = descriptor.detach()
+    if with_heads and settings.confidence > 0.0:
+        frozen = type(features)(
+            features.received.detach(), features.at16.detach(), features.at8.detach(), features.at4.detach()
+        )
+        logit, displacement = model.judge(frozen, x_hat.detach())
+        label = confidence_label(x_hat, x, settings.confidence_sharpness)
+        pixel = confidence_loss(logit, label, settings.confidence_loss)
+        with torch.no_grad():
+            moved, strength = lucas_kanade_step(grey(x), grey(x_hat.detach().clamp(0.0, 1.0)))
+        keypoint = displacement_loss(displacement, moved, strength)
+        loss = loss + settings.confidence * (pixel + 0.25 * keypoint)
+        logs["pixel"], logs["keypoint"] = pixel.detach(), keypoint.detach()
+    return loss, logs

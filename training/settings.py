@@ -1,0 +1,67 @@
+"""Settings of a training run."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from semcast.training.channel import ChannelSettings
+from semcast.training.data import CropSettings
+from semcast.training.losses import LossSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings:
+    """One training run, reproducible from these values, the data and the number of processes."""
+
+    architecture: str = field(default="3dcsc-lite", metadata={"help": "architecture from the registry"})
+    data: Path = field(default=Path("data/train"), metadata={"help": "folder of training images"})
+    valid: Path | None = field(default=None, metadata={"help": "folder of images to choose by"})
+    out: Path = field(
+        default=Path("checkpoints/3dcsc-lite"), metadata={"help": "folder of checkpoint and log"}
+    )
+    steps: int = field(default=100_000, metadata={"help": "optimiser steps"})
+    minutes: float = field(
+        default=0.0, metadata={"help": "end after this much training time if steps are not done; 0: no limit"}
+    )
+    warmup_steps: int = field(default=300, metadata={"help": "steps of linear warm-up"})
+    decay_share: float = field(
+        default=0.25, metadata={"help": "last share of the run: learning rate falls to 0"}
+    )
+    batch: int = field(default=16, metadata={"help": "crops in a step, for each process"})
+    optimiser: Literal["muon", "adamw"] = field(default="muon", metadata={"help": "for convolution kernels"})
+    lr: float = field(default=1e-3, metadata={"help": "learning rate of AdamW"})
+    lr_muon: float = field(default=0.01, metadata={"help": "learning rate of Muon"})
+    lr_linear: float = field(default=2e-4, metadata={"help": "learning rate of the linear heart"})
+    weight_decay: float = field(default=0.0, metadata={"help": "decoupled weight decay of kernels"})
+    clip: float = field(default=0.01, metadata={"help": "largest norm of the gradient"})
+    ema: float = field(default=0.999, metadata={"help": "decay of the averaged weights that are shipped"})
+    start: Literal["klt", "random"] = field(default="klt", metadata={"help": "linear layers at the start"})
+    head_every: int = field(
+        default=4, metadata={"help": "train the confidence heads every N steps until the decay"}
+    )
+    seed: int = field(default=0, metadata={"help": "seed of weights, data order and links"})
+    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where to train"})
+    bf16: bool = field(default=True, metadata={"help": "bfloat16 autocast"})
+    compile: bool = field(default=False, metadata={"help": "torch.compile the networks"})
+    threads: int = field(default=0, metadata={"help": "CPU threads; 0: as torch decides"})
+    log_every: int = field(default=50, metadata={"help": "steps between log lines"})
+    valid_every: int = field(default=2000, metadata={"help": "steps between validations"})
+    save_every: int = field(default=1000, metadata={"help": "steps between checkpoints"})
+    resume: bool = field(default=True, metadata={"help": "go on from the checkpoint in out, if there is one"})
+    crop: CropSettings = field(default_factory=CropSettings)
+    channel: ChannelSettings = field(default_factory=ChannelSettings)
+    loss: LossSettings = field(default_factory=LossSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "head_every", "log_every", "valid_every", "save_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}")
+        for name in ("warmup_steps", "minutes", "threads", "weight_decay"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
+        for name in ("lr", "lr_muon", "lr_linear", "clip"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
+        for name in ("decay_share", "ema"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")

@@ -1,0 +1,53 @@
+"""Quality on whole images that were not trained on."""
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from semcast.common.nets.transceiver import Transceiver
+from semcast.common.phy.slots import BLOCK_PX
+from semcast.training.channel import LinkDraw, through_link
+
+SNRS_DB = (2.0, 6.0, 10.0)
+
+
+def validate(
+    model: Transceiver,
+    images: list[NDArray[np.uint8]],
+    device: torch.device,
+    bf16: bool,
+    analog: bool = False,
+) -> dict[str, float]:
+    """Return the mean PSNR of images over AWGN at each of ``SNRS_DB``, and the mean 16-QAM power.
+
+    Args:
+        model: The transceiver.
+        images: ``(H, W, 3)`` uint8, cut to whole blocks.
+        device: Where the model is.
+        bf16: Use bfloat16 autocast.
+        analog: Measure analog modulation instead of 16-QAM.
+    """
+    generator = torch.Generator().manual_seed(1234)
+    psnr_db: dict[str, list[float]] = {f"psnr_{s:g}db": [] for s in SNRS_DB}
+    powers = []
+    with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+        for image in images:
+            height, width = (side // BLOCK_PX * BLOCK_PX for side in image.shape[:2])
+            x = torch.from_numpy(image[:height, :width].copy()).permute(2, 0, 1)[None].to(device) / 255.0
+            for snr_db in SNRS_DB:
+                slots = (1, 1, height // BLOCK_PX, 1)
+                level = torch.full((1,), snr_db)
+                flag = torch.full((1,), 0.0 if analog else 1.0)
+                draw = LinkDraw(level, level, flag, torch.ones(slots), torch.zeros(slots))
+                draw = LinkDraw(*(t.to(device) for t in vars(draw).values()))
+                symbols = model.transmit(model.latent(x, draw.expected_snr_db, draw.is_qam), draw.is_qam)
+                noise = torch.randn(symbols.shape, generator=generator).to(device)
+                y_rx, plane = through_link(symbols, draw, noise)
+                x_hat, _ = model.receive(y_rx, plane, draw.is_qam)
+                rounded = (x_hat.float().clamp(0, 1) * 255).round() / 255
+                mse = float((rounded - x).square().mean())
+                psnr_db[f"psnr_{snr_db:g}db"].append(-10.0 * math.log10(max(mse, 1e-10)))
+                powers.append(2.0 * float(symbols.square().mean()))
+    return {k: float(np.mean(v)) for k, v in psnr_db.items()} | {"power": float(np.mean(powers))}
