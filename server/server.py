@@ -309,7 +309,7 @@ class Server:
     def _close_viewer(self) -> None:
         viewer, self._viewer = self._viewer, None
         if viewer is not None:
-            viewer.close()
+            viewer.close(leave_window=self._complete and self._settings.view.leave_open)
 
     def _drops(self) -> dict[str, int]:
         """Drops since the present stream began."""

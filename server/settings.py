@@ -21,6 +21,7 @@ class ViewSettings:
             ``none`` shows nothing, ``auto`` is ``native`` where there is a display and ``file`` elsewhere.
         port: Where the viewer takes the stream, on loopback.
         web_port: Where the web page is, on loopback.
+        leave_open: Leave a native window open when the source has come to its end.
         memory_limit: What a viewer may keep before it forgets the oldest data.
         image_rate_hz: Images shown per second at most; poses and plots are always complete.
         jpeg_quality: Quality of the images in the viewer and in ``run.rrd``.
@@ -36,6 +37,10 @@ class ViewSettings:
         default=9876, metadata={"flag": "viewer_port", "help": "loopback port the viewer takes the stream on"}
     )
     web_port: int = field(default=9090, metadata={"help": "loopback port of the web viewer's page"})
+    leave_open: bool = field(
+        default=True,
+        metadata={"flag": "viewer_leave_open", "help": "leave the window open when the source has ended"},
+    )
     memory_limit: str = field(
         default="1GB", metadata={"flag": "viewer_memory", "help": "memory a viewer may use, such as 1GB"}
     )

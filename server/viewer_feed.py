@@ -237,11 +237,11 @@ class ViewerFeed:
         except ConfigError as err:
             logger.warning("%s", err)
 
-    def close(self, *, keep_viewer: bool = False) -> None:
+    def close(self, *, leave_window: bool = False) -> None:
         """Write what is pending, finish the file and end the viewer. Idempotent.
 
         Args:
-            keep_viewer: Leave the viewer open so that the result can be looked at.
+            leave_window: Leave a native window open so that the result can be looked at.
         """
         if self._stopping.is_set():
             return
@@ -249,7 +249,9 @@ class ViewerFeed:
         self._work.set()
         for thread in self._threads:
             thread.join(JOIN_DEADLINE_S)
-        if self._process is not None and not keep_viewer:
+        if self._process is not None:
+            if leave_window and self._process.kind == "native":
+                self._process.release()
             self._process.close()
         if self._file is not None:
             self._file.flush(JOIN_DEADLINE_S)

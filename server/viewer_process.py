@@ -70,7 +70,7 @@ class ViewerProcess:
         memory_limit: str,
         command: tuple[str, ...] | None = None,
     ) -> None:
-        self._kind = kind
+        self.kind = kind
         self._port = port
         self._web_port = web_port
         self._memory_limit = memory_limit
@@ -89,7 +89,7 @@ class ViewerProcess:
     def url(self) -> str:
         """Where a browser finds the web viewer, or where a viewer takes the stream."""
         stream = f"rerun+http://{LOOPBACK}:{self._port}/proxy"
-        if self._kind == "native":
+        if self.kind == "native":
             return stream
         return f"http://{LOOPBACK}:{self._web_port}/?url=" + stream.replace("+", "%2B")
 
@@ -97,13 +97,13 @@ class ViewerProcess:
     def restart_command(self) -> str:
         """The command that opens this viewer again by hand."""
         options = " ".join(("--serve-web", "--web-viewer-port", str(self._web_port)))
-        tail = f" {options}" if self._kind == "web" else ""
+        tail = f" {options}" if self.kind == "web" else ""
         return f"rerun --bind {LOOPBACK} --port {self._port}{tail}"
 
     def _arguments(self) -> list[str]:
         arguments = [*self._command, "--bind", LOOPBACK, "--port", str(self._port)]
         arguments += ["--server-memory-limit", self._memory_limit]
-        if self._kind == "web":
+        if self.kind == "web":
             return [*arguments, "--serve-web", "--web-viewer-port", str(self._web_port)]
         return [*arguments, "--memory-limit", self._memory_limit, "--expect-data-soon"]
 
@@ -177,6 +177,15 @@ class ViewerProcess:
                 os.killpg(self._child.pid, kind)
             except (ProcessLookupError, PermissionError):
                 logger.debug("viewer group %d is gone", self._child.pid)
+
+    def release(self) -> None:
+        """Leave a running child to the user, who closes its window; it is no longer looked after."""
+        self._done = True
+        if self._child is not None and self._child.poll() is None:
+            logger.info("the viewer is left open")
+            # The child outlives this process on purpose: Popen must not complain about that.
+            self._child.returncode = 0
+            self._child = None
 
     def close(self) -> None:
         """End the child and its group, also when frozen. Idempotent."""

@@ -215,6 +215,26 @@ def test_a_window_the_user_closed_stays_closed():
     process.close()
 
 
+def test_a_window_is_left_open_for_the_user_when_asked():
+    sleeper = (sys.executable, "-c", "import time; time.sleep(60)")
+    for leave, expected in ((True, None), (False, -signal.SIGTERM)):
+        port = free_port()
+        process = ViewerProcess("native", port, 1, "1GB", command=sleeper)
+        feed = ViewerFeed(ViewSettings(view="native", port=port), CAMERA, "left", process=process)
+        child = process._child
+        feed.close(leave_window=leave)
+        child.returncode = None
+        if expected is None:
+            assert child.poll() is None
+            os.killpg(child.pid, signal.SIGKILL)
+            child.wait(10)
+        else:
+            assert not is_listening(port)
+            with pytest.raises(ProcessLookupError):
+                os.kill(child.pid, 0)
+            child.returncode = expected
+
+
 def test_closing_takes_the_whole_process_group():
     script = "import subprocess,sys,time;print(subprocess.Popen(['sleep','60']).pid);time.sleep(60)"
     process = ViewerProcess("native", free_port(), 1, "1GB", command=(sys.executable, "-c", script))
