@@ -1,0 +1,55 @@
+import threading
+from pathlib import Path
+
+import pytest
+
+from semcast.common.errors import SemcastError
+from semcast.demo import DemoSettings, real_time_resize, role_commands, run_demo
+
+SEQUENCE = Path(__file__).resolve().parents[1] / "deploy" / "demo" / "kitti_06"
+
+
+def test_large_images_are_brought_down_and_small_ones_left_alone():
+    assert real_time_resize((480, 500)) == 1.0
+    assert real_time_resize((1000, 1000)) == pytest.approx(0.5)
+
+
+def test_every_setting_reaches_a_process(tmp_path):
+    settings = DemoSettings(
+        codec="webp-ldpc", modulation="analog", snr_db=3, channel="burst", confidence="paper", view="web",
+        seed=7, out=tmp_path / "o", record=tmp_path / "r.mcap",
+    )  # fmt: skip
+    words = [
+        w for command in role_commands(settings, SEQUENCE, 0.5, "tcp/127.0.0.1:1").values() for w in command
+    ]
+    for value in ("webp-ldpc", "analog", "3", "burst", "paper", "web", "7", "0.5", str(tmp_path / "o")):
+        assert value in words
+    assert str(tmp_path / "r.mcap") in words
+
+
+@pytest.mark.parametrize(
+    ("values", "message"), [({"snr_db": 42.0}, "snr_db must be in"), ({"resize": 2.0}, "resize")]
+)
+def test_bad_settings_are_refused_before_anything_starts(values, message):
+    with pytest.raises(ValueError, match=message):
+        DemoSettings(**values)
+
+
+def test_a_role_that_can_not_start_ends_the_demo_with_its_own_words(tmp_path):
+    settings = DemoSettings(codec="no-such-codec", view="none", resize=0.25, out=tmp_path)
+    with pytest.raises(SemcastError, match="agent did not start: .*no-such-codec"):
+        run_demo(settings, threading.Event(), lambda line: None, lambda row: None)
+
+
+@pytest.mark.slow
+def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
+    told, rows = [], []
+    settings = DemoSettings(codec="jpeg-ldpc", view="none", resize=0.4, out=tmp_path)
+    summary = run_demo(settings, threading.Event(), told.append, rows.append)
+    assert summary is not None
+    assert {line.split()[0] for line in told} >= {"server", "channel", "agent"}
+    assert rows[-1]["frame_id"] == 50
+    for name in ("trajectory.tum", "map.ply", "summary.json", "settings.toml"):
+        assert (tmp_path / name).stat().st_size > 0
+    assert summary["completeness"] > 0.3  # live, so a loaded machine drops frames
+    assert summary["ate_percent"] < 5.0
