@@ -388,4 +388,4 @@ def confidence_colours(confidence: NDArray[np.float32]) -> NDArray[np.uint8]:
     table = np.stack(
         [np.interp(np.arange(256), stops, channel) for channel in np.transpose(CONFIDENCE_COLOURS)], axis=1
     )
-    return np.rint(table).astype(np.uint8)[levels]
+    return np.asarray(np.rint(table).astype(np.uint8)[levels], dtype=np.uint8)

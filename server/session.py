@@ -332,7 +332,7 @@ class Session:
                     confidence=confidence,
                     observed_landmark_ids=landmark_ids[used],
                     observed_keyframe_ids=keyframe_ids[used],
-                    observed_xy=xy[used],
+                    observed_xy=xy[used].astype(np.float32),
                 ),
             )
         except (SemcastError, ValueError) as err:
