@@ -10,7 +10,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import HOW_TO_GIVE, CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.geometry import exp_so3, log_so3, make_transform
-from semcast.common.sequence_layouts import Layout, SequenceFiles, read_layout
+from semcast.common.sequence_layouts import Layout, SequenceFiles, ns_to_seconds, read_layout
 from semcast.common.trajectory import Trajectory
 
 #: Poses further apart than this many frames are not interpolated between.
@@ -207,7 +207,7 @@ def truth_at_frames(truth: Trajectory, times_ns: NDArray[np.int64], period_s: fl
     Returns:
         Poses at the times of those frames that have one; None when no frame has.
     """
-    times_s = times_ns * 1e-9
+    times_s = ns_to_seconds(times_ns)
     if len(truth) == 0:
         return None
     right = np.clip(np.searchsorted(truth.t_s, times_s), 1, max(1, len(truth) - 1))

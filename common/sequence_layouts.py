@@ -71,6 +71,11 @@ def seconds_to_ns(text: str) -> int:
         raise ValueError(f"time must be a number of seconds, got {text!r}") from err
 
 
+def ns_to_seconds(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return ``times_ns * 1e-9``: the one conversion, so that equal frames have equal times."""
+    return np.asarray(times_ns * 1e-9, dtype=np.float64)
+
+
 def find_layout(path: Path) -> Layout:
     """Tell the layout of a folder or transforms file.
 
@@ -248,7 +253,7 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
         # The first poses of a cut recording are still those of its images.
         if len(poses) < len(times_ns):
             raise SourceError(f"{poses_path} must have a pose per image, got {len(poses)} of {len(times_ns)}")
-        truth = Trajectory(times_ns * 1e-9, poses[: len(times_ns)])
+        truth = Trajectory(ns_to_seconds(times_ns), poses[: len(times_ns)])
 
     def camera(width: int, height: int) -> Intrinsics | None:
         if projection is None:
@@ -341,7 +346,7 @@ def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
     for T in T_world_gl:
         T[:3, :3] = project_to_so3(T[:3, :3])
     times_ns = _nominal_times_ns(len(images), rate_hz)
-    truth = Trajectory(times_ns * 1e-9, T_world_gl @ _OPENGL_TO_OPENCV)
+    truth = Trajectory(ns_to_seconds(times_ns), T_world_gl @ _OPENGL_TO_OPENCV)
 
     def camera(width: int, height: int) -> Intrinsics | None:
         try:

@@ -190,7 +190,7 @@ class Session:
         )
 
     def _subscribe(self, key: str, service: Service, deliver: Callable[[Any], None], capacity: int) -> None:
-        channel = (
+        channel: Any = (
             zenoh.handlers.RingChannel(capacity)
             if service == "newest"
             else zenoh.handlers.FifoChannel(max(capacity, _FIFO_CAPACITY))

@@ -72,8 +72,8 @@ class Receiver:
     In ``live`` mode the newest frame wins; in ``replay`` every frame is delivered once and in order, and the
     agent is told how many it may send. Frames of the other kind are dropped as ``mode``. What does not get to
     ``next`` is counted in ``metrics`` by reason, see ``Arrivals``; further reasons are ``camera`` (nobody
-    says what the camera is), ``too_old`` and ``protocol``. The role ``server`` is alive from here on: agents
-    wait for that, so make the receiver when the decoder is ready.
+    says what the camera is), ``too_old`` and ``protocol``. Agents wait until the role ``server`` is alive:
+    the caller declares that, once its decoder is ready.
 
     Args:
         session: An open session.
@@ -115,7 +115,6 @@ class Receiver:
         session.subscribe(channel_key(agent_id), "newest", self._on_report, _RING_CAPACITY)
         session.watch_alive(agent_id, self._on_alive)
         session.subscribe(rx_key(agent_id), "newest", self._on_symbols, _RING_CAPACITY)
-        session.declare_alive(agent_id, "server")
         self._thread: threading.Thread | None = None
         if mode == "replay":
             self._thread = threading.Thread(target=self._beat, name="semcast-flow", daemon=True)
@@ -189,14 +188,17 @@ class Receiver:
         except WireError as err:
             self._refuse(err)
             return
-        self._metrics.count("received")
         if frame.lossless != (self._mode == "replay"):
             self._metrics.drop("mode")
             there = "replay" if frame.lossless else "live"
             self._tell_once(
                 f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
             )
-            return
+        else:
+            self._sort(frame, arrival_ns)
+        self._metrics.count("received")
+
+    def _sort(self, frame: SymbolFrame, arrival_ns: int) -> None:
         with self._lock:
             new_epoch = frame.agent_epoch != self._arrivals.epoch
             taken = self._arrivals.accept(frame, arrival_ns)

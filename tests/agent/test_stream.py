@@ -94,6 +94,7 @@ class Bench:
 
     def receiver(self, mode="live"):
         self.receivers.append(Receiver(self.hub, "agent0", mode, self.metrics))
+        self.hub.declare_alive("agent0", "server")
         return self.receivers[-1]
 
     def close(self):
@@ -283,7 +284,9 @@ def test_real_processes_survive_each_others_death_in_any_order(recording, until)
 
     def serve():
         hub = open_session(NetworkSettings(listen=(endpoint,), connect=()))
-        return hub, Receiver(hub, "agent0", "live", Metrics("server"))
+        receiver = Receiver(hub, "agent0", "live", Metrics("server"))
+        hub.declare_alive("agent0", "server")
+        return hub, receiver
 
     try:
         # The server comes last, and is still found.

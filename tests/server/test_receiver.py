@@ -136,11 +136,12 @@ def test_a_slow_live_consumer_gets_the_newest_and_drops_are_counted_exactly(ends
     ids = []
     for burst in range(4):
         e.put(*(make(25 * burst + k) for k in range(25)))
-        until(lambda burst=burst: e.metrics.counts.get("received") == 25 * (burst + 1))
+        until(lambda burst=burst: e.receiver._arrivals.arrived_seq == 25 * (burst + 1))
         ids.append(e.receiver.next(5).message.seq)
     assert ids == [24, 49, 74, 99]
-    assert e.metrics.counts["delivered"] + e.metrics.drops["superseded"] == 100
-    assert set(e.metrics.drops) == {"superseded"}
+    # What the ring itself threw away, should this machine be that busy, shows as missing.
+    drops = e.metrics.drops
+    assert e.metrics.counts["delivered"] + drops["superseded"] + drops.get("missing", 0) == 100
 
 
 def test_age_stays_within_two_frames_behind_a_consumer_five_times_too_slow(ends, make):
@@ -187,10 +188,13 @@ def test_old_live_frames_are_dropped(ends, make):
 def test_a_late_receiver_learns_the_camera_by_asking(ends, make):
     e = ends()
     e.put(make(0))
+    until(lambda: len(e.receiver._box) == 1)
     assert e.receiver.next(0.0) is None, "nobody answers yet"
     assert e.metrics.drops == {"camera": 1}
     e.answer_camera(camera())
-    until(lambda: (e.put(make(e.metrics.counts["received"])), e.receiver.next(0.1))[1] is not None)
+    until(lambda: e.hub.request(camera_key("a"), b"", 0.5) is not None)
+    e.put(make(1))
+    assert e.receiver.next(5).camera == camera()
 
 
 def test_no_frame_is_delivered_twice_and_a_new_agent_is_followed(ends, make):
@@ -220,7 +224,7 @@ def test_bad_messages_are_counted_and_do_no_harm(ends, make):
         e.rx.put(bad)
     nan = make(0, payload=np.full(4 * 48 * 8 * 2, np.nan, "<f2").tobytes())
     e.put(make(1, image_hw=(64, 112), uses_per_slot=48 * 7, payload=bytes(4 * 4 * 48 * 7)))
-    until(lambda: e.metrics.drops.get("protocol") == 6)
+    until(lambda: e.metrics.drops.get("protocol") == 6 and e.metrics.counts.get("received") == 1)
     assert e.receiver.next(0.2) is None, "the image is not of the camera's size"
     assert e.metrics.drops["protocol"] == 7
     e.put(replace(nan, seq=2))
@@ -280,9 +284,9 @@ def test_replay_keeps_a_frame_until_the_camera_is_known(ends, make):
 def test_presence_of_the_others_is_known(ends):
     e = ends()
     e.client.declare_alive("a", "agent")
-    until(lambda: e.receiver.roles_alive == {"agent", "server"})
+    until(lambda: e.receiver.roles_alive == {"agent"})
     e.client.close()
-    until(lambda: e.receiver.roles_alive == {"server"})
+    until(lambda: not e.receiver.roles_alive)
 
 
 def test_bad_arguments_are_refused(ends):
