@@ -1,6 +1,7 @@
 """The server process: receives, decodes, tracks and maps one stream, shows it and keeps the results."""
 
 import contextlib
+import importlib
 import logging
 import threading
 import time
@@ -19,12 +20,13 @@ from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
 from semcast.common.transport import open_session
 from semcast.common.wire import WireError, pack, unpack
+from semcast.server.bundle_problem import BundleRunner
 from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import DecodedArrival, FrameDecoder
 from semcast.server.outbox import Outbox
 from semcast.server.receiver import ReceivedFrame, Receiver
 from semcast.server.reference import Reference
-from semcast.server.session import Arrival, Outcome, Session, StreamIdentity
+from semcast.server.session import Arrival, Outcome, Session, StreamIdentity, new_bundle
 from semcast.server.settings import ServerSettings
 
 if TYPE_CHECKING:  # Rerun is imported only when something is shown or recorded
@@ -34,6 +36,7 @@ logger = logging.getLogger(__name__)
 
 POLL_S = 0.1
 CAMERA_TIMEOUT_S = 0.5
+WARM_UP_SHAPE_HW = (256, 384)
 #: How long stragglers are waited for after the source's last frame.
 FINAL_IDLE_S = 0.5
 #: The last frame may be lost on the air: so many frames from the end count as the end once the agent is gone.
@@ -70,6 +73,7 @@ class Server:
         self._announced: CameraInfo | None = None
         self._inbox_lock = threading.Lock()
         self._drops_before: dict[str, int] = {}
+        self._spare_bundle: BundleRunner | None = None
         self._complete = False
         self._nearly_final = False
         self._new_map = False
@@ -85,8 +89,8 @@ class Server:
             )
             stack.callback(beat.close)
             session.answer(control_key(self._agent_id, "server"), self._answer)
-            if settings.codec is not None:
-                self._decoder.load(settings.codec, settings.modulation)
+            self._make_ready()
+            stack.callback(self._close_spare)
             session.subscribe(camera_key(self._agent_id), "every", self._on_camera)
             self._ask_for_camera(session)
             self._ahead = DecodeAhead(self._receiver.next, self._decoder.decode, self._on_failure)
@@ -101,6 +105,21 @@ class Server:
             num_threads=self._settings.threads,
             device=self._settings.device,
         )
+
+    def _make_ready(self) -> None:
+        """Do what takes long before others see that the server is there."""
+        settings = self._settings
+        self._spare_bundle = new_bundle(settings)
+        if settings.view.view != "none":
+            importlib.import_module("semcast.server.viewer_feed")
+        if settings.codec is not None:
+            codec = self._decoder.load(settings.codec, settings.modulation)
+            self._decoder.warm_up(codec.name, settings.modulation, codec.digest, WARM_UP_SHAPE_HW)
+
+    def _close_spare(self) -> None:
+        bundle, self._spare_bundle = self._spare_bundle, None
+        if bundle is not None:
+            bundle.close()
 
     def _ask_for_camera(self, session: NetworkSession) -> None:
         """Learn at once of an agent that is already there."""
@@ -270,7 +289,8 @@ class Server:
         self._complete = self._nearly_final = False
         if self._settings.reference is not None and self._reference is None:
             self._reference = Reference(self._settings.reference, identity.camera)
-        self._session = Session(self._settings, identity, self._settings.out, self._reference)
+        bundle, self._spare_bundle = self._spare_bundle, None
+        self._session = Session(self._settings, identity, self._settings.out, self._reference, bundle)
         self._drops_before = self._metrics.drops if former is not None else {}
         if former is not None and former.identity.camera != identity.camera:
             self._close_viewer()

@@ -29,6 +29,7 @@ from semcast.common.run_folder import (
 )
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.server.bundle import InlineBundle
+from semcast.server.bundle_problem import BundleRunner
 from semcast.server.bundle_process import ProcessBundle
 from semcast.server.checkpoint import (
     Checkpoint,
@@ -113,6 +114,7 @@ class Session:
         identity: What the map belongs to.
         folder: Where outputs go, or None.
         reference: Originals and truth, or None.
+        bundle: A runner made ahead by ``new_bundle``, which the session closes; None makes one.
     """
 
     def __init__(
@@ -121,13 +123,14 @@ class Session:
         identity: StreamIdentity,
         folder: Path | None,
         reference: Reference | None,
+        bundle: BundleRunner | None = None,
     ) -> None:
         self._settings = settings
         self.identity = identity
         self._folder = folder
         self._reference = reference
         lossless = settings.mode == "replay"
-        bundle = InlineBundle() if settings.bundle == "inline" else ProcessBundle(lossless=lossless)
+        bundle = bundle if bundle is not None else new_bundle(settings)
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
         self._t_source_ns: dict[int, int] = {}
         self._map_epoch = 0
@@ -346,6 +349,13 @@ class Session:
             self._images.close()
         self._record.close()
         self._reconstruction.close()
+
+
+def new_bundle(settings: ServerSettings) -> BundleRunner:
+    """Return a runner of bundle adjustments as the settings want it."""
+    if settings.bundle == "inline":
+        return InlineBundle()
+    return ProcessBundle(lossless=settings.mode == "replay")
 
 
 def frame_view(

@@ -102,7 +102,7 @@ def role_commands(
     meet = ["--agent-id", AGENT_ID, "--connect", endpoint]
     server = [*program, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
     server += ["--reference", str(sequence), "--confidence", settings.confidence, "--view", settings.view]
-    server += ["--seed", str(settings.seed)]
+    server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
     channel = [*program, "channel", *meet, "--channel", settings.channel, "--snr-db", f"{settings.snr_db:g}"]
     channel += ["--seed", str(settings.seed)]
     agent = [*program, "agent", *meet, "--source", str(sequence), "--codec", settings.codec]
