@@ -4,6 +4,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from semcast.common.errors import ConfigError
+from semcast.common.nets.linear import BlockAnalysis, BlockSynthesis
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
 
@@ -45,7 +47,13 @@ def start_from_klt(model: Transceiver, images: list[NDArray[np.uint8]], generato
         model: A transceiver whose encoder and decoder have a linear heart.
         images: Training images, ``(H, W, 3)`` uint8.
         generator: Draws the orthogonal mixing.
+
+    Raises:
+        ConfigError: The transceiver has no linear heart.
     """
+    heart_in, heart_out = getattr(model.encoder, "linear", None), getattr(model.decoder, "linear", None)
+    if not isinstance(heart_in, BlockAnalysis) or not isinstance(heart_out, BlockSynthesis):
+        raise ConfigError("start must be 'random' for an architecture without a linear heart, got 'klt'")
     mean, covariance = block_statistics(images)
     variances, vectors = np.linalg.eigh(covariance)
     variances = np.maximum(variances[::-1][:LATENT_CHANNELS], 1e-9)
@@ -55,7 +63,6 @@ def start_from_klt(model: Transceiver, images: list[NDArray[np.uint8]], generato
     mixing = torch.linalg.qr(torch.randn(LATENT_CHANNELS, LATENT_CHANNELS, generator=generator))[0].numpy()
     analysis = gain[:, None] * basis
     synthesis = (basis / gain[:, None]).T  # (768, 94)
-    heart_in, heart_out = model.encoder.linear, model.decoder.linear
     with torch.no_grad():
         heart_in.transform.weight.copy_(torch.from_numpy(analysis)[:, :, None, None])
         heart_in.transform.bias.copy_(torch.from_numpy(-analysis @ mean))

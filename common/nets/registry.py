@@ -6,7 +6,9 @@ from typing import Any
 
 from semcast.common.config import near_match
 from semcast.common.errors import CheckpointError
+from semcast.common.nets.cnn import CnnSizes, build_cnn
 from semcast.common.nets.transceiver import Sizes, Transceiver, build_3dcsc
+from semcast.common.nets.vit import VitSizes, build_vit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +29,12 @@ class Architecture:
 def _entries() -> tuple[Architecture, ...]:
     main = Sizes((96, 160, 192), (1, 2, 3), (1, 2, 3), 48)
     lite = Sizes((64, 96, 160), (1, 1, 2), (1, 2, 3), 32)
-    return (Architecture("3dcsc", main, build_3dcsc), Architecture("3dcsc-lite", lite, build_3dcsc))
+    return (
+        Architecture("3dcsc", main, build_3dcsc),
+        Architecture("3dcsc-lite", lite, build_3dcsc),
+        Architecture("cnn", CnnSizes(), build_cnn),
+        Architecture("vit", VitSizes(), build_vit),
+    )
 
 
 def architectures() -> dict[str, Architecture]:

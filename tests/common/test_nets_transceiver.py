@@ -4,6 +4,7 @@ import torch
 from semcast.common.nets.blocks import ChannelAttention, ResidualUnit, Upsample
 from semcast.common.nets.registry import build
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.common.nets.vit import positions
 
 TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
 
@@ -99,3 +100,24 @@ def test_the_encoder_keeps_its_budget_of_multiplications_per_pixel(name, limit):
     with torch.inference_mode():
         encoder(torch.rand(1, 3, 64, 64), torch.full((1,), 10.0), torch.ones(1))
     assert count / 64**2 <= limit
+
+
+@pytest.mark.parametrize("name", ["cnn", "vit"])
+def test_rivals_fit_the_same_shell(name):
+    torch.manual_seed(0)
+    model = build(name).eval()
+    is_qam = torch.tensor([1.0, 0.0])
+    with torch.inference_mode():
+        latent = model.latent(torch.rand(2, 3, 32, 48), torch.full((2,), 10.0), is_qam)
+        symbols = model.transmit(latent, is_qam)
+        x_hat, features = model.receive(symbols, link_planes(10, 2, 3).expand(2, 1, 2, 3), is_qam)
+        logit, displacement = model.judge(features, x_hat)
+    assert latent.shape == (2, 94, 2, 3)
+    assert x_hat.shape == (2, 3, 32, 48)
+    assert logit.shape == displacement.shape == (2, 1, 32, 48)
+
+
+def test_positions_tell_every_patch_apart():
+    grid = positions(6, 9, 64, torch.zeros(()))[0]
+    distance = torch.cdist(grid, grid) + 10 * torch.eye(54)
+    assert distance.min() > 0.1

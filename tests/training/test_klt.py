@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 import torch
 
+from semcast.common.errors import ConfigError
+from semcast.common.nets.registry import build
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
 from semcast.training.klt import block_statistics, start_from_klt
 
@@ -48,3 +50,8 @@ def test_before_any_training_the_link_already_carries_the_image(flag):
         symbols = model.transmit(latent, is_qam) * (100 / 101)
         x_hat, _ = model.receive(symbols, torch.full((1, 1, 6, 6), 20.0), is_qam)
     assert -10 * torch.log10((x_hat - x).square().mean()) > 20.0
+
+
+def test_an_architecture_without_a_linear_heart_is_refused():
+    with pytest.raises(ConfigError, match="start must be 'random'"):
+        start_from_klt(build("cnn"), smooth_photos(), torch.Generator())

@@ -16,6 +16,7 @@ from semcast.common.errors import CheckpointError
 from semcast.common.nets.codec import NeuralCodec
 from semcast.common.nets.registry import architectures
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.training.channel import ChannelSettings
 from semcast.training.data import CropSettings
 from semcast.training.loop import train
 from semcast.training.losses import LossSettings
@@ -102,8 +103,11 @@ def test_the_weights_change_and_the_seed_decides_how(tiny_network, photos, tmp_p
 def test_training_lowers_the_loss_on_the_images_it_sees(tiny_network, photos, tmp_path):
     reports = []
     rates = {"lr": 1e-2, "lr_linear": 1e-2, "clip": 1.0}
+    clean = ChannelSettings(snr_min_db=14.0, share_faded=0.0, share_lossy=0.0)
     train(
-        settings_for(photos, tmp_path / "run", steps=80, log_every=20, start="random", **rates),
+        settings_for(
+            photos, tmp_path / "run", steps=80, log_every=20, start="random", channel=clean, **rates
+        ),
         reports.append,
     )
     assert reports[-1].values["mse"] < 0.8 * reports[0].values["mse"]

@@ -1,0 +1,137 @@
+"""The transformer rival: 16x16 patches, transformer encoder and decoder, linear maps to latent and pixels."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import scaled_dot_product_attention
+
+from semcast.common.nets.blocks import NUM_CONDITIONS, condition_vector, normalise_snr_db
+from semcast.common.nets.confidence import ConfidenceBranch
+from semcast.common.nets.decoder import RECEIVED_CHANNELS, DecoderFeatures
+from semcast.common.nets.transceiver import Transceiver
+from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
+
+_PATCH_VALUES = 3 * BLOCK_PX * BLOCK_PX
+
+
+@dataclass(frozen=True)
+class VitSizes:
+    """Sizes of the transformer transceiver.
+
+    Attributes:
+        dim: Width of a token, a multiple of 4 and of ``heads``.
+        heads: Attention heads.
+        encoder_depth: Transformer blocks at the transmitter.
+        decoder_depth: Transformer blocks at the receiver.
+        confidence_channels: Width of the confidence branch.
+    """
+
+    dim: int = 256
+    heads: int = 8
+    encoder_depth: int = 4
+    decoder_depth: int = 4
+    confidence_channels: int = 32
+
+
+def positions(rows: int, columns: int, dim: int, like: Tensor) -> Tensor:
+    """Return sine and cosine positions ``(1, rows * columns, dim)`` that work at any image size."""
+    quarter = dim // 4
+    frequency = torch.exp(-math.log(1000.0) * torch.arange(quarter, device=like.device) / quarter)
+    row = torch.arange(rows, device=like.device)[:, None] * frequency
+    column = torch.arange(columns, device=like.device)[:, None] * frequency
+    row = torch.cat((row.sin(), row.cos()), dim=1)[:, None].expand(rows, columns, -1)
+    column = torch.cat((column.sin(), column.cos()), dim=1)[None].expand(rows, columns, -1)
+    return torch.cat((row, column), dim=2).reshape(1, rows * columns, dim).to(like.dtype)
+
+
+class TransformerBlock(nn.Module):
+    """Pre-norm attention and a two-layer network; the second layers start at zero."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm1, self.norm2 = nn.LayerNorm(dim), nn.LayerNorm(dim)
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.out = nn.Linear(dim, dim)
+        self.grow = nn.Linear(dim, 4 * dim)
+        self.shrink = nn.Linear(4 * dim, dim)
+        for last in (self.out, self.shrink):
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Refine tokens ``(B, N, dim)``."""
+        batch, count, dim = x.shape
+        parts = self.qkv(self.norm1(x)).view(batch, count, 3, self.heads, dim // self.heads)
+        q, k, v = parts.permute(2, 0, 3, 1, 4)
+        mixed = scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(batch, count, dim)
+        x = x + self.out(mixed)
+        refined: Tensor = x + self.shrink(nn.functional.gelu(self.grow(self.norm2(x))))
+        return refined
+
+
+class Trunk(nn.Module):
+    """Positions, link state and a stack of blocks over a grid of tokens."""
+
+    def __init__(self, dim: int, heads: int, depth: int) -> None:
+        super().__init__()
+        self.condition = nn.Linear(NUM_CONDITIONS, dim)
+        self.blocks = nn.ModuleList(TransformerBlock(dim, heads) for _ in range(depth))
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, f: Tensor, condition: Tensor) -> Tensor:
+        """Refine ``(B, dim, h, w)`` under a ``(B, 2)`` link state."""
+        batch, dim, rows, columns = f.shape
+        tokens = f.flatten(2).transpose(1, 2)
+        tokens = tokens + positions(rows, columns, dim, tokens)
+        tokens = tokens + self.condition(condition)[:, None].to(tokens.dtype)
+        for block in self.blocks:
+            tokens = block(tokens)
+        return self.norm(tokens).transpose(1, 2).reshape(batch, dim, rows, columns)
+
+
+class VitEncoder(nn.Module):
+    """Patches to tokens to latent."""
+
+    def __init__(self, sizes: VitSizes) -> None:
+        super().__init__()
+        self.fold = nn.PixelUnshuffle(BLOCK_PX)
+        self.stem = nn.Conv2d(_PATCH_VALUES, sizes.dim, 1)
+        self.trunk = Trunk(sizes.dim, sizes.heads, sizes.encoder_depth)
+        self.head = nn.Conv2d(sizes.dim, LATENT_CHANNELS, 1)
+
+    def forward(self, x: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+        """Map ``(B, 3, H, W)`` in [0, 1] to the latent ``(B, 94, H/16, W/16)`` before modulation."""
+        f = self.trunk(self.stem(self.fold(x - 0.5)), condition_vector(snr_db, is_qam))
+        latent: Tensor = self.head(f).float()
+        return latent
+
+
+class VitDecoder(nn.Module):
+    """Latent to tokens to patches."""
+
+    def __init__(self, sizes: VitSizes) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(RECEIVED_CHANNELS, sizes.dim, 1)
+        self.trunk = Trunk(sizes.dim, sizes.heads, sizes.decoder_depth)
+        self.head = nn.Conv2d(sizes.dim, _PATCH_VALUES, 1)
+        self.unfold = nn.PixelShuffle(BLOCK_PX)
+        self.fold8, self.fold4 = nn.PixelUnshuffle(8), nn.PixelUnshuffle(4)
+
+    def forward(
+        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor, is_qam: Tensor
+    ) -> tuple[Tensor, DecoderFeatures]:
+        """Map the received latent to ``(B, 3, 16 h, 16 w)``; finer features are the patches themselves."""
+        flag = (2.0 * is_qam - 1.0).view(-1, 1, 1, 1).expand_as(snr_db)
+        received = torch.cat((y, normalise_snr_db(snr_db), shrink, flag), dim=1)
+        f = self.trunk(self.stem(received), condition_vector(snr_db.mean(dim=(1, 2, 3)), is_qam))
+        pixels = self.unfold(self.head(f)).float()
+        return pixels + 0.5, DecoderFeatures(received, f, self.fold8(pixels), self.fold4(pixels))
+
+
+def build_vit(sizes: VitSizes) -> Transceiver:
+    """Build an untrained transformer transceiver."""
+    branch = ConfidenceBranch((48, 192, sizes.dim), sizes.confidence_channels)
+    return Transceiver(VitEncoder(sizes), VitDecoder(sizes), branch)
