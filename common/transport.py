@@ -5,6 +5,7 @@ a ring that no Python code has to empty. *Every one* for poses, map, camera and 
 order, the sender waits. All payloads are bytes; what they mean is ``wire``'s business.
 """
 
+import atexit
 import contextlib
 import json
 import logging
@@ -131,6 +132,8 @@ class Session:
         self._tokens: list[Any] = []
         self._lock = threading.Lock()
         self._closed = False
+        # A thread still inside zenoh while the interpreter ends would abort the process.
+        atexit.register(self.close)
 
     def __enter__(self) -> Self:
         return self
@@ -303,6 +306,7 @@ class Session:
                 return
             self._closed = True
             pumps, self._pumps = self._pumps, []
+        atexit.unregister(self.close)
         for pump in pumps:
             pump.close()
         with contextlib.suppress(zenoh.ZError):

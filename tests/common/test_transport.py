@@ -201,6 +201,17 @@ def test_nobody_there_and_a_port_in_use_are_said(hub):
         open_session(NetworkSettings(listen=(hub[1],), connect=()))
 
 
+def test_a_program_that_forgets_to_close_still_ends_cleanly():
+    program = (
+        "from semcast.common.transport import open_hub\n"
+        "session, _ = open_hub()\n"
+        "session.subscribe('semcast/a/pose', 'every', print)\n"
+        "session.watch_alive('a', print)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "", "")
+
+
 def test_closing_frees_port_and_threads():
     before = threading.active_count()
     session, endpoint = open_hub()
