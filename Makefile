@@ -4,10 +4,10 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test check format docs clean help
+.PHONY: demo test check format docs results-page clean help
 
 help:            ## what can be made
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
 
 demo: $(VENV)/.ready-run  ## stream the demo sequence over a noisy link and reconstruct it live
 	$(BIN)/semcast demo --out runs/demo $(ARGS)
@@ -27,6 +27,9 @@ format: $(VENV)/.ready-dev  ## rewrite the code in the project's format
 
 docs: $(VENV)/.ready-dev  ## write docs/commands.md from the command line
 	COLUMNS=100 $(BIN)/python -m semcast.reference
+
+results-page: $(VENV)/.ready-run  ## write docs/results.md from evaluation/results
+	$(BIN)/python -m semcast.evaluation.results_page
 
 clean:           ## remove the environment and build products
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

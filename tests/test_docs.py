@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from semcast.cli import VERBS, verb_parser
+from semcast.evaluation.results_page import readme_table, results_page, with_table
 from semcast.reference import reference
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -55,3 +56,10 @@ def test_links_between_pages_lead_somewhere(page):
     for target in LINK.findall(page.read_text(encoding="utf-8")):
         if "://" not in target:
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_the_figures_in_the_docs_are_those_of_the_result_files(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    assert (ROOT / "docs/results.md").read_text(encoding="utf-8") == results_page(), "run make results-page"
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert readme == with_table(readme, readme_table()), "run make results-page"

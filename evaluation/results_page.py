@@ -1,0 +1,199 @@
+"""``docs/results.md`` and the README's table from ``evaluation/results``: no figure is typed by hand.
+
+Files are recognised by their names: ``codec_*``, ``trajectory_*``, ``pairs_*``, ``confidence_*``, ``latency_*``
+and ``demo_*``. Each table is followed by the command, commit and machine that made it.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path("evaluation/results")
+PAGE = Path("docs/results.md")
+README = Path("README.md")
+START, END = "<!-- results -->", "<!-- /results -->"
+
+Report = Mapping[str, Any]
+Tables = Callable[[Report], Iterator[str]]
+
+HEAD = """# Results
+
+Written by `make results-page` from `evaluation/results/*.json`; each file holds the command, the seed, the
+commit and the machine. Trajectory errors are after alignment by a similarity, always with completeness (share of
+frames with a pose). PSNR of an outage counts the grey picture the receiver shows then (12.8 dB on Kodak).
+What the figures mean and what limits them is in [reading the results](reading-results.md).
+"""
+
+
+def number(value: Any, digits: int = 2) -> str:
+    """Return a figure as text, a dash where there is none."""
+    if value is None:
+        return "-"
+    return f"{value:.{digits}f}" if isinstance(value, float) else str(value)
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of a Markdown table."""
+    yield "| " + " | ".join(head) + " |"
+    yield "|" + "---|" * len(head)
+    for row in rows:
+        yield "| " + " | ".join(row) + " |"
+
+
+def _codec(report: Report) -> Iterator[str]:
+    rows = report["results"]
+    snrs = sorted({row["snr_db"] for row in rows})
+    for key, name, digits in (("psnr_db", "PSNR dB", 2), ("ssim", "SSIM", 3), ("ms_ssim", "MS-SSIM", 3)):
+        body = []
+        for codec in dict.fromkeys(row["codec"] for row in rows):
+            at = {row["snr_db"]: row[key] for row in rows if row["codec"] == codec}
+            body.append([codec, *(number(at.get(snr), digits) for snr in snrs)])
+        yield from table([name, *(f"{snr:g} dB" for snr in snrs)], body)
+        yield ""
+
+
+def _trajectory(report: Report) -> Iterator[str]:
+    head = ["SNR dB", "confidence", "ATE m", "ATE %", "completeness", "RPE %", "RPE deg", "PSNR dB", "seeds"]
+    yield from table(
+        head,
+        [
+            [
+                number(cell["snr_db"], 0) if cell["snr_db"] is not None else "no link",
+                cell["confidence"],
+                number(cell["ate_rmse_m"], 3),
+                number(cell["ate_percent"], 3),
+                number(cell["completeness"], 3),
+                number(cell["rpe_trans_percent"]),
+                number(cell["rpe_rot_deg"], 3),
+                number(cell["psnr_db"]),
+                str(len(cell["seeds"])),
+            ]
+            for cell in report["cells"]
+        ],
+    )
+
+
+def _pairs(report: Report) -> Iterator[str]:
+    keys = ("rot_deg_mean", "rot_deg_median", "tdir_deg_mean", "tdir_deg_median", "auc5", "auc10", "auc20")
+    cells = report.get("cells") or [report]
+    for cell in cells:
+        if cell.get("snr_db") is not None and not isinstance(cell["snr_db"], list):
+            yield f"{cell['snr_db']:g} dB:\n"
+        rows = [[mode, *(number(r.get(key)) for key in keys)] for mode, r in cell["results"].items()]
+        yield from table(["estimator", *(key.replace("_", " ") for key in keys)], rows)
+        yield ""
+
+
+def _confidence(report: Report) -> Iterator[str]:
+    for result in report["results"]:
+        yield f"{result['snr_db']:g} dB:\n"
+        rows = [
+            [f"{target}: {name}", number(value, 3)]
+            for target, grades in result.items()
+            if isinstance(grades, dict)
+            for name, value in grades.items()
+            if value is None or isinstance(value, (int, float))
+        ]
+        yield from table(["grade", "value"], rows)
+        yield ""
+
+
+def _latency(report: Report) -> Iterator[str]:
+    width, height = report["image_wh"]
+    yield f"{report['num_frames']} frames of {width}x{height}. Bottleneck: **{report['bottleneck']}**.\n"
+    yield from table(
+        ["stage", "p50 ms", "p95 ms", "runs on", "share of time"],
+        [
+            [
+                name,
+                number(s["p50"], 1),
+                number(s["p95"], 1),
+                f"{s['ran_share']:.0%}",
+                f"{s['time_share']:.0%}",
+            ]
+            for name, s in report["stages"].items()
+        ],
+    )
+
+
+def _demo(report: Report) -> Iterator[str]:
+    width, height = report["stream"]["image_wh"]
+    yield f"Three live processes and the viewer's recording, {width}x{height}, codec {report['stream']['codec']}.\n"
+    psnr = report["psnr_db"]
+    rows = [
+        ["frames with a pose", f"{report['completeness']:.1%}"],
+        ["ATE RMSE", f"{number(report['ate_rmse_m'], 3)} m"],
+        ["ATE in percent of the path", f"{number(report['ate_percent'], 3)} %"],
+        ["PSNR", f"{number(psnr.get('mean') if isinstance(psnr, dict) else psnr)} dB"],
+    ]
+    rows += [[f"dropped: {reason}", str(count)] for reason, count in report["drops"].items()]
+    for stage, figures in report["stage_ms"].items():
+        rows.append([f"{stage}, p50 / p95", f"{number(figures['p50'], 1)} / {number(figures['p95'], 1)} ms"])
+    yield from table(["figure", "value"], rows)
+
+
+SECTIONS: dict[str, tuple[str, Tables]] = {
+    "demo": ("The live demo", _demo),
+    "codec": ("Image quality per channel use (CBR 1/16, pilots included)", _codec),
+    "trajectory": ("Trajectories", _trajectory),
+    "pairs": ("Relative pose of frame pairs", _pairs),
+    "confidence": ("What the confidence maps are worth", _confidence),
+    "latency": ("Where the time goes", _latency),
+}
+
+
+def results_page(folder: Path = RESULTS) -> str:
+    """Return the page for all result files of a folder as Markdown."""
+    lines = [HEAD]
+    for kind, (title, tables) in SECTIONS.items():
+        files = sorted(folder.glob(f"{kind}_*.json"))
+        if files:
+            lines.append(f"## {title}\n")
+        for file in files:
+            report = json.loads(file.read_text(encoding="utf-8"))
+            lines.append(f"### {file.stem.removeprefix(kind + '_').replace('_', ' ')}\n")
+            lines.extend(tables(report))
+            commit = str(report.get("commit", "")).partition("+")
+            made = f"commit {commit[0][:12]}{commit[1]}{commit[2]}" if commit[0] else "see the file"
+            lines.append(
+                f"\n`{report.get('command', file.name)}` ({made}, {report.get('machine', '')}; `{file}`)\n"
+            )
+    return "\n".join(lines)
+
+
+def readme_table(folder: Path = RESULTS) -> str:
+    """Return the README's short table: every trajectory cell of the default mode, one line each."""
+    rows = []
+    for file in sorted(folder.glob("trajectory_*.json")):
+        report = json.loads(file.read_text(encoding="utf-8"))
+        channel = report["settings"]["link"]["channel"]
+        for cell in report["cells"]:
+            if cell["confidence"] == "robust":
+                link = "clean images" if cell["snr_db"] is None else f"{channel}, {cell['snr_db']:g} dB"
+                figures = (
+                    number(cell["psnr_db"], 1),
+                    number(cell["ate_percent"]),
+                    f"{cell['completeness']:.0%}",
+                )
+                rows.append([report["sequence"], link, *figures])
+    head = ("sequence", "link", "PSNR dB", "path error (ATE, % of path)", "frames with a pose")
+    return "\n".join(table(head, sorted(rows)))
+
+
+def with_table(readme: str, rows: str) -> str:
+    """Return the README with the lines between its two markers replaced.
+
+    Raises:
+        ValueError: A marker is missing.
+    """
+    before, start, rest = readme.partition(START)
+    _, end, after = rest.partition(END)
+    if not start or not end:
+        raise ValueError(f"README must hold {START} and {END}")
+    return f"{before}{start}\n{rows}\n{end}{after}"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(results_page(), encoding="utf-8")
+    README.write_text(with_table(README.read_text(encoding="utf-8"), readme_table()), encoding="utf-8")
