@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from semcast.common.codec import Codec, Modulation
 from semcast.common.codecs import load_codec
-from semcast.common.errors import SemcastError
+from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.keys import camera_key, control_key
 from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
 from semcast.common.metrics import Metrics
 from semcast.common.run_folder import VIEWER_NAME
+from semcast.common.sequence import open_sequence
 from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
 from semcast.common.transport import open_session
@@ -89,8 +90,8 @@ class Server:
             )
             stack.callback(beat.close)
             session.answer(control_key(self._agent_id, "server"), self._answer)
-            self._make_ready()
             stack.callback(self._close_spare)
+            self._make_ready()
             session.subscribe(camera_key(self._agent_id), "every", self._on_camera)
             self._ask_for_camera(session)
             self._ahead = DecodeAhead(self._receiver.next, self._decoder.decode, self._on_failure)
@@ -107,11 +108,20 @@ class Server:
         )
 
     def _make_ready(self) -> None:
-        """Do what takes long before others see that the server is there."""
+        """Do what takes long, or may fail, before others see that the server is there."""
         settings = self._settings
+        if settings.out is not None:
+            try:
+                settings.out.mkdir(parents=True, exist_ok=True)
+            except OSError as err:
+                raise ConfigError(f"{settings.out} can't be made a folder for outputs: {err}") from err
+        if settings.reference is not None:
+            open_sequence(settings.reference)
         self._spare_bundle = new_bundle(settings)
         if settings.view.view != "none":
-            importlib.import_module("semcast.server.viewer_feed")
+            importlib.import_module("semcast.server.viewer_feed").check_view(
+                settings.view, has_folder=settings.out is not None
+            )
         if settings.codec is not None:
             codec = self._decoder.load(settings.codec, settings.modulation)
             self._decoder.warm_up(codec.name, settings.modulation, codec.digest, WARM_UP_SHAPE_HW)
@@ -311,7 +321,7 @@ class Server:
             return
         from semcast.server.viewer_feed import ViewerFeed, resolve_view
 
-        if view == "auto" and resolve_view(view) == "file" and out is None:
+        if resolve_view(view, has_folder=out is not None) == "none":
             return
         file = out / VIEWER_NAME if out is not None else None
         if file is not None and resumed:

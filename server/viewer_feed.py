@@ -20,7 +20,7 @@ from semcast.server.scene import Cursor, FrameView, Scene, compress_picture
 from semcast.server.settings import ViewSettings
 from semcast.server.state import MapUpdate
 from semcast.server.viewer import Delivery, RerunStream
-from semcast.server.viewer_process import ViewerProcess, is_listening
+from semcast.server.viewer_process import ViewerProcess, is_listening, rerun_binary
 
 logger = logging.getLogger(__name__)
 
@@ -33,14 +33,27 @@ FILE_FLUSH_INTERVAL_S = 1.0
 JOIN_DEADLINE_S = 5.0
 
 
-def resolve_view(view: str) -> str:
-    """Turn ``auto`` into ``native`` where a window can open, else ``file``; others stay."""
+def resolve_view(view: str, *, has_folder: bool) -> str:
+    """Turn ``auto`` into ``native`` where a window can open, else ``file`` or ``none``; others stay."""
     if view != "auto":
         return view
     windowed = sys.platform in ("darwin", "win32") or bool(
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     )
-    return "native" if windowed else "file"
+    return "native" if windowed else "file" if has_folder else "none"
+
+
+def check_view(settings: ViewSettings, *, has_folder: bool) -> None:
+    """Check early that what is asked for can be shown.
+
+    Raises:
+        ConfigError: ``file`` without an output folder, or no viewer is installed.
+    """
+    view = resolve_view(settings.view, has_folder=has_folder)
+    if view == "file" and not has_folder:
+        raise ConfigError("view file needs an output folder: give --out DIR")
+    if view in ("native", "web"):
+        rerun_binary()
 
 
 class ViewerFeed:
@@ -87,9 +100,8 @@ class ViewerFeed:
         self._last_picture_s = -1e9
         self._last_align_s = -1e9
         self.num_connections = 0
-        view = resolve_view(settings.view)
-        if view == "file" and file is None:
-            raise ConfigError("view file needs an output folder: give --out DIR")
+        check_view(settings, has_folder=file is not None)
+        view = resolve_view(settings.view, has_folder=file is not None)
         self._file = self._open_stream(file) if file is not None else None
         self._process = process
         if process is None and view in ("native", "web"):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from semcast.common.codec import DecodedImage, EncodedImage
-from semcast.common.errors import CheckpointError
+from semcast.common.errors import CheckpointError, ConfigError, SourceError
 from semcast.common.keys import camera_key, control_key, flow_key, pose_key, rx_key
 from semcast.common.messages import (
     CameraInfo,
@@ -377,6 +377,19 @@ def test_a_codec_asked_for_at_the_start_must_exist(hub):
     session, _ = hub
     with pytest.raises(CheckpointError, match="no weights of nothing"):
         Server(ServerSettings(agent_id=AGENT, codec="nothing"), session, load)
+
+
+def test_what_cannot_work_is_said_before_the_server_shows_itself(hub, tmp_path):
+    session, _ = hub
+    (tmp_path / "file").write_text("")
+    for changes, error, text in (
+        ({"reference": tmp_path / "nowhere"}, SourceError, "nowhere"),
+        ({"out": tmp_path / "file"}, ConfigError, "folder for outputs"),
+        ({"view": ViewSettings(view="file")}, ConfigError, "--out"),
+    ):
+        with pytest.raises(error, match=text):
+            Server(ServerSettings(agent_id=AGENT, bundle="inline", **changes), session)
+    assert session.alive_roles(AGENT) == set()
 
 
 @pytest.mark.parametrize(

@@ -121,10 +121,11 @@ def test_auto_opens_a_window_only_where_there_is_a_display(monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.delenv("DISPLAY", raising=False)
-    assert resolve_view("auto") == "file"
+    assert resolve_view("auto", has_folder=True) == "file"
+    assert resolve_view("auto", has_folder=False) == "none"
     monkeypatch.setenv("DISPLAY", ":7")
-    assert resolve_view("auto") == "native"
-    assert resolve_view("web") == "web"
+    assert resolve_view("auto", has_folder=False) == "native"
+    assert resolve_view("web", has_folder=False) == "web"
 
 
 def test_a_killed_viewer_is_back_soon_and_gets_the_stream_again(feed_and_proxy):
