@@ -1,7 +1,7 @@
 """``docs/results.md`` and the README's table from ``evaluation/results``: no figure is typed by hand.
 
-Files are recognised by their names: ``codec_*``, ``trajectory_*``, ``pairs_*``, ``confidence_*``, ``latency_*``
-and ``demo_*``. Each table is followed by the command, commit and machine that made it.
+Files are recognised by their names: ``codec_*``, ``trajectory_*``, ``pairs_*``, ``confidence_*``,
+``latency_*`` and ``demo_*``. Each table is followed by the command, commit and machine that made it.
 """
 
 import json
@@ -20,8 +20,8 @@ Tables = Callable[[Report], Iterator[str]]
 HEAD = """# Results
 
 Written by `make results-page` from `evaluation/results/*.json`; each file holds the command, the seed, the
-commit and the machine. Trajectory errors are after alignment by a similarity, always with completeness (share of
-frames with a pose). PSNR of an outage counts the grey picture the receiver shows then (12.8 dB on Kodak).
+commit and the machine. Trajectory errors are after alignment by a similarity, always with completeness (share
+of frames with a pose). PSNR of an outage counts the grey picture the receiver shows then (12.8 dB on Kodak).
 What the figures mean and what limits them is in [reading the results](reading-results.md).
 """
 
@@ -119,7 +119,8 @@ def _latency(report: Report) -> Iterator[str]:
 
 def _demo(report: Report) -> Iterator[str]:
     width, height = report["stream"]["image_wh"]
-    yield f"Three live processes and the viewer's recording, {width}x{height}, codec {report['stream']['codec']}.\n"
+    codec = report["stream"]["codec"]
+    yield f"Three live processes and the viewer's recording, {width}x{height}, codec {codec}.\n"
     psnr = report["psnr_db"]
     rows = [
         ["frames with a pose", f"{report['completeness']:.1%}"],
