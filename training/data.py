@@ -47,11 +47,11 @@ def read_images(folder: Path) -> list[NDArray[np.uint8]]:
     Raises:
         SourceError: The folder holds no readable image.
     """
-    images = []
+    images: list[NDArray[np.uint8]] = []
     for path in sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES):
         bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if bgr is not None:
-            images.append(np.ascontiguousarray(bgr[:, :, ::-1]))
+            images.append(np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8))
     if not images:
         raise SourceError(f"{folder} holds no readable image ({', '.join(SUFFIXES)})")
     return images

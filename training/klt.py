@@ -63,12 +63,17 @@ def start_from_klt(model: Transceiver, images: list[NDArray[np.uint8]], generato
     mixing = torch.linalg.qr(torch.randn(LATENT_CHANNELS, LATENT_CHANNELS, generator=generator))[0].numpy()
     analysis = gain[:, None] * basis
     synthesis = (basis / gain[:, None]).T  # (768, 94)
+    start = {
+        heart_in.transform.weight: analysis[:, :, None, None],
+        heart_in.transform.bias: -analysis @ mean,
+        heart_in.mix.weight: _LATENT_RMS * mixing[:, :, None, None],
+        heart_out.unmix.weight: mixing.T[:, :, None, None] / _LATENT_RMS,
+        heart_out.unmix.bias: np.zeros(LATENT_CHANNELS),
+        heart_out.log_power: np.log(power),
+        heart_out.transform.weight: synthesis[:, :, None, None],
+        heart_out.transform.bias: mean,
+    }
     with torch.no_grad():
-        heart_in.transform.weight.copy_(torch.from_numpy(analysis)[:, :, None, None])
-        heart_in.transform.bias.copy_(torch.from_numpy(-analysis @ mean))
-        heart_in.mix.weight.copy_(_LATENT_RMS * torch.from_numpy(mixing)[:, :, None, None])
-        heart_out.unmix.weight.copy_(torch.from_numpy(mixing.T / _LATENT_RMS)[:, :, None, None])
-        heart_out.unmix.bias.zero_()
-        heart_out.log_power.copy_(torch.from_numpy(np.log(power)))
-        heart_out.transform.weight.copy_(torch.from_numpy(synthesis)[:, :, None, None])
-        heart_out.transform.bias.copy_(torch.from_numpy(mean))
+        for weight, values in start.items():
+            if weight is not None:
+                weight.copy_(torch.from_numpy(values))

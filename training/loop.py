@@ -85,7 +85,7 @@ class Run:
         checkpoint = self._read_checkpoint()
         if checkpoint is None and settings.start == "klt":
             start_from_klt(model, self.images, torch.Generator().manual_seed(settings.seed))
-        self.model = model.to(self.device, memory_format=torch.channels_last)
+        self.model = model.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.model).eval()
         self.optimisers = build_optimisers(self.model, settings)
         if checkpoint is not None:
@@ -195,8 +195,8 @@ class Run:
         noise = torch.randn(settings.batch, LATENT_CHANNELS, blocks, blocks, generator=generator).to(
             self.device
         )
-        in_decay = share >= 1.0 - settings.decay_share
-        with_heads = in_decay or self.step % settings.head_every == 0
+        is_ending = share >= 1.0 - settings.decay_share / 4.0
+        with_heads = is_ending or self.step % settings.head_every == 0
         set_rate(self.optimisers, rate_factor(share, self.step, settings))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=settings.bf16):
             loss, logs = self.loss(self.model, x, draw, noise, settings.loss, with_heads)

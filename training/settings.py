@@ -37,7 +37,10 @@ class TrainSettings:
     ema: float = field(default=0.999, metadata={"help": "decay of the averaged weights that are shipped"})
     start: Literal["klt", "random"] = field(default="klt", metadata={"help": "linear layers at the start"})
     head_every: int = field(
-        default=4, metadata={"help": "train the confidence heads every N steps until the decay"}
+        default=4,
+        metadata={
+            "help": "train the confidence heads every N steps, and always in the last quarter of the decay"
+        },
     )
     seed: int = field(default=0, metadata={"help": "seed of weights, data order and links"})
     device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where to train"})

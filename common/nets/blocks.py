@@ -59,7 +59,8 @@ class ResidualUnit(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Refine ``(B, C, H, W)``."""
-        return x + self.conv2(torch.relu(self.conv1(x)))
+        refined: Tensor = x + self.conv2(torch.relu(self.conv1(x)))
+        return refined
 
 
 class Stage(nn.Module):
@@ -88,4 +89,5 @@ class Upsample(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map ``(B, C, H, W)`` to ``(B, C', 2H, 2W)``."""
-        return self.shuffle(self.conv(x))
+        doubled: Tensor = self.shuffle(self.conv(x))
+        return doubled

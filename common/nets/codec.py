@@ -1,6 +1,7 @@
 """A trained transceiver behind the codec interface: numpy in, numpy out, on CPU or GPU."""
 
-import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -22,8 +23,6 @@ from semcast.common.nets.latent import latent_from_symbols, symbols_from_latent
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, layout_for
 from semcast.common.shapes import check_shape
-
-logger = logging.getLogger(__name__)
 
 #: No honest equaliser gives larger values; anything above is damage.
 _MAX_SYMBOL = 16.0
@@ -57,7 +56,8 @@ class NeuralCodec:
         self._modulation: Modulation = modulation
         self._device = device
         self._half = device.type == "cuda" or has_fast_bfloat16()
-        self._model = model.to(device, memory_format=torch.channels_last).eval().requires_grad_(False)
+        self._model = model.to(device).eval().requires_grad_(False)
+        self._model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._is_qam = (
             torch.ones(1, device=device) if modulation == "16qam" else torch.zeros(1, device=device)
         )
@@ -131,7 +131,7 @@ class NeuralCodec:
         bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX
         if bottom or right:
             image = np.pad(image, ((0, bottom), (0, right), (0, 0)), mode="edge")
-        with self._precision():
+        with _inference(self._device.type, self._half):
             pixels = torch.from_numpy(np.ascontiguousarray(image)).to(self._device)
             # (1, 3, H, W) in channels_last: the memory of the image as it is.
             x = pixels[None].permute(0, 3, 1, 2).float().mul_(1.0 / 255.0)
@@ -171,7 +171,7 @@ class NeuralCodec:
             latent = np.nan_to_num(latent, nan=0.0, posinf=0.0, neginf=0.0)
         latent = latent.clip(-_MAX_SYMBOL, _MAX_SYMBOL)
         height, width = received.shape_hw
-        with self._precision():
+        with _inference(self._device.type, self._half):
             y_rx = torch.from_numpy(latent)[None].to(self._device, memory_format=torch.channels_last)
             plane = torch.from_numpy(snr_db).to(self._device).view(1, 1, -1, 1)
             plane = plane.expand(1, 1, -1, layout.blocks_per_slot)
@@ -188,21 +188,9 @@ class NeuralCodec:
             outage=bool((snr_db <= LOST_SLOT_SNR_DB).all()),
         )
 
-    def _precision(self) -> "_Inference":
-        return _Inference(self._device.type, self._half)
 
-
-class _Inference:
-    """``inference_mode`` and, where it pays, bfloat16 autocast, as one context."""
-
-    def __init__(self, device_type: str, half: bool) -> None:
-        self._no_grad = torch.inference_mode()
-        self._cast = torch.autocast(device_type, torch.bfloat16, enabled=half)
-
-    def __enter__(self) -> None:
-        self._no_grad.__enter__()
-        self._cast.__enter__()
-
-    def __exit__(self, *error: object) -> None:
-        self._cast.__exit__(*error)  # type: ignore[arg-type]
-        self._no_grad.__exit__(*error)  # type: ignore[arg-type]
+@contextmanager
+def _inference(device_type: str, half: bool) -> Iterator[None]:
+    """No gradients and, where it pays, bfloat16 autocast."""
+    with torch.inference_mode(), torch.autocast(device_type, torch.bfloat16, enabled=half):
+        yield

@@ -49,4 +49,5 @@ class Encoder(nn.Module):
         f = self.down16(self.stage8(f, condition)).relu()
         f = self.stage16(f, condition)
         added, log_gain = self.head(f.relu()).chunk(2, dim=1)
-        return self.linear(x, log_gain).float() + added.float()
+        latent: Tensor = self.linear(x, log_gain).float() + added.float()
+        return latent

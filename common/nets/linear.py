@@ -77,4 +77,5 @@ class BlockSynthesis(nn.Module):
         log_noise = torch.log(noise + torch.exp(log_distortion))
         wiener = torch.sigmoid(self.log_power.view(1, -1, 1, 1) + more_power - log_noise)
         gain = wiener * torch.exp(log_gain.clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN))
-        return self.unfold(self.transform(coefficients * gain))
+        x: Tensor = self.unfold(self.transform(coefficients * gain))
+        return x

@@ -23,12 +23,12 @@ class _NearestLevel(torch.autograd.Function):
     """Round to the nearest level; pass the gradient straight through inside the clipping range."""
 
     @staticmethod
-    def forward(ctx: Any, y: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+    def forward(ctx: Any, y: Tensor) -> Tensor:
         ctx.save_for_backward(y)
         return (torch.floor(y / LEVEL_STEP).clamp(-2.0, 1.0) + 0.5) * LEVEL_STEP
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[no-untyped-def, override]
+    def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
         (y,) = ctx.saved_tensors
         pulls_inward = (y * grad) > 0
         return torch.where((y.abs() < CLIP) | pulls_inward, grad, torch.zeros_like(grad))
@@ -36,7 +36,8 @@ class _NearestLevel(torch.autograd.Function):
 
 def nearest_level(y: Tensor) -> Tensor:
     """Round every value to the nearest 4-PAM level; the gradient is the identity inside ``+-CLIP``."""
-    return _NearestLevel.apply(y)
+    rounded: Tensor = _NearestLevel.apply(y)  # type: ignore[no-untyped-call]
+    return rounded
 
 
 def carrier_pattern(like: Tensor) -> Tensor:

@@ -89,7 +89,8 @@ class Trunk(nn.Module):
         tokens = tokens + self.condition(condition)[:, None].to(tokens.dtype)
         for block in self.blocks:
             tokens = block(tokens)
-        return self.norm(tokens).transpose(1, 2).reshape(batch, dim, rows, columns)
+        grid: Tensor = self.norm(tokens).transpose(1, 2).reshape(batch, dim, rows, columns)
+        return grid
 
 
 class VitEncoder(nn.Module):
