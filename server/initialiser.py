@@ -27,7 +27,7 @@ MAX_HISTORY = 300
 START_KEYFRAMES = 5
 MIN_POINTS = 40
 #: Share of the reference's tracks that must still be there; else the reference moves on.
-_MIN_SHARED = 0.35
+_MIN_SHARED = 0.12
 #: Median way of the tracks, as share of the image width, below which no start is tried.
 _MIN_FLOW_SHARE = 0.012
 #: Median angle between the rays of the two views.

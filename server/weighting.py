@@ -31,6 +31,8 @@ SIGMA0_RANGE_PX = (0.25, 6.0)
 #: A gate is never narrower than that of this sigma: landmarks have errors of their own, and a gate that
 #: follows the residuals it lets through would close by itself.
 _MIN_GATE_SIGMA_PX = 0.6
+#: The pixel confidence is trained on ``1 - tanh(30 |x_hat - x|)`` (paper Sec. III-B) with images in [0, 1].
+_LABEL_SHARPNESS = 30.0
 #: Median of |x| / sigma under normal noise.
 _MAD_TO_SIGMA = 1.0 / 0.67449
 
@@ -211,7 +213,8 @@ def geometric_confidence(cues: KeypointCues) -> Array:
     """
     noise_grey = np.full(len(cues.gradient_grey2), 2.0)
     if cues.pixel_confidence is not None:
-        noise_grey = np.maximum(noise_grey, 255.0 * (1.0 - np.clip(cues.pixel_confidence, 0.0, 1.0)))
+        doubt = 1.0 - np.clip(cues.pixel_confidence, 0.0, 1.0)
+        noise_grey = np.maximum(noise_grey, 255.0 / _LABEL_SHARPNESS * np.arctanh(np.minimum(doubt, 0.999)))
     noise_grey = np.maximum(noise_grey, cues.photometric_grey)
     # Noise of decoded images is correlated over blocks: a window holds about 16 independent values.
     bound_px2 = noise_grey**2 / (16.0 * np.maximum(cues.gradient_grey2, 0.5))
