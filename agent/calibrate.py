@@ -156,7 +156,7 @@ def _fit(
     observed = [np.ascontiguousarray(view.corners_xy[:, None]) for view in views]
     try:
         rms_px, K, coefficients, rotations, translations, deviations, _, per_view = (
-            cv2.calibrateCameraExtended(
+            cv2.calibrateCameraExtended(  # type: ignore[call-overload]  # the stubs refuse None matrices
                 [points] * len(views), observed, size_wh, None, None, flags=_CV_FLAGS[distortion]
             )
         )

@@ -2,7 +2,7 @@
 
 from importlib import resources
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
 from semcast.common.codec import MODULATIONS, Codec, Modulation
 from semcast.common.config import near_match
@@ -41,7 +41,7 @@ def load_codec(
     *,
     modulation: Modulation = "16qam",
     num_threads: int | None = None,
-    device: str = "auto",
+    device: Literal["auto", "cpu", "cuda"] = "auto",
     weights: Path | None = None,
 ) -> Codec:
     """Load a codec, ready for use.

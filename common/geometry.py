@@ -46,10 +46,10 @@ def exp_so3(rotation_vector_rad: ArrayLike) -> Array:
     angle_rad = float(np.linalg.norm(w))
     W = skew(w)
     if angle_rad < 1e-8:
-        return np.eye(3) + W + 0.5 * W @ W
+        return np.asarray(np.eye(3) + W + 0.5 * W @ W)
     a = np.sin(angle_rad) / angle_rad
     b = (1.0 - np.cos(angle_rad)) / angle_rad**2
-    return np.eye(3) + a * W + b * (W @ W)
+    return np.asarray(np.eye(3) + a * W + b * (W @ W))
 
 
 def log_so3(R: ArrayLike) -> Array:

@@ -9,34 +9,41 @@ from rich.console import Console
 from rich.table import Table
 
 from semcast.commands.running import add_settings, read_settings
-from semcast.evaluation.codec import CodecSettings, evaluate_codec
-from semcast.evaluation.confidence import ConfidenceSettings, evaluate_confidence
-from semcast.evaluation.latency import LatencySettings, evaluate_latency
-from semcast.evaluation.pairs import PairSettings, evaluate_pairs
-from semcast.evaluation.pipeline import UNUSED_LINK_FIELDS
-from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory
-
-#: The SNRs and the seed of a run are the evaluation's own settings, not those of the nested parts.
-_NESTED = frozenset({"reconstruction.seed"}) | UNUSED_LINK_FIELDS
-_WITH_MODES = _NESTED | {"reconstruction.confidence"}
+from semcast.evaluation import codec, confidence, latency, pairs, trajectory
 
 _Evaluation = tuple[type, Callable[[Any], dict[str, Any]], frozenset[str], str]
+#: what -> settings, function, settings the evaluation sets itself, one line of help
 EVALUATIONS: dict[str, _Evaluation] = {
     "trajectory": (
-        TrajectorySettings,
-        evaluate_trajectory,
-        _WITH_MODES,
+        trajectory.TrajectorySettings,
+        trajectory.evaluate_trajectory,
+        trajectory.UNUSED_FIELDS,
         "send a recording over the channel, reconstruct it and compare with the true path",
     ),
     "pairs": (
-        PairSettings,
-        evaluate_pairs,
-        _WITH_MODES,
+        pairs.PairSettings,
+        pairs.evaluate_pairs,
+        pairs.UNUSED_FIELDS,
         "relative-pose error of frame pairs, with and without confidence, beside other estimators",
     ),
-    "codec": (CodecSettings, evaluate_codec, _NESTED, "image quality of codecs over SNR"),
-    "confidence": (ConfidenceSettings, evaluate_confidence, _NESTED, "grade the confidence maps of a codec"),
-    "latency": (LatencySettings, evaluate_latency, _NESTED, "time every stage from encoder to viewer"),
+    "codec": (
+        codec.CodecSettings,
+        codec.evaluate_codec,
+        codec.UNUSED_LINK_FIELDS,
+        "image quality of codecs over SNR",
+    ),
+    "confidence": (
+        confidence.ConfidenceSettings,
+        confidence.evaluate_confidence,
+        confidence.UNUSED_FIELDS,
+        "grade the confidence maps of a codec",
+    ),
+    "latency": (
+        latency.LatencySettings,
+        latency.evaluate_latency,
+        latency.UNUSED_FIELDS,
+        "time every stage from encoder to viewer",
+    ),
 }
 
 
@@ -63,7 +70,7 @@ def _table(what: str, rows: list[dict[str, Any]]) -> Table:
 
 def _rows(report: dict[str, Any]) -> list[dict[str, Any]]:
     """Find the rows of a report: cells, results (a list or one entry per mode) or stages."""
-    for key in ("cells", "results", "stages"):
+    for key in ("results", "cells", "stages"):
         value = report.get(key)
         if isinstance(value, list) and value and isinstance(value[0], dict):
             return value
@@ -75,7 +82,7 @@ def _rows(report: dict[str, Any]) -> list[dict[str, Any]]:
 def run(arguments: argparse.Namespace) -> int:
     """Run one evaluation; a table on stdout, or the whole JSON where no ``--json`` file takes it."""
     cls, evaluate, _, text = EVALUATIONS[arguments.what]
-    settings = read_settings(cls, arguments)
+    settings: Any = read_settings(cls, arguments)
     talk = Console(stderr=True)
     with talk.status(f"{text} ..."):
         report = evaluate(settings)
