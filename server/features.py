@@ -39,6 +39,7 @@ def detect_corners(
     occupied_xy: Array | None = None,
     usable: NDArray[np.bool_] | None = None,
     cell_px: int = 48,
+    strength: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Find corners, spread over the image by taking the strongest of every cell.
 
@@ -49,6 +50,7 @@ def detect_corners(
             counts for its cell.
         usable: ``(H, W)`` bool, False where no corner may be taken (lost bands).
         cell_px: Side of a cell.
+        strength: ``corner_strength(grey)`` where it is known already.
 
     Returns:
         ``(N, 2)`` float32 pixels, strongest first within each round over the cells.
@@ -56,7 +58,7 @@ def detect_corners(
     height, width = grey.shape
     if num_wanted <= 0 or height <= 2 * BORDER_PX or width <= 2 * BORDER_PX:
         return np.zeros((0, 2), np.float32)
-    strength = corner_strength(grey)
+    strength = corner_strength(grey) if strength is None else strength
     floor = max(_MIN_EIGEN_GREY2, _MIN_EIGEN_SHARE * float(strength.max()))
     peak = (strength >= cv2.dilate(strength, np.ones((7, 7), np.uint8))) & (strength > floor)
     peak[:BORDER_PX] = peak[-BORDER_PX:] = False

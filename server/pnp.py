@@ -124,8 +124,10 @@ def refine_pose(
         w = weight[used] * np.minimum(1.0, k / np.maximum(length, 1e-9))
         if iteration >= 2:
             w = np.where(length < 3.0 * gate_px[used], w, 0.0)
-        hessian = np.einsum("nij,n,nik->jk", J, w, J, optimize=True)
-        gradient = np.einsum("nij,n,ni->j", J, w, residual, optimize=True)
+        rows = J.reshape(-1, 6)
+        weighted = (rows * np.repeat(w, 2)[:, None]).T
+        hessian = weighted @ rows
+        gradient = weighted @ residual.ravel()
         if prior_information is not None:
             hessian = hessian + prior_information
             gradient = gradient - prior_information @ offset
@@ -137,7 +139,7 @@ def refine_pose(
             return _without_inliers(T_start, len(points_world))
         T = exp_se3(step) @ T
         offset = offset + step
-        if iteration >= 3 and float(np.abs(step).max()) < 1e-7:
+        if iteration >= 3 and float(np.abs(step).max()) < 1e-6:
             break
     T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
     residual, front = reprojection_residual(camera, T, points_world, keypoints_xy)

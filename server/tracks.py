@@ -198,14 +198,14 @@ class TrackTable:
             usable = np.repeat(rows[:, None], sight.grey.shape[1], axis=1)
         height, width = sight.grey.shape
         cell_px = int(np.clip(np.sqrt(height * width / max(1.0, self._max_features / 2.5)), 16, 96))
-        corners = detect_corners(sight.grey, wanted, self.xy[self.visible], usable, cell_px).astype(
-            np.float64
-        )
+        strength = corner_strength(sight.grey)
+        corners = detect_corners(sight.grey, wanted, self.xy[self.visible], usable, cell_px, strength)
+        corners = corners.astype(np.float64)
         count = len(corners)
         if count == 0:
             return 0
-        strength = sample_map(corner_strength(sight.grey), corners)
-        cues = self._cues(sight, corners, np.full(count, 0.1), np.zeros(count), strength)
+        gradient = sample_map(strength, corners)
+        cues = self._cues(sight, corners, np.full(count, 0.1), np.zeros(count), gradient)
         self.ids = np.concatenate([self.ids, self._next_id + np.arange(count, dtype=np.int64)])
         self._next_id += count
         around = self.velocity[self.visible]

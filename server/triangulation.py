@@ -17,7 +17,7 @@ class Triangulation:
 
     Attributes:
         xyz: ``(P, 3)`` world frame.
-        parallax_deg: ``(P,)`` largest angle between two of a point's rays.
+        parallax_deg: ``(P,)`` largest angle of a point's rays to its first ray.
         error_sigma: ``(P,)`` root mean square reprojection error in standard deviations.
         in_front: ``(P,)`` bool, positive depth in every view.
     """
@@ -72,7 +72,7 @@ def triangulate(
     b = _sum_by(point, np.einsum("mij,mj->mi", across, centre) * w[:, None], num_points)
     xyz = _solve(A, b)
     for _ in range(refinements):
-        points_cam = np.einsum("mij,mj->mi", R, xyz[point]) + t
+        points_cam = (R @ xyz[point][:, :, None])[..., 0] + t
         z = np.maximum(points_cam[:, 2], MIN_DEPTH_MAP)
         u, v = points_cam[:, 0] / z, points_cam[:, 1] / z
         residual = keypoints_xy - np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1)
@@ -84,17 +84,21 @@ def triangulate(
             ],
             axis=1,
         )
-        J = np.einsum("mij,mjk->mik", J_cam, R)
+        J = J_cam @ R
         good = (points_cam[:, 2] > MIN_DEPTH_MAP) & np.isfinite(residual).all(axis=1)
         step_w = np.where(good, w, 0.0)
-        H = _sum_by(point, np.einsum("mij,m,mik->mjk", J, step_w, J), num_points)
-        g = _sum_by(point, np.einsum("mij,m,mi->mj", J, step_w, np.nan_to_num(residual)), num_points)
+        H = _sum_by(point, np.swapaxes(J, 1, 2) @ (J * step_w[:, None, None]), num_points)
+        g = _sum_by(
+            point,
+            (np.swapaxes(J, 1, 2) @ (np.nan_to_num(residual) * step_w[:, None])[..., None])[..., 0],
+            num_points,
+        )
         step = _solve(H, g)
         # A step longer than half the distance to the cameras has left the linear range.
         reach = 0.5 * np.linalg.norm(xyz - mean_centre(centre, point, num_points), axis=1)
         length = np.linalg.norm(step, axis=1)
         xyz = xyz + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
-    points_cam = np.einsum("mij,mj->mi", R, xyz[point]) + t
+    points_cam = (R @ xyz[point][:, :, None])[..., 0] + t
     front = points_cam[:, 2] > MIN_DEPTH_MAP
     z = np.where(front, points_cam[:, 2], 1.0)
     projected = np.stack(

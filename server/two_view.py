@@ -5,7 +5,7 @@ score that does not know confidence; then a refinement whose weights are fitted 
 kept only where it fits better. A misleading confidence can therefore cost time, not accuracy.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -93,27 +93,50 @@ def estimate_two_view(
         found = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
         if found is None:
             return None
-        score = msac_score(sampson_px(fundamental_matrix(camera, found.T_cam1_cam0), xy0, xy1), threshold_px)
+        score = _score(camera, found.T_cam1_cam0, xy0, xy1, threshold_px)
         return _result(camera, found.T_cam1_cam0, xy0, xy1, threshold_px, score, choose_model)
     budget = (threshold_px, seed, max_iterations, min_iterations)
     candidates = [_search(camera, xy0, xy1, None, *budget)]
     informative = mode != "off" and confidence is not None and float(np.ptp(confidence)) > 1e-6
     if informative and confidence is not None:
         candidates.append(_search(camera, xy0, xy1, np.argsort(-confidence, kind="stable"), *budget))
+    num_searched = len(candidates)
     if choose_model:
         candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
     scored = [
-        (msac_score(sampson_px(fundamental_matrix(camera, T), xy0, xy1), threshold_px), k, T)
+        (_score(camera, turned, xy0, xy1, threshold_px), k, turned)
         for k, T in enumerate(candidates)
         if T is not None
+        for turned in [in_front_sign(camera, T, xy0, xy1)]
     ]
     if not scored:
         return None
     # A later candidate must be better by more than the score's own noise to displace the first.
-    score, _, T = min(scored, key=lambda item: (item[0] * (1.0 if item[1] == 0 else 1.0 + 1e-3), item[1]))
+    score, chosen, T = min(scored, key=lambda item: (item[0] * (1.0 if item[1] == 0 else 1.0 + 1e-3), item[1]))
     if informative and confidence is not None:
         T = _refine_with_confidence(camera, T, xy0, xy1, confidence, threshold_px)
-    return _result(camera, T, xy0, xy1, threshold_px, score, choose_model)
+    result = _result(camera, T, xy0, xy1, threshold_px, score, choose_model)
+    if chosen >= num_searched and result.model == "essential":
+        result = replace(result, model="homography")
+    return result
+
+
+def _score(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float) -> float:
+    """MSAC score without confidence, in which a point clearly behind a camera is an outlier.
+
+    The depths tell the two poses of a plane apart, which fit the epipolar constraint equally well.
+    """
+    residual = sampson_px(fundamental_matrix(camera, T), xy0, xy1)
+    return msac_score(np.where(_behind(camera, T, xy0, xy1, threshold_px), np.inf, residual), threshold_px)
+
+
+def _behind(
+    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float
+) -> NDArray[np.bool_]:
+    """Points behind a camera, beyond what noise does to points without parallax."""
+    depth0, depth1 = depths(camera, T, xy0, xy1)
+    sure = rays_angle_deg(camera, T, xy0, xy1) > np.degrees(2.0 * threshold_px / camera.fx)
+    return np.asarray(sure & ((depth0 <= 0) | (depth1 <= 0)))
 
 
 def _search(
@@ -180,8 +203,7 @@ def _refine_with_confidence(
     if model is None or model.beta == 0.0:
         return T
     sigma = model.sigma_px(confidence)
-    refined = refine_relative_pose(camera, T, xy0, xy1, sigma)
-    return refined
+    return refine_relative_pose(camera, T, xy0, xy1, sigma)
 
 
 def _result(
