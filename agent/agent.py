@@ -1,5 +1,6 @@
 """The agent process: captures, encodes and publishes, in live or lossless service."""
 
+import contextlib
 import logging
 import threading
 import time
@@ -29,6 +30,8 @@ _FLOW_POLL_S = 0.05
 _BUSY_POLL_S = 0.005
 #: Live: the last frame is repeated until the receiver reports on it, for at most so long.
 _FAREWELL_S = 2.0
+#: Longest wait for a server that is alive but does not say it is ready.
+_READY_S = 10.0
 _REPEAT_S = 0.2
 
 
@@ -177,6 +180,21 @@ def _wait_for_peers(session: Session, agent_id: str, stop: threading.Event) -> N
         pass
 
 
+def _wait_until_ready(session: Session, agent_id: str, agent_epoch: int, stop: threading.Event) -> None:
+    """Wait until the server has its decoder, map and viewer ready for this stream, at most a while."""
+    ready = threading.Event()
+
+    def on_flow(payload: bytes) -> None:
+        with contextlib.suppress(WireError):
+            if unpack(payload, FlowMessage).agent_epoch == agent_epoch:
+                ready.set()
+
+    session.subscribe(flow_key(agent_id), "newest", on_flow)
+    until_s = time.monotonic() + _READY_S
+    while not stop.is_set() and not ready.wait(_POLL_S) and time.monotonic() < until_s:
+        pass
+
+
 def run_agent(
     settings: AgentSettings,
     stop: threading.Event,
@@ -227,6 +245,8 @@ def run_agent(
         session.declare_alive(settings.agent_id, ROLE)
         if settings.wait:
             _wait_for_peers(session, settings.agent_id, stop)
+            if not sending.lossless:
+                _wait_until_ready(session, settings.agent_id, sending.agent_epoch, stop)
         logger.info("sending %s with %s, %s", source.name, codec.name, settings.mode)
         capture = Capture(source, "all" if sending.lossless else "newest", metrics)
         try:

@@ -196,7 +196,9 @@ class LinkReport:
 
 @dataclass(frozen=True, kw_only=True)
 class FlowMessage:
-    """Receiver to agent in lossless service: how far it is, and how many frames may be under way.
+    """Receiver to agent: how far it is, and how many frames may be under way.
+
+    In live service it is sent only before the first frame and says that the server is ready for the epoch.
 
     Attributes:
         agent_epoch: Whose frames; 0 when the receiver has seen none yet.

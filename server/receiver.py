@@ -216,6 +216,10 @@ class Receiver:
         while not self._stopping.wait(FLOW_INTERVAL_S):
             self._send_flow()
 
+    def announce_ready(self, agent_epoch: int) -> None:
+        """Tell a live agent that everything is set up for its first frame; it waits for this."""
+        self._put_flow(FlowMessage(agent_epoch=agent_epoch, next_seq=0, arrived_seq=0, window=WINDOW))
+
     def _send_flow(self) -> None:
         with self._lock:
             arrivals = self._arrivals
@@ -225,6 +229,9 @@ class Receiver:
                 arrived_seq=arrivals.arrived_seq,
                 window=WINDOW,
             )
+        self._put_flow(flow)
+
+    def _put_flow(self, flow: FlowMessage) -> None:
         try:
             self._flow.put(pack(flow))
         except TransportError as err:

@@ -181,6 +181,7 @@ class Server:
                 now_s = time.monotonic()
                 self._serve_requests()
                 self._prepare()
+                self._say_ready()
                 if decoded is not None:
                     last_frame_s = now_s
                     self._take(decoded)
@@ -232,6 +233,12 @@ class Server:
             self._decoder.warm_up(camera.codec, camera.modulation, camera.digest, (height, width))
         except SemcastError as err:
             logger.warning("%s", err)
+
+    def _say_ready(self) -> None:
+        """Let a live agent begin once all is prepared; repeated until its first frame is there."""
+        session = self._session
+        if session is not None and session.last_frame_id < 0 and self._settings.mode == "live":
+            self._receiver.announce_ready(session.identity.agent_epoch)
 
     def _take(self, decoded: DecodedArrival) -> None:
         """Track one frame, send and show what came of it. One bad frame never stops the stream."""

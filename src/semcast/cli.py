@@ -57,12 +57,13 @@ def verb_parser(verb: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _configure_logging(debug: bool) -> None:
+def _configure_logging(debug: bool) -> logging.Handler:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S"))
     root = logging.getLogger("semcast")
     root.addHandler(handler)
     root.setLevel(logging.DEBUG if debug else logging.INFO)
+    return handler
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -79,9 +80,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"semcast: unknown verb {verb!r}{near_match(verb, list(VERBS))}", file=sys.stderr)
         return EXIT_USAGE
     debug = "--debug" in words
+    handler = _configure_logging(debug)
     try:
         arguments = verb_parser(verb).parse_args(words[1:])
-        _configure_logging(debug)
         return int(arguments.command(arguments))
     except SemcastError as err:
         if debug:
@@ -102,3 +103,5 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         sys.stderr.close()
         return EXIT_ERROR
+    finally:
+        logging.getLogger("semcast").removeHandler(handler)

@@ -196,6 +196,12 @@ class Running:
         except Exception as err:
             self.error = err
 
+    def wait_for_drop(self, reason):
+        deadline_s = time.monotonic() + DEADLINE_S
+        while not self.server._metrics.drops.get(reason):
+            assert time.monotonic() < deadline_s, f"no {reason} within {DEADLINE_S} s"
+            self.stop.wait(0.01)
+
     def finish(self, *, stop=False):
         if stop:
             self.stop.set()
@@ -251,8 +257,10 @@ def test_bad_frames_are_counted_and_never_stop_the_stream(hub, sequence, picture
     radio.stream([0, 1])
     radio._symbols.put(b"\x93garbage")
     radio.send(2, digest="0" * 16)
+    running.wait_for_drop("codec")  # live: a newer frame would replace it unseen
     layout = layout_for(sequence.size_wh[::-1])
     radio.send(3, slot_lost=pack_lost(np.ones(layout.num_slots, bool)))
+    running.wait_for_drop("outage")
     radio.stream([4, 5])
     summary = running.finish(stop=True)
     assert summary["drops"]["protocol"] == 1
