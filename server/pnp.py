@@ -186,24 +186,22 @@ def search_pose(
 ) -> PoseEstimate | None:
     """Find a pose without a prior by PoseLib's LO-RANSAC over three points, then refine it with weights.
 
-    The most trusted observations are drawn first (progressive sampling).
+    It draws uniformly: three points are found soon, and a misleading order would cost the pose.
 
     Returns:
         The pose, or None when fewer than ``min_inliers`` agree.
     """
     if len(points_world) < max(4, min_inliers):
         return None
-    order = np.argsort(sigma_px, kind="stable")
     threshold_px = float(np.clip(np.median(gate_px), 2.0, 8.0))
     options = {
         "max_reproj_error": threshold_px,
         "max_iterations": max_iterations,
         "min_iterations": 50,
-        "progressive_sampling": True,
         "seed": seed,
     }
     found, info = poselib.estimate_absolute_pose(
-        keypoints_xy[order], points_world[order], poselib_camera(camera), options, {}
+        keypoints_xy, points_world, poselib_camera(camera), options, {}
     )
     R, t = np.asarray(found.R, dtype=np.float64), np.asarray(found.t, dtype=np.float64)
     if info["num_inliers"] < min_inliers or not (np.isfinite(R).all() and np.isfinite(t).all()):

@@ -89,7 +89,9 @@ def test_refinement_reaches_the_truth_on_exact_matches(seed):
     T, _, xy0, xy1 = make_pair(rng)
     t = T[:3, 3] + rng.normal(0, 0.05, 3)
     start = make_transform(exp_so3(rng.normal(0, 0.02, 3)) @ T[:3, :3], t / np.linalg.norm(t))
-    found = refine_relative_pose(CAMERA, start, xy0, xy1, np.full(len(xy0), 2.0), cut_sigmas=50, iterations=20)
+    found = refine_relative_pose(
+        CAMERA, start, xy0, xy1, np.full(len(xy0), 2.0), cut_sigmas=50, iterations=20
+    )
     assert rotation_angle_deg(found[:3, :3] @ T[:3, :3].T) < 1e-3
     assert angle_between_deg(found[:3, 3], T[:3, 3]) < 1e-2
 

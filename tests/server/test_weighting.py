@@ -158,7 +158,9 @@ def test_every_cue_lowers_the_confidence():
 
 def test_modes_of_confidence():
     rng = np.random.default_rng(0)
-    given = cues(pixel_confidence=np.array([0.1, 0.4, 0.9, 0.6]), forward_backward_px=np.array([0, 1, 2, 3.0]))
+    given = cues(
+        pixel_confidence=np.array([0.1, 0.4, 0.9, 0.6]), forward_backward_px=np.array([0, 1, 2, 3.0])
+    )
     robust = observation_confidence("robust", given, rng)
     assert np.all(observation_confidence("off", given, rng) == 1.0)
     assert np.allclose(observation_confidence("paper", given, rng), given.pixel_confidence)
