@@ -26,7 +26,7 @@ _FIXED_SIGMA = 1e-6
 
 
 def quantised_sigma(sigma_px: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Return the shared sigmas, ``(16,)`` pixels in equal ratios, and the step of each observation, ``(M,)``."""
+    """Return the shared sigmas, ``(16,)`` pixels in equal ratios, and each observation's step, ``(M,)``."""
     low, high = np.log(SIGMA_RANGE_PX[0]), np.log(SIGMA_RANGE_PX[1])
     position = (np.log(np.clip(sigma_px, *SIGMA_RANGE_PX)) - low) / (high - low) * (NUM_SIGMAS - 1)
     return np.exp(np.linspace(low, high, NUM_SIGMAS)), np.rint(position).astype(np.intp)

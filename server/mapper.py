@@ -155,7 +155,7 @@ def sample_colours(image: NDArray[np.uint8], xy: Array) -> NDArray[np.uint8]:
 def gather_observations(
     views: list[Keyframe], ids: Ids
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-    """View, row into ``ids``, pixel and confidence of every observation of ``ids`` (ascending) in the views."""
+    """View, row into ``ids``, pixel and confidence of all observations of ``ids`` (ascending) in the views."""
     view, point, xy, confidence = [], [], [], []
     for k, keyframe in enumerate(views):
         row = np.minimum(np.searchsorted(ids, keyframe.ids), max(0, len(ids) - 1))

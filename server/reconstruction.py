@@ -402,12 +402,12 @@ class Reconstruction:
     def landmarks(
         self,
     ) -> tuple[NDArray[np.int64], Array, NDArray[np.uint8], NDArray[np.float32]]:
-        """All landmarks: ids ``(N,)``, ``xyz (N, 3)`` in the world frame, ``rgb (N, 3)``, confidence ``(N,)``."""
+        """All landmarks: ids ``(N,)``, world ``xyz (N, 3)``, ``rgb (N, 3)``, confidence ``(N,)``."""
         marks = self._map.world.landmarks
         return marks.ids.copy(), marks.xyz.copy(), marks.rgb.copy(), marks.confidence.copy()
 
     def observations(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-        """Every observation of a landmark: landmark id, keyframe's frame id and pixel, ``(M,)``, ``(M,)``, ``(M, 2)``."""
+        """All observations: landmark ids ``(M,)``, frame ids of keyframes ``(M,)``, pixels ``(M, 2)``."""
         return self._map.world.observations()
 
     def snapshot(self) -> dict[str, NDArray]:
