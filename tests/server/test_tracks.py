@@ -1,0 +1,155 @@
+import cv2
+import numpy as np
+import pytest
+
+from semcast.server.features import to_grey
+from semcast.server.state import DecodedFrame
+from semcast.server.tracks import MAX_COAST, Sight, TrackTable, usable_rows
+
+SHAPE = (192, 256)
+
+
+def big_texture():
+    rng = np.random.default_rng(3)
+    noise = sum(
+        layer / layer.std()
+        for layer in (
+            cv2.GaussianBlur(rng.standard_normal((400, 500)).astype(np.float32), None, s) for s in (2, 5, 12)
+        )
+    )
+    return np.clip(noise * 30 + 128, 0, 255).astype(np.uint8)
+
+
+TEXTURE = big_texture()
+
+
+def sight_at(x, y=20, frame_id=0, lost=(), **changes):
+    """The texture as a camera sees it that moved by x and y; slots in ``lost`` are grey."""
+    image = np.repeat(TEXTURE[y : y + SHAPE[0], x : x + SHAPE[1], None], 3, axis=2).copy()
+    snr = np.full(SHAPE[0] // 16, 20.0, np.float32)
+    for slot in lost:
+        image[16 * slot : 16 * slot + 16] = 128
+        snr[slot] = -20
+    frame = DecodedFrame(frame_id, frame_id * 10**8, image, slot_snr_db=snr, **changes)
+    return Sight(frame, to_grey(image), usable_rows(frame, SHAPE[0]))
+
+
+def begin(x=20, **changes):
+    tracks = TrackTable("robust", 150, 0)
+    sight = sight_at(x, **changes)
+    tracks.remember(sight)
+    tracks.refill(sight)
+    return tracks
+
+
+def test_usable_rows_follow_the_slots():
+    frame = DecodedFrame(
+        0, 0, np.zeros((40, 8, 3), np.uint8), slot_snr_db=np.array([5, -20, np.nan], np.float32)
+    )
+    rows = usable_rows(frame, 40)
+    assert rows[:16].all()
+    assert not rows[16:].any()
+    assert usable_rows(DecodedFrame(0, 0, frame.image), 40).all()
+
+
+def test_tracks_keep_their_ids_and_follow_the_image():
+    tracks = begin()
+    ids, xy = tracks.ids.copy(), tracks.xy.copy()
+    tracks.follow(sight_at(26), tracks.xy)
+    stayed = np.isin(ids, tracks.ids)
+    assert stayed.mean() > 0.8
+    assert np.median(np.abs(tracks.xy - (xy[stayed] - (6, 0)))) < 0.1
+    assert np.allclose(np.median(tracks.velocity, axis=0), (-6, 0), atol=0.1)
+    assert np.all((tracks.confidence > 0) & (tracks.confidence <= 1))
+    tracks.keep(tracks.xy[:, 0] < 128)
+    assert tracks.refill(sight_at(26)) > 0
+    assert np.all(np.diff(tracks.ids) > 0)
+
+
+def test_tracks_in_a_lost_slot_coast_and_come_back():
+    tracks = begin()
+    in_band = (tracks.xy[:, 1] > 66) & (tracks.xy[:, 1] < 90)
+    band_ids = tracks.ids[in_band]
+    assert len(band_ids) >= 5
+    tracks.follow(sight_at(23, lost=(4, 5)), tracks.xy)
+    coasting = tracks.ids[~tracks.visible]
+    assert np.isin(band_ids, coasting).all()
+    tracks.follow(sight_at(26), tracks.xy + tracks.velocity)
+    assert np.isin(band_ids, tracks.ids[tracks.visible]).mean() > 0.6
+
+
+def test_nothing_coasts_for_ever():
+    tracks = begin()
+    for k in range(MAX_COAST + 1):
+        tracks.follow(sight_at(20, lost=range(12), frame_id=k), tracks.xy)
+    assert len(tracks) == 0
+
+
+def test_no_corner_is_taken_near_a_lost_slot():
+    tracks = begin(lost=(5,))
+    assert not np.any((tracks.xy[:, 1] > 80 - 6) & (tracks.xy[:, 1] < 96 + 6))
+
+
+def test_a_damaged_frame_makes_all_tracks_coast():
+    tracks = begin()
+    count = len(tracks)
+    noise = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+    frame = DecodedFrame(1, 1, noise)
+    tracks.follow(Sight(frame, to_grey(noise), np.ones(SHAPE[0], bool)), tracks.xy)
+    assert len(tracks) > 0.8 * count
+    tracks.follow(sight_at(22), tracks.xy)
+    assert tracks.visible.sum() > 0.6 * count
+
+
+def test_low_confidence_in_the_maps_lowers_that_of_tracks():
+    high, low = (
+        begin(confidence=np.full(SHAPE, c, np.float32), keypoint_confidence=np.full(SHAPE, k, np.float32))
+        for c, k in ((0.9, 0.9), (0.2, 0.3))
+    )
+    assert low.confidence.mean() < 0.6 * high.confidence.mean()
+
+
+def test_nan_maps_give_finite_confidence():
+    tracks = begin(
+        confidence=np.full(SHAPE, np.nan, np.float32), keypoint_confidence=np.full(SHAPE, np.nan, np.float32)
+    )
+    assert np.isfinite(tracks.confidence).all()
+
+
+def test_new_ids_are_higher_than_all_others():
+    tracks = begin()
+    highest = tracks.ids.max()
+    xy = {i: tuple(p) for i, p in zip(tracks.ids.tolist(), tracks.xy, strict=True)}
+    mask = tracks.ids % 2 == 0
+    renewed = tracks.xy[mask]
+    tracks.renew(mask)
+    assert np.all(np.diff(tracks.ids) > 0)
+    assert np.array_equal(np.sort(tracks.xy[tracks.ids > highest], axis=0), np.sort(renewed, axis=0))
+    assert all(xy[i] == tuple(p) for i, p in zip(tracks.ids, tracks.xy, strict=True) if i <= highest)
+
+
+def test_adopted_points_replace_all_tracks():
+    tracks = begin()
+    tracks.adopt(np.array([9, 4, 9]), np.array([[1.0, 1], [2, 2], [3, 3]]), 0.5)
+    assert tracks.ids.tolist() == [4, 9]
+    assert tracks.xy.tolist() == [[2, 2], [1, 1]]
+    assert tracks.visible.all()
+
+
+def test_off_ignores_the_maps():
+    tracks = TrackTable("off", 100, 0)
+    sight = sight_at(20, confidence=np.full(SHAPE, 0.1, np.float32))
+    tracks.remember(sight)
+    tracks.refill(sight)
+    assert np.all(tracks.confidence == 1.0)
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_an_empty_image_has_no_tracks(value):
+    image = np.full((*SHAPE, 3), value, np.uint8)
+    sight = Sight(DecodedFrame(0, 0, image), to_grey(image), np.ones(SHAPE[0], bool))
+    tracks = TrackTable("robust", 100, 0)
+    tracks.remember(sight)
+    assert tracks.refill(sight) == 0
+    tracks.follow(sight, tracks.xy)
+    assert len(tracks) == 0
