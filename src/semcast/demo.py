@@ -61,9 +61,6 @@ class DemoSettings:
     seed: int = field(default=0, metadata={"help": "seed of channel and estimation"})
     out: Path = field(default=Path("runs/demo"), metadata={"help": "folder for all outputs"})
     json: Path | None = field(default=None, metadata={"help": "also write the summary to this file"})
-    record: Path | None = field(
-        default=None, metadata={"help": "record everything that crossed the link (MCAP)"}
-    )
 
     def __post_init__(self) -> None:
         """Check ranges that the three processes would only notice after their start."""
@@ -107,8 +104,6 @@ def role_commands(
     channel += ["--seed", str(settings.seed)]
     agent = [*program, "agent", *meet, "--source", str(sequence), "--codec", settings.codec]
     agent += ["--modulation", settings.modulation, "--resize", f"{resize:g}"]
-    if settings.record is not None:
-        server += ["--record", str(settings.record)]
     return {"server": server, "channel": channel, "agent": agent}
 
 
