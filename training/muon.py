@@ -31,7 +31,9 @@ class Muon(torch.optim.Optimizer):
         params: Weights of two or more dimensions.
         lr: Length of an update against the size of the matrix; 0.02 suits most.
         momentum: Nesterov momentum.
-        weight_decay: Decoupled decay, times the learning rate.
+        weight_decay: Decoupled decay, times the learning rate. An update has singular values of 1, so a
+            kernel's can't outgrow ``1 / weight_decay``. Without it they grow without end where the gradient
+            is mostly noise.
     """
 
     def __init__(

@@ -37,7 +37,7 @@ def build_optimisers(model: Transceiver, settings: TrainSettings) -> list[torch.
             rest.append(weight)
     adamw = torch.optim.AdamW(
         [
-            {"params": rest, "lr": settings.lr, "weight_decay": settings.weight_decay},
+            {"params": rest, "lr": settings.lr, "weight_decay": 0.0},
             {"params": linear, "lr": settings.lr_linear, "weight_decay": 0.0},
         ],
         betas=(0.9, 0.99),

@@ -30,9 +30,11 @@ class TrainSettings:
     batch: int = field(default=16, metadata={"help": "crops in a step, for each process"})
     optimiser: Literal["muon", "adamw"] = field(default="muon", metadata={"help": "for convolution kernels"})
     lr: float = field(default=1e-3, metadata={"help": "learning rate of AdamW"})
-    lr_muon: float = field(default=0.01, metadata={"help": "learning rate of Muon"})
+    lr_muon: float = field(default=0.006, metadata={"help": "learning rate of Muon"})
     lr_linear: float = field(default=2e-4, metadata={"help": "learning rate of the linear heart"})
-    weight_decay: float = field(default=0.0, metadata={"help": "decoupled weight decay of kernels"})
+    weight_decay: float = field(
+        default=1.0, metadata={"help": "decay of Muon's kernels: holds their largest gain near 1 / decay"}
+    )
     clip: float = field(default=0.01, metadata={"help": "largest norm of the gradient"})
     ema: float = field(default=0.999, metadata={"help": "decay of the averaged weights that are shipped"})
     start: Literal["klt", "random"] = field(default="klt", metadata={"help": "linear layers at the start"})
