@@ -64,7 +64,7 @@ def rays_angle_deg(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Arra
     ray0 = camera.unproject(xy0) @ T_cam1_cam0[:3, :3].T
     ray1 = camera.unproject(xy1)
     sine = np.linalg.norm(np.cross(ray0, ray1), axis=1)
-    return np.degrees(np.arctan2(sine, (ray0 * ray1).sum(axis=1)))
+    return np.asarray(np.degrees(np.arctan2(sine, (ray0 * ray1).sum(axis=1))))
 
 
 def rotation_residual_px(camera: Intrinsics, R_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
@@ -152,7 +152,7 @@ def refine_relative_pose(
             break
         if not np.isfinite(step).all() or float(np.abs(step).max()) > 1.0:
             break
-        candidate = _moved(T, step)
+        candidate = _moved(T, np.asarray(step))
         new_residual = residual_of(candidate)
         new_cost = cost_of(new_residual)
         if new_cost < cost:

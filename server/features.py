@@ -1,6 +1,7 @@
 """Keypoints: corners spread over the image, tracking from frame to frame, descriptors on keyframes."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -178,12 +179,12 @@ def track_points(
         xy=found.astype(np.float64),
         ok=ok,
         forward_backward_px=distance,
-        photometric_grey=_where_found(error, status),
-        gradient_grey2=_where_found(eigen, back_status) * _EIGEN_UNIT,
+        photometric_grey=_where_found(np.asarray(error), np.asarray(status)),
+        gradient_grey2=_where_found(np.asarray(eigen), np.asarray(back_status)) * _EIGEN_UNIT,
     )
 
 
-def _where_found(values: NDArray[np.float32], status: NDArray[np.uint8]) -> Array:
+def _where_found(values: NDArray[Any], status: NDArray[Any]) -> Array:
     """KLT's error column; 0 for points that were not found, where it is not initialised."""
     usable = (status.ravel() == 1) & np.isfinite(values.ravel())
     return np.where(usable, values.ravel(), np.float32(0.0)).astype(np.float64)
@@ -211,7 +212,7 @@ class Describer:
     """Binary descriptors (ORB, upright) of given points, and their matching."""
 
     def __init__(self) -> None:
-        self._orb = cv2.ORB_create(
+        self._orb = cv2.ORB.create(
             nfeatures=5000, scaleFactor=_ORB_SCALE, nlevels=5, edgeThreshold=16, patchSize=31
         )
 
@@ -239,7 +240,7 @@ class Describer:
 
 def hamming(descriptors0: NDArray[np.uint8], descriptors1: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Number of different bits of descriptors, row by row, ``(N,)``."""
-    return np.bitwise_count(descriptors0 ^ descriptors1).sum(axis=1, dtype=np.int64)
+    return np.asarray(np.bitwise_count(descriptors0 ^ descriptors1).sum(axis=1, dtype=np.int64))
 
 
 def match_descriptors(

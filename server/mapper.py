@@ -149,13 +149,16 @@ def sample_colours(image: NDArray[np.uint8], xy: Array) -> NDArray[np.uint8]:
     height, width = image.shape[:2]
     x = np.clip(np.rint(xy[:, 0]), 0, width - 1).astype(np.intp)
     y = np.clip(np.rint(xy[:, 1]), 0, height - 1).astype(np.intp)
-    return np.where((xy < 0).any(axis=1)[:, None], np.uint8(128), image[y, x])
+    return np.where(np.any(xy < 0, axis=1, keepdims=True), np.uint8(128), image[y, x])
 
 
 def gather_observations(
     views: list[Keyframe], ids: Ids
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-    """View, row into ``ids``, pixel and confidence of all observations of ``ids`` (ascending) in the views."""
+    """View, row into ``ids``, pixel and confidence of every observation of ``ids`` in the views.
+
+    ``ids`` must ascend.
+    """
     view, point, xy, confidence = [], [], [], []
     for k, keyframe in enumerate(views):
         row = np.minimum(np.searchsorted(ids, keyframe.ids), max(0, len(ids) - 1))

@@ -1,4 +1,4 @@
-"""Pose of a camera from landmarks: weighted refinement with a covariance, and a robust search without a prior."""
+"""Pose of a camera from landmarks: weighted refinement with a covariance, and a search without a prior."""
 
 from dataclasses import dataclass
 

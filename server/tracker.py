@@ -84,7 +84,7 @@ def expected_positions(
 def _project(camera: Intrinsics, T_cam_world: Array, xyz: Array, otherwise: Array) -> Array:
     points_cam = xyz @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     projected = camera.project(points_cam)
-    return np.where(np.isfinite(projected).all(axis=1)[:, None], projected, otherwise)
+    return np.where(np.isfinite(projected).all(axis=1, keepdims=True), projected, otherwise)
 
 
 def track_pose(

@@ -106,7 +106,7 @@ class TrackTable:
     @property
     def visible(self) -> NDArray[np.bool_]:
         """Tracks seen in the newest image."""
-        return self.missed == 0
+        return np.asarray(self.missed == 0)
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Forget tracks outside the mask."""
@@ -199,8 +199,8 @@ class TrackTable:
         height, width = sight.grey.shape
         cell_px = int(np.clip(np.sqrt(height * width / max(1.0, self._max_features / 2.5)), 16, 96))
         strength = corner_strength(sight.grey)
-        corners = detect_corners(sight.grey, wanted, self.xy[self.visible], usable, cell_px, strength)
-        corners = corners.astype(np.float64)
+        found = detect_corners(sight.grey, wanted, self.xy[self.visible], usable, cell_px, strength)
+        corners: Array = found.astype(np.float64)
         count = len(corners)
         if count == 0:
             return 0

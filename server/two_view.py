@@ -112,7 +112,7 @@ def estimate_two_view(
     if not scored:
         return None
     # A later candidate must be better by more than the score's own noise to displace the first.
-    score, chosen, T = min(scored, key=lambda item: (item[0] * (1.0 if item[1] == 0 else 1.0 + 1e-3), item[1]))
+    score, chosen, T = min(scored, key=lambda item: (item[0] * (1.0 if item[1] == 0 else 1.001), item[1]))
     if informative and confidence is not None:
         T = _refine_with_confidence(camera, T, xy0, xy1, confidence, threshold_px)
     result = _result(camera, T, xy0, xy1, threshold_px, score, choose_model)
@@ -130,9 +130,7 @@ def _score(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: f
     return msac_score(np.where(_behind(camera, T, xy0, xy1, threshold_px), np.inf, residual), threshold_px)
 
 
-def _behind(
-    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float
-) -> NDArray[np.bool_]:
+def _behind(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float) -> NDArray[np.bool_]:
     """Points behind a camera, beyond what noise does to points without parallax."""
     depth0, depth1 = depths(camera, T, xy0, xy1)
     sure = rays_angle_deg(camera, T, xy0, xy1) > np.degrees(2.0 * threshold_px / camera.fx)

@@ -3,8 +3,8 @@
 One noise model everywhere: ``sigma^2(c) = sigma0^2 exp(beta (1 - c))`` (Eq. 22 of the paper). It sets the
 thresholds of the two-view search, the weights of PnP and the factor noise of bundle adjustment.
 
-``paper`` takes the codec's pixel confidence for ``c`` and given ``sigma0`` and ``beta``. ``robust`` first makes
-a *geometric* confidence out of everything that speaks of a keypoint's displacement (see
+``paper`` takes the codec's pixel confidence for ``c`` and given ``sigma0`` and ``beta``. ``robust`` first
+makes a *geometric* confidence out of everything that speaks of a keypoint's displacement (see
 ``geometric_confidence``) and then fits ``sigma0`` and ``beta`` to the residuals, so that a confidence
 without information ends at ``beta = 0``: unweighted.
 """
@@ -207,8 +207,8 @@ class KeypointCues:
 def geometric_confidence(cues: KeypointCues) -> Array:
     """Confidence in a keypoint's *position*: ``1 / (1 + d)`` of the displacement ``d`` that is expected.
 
-    Pixel confidence alone misleads: pixel errors are largest on strong edges, where localisation is best. So the
-    image noise it stands for is divided by the structure tensor (the localisation bound), and what the
+    Pixel confidence alone misleads: pixel errors are largest on strong edges, where localisation is best. So
+    the image noise it stands for is divided by the structure tensor (the localisation bound), and what the
     displacement head and the tracker itself say is added as independent variance.
     """
     noise_grey = np.full(len(cues.gradient_grey2), 2.0)

@@ -26,7 +26,8 @@ def make_world(num_keyframes=5, num_points=80, noise_px=0.2, step=0.3, seed=0, s
     points = rng.uniform((-2, -1.5, 5), (3, 1.5, 10), (num_points, 3))
     truth = []
     for k in range(num_keyframes):
-        T = make_transform(exp_so3(rng.normal(0, 0.02, 3)), (step * k, 0.15 * step * rng.normal(), 0.15 * step * k))
+        centre = (step * k, 0.15 * step * rng.normal(), 0.15 * step * k)
+        T = make_transform(exp_so3(rng.normal(0, 0.02, 3)), centre)
         truth.append(T)
         xy = CAMERA.project(transform_points(invert_transform(T), points)) + rng.normal(
             0, noise_px, (num_points, 2)
@@ -121,7 +122,7 @@ def test_an_adjustment_mends_shaken_poses():
 
 
 def test_what_came_after_the_question_moves_with_the_answer():
-    world, _, truth = make_world(5, 100, shake=0.01)
+    world, _, _ = make_world(5, 100, shake=0.01)
     add_landmarks(world, CAMERA, NoiseModel(6.0, 0.0), IMAGE, 0.5)
     problem = build_problem(world, CAMERA, NOISE, 10)
     assert problem is not None

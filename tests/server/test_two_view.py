@@ -83,7 +83,7 @@ def test_right_confidence_helps_where_matches_are_few_and_unequal():
 
 
 def test_turning_on_the_spot_is_recognised():
-    T, xy0, xy1, _ = make_matches(0, t=(0.0, 0.0, 0.0), outlier_share=0.1)
+    _, xy0, xy1, _ = make_matches(0, t=(0.0, 0.0, 0.0), outlier_share=0.1)
     found = estimate_two_view(CAMERA, xy0, xy1, choose_model=True, **FAST)
     assert found is None or found.model == "rotation"
 
