@@ -36,7 +36,7 @@ def test_bad_settings_are_refused_before_anything_starts(values, message):
 
 def test_a_role_that_can_not_start_ends_the_demo_with_its_own_words(tmp_path):
     settings = DemoSettings(codec="no-such-codec", view="none", resize=0.25, out=tmp_path)
-    with pytest.raises(SemcastError, match="agent did not start: .*no-such-codec"):
+    with pytest.raises(SemcastError, match="did not start: .*no-such-codec"):
         run_demo(settings, threading.Event(), lambda line: None, lambda row: None)
 
 

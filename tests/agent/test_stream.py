@@ -118,8 +118,11 @@ def take(receiver, count=None, deadline_s=20.0, pause_s=0.0):
     end_s = time.monotonic() + deadline_s
     tick = threading.Event()
     while time.monotonic() < end_s:
-        frame = receiver.next(0.2)
-        if frame is not None:
+        frame = receiver.next(0.05)
+        if frame is None:
+            for epoch in list(receiver._cameras):  # what a server says once its decoder is loaded
+                receiver.announce_ready(epoch)
+        else:
             frames.append(frame)
             if frame.message.final or len(frames) == count:
                 return frames
