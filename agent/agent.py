@@ -31,7 +31,7 @@ _BUSY_POLL_S = 0.005
 #: Live: the last frame is repeated until the receiver reports on it, for at most so long.
 _FAREWELL_S = 2.0
 #: Longest wait for a server that is alive but does not say it is ready.
-_READY_S = 10.0
+_READY_S = 5.0
 _REPEAT_S = 0.2
 
 
