@@ -235,7 +235,8 @@ class Describer:
         kept, descriptors = self._orb.compute(grey, keypoints)
         if descriptors is None or not len(kept):
             return np.zeros(0, np.intp), np.zeros((0, 32), np.uint8)
-        return np.array([k.class_id for k in kept], dtype=np.intp), descriptors
+        rows = np.array([k.class_id for k in kept], dtype=np.intp)
+        return rows, np.asarray(descriptors, dtype=np.uint8)
 
 
 def hamming(descriptors0: NDArray[np.uint8], descriptors1: NDArray[np.uint8]) -> NDArray[np.int64]:
