@@ -1,0 +1,152 @@
+"""Records messages beside a running system: a bounded queue and a thread, so the live path never waits."""
+
+import logging
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+from semcast.common.errors import SourceError
+from semcast.common.recording import FLUSH_INTERVAL_S, RecordingWriter
+
+logger = logging.getLogger(__name__)
+
+QUEUE_BYTES = 64 * 1024**2
+
+
+class Recorder:
+    """Takes messages from any thread and writes them on its own.
+
+    When the disk is too slow, newest messages are dropped and counted. When it is full, that is reported
+    once and later messages are counted as dropped.
+
+    Args:
+        path: File to write; replaced when it exists.
+        header: See ``recording_metadata``.
+        queue_bytes: Payload that may wait for the disk.
+        stream: Written instead of ``path``, for tests.
+
+    Raises:
+        SourceError: The file can't be opened.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: Mapping[str, str],
+        *,
+        queue_bytes: int = QUEUE_BYTES,
+        stream: BinaryIO | None = None,
+    ) -> None:
+        self._path = path
+        self._limit_bytes = queue_bytes
+        self._queue: deque[tuple[str, str, int, int, bytes] | tuple[str, Mapping[str, str]]] = deque()
+        self._queued_bytes = 0
+        self._sequence: Counter[str] = Counter()
+        self._condition = threading.Condition()
+        self._closed = False
+        self.num_written = 0
+        self.bytes_written = 0
+        self.drops: Counter[str] = Counter()
+        self.error: str | None = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream = stream if stream is not None else path.open("wb")
+            self._writer = RecordingWriter(self._stream, header)
+        except OSError as err:
+            raise SourceError(f"{path} can't be written: {err}") from err
+        self._thread = threading.Thread(target=self._run, name="semcast-recorder", daemon=True)
+        self._thread.start()
+
+    def put(self, topic: str, kind: str, data: bytes, log_time_ns: int | None = None) -> None:
+        """Queue one message; returns at once.
+
+        Args:
+            topic: Its key expression.
+            kind: Kind of message.
+            data: Wire bytes.
+            log_time_ns: Wall time of arrival, now by default.
+        """
+        now_ns = time.time_ns() if log_time_ns is None else log_time_ns
+        with self._condition:
+            sequence = self._sequence[topic]
+            self._sequence[topic] += 1
+            if self._closed or self.error is not None:
+                self.drops["closed" if self._closed else "disk"] += 1
+                return
+            if self._queued_bytes + len(data) > self._limit_bytes:
+                self.drops["queue"] += 1
+                return
+            self._queue.append((topic, kind, now_ns, sequence, data))
+            self._queued_bytes += len(data)
+            self._condition.notify()
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Queue a named set of texts."""
+        with self._condition:
+            if not self._closed and self.error is None:
+                self._queue.append((name, dict(values)))
+                self._condition.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._condition:
+                self._condition.wait_for(lambda: bool(self._queue) or self._closed, FLUSH_INTERVAL_S)
+                batch, self._queue = self._queue, deque()
+                self._queued_bytes = 0
+                ending = self._closed
+            try:
+                while batch:
+                    self._write(batch[0])
+                    batch.popleft()
+                self._writer.flush_if_due()
+                if ending:
+                    self._writer.finish()
+            except (OSError, ValueError) as err:
+                self._fail(err, batch)
+                return
+            if ending:
+                return
+
+    def _write(self, item: tuple[str, str, int, int, bytes] | tuple[str, Mapping[str, str]]) -> None:
+        if len(item) == 2:
+            self._writer.add_metadata(*item)
+            return
+        self._writer.add(*item)
+        self.num_written += 1
+        self.bytes_written += len(item[4])
+
+    def _fail(self, err: Exception, batch: "deque") -> None:
+        """Say once that recording ended; what was written up to here stays readable."""
+        logger.error(
+            "recording into %s ended: %s; the stream goes on, %d messages were recorded",
+            self._path,
+            err,
+            self.num_written,
+        )
+        with self._condition:
+            self.error = str(err)
+            lost = sum(len(item) != 2 for item in (*batch, *self._queue))
+            self.drops["disk"] += lost
+            self._queue.clear()
+            self._queued_bytes = 0
+
+    def close(self, deadline_s: float = 10.0) -> None:
+        """Write what waits, the index and the end mark, and close the file. Idempotent."""
+        with self._condition:
+            already, self._closed = self._closed, True
+            self._condition.notify()
+        self._thread.join(deadline_s)
+        if not already and not self._thread.is_alive():
+            try:
+                self._stream.close()
+            except OSError as err:
+                logger.error("closing %s failed: %s", self._path, err)
+
+    def __enter__(self) -> "Recorder":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()

@@ -1,0 +1,211 @@
+"""Replays a recording through the same decoder, tracker and outputs as the live server, without a network."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.channel.link import Link
+from semcast.channel.settings import ChannelSettings
+from semcast.common.codecs import load_codec
+from semcast.common.errors import SourceError
+from semcast.common.keys import agent_of
+from semcast.common.messages import CameraInfo, SymbolFrame
+from semcast.common.phy.equaliser import equalise
+from semcast.common.phy.pilots import insert_pilots
+from semcast.common.recording_reader import RecordingReader
+from semcast.common.symbol_payload import data_symbols, lost_slots_of, slots_of
+from semcast.common.wire import unpack
+from semcast.server.decoder import DecodedArrival, FrameDecoder
+from semcast.server.receiver import ReceivedFrame
+from semcast.server.reconstruction_settings import ReconstructionSettings
+from semcast.server.reference import Reference
+from semcast.server.session import Arrival, Session, StreamIdentity
+from semcast.server.settings import ServerSettings, ViewSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplaySettings:
+    """How a recording is replayed: lossless, as fast as it goes, repeatable to the bit.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    file: Path = field(metadata={"help": "recording to replay (MCAP)"})
+    symbols: Literal["received", "transmitted"] = field(
+        default="received",
+        metadata={
+            "help": "received: what the recorded link made of the frames; "
+            "transmitted: what the agent sent, through the channel given here"
+        },
+    )
+    link: ChannelSettings = field(
+        default=ChannelSettings(), metadata={"help": "the channel for transmitted symbols"}
+    )
+    seed: int = field(default=0, metadata={"help": "seed of the channel"})
+    out: Path | None = field(default=None, metadata={"help": "folder for trajectory, map, summary"})
+    reference: Path | None = field(
+        default=None, metadata={"help": "recorded sequence the agent sent: gives PSNR and ground truth"}
+    )
+    threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})
+    start_s: float = field(default=0.0, metadata={"help": "leave out frames before this time of the source"})
+    end_s: float | None = field(default=None, metadata={"help": "leave out frames after this time"})
+    reconstruction: ReconstructionSettings = field(
+        default=ReconstructionSettings(), metadata={"help": "tracking and mapping"}
+    )
+
+    def __post_init__(self) -> None:
+        if self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}")
+        if self.end_s is not None and self.end_s <= self.start_s:
+            raise ValueError(f"end_s must be later than start_s ({self.start_s:g}), got {self.end_s:g}")
+
+
+def replay(
+    settings: ReplaySettings,
+    stop: threading.Event | None = None,
+    on_frame: Callable[[int], None] | None = None,
+) -> dict[str, Any]:
+    """Replay the newest stream of a recording.
+
+    Args:
+        settings: What and how.
+        stop: Ends early; outputs are still written.
+        on_frame: Is told the id of each frame that was processed.
+
+    Returns:
+        The summary, which is also in ``summary.json`` of ``settings.out``.
+
+    Raises:
+        SourceError: The file is no recording, or holds no frames of the kind asked for.
+        CheckpointError: The recorded stream was encoded with other weights than those installed.
+    """
+    reader = RecordingReader(settings.file)
+    agent_id, camera = _newest_camera(reader)
+    server = ServerSettings(
+        agent_id=agent_id,
+        mode="replay",
+        out=settings.out,
+        threads=settings.threads,
+        reference=settings.reference,
+        bundle="inline",
+        resume=False,
+        reconstruction=settings.reconstruction,
+        view=ViewSettings(view="none"),
+    )
+    decoder = FrameDecoder(
+        lambda name, modulation: load_codec(name, modulation=modulation, num_threads=settings.threads)
+    )
+    identity = StreamIdentity(
+        agent_id=agent_id,
+        agent_epoch=camera.agent_epoch,
+        codec=camera.codec,
+        digest=camera.digest,
+        camera=camera.intrinsics,
+        num_frames=camera.num_frames,
+    )
+    reference = Reference(settings.reference, camera.intrinsics) if settings.reference is not None else None
+    session = Session(server, identity, settings.out, reference)
+    drops: dict[str, int] = {}
+    processed = 0
+    try:
+        for arrival in _arrivals(reader, camera, settings):
+            if stop is not None and stop.is_set():
+                break
+            decoded = decoder.decode(arrival)
+            if decoded.frame is None:
+                reason = "lost_on_air" if arrival.received is None else "outage"
+                drops[reason] = drops.get(reason, 0) + 1
+                continue
+            _process(session, decoded, drops)
+            processed += 1
+            if on_frame is not None:
+                on_frame(arrival.message.frame_id)
+        if not processed:
+            raise SourceError(f"{settings.file} holds no {settings.symbols} frames that can be decoded")
+        return session.write_outputs(settings.out, drops, complete=True)
+    finally:
+        session.close()
+        if reference is not None:
+            reference.close()
+
+
+def _process(session: Session, decoded: DecodedArrival, drops: dict[str, int]) -> None:
+    assert decoded.frame is not None
+    arrival = decoded.arrival
+    session.process(
+        decoded.frame,
+        Arrival(
+            snr_set_db=arrival.snr_db_set,
+            snr_estimated_db=arrival.snr_db,
+            t_arrival_ns=arrival.t_arrival_ns,
+            stage_ms={"decode": decoded.decode_ms},
+            drops=drops,
+        ),
+    )
+
+
+def _newest_camera(reader: RecordingReader) -> tuple[str, CameraInfo]:
+    newest: tuple[str, CameraInfo] | None = None
+    for message in reader.messages(frozenset({"camera"})):
+        camera = unpack(message.data, CameraInfo)
+        if newest is None or camera.agent_epoch >= newest[1].agent_epoch:
+            newest = agent_of(message.topic), camera
+    if newest is None:
+        raise SourceError(f"{reader.path} says nothing about a camera, so its frames can't be placed")
+    return newest
+
+
+def _arrivals(
+    reader: RecordingReader, camera: CameraInfo, settings: ReplaySettings
+) -> Iterator[ReceivedFrame]:
+    """Yield the frames of the stream in order, each once."""
+    direction = "rx" if settings.symbols == "received" else "tx"
+    link = Link(settings.link, settings.seed) if direction == "tx" else None
+    last_id, first_ns = -1, None
+    for message in reader.messages(frozenset({"symbols"})):
+        frame = unpack(message.data, SymbolFrame)
+        if (
+            frame.direction != direction
+            or frame.agent_epoch != camera.agent_epoch
+            or frame.frame_id <= last_id
+        ):
+            continue
+        last_id = frame.frame_id
+        first_ns = frame.t_source_ns if first_ns is None else first_ns
+        t_s = (frame.t_source_ns - first_ns) * 1e-9
+        if t_s < settings.start_s or (settings.end_s is not None and t_s > settings.end_s):
+            continue
+        slots, lost, snr_db_set = _on_the_air(frame, link, t_s)
+        arrival = ReceivedFrame(
+            message=frame,
+            camera=camera,
+            received=None,
+            snr_db=None,
+            snr_db_set=snr_db_set,
+            t_arrival_ns=time.perf_counter_ns(),
+            age_ms=0.0,
+            equalise_ms=0.0,
+        )
+        if slots is not None:
+            equalised = equalise(slots, frame.image_hw, frame.modulation, slot_lost=lost)
+            arrival = replace(arrival, received=equalised.received, snr_db=float(equalised.snr_db))
+        yield arrival
+
+
+def _on_the_air(
+    frame: SymbolFrame, link: Link | None, t_s: float
+) -> tuple[NDArray[np.complex64] | None, NDArray[np.bool_] | None, float | None]:
+    """Return received slots, which of them are lost, and the SNR set; no slots when the frame is lost."""
+    if link is None:
+        if frame.payload_format == "lost":
+            return None, None, None
+        return slots_of(frame), lost_slots_of(frame), None
+    sent = link.transmit(insert_pilots(data_symbols(frame)), t_s, frame.frame_id)
+    return (None if sent.frame_lost else sent.slots_rx), sent.slot_lost, sent.snr_db_set

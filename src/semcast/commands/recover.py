@@ -1,0 +1,24 @@
+"""``semcast recover``: make a recording that was cut off whole again."""
+
+import argparse
+from pathlib import Path
+
+from semcast.common.recording import recover_file
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("file", type=Path, help="recording that was cut off or damaged")
+    parser.add_argument(
+        "--out", type=Path, metavar="PATH", help="where to write it; without it FILE is replaced"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Copy every whole message and say what was there."""
+    out = arguments.out or arguments.file
+    info = recover_file(arguments.file, out)
+    state = "was whole" if info.complete else "was cut off"
+    damaged = f", {info.num_damaged_chunks} damaged chunks left out" if info.num_damaged_chunks else ""
+    print(f"{out}: {info.counts.total()} messages; {arguments.file} {state}{damaged}")
+    return 0

@@ -1,0 +1,36 @@
+"""``semcast replay``: reconstruct again from a recording, as received or through another channel."""
+
+import argparse
+import threading
+from typing import Any
+
+from rich.console import Console
+
+from semcast.commands.demo import summary_table
+from semcast.commands.running import add_settings, read_settings, run_until_stopped
+from semcast.server.replay import ReplaySettings, replay
+
+#: A recording is replayed in order and at once; the seed is that of channel and estimation alike.
+_UNUSED = frozenset({"link.delay_ms", "link.jitter_ms", "reconstruction.seed"})
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_settings(parser, ReplaySettings, _UNUSED)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Replay and print the figures."""
+    settings = read_settings(ReplaySettings, arguments)
+    talk = Console(stderr=True)
+    summary: dict[str, Any] = {}
+
+    def work(stop: threading.Event) -> None:
+        with talk.status(f"replaying {settings.file}") as status:
+            summary.update(
+                replay(settings, stop, lambda k: status.update(f"replaying {settings.file}: frame {k}"))
+            )
+
+    code = run_until_stopped(work)
+    Console().print(summary_table(summary))
+    return code

@@ -1,0 +1,302 @@
+import errno
+import io
+import json
+import threading
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from semcast import SourceError
+from semcast.common.recorder import Recorder
+from semcast.common.recording import (
+    RecordingWriter,
+    recording_metadata,
+    recover_file,
+    recover_stream,
+)
+from semcast.common.recording_reader import (
+    RecordedMessage,
+    RecordedMetadata,
+    RecordingReader,
+    RecordingScan,
+    scan_info,
+)
+
+HEADER = recording_metadata('codec = "3dcsc"\n', "9.9")
+TOPICS = (("semcast/a/rx/symbols", "symbols"), ("semcast/a/pose", "pose"), ("semcast/a/link", "link"))
+
+
+def made_messages(count=120, seed=0):
+    """Messages of unlike sizes, every payload findable in the file by its first sixteen random bytes."""
+    rng = np.random.default_rng(seed)
+    sequence = dict.fromkeys(TOPICS, 0)
+    messages = []
+    for k in range(count):
+        topic = TOPICS[k % 3]
+        size = int(rng.integers(16, 900))
+        messages.append((*topic, 1000 + 10 * k, sequence[topic], rng.bytes(size)))
+        sequence[topic] += 1
+    return messages
+
+
+def written(messages, chunk_bytes=4000, finish=True):
+    stream = io.BytesIO()
+    writer = RecordingWriter(stream, HEADER, chunk_bytes=chunk_bytes)
+    for message in messages:
+        writer.add(*message)
+    if finish:
+        writer.finish()
+    else:
+        writer.flush()
+    return stream.getvalue()
+
+
+def scanned(data, strict=True):
+    scan = RecordingScan(io.BytesIO(data), "bytes", strict=strict)
+    records = list(scan.records())
+    return [r for r in records if isinstance(r, RecordedMessage)], records, scan
+
+
+def as_tuple(message):
+    return (message.topic, message.kind, message.log_time_ns, message.sequence, message.data)
+
+
+def test_what_was_written_is_read_back_in_order():
+    messages = made_messages()
+    found, records, scan = scanned(written(messages))
+    assert [as_tuple(m) for m in found] == messages
+    assert records[0] == RecordedMetadata("semcast.recording", HEADER)
+    assert scan.complete
+
+
+def test_the_mcap_library_reads_the_file_too():
+    messages = made_messages()
+    reader = make_reader(io.BytesIO(written(messages)), validate_crcs=True)
+    found = [
+        (channel.topic, schema.name, message.log_time, message.sequence, message.data)
+        for schema, channel, message in reader.iter_messages()
+    ]
+    assert found == [(t, f"semcast.{k}", ns, s, d) for t, k, ns, s, d in messages]
+    assert next(iter(reader.iter_metadata())).metadata == HEADER
+    summary = reader.get_summary()
+    assert all(chunk.compression == "" for chunk in summary.chunk_indexes)
+    assert len(summary.chunk_indexes) > 5
+    channels = summary.channels.values()
+    assert {c.message_encoding for c in channels} == {"msgpack"}
+
+
+def test_a_file_cut_at_any_place_gives_every_whole_message():
+    messages = made_messages()
+    whole = written(messages)
+    # Where each message ends, found without the reader: payloads are random and so occur once.
+    ends = np.array([whole.index(m[4]) + len(m[4]) for m in messages])
+    assert np.all(np.diff(ends) > 0)
+    rng = np.random.default_rng(1)
+    places = np.unique(np.concatenate([rng.integers(0, len(whole), 1000), ends, ends - 1, [len(whole)]]))
+    recovered = 0
+    for place in places:
+        data = whole[:place]
+        expected = messages[: int((ends <= place).sum())]
+        if place < 8:
+            with pytest.raises(SourceError, match="not a recording"):
+                scanned(data)
+            continue
+        found, records, scan = scanned(data)
+        assert [as_tuple(m) for m in found] == expected, place
+        if not any(isinstance(r, RecordedMetadata) for r in records):
+            assert not expected
+            with pytest.raises(SourceError, match="nothing to recover"):
+                recover_stream(io.BytesIO(data), io.BytesIO(), "bytes")
+        elif place % 5 == 0:
+            target = io.BytesIO()
+            info = recover_stream(io.BytesIO(data), target, "bytes")
+            assert info.complete == scan.complete
+            again, _, after = scanned(target.getvalue())
+            assert [as_tuple(m) for m in again] == expected
+            assert after.complete
+            recovered += 1
+    assert recovered > 100
+
+
+def test_damage_in_the_middle_is_named_and_recover_keeps_the_other_chunks():
+    messages = made_messages()
+    whole = bytearray(written(messages))
+    whole[whole.index(messages[40][4]) + 5] ^= 0x01
+    with pytest.raises(SourceError, match="semcast recover"):
+        scanned(bytes(whole))
+    target = io.BytesIO()
+    info = recover_stream(io.BytesIO(bytes(whole)), target, "bytes")
+    assert info.num_damaged_chunks == 1
+    found = [as_tuple(m) for m in scanned(target.getvalue())[0]]
+    lost = [m for m in messages if m not in found]
+    assert messages[40] in lost
+    assert len(lost) < 15
+    assert sum(info.missed.values()) == len(lost)
+
+
+def test_random_damage_never_raises_anything_but_a_source_error():
+    whole = written(made_messages(40))
+    rng = np.random.default_rng(2)
+    for _ in range(400):
+        data = bytearray(whole)
+        for place in rng.integers(0, len(whole), rng.integers(1, 6)):
+            data[place] = rng.integers(256)
+        for strict in (True, False):
+            try:
+                scanned(bytes(data), strict)
+            except SourceError:
+                continue
+        try:
+            recover_stream(io.BytesIO(bytes(data)), io.BytesIO(), "bytes")
+        except SourceError:
+            continue
+
+
+def test_zeros_at_the_end_as_after_a_power_cut_end_the_reading():
+    messages = made_messages(30)
+    data = written(messages, finish=False)
+    found, _, scan = scanned(data + bytes(5000))
+    assert [as_tuple(m) for m in found] == messages
+    assert not scan.complete
+
+
+def test_flushed_messages_are_in_the_file_before_it_is_closed():
+    stream = io.BytesIO()
+    writer = RecordingWriter(stream, HEADER)
+    writer.add("t", "pose", 1, 0, b"payload")
+    assert b"payload" not in stream.getvalue()
+    writer.flush()
+    assert [m.data for m in scanned(stream.getvalue())[0]] == [b"payload"]
+
+
+def test_info_counts_topics_times_and_messages_the_recorder_missed():
+    messages = [("t", "pose", 5, 0, b"abc"), ("t", "pose", 6, 1, b"de"), ("t", "pose", 9, 4, b"f")]
+    info = scan_info(io.BytesIO(written(messages)), "bytes")
+    assert info.counts == {"t": 3}
+    assert info.num_bytes == {"t": 6}
+    assert info.kinds == {"t": "pose"}
+    assert info.missed == {"t": 2}
+    assert (info.start_ns, info.end_ns, info.complete) == (5, 9, True)
+
+
+def test_other_files_are_refused_with_the_reason(tmp_path):
+    path = tmp_path / "a.mcap"
+    with pytest.raises(SourceError, match="can't be read"):
+        RecordingReader(path)
+    path.write_bytes(b"\x89PNG\r\n and so on")
+    with pytest.raises(SourceError, match="does not start as an MCAP file"):
+        RecordingReader(path)
+    path.write_bytes(written([])[:60])
+    with pytest.raises(SourceError, match="cut off before its first record"):
+        RecordingReader(path)
+    stream = io.BytesIO()
+    RecordingWriter(stream, {**HEADER, "format": "7", "semcast": "3.0"}).finish()
+    path.write_bytes(stream.getvalue())
+    with pytest.raises(SourceError, match=r"format 7 by semcast 3\.0, this semcast reads format 1"):
+        RecordingReader(path)
+
+
+def test_recover_replaces_the_file_only_when_the_new_one_is_whole(tmp_path):
+    messages = made_messages(50)
+    path = tmp_path / "a.mcap"
+    path.write_bytes(written(messages)[:-3000])
+    before, _, _ = scanned(path.read_bytes())
+    info = recover_file(path, path)
+    assert not info.complete
+    assert [m.data for m in RecordingReader(path).messages()] == [m.data for m in before]
+    assert RecordingReader(path).info().complete
+    path.write_bytes(b"nothing")
+    with pytest.raises(SourceError, match="not start"):
+        recover_file(path, path)
+    assert path.read_bytes() == b"nothing"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_the_recorder_writes_from_its_thread_and_counts(tmp_path):
+    path = tmp_path / "sub" / "a.mcap"
+    with Recorder(path, HEADER) as recorder:
+        for topic, kind, ns, _, data in made_messages(200):
+            recorder.put(topic, kind, data, ns)
+        recorder.add_metadata("semcast.stream", {"digest": "d"})
+    recorder.put("late", "pose", b"x")
+    assert recorder.num_written == 200
+    assert recorder.drops == {"closed": 1}
+    reader = RecordingReader(path)
+    assert [as_tuple(m) for m in reader.messages()] == made_messages(200)
+    poses = list(reader.messages(frozenset({"pose"})))
+    assert {m.topic for m in poses} == {"semcast/a/pose"}
+    info = reader.info()
+    assert info.complete
+    assert info.metadata["semcast.stream"] == {"digest": "d"}
+    assert json.dumps(info.metadata)
+
+
+class SlowStream(io.BytesIO):
+    """Waits at the first chunk until it is let go."""
+
+    def __init__(self, gate):
+        super().__init__()
+        self._gate = gate
+
+    def write(self, data):
+        if len(data) > 600:
+            self._gate.wait(10)
+        return super().write(data)
+
+
+def test_a_slow_disk_drops_newest_messages_counts_them_and_never_blocks(tmp_path):
+    gate = threading.Event()
+    stream = SlowStream(gate)
+    kept = io.BytesIO()
+    stream.close = lambda: kept.write(stream.getvalue())
+    recorder = Recorder(tmp_path / "a", HEADER, queue_bytes=50_000, stream=stream)
+    for _ in range(3000):
+        recorder.put("t", "pose", bytes(1000))
+    assert recorder.drops["queue"] > 500
+    gate.set()
+    recorder.close()
+    info = scan_info(io.BytesIO(kept.getvalue()), "kept")
+    assert info.counts["t"] == recorder.num_written == 3000 - recorder.drops["queue"]
+    # Gaps inside are seen; those at the very end leave no later message to show them.
+    assert 0 <= info.missed.get("t", 0) <= recorder.drops["queue"]
+
+
+class FullDisk(io.BytesIO):
+    """Has room for so many bytes."""
+
+    def __init__(self, room):
+        super().__init__()
+        self._room = room
+
+    def write(self, data):
+        if self.tell() + len(data) > self._room:
+            super().write(bytes(data)[: max(0, self._room - self.tell())])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return super().write(data)
+
+
+def test_a_full_disk_is_reported_once_and_what_was_written_stays_readable(tmp_path, caplog):
+    stream = FullDisk(3_000_000)
+    kept = io.BytesIO()
+    stream.close = lambda: kept.write(stream.getvalue())
+    recorder = Recorder(tmp_path / "a", HEADER, stream=stream)
+    for k in range(600):
+        recorder.put("t", "pose", k.to_bytes(4, "big") + bytes(9996))
+    recorder.close()
+    for _ in range(5):
+        recorder.put("t", "pose", b"later")
+    reports = [r for r in caplog.records if "No space left" in r.getMessage()]
+    assert len(reports) == 1
+    assert "the stream goes on" in reports[0].getMessage()
+    assert recorder.error is not None
+    assert recorder.drops["disk"] > 0
+    found = scanned(kept.getvalue())[0]
+    assert len(found) > 200
+    assert [int.from_bytes(m.data[:4], "big") for m in found] == list(range(len(found)))
+
+
+def test_a_path_that_can_not_be_written_is_a_clear_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SourceError, match="can't be written"):
+        Recorder(tmp_path / "file" / "a.mcap", HEADER)

@@ -1,0 +1,100 @@
+"""A recording replays to the same poses every time; through another channel it does not."""
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from semcast.agent.agent import run_agent
+from semcast.agent.settings import AgentSettings
+from semcast.agent.source_settings import SourceSettings
+from semcast.channel.emulator import run_channel
+from semcast.channel.emulator_settings import EmulatorSettings
+from semcast.channel.settings import ChannelSettings
+from semcast.common.errors import SourceError
+from semcast.common.network_settings import NetworkSettings
+from semcast.common.recording import recover_file
+from semcast.common.recording_reader import RecordingReader
+from semcast.common.transport import open_hub
+from semcast.server.record import RecordSettings, kind_of_key, run_record
+from semcast.server.replay import ReplaySettings, replay
+
+SEQUENCE = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
+FRAMES = 14
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A stream recorded beside a running agent and channel."""
+    path = tmp_path_factory.mktemp("recording") / "run.mcap"
+    hub, endpoint = open_hub()
+    network = NetworkSettings(connect=(endpoint,))
+    stop = threading.Event()
+    radio = EmulatorSettings(network=network, link=ChannelSettings(snr_db=15.0))
+    others = [
+        threading.Thread(target=run_channel, args=(radio, stop)),
+        threading.Thread(target=run_record, args=(RecordSettings(file=path, network=network), stop)),
+    ]
+    seen = threading.Event()
+    hub.subscribe("semcast/agent0/rx/symbols", "every", lambda payload: frames.append(payload) or seen.set())
+    frames = []
+    for thread in others:
+        thread.start()
+    hub.declare_alive("agent0", "server")
+    source = SourceSettings(source=str(SEQUENCE), resize=0.4, max_frames=FRAMES, pace="rate", rate_hz=4.0)
+    run_agent(AgentSettings(source=source, codec="jpeg-ldpc", network=network), threading.Event())
+    assert seen.wait(20)
+    stop.set()
+    for thread in others:
+        thread.join(20)
+    hub.close()
+    return path
+
+
+def test_a_key_tells_the_kind_of_its_messages():
+    assert kind_of_key("semcast/a/rx/symbols") == kind_of_key("semcast/a/tx/symbols") == "symbols"
+    assert kind_of_key("semcast/a/status/agent") == "status"
+
+
+def test_everything_that_was_sent_is_in_the_recording(recording):
+    counts = RecordingReader(recording).info().counts
+    assert counts["semcast/agent0/tx/symbols"] >= FRAMES // 2
+    assert counts["semcast/agent0/rx/symbols"] >= FRAMES // 2
+    assert counts["semcast/agent0/camera"] >= 1
+
+
+def test_two_replays_give_the_same_files_and_another_channel_does_not(recording, tmp_path):
+    seen = []
+    for name in ("a", "b"):
+        summary = replay(
+            ReplaySettings(file=recording, out=tmp_path / name, reference=SEQUENCE), None, seen.append
+        )
+        assert summary["completeness"] > 0.4
+    assert len(seen) == 2 * len(set(seen)) >= FRAMES
+    first, second = ((tmp_path / name / "trajectory.tum").read_bytes() for name in ("a", "b"))
+    assert first == second
+    lossy = ReplaySettings(
+        file=recording,
+        out=tmp_path / "c",
+        symbols="transmitted",
+        link=ChannelSettings(snr_db=15.0, frame_loss=0.4),
+    )
+    replay(lossy)
+    assert (tmp_path / "c" / "trajectory.tum").read_bytes() != first
+
+
+def test_a_cut_recording_is_recovered_and_still_replays(recording, tmp_path):
+    cut = tmp_path / "cut.mcap"
+    data = recording.read_bytes()
+    cut.write_bytes(data[: len(data) * 3 // 4])
+    info = recover_file(cut, tmp_path / "whole.mcap")
+    assert not info.complete
+    assert RecordingReader(tmp_path / "whole.mcap").info().complete
+    assert replay(ReplaySettings(file=tmp_path / "whole.mcap"))["frames"]
+
+
+def test_a_time_range_without_frames_is_one_clear_error(recording):
+    with pytest.raises(SourceError, match="holds no received frames"):
+        replay(ReplaySettings(file=recording, start_s=1e6))
+    with pytest.raises(ValueError, match="end_s must be later"):
+        ReplaySettings(file=recording, start_s=2.0, end_s=1.0)
