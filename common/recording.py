@@ -103,14 +103,14 @@ class RecordingWriter:
     def flush(self) -> None:
         """End the chunk and hand everything to the operating system."""
         # The library ends a chunk only when it is full and has no public way to ask for it.
-        self._writer._Writer__finalize_chunk()
+        self._writer._Writer__finalize_chunk()  # type: ignore[attr-defined]
         self._stream.flush()
         self._pending = False
         self._flushed_s = time.monotonic()
 
     def finish(self) -> None:
         """Write index and end mark; the stream stays open."""
-        self._writer.finish()
+        self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.flush()
 
 
