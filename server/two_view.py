@@ -1,8 +1,8 @@
 """Relative pose of two images from matches.
 
-``robust``: PoseLib's LO-RANSAC twice, once drawing uniformly and once the trusted matches first, judged by a
-score that does not know confidence; then a refinement whose weights are fitted to this pair's own residuals,
-kept only where it fits better. A misleading confidence can therefore cost time, not accuracy.
+``robust``: PoseLib's LO-RANSAC twice, once drawing uniformly and once the trusted matches first, each at two
+thresholds, judged by a score that does not know confidence; then a refinement whose weights are fitted to
+this pair's own residuals. A misleading confidence can therefore cost time, hardly accuracy.
 """
 
 from dataclasses import dataclass, replace
@@ -26,11 +26,19 @@ from semcast.server.epipolar import (
 )
 from semcast.server.pnp import poselib_camera
 from semcast.server.ransac import confidence_ransac, in_front
-from semcast.server.weighting import ConfidenceMode, fit_noise
+from semcast.server.weighting import ConfidenceMode, NoiseModel, fit_noise
 
 Array = NDArray[np.float64]
 
 MIN_MATCHES = 8
+#: Thresholds of the searches and of the score, in units of the one that is asked for.
+_THRESHOLD_FACTORS = (1.0, 2.0)
+_SCORE_FACTORS = (0.5, 1.0, 2.0, 4.0)
+#: Points near the camera have larger errors and most of the information: the fitted beta overstates what
+#: confidence is worth, half of it does best.
+_BETA_SHARE = 0.5
+_CUT_SIGMAS = 2.5
+_MIN_SIGMA_PX = 0.1
 Model = Literal["essential", "homography", "rotation"]
 
 
@@ -64,7 +72,7 @@ def estimate_two_view(
     threshold_px: float = 1.0,
     seed: int = 0,
     max_iterations: int = 10_000,
-    min_iterations: int = 1000,
+    min_iterations: int = 500,
     choose_model: bool = False,
 ) -> TwoViewResult | None:
     """Estimate the relative pose of two images.
@@ -74,8 +82,8 @@ def estimate_two_view(
         keypoints0_xy: ``(N, 2)`` pixels.
         keypoints1_xy: ``(N, 2)`` pixels, matched row by row.
         confidence: ``(N,)`` in [0, 1], from ``weighting``; None is the same as mode ``off``.
-        mode: ``paper`` is the paper's RANSAC; ``off`` searches uniformly and refines without weights; all
-            others search twice and refine with fitted weights.
+        mode: ``paper`` is the paper's RANSAC; ``off`` searches uniformly alone; all others search in both
+            ways and refine with fitted weights.
         threshold_px: Inlier threshold on the Sampson distance.
         seed: Of the searches.
         max_iterations: Hypotheses of one search at most.
@@ -95,11 +103,16 @@ def estimate_two_view(
             return None
         score = _score(camera, found.T_cam1_cam0, xy0, xy1, threshold_px)
         return _result(camera, found.T_cam1_cam0, xy0, xy1, threshold_px, score, choose_model)
-    budget = (threshold_px, seed, max_iterations, min_iterations)
-    candidates = [_search(camera, xy0, xy1, None, *budget)]
     informative = mode != "off" and confidence is not None and float(np.ptp(confidence)) > 1e-6
+    orders: list[NDArray[np.intp] | None] = [None]
     if informative and confidence is not None:
-        candidates.append(_search(camera, xy0, xy1, np.argsort(-confidence, kind="stable"), *budget))
+        orders.append(np.argsort(-confidence, kind="stable"))
+    budget = (seed, max_iterations, min_iterations)
+    candidates = [
+        _search(camera, xy0, xy1, order, factor * threshold_px, *budget)
+        for factor in _THRESHOLD_FACTORS
+        for order in orders
+    ]
     num_searched = len(candidates)
     if choose_model:
         candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
@@ -113,8 +126,7 @@ def estimate_two_view(
         return None
     # A later candidate must be better by more than the score's own noise to displace the first.
     score, chosen, T = min(scored, key=lambda item: (item[0] * (1.0 if item[1] == 0 else 1.001), item[1]))
-    if informative and confidence is not None:
-        T = _refine_with_confidence(camera, T, xy0, xy1, confidence, threshold_px)
+    T = _refine(camera, T, xy0, xy1, confidence if informative else None, threshold_px)
     result = _result(camera, T, xy0, xy1, threshold_px, score, choose_model)
     if chosen >= num_searched and result.model == "essential":
         result = replace(result, model="homography")
@@ -124,10 +136,12 @@ def estimate_two_view(
 def _score(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float) -> float:
     """MSAC score without confidence, in which a point clearly behind a camera is an outlier.
 
+    It is the mean over several thresholds, because the noise of decoded images is not known beforehand.
     The depths tell the two poses of a plane apart, which fit the epipolar constraint equally well.
     """
     residual = sampson_px(fundamental_matrix(camera, T), xy0, xy1)
-    return msac_score(np.where(_behind(camera, T, xy0, xy1, threshold_px), np.inf, residual), threshold_px)
+    residual = np.where(_behind(camera, T, xy0, xy1, threshold_px), np.inf, residual)
+    return float(np.mean([msac_score(residual, factor * threshold_px) for factor in _SCORE_FACTORS]))
 
 
 def _behind(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float) -> NDArray[np.bool_]:
@@ -191,17 +205,22 @@ def _from_plane(
     return found
 
 
-def _refine_with_confidence(
-    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, confidence: Array, threshold_px: float
+def _refine(
+    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, confidence: Array | None, threshold_px: float
 ) -> Array:
-    """Refine with the noise model fitted to this pair; unchanged where confidence tells nothing."""
+    """Refine with the noise fitted to this pair; with equal weights where confidence tells nothing."""
     residual = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
     near = residual < 3.0 * threshold_px
-    model = fit_noise(confidence[near], residual[near])
-    if model is None or model.beta == 0.0:
+    if int(near.sum()) < MIN_MATCHES:
         return T
-    sigma = model.sigma_px(confidence)
-    return refine_relative_pose(camera, T, xy0, xy1, sigma)
+    sigma = np.ones(len(xy0))
+    model = fit_noise(confidence[near], residual[near]) if confidence is not None else None
+    if model is not None and confidence is not None:
+        sigma = NoiseModel(1.0, _BETA_SHARE * model.beta).sigma_px(confidence)
+    scale_px = float(np.median(residual[near] / sigma[near])) / 0.6745
+    return refine_relative_pose(
+        camera, T, xy0, xy1, max(scale_px, _MIN_SIGMA_PX) * sigma, cut_sigmas=_CUT_SIGMAS
+    )
 
 
 def _result(
