@@ -91,7 +91,7 @@ def optimise(problem: BundleProblem) -> BundleResult:
         graph, values = _build(problem, used)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(problem.iterations)
-        parameters.setRelativeErrorTol(1e-4)
+        parameters.setRelativeErrorTol(1e-3)
         parameters.setlambdaInitial(1e-4)
         try:
             optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)

@@ -23,6 +23,7 @@ _MIN_FIRST = 9
 MIN_INLIERS = 20
 #: Keyframes around the recognised one whose landmarks are looked for.
 _NEIGHBOURS = 5
+_SEARCH_ITERATIONS = 400
 _GUIDED_RADIUS_PX = 14.0
 _GUIDED_MAX_BITS = 70
 _MIN_GUIDED_SHARE = 0.35
@@ -105,7 +106,14 @@ class Relocaliser:
         sigma = np.full(len(xy), sigma_px)
         points = world.landmarks.xyz[world.landmarks.rows(ids)]
         return search_pose(
-            self._camera, points, xy, sigma, GATE_SIGMAS * sigma, seed=self._seed, min_inliers=_MIN_FIRST
+            self._camera,
+            points,
+            xy,
+            sigma,
+            GATE_SIGMAS * sigma,
+            seed=self._seed,
+            min_inliers=_MIN_FIRST,
+            max_iterations=_SEARCH_ITERATIONS,
         )
 
     def _confirm(
