@@ -1,7 +1,6 @@
 """``semcast demo``: the whole system on one machine, ending in a table of figures."""
 
 import argparse
-import shutil
 import threading
 from collections.abc import Mapping
 from typing import Any
@@ -13,6 +12,7 @@ from rich.table import Table
 from semcast.commands.running import add_settings, read_settings, run_until_stopped
 from semcast.common.sequence import open_sequence
 from semcast.demo import DemoSettings, default_sequence, run_demo
+from semcast.evaluation.report import provenance, write_json
 
 #: Rows of the final table: key of the summary, name, format.
 _FIGURES = (
@@ -82,5 +82,6 @@ def run(arguments: argparse.Namespace) -> int:
     )
     print(f"in {settings.out}: {there}{again}")
     if settings.json is not None:
-        shutil.copyfile(settings.out / "summary.json", settings.json)
+        # The demo's own settings in place of the server's, which name folders of this machine.
+        write_json(settings.json, {**result, **provenance("demo", settings)})
     return code or (0 if result.get("completeness") else 1)
