@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shlex
 import signal
 import subprocess
@@ -132,6 +133,12 @@ class Role:
         lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return lines[-1] if lines else "no output"
 
+    def viewer_address(self) -> str | None:
+        """Return the address of the viewer's page, once the log names it."""
+        log = self.log.read_text(encoding="utf-8", errors="replace")
+        found = re.search(r"viewer: (http\S+)", log)
+        return found.group(1) if found else None
+
     def stop(self) -> None:
         """Ask the process to end; kill it when it does not in time."""
         if self._process is None or self._process.poll() is not None:
@@ -244,7 +251,10 @@ def _watch(
     """Follow the rows the server writes until its summary is there."""
     rows = out / "frames.jsonl"
     read_bytes = 0
+    page: str | None = None
     while not stop.is_set() and not summary_file.exists():
+        if page is None and (page := children["server"].viewer_address()) is not None:
+            tell(f"open {page}")
         for child in children.values():
             code = child.returncode
             if code and not child.told:
