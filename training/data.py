@@ -1,6 +1,6 @@
 """Training images: decoded once, held in memory, cut and changed at random but repeatably."""
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -83,7 +83,7 @@ def random_crop(
 
 
 class Batches:
-    """The batch of every step, a function of seed, step and rank alone, prepared one step ahead.
+    """The batch of every step, a function of seed, step and rank alone, prepared ahead of its use.
 
     Args:
         images: From ``read_images``.
@@ -91,18 +91,31 @@ class Batches:
         batch: Crops in a batch.
         seed: Of the whole run.
         rank: Of this process.
+        workers: Threads that prepare batches; a CPU that also trains needs one, a GPU waits for fewer than
+            about eight. The batches are the same for any number.
+
+    Raises:
+        ValueError: ``workers`` is less than 1.
     """
 
     def __init__(
-        self, images: list[NDArray[np.uint8]], settings: CropSettings, batch: int, seed: int, rank: int = 0
+        self,
+        images: list[NDArray[np.uint8]],
+        settings: CropSettings,
+        batch: int,
+        seed: int,
+        rank: int = 0,
+        workers: int = 1,
     ) -> None:
+        if workers < 1:
+            raise ValueError(f"workers must be >= 1, got {workers}")
         self._images = images
         self._settings = settings
         self._batch = batch
         self._key = (seed, rank)
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="batches")
-        self._ahead_step = -1
-        self._ahead = self._pool.submit(lambda: torch.empty(0))
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="batches")
+        self._num_ahead = workers if workers == 1 else 2 * workers
+        self._ahead: dict[int, Future[Tensor]] = {}
 
     def make(self, step: int) -> Tensor:
         """Return the batch of a step, ``(B, 3, size, size)`` uint8."""
@@ -112,12 +125,13 @@ class Batches:
         return torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2)
 
     def get(self, step: int) -> Tensor:
-        """Return the batch of a step and start on the next one."""
-        batch = self._ahead.result() if self._ahead_step == step else self.make(step)
-        self._ahead_step = step + 1
-        self._ahead = self._pool.submit(self.make, step + 1)
+        """Return the batch of a step and start on the next ones."""
+        ready = self._ahead.pop(step, None)
+        batch = ready.result() if ready is not None else self.make(step)
+        wanted = range(step + 1, step + 1 + self._num_ahead)
+        self._ahead = {k: self._ahead.get(k) or self._pool.submit(self.make, k) for k in wanted}
         return batch
 
     def close(self) -> None:
-        """Stop the thread that prepares batches."""
+        """Stop the threads that prepare batches."""
         self._pool.shutdown(cancel_futures=True)

@@ -90,7 +90,9 @@ class Run:
         self.optimisers = build_optimisers(self.model, settings)
         if checkpoint is not None:
             self._restore(checkpoint)
-        self.batches = Batches(self.images, settings.crop, settings.batch, settings.seed, rank)
+        self.batches = Batches(
+            self.images, settings.crop, settings.batch, settings.seed, rank, settings.data_workers
+        )
         self.loss = torch.compile(transceiver_loss) if settings.compile else transceiver_loss
 
     @property
@@ -192,9 +194,10 @@ class Run:
         blocks = settings.crop.size_px // BLOCK_PX
         draw = draw_links(settings.channel, settings.batch, blocks, generator)
         draw = LinkDraw(*(t.to(self.device) for t in vars(draw).values()))
-        noise = torch.randn(settings.batch, LATENT_CHANNELS, blocks, blocks, generator=generator).to(
-            self.device
-        )
+        # Drawn where it is used: on a CPU the noise of a large batch would cost a GPU more than the network.
+        on_device = torch.Generator(self.device).manual_seed(seed + 1_000_003)
+        shape = (settings.batch, LATENT_CHANNELS, blocks, blocks)
+        noise = torch.randn(shape, generator=on_device, device=self.device)
         is_ending = share >= 1.0 - settings.decay_share / 4.0
         with_heads = is_ending or self.step % settings.head_every == 0
         set_rate(self.optimisers, rate_factor(share, self.step, settings))

@@ -49,6 +49,9 @@ class TrainSettings:
     bf16: bool = field(default=True, metadata={"help": "bfloat16 autocast"})
     compile: bool = field(default=False, metadata={"help": "torch.compile the networks"})
     threads: int = field(default=0, metadata={"help": "CPU threads; 0: as torch decides"})
+    data_workers: int = field(
+        default=1, metadata={"help": "threads that cut crops; about 8 keep one GPU busy"}
+    )
     log_every: int = field(default=50, metadata={"help": "steps between log lines"})
     valid_every: int = field(default=2000, metadata={"help": "steps between validations"})
     save_every: int = field(default=1000, metadata={"help": "steps between checkpoints"})
@@ -58,7 +61,15 @@ class TrainSettings:
     loss: LossSettings = field(default_factory=LossSettings)
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "head_every", "log_every", "valid_every", "save_every"):
+        for name in (
+            "steps",
+            "batch",
+            "data_workers",
+            "head_every",
+            "log_every",
+            "valid_every",
+            "save_every",
+        ):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}")
         for name in ("warmup_steps", "minutes", "threads", "weight_decay"):

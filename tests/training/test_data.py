@@ -26,6 +26,17 @@ def test_the_batch_of_a_step_does_not_depend_on_the_steps_before(batches):
     assert not torch.equal(in_order[0], in_order[1])
 
 
+def test_the_batches_do_not_depend_on_the_number_of_workers():
+    images = [photo(seed=k) for k in range(3)]
+    made = [Batches(images, CropSettings(size_px=32), 4, seed=7, workers=workers) for workers in (1, 3)]
+    for step in (0, 1, 2, 7, 8):
+        torch.testing.assert_close(made[0].get(step), made[1].get(step))
+    for one in made:
+        one.close()
+    with pytest.raises(ValueError, match="workers must be >= 1, got 0"):
+        Batches(images, CropSettings(size_px=32), 4, seed=7, workers=0)
+
+
 def test_ranks_see_different_crops():
     images = [photo(seed=k) for k in range(3)]
     both = [Batches(images, CropSettings(size_px=32), 4, seed=7, rank=rank) for rank in (0, 1)]
