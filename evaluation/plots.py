@@ -26,7 +26,24 @@ def _new_figure(width_in: float = 5.0, height_in: float = 3.6) -> tuple[Figure, 
     return figure, axes
 
 
-def _save(figure: Figure, path: Path) -> None:
+def new_grid(
+    num_rows: int, num_columns: int, width_in: float, height_in: float, *, share_x: bool = False
+) -> tuple[Figure, list[list[Axes]]]:
+    """Return a figure with a grid of axes, as lists of rows."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(num_rows, num_columns, squeeze=False, sharex=share_x)
+    for axes in grid.flat:
+        axes.grid(alpha=0.3)
+    return figure, [list(row) for row in grid]
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure in the format its name asks for, making the folder.
+
+    Raises:
+        SemcastError: The file can't be written.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Without a date in the file the same result gives the same bytes.
@@ -74,7 +91,7 @@ def plot_against_snr(
     if from_zero:
         axes.set_ylim(bottom=0.0)
     axes.legend(fontsize="small")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_pair_errors(
@@ -131,7 +148,7 @@ def plot_top_view(
     axes.set(xlabel=f"{axes_names[0]} ({unit})", ylabel=f"{axes_names[1]} ({unit})", title=title)
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(fontsize="small")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_reliability(
@@ -156,4 +173,4 @@ def plot_reliability(
         )
     axes.set(xlabel="confidence", ylabel="1 - |error|", title=title, xlim=(0, 1), ylim=(0, 1))
     axes.legend(fontsize="small")
-    _save(figure, path)
+    save_figure(figure, path)

@@ -24,6 +24,8 @@ VERBS: dict[str, tuple[str, str]] = {
     "replay": ("replay", "reconstruct again from a recording, as received or through another channel"),
     "recover": ("recover", "make a recording that was cut off whole again"),
     "export": ("export", "write a run in the format of COLMAP, nerfstudio, evo, Rerun or as points"),
+    "plot": ("plot", "draw a run: its path against the truth, and what happened over time"),
+    "info": ("info", "say what a recording, run, sequence or weights file is, in a screenful"),
     "calibrate": ("calibrate", "find a camera's intrinsics from pictures of a chessboard or live"),
     "eval": ("evaluate", "measure trajectories, frame pairs, codecs and confidence offline"),
     "train": ("train", "train a transceiver from a settings file"),

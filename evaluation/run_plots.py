@@ -1,0 +1,185 @@
+"""Pictures of one finished run: its path, and what happened over time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.errors import SourceError
+from semcast.common.run_folder import FRAMES_NAME, TRAJECTORY_NAME
+from semcast.common.trajectory import Trajectory, read_tum
+from semcast.common.trajectory_error import AteResult, ate
+from semcast.evaluation.plots import new_grid, save_figure
+from semcast.server.run_record import FrameRow, read_rows
+
+Array = NDArray[np.float64]
+
+_STATE_COLOURS = {"initializing": "#f0c040", "lost": "#d05050"}
+
+
+@dataclass(frozen=True)
+class RunToPlot:
+    """What is drawn of a run.
+
+    Attributes:
+        name: For the titles.
+        trajectory: All posed frames.
+        rows: One per frame that reached the tracker, in order.
+        truth: Reference path, None where unknown.
+    """
+
+    name: str
+    trajectory: Trajectory
+    rows: Sequence[FrameRow]
+    truth: Trajectory | None
+
+    @staticmethod
+    def read(folder: Path, truth: Trajectory | None) -> "RunToPlot":
+        """Read a run folder.
+
+        Raises:
+            SourceError: The folder is no run, or holds no pose and no row.
+        """
+        if not folder.is_dir():
+            raise SourceError(f"{folder} is not a folder; give the folder that --out wrote")
+        path, rows = folder / TRAJECTORY_NAME, read_rows(folder / FRAMES_NAME)
+        if not path.is_file() and not rows:
+            raise SourceError(
+                f"{folder} holds neither {TRAJECTORY_NAME} nor {FRAMES_NAME}: there is nothing to plot"
+            )
+        empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+        return RunToPlot(folder.name, read_tum(path) if path.is_file() else empty, rows, truth)
+
+
+def plot_run(run: RunToPlot, out: Path, image_format: str = "png") -> list[Path]:
+    """Draw ``trajectory`` (path from above and from the side, error over time) and ``timeline``.
+
+    Args:
+        run: What to draw.
+        out: Folder the pictures go to.
+        image_format: ``png`` or ``svg``.
+
+    Returns:
+        The files written; a picture without anything to show is left out.
+
+    Raises:
+        SemcastError: A file can't be written.
+    """
+    files = []
+    if len(run.trajectory):
+        files.append(_plot_path(run, out / f"trajectory.{image_format}"))
+    if run.rows:
+        files.append(_plot_timeline(run, out / f"timeline.{image_format}"))
+    return files
+
+
+def _plot_path(run: RunToPlot, path: Path) -> Path:
+    result = ate(run.trajectory, run.truth) if run.truth is not None else None
+    estimate = run.trajectory.positions
+    unit = "map units"
+    if result is not None:
+        estimate = result.scale * estimate @ result.R_truth_map.T + result.t_truth_map
+        unit = "m"
+    figure, grid = new_grid(1 if result is None else 2, 2, 9.0, 4.2 if result is None else 6.4)
+    truth = run.truth.positions if result is not None and run.truth is not None else None
+    for axes, (first, second), view in zip(
+        grid[0], (("x", "z"), ("z", "y")), ("above", "the side"), strict=True
+    ):
+        columns = ["xyz".index(first), "xyz".index(second)]
+        if truth is not None:
+            axes.plot(*truth[:, columns].T, color="0.75", linewidth=4.5, label="ground truth")
+        axes.plot(*estimate[:, columns].T, "-", color="#1f77b4", linewidth=1.5, label="estimate")
+        axes.plot(*estimate[:1, columns].T, "o", color="#2ca02c", markersize=6, label="start")
+        axes.set(xlabel=f"{first} ({unit})", ylabel=f"{second} ({unit})", title=f"from {view}")
+        axes.set_aspect("equal", adjustable="datalim")
+        if second == "y":
+            axes.invert_yaxis()  # y points down
+    grid[0][0].legend(fontsize="small")
+    if result is not None:
+        _plot_error(grid[1], result)
+        figure.suptitle(
+            f"{run.name}: ATE {result.rmse_m:.3g} m RMSE, {result.percent:.2f} % "
+            f"of {result.path_length_m:.3g} m"
+        )
+    else:
+        figure.suptitle(f"{run.name}: {len(estimate)} poses, no ground truth")
+    save_figure(figure, path)
+    return path
+
+
+def _plot_error(row: Sequence[Any], result: AteResult) -> None:
+    over_time, histogram = row
+    t_s = result.t_s - result.t_s[0]
+    over_time.plot(t_s, result.error_m, color="#d05050", linewidth=1.2)
+    over_time.axhline(result.rmse_m, color="k", linestyle=":", linewidth=1.0, label="RMSE")
+    over_time.set(xlabel="time (s)", ylabel="position error (m)", title="error over time")
+    over_time.set_ylim(bottom=0.0)
+    over_time.legend(fontsize="small")
+    histogram.hist(result.error_m, bins=min(30, max(5, len(result.error_m) // 4)), color="#d05050")
+    histogram.set(xlabel="position error (m)", ylabel="frames", title="how the error is spread")
+
+
+def _plot_timeline(run: RunToPlot, path: Path) -> Path:
+    rows = run.rows
+    t_s = np.array([row.t_source_ns for row in rows], dtype=np.float64) * 1e-9
+    t_s -= t_s[0]
+    panels: list[tuple[str, dict[str, Array]]] = [
+        ("SNR (dB)", {"set": _column(rows, "snr_set_db"), "estimated": _column(rows, "snr_estimated_db")}),
+        ("PSNR (dB)", {"decoded image": _column(rows, "psnr_db")}),
+        ("mean confidence", {"decoded image": _column(rows, "confidence_mean")}),
+        ("keypoints", {"tracked": _column(rows, "num_tracked"), "inliers": _column(rows, "num_inliers")}),
+        ("reprojection\nerror (px)", {"median of inliers": _column(rows, "reprojection_error_px")}),
+        ("arrival to\npose (ms)", {"whole": _column(rows, "age_ms"), **_stages(rows)}),
+    ]
+    panels = [
+        (label, curves) for label, curves in panels if any(np.isfinite(v).any() for v in curves.values())
+    ]
+    figure, grid = new_grid(len(panels), 1, 9.0, 1.5 * len(panels) + 0.6, share_x=True)
+    for (axes,), (label, curves) in zip(grid, panels, strict=True):
+        for name, values in curves.items():
+            if np.isfinite(values).any():
+                axes.plot(
+                    t_s,
+                    values,
+                    linewidth=1.1,
+                    marker="." if len(rows) <= 150 else None,
+                    markersize=3,
+                    label=name,
+                )
+        axes.set_ylabel(label, fontsize="small")
+        _shade_states(axes, t_s, rows)
+        if len(curves) > 1:
+            axes.legend(fontsize="x-small", loc="upper left", bbox_to_anchor=(1.005, 1.02))
+    grid[-1][0].set_xlabel("recorded time (s); yellow: no map yet, red: lost, |: keyframe")
+    keyframes = t_s[[row.is_keyframe for row in rows]]
+    grid[0][0].plot(
+        keyframes, np.ones(len(keyframes)), "|", color="k", transform=grid[0][0].get_xaxis_transform()
+    )
+    posed = sum(row.posed for row in rows)
+    figure.suptitle(f"{run.name}: {len(rows)} frames, {posed} with a pose at once")
+    save_figure(figure, path)
+    return path
+
+
+def _column(rows: Sequence[FrameRow], name: str) -> Array:
+    return np.array([np.nan if (v := getattr(row, name)) is None else v for row in rows], dtype=np.float64)
+
+
+def _stages(rows: Sequence[FrameRow], most: int = 3) -> dict[str, Array]:
+    """Return the stages that take longest in all, each with a value per row."""
+    names = {name for row in rows for name in row.stage_ms} - {"bundle"}  # which runs beside the frames
+    total = {name: sum(row.stage_ms.get(name, 0.0) for row in rows) for name in names}
+    longest = sorted(total, key=lambda name: (-total[name], name))[:most]
+    return {name: np.array([row.stage_ms.get(name, np.nan) for row in rows]) for name in longest}
+
+
+def _shade_states(axes: Any, t_s: Array, rows: Sequence[FrameRow]) -> None:
+    """Mark spans without tracking behind the curves."""
+    ends = np.append(t_s[1:], t_s[-1] + (t_s[-1] - t_s[-2] if len(t_s) > 1 else 1.0))
+    for row, begin, end in zip(rows, t_s, ends, strict=True):
+        colour = _STATE_COLOURS.get(row.state)
+        if colour is not None:
+            axes.axvspan(begin, end, color=colour, alpha=0.25, linewidth=0)

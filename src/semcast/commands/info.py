@@ -1,0 +1,36 @@
+"""``semcast info``: what a recording, run, sequence or weights file is."""
+
+import argparse
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "path",
+        type=Path,
+        metavar="PATH",
+        help="recording (.mcap), folder that --out wrote, sequence folder, weights (.safetensors) or the "
+        "name of shipped weights",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print what is there."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from semcast.describe import describe
+
+    console = Console(highlight=False)
+    for heading, lines in describe(arguments.path):
+        if not lines:
+            continue
+        console.print(heading, style="bold", markup=False, soft_wrap=True)
+        table = Table.grid(padding=(0, 2))
+        table.add_column(style="dim", no_wrap=True)
+        table.add_column(overflow="fold")
+        for name, value in lines:
+            table.add_row(f"  {name}", value)
+        console.print(table)
+    return 0

@@ -1,0 +1,54 @@
+"""``semcast plot``: pictures of a finished run."""
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+
+logger = logging.getLogger(__name__)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "run", type=Path, metavar="RUN", help="folder that --out of demo, server or replay wrote"
+    )
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="PATH",
+        help="true path: a TUM file or a sequence folder; by default the sequence the run was compared with",
+    )
+    parser.add_argument("--format", choices=("png", "svg"), default="png", help="of the pictures")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the pictures; by default RUN/plots"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw the pictures and name their files on stdout."""
+    from semcast.common.errors import SourceError
+    from semcast.common.run_summary import read_summary
+    from semcast.common.sequence import open_sequence
+    from semcast.common.trajectory import read_tum
+    from semcast.evaluation.run_plots import RunToPlot, plot_run
+
+    folder: Path = arguments.run
+    truth = None
+    if arguments.truth is not None:
+        is_file = arguments.truth.is_file()
+        truth = read_tum(arguments.truth) if is_file else open_sequence(arguments.truth).groundtruth()
+        if truth is None:
+            raise SourceError(f"{arguments.truth} is a sequence without a true path")
+    else:
+        reference = read_summary(folder).get("settings", {}).get("reference")
+        if reference and Path(reference).is_dir():
+            truth = open_sequence(Path(reference)).groundtruth()
+        elif reference:
+            logger.warning("the sequence %s is gone: no true path is drawn; give it by --truth", reference)
+    files = plot_run(RunToPlot.read(folder, truth), arguments.out or folder / "plots", arguments.format)
+    if truth is None:
+        print("no true path is known; give one by --truth", file=sys.stderr)
+    for file in files:
+        print(file)
+    return 0

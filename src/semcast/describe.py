@@ -1,0 +1,227 @@
+"""What a file or folder is, in a screenful: recordings, runs, recorded sequences and weights."""
+
+import datetime
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from semcast.common.errors import SemcastError, SourceError
+from semcast.common.recording_reader import RECORDING_METADATA, RecordingReader
+from semcast.common.run_folder import (
+    FRAMES_NAME,
+    MAP_NAME,
+    RECONSTRUCTION_NAME,
+    SUMMARY_NAME,
+    TRAJECTORY_NAME,
+    VIEWER_NAME,
+    read_image_paths,
+    read_run,
+)
+from semcast.common.run_summary import read_summary
+
+#: Heading and ``(name, value)`` lines; a name of "" goes on with the line before.
+Section = tuple[str, list[tuple[str, str]]]
+
+
+def describe(path: Path) -> list[Section]:
+    """Say what a path holds.
+
+    Args:
+        path: A recording (``.mcap``), a run folder, a sequence folder, or weights (``.safetensors`` or a
+            shipped name such as ``3dcsc-lite``).
+
+    Raises:
+        SemcastError: It is none of these, or damaged.
+    """
+    if path.is_dir():
+        if any((path / name).exists() for name in (RECONSTRUCTION_NAME, FRAMES_NAME, SUMMARY_NAME)):
+            return describe_run(path)
+        return describe_sequence(path)
+    if path.suffix == ".mcap":
+        return describe_recording(path)
+    if path.suffix in (".safetensors", "") and (path.suffix or not path.exists()):
+        return describe_weights(path)
+    if path.is_file():
+        with path.open("rb") as file:
+            if file.read(5) == b"\x89MCAP":
+                return describe_recording(path)
+    raise SourceError(
+        f"{path} must be a recording (.mcap), a folder that --out wrote, a sequence folder, or weights "
+        f"(.safetensors), got {'another kind of file' if path.exists() else 'nothing at that path'}"
+    )
+
+
+def describe_recording(path: Path) -> list[Section]:
+    """Say what a recording holds: topics, counts, sizes, span, and whether it is whole."""
+    reader = RecordingReader(path)
+    info = reader.info()
+    header = info.metadata.get(RECORDING_METADATA, {})
+    state = "whole" if info.complete else "cut off: replay reads it up to there, 'semcast recover' mends it"
+    facts = [("state", state), ("size", _bytes(reader.size_bytes))]
+    if info.start_ns is not None and info.end_ns is not None:
+        began = datetime.datetime.fromtimestamp(info.start_ns * 1e-9, datetime.UTC)
+        span_s = (info.end_ns - info.start_ns) * 1e-9
+        facts.append(("time", f"{began:%Y-%m-%d %H:%M:%S} UTC, {span_s:.1f} s"))
+    facts.append(("written by", f"semcast {header.get('semcast', '?')}, format {header.get('format', '?')}"))
+    if info.num_damaged_chunks:
+        facts.append(("damaged", f"{info.num_damaged_chunks} chunks left out"))
+    topics = []
+    for topic, count in sorted(info.counts.items()):
+        missed = f", {info.missed[topic]} dropped by the recorder" if info.missed.get(topic) else ""
+        kind, size = info.kinds.get(topic, "?"), _bytes(info.num_bytes[topic])
+        topics.append((topic, f"{count:>6} {kind}, {size}{missed}"))
+    sections: list[Section] = [(f"recording {path}", facts), ("messages", topics)]
+    for name, values in info.metadata.items():
+        if name != RECORDING_METADATA:
+            sections.append((name, [(key, _short(value)) for key, value in sorted(values.items())]))
+    settings = header.get("settings", "")
+    if settings:
+        sections.append(("settings of the recorder", _flat_toml(settings)))
+    return sections
+
+
+def describe_run(path: Path) -> list[Section]:
+    """Say what came out of a run, from its summary and its arrays."""
+    summary = read_summary(path)
+    facts: list[tuple[str, str]] = []
+    if summary:
+        stream, frames = summary.get("stream") or {}, summary.get("frames") or {}
+        size = "x".join(str(v) for v in stream.get("image_wh", ()))
+        facts.append(("stream", f"{stream.get('agent_id', '?')}, {stream.get('codec', '?')}, {size}"))
+        facts.append(("frames", ", ".join(f"{count} {name}" for name, count in frames.items())))
+        for key, name, form in (
+            ("completeness", "frames with a pose", "{:.1%}"),
+            ("ate_percent", "position error (ATE)", "{:.2f} % of the path"),
+            ("psnr_db", "image quality (PSNR)", "{:.2f} dB"),
+            ("snr_estimated_db", "SNR at the receiver", "{:.1f} dB"),
+            ("confidence_mean", "mean confidence", "{:.2f}"),
+            ("frame_rate_hz", "frame rate", "{:.1f} Hz"),
+        ):
+            if summary.get(key) is not None:
+                facts.append((name, form.format(summary[key])))
+        age = (summary.get("stage_ms") or {}).get("arrival_to_pose")
+        if age:
+            facts.append(("arrival to pose", f"p50 {age['p50']:.0f} ms, p95 {age['p95']:.0f} ms"))
+        if summary.get("drops"):
+            facts.append(("dropped frames", ", ".join(f"{n} {why}" for why, n in summary["drops"].items())))
+    else:
+        facts.append(("state", f"no {SUMMARY_NAME}: the run is going on, or was killed"))
+    if (path / RECONSTRUCTION_NAME).is_file():
+        data = read_run(path)
+        facts.append(
+            (
+                "map",
+                f"{len(data.landmark_ids)} landmarks, {len(data.keyframe_ids)} keyframes, "
+                f"{len(data.observed_landmark_ids)} observations",
+            )
+        )
+        camera = data.intrinsics
+        facts.append(
+            (
+                "camera",
+                f"{camera.width}x{camera.height}, fx {camera.fx:.1f} fy {camera.fy:.1f} "
+                f"cx {camera.cx:.1f} cy {camera.cy:.1f} px",
+            )
+        )
+    names = (TRAJECTORY_NAME, MAP_NAME, VIEWER_NAME, RECONSTRUCTION_NAME, FRAMES_NAME, SUMMARY_NAME)
+    files = [(name, _bytes((path / name).stat().st_size)) for name in names if (path / name).is_file()]
+    images = read_image_paths(path)
+    if images:
+        files.append(("images/", f"{len(images)} decoded images"))
+    versions = [(name, str(value)) for name, value in (summary.get("versions") or {}).items()]
+    return [(f"run {path}", facts), ("files", files), ("made with", versions)]
+
+
+def describe_sequence(path: Path) -> list[Section]:
+    """Say what a recorded image sequence holds; what is missing is said, not an error."""
+    from semcast.common.sequence import open_sequence
+
+    sequence = open_sequence(path)
+    facts = [("images", f"{len(sequence)}, {sequence.size_wh[0]}x{sequence.size_wh[1]} px")]
+    times_s = sequence.times_ns * 1e-9
+    if len(times_s) > 1:
+        rate_hz = (len(times_s) - 1) / (times_s[-1] - times_s[0])
+        facts.append(("time", f"{times_s[-1] - times_s[0]:.1f} s, {rate_hz:.1f} images a second"))
+    try:
+        camera = sequence.intrinsics
+        distortion = ", with distortion" if camera.distortion else ""
+        facts.append(
+            (
+                "camera",
+                f"fx {camera.fx:.1f} fy {camera.fy:.1f} cx {camera.cx:.1f} cy {camera.cy:.1f} px{distortion}",
+            )
+        )
+    except SemcastError as err:
+        facts.append(("camera", f"unknown: {err}"))
+    truth = sequence.groundtruth()
+    facts.append(("true path", "none" if truth is None else f"{len(truth)} poses, {truth.path_length:.2f} m"))
+    return [(f"sequence {path}", facts)]
+
+
+def describe_weights(path: Path) -> list[Section]:
+    """Say what weights are, how they were made and what they reached."""
+    from semcast.common.nets.checkpoint import read_manifest, weights_path
+
+    file = weights_path(path if path.suffix else str(path))
+    manifest = read_manifest(file)
+    low_db, high_db = manifest.snr_range_db
+    facts = [
+        ("architecture", f"{manifest.architecture} {json.dumps(manifest.sizes)}"),
+        ("size", _bytes(file.stat().st_size)),
+        ("sha256", manifest.sha256),
+        ("channel uses", f"{manifest.cbr:.4f} for each source value, pilots included"),
+        ("modulations", ", ".join(manifest.modulations)),
+        ("trained for", f"{low_db:g}..{high_db:g} dB"),
+    ]
+    made = [(k, _short(v)) for k, v in manifest.made_by.items() if k != "settings"]
+    measured = []
+    for name, value in manifest.measured.items():
+        measured += [(f"{name} {key}" if key else name, text) for key, text in _curves(value)]
+    return [(f"weights {file.name}", facts), ("made by", made), ("measured", measured)]
+
+
+def _curves(value: Any) -> list[tuple[str, str]]:
+    """Shorten measurements: a curve becomes one line."""
+    if not isinstance(value, dict):
+        return [("", _short(value))]
+    lines = []
+    for key, inner in value.items():
+        if isinstance(inner, list) and inner and isinstance(inner[0], dict) and "snr_db" in inner[0]:
+            points = (f"{point['snr_db']:g} dB: {point.get('psnr_db', float('nan')):.1f}" for point in inner)
+            lines.append((key, "PSNR dB at " + ", ".join(points)))
+        else:
+            lines.append((key, _short(inner)))
+    return lines
+
+
+def _flat_toml(text: str) -> list[tuple[str, str]]:
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return [("", _short(text))]
+    lines: list[tuple[str, str]] = []
+
+    def walk(prefix: str, table: dict[str, Any]) -> None:
+        for key, value in table.items():
+            if isinstance(value, dict):
+                walk(f"{prefix}{key}.", value)
+            else:
+                lines.append((f"{prefix}{key}", _short(value)))
+
+    walk("", values)
+    return lines
+
+
+def _short(value: Any, most: int = 160) -> str:
+    text = value if isinstance(value, str) else json.dumps(value, default=str)
+    text = " ".join(text.split())
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def _bytes(count: float) -> str:
+    for unit in ("B", "KiB", "MiB"):
+        if count < 1024:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1024
+    return f"{count:.1f} GiB"
