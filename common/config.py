@@ -138,6 +138,8 @@ def add_flags(
 ) -> None:
     """Add one flag per field, nested settings flattened; absent flags leave no value behind.
 
+    A field with ``positional`` in its metadata is an argument without a flag.
+
     Args:
         parser: Where the flags go.
         cls: A settings class.
@@ -155,6 +157,15 @@ def add_flags(
         text = str(field.metadata.get("help", "")).replace("%", "%%") + _default_text(field).replace(
             "%", "%%"
         )
+        if field.metadata.get("positional"):
+            # Optional for argparse, since a settings file may give it; a missing one is missed later.
+            options = {
+                "metavar": field.name.upper(),
+                "nargs": "?",
+                "type": _flag_options(annotations[field.name])["type"],
+            }
+            parser.add_argument(dotted, default=argparse.SUPPRESS, help=text, **options)
+            continue
         parser.add_argument(
             "--" + field.metadata.get("flag", field.name).replace("_", "-"),
             dest=dotted,

@@ -1,6 +1,8 @@
 """Records everything a running system sends, beside it: nobody waits for the recorder."""
 
+import contextlib
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from semcast.common.keys import DEFAULT_AGENT_ID, all_keys, camera_key, check_ag
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
 from semcast.common.recording import recording_metadata
-from semcast.common.transport import open_session
+from semcast.common.transport import Session, open_session
 
 CAMERA_TIMEOUT_S = 0.5
 
@@ -24,7 +26,9 @@ class RecordSettings:
         ValueError: The agent's name is not well formed.
     """
 
-    file: Path = field(default=Path("run.mcap"), metadata={"help": "recording to write (MCAP)"})
+    file: Path = field(
+        default=Path("run.mcap"), metadata={"help": "recording to write (MCAP)", "positional": True}
+    )
     agent_id: str = field(default=DEFAULT_AGENT_ID, metadata={"help": "name of the agent to record"})
     network: NetworkSettings = field(default=NetworkSettings(), metadata={"help": "where the hub is"})
 
@@ -36,6 +40,26 @@ def kind_of_key(key: str) -> str:
     """Return the kind of message a key carries: ``symbols`` for both directions, else the key's own word."""
     word = key.split("/")[2]
     return "symbols" if word in ("tx", "rx") else word
+
+
+@contextlib.contextmanager
+def recording(session: Session, agent_id: str, file: Path, settings_toml: str) -> Iterator[Recorder]:
+    """Record all that is sent about one agent while the context lasts.
+
+    Args:
+        session: Open network session; what it sends itself is recorded too.
+        agent_id: Whose stream.
+        file: Recording to write; replaced when it exists.
+        settings_toml: Resolved settings of the program, kept in the recording.
+
+    Raises:
+        SourceError: The file can't be written.
+    """
+    with Recorder(file, recording_metadata(settings_toml, __version__)) as recorder:
+        session.subscribe_keyed(
+            all_keys(agent_id), "every", lambda key, payload: recorder.put(key, kind_of_key(key), payload)
+        )
+        yield recorder
 
 
 def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any]:
@@ -51,17 +75,11 @@ def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any
     session = open_session(settings.network, stop)
     if session is None:
         return {"messages": 0, "bytes": 0, "drops": {}}
-    header = recording_metadata(to_toml(settings), __version__)
-    with session, Recorder(settings.file, header) as recorder:
-
-        def take(key: str, payload: bytes) -> None:
-            recorder.put(key, kind_of_key(key), payload)
-
-        session.subscribe_keyed(all_keys(settings.agent_id), "every", take)
+    with session, recording(session, settings.agent_id, settings.file, to_toml(settings)) as recorder:
         # The camera was announced before we came.
         camera = session.request(camera_key(settings.agent_id), b"", CAMERA_TIMEOUT_S)
         if camera is not None:
-            take(camera_key(settings.agent_id), camera)
+            recorder.put(camera_key(settings.agent_id), "camera", camera)
         stop.wait()
     return {
         "messages": recorder.num_written,

@@ -25,24 +25,25 @@ from semcast.server.decoder import DecodedArrival, FrameDecoder
 from semcast.server.receiver import ReceivedFrame
 from semcast.server.reconstruction_settings import ReconstructionSettings
 from semcast.server.reference import Reference
-from semcast.server.session import Arrival, Session, StreamIdentity
+from semcast.server.session import Arrival, Outcome, Session, StreamIdentity
 from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.viewer_choice import check_viewer, open_viewer
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplaySettings:
-    """How a recording is replayed: lossless, as fast as it goes, repeatable to the bit.
+    """How a recording is replayed: lossless and repeatable to the bit, at any pace.
 
     Raises:
         ValueError: A value is out of range.
     """
 
-    file: Path = field(metadata={"help": "recording to replay (MCAP)"})
-    symbols: Literal["received", "transmitted"] = field(
-        default="received",
+    file: Path = field(metadata={"help": "recording to replay (MCAP)", "positional": True})
+    symbols: Literal["received", "transmitted"] | None = field(
+        default=None,
         metadata={
-            "help": "received: what the recorded link made of the frames; "
-            "transmitted: what the agent sent, through the channel given here"
+            "help": "received: what the recorded link made of the frames (default); "
+            "transmitted: what the agent sent, through the channel given here (default when one is given)"
         },
     )
     link: ChannelSettings = field(
@@ -53,6 +54,10 @@ class ReplaySettings:
     reference: Path | None = field(
         default=None, metadata={"help": "recorded sequence the agent sent: gives PSNR and ground truth"}
     )
+    pace: float = field(
+        default=0.0,
+        metadata={"help": "1: as recorded, 2: twice as fast; 0: as fast as this machine goes"},
+    )
     threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})
     start_s: float = field(default=0.0, metadata={"help": "leave out frames before this time of the source"})
     end_s: float | None = field(default=None, metadata={"help": "leave out frames after this time"})
@@ -60,11 +65,26 @@ class ReplaySettings:
         default=ReconstructionSettings(), metadata={"help": "tracking and mapping"}
     )
 
+    view: ViewSettings = field(default=ViewSettings(view="none"), metadata={"help": "viewer"})
+
     def __post_init__(self) -> None:
+        if self.symbols == "received" and self.link != ChannelSettings():
+            raise ValueError(
+                "symbols must be transmitted for another channel, got received: they have been through one"
+            )
+        if not 0.0 <= self.pace <= 100.0:
+            raise ValueError(f"pace must be in [0, 100], got {self.pace:g}")
         if self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
         if self.end_s is not None and self.end_s <= self.start_s:
             raise ValueError(f"end_s must be later than start_s ({self.start_s:g}), got {self.end_s:g}")
+
+    @property
+    def source(self) -> Literal["received", "transmitted"]:
+        """Which symbols are replayed."""
+        if self.symbols is not None:
+            return self.symbols
+        return "received" if self.link == ChannelSettings() else "transmitted"
 
 
 def replay(
@@ -97,8 +117,9 @@ def replay(
         bundle="inline",
         resume=False,
         reconstruction=settings.reconstruction,
-        view=ViewSettings(view="none"),
+        view=settings.view,
     )
+    check_viewer(server)
     decoder = FrameDecoder(
         lambda name, modulation: load_codec(name, modulation=modulation, num_threads=settings.threads)
     )
@@ -112,34 +133,40 @@ def replay(
     )
     reference = Reference(settings.reference, camera.intrinsics) if settings.reference is not None else None
     session = Session(server, identity, settings.out, reference)
+    viewer = open_viewer(server, identity, reference.truth if reference is not None else None)
+    stop = stop if stop is not None else threading.Event()
     drops: dict[str, int] = {}
     processed = 0
     try:
-        for arrival in _arrivals(reader, camera, settings):
-            if stop is not None and stop.is_set():
+        for arrival in _paced(_arrivals(reader, camera, settings), settings.pace, stop):
+            if stop.is_set():
                 break
             decoded = decoder.decode(arrival)
             if decoded.frame is None:
                 reason = "lost_on_air" if arrival.received is None else "outage"
                 drops[reason] = drops.get(reason, 0) + 1
                 continue
-            _process(session, decoded, drops)
+            outcome = _process(session, decoded, drops)
+            if viewer is not None:
+                viewer.submit(outcome.view, outcome.update)
             processed += 1
             if on_frame is not None:
                 on_frame(arrival.message.frame_id)
         if not processed:
-            raise SourceError(f"{settings.file} holds no {settings.symbols} frames that can be decoded")
+            raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
         return session.write_outputs(settings.out, drops, complete=True)
     finally:
         session.close()
+        if viewer is not None:
+            viewer.close(leave_window=settings.view.leave_open)
         if reference is not None:
             reference.close()
 
 
-def _process(session: Session, decoded: DecodedArrival, drops: dict[str, int]) -> None:
+def _process(session: Session, decoded: DecodedArrival, drops: dict[str, int]) -> Outcome:
     assert decoded.frame is not None
     arrival = decoded.arrival
-    session.process(
+    return session.process(
         decoded.frame,
         Arrival(
             snr_set_db=arrival.snr_db_set,
@@ -166,7 +193,7 @@ def _arrivals(
     reader: RecordingReader, camera: CameraInfo, settings: ReplaySettings
 ) -> Iterator[ReceivedFrame]:
     """Yield the frames of the stream in order, each once."""
-    direction = "rx" if settings.symbols == "received" else "tx"
+    direction = "rx" if settings.source == "received" else "tx"
     link = Link(settings.link, settings.seed) if direction == "tx" else None
     last_id, first_ns = -1, None
     for message in reader.messages(frozenset({"symbols"})):
@@ -197,6 +224,18 @@ def _arrivals(
             equalised = equalise(slots, frame.image_hw, frame.modulation, slot_lost=lost)
             arrival = replace(arrival, received=equalised.received, snr_db=float(equalised.snr_db))
         yield arrival
+
+
+def _paced(arrivals: Iterator[ReceivedFrame], pace: float, stop: threading.Event) -> Iterator[ReceivedFrame]:
+    """Hold every frame back until its recorded time, sped up by ``pace``; 0 holds nothing back."""
+    first_ns: int | None = None
+    started_s = time.monotonic()
+    for arrival in arrivals:
+        if pace > 0.0:
+            first_ns = arrival.message.t_source_ns if first_ns is None else first_ns
+            due_s = started_s + (arrival.message.t_source_ns - first_ns) * 1e-9 / pace
+            stop.wait(max(0.0, due_s - time.monotonic()))
+        yield replace(arrival, t_arrival_ns=time.perf_counter_ns())
 
 
 def _on_the_air(

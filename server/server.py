@@ -1,7 +1,6 @@
 """The server process: receives, decodes, tracks and maps one stream, shows it and keeps the results."""
 
 import contextlib
-import importlib
 import logging
 import threading
 import time
@@ -11,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from semcast.common.codec import Codec, Modulation
 from semcast.common.codecs import load_codec
+from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.keys import camera_key, control_key
 from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
 from semcast.common.metrics import Metrics
-from semcast.common.run_folder import VIEWER_NAME
 from semcast.common.sequence import open_sequence
 from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
@@ -26,9 +25,11 @@ from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import DecodedArrival, FrameDecoder
 from semcast.server.outbox import Outbox
 from semcast.server.receiver import ReceivedFrame, Receiver
+from semcast.server.record import recording
 from semcast.server.reference import Reference
 from semcast.server.session import Arrival, Outcome, Session, StreamIdentity, new_bundle
 from semcast.server.settings import ServerSettings
+from semcast.server.viewer_choice import check_viewer, open_viewer
 
 if TYPE_CHECKING:  # Rerun is imported only when something is shown or recorded
     from semcast.server.viewer_feed import ViewerFeed
@@ -80,6 +81,8 @@ class Server:
         self._new_map = False
         self._resources = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
+            if settings.record is not None:
+                stack.enter_context(recording(session, self._agent_id, settings.record, to_toml(settings)))
             self._receiver = stack.enter_context(
                 Receiver(session, self._agent_id, settings.mode, self._metrics, settings.max_age_ms)
             )
@@ -118,10 +121,7 @@ class Server:
         if settings.reference is not None:
             open_sequence(settings.reference)
         self._spare_bundle = new_bundle(settings)
-        if settings.view.view != "none":
-            importlib.import_module("semcast.server.viewer_feed").check_view(
-                settings.view, has_folder=settings.out is not None
-            )
+        check_viewer(settings)
         if settings.codec is not None:
             codec = self._decoder.load(settings.codec, settings.modulation)
             self._decoder.warm_up(codec.name, settings.modulation, codec.digest, WARM_UP_SHAPE_HW)
@@ -323,25 +323,8 @@ class Server:
         return self._session
 
     def _open_viewer(self, identity: StreamIdentity, resumed: bool) -> None:
-        view, out = self._settings.view.view, self._settings.out
-        if view == "none":
-            return
-        from semcast.server.viewer_feed import ViewerFeed, resolve_view
-
-        if resolve_view(view, has_folder=out is not None) == "none":
-            return
-        file = out / VIEWER_NAME if out is not None else None
-        if file is not None and resumed:
-            keep_former(file)
-        self._viewer = ViewerFeed(
-            self._settings.view,
-            identity.camera,
-            f"{identity.agent_id}-{identity.agent_epoch}",
-            truth=self._reference.truth if self._reference is not None else None,
-            file=file,
-        )
-        if self._viewer.url is not None:
-            logger.info("viewer: %s", self._viewer.url)
+        truth = self._reference.truth if self._reference is not None else None
+        self._viewer = open_viewer(self._settings, identity, truth, resumed=resumed)
 
     def _close_viewer(self) -> None:
         viewer, self._viewer = self._viewer, None
@@ -394,15 +377,6 @@ class Server:
         reference, self._reference = self._reference, None
         if reference is not None:
             reference.close()
-
-
-def keep_former(file: Path) -> None:
-    """Rename an existing file to ``<stem>-<n><suffix>`` so that it is not overwritten."""
-    n = 1
-    while (former := file.with_name(f"{file.stem}-{n}{file.suffix}")).exists():
-        n += 1
-    with contextlib.suppress(FileNotFoundError):
-        file.rename(former)
 
 
 def run_server(settings: ServerSettings, stop_event: threading.Event) -> dict[str, Any]:

@@ -84,6 +84,7 @@ class ServerSettings:
         bundle: Where bundle adjustment runs: a process of its own, or inline.
         checkpoint_interval_s: How much of the map a killed server may lose.
         resume: Go on with the map in ``out`` when it belongs to the same stream.
+        record: Recording to write of everything that is sent, or None.
         save_images: Which decoded images to keep in ``out``, for exports.
         keep_running: Go on after the source's last frame and wait for the next agent.
         idle_timeout_s: End when nothing arrives for so long after the first frame.
@@ -119,6 +120,9 @@ class ServerSettings:
     )
     resume: bool = field(
         default=True, metadata={"help": "go on with the map in the output folder if it is of the same stream"}
+    )
+    record: Path | None = field(
+        default=None, metadata={"help": "also keep everything that is sent in this recording (MCAP)"}
     )
     save_images: Literal["none", "keyframes", "all"] = field(
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}

@@ -59,6 +59,9 @@ class DemoSettings:
             "help": "factor on the image size; by default what two cores can serve at 10 frames a second"
         },
     )
+    record: Path | None = field(
+        default=None, metadata={"help": "also keep everything that is sent in this recording (MCAP)"}
+    )
     seed: int = field(default=0, metadata={"help": "seed of channel and estimation"})
     out: Path = field(default=Path("runs/demo"), metadata={"help": "folder for all outputs"})
     json: Path | None = field(default=None, metadata={"help": "also write the summary to this file"})
@@ -101,6 +104,8 @@ def role_commands(
     server = [*program, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
     server += ["--reference", str(sequence), "--confidence", settings.confidence, "--view", settings.view]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
+    if settings.record is not None:
+        server += ["--record", str(settings.record)]
     channel = [*program, "channel", *meet, "--channel", settings.channel, "--snr-db", f"{settings.snr_db:g}"]
     channel += ["--seed", str(settings.seed)]
     agent = [*program, "agent", *meet, "--source", str(sequence), "--codec", settings.codec]

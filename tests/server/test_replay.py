@@ -1,6 +1,7 @@
 """A recording replays to the same poses every time; through another channel it does not."""
 
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from semcast.common.recording_reader import RecordingReader
 from semcast.common.transport import open_hub
 from semcast.server.record import RecordSettings, kind_of_key, run_record
 from semcast.server.replay import ReplaySettings, replay
+from semcast.server.settings import ViewSettings
 
 SEQUENCE = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
 FRAMES = 14
@@ -76,11 +78,34 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
     lossy = ReplaySettings(
         file=recording,
         out=tmp_path / "c",
-        symbols="transmitted",
         link=ChannelSettings(snr_db=15.0, frame_loss=0.4),
     )
     replay(lossy)
     assert (tmp_path / "c" / "trajectory.tum").read_bytes() != first
+
+
+def test_a_paced_and_shown_replay_gives_the_same_poses(recording, tmp_path):
+    plain = ReplaySettings(file=recording, out=tmp_path / "plain", end_s=0.6)
+    assert plain.source == "received"
+    replay(plain)
+    began_s = time.monotonic()
+    shown = ReplaySettings(
+        file=recording, out=tmp_path / "shown", end_s=0.6, pace=0.5, view=ViewSettings(view="file")
+    )
+    replay(shown)
+    assert time.monotonic() - began_s > 0.8  # the source's 0.5 s or more at half the pace
+    first, second = ((tmp_path / name / "trajectory.tum").read_bytes() for name in ("plain", "shown"))
+    assert first == second
+    assert (tmp_path / "shown" / "run.rrd").stat().st_size > 10_000
+    assert not (tmp_path / "plain" / "run.rrd").exists()
+
+
+def test_a_channel_means_the_transmitted_symbols(recording):
+    assert ReplaySettings(file=recording, link=ChannelSettings(snr_db=4.0)).source == "transmitted"
+    with pytest.raises(ValueError, match="symbols must be transmitted for another channel, got received"):
+        ReplaySettings(file=recording, symbols="received", link=ChannelSettings(snr_db=4.0))
+    with pytest.raises(ValueError, match=r"pace must be in \[0, 100\], got -1"):
+        ReplaySettings(file=recording, pace=-1.0)
 
 
 def test_a_cut_recording_is_recovered_and_still_replays(recording, tmp_path):

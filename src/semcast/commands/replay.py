@@ -2,6 +2,7 @@
 
 import argparse
 import threading
+from dataclasses import replace
 from typing import Any
 
 from rich.console import Console
@@ -22,6 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Replay and print the figures."""
     settings = read_settings(ReplaySettings, arguments)
+    if settings.symbols is None and any(name.startswith("link.") for name in vars(arguments)):
+        settings = replace(settings, symbols="transmitted")  # a channel asked for by its default values
     talk = Console(stderr=True)
     summary: dict[str, Any] = {}
 
