@@ -140,6 +140,9 @@ def _flags(settings: Any) -> list[str]:
             default = field.default_factory()
         if value is None or (default is not dataclasses.MISSING and value == default):
             continue
+        if field.metadata.get("positional"):
+            words.append(str(json_ready(value)))
+            continue
         flag = str(field.metadata.get("flag", field.name)).replace("_", "-")
         if isinstance(value, bool):
             words.append(f"--{flag}" if value else f"--no-{flag}")
