@@ -24,6 +24,7 @@ from semcast.training.channel import LinkDraw, draw_links
 from semcast.training.data import Batches, read_images
 from semcast.training.klt import start_from_klt
 from semcast.training.losses import transceiver_loss
+from semcast.training.masked import masked_image_loss
 from semcast.training.optimisers import build_optimisers, rate_factor, set_rate
 from semcast.training.settings import TrainSettings
 from semcast.training.validation import validate
@@ -202,7 +203,10 @@ class Run:
         with_heads = is_ending or self.step % settings.head_every == 0
         set_rate(self.optimisers, rate_factor(share, self.step, settings))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=settings.bf16):
-            loss, logs = self.loss(self.model, x, draw, noise, settings.loss, with_heads)
+            if share < settings.pretrain_share:
+                loss, logs = masked_image_loss(self.model, x, settings.mask_share, generator)
+            else:
+                loss, logs = self.loss(self.model, x, draw, noise, settings.loss, with_heads)
         loss.backward()
         self._share_gradients()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip)

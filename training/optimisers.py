@@ -21,17 +21,18 @@ def rate_factor(progress: float, step: int, settings: TrainSettings) -> float:
 
 
 def build_optimisers(model: Transceiver, settings: TrainSettings) -> list[torch.optim.Optimizer]:
-    """Give kernels to Muon (or AdamW), the linear heart and everything else to AdamW.
+    """Give kernels and a transformer's matrices to Muon (or AdamW), the linear heart and the rest to AdamW.
 
     First and last layers of the image path are AdamW's: their rows are pixels, not features.
     """
     kernels, linear, rest = [], [], []
     for name, weight in model.named_parameters():
         is_heart = ".linear." in name
+        is_matrix = weight.ndim == 4 or (weight.ndim == 2 and ".blocks." in name)
         is_edge = "head." in name or name.endswith(("encoder.stem.weight", "decoder.estimate.weight"))
         if is_heart:
             linear.append(weight)
-        elif weight.ndim == 4 and not is_edge and settings.optimiser == "muon":
+        elif is_matrix and not is_edge and settings.optimiser == "muon":
             kernels.append(weight)
         else:
             rest.append(weight)

@@ -38,6 +38,10 @@ class TrainSettings:
     clip: float = field(default=0.01, metadata={"help": "largest norm of the gradient"})
     ema: float = field(default=0.999, metadata={"help": "decay of the averaged weights that are shipped"})
     start: Literal["klt", "random"] = field(default="klt", metadata={"help": "linear layers at the start"})
+    pretrain_share: float = field(
+        default=0.0, metadata={"help": "first share of the run: fill in hidden patches, without a link (mae)"}
+    )
+    mask_share: float = field(default=0.75, metadata={"help": "share of patches hidden in pre-training"})
     head_every: int = field(
         default=4,
         metadata={
@@ -78,6 +82,8 @@ class TrainSettings:
         for name in ("lr", "lr_muon", "lr_linear", "clip"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
-        for name in ("decay_share", "ema"):
+        if not 0.0 < self.mask_share < 1.0:
+            raise ValueError(f"mask_share must be in (0, 1), got {self.mask_share}")
+        for name in ("decay_share", "ema", "pretrain_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")

@@ -84,13 +84,22 @@ class Trunk(nn.Module):
     def forward(self, f: Tensor, condition: Tensor) -> Tensor:
         """Refine ``(B, dim, h, w)`` under a ``(B, 2)`` link state."""
         batch, dim, rows, columns = f.shape
+        tokens = self.refine(self.place(f) + self.condition(condition)[:, None].to(f.dtype))
+        grid: Tensor = tokens.transpose(1, 2).reshape(batch, dim, rows, columns)
+        return grid
+
+    def place(self, f: Tensor) -> Tensor:
+        """Turn ``(B, dim, h, w)`` into tokens ``(B, h * w, dim)`` that know their position."""
+        _, dim, rows, columns = f.shape
         tokens = f.flatten(2).transpose(1, 2)
-        tokens = tokens + positions(rows, columns, dim, tokens)
-        tokens = tokens + self.condition(condition)[:, None].to(tokens.dtype)
+        return tokens + positions(rows, columns, dim, tokens)
+
+    def refine(self, tokens: Tensor) -> Tensor:
+        """Pass tokens ``(B, N, dim)`` through all blocks."""
         for block in self.blocks:
             tokens = block(tokens)
-        grid: Tensor = self.norm(tokens).transpose(1, 2).reshape(batch, dim, rows, columns)
-        return grid
+        refined: Tensor = self.norm(tokens)
+        return refined
 
 
 class VitEncoder(nn.Module):

@@ -102,7 +102,7 @@ def test_the_encoder_keeps_its_budget_of_multiplications_per_pixel(name, limit):
     assert count / 64**2 <= limit
 
 
-@pytest.mark.parametrize("name", ["cnn", "vit"])
+@pytest.mark.parametrize("name", ["cnn", "vit", "mae"])
 def test_rivals_fit_the_same_shell(name):
     torch.manual_seed(0)
     model = build(name).eval()
