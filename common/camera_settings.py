@@ -1,5 +1,6 @@
 """How a user says what the camera is: a calibration file, or the four numbers of a pinhole."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,8 +10,11 @@ from semcast.common.errors import SourceError
 
 HOW_TO_GIVE = (
     "put intrinsics.json (fx fy cx cy width height) beside the images, or give --intrinsics FILE "
-    "(.json, or .yaml of OpenCV, ROS or EuRoC), or --fx --fy --cx --cy in pixels"
+    "(.json, or .yaml of OpenCV, ROS or EuRoC), or --fx --fy --cx --cy in pixels. 'semcast calibrate' finds "
+    "them from pictures of a chessboard; --focal-35mm 26 (a phone's main camera) is a rough start without"
 )
+#: Diagonal of a 35 mm film frame, 36 x 24 mm.
+_FILM_DIAGONAL_MM = 43.27
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +22,8 @@ class CameraSettings:
     """Intrinsics from the command line; all unset means: take what the source itself says.
 
     Raises:
-        ValueError: Only some of fx, fy, cx, cy are given, or a file and numbers.
+        ValueError: Only some of fx, fy, cx, cy are given, or more than one of file, numbers and
+            ``focal_35mm``.
     """
 
     intrinsics: Path | None = field(
@@ -28,6 +33,13 @@ class CameraSettings:
     fy: float | None = field(default=None, metadata={"help": "focal length in pixels, vertical"})
     cx: float | None = field(default=None, metadata={"help": "principal point x in pixels"})
     cy: float | None = field(default=None, metadata={"help": "principal point y in pixels"})
+    focal_35mm: float | None = field(
+        default=None,
+        metadata={
+            "help": "focal length in mm of a 35 mm camera with the same view, as phones and EXIF name it: a "
+            "rough start where there is no calibration"
+        },
+    )
     distortion: tuple[float, ...] = field(
         default=(), metadata={"help": "OpenCV coefficients k1 k2 p1 p2 [k3 [k4 k5 k6]]"}
     )
@@ -38,6 +50,10 @@ class CameraSettings:
             raise ValueError(f"fx, fy, cx and cy must be given together, got only {', '.join(given)}")
         if given and self.intrinsics is not None:
             raise ValueError(f"give either intrinsics or {', '.join(given)}, got both")
+        if self.focal_35mm is not None and (given or self.intrinsics is not None):
+            raise ValueError("focal_35mm must be given alone: a calibration says more")
+        if self.focal_35mm is not None and not 5.0 <= self.focal_35mm <= 1000.0:
+            raise ValueError(f"focal_35mm must be in [5, 1000], got {self.focal_35mm:g}")
         if self.distortion and not given:
             raise ValueError("distortion must come with fx, fy, cx and cy")
 
@@ -49,6 +65,11 @@ class CameraSettings:
         """
         if self.intrinsics is not None:
             return read_intrinsics(self.intrinsics)
+        if self.focal_35mm is not None:
+            focal_px = self.focal_35mm * math.hypot(width, height) / _FILM_DIAGONAL_MM
+            return Intrinsics(
+                fx=focal_px, fy=focal_px, cx=(width - 1) / 2, cy=(height - 1) / 2, width=width, height=height
+            )
         if self.fx is None or self.fy is None or self.cx is None or self.cy is None:
             return None
         try:

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 
+from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SemcastError
 from semcast.common.recording_reader import RecordingReader
 from semcast.demo import DemoSettings, real_time_resize, role_commands, run_demo
@@ -26,6 +27,19 @@ def test_every_setting_reaches_a_process(tmp_path):
     ]
     for value in ("webp-ldpc", "analog", "3", "burst", "paper", "web", "7", "0.5", str(tmp_path / "o")):
         assert value in words
+
+
+def test_the_camera_reaches_the_agent_and_distorted_images_are_no_reference(tmp_path):
+    def commands(**camera):
+        settings = DemoSettings(camera=CameraSettings(**camera), out=tmp_path)
+        return role_commands(settings, SEQUENCE, 0.5, "tcp/127.0.0.1:1")
+
+    plain = commands(focal_35mm=26.0)
+    assert plain["agent"][-2:] == ["--focal-35mm", "26.0"]
+    assert "--reference" in plain["server"]
+    bent = commands(fx=500.0, fy=500.0, cx=320.0, cy=240.0, distortion=(0.1, 0.0, 0.0, 0.0))
+    assert bent["agent"][-5:] == ["--distortion", "0.1", "0.0", "0.0", "0.0"]
+    assert "--reference" not in bent["server"]
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
+from semcast.common.camera_file import read_intrinsics
+from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.network_settings import NetworkSettings
@@ -39,6 +41,9 @@ class DemoSettings:
 
     sequence: Path | None = field(
         default=None, metadata={"help": "recorded sequence; without it the one shipped with semcast"}
+    )
+    camera: CameraSettings = field(
+        default=CameraSettings(), metadata={"help": "camera of a sequence that does not say it"}
     )
     codec: str = field(default=DEFAULT_CODEC, metadata={"help": "codec by name, such as jpeg-ldpc"})
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
@@ -102,15 +107,35 @@ def role_commands(
     program = [sys.executable, "-m", "semcast"]
     meet = ["--agent-id", AGENT_ID, "--connect", endpoint]
     server = [*program, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
-    server += ["--reference", str(sequence), "--confidence", settings.confidence, "--view", settings.view]
+    if not _changes_pixels(settings.camera):
+        server += ["--reference", str(sequence)]
+    server += ["--confidence", settings.confidence, "--view", settings.view]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
     if settings.record is not None:
         server += ["--record", str(settings.record)]
     channel = [*program, "channel", *meet, "--channel", settings.channel, "--snr-db", f"{settings.snr_db:g}"]
     channel += ["--seed", str(settings.seed)]
     agent = [*program, "agent", *meet, "--source", str(sequence), "--codec", settings.codec]
-    agent += ["--modulation", settings.modulation, "--resize", f"{resize:g}"]
+    agent += ["--modulation", settings.modulation, "--resize", f"{resize:g}", *_camera_flags(settings.camera)]
     return {"server": server, "channel": channel, "agent": agent}
+
+
+def _camera_flags(camera: CameraSettings) -> list[str]:
+    """Return the flags that give the agent the same camera."""
+    words: list[str] = []
+    for entry in fields(camera):
+        value = getattr(camera, entry.name)
+        if value is not None and value != ():
+            values = value if isinstance(value, tuple) else (value,)
+            words += ["--" + entry.name.replace("_", "-"), *(str(v) for v in values)]
+    return words
+
+
+def _changes_pixels(camera: CameraSettings) -> bool:
+    """Tell whether the agent removes distortion: the recorded images still have it and are no reference."""
+    if camera.intrinsics is not None:
+        return bool(read_intrinsics(camera.intrinsics).distortion)
+    return bool(camera.distortion)
 
 
 class Role:
@@ -216,7 +241,7 @@ def run_demo(
     logs = settings.out / "logs"
     logs.mkdir(exist_ok=True)
     endpoint = free_endpoint()
-    resize = settings.resize or real_time_resize(open_sequence(sequence).intrinsics.shape_hw)
+    resize = settings.resize or real_time_resize(open_sequence(sequence, settings.camera).intrinsics.shape_hw)
     commands = role_commands(settings, sequence, resize, endpoint)
     children = {name: Role(name, command, logs / f"{name}.log") for name, command in commands.items()}
     alive = Alive(set(), threading.Condition())

@@ -349,3 +349,14 @@ def test_a_damaged_image_in_the_middle_is_an_error_of_that_frame_alone(native):
 def test_arguments_out_of_range_are_refused(native, arguments, message):
     with pytest.raises(ValueError, match=message):
         open_sequence(native, **arguments)
+
+
+def test_a_phone_s_focal_length_gives_a_rough_camera():
+    # 26 mm on the 43.27 mm diagonal of film; 3 4 5 makes the image's diagonal 1000 px.
+    camera = CameraSettings(focal_35mm=26.0).resolve(800, 600)
+    assert camera.fx == camera.fy == pytest.approx(26.0 / 43.27 * 1000.0)
+    assert (camera.cx, camera.cy) == (399.5, 299.5)
+    with pytest.raises(ValueError, match="focal_35mm must be given alone"):
+        CameraSettings(focal_35mm=26.0, fx=1.0, fy=1.0, cx=1.0, cy=1.0)
+    with pytest.raises(ValueError, match=r"focal_35mm must be in \[5, 1000\], got 0.02"):
+        CameraSettings(focal_35mm=0.02)
