@@ -8,7 +8,7 @@ import pickle
 import subprocess
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +193,10 @@ class Run:
         seed = (settings.seed * 1_000_003 + self.step) * 64 + self.rank
         generator = torch.Generator().manual_seed(seed)
         blocks = settings.crop.size_px // BLOCK_PX
-        draw = draw_links(settings.channel, settings.batch, blocks, generator)
+        channel = settings.channel
+        if share < settings.analog_share:
+            channel = replace(channel, share_16qam=0.0)
+        draw = draw_links(channel, settings.batch, blocks, generator)
         draw = LinkDraw(*(t.to(self.device) for t in vars(draw).values()))
         # Drawn where it is used: on a CPU the noise of a large batch would cost a GPU more than the network.
         on_device = torch.Generator(self.device).manual_seed(seed + 1_000_003)

@@ -41,6 +41,13 @@ class TrainSettings:
     pretrain_share: float = field(
         default=0.0, metadata={"help": "first share of the run: fill in hidden patches, without a link (mae)"}
     )
+    analog_share: float = field(
+        default=0.0,
+        metadata={
+            "help": "until this share of the run all images are sent analog: rounding to levels hides from a "
+            "randomly started network what it could gain"
+        },
+    )
     mask_share: float = field(default=0.75, metadata={"help": "share of patches hidden in pre-training"})
     head_every: int = field(
         default=4,
@@ -84,6 +91,6 @@ class TrainSettings:
                 raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
         if not 0.0 < self.mask_share < 1.0:
             raise ValueError(f"mask_share must be in (0, 1), got {self.mask_share}")
-        for name in ("decay_share", "ema", "pretrain_share"):
+        for name in ("decay_share", "ema", "pretrain_share", "analog_share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")

@@ -14,6 +14,7 @@ import semcast.common.nets.registry as registry
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import CheckpointError
 from semcast.common.nets.codec import NeuralCodec
+from semcast.common.nets.mae import MaeSizes, build_mae
 from semcast.common.nets.registry import architectures
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
 from semcast.training.channel import ChannelSettings
@@ -116,6 +117,38 @@ def test_training_lowers_the_loss_on_the_images_it_sees(tiny_network, photos, tm
 @pytest.mark.parametrize("changes", [{"optimiser": "adamw"}, {"loss": LossSettings(descriptor=0.01)}])
 def test_other_optimisers_and_terms_run(tiny_network, photos, tmp_path, changes):
     assert train(settings_for(photos, tmp_path / "run", steps=2, **changes)).steps == 2
+
+
+def test_a_run_can_begin_with_analog_links(tiny_network, photos, tmp_path):
+    always_qam = ChannelSettings(share_16qam=1.0)
+    train(settings_for(photos, tmp_path / "o", analog_share=0.5, channel=always_qam, log_every=1))
+    rows = [json.loads(line) for line in (tmp_path / "o" / "log.jsonl").read_text().splitlines()]
+    power = [row["power"] for row in rows if "power" in row]  # of the 16-QAM images, 0 where there is none
+    assert power[:3] == [0.0, 0.0, 0.0]
+    assert min(power[3:]) > 0.1
+
+
+def test_a_masked_autoencoder_is_pre_trained_before_it_is_sent(photos, tmp_path, monkeypatch):
+    small = MaeSizes(
+        dim=16, heads=2, encoder_depth=1, decoder_depth=1, block_channels=8, confidence_channels=8
+    )
+    monkeypatch.setattr(registry, "_entries", lambda: (registry.Architecture("mae", small, build_mae),))
+    crop = CropSettings(size_px=96)
+    train(
+        settings_for(
+            photos,
+            tmp_path / "o",
+            architecture="mae",
+            start="random",
+            pretrain_share=0.5,
+            crop=crop,
+            log_every=1,
+        )
+    )
+    rows = [json.loads(line) for line in (tmp_path / "o" / "log.jsonl").read_text().splitlines()]
+    assert ["masked" in row for row in rows if "mse" in row] == [True] * 3 + [False] * 3
+    codec = NeuralCodec.load(tmp_path / "o" / "mae.safetensors")
+    assert codec.encode(np.zeros((64, 80, 3), np.uint8), 10.0).symbols.size == 20 * 47
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(tiny_network, photos, tmp_path, monkeypatch):
