@@ -51,6 +51,9 @@ class ReplaySettings:
     )
     seed: int = field(default=0, metadata={"help": "seed of the channel"})
     out: Path | None = field(default=None, metadata={"help": "folder for trajectory, map, summary"})
+    save_images: Literal["none", "keyframes", "all"] = field(
+        default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
+    )
     reference: Path | None = field(
         default=None, metadata={"help": "recorded sequence the agent sent: gives PSNR and ground truth"}
     )
@@ -112,6 +115,7 @@ def replay(
         agent_id=agent_id,
         mode="replay",
         out=settings.out,
+        save_images=settings.save_images,
         threads=settings.threads,
         reference=settings.reference,
         bundle="inline",

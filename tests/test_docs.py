@@ -8,7 +8,7 @@ import pytest
 
 from semcast.cli import VERBS, verb_parser
 from semcast.evaluation.results_page import readme_table, results_page, with_table
-from semcast.reference import reference
+from semcast.reference import reference, with_messages
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
@@ -49,6 +49,12 @@ def test_every_command_in_the_docs_is_one_the_parser_knows(page):
 
 def test_the_reference_page_is_up_to_date():
     assert (ROOT / "docs/commands.md").read_text(encoding="utf-8") == reference(), "run make docs"
+
+
+def test_the_table_of_messages_is_up_to_date():
+    page = (ROOT / "docs/file-formats.md").read_text(encoding="utf-8")
+    assert page == with_messages(page), "run make docs"
+    assert "`payload_format`" in page
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

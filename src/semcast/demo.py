@@ -64,6 +64,9 @@ class DemoSettings:
             "help": "factor on the image size; by default what two cores can serve at 10 frames a second"
         },
     )
+    save_images: Literal["none", "keyframes", "all"] = field(
+        default="keyframes", metadata={"help": "decoded images kept in the output folder, for exports"}
+    )
     record: Path | None = field(
         default=None, metadata={"help": "also keep everything that is sent in this recording (MCAP)"}
     )
@@ -111,6 +114,7 @@ def role_commands(
         server += ["--reference", str(sequence)]
     server += ["--confidence", settings.confidence, "--view", settings.view]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
+    server += ["--save-images", settings.save_images]
     if settings.record is not None:
         server += ["--record", str(settings.record)]
     channel = [*program, "channel", *meet, "--channel", settings.channel, "--snr-db", f"{settings.snr_db:g}"]

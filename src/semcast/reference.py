@@ -1,10 +1,14 @@
-"""The reference of all verbs and settings, written from the parsers themselves into ``docs/commands.md``."""
+"""The reference of all verbs and settings, from the parsers, and of all messages, from their classes."""
 
 import argparse
+import dataclasses
+import inspect
+import typing
 from collections.abc import Iterator
 from pathlib import Path
 
 from semcast.cli import VERBS, verb_parser
+from semcast.common.messages import Message
 
 HEAD = """# Every verb and setting
 
@@ -50,5 +54,25 @@ def reference() -> str:
     return "\n".join(lines) + "\n"
 
 
+def messages_table() -> str:
+    """Return the table of all messages and their fields as Markdown."""
+    lines = ["| kind | what | fields |", "|---|---|---|"]
+    for cls in typing.get_args(Message):
+        entries = {entry.name: entry for entry in dataclasses.fields(cls)}
+        what = inspect.getdoc(cls) or ""
+        names = ", ".join(f"`{name}`" for name in entries if name not in ("version", "kind"))
+        lines.append(f"| `{entries['kind'].default}` | {what.splitlines()[0]} | {names} |")
+    return "\n".join(lines)
+
+
+def with_messages(page: str) -> str:
+    """Put the table between the marks of a page."""
+    before, begin, rest = page.partition("<!-- messages -->\n")
+    _, end, after = rest.partition("<!-- /messages -->")
+    return f"{before}{begin}{messages_table()}\n{end}{after}"
+
+
 if __name__ == "__main__":
     Path("docs/commands.md").write_text(reference(), encoding="utf-8")
+    formats = Path("docs/file-formats.md")
+    formats.write_text(with_messages(formats.read_text(encoding="utf-8")), encoding="utf-8")
