@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import trimesh
 from evo.tools import file_interface
 
 from semcast import SourceError
@@ -269,3 +270,12 @@ def test_export_says_in_one_line_what_is_wrong(tmp_path, arc_run, write_arc_run,
     (tmp_path / "file").write_text("")
     assert main(["export", str(tmp_path / "run"), "--format", "colmap", "--out", str(tmp_path / "file")]) == 1
     assert "is a file" in capsys.readouterr().err
+
+
+def test_trimesh_reads_the_points_with_their_colours(tmp_path, arc_run, write_arc_run):
+    data = arc_run()
+    write_arc_run(tmp_path / "run", data)
+    export_run(tmp_path / "run", "ply", tmp_path / "map.ply")
+    cloud = trimesh.load(tmp_path / "map.ply")
+    np.testing.assert_allclose(cloud.vertices, data.xyz, atol=1e-5)
+    np.testing.assert_array_equal(np.asarray(cloud.colors)[:, :3], data.rgb)
