@@ -38,8 +38,8 @@ class PairMatches:
         confidence1: ``(N,)`` at the second end.
         keypoint_confidence0: ``(N,)`` the codec's keypoint confidence at the first end, or None.
         keypoint_confidence1: ``(N,)`` at the second end, or None.
-        gradient_grey2: ``(N,)`` smaller eigenvalue of the structure tensor, mean per pixel: of the tracked
-            window for KLT, of the worse end for descriptors.
+        gradient0_grey2: ``(N,)`` smaller eigenvalue of the structure tensor at the first end, mean per pixel.
+        gradient1_grey2: ``(N,)`` at the second end: of the tracked window for KLT.
         forward_backward_px: ``(N,)`` way there and back of a KLT track; None for descriptors.
         photometric_grey: ``(N,)`` difference of the windows of a KLT track; None for descriptors.
     """
@@ -50,7 +50,8 @@ class PairMatches:
     confidence1: Array
     keypoint_confidence0: Array | None
     keypoint_confidence1: Array | None
-    gradient_grey2: Array
+    gradient0_grey2: Array
+    gradient1_grey2: Array
     forward_backward_px: Array | None
     photometric_grey: Array | None
 
@@ -80,7 +81,7 @@ class PairMatches:
         """Return what may tell right matches from wrong ones, higher for right."""
         cues = {
             "confidence": self.confidence,
-            "corner_strength": self.gradient_grey2,
+            "corner_strength": np.minimum(self.gradient0_grey2, self.gradient1_grey2),
         }
         keypoint_confidence = self.keypoint_confidence
         if keypoint_confidence is not None:
@@ -108,18 +109,18 @@ def match_pair(
     """
     grey0, grey1 = to_grey(decoded0.image), to_grey(decoded1.image)
     forward_backward_px = photometric_grey = None
+    strength0 = corner_strength(grey0)
     if features == "klt":
-        corners = detect_corners(grey0, max_features).astype(np.float64)
+        corners = detect_corners(grey0, max_features, strength=strength0).astype(np.float64)
         tracked = track_points(grey0, grey1, corners, corners)
         found = np.flatnonzero(tracked.ok)
         xy0, xy1 = corners[found], tracked.xy[found]
-        gradient_grey2 = tracked.gradient_grey2[found]
+        gradient1_grey2 = tracked.gradient_grey2[found]
         forward_backward_px = tracked.forward_backward_px[found]
         photometric_grey = tracked.photometric_grey[found]
     else:
         xy0, xy1 = _match_descriptors(grey0, grey1, features, max_features)
-        strength0, strength1 = (corner_strength(grey) for grey in (grey0, grey1))
-        gradient_grey2 = np.minimum(sample_map(strength0, xy0), sample_map(strength1, xy1))
+        gradient1_grey2 = sample_map(corner_strength(grey1), xy1)
     c0, c1 = decoded0.keypoint_confidence, decoded1.keypoint_confidence
     has_keypoint_confidence = c0 is not None and c1 is not None
     matches = PairMatches(
@@ -129,7 +130,8 @@ def match_pair(
         confidence1=sample_map(decoded1.confidence, xy1),
         keypoint_confidence0=sample_map(c0, xy0) if has_keypoint_confidence and c0 is not None else None,
         keypoint_confidence1=sample_map(c1, xy1) if has_keypoint_confidence and c1 is not None else None,
-        gradient_grey2=gradient_grey2,
+        gradient0_grey2=sample_map(strength0, xy0),
+        gradient1_grey2=gradient1_grey2,
         forward_backward_px=forward_backward_px,
         photometric_grey=photometric_grey,
     )

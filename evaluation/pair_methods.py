@@ -9,7 +9,12 @@ from semcast.common.camera import Intrinsics
 from semcast.evaluation.competitors import COMPETITORS, CompetitorSettings
 from semcast.evaluation.pair_matches import PairMatches
 from semcast.server.two_view import estimate_two_view
-from semcast.server.weighting import ConfidenceMode, KeypointCues, observation_confidence
+from semcast.server.weighting import (
+    ConfidenceMode,
+    KeypointCues,
+    fuse_confidence,
+    observation_confidence,
+)
 
 Array = NDArray[np.float64]
 
@@ -17,23 +22,36 @@ Array = NDArray[np.float64]
 Estimator = Callable[[PairMatches, Intrinsics, float, int], Array | None]
 
 _ABLATION_STREAM = 0xAB1A
+#: What the server's tracks assume of a corner that was never followed.
+NEW_CORNER_PX = 0.1
 
 
 def match_confidence(mode: ConfidenceMode, matches: PairMatches, seed: int) -> Array:
     """Return the ``c`` of each match that the estimator is given in a mode, ``(N,)`` in [0, 1].
 
-    The weighting is the server's; of both ends of a match the less trusted counts (Eq. 16 of the paper).
-    Descriptor matches have no track, so nothing is known of its way back or its windows.
+    It is the server's way: cues of each end become the confidence of that end, and of both the smaller counts
+    (Eq. 16 of the paper). The first end is a corner found anew, as the server's tracks begin; the second has
+    the way back and the windows of its track. Descriptor matches have no track, so nothing is known of those.
     """
+    rng = np.random.default_rng((seed, _ABLATION_STREAM))
     none = np.zeros(len(matches))
-    cues = KeypointCues(
-        pixel_confidence=matches.confidence,
-        keypoint_confidence=matches.keypoint_confidence,
-        gradient_grey2=matches.gradient_grey2,
+    tracked = matches.forward_backward_px is not None
+    first = KeypointCues(
+        pixel_confidence=matches.confidence0,
+        keypoint_confidence=matches.keypoint_confidence0,
+        gradient_grey2=matches.gradient0_grey2,
+        forward_backward_px=np.full(len(matches), NEW_CORNER_PX if tracked else 0.0),
+        photometric_grey=none,
+    )
+    second = KeypointCues(
+        pixel_confidence=matches.confidence1,
+        keypoint_confidence=matches.keypoint_confidence1,
+        gradient_grey2=matches.gradient1_grey2,
         forward_backward_px=none if matches.forward_backward_px is None else matches.forward_backward_px,
         photometric_grey=none if matches.photometric_grey is None else matches.photometric_grey,
     )
-    return observation_confidence(mode, cues, np.random.default_rng((seed, _ABLATION_STREAM)))
+    ends = (observation_confidence(mode, cues, rng) for cues in (first, second))
+    return fuse_confidence(*ends)
 
 
 def confidence_estimator(mode: ConfidenceMode) -> Estimator:

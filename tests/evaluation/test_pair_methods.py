@@ -7,12 +7,33 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform, transform_points
 from semcast.evaluation.competitors import COMPETITORS
 from semcast.evaluation.pair_matches import PairMatches
-from semcast.evaluation.pair_methods import competitor_estimator, confidence_estimator, match_confidence
+from semcast.evaluation.pair_methods import (
+    NEW_CORNER_PX,
+    competitor_estimator,
+    confidence_estimator,
+    match_confidence,
+)
 from semcast.evaluation.pose_error import relative_pose_error
+from semcast.server.weighting import KeypointCues, geometric_confidence
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
 T_CAM1_CAM0 = make_transform(exp_so3([0.02, 0.05, -0.01]), [0.5, 0.1, 0.05])
 MODES = ("robust", "paper", "off", "constant", "shuffled", "inverted")
+
+
+def ends(matches):
+    """The geometric confidence of both ends."""
+    new = np.full(len(matches), NEW_CORNER_PX)
+    none = np.zeros(len(matches))
+    first = KeypointCues(matches.confidence0, None, matches.gradient0_grey2, new, none)
+    second = KeypointCues(
+        matches.confidence1,
+        None,
+        matches.gradient1_grey2,
+        matches.forward_backward_px,
+        matches.photometric_grey,
+    )
+    return geometric_confidence(first), geometric_confidence(second)
 
 
 @pytest.fixture
@@ -27,7 +48,8 @@ def matches(rng):
         confidence1=rng.random(150),
         keypoint_confidence0=None,
         keypoint_confidence1=None,
-        gradient_grey2=rng.uniform(10, 200, 150),
+        gradient0_grey2=rng.uniform(10, 200, 150),
+        gradient1_grey2=rng.uniform(10, 200, 150),
         forward_backward_px=rng.exponential(0.2, 150),
         photometric_grey=rng.uniform(1, 5, 150),
     )
@@ -38,10 +60,27 @@ def test_each_mode_gets_its_own_confidence(matches):
     np.testing.assert_array_equal(c["off"], 1.0)
     np.testing.assert_array_equal(c["paper"], np.minimum(matches.confidence0, matches.confidence1))
     assert np.ptp(c["robust"]) > 0.1
-    np.testing.assert_allclose(c["constant"], c["robust"].mean())
-    np.testing.assert_array_equal(np.sort(c["shuffled"]), np.sort(c["robust"]))
+    first, second = ends(matches)
+    np.testing.assert_allclose(c["robust"], np.minimum(first, second))
+    np.testing.assert_allclose(c["constant"], min(first.mean(), second.mean()))
+    np.testing.assert_allclose(c["inverted"], np.minimum(1 - first, 1 - second))
     assert (c["shuffled"] != c["robust"]).any()
-    np.testing.assert_allclose(c["inverted"], 1 - c["robust"])
+    assert set(c["shuffled"]) <= {*first, *second}
+
+
+def test_the_first_end_is_a_new_corner_and_the_second_one_was_followed(matches):
+    still = replace(
+        matches,
+        gradient0_grey2=np.full(150, 100.0),
+        gradient1_grey2=np.full(150, 1e9),
+        confidence0=np.ones(150),
+        confidence1=np.ones(150),
+        forward_backward_px=np.full(150, 0.3),
+    )
+    # First: 2 grey levels over 16 * 100 give 0.05 px, with 0.1 px of a new corner. Second: 0.3 px.
+    np.testing.assert_allclose(match_confidence("robust", still, 0), 1 / 1.3, rtol=1e-3)
+    calm = replace(still, forward_backward_px=np.zeros(150))
+    np.testing.assert_allclose(match_confidence("robust", calm, 0), 1 / (1 + np.hypot(0.05, 0.1)))
 
 
 def test_shuffling_depends_on_the_seed_alone(matches):
@@ -54,7 +93,7 @@ def test_descriptor_matches_have_a_confidence_too(matches):
     bare = replace(matches, forward_backward_px=None, photometric_grey=None)
     c = match_confidence("robust", bare, seed=0)
     assert c.shape == (150,)
-    assert np.mean(c >= match_confidence("robust", matches, seed=0)) > 0.99
+    assert np.all(c >= match_confidence("robust", matches, seed=0))
 
 
 @pytest.mark.parametrize("mode", MODES)
