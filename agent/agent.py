@@ -230,6 +230,7 @@ def run_agent(
                 num_threads=settings.threads,
                 device=settings.device,
                 weights=settings.weights,
+                runtime=settings.runtime,
             )
         session = open_session(settings.network, stop)
     except BaseException:

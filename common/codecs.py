@@ -1,6 +1,7 @@
 """All codecs by name, learned and conventional: the one way to get a codec."""
 
 from importlib import resources
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -8,6 +9,8 @@ from semcast.common.codec import MODULATIONS, Codec, Modulation
 from semcast.common.config import near_match
 from semcast.common.conventional_source import ImageFormat
 from semcast.common.errors import ConfigError
+
+Runtime = Literal["auto", "torch", "onnx"]
 
 #: Learned transceivers in the order they are listed; their networks are in ``semcast.common.nets.registry``.
 LEARNED_CODECS = ("3dcsc", "3dcsc-lite", "cnn", "vit", "mae")
@@ -36,6 +39,17 @@ def available_codecs() -> list[str]:
     return [*_shipped_weights(), *_conventional_names()]
 
 
+def _onnx_encoder(source: str | Path, modulation: Modulation, num_threads: int | None) -> Codec:
+    if find_spec("onnxruntime") is None:
+        raise ConfigError(
+            "a learned codec needs torch (semcast[agent]) or, to send only, onnxruntime (semcast[edge]); "
+            "neither was found"
+        )
+    from semcast.common.nets.onnx_encoder import OnnxEncoder
+
+    return OnnxEncoder(source, modulation, num_threads)
+
+
 def load_codec(
     name: str,
     *,
@@ -43,6 +57,7 @@ def load_codec(
     num_threads: int | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     weights: Path | None = None,
+    runtime: Runtime = "torch",
 ) -> Codec:
     """Load a codec, ready for use.
 
@@ -52,18 +67,26 @@ def load_codec(
         num_threads: CPU threads of a learned codec; None leaves the library's choice.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``, for learned codecs.
         weights: File to take instead of the shipped weights of a learned codec.
+        runtime: What computes a learned codec: ``torch``; ``onnx``, which can only encode; ``auto``: torch
+            where it is installed.
 
     Raises:
-        ConfigError: The name or modulation is unknown, or weights were given for a codec without any.
+        ConfigError: The name or modulation is unknown, weights were given for a codec without any, or the
+            runtime is not installed.
         CheckpointError: The weights are missing or damaged.
     """
     if modulation not in MODULATIONS:
         hint = near_match(modulation, list(MODULATIONS))
         raise ConfigError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}{hint}")
     if name in LEARNED_CODECS or name in _shipped_weights():
+        source = name if weights is None else weights
+        if runtime == "auto":
+            is_exported = weights is not None and weights.suffix == ".onnx"
+            runtime = "torch" if find_spec("torch") is not None and not is_exported else "onnx"
+        if runtime == "onnx":
+            return _onnx_encoder(source, modulation, num_threads)
         from semcast.common.nets.codec import NeuralCodec
 
-        source = name if weights is None else weights
         codec: Codec = NeuralCodec.load(source, modulation=modulation, num_threads=num_threads, device=device)
         return codec
     conventional = _conventional_names()

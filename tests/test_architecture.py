@@ -22,6 +22,8 @@ HOMES = {
     "gtsam": {"server/bundle.py"},
     "rerun": {"server/viewer.py"},
     "mcap": {"common/recording.py"},
+    "onnxruntime": {"common/nets/onnx_encoder.py"},
+    "onnx": {"training/onnx_export.py"},
 }
 
 

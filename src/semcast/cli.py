@@ -29,6 +29,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "calibrate": ("calibrate", "find a camera's intrinsics from pictures of a chessboard or live"),
     "eval": ("evaluate", "measure trajectories, frame pairs, codecs and confidence offline"),
     "train": ("train", "train a transceiver from a settings file"),
+    "onnx": ("onnx", "write a codec's encoder for agents without torch"),
     "doctor": ("doctor", "check this machine and a running system, and say what to mend"),
 }
 

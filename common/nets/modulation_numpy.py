@@ -1,0 +1,40 @@
+"""The transmitter's modulation without torch, for agents that run an exported encoder.
+
+The same rules as ``modulation``, value for value; a test holds both together.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.codec import Modulation
+
+LEVEL_STEP = 2.0 / 10.0**0.5
+CARRIER_AMPLITUDE = 0.12
+
+
+def nearest_level(latent: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Round every value to the nearest 4-PAM level of unit-power 16-QAM."""
+    step = np.float32(LEVEL_STEP)
+    return np.asarray((np.floor(latent / step).clip(-2.0, 1.0) + np.float32(0.5)) * step, dtype=np.float32)
+
+
+def carrier_pattern(channels: int, rows: int, columns: int) -> NDArray[np.float32]:
+    """Return the known ``(C, h, w)`` pattern of +-1."""
+    channel = np.arange(channels)
+    sign = 1.0 - 2.0 * ((channel * (channel + 1) // 2) % 2)
+    board = 1.0 - 2.0 * ((np.arange(rows)[:, None] + np.arange(columns)) % 2)
+    return (sign[:, None, None] * board).astype(np.float32)
+
+
+def analog_symbols(latent: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Add the carrier and scale the frame to average power 1/2 for each real value."""
+    pattern = carrier_pattern(*latent.shape)
+    y = latent - (latent * pattern).mean(dtype=np.float64).astype(np.float32) * pattern
+    y = y + np.float32(CARRIER_AMPLITUDE) * pattern
+    power = np.square(y).mean(dtype=np.float64)
+    return np.asarray(y / np.sqrt(2.0 * power + 1e-12), dtype=np.float32)
+
+
+def transmit(latent: NDArray[np.float32], modulation: Modulation) -> NDArray[np.float32]:
+    """Modulate the latent ``(94, h, w)`` of one frame: real parts of power 1/2 of unit-power symbols."""
+    return nearest_level(latent) if modulation == "16qam" else analog_symbols(latent)

@@ -1,0 +1,132 @@
+"""The sending end of a learned codec on onnxruntime, for small computers without torch.
+
+The exported graph maps an image to the latent; padding, rounding to levels and pairing are a little numpy.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from semcast.common.codec import MODULATIONS, DecodedImage, EncodedImage, Modulation, ReceivedImage
+from semcast.common.errors import CheckpointError, ConfigError
+from semcast.common.nets.latent import symbols_from_latent
+from semcast.common.nets.modulation_numpy import transmit
+from semcast.common.phy.slots import BLOCK_PX
+from semcast.common.shapes import check_shape
+
+SUFFIX = ".onnx"
+#: Version of what the graph takes and gives, and of its metadata.
+FORMAT = "1"
+INPUTS = ("image", "snr_db", "is_qam")
+OUTPUT = "latent"
+
+
+def encoder_path(name_or_path: str | Path) -> Path:
+    """Return the file of an exported encoder, of a shipped name or of a path.
+
+    Raises:
+        CheckpointError: There is no such file.
+    """
+    path = Path(name_or_path)
+    if path.suffix != SUFFIX:
+        folder = Path(__file__).resolve().parent.parent / "weights"
+        path = folder / f"{name_or_path}{SUFFIX}"
+    if not path.is_file():
+        raise CheckpointError(
+            f"no exported encoder {path.name}; write one with 'semcast onnx' where torch is installed"
+        )
+    return path
+
+
+class OnnxEncoder:
+    """The encoder of a codec; it can send, not receive.
+
+    Args:
+        name_or_path: Shipped name such as ``3dcsc-lite``, or an ``.onnx`` file of ``semcast onnx``.
+        modulation: How symbols travel.
+        num_threads: CPU threads; None leaves the library's choice.
+
+    Raises:
+        CheckpointError: The file is missing, damaged or of another version.
+        ValueError: The modulation or number of threads is not usable.
+    """
+
+    def __init__(
+        self, name_or_path: str | Path, modulation: Modulation = "16qam", num_threads: int | None = None
+    ) -> None:
+        if modulation not in MODULATIONS:
+            raise ValueError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}")
+        if num_threads is not None and num_threads < 1:
+            raise ValueError(f"num_threads must be >= 1, got {num_threads}")
+        path = encoder_path(name_or_path)
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = num_threads or 0
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        # A thread that spins between frames would take a small computer's core.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        try:
+            self._session = onnxruntime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"]
+            )
+            facts = self._session.get_modelmeta().custom_metadata_map
+        except Exception as err:  # onnxruntime has no common class of errors
+            raise CheckpointError(f"encoder {path} can't be read: {err}") from err
+        if facts.get("semcast_format") != FORMAT:
+            raise CheckpointError(
+                f"encoder {path} must have format {FORMAT}, got {facts.get('semcast_format')}"
+            )
+        self._name, self._digest = str(facts["architecture"]), str(facts["digest"])
+        self._snr_range_db = float(facts["snr_min_db"]), float(facts["snr_max_db"])
+        self._modulation: Modulation = modulation
+        self._is_qam = np.array([float(modulation == "16qam")], dtype=np.float32)
+
+    @property
+    def name(self) -> str:
+        """Registry name of the architecture."""
+        return self._name
+
+    @property
+    def digest(self) -> str:
+        """Digest of the weights the encoder was exported from: the server decodes with the same."""
+        return self._digest
+
+    def warm_up(self, shape_hw: tuple[int, int]) -> None:
+        """Encode one empty frame, so that the first real one is not slow."""
+        self.encode(np.zeros((*shape_hw, 3), dtype=np.uint8), 10.0)
+
+    def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
+        """Encode one image; see ``NeuralCodec.encode``.
+
+        Raises:
+            ValueError: The image is not ``(H, W, 3)`` uint8.
+        """
+        sizes = check_shape(image, "H W 3", "image")
+        if image.dtype != np.uint8:
+            raise ValueError(f"image must be uint8, got {image.dtype}")
+        low, high = self._snr_range_db
+        expected = float(np.clip(snr_db, low, high)) if np.isfinite(snr_db) else low
+        bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX
+        if bottom or right:
+            image = np.pad(image, ((0, bottom), (0, right), (0, 0)), mode="edge")
+        given = {
+            "image": np.ascontiguousarray(image)[None],
+            "snr_db": np.array([expected], dtype=np.float32),
+            "is_qam": self._is_qam,
+        }
+        latent = self._session.run([OUTPUT], given)[0][0]
+        return EncodedImage(
+            shape_hw=(sizes["H"], sizes["W"]),
+            symbols=symbols_from_latent(transmit(latent, self._modulation)),
+            modulation=self._modulation,
+        )
+
+    def decode(self, received: ReceivedImage) -> DecodedImage:
+        """Say that this end only sends.
+
+        Raises:
+            ConfigError: Always.
+        """
+        raise ConfigError("an exported encoder can't decode: a server needs torch (semcast[server])")

@@ -1,0 +1,157 @@
+"""The exported encoder sends what the torch encoder sends, and needs no torch."""
+
+import subprocess
+import sys
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from semcast.common.codecs import load_codec
+from semcast.common.errors import CheckpointError, ConfigError
+from semcast.common.nets import modulation, modulation_numpy
+from semcast.common.nets.checkpoint import load_transceiver, read_manifest, save_transceiver, weights_path
+from semcast.common.nets.latent import symbols_from_latent
+from semcast.common.nets.onnx_encoder import OnnxEncoder, encoder_path
+from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.training.onnx_export import export_encoder
+
+TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    torch.manual_seed(0)
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    model = build_3dcsc(TINY)
+    with torch.no_grad():
+        model.encoder.linear.transform.weight.mul_(20.0)
+        for layer in (model.encoder.head, model.encoder.stage16.attention.excite):
+            layer.weight.normal_()  # so that SNR and modulation matter
+    facts = {"architecture": "3dcsc", "sizes": TINY, "cbr": 1 / 16, "snr_range_db": (0.0, 14.0)}
+    save_transceiver(model, path, made_by={"steps": 0}, **facts)
+    return path
+
+
+@pytest.fixture(scope="module")
+def exported(weights):
+    return export_encoder(weights, weights.with_suffix(".onnx"))
+
+
+def some_image(shape_hw):
+    return np.random.default_rng(0).integers(0, 256, size=(*shape_hw, 3), dtype=np.uint8)
+
+
+def in_full_precision(weights, image, snr_db, way):
+    """The torch encoder's symbols without bfloat16."""
+    model, _ = load_transceiver(weights)
+    is_qam = torch.tensor([float(way == "16qam")])
+    x = torch.from_numpy(image)[None].permute(0, 3, 1, 2).float() / 255.0
+    with torch.inference_mode():
+        latent = model.latent(x, torch.tensor([snr_db]), is_qam)
+        return symbols_from_latent(model.transmit(latent, is_qam)[0].numpy())
+
+
+@pytest.mark.parametrize("way", ["16qam", "analog"])
+@pytest.mark.parametrize("shape_hw", [(32, 48), (64, 160)])
+def test_it_sends_what_torch_sends(weights, exported, way, shape_hw):
+    image = some_image(shape_hw)
+    for snr_db in (2.0, 12.0):
+        encoded = OnnxEncoder(exported, way, 1).encode(image, snr_db)
+        expected = in_full_precision(weights, image, snr_db, way)
+        assert encoded.symbols.dtype == np.complex64
+        different = np.abs(encoded.symbols - expected) > 1e-3
+        assert different.mean() < 0.001  # a value on the edge of a level may fall to either side
+
+
+def test_the_expected_snr_is_heard(exported):
+    codec, image = OnnxEncoder(exported, "analog"), some_image((32, 48))
+    assert not np.allclose(codec.encode(image, 0.0).symbols, codec.encode(image, 14.0).symbols, atol=1e-4)
+    # Outside the trained range it is clipped, and what is no number counts as the worst link.
+    np.testing.assert_array_equal(codec.encode(image, 99.0).symbols, codec.encode(image, 14.0).symbols)
+    np.testing.assert_array_equal(codec.encode(image, np.nan).symbols, codec.encode(image, 0.0).symbols)
+
+
+def test_any_size_is_padded_to_whole_blocks(exported):
+    encoded = OnnxEncoder(exported).encode(some_image((33, 47)), 10.0)
+    assert encoded.shape_hw == (33, 47)
+    assert encoded.symbols.shape == (3, 47 * 3)
+
+
+@pytest.mark.parametrize(("way", "numpy_way"), [("nearest_level", "16qam"), ("analog_symbols", "analog")])
+def test_modulation_without_torch_is_the_same(way, numpy_way):
+    latent = np.random.default_rng(0).normal(0, 0.9, (94, 4, 6)).astype(np.float32)
+    expected = getattr(modulation, way)(torch.from_numpy(latent)[None])[0].numpy()
+    np.testing.assert_allclose(modulation_numpy.transmit(latent, numpy_way), expected, atol=2e-6)
+
+
+def test_it_can_not_decode_and_says_who_can(exported):
+    with pytest.raises(ConfigError, match="a server needs torch"):
+        OnnxEncoder(exported).decode(None)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [(np.zeros((32, 32), np.uint8), "image"), (np.zeros((32, 32, 3), np.float32), "image must be uint8")],
+)
+def test_bad_images_are_refused(exported, image, message):
+    with pytest.raises(ValueError, match=message):
+        OnnxEncoder(exported).encode(image, 10.0)
+
+
+def test_bad_files_are_one_clear_error(exported, tmp_path):
+    with pytest.raises(
+        CheckpointError, match="no exported encoder nothing.onnx; write one with 'semcast onnx'"
+    ):
+        OnnxEncoder(tmp_path / "nothing.onnx")
+    (tmp_path / "cut.onnx").write_bytes(exported.read_bytes()[:1000])
+    with pytest.raises(CheckpointError, match="can't be read"):
+        OnnxEncoder(tmp_path / "cut.onnx")
+    other = onnx.load(str(exported))
+    onnx.helper.set_model_props(other, {"semcast_format": "99"})
+    onnx.save(other, str(tmp_path / "other.onnx"))
+    with pytest.raises(CheckpointError, match="must have format 1, got 99"):
+        OnnxEncoder(tmp_path / "other.onnx")
+    with pytest.raises(ValueError, match="num_threads must be >= 1, got 0"):
+        OnnxEncoder(exported, num_threads=0)
+
+
+@pytest.mark.weights
+def test_the_shipped_encoder_belongs_to_the_shipped_weights():
+    manifest = read_manifest(weights_path("3dcsc-lite"))
+    encoder = OnnxEncoder(encoder_path("3dcsc-lite"))
+    assert encoder.digest == manifest.sha256[:16], (
+        "run: semcast onnx 3dcsc-lite --out common/weights/3dcsc-lite.onnx"
+    )
+    assert encoder.name == "3dcsc-lite"
+    assert load_codec("3dcsc-lite", runtime="onnx").digest == encoder.digest
+
+
+@pytest.mark.weights
+def test_an_agent_starts_and_encodes_without_torch():
+    code = """
+import sys
+for name in ("torch", "gtsam", "rerun", "poselib", "mcap", "matplotlib", "onnx"):
+    sys.modules[name] = None
+import numpy as np
+import semcast.commands.agent
+from semcast.common.codecs import load_codec
+codec = load_codec("3dcsc-lite", num_threads=1, runtime="auto")
+symbols = codec.encode(np.full((48, 64, 3), 90, np.uint8), 10.0).symbols
+print(type(codec).__name__, symbols.shape, bool(abs(np.mean(abs(symbols) ** 2) - 1.0) < 0.6))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split("\n")[0] == "OnnxEncoder (3, 188) True"
+
+
+def test_without_any_runtime_the_message_says_what_to_install():
+    code = """
+import sys
+sys.modules["torch"] = sys.modules["onnxruntime"] = None
+from semcast.common.codecs import load_codec
+load_codec("3dcsc-lite", runtime="auto")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "semcast[edge]" in done.stderr.splitlines()[-1]

@@ -1,0 +1,88 @@
+"""Writes the encoder of trained weights as an ONNX file, which agents without torch run."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from torch import Tensor, nn
+
+from semcast.common.errors import CheckpointError
+from semcast.common.nets.checkpoint import load_transceiver, weights_path
+from semcast.common.nets.onnx_encoder import FORMAT, INPUTS, OUTPUT
+
+OPSET = 17
+_HALVE_FROM_VALUES = 256
+
+
+class _ImageToLatent(nn.Module):
+    """The encoder from the bytes of an image on."""
+
+    def __init__(self, encoder: nn.Module) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, image: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+        x = image.permute(0, 3, 1, 2).to(torch.float32) * (1.0 / 255.0)
+        latent: Tensor = self.encoder(x, snr_db, is_qam)
+        return latent
+
+
+def export_encoder(name_or_path: str | Path, out: Path) -> Path:
+    """Export the encoder of shipped weights or of a weights file.
+
+    Weights stay in half precision in the file and are widened when it is loaded. The graph takes ``image``
+    ``(1, H, W, 3)`` uint8 with sides that are multiples of 16, ``snr_db (1,)`` and ``is_qam (1,)``, and gives
+    ``latent (1, 94, H/16, W/16)``.
+
+    Raises:
+        CheckpointError: There are no such weights, or the file can't be written.
+    """
+    model, manifest = load_transceiver(weights_path(name_or_path))
+    example = (torch.zeros(1, 64, 96, 3, dtype=torch.uint8), torch.full((1,), 10.0), torch.ones(1))
+    sides = {1: "height", 2: "width"}
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the exporter, about its own future
+            torch.onnx.export(
+                _ImageToLatent(model.encoder).eval(),
+                example,
+                str(out),
+                input_names=list(INPUTS),
+                output_names=[OUTPUT],
+                opset_version=OPSET,
+                dynamic_axes={"image": sides, OUTPUT: {2: "rows", 3: "columns"}},
+                dynamo=False,
+            )
+        graph = onnx.load(str(out))
+        halve_weights(graph)
+        facts = {
+            "semcast_format": FORMAT,
+            "architecture": manifest.architecture,
+            "digest": manifest.sha256[:16],
+            "snr_min_db": str(manifest.snr_range_db[0]),
+            "snr_max_db": str(manifest.snr_range_db[1]),
+        }
+        helper.set_model_props(graph, facts)
+        onnx.save(graph, str(out))
+    except OSError as err:
+        raise CheckpointError(f"encoder {out} can't be written: {err}") from err
+    return out
+
+
+def halve_weights(graph: onnx.ModelProto) -> None:
+    """Keep large weights in half precision, as the weights file does, each widened by a Cast."""
+    casts = []
+    for tensor in list(graph.graph.initializer):
+        values = numpy_helper.to_array(tensor)
+        if tensor.data_type != TensorProto.FLOAT or values.size < _HALVE_FROM_VALUES:
+            continue
+        half = numpy_helper.from_array(values.astype(np.float16), tensor.name + "_half")
+        graph.graph.initializer.remove(tensor)
+        graph.graph.initializer.append(half)
+        casts.append(helper.make_node("Cast", [half.name], [tensor.name], to=TensorProto.FLOAT))
+    for cast in reversed(casts):
+        graph.graph.node.insert(0, cast)
