@@ -19,15 +19,14 @@ class PairOutcome:
 
     Attributes:
         errors: Method -> error.
-        elapsed_ms: Method -> duration of the estimation alone.
+        cpu_ms: Method -> processor time of the estimation alone.
         num_matches: Matches every method was given.
-        cues: Cue -> ``(N,)`` score per match, higher means more trusted; the same cues on every pair that
-            has matches.
+        cues: Cue -> ``(N,)`` score per match, higher means more trusted.
         true_inlier: Kind of truth -> ``(N,)`` bool.
     """
 
     errors: Mapping[str, PoseError]
-    elapsed_ms: Mapping[str, float]
+    cpu_ms: Mapping[str, float]
     num_matches: int
     cues: Mapping[str, NDArray[np.float32]]
     true_inlier: Mapping[str, NDArray[np.bool_]]
@@ -80,28 +79,31 @@ class PairCell:
         }
 
     def results(self) -> dict[str, dict[str, Any]]:
-        """Return per method the summary of its errors and ``elapsed_ms``."""
+        """Return per method the summary of its errors and ``cpu_ms``."""
         summary = {}
         for method in self._methods:
             flat = {name: values.ravel() for name, values in self.errors(method).items()}
-            times = [o.elapsed_ms[method] for o in self.outcomes if method in o.elapsed_ms]
-            summary[method] = {**summarise_pose_errors(flat), "elapsed_ms": percentiles(times)}
+            times = [o.cpu_ms[method] for o in self.outcomes if method in o.cpu_ms]
+            summary[method] = {**summarise_pose_errors(flat), "cpu_ms": percentiles(times)}
         return summary
 
     def auroc_of_cues(self) -> dict[str, dict[str, float | None]]:
-        """Return, per kind of truth and cue, how well the cue tells true inliers, over all matches."""
+        """Return, per kind of truth and cue, how well the cue tells true inliers, over all matches.
+
+        A cue that some pair lacks is left out.
+        """
         with_matches = [o for o in self.outcomes if o.num_matches > 0]
         if not with_matches:
             return {}
-        labels = {
-            kind: np.concatenate([o.true_inlier[kind] for o in with_matches])
-            for kind in with_matches[0].true_inlier
-        }
-        cues = {cue: np.concatenate([o.cues[cue] for o in with_matches]) for cue in with_matches[0].cues}
-        return {
-            kind: {cue: auroc(scores, positive) for cue, scores in cues.items()}
-            for kind, positive in labels.items()
-        }
+        found: dict[str, dict[str, float | None]] = {}
+        for kind in dict.fromkeys(kind for o in with_matches for kind in o.true_inlier):
+            labelled = [o for o in with_matches if kind in o.true_inlier]
+            positive = np.concatenate([o.true_inlier[kind] for o in labelled])
+            shared = [cue for cue in labelled[0].cues if all(cue in o.cues for o in labelled)]
+            found[kind] = {
+                cue: auroc(np.concatenate([o.cues[cue] for o in labelled]), positive) for cue in shared
+            }
+        return found
 
     def inlier_share(self, kind: str) -> float | None:
         """Return the share of matches that are true inliers; None without matches."""

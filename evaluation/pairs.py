@@ -3,7 +3,8 @@
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.evaluation.competitors import COMPETITORS
 from semcast.evaluation.match_truth import epipolar_distance_px, track_error_px
 from semcast.evaluation.pair_cell import PairCell, PairOutcome, merge_cells
-from semcast.evaluation.pair_matches import Features, match_pair
+from semcast.evaluation.pair_matches import Features, PairMatches, match_pair
 from semcast.evaluation.pair_methods import (
     Estimator,
     competitor_estimator,
@@ -56,10 +57,13 @@ class PairSettings(StreamSettings):
         ValueError: A value is out of range.
     """
 
-    gap: int = field(
-        default=1, metadata={"help": "frames from the first to the second image, after --stride"}
+    gap: tuple[int, ...] = field(
+        default=(1,),
+        metadata={"help": "frames from the first to the second image, after --stride; one or more"},
     )
-    features: Features = field(default="klt", metadata={"help": "how points are matched: klt, orb or sift"})
+    features: tuple[Features, ...] = field(
+        default=("klt",), metadata={"help": "how points are matched: klt, orb or sift; one or more"}
+    )
     confidence: tuple[ConfidenceMode, ...] = field(
         default=("robust", "paper", "off"),
         metadata={"help": "ways to use confidence, all on the same matches of the same decoded images"},
@@ -68,8 +72,9 @@ class PairSettings(StreamSettings):
         default=True, metadata={"help": "also run OpenCV RANSAC, MAGSAC++ and PoseLib on the same matches"}
     )
     max_features: int = field(default=800, metadata={"help": "keypoints per image at most"})
-    max_matches: int | None = field(
-        default=None, metadata={"help": "thin the matches of each pair to so many, at random"}
+    max_matches: tuple[int, ...] = field(
+        default=(0,),
+        metadata={"help": "thin the matches of each pair to so many, at random; 0 keeps all; one or more"},
     )
     threshold_px: float = field(default=1.0, metadata={"help": "inlier threshold of all methods but paper"})
     inlier_px: float = field(
@@ -86,11 +91,16 @@ class PairSettings(StreamSettings):
         super().__post_init__()
         if not self.confidence or len(set(self.confidence)) != len(self.confidence):
             raise ValueError(f"confidence must be one or more different modes, got {self.confidence}")
-        for name, least in (("gap", 1), ("max_features", 8)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
-        if self.max_matches is not None and self.max_matches < 5:
-            raise ValueError(f"max_matches must be at least 5, got {self.max_matches}")
+        if self.max_features < 8:
+            raise ValueError(f"max_features must be at least 8, got {self.max_features}")
+        for name in ("gap", "features", "max_matches"):
+            values = getattr(self, name)
+            if not values or len(set(values)) != len(values):
+                raise ValueError(f"{name} must be one or more different values, got {values}")
+        if min(self.gap) < 1:
+            raise ValueError(f"gap must be at least 1, got {self.gap}")
+        if any(count != 0 and count < 5 for count in self.max_matches):
+            raise ValueError(f"max_matches must be 0 or at least 5, got {self.max_matches}")
         for name in ("threshold_px", "inlier_px"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
@@ -101,20 +111,31 @@ class PairSettings(StreamSettings):
             )
 
 
+@dataclass(frozen=True)
+class _Variant:
+    """What is matched: frames so far apart, by these features, thinned to so many (0: all)."""
+
+    gap: int
+    features: Features
+    max_matches: int
+
+
 def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[str, Any]:
     """Estimate the relative pose of every pair, by every method, on the same matches of the same images.
+
+    Every frame is sent and decoded once per SNR and seed, whatever is made of it.
 
     Args:
         settings: What to run.
         codec: Used instead of the codec that ``settings.codec`` names.
 
     Returns:
-        Provenance and ``cells``, one per SNR: ``results`` (method -> ``rot_deg_mean``, ``rot_deg_median``,
-        ``tdir_deg_mean``, ``tdir_deg_median``, ``auc5``, ``auc10``, ``auc20``, ``num_failed`` and
-        ``elapsed_ms``), ``auroc`` (kind of truth -> cue -> AUROC) with ``auroc_confidence`` for the codec's
-        own confidence and epipolar truth, and ``comparisons``: paired differences to ``off`` and the
-        competitors with 95 % intervals. ``results``, ``auroc`` and ``auroc_confidence`` at the top level are
-        over all SNRs together.
+        Provenance and ``cells``, one per SNR, ``gap``, ``features`` and ``max_matches``: ``results`` (method
+        -> ``rot_deg_mean``, ``rot_deg_median``, ``tdir_deg_mean``, ``tdir_deg_median``, ``auc5``, ``auc10``,
+        ``auc20``, ``num_failed`` and ``cpu_ms``, the processor time of the estimation), ``auroc`` (kind of
+        truth -> cue -> AUROC) with ``auroc_confidence`` for the codec's own confidence and epipolar truth,
+        and ``comparisons``: paired differences to ``off`` and the competitors with 95 % intervals.
+        ``results``, ``auroc`` and ``auroc_confidence`` at the top level are over all cells together.
         A pair with a lost frame counts as failed under every method.
 
     Raises:
@@ -123,30 +144,40 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
     """
     sequence, codec = open_stream(settings, codec)
     frame_ids = selected_frame_ids(sequence, settings)
-    motions = true_motions(sequence, frame_ids, settings)
+    motions = {gap: true_motions(sequence, frame_ids, settings, gap) for gap in settings.gap}
     methods = [*settings.confidence, *(COMPETITORS if settings.competitors else ())]
     # Without a link the SNR changes nothing: one cell stands for all.
     snrs_db: tuple[float | None, ...] = settings.snr_db if codec is not None else (None,)
-    cells = [PairCell(methods) for _ in snrs_db]
-    entries = []
-    for snr_db, cell in zip(snrs_db, cells, strict=True):
+    variants = [
+        _Variant(*choice) for choice in product(settings.gap, settings.features, settings.max_matches)
+    ]
+    cells, entries = [], []
+    for snr_db in snrs_db:
         quality_db: list[float] = []
         link = settings.link_at(snr_db) if snr_db is not None else settings.link
+        at_snr = {variant: PairCell(methods) for variant in variants}
         for seed in settings.all_seeds:
             run = FrameRun(sequence, frame_ids, codec, link, seed, cache_bytes=0)
-            for pair_idx, (frame0, frame1) in enumerate(_neighbours(run, settings.gap, quality_db)):
-                T_cam1_cam0 = motions.get((frame0.frame_id, frame1.frame_id))
-                if T_cam1_cam0 is not None:
-                    outcome = _measure(frame0, frame1, T_cam1_cam0, sequence.intrinsics, settings, seed)
-                    cell.add(pair_idx, seed, outcome)
-        entries.append({"snr_db": snr_db, "psnr_db": finite_mean(quality_db), **_entry(cell, settings)})
+            for gap, pair_idx, frame0, frame1 in _neighbours(run, settings.gap, quality_db):
+                T_cam1_cam0 = motions[gap].get((frame0.frame_id, frame1.frame_id))
+                if T_cam1_cam0 is None:
+                    continue
+                pair = _Pair(frame0, frame1, T_cam1_cam0, sequence.intrinsics)
+                for variant, outcome in _measure(pair, gap, settings, seed):
+                    at_snr[variant].add(pair_idx, seed, outcome)
+        cells += list(at_snr.values())
+        psnr = finite_mean(quality_db)
+        entries += [
+            {"snr_db": snr_db, "psnr_db": psnr, **asdict(variant), **_entry(cell, variant, settings)}
+            for variant, cell in at_snr.items()
+        ]
     merged = merge_cells(methods, cells)
     report = json_ready(
         {
             **provenance(VERB, settings),
             "sequence": sequence.name,
-            "title": f"{sequence.name}, {settings.features}, gap {settings.gap}, {settings.codec}",
-            "num_pairs": len(motions),
+            "title": f"{sequence.name}, {settings.codec}, {settings.link.channel}",
+            "num_pairs": sum(len(of_gap) for of_gap in motions.values()),
             "results": merged.results(),
             "auroc": merged.auroc_of_cues(),
             "auroc_confidence": _auroc_confidence(merged),
@@ -161,7 +192,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
 
 
 def true_motions(
-    sequence: RecordedSequence, frame_ids: list[int], settings: PairSettings
+    sequence: RecordedSequence, frame_ids: list[int], settings: PairSettings, gap: int
 ) -> dict[tuple[int, int], Array]:
     """Return ``(first frame, second frame) -> T_cam1_cam0`` of the pairs with the baseline asked for.
 
@@ -176,7 +207,7 @@ def true_motions(
     extent_m = float(np.linalg.norm(np.ptp(truth.positions, axis=0)))
     least_m = max(settings.min_baseline_m, settings.min_baseline_share * extent_m)
     motions = {}
-    for id0, id1 in zip(frame_ids, frame_ids[settings.gap :], strict=False):
+    for id0, id1 in zip(frame_ids, frame_ids[gap:], strict=False):
         if id0 not in T_world_cam or id1 not in T_world_cam:
             continue
         T_cam1_cam0 = invert_transform(T_world_cam[id1]) @ T_world_cam[id0]
@@ -185,73 +216,94 @@ def true_motions(
     if not motions:
         raise ConfigError(
             f"no pair of {sequence.name} has ground truth and a baseline of {least_m:.3g} m at gap "
-            f"{settings.gap}: try a larger --gap"
+            f"{gap}: try a larger --gap"
         )
     return motions
 
 
 def _neighbours(
-    run: FrameRun, gap: int, quality_db: list[float]
-) -> Iterator[tuple[LinkedFrame, LinkedFrame]]:
-    """Yield frames ``gap`` places apart, holding only those in between; collect the PSNR on the way."""
-    recent: deque[LinkedFrame] = deque(maxlen=gap + 1)
-    for frame in run:
+    run: FrameRun, gaps: tuple[int, ...], quality_db: list[float]
+) -> Iterator[tuple[int, int, LinkedFrame, LinkedFrame]]:
+    """Yield gap, index of the first frame, and two frames that far apart, holding only those in between.
+
+    The PSNR is collected on the way.
+    """
+    recent: deque[LinkedFrame] = deque(maxlen=max(gaps) + 1)
+    for idx, frame in enumerate(run):
         if frame.decoded is not None and frame.effective_snr_db is not None:
             quality_db.append(psnr_db(frame.original, frame.decoded.image))
         recent.append(frame)
-        if len(recent) == gap + 1:
-            yield recent[0], recent[-1]
+        for gap in gaps:
+            if len(recent) > gap:
+                yield gap, idx - gap, recent[-1 - gap], recent[-1]
+
+
+@dataclass(frozen=True)
+class _Pair:
+    frame0: LinkedFrame
+    frame1: LinkedFrame
+    T_cam1_cam0: Array
+    camera: Intrinsics
 
 
 def _measure(
-    frame0: LinkedFrame,
-    frame1: LinkedFrame,
-    T_cam1_cam0: Array,
-    camera: Intrinsics,
-    settings: PairSettings,
-    seed: int,
-) -> PairOutcome:
+    pair: _Pair, gap: int, settings: PairSettings, seed: int
+) -> Iterator[tuple[_Variant, PairOutcome]]:
+    """Match a pair in every way and give the matches to every estimator."""
     estimators: dict[str, Estimator] = {mode: confidence_estimator(mode) for mode in settings.confidence}
     if settings.competitors:
         estimators |= {name: competitor_estimator(name) for name in COMPETITORS}
-    if frame0.decoded is None or frame1.decoded is None:
-        failed = relative_pose_error(None, T_cam1_cam0)
-        return PairOutcome(dict.fromkeys(estimators, failed), {}, 0, {}, {})
-    matches = match_pair(frame0.decoded, frame1.decoded, settings.features, settings.max_features)
-    if settings.max_matches is not None and len(matches) > settings.max_matches:
-        rng = np.random.default_rng((seed, _THINNING_STREAM, frame0.frame_id))
-        matches = matches.take(np.sort(rng.choice(len(matches), settings.max_matches, replace=False)))
-    errors, elapsed_ms = {}, {}
+    decoded0, decoded1 = pair.frame0.decoded, pair.frame1.decoded
+    for features in settings.features:
+        if decoded0 is None or decoded1 is None:
+            failed = relative_pose_error(None, pair.T_cam1_cam0)
+            lost = PairOutcome(dict.fromkeys(estimators, failed), {}, 0, {}, {})
+            yield from ((_Variant(gap, features, count), lost) for count in settings.max_matches)
+            continue
+        found = match_pair(decoded0, decoded1, features, settings.max_features)
+        for count in settings.max_matches:
+            matches = found
+            if 0 < count < len(found):
+                rng = np.random.default_rng((seed, _THINNING_STREAM, pair.frame0.frame_id))
+                matches = found.take(np.sort(rng.choice(len(found), count, replace=False)))
+            outcome = _estimate(matches, pair, estimators, settings, seed)
+            yield _Variant(gap, features, count), outcome
+
+
+def _estimate(
+    matches: PairMatches, pair: _Pair, estimators: dict[str, Estimator], settings: PairSettings, seed: int
+) -> PairOutcome:
+    errors, cpu_ms = {}, {}
     for name, estimate in estimators.items():
-        since = time.perf_counter_ns()
-        T_estimated = estimate(matches, camera, settings.threshold_px, seed)
-        elapsed_ms[name] = (time.perf_counter_ns() - since) * 1e-6
-        errors[name] = relative_pose_error(T_estimated, T_cam1_cam0)
+        since = time.thread_time_ns()
+        T_estimated = estimate(matches, pair.camera, settings.threshold_px, seed)
+        cpu_ms[name] = (time.thread_time_ns() - since) * 1e-6
+        errors[name] = relative_pose_error(T_estimated, pair.T_cam1_cam0)
     xy0, xy1 = matches.keypoints0_xy, matches.keypoints1_xy
-    true_inlier = {
-        "epipolar": epipolar_distance_px(xy0, xy1, T_cam1_cam0, camera) < settings.inlier_px,
-    }
-    if settings.features == "klt":
-        true_inlier["track"] = track_error_px(xy0, xy1, frame0.original, frame1.original) < settings.inlier_px
+    distance_px = epipolar_distance_px(xy0, xy1, pair.T_cam1_cam0, pair.camera)
+    true_inlier = {"epipolar": distance_px < settings.inlier_px}
+    if matches.forward_backward_px is not None:
+        error_px = track_error_px(xy0, xy1, pair.frame0.original, pair.frame1.original)
+        true_inlier["track"] = error_px < settings.inlier_px
     geometric = match_confidence("robust", matches, seed).astype(np.float32)
     cues = {**matches.cues, "geometric_confidence": geometric}
-    return PairOutcome(errors, elapsed_ms, len(matches), cues, true_inlier)
+    return PairOutcome(errors, cpu_ms, len(matches), cues, true_inlier)
 
 
-def _entry(cell: PairCell, settings: PairSettings) -> dict[str, Any]:
+def _entry(cell: PairCell, variant: _Variant, settings: PairSettings) -> dict[str, Any]:
     outcomes = cell.outcomes
     rivals = [m for m in ("off",) if m in settings.confidence]
     rivals += list(COMPETITORS) if settings.competitors else []
-    kinds = ("epipolar", "track") if settings.features == "klt" else ("epipolar",)
+    kinds = ("epipolar", "track") if variant.features == "klt" else ("epipolar",)
     return {
-        "num_pairs_lost": sum(not o.elapsed_ms for o in outcomes),
+        "num_pairs_lost": sum(not o.cpu_ms for o in outcomes),
         "num_matches": percentiles([o.num_matches for o in outcomes], (5, 50)),
         "true_inlier_share": {kind: cell.inlier_share(kind) for kind in kinds},
         "results": cell.results(),
         "auroc": cell.auroc_of_cues(),
         "auroc_confidence": _auroc_confidence(cell),
         "comparisons": cell.comparisons(
-            settings.confidence, rivals, np.random.default_rng(settings.seed), block=settings.gap
+            settings.confidence, rivals, np.random.default_rng(settings.seed), block=variant.gap
         ),
     }
 

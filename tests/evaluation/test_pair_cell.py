@@ -8,7 +8,7 @@ from semcast.evaluation.pose_error import PoseError
 def outcome(ours, theirs, cue=(), inlier=()):
     return PairOutcome(
         errors={"robust": PoseError(*ours), "off": PoseError(*theirs)},
-        elapsed_ms={"robust": 2.0, "off": 1.0},
+        cpu_ms={"robust": 2.0, "off": 1.0},
         num_matches=len(cue),
         cues={"confidence": np.array(cue, np.float32)},
         true_inlier={"epipolar": np.array(inlier, dtype=bool)},
@@ -40,7 +40,7 @@ def test_results_by_hand(cell):
     assert results["robust"]["tdir_deg_mean"] == pytest.approx(4.5)
     assert results["off"]["rot_deg_median"] == 1.5
     assert results["off"]["num_pairs"] == 12
-    assert results["off"]["elapsed_ms"]["p50"] == 1.0
+    assert results["off"]["cpu_ms"]["p50"] == 1.0
 
 
 def test_auroc_and_inlier_share_count_all_matches(cell):

@@ -20,13 +20,13 @@ KEYS = {
     "auc20",
     "num_pairs",
     "num_failed",
-    "elapsed_ms",
+    "cpu_ms",
 }
 METHODS = {"robust", "paper", "off", "opencv_ransac", "opencv_magsac", "poselib"}
 
 
 def settings(room, **values):
-    base = {"sequence": room, "codec": "phase", "gap": 4, "max_frames": 7, "snr_db": (20.0,)}
+    base = {"sequence": room, "codec": "phase", "gap": (4,), "max_frames": 7, "snr_db": (20.0,)}
     return PairSettings(**{**base, **values})
 
 
@@ -53,7 +53,7 @@ def test_all_methods_are_measured_on_the_same_pairs(room, phase_codec, tmp_path)
 
 @pytest.mark.parametrize("features", ["orb", "sift"])
 def test_descriptor_matches_work_too(room, features):
-    report = evaluate_pairs(settings(room, codec="none", features=features, confidence=("robust", "off")))
+    report = evaluate_pairs(settings(room, codec="none", features=(features,), confidence=("robust", "off")))
     assert report["results"]["robust"]["rot_deg_median"] < 2.0
     assert report["cells"][0]["num_matches"]["p50"] > 30
     assert set(report["auroc"]) == {"epipolar"}
@@ -61,18 +61,42 @@ def test_descriptor_matches_work_too(room, features):
 
 def test_thinning_leaves_so_many_matches_to_everyone(room, phase_codec):
     report = evaluate_pairs(
-        settings(room, max_matches=40, confidence=("off",), competitors=False), phase_codec
+        settings(room, max_matches=(40,), confidence=("off",), competitors=False), phase_codec
     )
     assert report["cells"][0]["num_matches"] == {"p5": 40.0, "p50": 40.0}
     assert set(report["results"]) == {"off"}
 
 
+def test_frames_are_decoded_once_for_all_variants(room, phase_codec):
+    wanted = settings(
+        room,
+        gap=(2, 4),
+        features=("klt", "orb"),
+        max_matches=(0, 20),
+        confidence=("off",),
+        competitors=False,
+    )
+    report = evaluate_pairs(wanted, phase_codec)
+    assert phase_codec.num_decoded == 7
+    cells = {(c["gap"], c["features"], c["max_matches"]): c for c in report["cells"]}
+    assert len(cells) == len(report["cells"]) == 8
+    assert cells[2, "klt", 0]["results"]["off"]["num_pairs"] == 5
+    assert cells[4, "orb", 20]["results"]["off"]["num_pairs"] == 3
+    assert cells[4, "klt", 20]["num_matches"]["p50"] == 20 < cells[4, "klt", 0]["num_matches"]["p50"]
+    alone = evaluate_pairs(settings(room, confidence=("off",), competitors=False), phase_codec)
+    for result in (alone["cells"][0], cells[4, "klt", 0]):
+        result["results"]["off"].pop("cpu_ms")
+    assert alone["cells"][0] == cells[4, "klt", 0]
+    # Orb matches have no track: the truth of tracks is taken over the others.
+    assert set(report["auroc"]["track"]) > set(report["auroc"]["epipolar"])
+
+
 def test_the_result_is_the_same_every_time(room, phase_codec):
     def run():
-        report = evaluate_pairs(settings(room, seeds=2, max_matches=60, max_frames=6), phase_codec)
+        report = evaluate_pairs(settings(room, seeds=2, max_matches=(60,), max_frames=6), phase_codec)
         for results in (report["results"], report["cells"][0]["results"]):
             for result in results.values():
-                result.pop("elapsed_ms")
+                result.pop("cpu_ms")
         return {key: report[key] for key in ("results", "auroc", "cells")}
 
     assert run() == run()
@@ -99,7 +123,7 @@ def test_pairs_with_a_lost_frame_fail_under_every_method(room, phase_codec):
 def test_true_motion_maps_the_first_camera_to_the_second(room):
     sequence = open_sequence(room)
     wanted = settings(room)
-    motions = true_motions(sequence, selected_frame_ids(sequence, wanted), wanted)
+    motions = true_motions(sequence, selected_frame_ids(sequence, wanted), wanted, 4)
     assert list(motions) == [(k, k + 4) for k in range(3)]
     truth = sequence.groundtruth().T_world_cam
     np.testing.assert_allclose(truth[4] @ motions[0, 4], truth[0], atol=1e-7)
@@ -109,17 +133,19 @@ def test_short_baselines_are_left_out(room):
     sequence = open_sequence(room)
     wanted = settings(room, min_baseline_m=10.0)
     with pytest.raises(ConfigError, match="larger --gap"):
-        true_motions(sequence, selected_frame_ids(sequence, wanted), wanted)
+        true_motions(sequence, selected_frame_ids(sequence, wanted), wanted, 4)
     shared = settings(room, min_baseline_share=0.9)
     with pytest.raises(ConfigError, match="baseline"):
-        true_motions(sequence, selected_frame_ids(sequence, shared), shared)
+        true_motions(sequence, selected_frame_ids(sequence, shared), shared, 4)
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"gap": 0}, "gap"),
-        ({"max_matches": 4}, "max_matches"),
+        ({"gap": (0,)}, "gap"),
+        ({"gap": ()}, "gap"),
+        ({"features": ("klt", "klt")}, "features"),
+        ({"max_matches": (4,)}, "max_matches"),
         ({"threshold_px": 0.0}, "threshold_px"),
         ({"min_baseline_share": 1.0}, "min_baseline_share"),
         ({"confidence": ()}, "confidence"),

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from semcast.commands.running import add_settings, read_settings
-from semcast.evaluation import codec, confidence, latency, pairs, recording, trajectory
+from semcast.evaluation import codec, confidence, latency, pairs, recording, runtime, trajectory
 
 _Evaluation = tuple[type, Callable[[Any], dict[str, Any]], frozenset[str], str]
 #: what -> settings, function, settings the evaluation sets itself, one line of help
@@ -43,6 +43,12 @@ EVALUATIONS: dict[str, _Evaluation] = {
         latency.evaluate_latency,
         latency.UNUSED_FIELDS,
         "time every stage from encoder to viewer",
+    ),
+    "runtime": (
+        runtime.RuntimeSettings,
+        runtime.evaluate_runtime,
+        runtime.UNUSED_FIELDS,
+        "time encoder and decoder by runtime, instruction set and threads",
     ),
     "recording": (
         recording.RecordingSettings,

@@ -1,0 +1,50 @@
+"""One variant of a codec's runtime in its own process: instruction sets and threads are fixed at the start.
+
+Reads one JSON line with the variant, answers ``ready``; every further line with a count is answered with the
+wall times of that many calls.
+"""
+
+import json
+import sys
+import time
+
+import numpy as np
+
+from semcast.common.codec import ReceivedImage
+from semcast.common.codecs import load_codec
+
+
+def main() -> None:
+    """Serve until the input ends."""
+    task = json.loads(sys.stdin.readline())
+    height, width = task["shape_hw"]
+    codec = load_codec(
+        task["codec"], modulation="16qam", num_threads=task["threads"], device="cpu", runtime=task["runtime"]
+    )
+    rng = np.random.default_rng(0)
+    coarse = rng.integers(0, 256, (height // 16 + 1, width // 16 + 1, 3), dtype=np.uint8)
+    image = np.ascontiguousarray(coarse.repeat(16, axis=0).repeat(16, axis=1)[:height, :width])
+    encoded = codec.encode(image, 10.0)
+    snr_db = np.full(encoded.symbols.shape[0], 10.0, dtype=np.float32)
+    received = ReceivedImage(encoded.shape_hw, encoded.symbols * np.float32(10 / 11), snr_db, "16qam")
+
+    def call() -> None:
+        if task["work"] == "encode":
+            codec.encode(image, 10.0)
+        else:
+            codec.decode(received)
+
+    for _ in range(3):
+        call()
+    print(json.dumps("ready"), flush=True)
+    for line in sys.stdin:
+        times_ms = []
+        for _ in range(json.loads(line)):
+            since_ns = time.perf_counter_ns()
+            call()
+            times_ms.append((time.perf_counter_ns() - since_ns) * 1e-6)
+        print(json.dumps(times_ms), flush=True)
+
+
+if __name__ == "__main__":
+    main()

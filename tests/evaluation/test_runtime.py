@@ -1,0 +1,34 @@
+import json
+
+import pytest
+
+from semcast.common.errors import SemcastError
+from semcast.evaluation.runtime import RuntimeSettings, evaluate_runtime, variants
+
+
+def test_every_runtime_encodes_and_torch_alone_decodes():
+    found = variants(RuntimeSettings(threads=(1, 2)))
+    assert len(found) == len(set(found)) == 10
+    assert {(v.work, v.isa) for v in found if v.runtime == "onnx"} == {("encode", "all")}
+    assert {(v.work, v.isa) for v in found if v.runtime == "torch"} == {
+        (work, isa) for work in ("encode", "decode") for isa in ("all", "AVX2")
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.weights
+def test_all_variants_are_timed(tmp_path):
+    settings = RuntimeSettings(width=64, height=48, threads=(1,), rounds=2, calls=2, json=tmp_path / "r.json")
+    report = evaluate_runtime(settings)
+    assert json.loads(settings.json.read_text()) == report
+    assert len(report["results"]) == 5
+    for row in report["results"]:
+        assert 0.0 < row["p50_ms"] <= row["p95_ms"]
+        assert row["fps"] == pytest.approx(1000.0 / row["p50_ms"])
+
+
+def test_a_codec_without_weights_is_one_clear_error():
+    with pytest.raises(SemcastError, match="no variant ran: .*no trained weights for '3dcsc'"):
+        evaluate_runtime(RuntimeSettings(codecs=("3dcsc",), threads=(1,), rounds=1))
+    with pytest.raises(ValueError, match="threads must be at least 1"):
+        RuntimeSettings(threads=(0,))
