@@ -1,7 +1,8 @@
 """``docs/results.md`` and the README's table from ``evaluation/results``: no figure is typed by hand.
 
 Files are recognised by their names: ``codec_*``, ``trajectory_*``, ``pairs_*``, ``confidence_*``,
-``latency_*`` and ``demo_*``. Each table is followed by the command, commit and machine that made it.
+``latency_*``, ``runtime_*``, ``recording_*`` and ``demo_*``. Each table is followed by the pictures that belong
+to it, ``<name>-*.png``, and by the command, commit and machine that made it.
 """
 
 import json
@@ -134,6 +135,33 @@ def _demo(report: Report) -> Iterator[str]:
     yield from table(["figure", "value"], rows)
 
 
+def _runtime(report: Report) -> Iterator[str]:
+    settings = report["settings"]
+    yield f"Images of {settings['width']}x{settings['height']}; all variants take turns in one run.\n"
+    head = ["codec", "work", "runtime", "instruction sets", "threads", "p50 ms", "p95 ms", "per second"]
+    keys = ("codec", "work", "runtime", "isa", "threads")
+    yield from table(
+        head,
+        [
+            [*(str(row[k]) for k in keys), *(number(row[k], 1) for k in ("p50_ms", "p95_ms", "fps"))]
+            for row in report["results"]
+        ],
+    )
+
+
+def _recording(report: Report) -> Iterator[str]:
+    rows = [
+        ["share of a core", f"{report['core_share']:.1%}"],
+        [
+            "a sender is held up, p50 / p99",
+            f"{report['put_us']['p50']:.0f} / {report['put_us']['p99']:.0f} us",
+        ],
+        ["written", f"{report['bytes_per_s'] / 1e6:.1f} MB/s"],
+        ["messages dropped", str(report["dropped"])],
+    ]
+    yield from table(["figure", "value"], rows)
+
+
 SECTIONS: dict[str, tuple[str, Tables]] = {
     "demo": ("The live demo", _demo),
     "codec": ("Image quality per channel use (CBR 1/16, pilots included)", _codec),
@@ -141,6 +169,8 @@ SECTIONS: dict[str, tuple[str, Tables]] = {
     "pairs": ("Relative pose of frame pairs", _pairs),
     "confidence": ("What the confidence maps are worth", _confidence),
     "latency": ("Where the time goes", _latency),
+    "runtime": ("How fast encoder and decoder are", _runtime),
+    "recording": ("What recording costs", _recording),
 }
 
 
@@ -155,6 +185,8 @@ def results_page(folder: Path = RESULTS) -> str:
             report = json.loads(file.read_text(encoding="utf-8"))
             lines.append(f"### {file.stem.removeprefix(kind + '_').replace('_', ' ')}\n")
             lines.extend(tables(report))
+            for picture in sorted(folder.glob(f"{file.stem}-*.png")):
+                lines.append(f"\n![{picture.stem.replace('-', ', ').replace('_', ' ')}](../{picture})")
             commit = str(report.get("commit", "")).partition("+")
             made = f"commit {commit[0][:12]}{commit[1]}{commit[2]}" if commit[0] else "see the file"
             lines.append(

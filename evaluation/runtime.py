@@ -121,8 +121,8 @@ def evaluate_runtime(settings: RuntimeSettings) -> dict[str, Any]:
     """Time all variants in one run, taking turns.
 
     Returns:
-        ``results``: a row for each variant with ``p50_ms``, ``p95_ms`` and ``fps``, or ``error`` where a codec
-        has no weights or no exported encoder; and provenance.
+        ``results``: a row for each variant with ``p50_ms``, ``p95_ms`` and ``fps``, or ``error`` where a
+        codec has no weights or no exported encoder; and provenance.
 
     Raises:
         SemcastError: No variant ran.
