@@ -1,4 +1,4 @@
-"""Confidence-free relative-pose estimators of others, run on the same matches as ours."""
+"""Confidence-free relative-pose estimators, run on the same matches as ours."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
+from semcast.server.ransac import confidence_ransac
 
 Array = NDArray[np.float64]
 
@@ -115,8 +116,27 @@ def poselib_lo_ransac(
     return make_transform(pose_cam1_cam0.R, t_cam1_cam0 / length)
 
 
+def plain_ransac(
+    keypoints0_xy: Array, keypoints1_xy: Array, camera: Intrinsics, settings: CompetitorSettings
+) -> Array | None:
+    """The paper's own RANSAC without confidence: uniform sampling, one threshold, most inliers.
+
+    What separates it from mode ``paper`` is confidence alone. Arguments and result as ``opencv_ransac``.
+    """
+    found = confidence_ransac(
+        camera,
+        keypoints0_xy,
+        keypoints1_xy,
+        np.ones(len(keypoints0_xy)),
+        delta0=settings.threshold_px / camera.fx,
+        seed=settings.seed,
+    )
+    return None if found is None else found.T_cam1_cam0
+
+
 #: Name in results -> estimator.
 COMPETITORS: dict[str, Competitor] = {
+    "plain_ransac": plain_ransac,
     "opencv_ransac": opencv_ransac,
     "opencv_magsac": opencv_magsac,
     "poselib": poselib_lo_ransac,

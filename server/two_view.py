@@ -71,8 +71,8 @@ def estimate_two_view(
     mode: ConfidenceMode = "robust",
     threshold_px: float = 1.0,
     seed: int = 0,
-    max_iterations: int = 10_000,
-    min_iterations: int = 500,
+    max_iterations: int = 1000,
+    min_iterations: int = 150,
     choose_model: bool = False,
 ) -> TwoViewResult | None:
     """Estimate the relative pose of two images.
