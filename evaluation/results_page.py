@@ -1,8 +1,8 @@
 """``docs/results.md`` and the README's table from ``evaluation/results``: no figure is typed by hand.
 
 Files are recognised by their names: ``codec_*``, ``trajectory_*``, ``pairs_*``, ``confidence_*``,
-``latency_*``, ``runtime_*``, ``recording_*`` and ``demo_*``. Each table is followed by the pictures that belong
-to it, ``<name>-*.png``, and by the command, commit and machine that made it.
+``latency_*``, ``runtime_*``, ``recording_*`` and ``demo_*``. Each table is followed by its pictures,
+``<name>-*.png``, and by the command, commit and machine that made it.
 """
 
 import json

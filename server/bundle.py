@@ -98,7 +98,7 @@ def optimise(problem: BundleProblem) -> BundleResult:
             before = optimiser.error()
             solved = optimiser.optimize()
             ok = bool(np.isfinite(optimiser.error()) and optimiser.error() <= before)
-        except RuntimeError:  # an indeterminate linear system
+        except (RuntimeError, IndexError):  # an indeterminate system, a pose without a factor
             ok = False
         if ok:
             for k in np.flatnonzero(~problem.fixed).tolist():
@@ -121,7 +121,7 @@ def _covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int)
     """Marginal covariance of one pose, None where the system does not fix it."""
     try:
         covariance = np.asarray(gtsam.Marginals(graph, values).marginalCovariance(X(k)))
-    except RuntimeError:
+    except (RuntimeError, IndexError):  # IndexError: no observation is left on this pose
         return None
     return covariance if np.isfinite(covariance).all() else None
 

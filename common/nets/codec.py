@@ -1,7 +1,5 @@
 """A trained transceiver behind the codec interface: numpy in, numpy out, on CPU or GPU."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +17,9 @@ from semcast.common.codec import (
     confidence_from_displacement_px,
 )
 from semcast.common.nets.checkpoint import Manifest, load_transceiver, weights_path
+from semcast.common.nets.inference import inference_net
 from semcast.common.nets.latent import latent_from_symbols, symbols_from_latent
+from semcast.common.nets.modulation import modulate
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, layout_for
 from semcast.common.shapes import check_shape
@@ -55,9 +55,9 @@ class NeuralCodec:
         self.manifest = manifest
         self._modulation: Modulation = modulation
         self._device = device
-        self._half = device.type == "cuda" or has_fast_bfloat16()
-        self._model = model.to(device).eval().requires_grad_(False)
-        self._model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        half = device.type == "cuda" or has_fast_bfloat16()
+        model = model.to(device).eval().requires_grad_(False)
+        self._net = inference_net(model, torch.bfloat16 if half else torch.float32)
         self._is_qam = (
             torch.ones(1, device=device) if modulation == "16qam" else torch.zeros(1, device=device)
         )
@@ -131,12 +131,10 @@ class NeuralCodec:
         bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX
         if bottom or right:
             image = np.pad(image, ((0, bottom), (0, right), (0, 0)), mode="edge")
-        with _inference(self._device.type, self._half):
+        with torch.inference_mode():
             pixels = torch.from_numpy(np.ascontiguousarray(image)).to(self._device)
-            # (1, 3, H, W) in channels_last: the memory of the image as it is.
-            x = pixels[None].permute(0, 3, 1, 2).float().mul_(1.0 / 255.0)
-            latent = self._model.latent(x, torch.full((1,), expected, device=self._device), self._is_qam)
-            symbols = self._model.transmit(latent, self._is_qam)[0]
+            latent = self._net.latent(pixels, torch.full((1,), expected, device=self._device), self._is_qam)
+            symbols = modulate(latent, self._is_qam)[0]
         return EncodedImage(
             shape_hw=(sizes["H"], sizes["W"]),
             symbols=symbols_from_latent(symbols.cpu().numpy()),
@@ -171,26 +169,15 @@ class NeuralCodec:
             latent = np.nan_to_num(latent, nan=0.0, posinf=0.0, neginf=0.0)
         latent = latent.clip(-_MAX_SYMBOL, _MAX_SYMBOL)
         height, width = received.shape_hw
-        with _inference(self._device.type, self._half):
+        with torch.inference_mode():
             y_rx = torch.from_numpy(latent)[None].to(self._device, memory_format=torch.channels_last)
             plane = torch.from_numpy(snr_db).to(self._device).view(1, 1, -1, 1)
             plane = plane.expand(1, 1, -1, layout.blocks_per_slot)
-            x_hat, features = self._model.receive(y_rx, plane, self._is_qam)
-            logit, displacement = self._model.judge(features, x_hat)
-            pixels = x_hat[0].float().clamp_(0.0, 1.0).mul_(255.0).round_().to(torch.uint8).permute(1, 2, 0)
-            image = pixels[:height, :width].contiguous().cpu().numpy()
-            confidence = torch.sigmoid(logit[0, 0, :height, :width]).contiguous().cpu().numpy()
-            moved_px = displacement[0, 0, :height, :width].contiguous().cpu().numpy()
+            maps = self._net.decode(y_rx, plane, self._is_qam)
+            image, confidence, moved_px = (m[:height, :width].contiguous().cpu().numpy() for m in maps)
         return DecodedImage(
             image=image,
             confidence=confidence,
             keypoint_confidence=confidence_from_displacement_px(moved_px),
             outage=bool((snr_db <= LOST_SLOT_SNR_DB).all()),
         )
-
-
-@contextmanager
-def _inference(device_type: str, half: bool) -> Iterator[None]:
-    """No gradients and, where it pays, bfloat16 autocast."""
-    with torch.inference_mode(), torch.autocast(device_type, torch.bfloat16, enabled=half):
-        yield

@@ -68,14 +68,17 @@ class BlockSynthesis(nn.Module):
         Returns:
             ``(B, 3, 16 h, 16 w)``.
         """
+        coefficients = self.unmix(y).float() * self.gain(shrink, scale, is_qam, adapt)
+        x: Tensor = self.unfold(self.transform(coefficients))
+        return x
+
+    def gain(self, shrink: Tensor, scale: Tensor, is_qam: Tensor, adapt: Tensor) -> Tensor:
+        """Wiener gain of each coefficient, ``(B, 94, h, w)``, which also undoes ``shrink``."""
         shrink = shrink.clamp_min(1e-2)
         noise = (1.0 - shrink) / shrink * scale.square()  # noise variance for unit power
         flag = is_qam.view(-1, 1, 1, 1)
         log_distortion = self.log_distortion[0] * (1.0 - flag) + self.log_distortion[1] * flag
         more_power, log_gain = adapt.float().chunk(2, dim=1)
-        coefficients = self.unmix(y).float() / shrink
         log_noise = torch.log(noise + torch.exp(log_distortion))
         wiener = torch.sigmoid(self.log_power.view(1, -1, 1, 1) + more_power - log_noise)
-        gain = wiener * torch.exp(log_gain.clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN))
-        x: Tensor = self.unfold(self.transform(coefficients * gain))
-        return x
+        return wiener * torch.exp(log_gain.clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN)) / shrink

@@ -65,6 +65,36 @@ def analog_symbols(y: Tensor) -> Tensor:
     return y * torch.rsqrt(2.0 * power + 1e-12)
 
 
+def modulate(latent: Tensor, is_qam: Tensor) -> Tensor:
+    """Modulate: real and imaginary parts of unit-power symbols, so power 1/2 for each real value.
+
+    Args:
+        latent: ``(B, C, h, w)``.
+        is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
+    """
+    if bool((is_qam == 1).all()):
+        return nearest_level(latent)
+    if bool((is_qam == 0).all()):
+        return analog_symbols(latent)
+    return torch.where(is_qam.view(-1, 1, 1, 1) > 0, nearest_level(latent), analog_symbols(latent))
+
+
+def demodulate(y_rx: Tensor, shrink: Tensor, is_qam: Tensor) -> tuple[Tensor, Tensor]:
+    """Undo the scale of analog images and leave 16-QAM as it is.
+
+    Args:
+        y_rx: ``(B, C, h, w)`` MMSE-equalised values.
+        shrink: ``(B, 1, h, w)`` in [0, 1], ``snr / (1 + snr)`` of each slot.
+        is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
+
+    Returns:
+        The latent, still shrunk by ``shrink``, and the ``(B, 1, 1, 1)`` factor that was applied.
+    """
+    flag = is_qam.view(-1, 1, 1, 1)
+    descaled, scale = undo_analog(y_rx, shrink)
+    return torch.where(flag > 0, y_rx, descaled), torch.where(flag > 0, torch.ones_like(scale), scale)
+
+
 def undo_analog(y_rx: Tensor, shrink: Tensor) -> tuple[Tensor, Tensor]:
     """Estimate the transmitter's divisor from the carrier, undo it and take the carrier away.
 

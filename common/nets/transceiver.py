@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor, nn
 
 from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import Decoder, DecoderFeatures
 from semcast.common.nets.encoder import Encoder
-from semcast.common.nets.modulation import analog_symbols, nearest_level, undo_analog
+from semcast.common.nets.modulation import demodulate, modulate
 
 
 @dataclass(frozen=True)
@@ -48,11 +47,7 @@ class Transceiver(nn.Module):
 
     def transmit(self, latent: Tensor, is_qam: Tensor) -> Tensor:
         """Modulate: real and imaginary parts of unit-power symbols, so power 1/2 for each real value."""
-        if bool((is_qam == 1).all()):
-            return nearest_level(latent)
-        if bool((is_qam == 0).all()):
-            return analog_symbols(latent)
-        return torch.where(is_qam.view(-1, 1, 1, 1) > 0, nearest_level(latent), analog_symbols(latent))
+        return modulate(latent, is_qam)
 
     def receive(self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, DecoderFeatures]:
         """Decode equalised symbols to an image that is not yet clipped.
@@ -64,10 +59,7 @@ class Transceiver(nn.Module):
         """
         linear = 10.0 ** (snr_db / 10.0)
         shrink = linear / (1.0 + linear)
-        descaled, scale = undo_analog(y_rx, shrink)
-        flag = is_qam.view(-1, 1, 1, 1)
-        y = torch.where(flag > 0, y_rx, descaled)
-        scale = torch.where(flag > 0, torch.ones_like(scale), scale)
+        y, scale = demodulate(y_rx, shrink, is_qam)
         decoded: tuple[Tensor, DecoderFeatures] = self.decoder(y, snr_db, shrink, scale, is_qam)
         return decoded
 

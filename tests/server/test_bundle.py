@@ -130,8 +130,10 @@ def test_a_point_behind_a_camera_is_left_out():
         {"xy": np.full((360, 2), np.nan)},
         {"T_world_cam": np.stack([np.eye(4)] * 6), "xyz": np.full((60, 3), (0.0, 0.0, 5.0))},
         {"T_world_cam": np.stack([1.3 * np.eye(4)] * 6)},
+        {"xy": np.concatenate([np.zeros((300, 2)), np.full((60, 2), np.nan)])},
+        {"view": np.repeat(np.arange(6), 60) % 5},
     ],
-    ids=["no gauge", "all behind", "nan", "no parallax", "no rotations"],
+    ids=["no gauge", "all behind", "nan", "no parallax", "no rotations", "nothing seen last", "unseen pose"],
 )
 def test_degenerate_windows_end_without_an_exception(changes):
     problem, _, _ = make_problem()

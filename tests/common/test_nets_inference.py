@@ -1,0 +1,77 @@
+import copy
+
+import pytest
+import torch
+
+from semcast.common.nets.inference import ArrangedNet, PlainNet, inference_net
+from semcast.common.nets.modulation import modulate
+from semcast.common.nets.registry import build
+
+torch.manual_seed(0)
+
+
+def perturbed(name):
+    """A network none of whose layers is at its start: each layer's order of channels matters then."""
+    model = build(name).eval().requires_grad_(False)
+    generator = torch.Generator().manual_seed(1)
+    for parameter in model.parameters():
+        parameter.add_(0.03 * torch.randn(parameter.shape, generator=generator))
+    return model
+
+
+def example(is_qam):
+    generator = torch.Generator().manual_seed(2)
+    pixels = torch.randint(0, 256, (48, 80, 3), generator=generator, dtype=torch.uint8)
+    snr_db = torch.tensor([4.0])
+    plane = torch.linspace(-10, 12, 15).view(1, 1, 3, 5)
+    y_rx = 0.7 * torch.randn(1, 94, 3, 5, generator=generator)
+    return pixels, snr_db, plane, y_rx, torch.tensor([float(is_qam)])
+
+
+@pytest.mark.parametrize("is_qam", [False, True])
+@pytest.mark.parametrize("name", ["3dcsc", "3dcsc-lite"])
+def test_arranged_network_equals_its_modules(name, is_qam):
+    model = perturbed(name)
+    net = inference_net(copy.deepcopy(model), torch.float32)
+    assert isinstance(net, ArrangedNet)
+    pixels, snr_db, plane, y_rx, flag = example(is_qam)
+    with torch.inference_mode():
+        x = pixels.permute(2, 0, 1)[None].float() / 255.0
+        torch.testing.assert_close(
+            net.latent(pixels, snr_db, flag), model.latent(x, snr_db, flag), rtol=1e-4, atol=1e-4
+        )
+        x_hat, features = model.receive(y_rx, plane, flag)
+        logit, displacement_px = model.judge(features, x_hat)
+        image, confidence, moved_px = net.decode(y_rx, plane, flag)
+    expected = x_hat[0].clamp(0, 1).mul(255).round().permute(1, 2, 0)
+    assert expected.std() > 10  # neither black nor white everywhere
+    assert (image.float() - expected).abs().max() <= 1
+    torch.testing.assert_close(confidence, torch.sigmoid(logit[0, 0]), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(moved_px, displacement_px[0, 0], rtol=1e-3, atol=1e-4)
+
+
+def test_bfloat16_stays_close():
+    model = perturbed("3dcsc-lite")
+    exact, quick = (inference_net(copy.deepcopy(model), d) for d in (torch.float32, torch.bfloat16))
+    pixels, snr_db, plane, y_rx, flag = example(is_qam=True)
+    with torch.inference_mode():
+        latents = [n.latent(pixels, snr_db, flag) for n in (exact, quick)]
+        same = modulate(latents[0], flag) == modulate(latents[1], flag)
+        images = [n.decode(y_rx, plane, flag)[0].float() for n in (exact, quick)]
+    assert same.float().mean() > 0.95
+    assert (images[0] - images[1]).abs().mean() < 2
+
+
+@pytest.mark.parametrize("name", ["cnn", "vit"])
+def test_rivals_run_through_their_own_modules(name):
+    model = perturbed(name)
+    net = inference_net(copy.deepcopy(model), torch.bfloat16)
+    assert isinstance(net, PlainNet)
+    pixels, snr_db, plane, y_rx, flag = example(is_qam=True)
+    with torch.inference_mode():
+        latent = net.latent(pixels, snr_db, flag)
+        image, confidence, moved_px = net.decode(y_rx, plane, flag)
+    assert latent.shape == (1, 94, 3, 5)
+    assert image.shape == (48, 80, 3)
+    assert confidence.shape == moved_px.shape == (48, 80)
+    assert moved_px.min() >= 0
