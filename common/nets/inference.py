@@ -82,7 +82,7 @@ class PlainNet:
         with torch.autocast(y_rx.device.type, torch.bfloat16, enabled=self._half):
             x_hat, features = self._model.receive(y_rx, snr_db, is_qam)
             logit, displacement = self._model.judge(features, x_hat)
-        pixels = x_hat[0].float().clamp_(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
+        pixels: Tensor = x_hat[0].float().clamp_(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
         return pixels.permute(1, 2, 0).contiguous(), torch.sigmoid(logit[0, 0].float()), displacement[0, 0]
 
 
