@@ -75,7 +75,8 @@ class PlainNet:
         with torch.autocast(pixels.device.type, torch.bfloat16, enabled=self._half):
             # (1, 3, H, W) in channels_last: the memory of the image as it is.
             x = pixels[None].permute(0, 3, 1, 2).float().mul_(1.0 / 255.0)
-            return self._model.latent(x, snr_db, is_qam)
+            latent: Tensor = self._model.latent(x, snr_db, is_qam)
+        return latent
 
     def decode(self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See ``InferenceNet``."""
