@@ -95,32 +95,66 @@ def plot_against_snr(
 
 
 def plot_pair_errors(
-    folder: Path, result: Mapping[str, Any], modes: Sequence[str] | None = None
+    folder: Path, result: Mapping[str, Any], modes: Sequence[str] | None = None, prefix: str = ""
 ) -> list[Path]:
     """Draw rotation and translation-direction error against SNR, with and without confidence.
 
-    These are Fig. 9 (``fig9_rotation.png``) and Fig. 10 (``fig10_translation_direction.png``) of the paper.
+    These are Fig. 9 (``fig9_rotation.png``) and Fig. 10 (``fig10_translation_direction.png``) of the paper,
+    with a panel for every gap, kind of features and thinning.
 
     Args:
         folder: Where the two files go.
         result: What ``evaluate_pairs`` returned.
         modes: Curves to show; all modes of the result by default.
+        prefix: Of the file names.
 
     Returns:
         The files written.
     """
-    cells = sorted(result["cells"], key=lambda cell: cell["snr_db"])
-    snr_db = [cell["snr_db"] for cell in cells]
-    modes = list(modes or cells[0]["results"])
+    panels: dict[str, list[Mapping[str, Any]]] = {}
+    for cell in sorted(result["cells"], key=lambda cell: float(cell["snr_db"])):
+        panels.setdefault(variant_name(cell), []).append(cell)
+    modes = list(modes or result["cells"][0]["results"])
     paths = []
     for name, key, label in (
         ("fig9_rotation.png", "rot_deg_mean", "mean rotation error (deg)"),
         ("fig10_translation_direction.png", "tdir_deg_mean", "mean translation-direction error (deg)"),
     ):
-        curves = {mode: [cell["results"][mode][key] for cell in cells] for mode in modes}
-        plot_against_snr(folder / name, snr_db, curves, label, title=str(result.get("title", "")))
-        paths.append(folder / name)
+        num_columns = min(len(panels), 4)
+        num_rows = -(-len(panels) // num_columns)
+        size = (5.0, 3.6) if len(panels) == 1 else (3.2 * num_columns, 2.9 * num_rows)
+        figure, grid = new_grid(num_rows, num_columns, *size)
+        flat = [axes for row in grid for axes in row]
+        for axes in flat[len(panels) :]:
+            axes.set_visible(False)
+        for axes, (variant, cells) in zip(flat, panels.items(), strict=False):
+            snr_db = [cell["snr_db"] for cell in cells]
+            for k, mode in enumerate(modes):
+                values = [cell["results"][mode][key] for cell in cells]
+                y = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+                axes.plot(snr_db, y, marker=_MARKERS[k % len(_MARKERS)], markersize=4, label=mode)
+            title = variant if len(panels) > 1 else str(result.get("title", ""))
+            axes.set_title(title, fontsize="medium")
+            axes.set(xlabel="SNR (dB)")
+            axes.set_ylim(bottom=0.0)
+        for row in grid:
+            row[0].set_ylabel(label, fontsize="small")
+        flat[0].legend(fontsize="x-small")
+        if len(panels) > 1:
+            figure.suptitle(str(result.get("title", "")))
+        save_figure(figure, folder / f"{prefix}{name}")
+        paths.append(folder / f"{prefix}{name}")
     return paths
+
+
+def variant_name(cell: Mapping[str, Any]) -> str:
+    """Return what the matches of a cell of ``evaluate_pairs`` are, such as ``klt, 40 matches, gap 2``."""
+    parts = [str(cell.get("features", ""))]
+    if cell.get("max_matches"):
+        parts.append(f"{cell['max_matches']} matches")
+    if cell.get("gap", 1) != 1:
+        parts.append(f"gap {cell['gap']}")
+    return ", ".join(parts)
 
 
 def plot_top_view(

@@ -1,4 +1,4 @@
-"""``docs/results.md`` and the README's table from ``evaluation/results``: no figure is typed by hand.
+"""``docs/results.md`` and the generated parts of README and ``docs/confidence.md``, from result files.
 
 Files are recognised by their names: ``codec_*``, ``trajectory_*``, ``pairs_*``, ``confidence_*``,
 ``latency_*``, ``runtime_*``, ``recording_*`` and ``demo_*``. Each table is followed by its pictures,
@@ -6,14 +6,18 @@ Files are recognised by their names: ``codec_*``, ``trajectory_*``, ``pairs_*``,
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+from semcast.evaluation.markdown import number, table, with_part
+from semcast.evaluation.pair_summary import RIVAL, pair_summary
+from semcast.evaluation.plots import variant_name
 
 RESULTS = Path("evaluation/results")
 PAGE = Path("docs/results.md")
 README = Path("README.md")
-START, END = "<!-- results -->", "<!-- /results -->"
+CONFIDENCE_PAGE = Path("docs/confidence.md")
 
 Report = Mapping[str, Any]
 Tables = Callable[[Report], Iterator[str]]
@@ -25,21 +29,6 @@ commit and the machine. Trajectory errors are after alignment by a similarity, a
 of frames with a pose). PSNR of an outage counts the grey picture the receiver shows then (12.8 dB on Kodak).
 What the figures mean and what limits them is in [reading the results](reading-results.md).
 """
-
-
-def number(value: Any, digits: int = 2) -> str:
-    """Return a figure as text, a dash where there is none."""
-    if value is None:
-        return "-"
-    return f"{value:.{digits}f}" if isinstance(value, float) else str(value)
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Yield the lines of a Markdown table."""
-    yield "| " + " | ".join(head) + " |"
-    yield "|" + "---|" * len(head)
-    for row in rows:
-        yield "| " + " | ".join(row) + " |"
 
 
 def _codec(report: Report) -> Iterator[str]:
@@ -76,14 +65,21 @@ def _trajectory(report: Report) -> Iterator[str]:
 
 
 def _pairs(report: Report) -> Iterator[str]:
-    keys = ("rot_deg_mean", "rot_deg_median", "tdir_deg_mean", "tdir_deg_median", "auc5", "auc10", "auc20")
-    cells = report.get("cells") or [report]
-    for cell in cells:
-        if cell.get("snr_db") is not None and not isinstance(cell["snr_db"], list):
-            yield f"{cell['snr_db']:g} dB:\n"
-        rows = [[mode, *(number(r.get(key)) for key in keys)] for mode, r in cell["results"].items()]
-        yield from table(["estimator", *(key.replace("_", " ") for key in keys)], rows)
-        yield ""
+    methods = list(report["results"])
+    yield "Mean translation-direction error in degrees; the last column is its 95 % interval.\n"
+    rows = []
+    for cell in report["cells"]:
+        snr = "no link" if cell["snr_db"] is None else f"{cell['snr_db']:g}"
+        found = [number(cell["results"][m]["tdir_deg_mean"], 1) for m in methods]
+        rows.append([snr, variant_name(cell), *found, _interval(cell)])
+    yield from table(["SNR dB", "matches", *methods, f"robust - {RIVAL}"], rows)
+
+
+def _interval(cell: Mapping[str, Any]) -> str:
+    for c in cell["comparisons"]:
+        if (c["mode"], c["against"], c["figure"]) == ("robust", RIVAL, "tdir_deg_mean") and c["paired"]:
+            return f"{c['paired']['low']:+.1f} .. {c['paired']['high']:+.1f}"
+    return "-"
 
 
 def _confidence(report: Report) -> Iterator[str]:
@@ -214,19 +210,16 @@ def readme_table(folder: Path = RESULTS) -> str:
     return "\n".join(table(head, sorted(rows)))
 
 
-def with_table(readme: str, rows: str) -> str:
-    """Return the README with the lines between its two markers replaced.
-
-    Raises:
-        ValueError: A marker is missing.
-    """
-    before, start, rest = readme.partition(START)
-    _, end, after = rest.partition(END)
-    if not start or not end:
-        raise ValueError(f"README must hold {START} and {END}")
-    return f"{before}{start}\n{rows}\n{end}{after}"
+def confidence_part(folder: Path = RESULTS) -> str:
+    """Return the generated part of the page on confidence."""
+    files = sorted(folder.glob("pairs_*.json"))
+    return pair_summary(json.loads(file.read_text(encoding="utf-8")) for file in files)
 
 
 if __name__ == "__main__":
     PAGE.write_text(results_page(), encoding="utf-8")
-    README.write_text(with_table(README.read_text(encoding="utf-8"), readme_table()), encoding="utf-8")
+    for page, name, part in (
+        (README, "results", readme_table()),
+        (CONFIDENCE_PAGE, "pairs", confidence_part()),
+    ):
+        page.write_text(with_part(page.read_text(encoding="utf-8"), name, part), encoding="utf-8")

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from semcast.cli import VERBS, verb_parser
-from semcast.evaluation.results_page import readme_table, results_page, with_table
+from semcast.evaluation.markdown import with_part
+from semcast.evaluation.results_page import confidence_part, readme_table, results_page
 from semcast.reference import reference, with_messages
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -68,4 +69,6 @@ def test_the_figures_in_the_docs_are_those_of_the_result_files(monkeypatch):
     monkeypatch.chdir(ROOT)
     assert (ROOT / "docs/results.md").read_text(encoding="utf-8") == results_page(), "run make results-page"
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert readme == with_table(readme, readme_table()), "run make results-page"
+    assert readme == with_part(readme, "results", readme_table()), "run make results-page"
+    confidence = (ROOT / "docs/confidence.md").read_text(encoding="utf-8")
+    assert confidence == with_part(confidence, "pairs", confidence_part()), "run make results-page"

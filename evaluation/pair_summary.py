@@ -1,0 +1,185 @@
+"""What the pair benchmark says in a few tables: the part of ``docs/confidence.md`` between its markers.
+
+A cell is one recording, channel, SNR, gap, kind of features and thinning. Ratios of cells are averaged
+geometrically, so that no hard cell outweighs all others.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from semcast.evaluation.markdown import number, table
+from semcast.evaluation.plots import variant_name
+
+#: The best confidence-free estimator of others on these matches.
+RIVAL = "poselib"
+PLAIN = "plain_ransac"
+#: The paper's claim is about links this bad.
+BAD_LINK_DB = 6.0
+_METHODS = ("plain_ransac", "opencv_ransac", "opencv_magsac", "poselib", "paper", "off", "robust")
+_MISLEADING = ("constant", "shuffled", "inverted")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell and where it comes from."""
+
+    recording: str
+    channel: str
+    codec: str
+    values: Mapping[str, Any]
+
+    @property
+    def title(self) -> str:
+        """Recording, codec where it is not the default, and matches, as a row is named."""
+        codec = "" if self.codec.startswith("3dcsc") else f", {self.codec}"
+        return f"{self.recording}, {self.channel}{codec}"
+
+    def mean(self, method: str, figure: str = "tdir_deg_mean") -> float | None:
+        """Return a figure of one method, None where it was not run."""
+        value = self.values["results"].get(method, {}).get(figure)
+        return None if value is None else float(value)
+
+    def interval(self, mode: str, against: str, figure: str = "tdir_deg_mean") -> Mapping[str, Any] | None:
+        """Return the paired comparison of a mode to a rival."""
+        wanted = {"mode": mode, "against": against, "figure": figure}
+        for comparison in self.values["comparisons"]:
+            if wanted.items() <= comparison.items():
+                paired: Mapping[str, Any] | None = comparison["paired"]
+                return paired
+        return None
+
+
+def cells_of(reports: Iterable[Mapping[str, Any]]) -> list[Cell]:
+    """Return all cells of reports of ``semcast eval pairs``; those without a link are left out."""
+    return [
+        Cell(report["sequence"], report["settings"]["link"]["channel"], report["settings"]["codec"], values)
+        for report in reports
+        for values in report["cells"]
+        if values["snr_db"] is not None
+    ]
+
+
+def pair_summary(reports: Iterable[Mapping[str, Any]]) -> str:
+    """Return the tables as Markdown.
+
+    Args:
+        reports: Results of ``semcast eval pairs`` with all modes and competitors.
+    """
+    cells = cells_of(reports)
+    if not cells:
+        return ""
+    parts = [
+        _against_rival(cells),
+        _against_plain(cells),
+        _misleading(cells),
+        _cues(cells),
+        _time(cells),
+    ]
+    return "\n".join(line for part in parts for line in (*part, ""))
+
+
+def _against_rival(cells: Sequence[Cell]) -> Iterator[str]:
+    yield "**Mean translation-direction error in degrees**, mean over the cells of a row. `better` and"
+    yield f"`worse` count cells in which the 95 % interval of `robust` minus `{RIVAL}` excludes zero.\n"
+    rows = []
+    for title, group in _grouped(cells, lambda c: f"{c.title}; {variant_name(c.values)}").items():
+        figures = [number(_mean(c.mean(m) for c in group), 1) for m in _METHODS]
+        paired = [p for c in group if (p := c.interval("robust", RIVAL)) is not None]
+        better = sum(p["high"] < 0 for p in paired)
+        worse = sum(p["low"] > 0 for p in paired)
+        ratio = number(_ratio(group, "robust", RIVAL))
+        rows.append([title, str(len(group)), *figures, ratio, str(better), str(worse)])
+    head = ["recording, channel; matches", "cells", *_METHODS, f"robust / {RIVAL}", "better", "worse"]
+    yield from table(head, rows)
+    yield ""
+    yield (
+        f"Over all {len(cells)} cells `robust` has {_ratio(cells, 'robust', RIVAL):.2f} times the error of "
+        f"`{RIVAL}` and {_ratio(cells, 'robust', 'off'):.2f} times that of `off`; `paper` has "
+        f"{_ratio(cells, 'paper', PLAIN):.2f} times that of `{PLAIN}`."
+    )
+
+
+def _against_plain(cells: Sequence[Cell]) -> Iterator[str]:
+    bad = [c for c in cells if float(c.values["snr_db"]) <= BAD_LINK_DB]
+    if not bad:
+        return
+    yield f"**Gain over plain RANSAC at {BAD_LINK_DB:g} dB and below**, in degrees of the mean error; the"
+    yield "paper claims 1-2 of rotation and 8-10 of translation direction.\n"
+    rows = []
+    for title, group in _grouped(bad, lambda c: f"{c.title}; {variant_name(c.values)}").items():
+        row = [title]
+        for figure in ("rot_deg_mean", "tdir_deg_mean"):
+            plain = _mean(c.mean(PLAIN, figure) for c in group)
+            row.append(number(plain, 1))
+            for mode in ("paper", "robust"):
+                ours = _mean(c.mean(mode, figure) for c in group)
+                row.append("-" if plain is None or ours is None else f"{plain - ours:+.1f}")
+        rows.append(row)
+    names = ("plain", "paper", "robust")
+    figures = (f"{figure}, {name}" for figure in ("rotation", "direction") for name in names)
+    head = ["recording, channel; matches", *figures]
+    yield from table(head, rows)
+
+
+def _misleading(cells: Sequence[Cell]) -> Iterator[str]:
+    yield "**What a misleading confidence costs**: AUC@10 in points minus that of `off`, mean and worst.\n"
+    rows = []
+    for mode in ("robust", *_MISLEADING):
+        gaps = [
+            a - b
+            for c in cells
+            if (a := c.mean(mode, "auc10")) is not None and (b := c.mean("off", "auc10")) is not None
+        ]
+        if gaps:
+            rows.append([mode, f"{np.mean(gaps):+.1f}", f"{min(gaps):+.1f}"])
+    yield from table(["confidence", "mean", "worst"], rows)
+
+
+def _cues(cells: Sequence[Cell]) -> Iterator[str]:
+    yield "**How well each cue tells true inliers** (AUROC, mean over cells; 0.5 says nothing). `epipolar`:"
+    yield "within 2 px of the true epipolar line; `track`: of where the originals put the point.\n"
+    found: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+    for c in cells:
+        for kind, cues in c.values["auroc"].items():
+            for cue, value in cues.items():
+                if value is not None:
+                    found[kind, c.values["features"], cue].append(float(value))
+    kinds = sorted({(kind, features) for kind, features, _ in found})
+    rows = [
+        [cue, *(number(_mean(found.get((*kind, cue), ()))) for kind in kinds)]
+        for cue in sorted({cue for _, _, cue in found})
+    ]
+    yield from table(["cue", *(f"{kind}, {features}" for kind, features in kinds)], rows)
+
+
+def _time(cells: Sequence[Cell]) -> Iterator[str]:
+    yield "**Processor time of one estimation** in ms, median over cells of the medians, all matches.\n"
+    whole = [c for c in cells if not c.values["max_matches"]]
+    names = [name for name in _METHODS if any(name in c.values["results"] for c in whole)]
+    medians = [
+        [t["p50"] for c in whole if (t := c.values["results"].get(name, {}).get("cpu_ms"))] for name in names
+    ]
+    yield from table(names, [[number(float(np.median(m)), 1) if m else "-" for m in medians]])
+
+
+def _grouped(cells: Iterable[Cell], key: Any) -> dict[str, list[Cell]]:
+    groups: dict[str, list[Cell]] = {}
+    for cell in cells:
+        groups.setdefault(key(cell), []).append(cell)
+    return groups
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _ratio(cells: Iterable[Cell], ours: str, theirs: str) -> float:
+    """Geometric mean of the ratios of mean translation-direction errors; NaN without any."""
+    pairs = [(c.mean(ours), c.mean(theirs)) for c in cells]
+    logs = [np.log(a / b) for a, b in pairs if a and b]
+    return float(np.exp(np.mean(logs))) if logs else float("nan")

@@ -1,0 +1,79 @@
+import pytest
+
+from semcast.evaluation.markdown import table, with_part
+from semcast.evaluation.pair_summary import cells_of, pair_summary
+
+
+def cell(snr_db, errors_deg, interval=(-1.0, 1.0), **values):
+    results = {
+        mode: {"rot_deg_mean": e / 2, "tdir_deg_mean": e, "auc10": 100 - e, "cpu_ms": {"p50": 7.0}}
+        for mode, e in errors_deg.items()
+    }
+    low, high = interval
+    paired = {"mode": "robust", "against": "poselib", "figure": "tdir_deg_mean"}
+    return {
+        "snr_db": snr_db,
+        "features": "klt",
+        "max_matches": 0,
+        "gap": 1,
+        "results": results,
+        "auroc": {"epipolar": {"confidence": 0.25}},
+        "comparisons": [{**paired, "paired": {"low": low, "high": high}}],
+        **values,
+    }
+
+
+def report(*cells):
+    settings = {"codec": "3dcsc-lite", "link": {"channel": "awgn"}}
+    return {"sequence": "room", "settings": settings, "cells": list(cells)}
+
+
+ERRORS = {"plain_ransac": 20.0, "poselib": 8.0, "paper": 10.0, "off": 4.0, "robust": 4.0, "inverted": 6.0}
+
+
+def rows_of(text, first):
+    return [
+        [part.strip() for part in line.strip("|").split("|")]
+        for line in text.splitlines()
+        if line.startswith(f"| {first}")
+    ]
+
+
+def test_figures_by_hand():
+    worse = {**ERRORS, "robust": 16.0, "poselib": 8.0}
+    text = pair_summary([report(cell(2.0, ERRORS, (-5, -3)), cell(12.0, worse, (2, 9)))])
+    against, gain = rows_of(text, "room, awgn; klt")
+    # ratio of the two cells: 4/8 and 16/8, geometric mean 1; one cell better, one worse
+    assert against == [
+        "room, awgn; klt",
+        "2",
+        "20.0",
+        "-",
+        "-",
+        "8.0",
+        "10.0",
+        "4.0",
+        "10.0",
+        "1.00",
+        "1",
+        "1",
+    ]
+    # only the cell at 2 dB counts: 10 - 5 and 10 - 2 of rotation, 20 - 10 and 20 - 4 of direction
+    assert gain == ["room, awgn; klt", "10.0", "+5.0", "+8.0", "20.0", "+10.0", "+16.0"]
+    assert "`paper` has 0.50 times that of `plain_ransac`" in text
+    assert rows_of(text, "inverted") == [["inverted", "-2.0", "-2.0"]]
+    assert rows_of(text, "robust") == [["robust", "-6.0", "-12.0"]]
+    assert rows_of(text, "confidence |")[-1] == ["confidence", "0.25"]
+
+
+def test_cells_without_a_link_are_left_out():
+    assert cells_of([report(cell(None, ERRORS))]) == []
+    assert pair_summary([]) == ""
+
+
+def test_a_part_of_a_page_is_replaced_and_markers_are_needed():
+    page = "a\n<!-- x -->\nold\n<!-- /x -->\nb\n"
+    assert with_part(page, "x", "new") == "a\n<!-- x -->\nnew\n<!-- /x -->\nb\n"
+    with pytest.raises(ValueError, match="<!-- y -->"):
+        with_part(page, "y", "new")
+    assert list(table(["a"], [["1"]])) == ["| a |", "|---|", "| 1 |"]
