@@ -9,6 +9,7 @@ from typing import Any
 
 from semcast.agent.capture import Capture
 from semcast.agent.encoder import FrameEncoder, LinkFeedback
+from semcast.agent.originals import OriginalSharer
 from semcast.agent.replay_window import ReplayWindow
 from semcast.agent.settings import AgentSettings
 from semcast.agent.source import Source, SourceFrame, open_source
@@ -74,6 +75,11 @@ class _Sending:
         session.subscribe(link_key(agent_id), "newest", self._on_link)
         self._symbols = session.publisher(tx_key(agent_id), "every" if self.lossless else "newest")
         session.publisher(camera_key(agent_id), "every").put(camera)
+        self._originals = (
+            OriginalSharer(session, agent_id, self.agent_epoch, settings.share_source, self.lossless, metrics)
+            if settings.share_source != "off"
+            else None
+        )
 
     def _on_link(self, payload: bytes) -> None:
         try:
@@ -91,6 +97,8 @@ class _Sending:
 
     def encode(self, frame: SourceFrame) -> SymbolFrame:
         """Encode for the link as it is now; in replay for a fixed SNR, so that runs repeat exactly."""
+        if self._originals is not None:
+            self._originals.put(frame)
         snr_db = self._settings.snr_db if self.lossless else self.feedback.snr_db()
         with self.metrics.stage("encode"):
             return self._encoder.encode(frame, snr_db)
@@ -101,6 +109,11 @@ class _Sending:
             self._symbols.put(pack(message))
         self.metrics.count("sent")
         self.metrics.observe("capture_to_sent", (time.monotonic_ns() - message.t_capture_ns) * 1e-6)
+
+    def close(self) -> None:
+        """Let the originals that wait be sent. Idempotent."""
+        if self._originals is not None:
+            self._originals.close()
 
 
 def _send_live(sending: _Sending, capture: Capture, stop: threading.Event) -> None:
@@ -261,5 +274,6 @@ def run_agent(
             raise
         finally:
             capture.close()
+            sending.close()
             beat.close()
     return {**metrics.summary(), **summary}

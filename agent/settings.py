@@ -45,6 +45,13 @@ class AgentSettings:
     feedback_max_age_s: float = field(
         default=2.0, metadata={"help": "a report about the link counts for so many seconds"}
     )
+    share_source: Literal["off", "jpeg", "png"] = field(
+        default="off",
+        metadata={
+            "help": "also publish the original frames, not through the channel, so that a recording keeps "
+            "them: jpeg (quality 95) or png (lossless)"
+        },
+    )
     wait: bool = field(
         default=True, metadata={"help": "send nothing until channel and server are there for the first time"}
     )

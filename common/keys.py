@@ -42,6 +42,11 @@ def tx_key(agent_id: str) -> str:
     return _key(agent_id, "tx/symbols")
 
 
+def source_key(agent_id: str) -> str:
+    """``SourceImage`` from agent to recorders; it does not cross the channel."""
+    return _key(agent_id, "source")
+
+
 def rx_key(agent_id: str) -> str:
     """``SymbolFrame`` from channel to server."""
     return _key(agent_id, "rx/symbols")

@@ -183,6 +183,27 @@ class SymbolFrame:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SourceImage:
+    """Agent to recorders: a frame as it was before the encoder. It does not cross the channel.
+
+    Attributes:
+        agent_epoch: See ``CameraInfo``.
+        frame_id: Of the ``SymbolFrame`` with the same content.
+        image_hw: Height and width in pixels.
+        image_format: ``jpeg`` or ``png``.
+        data: The compressed image.
+    """
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("source")
+    agent_epoch: int = field(metadata=_COUNT)
+    frame_id: int = field(metadata=_COUNT)
+    image_hw: tuple[int, int] = field(metadata=_SIZE)
+    image_format: Literal["jpeg", "png"] = field(metadata=rule(Choice(("jpeg", "png"))))
+    data: bytes = field(metadata=rule(Bytes(MAX_PAYLOAD_BYTES)))
+
+
+@dataclass(frozen=True, kw_only=True)
 class LinkReport:
     """Receiver to agent: how good the link was for a frame, with the agent's own capture time for the age."""
 
@@ -343,6 +364,7 @@ class ControlReply:
 Message = (
     CameraInfo
     | SymbolFrame
+    | SourceImage
     | LinkReport
     | FlowMessage
     | ChannelReport

@@ -1,6 +1,7 @@
 """The original of what was sent, where it is known: image quality and true path while the run goes on."""
 
 import logging
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -9,55 +10,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.errors import SourceError
+from semcast.common.errors import ProtocolError, SourceError
+from semcast.common.image import psnr_db
+from semcast.common.messages import SourceImage
+from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
 from semcast.common.trajectory import Trajectory
+from semcast.common.wire import unpack
 
 logger = logging.getLogger(__name__)
 
-
-def psnr_db(x: NDArray[np.uint8], x_hat: NDArray[np.uint8]) -> float:
-    """Peak signal-to-noise ratio of two uint8 images of one shape; infinite where they are equal.
-
-    Raises:
-        ValueError: The shapes differ.
-    """
-    if x.shape != x_hat.shape:
-        raise ValueError(f"images must have one shape, got {x.shape} and {x_hat.shape}")
-    squared = float(cv2.norm(x, x_hat, cv2.NORM_L2SQR))
-    return float(10.0 * np.log10(255.0**2 * x.size / squared)) if squared > 0 else float("inf")
+#: Frame id to the original image, None where there is none.
+Originals = Callable[[int], NDArray[np.uint8] | None]
 
 
 class Reference:
-    """Compares decoded frames with the recorded sequence they came from, on a thread of its own.
+    """Compares decoded frames with their originals, on a thread of its own.
 
     Args:
-        folder: The sequence the agent reads, in any layout ``open_sequence`` knows.
-        camera: Intrinsics of the decoded images; originals are brought to this camera.
-
-    Raises:
-        SourceError: The folder is no sequence.
+        originals: Asked on that thread, with increasing frame ids.
+        truth: True path in metres, None where it is not known.
     """
 
-    def __init__(self, folder: Path, camera: Intrinsics) -> None:
-        self._sequence = open_sequence(folder)
-        self._camera = camera
+    def __init__(self, originals: Originals, truth: Trajectory | None = None) -> None:
+        self.truth = truth
+        self._originals = originals
         self._failed = False
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="semcast-reference")
 
-    @property
-    def truth(self) -> Trajectory | None:
-        """True path in metres, None where the sequence has none."""
-        return self._sequence.groundtruth()
-
     def psnr_db(self, frame_id: int, x_hat: NDArray[np.uint8]) -> "Future[float | None]":
-        """Compare a decoded image with its original; None where that can't be read."""
+        """Compare a decoded image with its original; None where there is none or it can't be read."""
         return self._pool.submit(self._compare, frame_id, x_hat)
 
     def _compare(self, frame_id: int, x_hat: NDArray[np.uint8]) -> float | None:
         try:
-            return psnr_db(self._sequence.image(frame_id, self._camera), x_hat)
-        except (SourceError, ValueError, IndexError) as err:
+            original = self._originals(frame_id)
+            return psnr_db(original, x_hat) if original is not None else None
+        except (SourceError, ProtocolError, ValueError, IndexError) as err:
             if not self._failed:
                 logger.warning("no PSNR: %s", err)
             self._failed = True
@@ -66,3 +55,47 @@ class Reference:
     def close(self) -> None:
         """End the thread. Idempotent."""
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def sequence_reference(folder: Path, camera: Intrinsics) -> Reference:
+    """Compare with the recorded sequence the agent reads.
+
+    Args:
+        folder: In any layout ``open_sequence`` knows.
+        camera: Intrinsics of the decoded images; originals are brought to this camera.
+
+    Raises:
+        SourceError: The folder is no sequence.
+    """
+    sequence = open_sequence(folder)
+    return Reference(lambda frame_id: sequence.image(frame_id, camera), sequence.groundtruth())
+
+
+def recording_reference(reader: RecordingReader, agent_epoch: int) -> Reference | None:
+    """Compare with the originals an agent shared (``--share-source``); None where the recording has none."""
+    images = _recorded_images(reader, agent_epoch)
+    newest = next(images, None)
+    if newest is None:
+        return None
+
+    def original(frame_id: int) -> NDArray[np.uint8] | None:
+        nonlocal newest
+        while newest is not None and newest.frame_id < frame_id:
+            newest = next(images, None)
+        return _pixels(newest) if newest is not None and newest.frame_id == frame_id else None
+
+    return Reference(original)
+
+
+def _recorded_images(reader: RecordingReader, agent_epoch: int) -> Iterator[SourceImage]:
+    for message in reader.messages(frozenset({"source"})):
+        image = unpack(message.data, SourceImage)
+        if image.agent_epoch == agent_epoch:
+            yield image
+
+
+def _pixels(image: SourceImage) -> NDArray[np.uint8]:
+    bgr = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
+    if bgr is None:
+        raise ValueError(f"the original of frame {image.frame_id} is no {image.image_format} image")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

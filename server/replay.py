@@ -24,7 +24,7 @@ from semcast.common.wire import unpack
 from semcast.server.decoder import DecodedArrival, FrameDecoder
 from semcast.server.receiver import ReceivedFrame
 from semcast.server.reconstruction_settings import ReconstructionSettings
-from semcast.server.reference import Reference
+from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Arrival, Outcome, Session, StreamIdentity
 from semcast.server.settings import ServerSettings, ViewSettings
 from semcast.server.viewer_choice import check_viewer, open_viewer
@@ -55,7 +55,11 @@ class ReplaySettings:
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
     reference: Path | None = field(
-        default=None, metadata={"help": "recorded sequence the agent sent: gives PSNR and ground truth"}
+        default=None,
+        metadata={
+            "help": "recorded sequence the agent sent: gives PSNR and ground truth; without it PSNR comes "
+            "from originals in the recording (agent --share-source)"
+        },
     )
     pace: float = field(
         default=0.0,
@@ -135,7 +139,11 @@ def replay(
         camera=camera.intrinsics,
         num_frames=camera.num_frames,
     )
-    reference = Reference(settings.reference, camera.intrinsics) if settings.reference is not None else None
+    reference = (
+        sequence_reference(settings.reference, camera.intrinsics)
+        if settings.reference is not None
+        else recording_reference(reader, camera.agent_epoch)
+    )
     session = Session(server, identity, settings.out, reference)
     viewer = open_viewer(server, identity, reference.truth if reference is not None else None)
     stop = stop if stop is not None else threading.Event()

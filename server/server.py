@@ -26,7 +26,7 @@ from semcast.server.decoder import DecodedArrival, FrameDecoder
 from semcast.server.outbox import Outbox
 from semcast.server.receiver import ReceivedFrame, Receiver
 from semcast.server.record import recording
-from semcast.server.reference import Reference
+from semcast.server.reference import Reference, sequence_reference
 from semcast.server.session import Arrival, Outcome, Session, StreamIdentity, new_bundle
 from semcast.server.settings import ServerSettings
 from semcast.server.viewer_choice import check_viewer, open_viewer
@@ -305,7 +305,7 @@ class Server:
             self._end(former, self._folder_for_former())
         self._complete = self._nearly_final = False
         if self._settings.reference is not None and self._reference is None:
-            self._reference = Reference(self._settings.reference, identity.camera)
+            self._reference = sequence_reference(self._settings.reference, identity.camera)
         bundle, self._spare_bundle = self._spare_bundle, None
         self._session = Session(self._settings, identity, self._settings.out, self._reference, bundle)
         self._drops_before = self._metrics.drops if former is not None else {}

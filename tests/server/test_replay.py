@@ -1,5 +1,6 @@
 """A recording replays to the same poses every time; through another channel it does not."""
 
+import json
 import threading
 import time
 from pathlib import Path
@@ -44,7 +45,8 @@ def recording(tmp_path_factory):
         thread.start()
     hub.declare_alive("agent0", "server")
     source = SourceSettings(source=str(SEQUENCE), resize=0.4, max_frames=FRAMES, pace="rate", rate_hz=4.0)
-    run_agent(AgentSettings(source=source, codec="jpeg-ldpc", network=network), threading.Event())
+    agent = AgentSettings(source=source, codec="jpeg-ldpc", share_source="png", network=network)
+    run_agent(agent, threading.Event())
     assert seen.wait(20)
     stop.set()
     for thread in others:
@@ -82,6 +84,17 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
     )
     replay(lossy)
     assert (tmp_path / "c" / "trajectory.tum").read_bytes() != first
+
+
+def test_recorded_originals_give_the_same_psnr_as_the_sequence(recording, tmp_path):
+    found = {}
+    for name, reference in (("recorded", None), ("sequence", SEQUENCE)):
+        replay(ReplaySettings(file=recording, out=tmp_path / name, reference=reference))
+        rows = (tmp_path / name / "frames.jsonl").read_text().splitlines()
+        found[name] = [json.loads(row)["psnr_db"] for row in rows]
+    assert len(found["recorded"]) >= FRAMES // 2
+    assert all(15.0 < psnr < 45.0 for psnr in found["recorded"])
+    assert found["recorded"] == found["sequence"]
 
 
 def test_a_paced_and_shown_replay_gives_the_same_poses(recording, tmp_path):

@@ -1,0 +1,73 @@
+"""Originals published beside the symbols."""
+
+import threading
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast.agent.originals import OriginalSharer, source_image
+from semcast.agent.source import SourceFrame
+from semcast.common.keys import source_key
+from semcast.common.messages import SourceImage
+from semcast.common.metrics import Metrics
+from semcast.common.wire import unpack
+
+
+def frame(frame_id, shape_hw=(48, 64)):
+    ramp = np.linspace(0, 255, shape_hw[1])[None, :, None] * np.array([1.0, 0.5, 0.1])
+    image = np.broadcast_to(ramp, (*shape_hw, 3)).astype(np.uint8)
+    return SourceFrame(frame_id=frame_id, t_source_ns=0, t_capture_ns=0, image=image, final=False)
+
+
+@pytest.mark.parametrize(("image_format", "largest"), [("png", 0), ("jpeg", 24)])
+def test_an_original_comes_back_in_its_colours(image_format, largest):
+    sent = frame(7)
+    message = source_image(sent, 5, image_format)
+    assert (message.agent_epoch, message.frame_id, message.image_hw) == (5, 7, (48, 64))
+    back = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert np.abs(back.astype(int) - sent.image).max() <= largest
+
+
+class SlowSession:
+    """Stands for a session whose publisher takes until it is let go."""
+
+    def __init__(self):
+        self.go = threading.Event()
+        self.sent = []
+        self.services = []
+
+    def publisher(self, key, service):
+        assert key == source_key("agent0")
+        self.services.append(service)
+        return self
+
+    def put(self, payload):
+        assert self.go.wait(10)
+        self.sent.append(unpack(payload, SourceImage).frame_id)
+
+
+def test_live_sharing_never_waits_and_counts_what_it_leaves_out():
+    session, metrics = SlowSession(), Metrics("agent")
+    sharer = OriginalSharer(session, "agent0", 1, "jpeg", False, metrics)
+    for k in range(10):
+        sharer.put(frame(k))
+    session.go.set()
+    sharer.close()
+    sharer.close()
+    assert session.services == ["newest"]
+    assert session.sent[-1] == 9
+    assert session.sent == sorted(session.sent)
+    left_out = metrics.summary()["drops"]["source_superseded"]
+    assert left_out >= 7
+    assert len(session.sent) + left_out == 10 == left_out + metrics.summary()["counts"]["source_shared"]
+
+
+def test_lossless_sharing_leaves_out_nothing():
+    session, metrics = SlowSession(), Metrics("agent")
+    session.go.set()
+    sharer = OriginalSharer(session, "agent0", 1, "jpeg", True, metrics)
+    for k in range(10):
+        sharer.put(frame(k))
+    sharer.close()
+    assert (session.services, session.sent) == (["every"], list(range(10)))
