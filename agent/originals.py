@@ -1,4 +1,4 @@
-"""Publishes the original frames beside the symbols, not through the channel, so that a recording keeps them."""
+"""Publishes original frames beside the symbols, not through the channel, so that a recording keeps them."""
 
 import threading
 from typing import Literal
