@@ -19,6 +19,7 @@ from semcast.common.errors import TransportError
 from semcast.common.keys import camera_key, flow_key, link_key, tx_key
 from semcast.common.messages import CameraInfo, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
+from semcast.common.rate import RateControl
 from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session, open_session
 from semcast.common.wire import WireError, pack, unpack
@@ -68,6 +69,7 @@ class _Sending:
         self.lossless = settings.mode == "replay"
         self.feedback = LinkFeedback(self.agent_epoch, settings.snr_db, settings.feedback_max_age_s)
         self._settings = settings
+        self._rate = RateControl(settings.rate)
         self._encoder = FrameEncoder(codec, self.agent_epoch, self.lossless)
         agent_id = settings.agent_id
         camera = pack(camera_info(settings, source, codec, self.agent_epoch))
@@ -101,7 +103,7 @@ class _Sending:
             self._originals.put(frame)
         snr_db = self._settings.snr_db if self.lossless else self.feedback.snr_db()
         with self.metrics.stage("encode"):
-            return self._encoder.encode(frame, snr_db)
+            return self._encoder.encode(frame, snr_db, self._rate.choose(snr_db))
 
     def send(self, message: SymbolFrame) -> None:
         """Publish a frame."""

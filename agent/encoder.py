@@ -8,6 +8,7 @@ from semcast.agent.source import SourceFrame
 from semcast.common.codec import Codec
 from semcast.common.messages import LinkReport, SymbolFrame
 from semcast.common.phy.slots import layout_for
+from semcast.common.rate import NATIVE_RATE, Rate, to_coded
 from semcast.common.symbol_payload import pack_data_symbols
 
 
@@ -80,17 +81,18 @@ class FrameEncoder:
         self._lossless = lossless
         self._next_seq = 0
 
-    def encode(self, frame: SourceFrame, snr_db: float) -> SymbolFrame:
+    def encode(self, frame: SourceFrame, snr_db: float, rate: Rate = NATIVE_RATE) -> SymbolFrame:
         """Return the message for a frame; the next one has the next ``seq``.
 
         Args:
             frame: To encode.
             snr_db: Expected SNR of the link.
+            rate: Channel uses per source value.
 
         Raises:
             ValueError: The codec's symbols don't fit the slot grid.
         """
-        encoded = self._codec.encode(frame.image, snr_db)
+        encoded = self._codec.encode(to_coded(frame.image, rate), snr_db)
         payload_format, payload = pack_data_symbols(encoded)
         layout = layout_for(encoded.shape_hw)
         message = SymbolFrame(

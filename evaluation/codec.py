@@ -21,7 +21,8 @@ from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
 from semcast.common.codecs import load_codec
 from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
-from semcast.common.phy.slots import channel_bandwidth_ratio
+from semcast.common.phy.slots import layout_for
+from semcast.common.rate import NATIVE_RATE, Rate, from_coded, to_coded
 from semcast.evaluation.calibration import reliability
 from semcast.evaluation.image_quality import ms_ssim, ssim
 from semcast.evaluation.picture_strip import write_picture_strip
@@ -61,6 +62,7 @@ class CodecSettings:
         default=(2.0, 4.0, 6.0, 8.0, 10.0, 12.0), metadata={"help": "SNRs in dB, one or more"}
     )
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    rate: Rate = field(default=NATIVE_RATE, metadata={"help": "channel uses per pixel value"})
     link: ChannelSettings = field(default=ChannelSettings(), metadata={"help": "the channel"})
     perfect_csi: bool = field(
         default=False, metadata={"help": "tell the receiver the true channel instead of estimating it"}
@@ -185,7 +187,7 @@ def _run(
     # A link of its own per image: traces and fading see the time of the image and not of the run.
     link = Link(channel, settings.seed)
     start_ns = time.perf_counter_ns()
-    encoded = codec.encode(image, channel.snr_db)
+    encoded = codec.encode(to_coded(image, settings.rate), channel.snr_db)
     encode_ms = (time.perf_counter_ns() - start_ns) * 1e-6
     equalised = link.receive(encoded, k * _FRAME_INTERVAL_S, k, perfect_csi=settings.perfect_csi)
     times_ms = {"encode": encode_ms}
@@ -197,14 +199,14 @@ def _run(
         )
     else:
         start_ns = time.perf_counter_ns()
-        decoded = codec.decode(equalised.received)
+        decoded = from_coded(codec.decode(equalised.received), (image.shape[0], image.shape[1]))
         times_ms["decode"] = (time.perf_counter_ns() - start_ns) * 1e-6
     big_enough = min(image.shape[:2]) >= 11
     figures = {
         "psnr_db": psnr_db(decoded.image, image),
         "ssim": ssim(decoded.image, image) if big_enough else None,
         "ms_ssim": ms_ssim(decoded.image, image) if big_enough else None,
-        "cbr": channel_bandwidth_ratio((image.shape[0], image.shape[1])),
+        "cbr": layout_for(encoded.shape_hw).num_uses / image.size,
         "outage": float(decoded.outage),
         "snr_db_estimate": None if equalised is None else equalised.snr_db,
     }

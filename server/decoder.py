@@ -11,6 +11,7 @@ import numpy as np
 from semcast.common.codec import LOST_SLOT_SNR_DB, Codec, Modulation, ReceivedImage
 from semcast.common.errors import CheckpointError
 from semcast.common.phy.slots import layout_for
+from semcast.common.rate import from_coded
 from semcast.server.receiver import ReceivedFrame
 from semcast.server.state import DecodedFrame
 
@@ -105,7 +106,7 @@ class FrameDecoder:
         with self._lock:
             codec = self.codec_for(message.codec, message.modulation, message.digest)
             started_ns = time.perf_counter_ns()
-            decoded = codec.decode(arrival.received)
+            decoded = from_coded(codec.decode(arrival.received), arrival.camera.intrinsics.shape_hw)
         decode_ms = (time.perf_counter_ns() - started_ns) * 1e-6
         if decoded.outage:
             return DecodedArrival(arrival, None, decode_ms)

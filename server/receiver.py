@@ -18,6 +18,8 @@ from semcast.common.mailbox import Mailbox
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.phy.equaliser import equalise
+from semcast.common.phy.slots import layout_for
+from semcast.common.rate import belongs_to, slots_at
 from semcast.common.symbol_payload import lost_slots_of, slots_of
 from semcast.common.transport import Session
 from semcast.common.wire import WireError, pack, unpack
@@ -62,8 +64,10 @@ class ReceivedFrame:
 
     @property
     def slot_snr_db(self) -> NDArray[np.float32] | None:
-        """``(num_slots,)`` effective SNR of each slot, None when the frame was lost."""
-        return self.received.effective_snr_db if self.received is not None else None
+        """``(num_slots,)`` effective SNR of each slot of the camera's grid, None when the frame was lost."""
+        if self.received is None:
+            return None
+        return slots_at(self.received.effective_snr_db, layout_for(self.camera.intrinsics.shape_hw).num_slots)
 
 
 class Receiver:
@@ -276,9 +280,11 @@ class Receiver:
         received, snr_db, equalise_ms = None, None, 0.0
         if message.payload_format == "lost":
             self._metrics.count("lost_on_air")
-        elif camera.image_wh != (message.image_hw[1], message.image_hw[0]):
+        elif not belongs_to(message.image_hw, camera.intrinsics.shape_hw):
             self._metrics.drop("protocol")
-            self._tell_once(f"frames are {message.image_hw} but the camera is {camera.image_wh}")
+            self._tell_once(
+                f"frames are {message.image_hw}, no coded size of the camera's {camera.intrinsics.shape_hw}"
+            )
             self._took(message)
             return None
         else:

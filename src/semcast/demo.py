@@ -47,6 +47,9 @@ class DemoSettings:
     )
     codec: str = field(default=DEFAULT_CODEC, metadata={"help": "codec by name, such as jpeg-ldpc"})
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    rate: Literal["auto", "1/48", "1/32", "1/24", "1/16", "1/12", "1/8"] = field(
+        default="1/16", metadata={"help": "channel uses per pixel value; auto: as the link needs"}
+    )
     snr_db: float = field(default=10.0, metadata={"help": "Es/N0 of the link in dB"})
     channel: str = field(
         default="awgn",
@@ -120,6 +123,7 @@ def role_commands(
     channel = [*program, "channel", *meet, "--channel", settings.channel, "--snr-db", f"{settings.snr_db:g}"]
     channel += ["--seed", str(settings.seed)]
     agent = [*program, "agent", *meet, "--source", str(sequence), "--codec", settings.codec]
+    agent += ["--rate", settings.rate]
     agent += ["--modulation", settings.modulation, "--resize", f"{resize:g}", *_camera_flags(settings.camera)]
     return {"server": server, "channel": channel, "agent": agent}
 

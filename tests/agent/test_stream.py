@@ -149,6 +149,21 @@ def test_images_cross_the_link_and_feedback_comes_back(bench):
     assert (agent.result["source"], agent.result["complete"]) == ("steps", False)
 
 
+@pytest.mark.parametrize(("rate", "coded_hw"), [("1/48", (32, 32)), ("auto", (64, 96))])
+def test_frames_travel_at_the_rate_and_feedback_chooses_it(bench, rate, coded_hw):
+    bench.channel(snr_db=-3.0)
+    receiver = bench.receiver()
+    agent = bench.agent(rate=rate, source={"repeat": "loop"})
+    frames = take(receiver, count=20)
+    agent.end()
+    assert frames[-1].message.image_hw == coded_hw
+    assert frames[-1].camera.image_wh == (64, 48)
+    assert frames[-1].received.shape_hw == coded_hw
+    assert frames[-1].slot_snr_db.shape == (3,), "on the camera's grid"
+    if rate == "auto":
+        assert frames[0].message.image_hw == (48, 64), "nothing is known before the first report"
+
+
 def test_a_finite_live_source_ends_when_its_last_frame_was_seen(bench):
     bench.channel()
     receiver = bench.receiver()
