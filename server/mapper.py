@@ -61,7 +61,8 @@ def wants_keyframe(cues: KeyframeCues) -> bool:
     thinned = cues.num_inliers < 0.75 * cues.num_inliers_at_keyframe
     sparse = cues.num_visible < 0.6 * cues.max_features
     moved = cues.median_flow_px > 0.045 * cues.width_px
-    return few or moved or ((thinned or sparse) and cues.frames_since >= 2)
+    changing = cues.frames_since >= 2 or cues.median_flow_px > 0.02 * cues.width_px
+    return few or moved or ((thinned or sparse) and changing)
 
 
 def keyframe_cues(

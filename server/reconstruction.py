@@ -18,7 +18,7 @@ from semcast.server.motion import ConstantVelocity
 from semcast.server.reconstruction_settings import ReconstructionSettings
 from semcast.server.relocalisation import Place
 from semcast.server.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
-from semcast.server.tracker import TrackedPose, expected_positions, track_pose
+from semcast.server.tracker import MIN_BELIEVED_SHARE, TrackedPose, expected_positions, track_pose
 from semcast.server.tracks import Sight, TrackTable, usable_rows
 
 __all__ = ["Reconstruction", "ReconstructionSettings"]
@@ -34,6 +34,8 @@ _JOIN_INTERVAL = 3
 _START_LEVELS = 5
 #: Tracks a frame must have to count towards a new map.
 _MIN_TRACKS_TO_GIVE_UP = 50
+#: Share of the landmarks in sight that must agree with a pose found without a prior.
+_MIN_SHARE_WHEN_LOST = 0.5
 
 
 class Reconstruction:
@@ -151,7 +153,9 @@ class Reconstruction:
     def _last_pose(self) -> Array | None:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
 
-    def _pose(self, T_world_guess: Array | None) -> TrackedPose | None:
+    def _pose(
+        self, T_world_guess: Array | None, *, min_share: float = MIN_BELIEVED_SHARE
+    ) -> TrackedPose | None:
         visible = self._tracks.visible
         return track_pose(
             self._camera,
@@ -162,11 +166,14 @@ class Reconstruction:
             self._tracks.confidence[visible],
             T_world_guess,
             seed=self._settings.seed,
+            min_share=min_share,
         )
 
     def _track(self, sight: Sight, T_world_guess: Array | None) -> FrameResult:
         since = time.perf_counter_ns()
         pose = self._pose(T_world_guess)
+        if pose is None and self._tracks.follow_jump(sight):
+            pose = self._pose(T_world_guess)
         self._lap("pose", since)
         if pose is not None:
             return self._accept(sight, pose)
@@ -255,7 +262,9 @@ class Reconstruction:
         if not world.keyframes:
             return None
         since = time.perf_counter_ns()
-        pose = self._pose(None) if self._state is TrackingState.LOST else None
+        pose = None
+        if self._state is TrackingState.LOST:
+            pose = self._pose(None, min_share=_MIN_SHARE_WHEN_LOST)
         if pose is None:
             pose = self._recognise(sight)
         self._lap("relocalise", since)

@@ -20,7 +20,7 @@ Ids = NDArray[np.int64]
 MAX_CANDIDATES = 4
 #: Agreeing matches that are worth a closer look, and agreeing landmarks that prove a place.
 _MIN_FIRST = 9
-MIN_INLIERS = 20
+MIN_INLIERS = 45
 #: Keyframes around the recognised one whose landmarks are looked for.
 _NEIGHBOURS = 5
 _SEARCH_ITERATIONS = 400

@@ -19,6 +19,8 @@ Ids = NDArray[np.int64]
 MIN_INLIERS = 15
 #: With fewer inliers than this share, the start was poor: search without it.
 _MIN_INLIER_SHARE = 0.5
+#: Share of the landmarks in sight that must agree with a pose, when the frame before had one.
+MIN_BELIEVED_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,7 @@ def track_pose(
     *,
     seed: int,
     min_inliers: int = MIN_INLIERS,
+    min_share: float = MIN_BELIEVED_SHARE,
 ) -> TrackedPose | None:
     """Pose from the landmarks among the tracks of a frame.
 
@@ -111,6 +114,7 @@ def track_pose(
         T_world_guess: Expected pose, or None to search for it.
         seed: Of the search.
         min_inliers: Agreeing landmarks needed.
+        min_share: And their share of all that are in sight: fewer are a chance find.
 
     Returns:
         The pose, or None when too few landmarks agree with any.
@@ -128,7 +132,8 @@ def track_pose(
         searched = search_pose(camera, points, observed, sigma, gate, seed=seed, min_inliers=min_inliers)
         if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
             best = searched
-    if best is None or best.num_inliers < min_inliers or not np.isfinite(best.T_cam_world).all():
+    enough = max(min_inliers, min_share * len(points))
+    if best is None or best.num_inliers < enough or not np.isfinite(best.T_cam_world).all():
         return None
     T_world_cam = invert_transform(best.T_cam_world)
     return TrackedPose(T_world_cam, best.covariance, ids[known], best.inliers, best.residual_px)

@@ -1,6 +1,6 @@
 """Keypoint tracks: points followed from image to image, with the confidence of their newest position."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.features import (
     KLT_WINDOW_PX,
     Grey,
+    TrackedPoints,
     corner_strength,
     deduplicate,
     detect_corners,
@@ -17,6 +18,7 @@ from semcast.server.features import (
 )
 from semcast.server.state import DecodedFrame
 from semcast.server.weighting import ConfidenceMode, KeypointCues, observation_confidence
+from semcast.server.wide_search import search_wide
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -62,6 +64,35 @@ class Sight:
         return np.asarray(reach[y])
 
 
+#: After a jump a point is looked for no further than this from where descriptors put it.
+_MAX_FROM_JUMP_PX = 25.0
+#: What a track has, by attribute of ``TrackTable``.
+_COLUMNS = ("ids", "xy", "velocity", "confidence", "age", "missed")
+
+
+@dataclass
+class _Found:
+    """Where tracks were found, row by row, filled in step by step."""
+
+    ok: NDArray[np.bool_]
+    xy: Array
+    forward_backward: Array
+    photometric: Array
+    gradient: Array
+
+    @staticmethod
+    def nothing(xy: Array) -> "_Found":
+        count = len(xy)
+        return _Found(np.zeros(count, bool), xy.copy(), np.full(count, 9.0), np.zeros(count), np.zeros(count))
+
+    def take(self, rows: NDArray[np.intp], points: TrackedPoints) -> None:
+        self.ok[rows] = points.ok
+        self.xy[rows] = points.xy
+        self.forward_backward[rows] = points.forward_backward_px
+        self.photometric[rows] = points.photometric_grey
+        self.gradient[rows] = points.gradient_grey2
+
+
 class TrackTable:
     """All tracks that are alive.
 
@@ -80,6 +111,7 @@ class TrackTable:
         self._rng = np.random.default_rng(seed)
         self._next_id = 0
         self._greys: list[Grey] = []
+        self._before: dict[str, Array] | None = None
         self.clear()
 
     def clear(self) -> None:
@@ -110,7 +142,7 @@ class TrackTable:
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Forget tracks outside the mask."""
-        for name in ("ids", "xy", "velocity", "confidence", "age", "missed"):
+        for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[mask])
 
     def adopt(self, ids: Ids, xy: Array, confidence: float) -> None:
@@ -133,14 +165,15 @@ class TrackTable:
         self.ids[mask] = self._next_id + np.arange(count, dtype=np.int64)
         self._next_id += count
         order = np.argsort(self.ids, kind="stable")
-        for name in ("ids", "xy", "velocity", "confidence", "age", "missed"):
+        for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[order])
 
     def follow(self, sight: Sight, guess_xy: Array, max_level: int = 3) -> None:
         """Look for every track in a new image.
 
         A track that runs into rows that did not arrive coasts: it is looked for again from the image it was
-        last seen in. So do all tracks when hardly any is found, because then the image is at fault.
+        last seen in. When hardly any is found, the image jumped, and tracks are found by descriptors; or it
+        is at fault, and all coast.
 
         Args:
             sight: The new image.
@@ -148,37 +181,85 @@ class TrackTable:
             max_level: KLT pyramid levels.
         """
         count = len(self)
-        found = np.zeros(count, bool)
-        xy, forward_backward = self.xy.copy(), np.full(count, 9.0)
-        photometric, gradient = np.zeros(count), np.zeros(count)
+        self._before = {name: getattr(self, name).copy() for name in _COLUMNS}
+        found = _Found.nothing(self.xy)
         for back in range(min(len(self._greys), MAX_COAST + 1)):
             rows = np.flatnonzero(self.missed == back)
-            if len(rows) == 0:
-                continue
-            points = track_points(
-                self._greys[-1 - back], sight.grey, self.xy[rows], guess_xy[rows], max_level=max_level
-            )
-            found[rows] = points.ok
-            xy[rows] = points.xy
-            forward_backward[rows] = points.forward_backward_px
-            photometric[rows] = points.photometric_grey
-            gradient[rows] = points.gradient_grey2
-        expected = np.where(found[:, None], xy, guess_xy)
-        hidden = sight.near_lost(expected, KLT_WINDOW_PX // 2 - 2)
-        found &= ~hidden
-        seen_share = found.sum() / max(1, count - int(hidden.sum()))
-        coasting = ~found & (hidden | (seen_share < _MIN_FOUND_SHARE))
-        steps = (self.missed + 1)[:, None]
-        self.velocity = np.where(found[:, None], (xy - self.xy) / steps, self.velocity)
-        self.xy = np.where(found[:, None], xy, self.xy)
-        self.age = self.age + found
-        self.missed = np.where(found, 0, self.missed + 1)
-        cues = self._cues(sight, xy[found], forward_backward[found], photometric[found], gradient[found])
-        self.confidence[found] = observation_confidence(self._mode, cues, self._rng)
-        alive = found | (coasting & (self.missed <= MAX_COAST))
-        alive[found] &= deduplicate(self.xy[found])
-        self.keep(alive)
+            if len(rows):
+                points = track_points(
+                    self._greys[-1 - back], sight.grey, self.xy[rows], guess_xy[rows], max_level=max_level
+                )
+                found.take(rows, points)
+        hidden = self._hidden(sight, found, guess_xy)
+        coasting = hidden & ~found.ok
+        if found.ok.sum() < _MIN_FOUND_SHARE * max(1, count - int(hidden.sum())):
+            jumped = self._jump(sight, found) if len(self._greys) else False
+            coasting = self._hidden(sight, found, guess_xy) & ~found.ok if jumped else ~found.ok
+        self._settle(sight, found, coasting)
         self.remember(sight)
+
+    def follow_jump(self, sight: Sight) -> bool:
+        """Look again for what ``follow`` just looked for, by descriptors.
+
+        For an image in which tracks were found, but not where they are. Without success all stays as it was.
+
+        Returns:
+            Whether more was found.
+        """
+        if self._before is None or len(self._greys) < 2:
+            return False
+        after = {name: getattr(self, name) for name in _COLUMNS}
+        for name, values in self._before.items():
+            setattr(self, name, values)
+        self._before = None
+        newest = self._greys.pop()
+        found = _Found.nothing(self.xy)
+        jumped = self._jump(sight, found)
+        self._greys.append(newest)
+        if not jumped:
+            for name, values in after.items():
+                setattr(self, name, values)
+            return False
+        self._settle(sight, found, np.zeros(len(self), bool))
+        return True
+
+    def _hidden(self, sight: Sight, found: "_Found", guess_xy: Array) -> NDArray[np.bool_]:
+        """Which tracks are, or would be, next to rows that did not arrive; none of them counts as found."""
+        hidden = sight.near_lost(np.where(found.ok[:, None], found.xy, guess_xy), KLT_WINDOW_PX // 2 - 2)
+        found.ok &= ~hidden
+        return hidden
+
+    def _jump(self, sight: Sight, found: "_Found") -> bool:
+        """Find tracks of the last image by descriptors, where that finds more; whether it did."""
+        rows = np.flatnonzero(self.missed == 0)
+        usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
+        jump = search_wide(self._greys[-1], sight.grey, self.xy[rows], usable)
+        if jump is None:
+            return False
+        points = track_points(self._greys[-1], sight.grey, self.xy[rows], jump, max_level=1)
+        # Points that left the image were clipped to its border and found something else there.
+        near = np.linalg.norm(points.xy - jump, axis=1) < _MAX_FROM_JUMP_PX
+        if (points.ok & near).sum() <= found.ok[rows].sum():
+            return False
+        found.take(rows, replace(points, ok=points.ok & near))
+        return True
+
+    def _settle(self, sight: Sight, found: "_Found", coasting: NDArray[np.bool_]) -> None:
+        """Move tracks to where they were found, and forget those that neither were nor coast."""
+        ok = found.ok
+        steps = (self.missed + 1)[:, None]
+        self.velocity = np.where(ok[:, None], (found.xy - self.xy) / steps, self.velocity)
+        self.xy = np.where(ok[:, None], found.xy, self.xy)
+        self.age = self.age + ok
+        self.missed = np.where(ok, 0, self.missed + 1)
+        cues = self._cues(
+            sight, found.xy[ok], found.forward_backward[ok], found.photometric[ok], found.gradient[ok]
+        )
+        self.confidence = self.confidence.copy()
+        self.confidence[ok] = observation_confidence(self._mode, cues, self._rng)
+        alive = ok | (coasting & (self.missed <= MAX_COAST))
+        alive[ok] &= deduplicate(self.xy[ok])
+        self.keep(alive)
 
     def remember(self, sight: Sight) -> None:
         """Keep the image for tracks that are looked for in later ones."""

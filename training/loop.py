@@ -123,11 +123,15 @@ class Run:
             self.average.load_state_dict(state["average"])
         except RuntimeError as err:
             raise CheckpointError(f"checkpoint {self.checkpoint_path} does not fit: {err}") from err
-        fresh = [[group["full_lr"] for group in o.param_groups] for o in self.optimisers]
-        for optimiser, saved, rates in zip(self.optimisers, state["optimisers"], fresh, strict=True):
+        # Moments are the checkpoint's; rates and weight decay are those asked for now.
+        fresh = [
+            [{name: v for name, v in group.items() if name != "params"} for group in o.param_groups]
+            for o in self.optimisers
+        ]
+        for optimiser, saved, groups in zip(self.optimisers, state["optimisers"], fresh, strict=True):
             optimiser.load_state_dict(saved)
-            for group, rate in zip(optimiser.param_groups, rates, strict=True):
-                group["full_lr"] = rate
+            for group, values in zip(optimiser.param_groups, groups, strict=True):
+                group.update(values)
         self.step, self.elapsed_s = state["step"], state["elapsed_s"]
         self.agreed_s = self.elapsed_s
 

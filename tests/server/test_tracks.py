@@ -153,3 +153,40 @@ def test_an_empty_image_has_no_tracks(value):
     assert tracks.refill(sight) == 0
     tracks.follow(sight, tracks.xy)
     assert len(tracks) == 0
+
+
+def test_tracks_are_found_again_after_a_jump_beyond_the_pyramid():
+    tracks = begin(x=20, y=10)
+    ids, xy = tracks.ids.copy(), tracks.xy.copy()
+    tracks.follow(sight_at(135, 75), tracks.xy, max_level=2)
+    visible = tracks.visible
+    assert visible.sum() > 25
+    was = xy[np.searchsorted(ids, tracks.ids[visible])]
+    error = np.linalg.norm(tracks.xy[visible] - (was - (115, 65)), axis=1)
+    assert (error < 0.5).mean() > 0.95
+    assert visible.all(), "what a jump does not find is gone, it does not coast"
+
+
+def test_another_place_is_no_jump():
+    tracks = begin()
+    count = len(tracks)
+    other = sight_at(20)
+    frame = DecodedFrame(1, 10**8, np.ascontiguousarray(other.frame.image[::-1, ::-1]))
+    tracks.follow(Sight(frame, to_grey(frame.image), other.usable), tracks.xy)
+    assert len(tracks) > 0.9 * count
+    assert tracks.visible.sum() < 0.2 * count
+
+
+def test_a_second_look_starts_from_the_image_before():
+    tracks = begin()
+    ids, xy = tracks.ids.copy(), tracks.xy.copy()
+    sight = sight_at(90)
+    assert not TrackTable("robust", 150, 0).follow_jump(sight), "nothing was followed yet"
+    tracks.follow(sight, tracks.xy - (70, 0))
+    tracks.xy = tracks.xy + 11.0  # as if they had slipped
+    assert tracks.follow_jump(sight)
+    was = xy[np.searchsorted(ids, tracks.ids)]
+    assert np.median(np.linalg.norm(tracks.xy - (was - (70, 0)), axis=1)) < 0.3
+    before = tracks.xy.copy()
+    assert not tracks.follow_jump(sight), "only one second look at an image"
+    np.testing.assert_array_equal(tracks.xy, before)
