@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from semcast.commands.running import add_settings, read_settings
-from semcast.evaluation import codec, confidence, latency, pairs, recording, runtime, trajectory
+from semcast.evaluation import codec, confidence, endurance, latency, pairs, recording, runtime, trajectory
 
 _Evaluation = tuple[type, Callable[[Any], dict[str, Any]], frozenset[str], str]
 #: what -> settings, function, settings the evaluation sets itself, one line of help
@@ -43,6 +43,12 @@ EVALUATIONS: dict[str, _Evaluation] = {
         latency.evaluate_latency,
         latency.UNUSED_FIELDS,
         "time every stage from encoder to viewer",
+    ),
+    "endurance": (
+        endurance.EnduranceSettings,
+        endurance.evaluate_endurance,
+        endurance.UNUSED_FIELDS,
+        "run for long, a recording back and forth, and watch cost per frame and memory",
     ),
     "runtime": (
         runtime.RuntimeSettings,

@@ -1,0 +1,185 @@
+"""``semcast eval endurance``: does cost per frame or memory grow when the server runs for long?
+
+A recording is passed back and forth, so that a short one gives as many frames as wanted and old places keep
+coming back. Frames are sent and decoded once; only estimation is measured, as in the live server: bundle
+adjustment in its own process.
+"""
+
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from semcast.common.codec import Codec
+from semcast.common.errors import ConfigError
+from semcast.common.trajectory import Trajectory
+from semcast.common.trajectory_error import trajectory_summary
+from semcast.evaluation.pipeline import (
+    UNUSED_LINK_FIELDS,
+    FrameRun,
+    LinkedFrame,
+    StreamSettings,
+    open_stream,
+    selected_frame_ids,
+)
+from semcast.evaluation.reconstruct import trajectory_of
+from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.server.bundle_process import ProcessBundle
+from semcast.server.reconstruction import Reconstruction
+from semcast.server.reconstruction_settings import ReconstructionSettings
+from semcast.server.state import DecodedFrame
+
+VERB = "eval endurance"
+#: One run; its seed is also that of the search.
+UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.seed", "seeds"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnduranceSettings(StreamSettings):
+    """Settings of ``evaluate_endurance``.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    frames: int = field(default=20_000, metadata={"help": "frames in all, back and forth"})
+    every: int = field(default=1000, metadata={"help": "frames a row of the result is about"})
+    reconstruction: ReconstructionSettings = field(
+        default=ReconstructionSettings(), metadata={"help": "the server's estimation"}
+    )
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        super().__post_init__()
+        if not 1 <= self.every <= self.frames:
+            raise ValueError(f"every must be in [1, {self.frames}], got {self.every}")
+        if len(self.snr_db) != 1 or self.seeds != 1:
+            raise ValueError("snr_db and seeds must be one each: it is one long run")
+
+
+def back_and_forth(num_frames: int, total: int) -> Iterator[int]:
+    """Yield ``total`` indices that run from 0 to the last frame and back, again and again."""
+    lap = [*range(num_frames), *range(num_frames - 2, 0, -1)]
+    for k in range(total):
+        yield lap[k % len(lap)]
+
+
+def resident_mb() -> float:
+    """Memory of this process in MB, as the operating system counts it; 0 where it does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) -> dict[str, Any]:
+    """Run the estimation over many frames and watch its cost.
+
+    Args:
+        settings: What to run.
+        codec: Used instead of the codec that ``settings.codec`` names.
+
+    Returns:
+        Provenance; ``results``, a row for every ``settings.every`` frames: ``frames`` so far,
+        ``posed_share``, ``frame_ms_p50`` and ``frame_ms_p95`` (decoded frame to pose), ``landmarks``,
+        ``keyframes`` with observations, ``memory_mb``, and ``ate_percent`` of the row's frames where the
+        recording has a truth; ``growth``: last row over the first of the second half.
+
+    Raises:
+        SourceError: The recording can't be read.
+        ConfigError: The codec is unknown, or too few frames arrive.
+    """
+    sequence, codec = open_stream(settings, codec)
+    link = settings.link_at(settings.snr_db[0])
+    frames = [
+        frame
+        for frame in FrameRun(
+            sequence, selected_frame_ids(sequence, settings), codec, link, settings.seed, cache_bytes=0
+        )
+        if frame.decoded is not None
+    ]
+    if len(frames) < 3:
+        raise ConfigError(f"max_frames must leave at least 3 frames that arrive, got {len(frames)}")
+    interval_ns = int(np.median(np.diff([f.t_source_ns for f in frames])))
+    truth = sequence.groundtruth()
+    rows: list[dict[str, Any]] = []
+    times_ms: list[float] = []
+    seen: list[tuple[int, int]] = []
+    reconstruction = Reconstruction(
+        sequence.intrinsics, settings.reconstruction, ProcessBundle(lossless=False)
+    )
+    try:
+        for k, index in enumerate(back_and_forth(len(frames), settings.frames)):
+            since = time.perf_counter_ns()
+            reconstruction.process(_again(frames[index], k, k * interval_ns))
+            times_ms.append((time.perf_counter_ns() - since) * 1e-6)
+            seen.append((k, index))
+            if (k + 1) % settings.every == 0:
+                rows.append(_row(reconstruction, times_ms, seen, frames, truth, interval_ns))
+                times_ms, seen = [], []
+    finally:
+        reconstruction.close()
+    middle, last = rows[len(rows) // 2], rows[-1]
+    keys = ("frame_ms_p50", "frame_ms_p95", "landmarks", "keyframes", "memory_mb")
+    report = json_ready(
+        {
+            **provenance(VERB, settings),
+            "sequence": sequence.name,
+            "image_wh": [sequence.intrinsics.width, sequence.intrinsics.height],
+            "growth": {key: last[key] / middle[key] if middle[key] else None for key in keys},
+            "results": rows,
+        }
+    )
+    if settings.json is not None:
+        write_json(settings.json, report)
+    return dict(report)
+
+
+def _again(frame: LinkedFrame, frame_id: int, t_source_ns: int) -> DecodedFrame:
+    decoded = frame.decoded
+    assert decoded is not None
+    return DecodedFrame(
+        frame_id=frame_id,
+        t_source_ns=t_source_ns,
+        image=decoded.image,
+        confidence=decoded.confidence,
+        keypoint_confidence=decoded.keypoint_confidence,
+        slot_snr_db=frame.effective_snr_db,
+    )
+
+
+def _row(
+    reconstruction: Reconstruction,
+    times_ms: list[float],
+    seen: list[tuple[int, int]],
+    frames: list[LinkedFrame],
+    truth: Trajectory | None,
+    interval_ns: int,
+) -> dict[str, Any]:
+    poses = reconstruction.final_trajectory()
+    posed = {k: poses[k] for k, _ in seen if k in poses}
+    row: dict[str, Any] = {
+        "frames": seen[-1][0] + 1,
+        "posed_share": len(posed) / len(seen),
+        "frame_ms_p50": float(np.percentile(times_ms, 50)),
+        "frame_ms_p95": float(np.percentile(times_ms, 95)),
+        "landmarks": len(reconstruction.landmarks()[0]),
+        "keyframes": len(np.unique(reconstruction.observations()[1])),
+        "memory_mb": resident_mb(),
+    }
+    if truth is not None and len(posed) >= 3:
+        # The same places at the times of this pass.
+        at_ns = {k: k * interval_ns for k, _ in seen}
+        places = {k: truth.T_world_cam[_nearest(truth, frames[index].t_source_ns)] for k, index in seen}
+        summary = trajectory_summary(trajectory_of(posed, at_ns), trajectory_of(places, at_ns), len(seen))
+        row["ate_percent"] = summary["ate_percent"]
+    return row
+
+
+def _nearest(truth: Trajectory, t_source_ns: int) -> int:
+    return int(np.argmin(np.abs(np.asarray(truth.t_s) - t_source_ns * 1e-9)))

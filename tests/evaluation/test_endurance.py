@@ -1,0 +1,41 @@
+import json
+
+import pytest
+
+from semcast.common.errors import ConfigError
+from semcast.evaluation.endurance import EnduranceSettings, back_and_forth, evaluate_endurance, resident_mb
+
+
+def test_frames_go_back_and_forth():
+    assert list(back_and_forth(4, 13)) == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2, 1, 0]
+
+
+def test_memory_counts_what_is_held():
+    before = resident_mb()
+    held = bytearray(b"x") * 60_000_000
+    assert 40 < resident_mb() - before < 90
+    assert len(held) == 60_000_000
+
+
+def test_a_long_run_reports_cost_and_map(room, tmp_path):
+    settings = EnduranceSettings(
+        sequence=room, codec="none", max_frames=14, frames=60, every=20, json=tmp_path / "e.json"
+    )
+    report = evaluate_endurance(settings)
+    assert json.loads(settings.json.read_text()) == report
+    assert [row["frames"] for row in report["results"]] == [20, 40, 60]
+    assert all(row["posed_share"] >= 0.9 for row in report["results"])
+    assert all(0.0 < row["frame_ms_p50"] <= row["frame_ms_p95"] for row in report["results"])
+    assert all(0.0 <= row["ate_percent"] < 3.0 for row in report["results"])
+    last = report["results"][-1]
+    assert 40 < last["landmarks"] <= 20_000
+    assert report["growth"]["memory_mb"] == pytest.approx(
+        last["memory_mb"] / report["results"][1]["memory_mb"]
+    )
+
+
+def test_settings_that_give_no_run_are_refused(room):
+    with pytest.raises(ValueError, match=r"every must be in \[1, 10\], got 11"):
+        EnduranceSettings(sequence=room, frames=10, every=11)
+    with pytest.raises(ConfigError, match="at least 3 frames"):
+        evaluate_endurance(EnduranceSettings(sequence=room, codec="none", max_frames=2, frames=5, every=5))
