@@ -1,8 +1,8 @@
 """``docs/results.md`` and the generated parts of README and ``docs/confidence.md``, from result files.
 
 Files are recognised by their names: ``codec_*``, ``trajectory_*``, ``pairs_*``, ``confidence_*``,
-``latency_*``, ``runtime_*``, ``recording_*`` and ``demo_*``. Each table is followed by its pictures,
-``<name>-*.png``, and by the command, commit and machine that made it.
+``latency_*``, ``runtime_*``, ``recording_*``, ``endurance_*``, ``training_*`` and ``demo_*``. Each table is
+followed by its pictures, ``<name>-*.png``, and by the command, commit and machine that made it.
 """
 
 import json
@@ -39,6 +39,13 @@ def _codec(report: Report) -> Iterator[str]:
         for codec in dict.fromkeys(row["codec"] for row in rows):
             at = {row["snr_db"]: row[key] for row in rows if row["codec"] == codec}
             body.append([codec, *(number(at.get(snr), digits) for snr in snrs)])
+        yield from table([name, *(f"{snr:g} dB" for snr in snrs)], body)
+        yield ""
+    for key, name in (("ece", "ECE of confidence"), ("spearman_blocks", "Spearman, 8x8 blocks")):
+        body = []
+        for codec in dict.fromkeys(row["codec"] for row in rows):
+            at = {row["snr_db"]: row["confidence"][key] for row in rows if row["codec"] == codec}
+            body.append([codec, *(number(at.get(snr), 3) for snr in snrs)])
         yield from table([name, *(f"{snr:g} dB" for snr in snrs)], body)
         yield ""
 
@@ -145,6 +152,33 @@ def _runtime(report: Report) -> Iterator[str]:
     )
 
 
+def _endurance(report: Report) -> Iterator[str]:
+    body = [
+        [
+            row["frames"],
+            f"{row['posed_share']:.1%}",
+            number(row["frame_ms_p50"], 1),
+            number(row["frame_ms_p95"], 1),
+            row["landmarks"],
+            row["keyframes"],
+            number(row["memory_mb"], 0),
+            number(row.get("ate_percent")),
+        ]
+        for row in report["results"]
+    ]
+    head = ["frames", "posed", "p50 ms", "p95 ms", "landmarks", "keyframes", "memory MB", "ATE %"]
+    step = max(1, len(body) // 5)
+    yield from table(head, body[step - 1 :: step])
+
+
+def _training(report: Report) -> Iterator[str]:
+    curve = report["curve"]
+    step = max(1, len(curve) // 8)
+    rows = [[r["step"], r["elapsed_s"], number(r["train_psnr_db"])] for r in curve[step - 1 :: step]]
+    yield from table(["step", "seconds", "PSNR dB of training crops"], rows)
+    yield f"\n{report['what'][0].upper()}{report['what'][1:]}."
+
+
 def _recording(report: Report) -> Iterator[str]:
     rows = [
         ["share of a core", f"{report['core_share']:.1%}"],
@@ -167,6 +201,8 @@ SECTIONS: dict[str, tuple[str, Tables]] = {
     "latency": ("Where the time goes", _latency),
     "runtime": ("How fast encoder and decoder are", _runtime),
     "recording": ("What recording costs", _recording),
+    "endurance": ("Running for long", _endurance),
+    "training": ("How the weights were trained", _training),
 }
 
 

@@ -4,7 +4,7 @@ It follows the definitions of the real link: ``noise_var = 10 ** (-snr_db / 10)`
 half for each real, one fading coefficient for each slot, whose phase the equaliser removes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -27,14 +27,20 @@ class ChannelSettings:
         estimate_sd_db: Error of the SNR the receiver estimates for each slot.
     """
 
-    snr_min_db: float = 0.0
-    snr_max_db: float = 14.0
-    share_16qam: float = 0.75
-    share_faded: float = 0.15
-    share_lossy: float = 0.15
-    lost_max: float = 0.5
-    feedback_sd_db: float = 1.0
-    estimate_sd_db: float = 0.5
+    snr_min_db: float = field(default=0.0, metadata={"help": "lowest SNR in dB"})
+    snr_max_db: float = field(default=14.0, metadata={"help": "highest SNR in dB"})
+    share_16qam: float = field(
+        default=0.75, metadata={"help": "share of images sent with 16-QAM; the others are analog"}
+    )
+    share_faded: float = field(default=0.15, metadata={"help": "share of images whose slots fade"})
+    share_lossy: float = field(default=0.15, metadata={"help": "share of images that lose slots"})
+    lost_max: float = field(default=0.5, metadata={"help": "largest share of lost slots in such an image"})
+    feedback_sd_db: float = field(
+        default=1.0, metadata={"help": "error of the SNR the transmitter believes in, in dB"}
+    )
+    estimate_sd_db: float = field(
+        default=0.5, metadata={"help": "error of the SNR the receiver estimates, in dB"}
+    )
 
     def __post_init__(self) -> None:
         if self.snr_min_db > self.snr_max_db:

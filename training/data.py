@@ -1,7 +1,7 @@
 """Training images: decoded once, held in memory, cut and changed at random but repeatably."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -26,10 +26,10 @@ class CropSettings:
         share_grey: Share of crops turned grey, since many cameras are.
     """
 
-    size_px: int = 128
-    scale_min: float = 0.5
-    scale_max: float = 0.9
-    share_grey: float = 0.18
+    size_px: int = field(default=128, metadata={"help": "side of a crop, a multiple of 16"})
+    scale_min: float = field(default=0.5, metadata={"help": "smallest factor a photo is reduced by before"})
+    scale_max: float = field(default=0.9, metadata={"help": "largest"})
+    share_grey: float = field(default=0.18, metadata={"help": "share of crops turned grey"})
 
     def __post_init__(self) -> None:
         if self.size_px < 16 or self.size_px % 16:

@@ -20,7 +20,8 @@ from semcast.common.nets.checkpoint import save_transceiver
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS, channel_bandwidth_ratio
-from semcast.training.channel import LinkDraw, draw_links
+from semcast.training.centring import centre_hidden, folded
+from semcast.training.channel import LinkDraw, draw_links, through_link
 from semcast.training.data import Batches, read_images
 from semcast.training.klt import start_from_klt
 from semcast.training.losses import transceiver_loss
@@ -32,6 +33,8 @@ from semcast.training.validation import validate
 logger = logging.getLogger(__name__)
 
 _VALID_IMAGES = 16
+#: Batches the means of hidden units are taken from, and a step no run gets to.
+_FOLD_BATCHES, _FOLD_STEP = 24, 2**40
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,7 @@ class Run:
         if checkpoint is None and settings.start == "klt":
             start_from_klt(model, self.images, torch.Generator().manual_seed(settings.seed))
         self.model = model.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        centre_hidden(self.model)
         self.average = copy.deepcopy(self.model).eval()
         self.optimisers = build_optimisers(self.model, settings)
         if checkpoint is not None:
@@ -152,6 +156,25 @@ class Run:
         torch.save(state, partial)
         partial.replace(self.checkpoint_path)
 
+    def shippable(self) -> Transceiver:
+        """Return the averaged weights as they run without the aids of training."""
+        return folded(self.average, self._pass_images)
+
+    def _pass_images(self, model: Transceiver) -> None:
+        """Run fresh crops through the whole link."""
+        settings = self.settings
+        blocks = settings.crop.size_px // BLOCK_PX
+        generator = torch.Generator().manual_seed(settings.seed)
+        for k in range(_FOLD_BATCHES):
+            x = self.batches.make(_FOLD_STEP + k).to(self.device).float() / 255.0
+            draw = draw_links(settings.channel, len(x), blocks, generator)
+            draw = LinkDraw(*(t.to(self.device) for t in vars(draw).values()))
+            noise = torch.randn((len(x), LATENT_CHANNELS, blocks, blocks), generator=generator)
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=settings.bf16):
+                symbols = model.transmit(model.latent(x, draw.expected_snr_db, draw.is_qam), draw.is_qam)
+                y_rx, snr_db = through_link(symbols, draw, noise.to(self.device))
+                model.receive(y_rx, snr_db, draw.is_qam)
+
     def export(self, valid: dict[str, float]) -> Path:
         """Write the averaged weights in half precision with their manifest."""
         settings = self.settings
@@ -160,7 +183,7 @@ class Run:
         for folder in ("data", "valid", "out"):
             plain.pop(folder)
         save_transceiver(
-            self.average,
+            self.shippable(),
             weights,
             architecture=settings.architecture,
             sizes=architecture(settings.architecture).sizes,
@@ -328,7 +351,7 @@ def _train(
                 if on_progress is not None:
                     on_progress(report)
             if run.step % settings.valid_every == 0 and run.valid_images and run.rank == 0:
-                valid = validate(run.average, run.valid_images, run.device, settings.bf16)
+                valid = validate(run.shippable(), run.valid_images, run.device, settings.bf16)
                 _append(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
             if run.step % settings.save_every == 0:
                 run.save()
@@ -336,7 +359,7 @@ def _train(
         run.batches.close()
         run.save()
     if run.rank == 0 and run.valid_images:
-        valid = validate(run.average, run.valid_images, run.device, settings.bf16)
+        valid = validate(run.shippable(), run.valid_images, run.device, settings.bf16)
         _append(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
     weights = settings.out / f"{settings.architecture}.safetensors"
     if run.rank == 0:

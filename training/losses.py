@@ -1,6 +1,6 @@
 """The loss terms: reconstruction, descriptor consistency, confidence, and a cap on the symbols' power."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -30,13 +30,21 @@ class LossSettings:
             levels.
     """
 
-    mse: float = 1.0
-    descriptor: float = 0.0
-    confidence: float = 0.01
-    mse_knee: float = 1e-3
-    confidence_sharpness: float = 30.0
-    confidence_loss: Literal["bce", "l1"] = "bce"
-    power: float = 0.002
+    mse: float = field(default=1.0, metadata={"help": "weight of the reconstruction error"})
+    descriptor: float = field(
+        default=0.0, metadata={"help": "weight of the descriptor consistency; 0 is off"}
+    )
+    confidence: float = field(default=0.01, metadata={"help": "weight of both confidence heads; 0 is off"})
+    mse_knee: float = field(
+        default=1e-3, metadata={"help": "squared error of an image from which its weight falls; 0: none"}
+    )
+    confidence_sharpness: float = field(
+        default=30.0, metadata={"help": "alpha of the label 1 - tanh(alpha |error|)"}
+    )
+    confidence_loss: Literal["bce", "l1"] = field(
+        default="bce", metadata={"help": "bce, or l1 as in the paper"}
+    )
+    power: float = field(default=0.002, metadata={"help": "weight of the penalty on a power that is not 1"})
 
     def __post_init__(self) -> None:
         for name in ("mse", "descriptor", "confidence", "mse_knee", "power"):
