@@ -26,9 +26,9 @@ from semcast.evaluation.pipeline import (
     open_stream,
     selected_frame_ids,
 )
-from semcast.evaluation.reconstruct import trajectory_of
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.server.bundle_process import ProcessBundle
+from semcast.server.export import trajectory_of
 from semcast.server.reconstruction import Reconstruction
 from semcast.server.reconstruction_settings import ReconstructionSettings
 from semcast.server.state import DecodedFrame

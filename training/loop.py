@@ -158,7 +158,8 @@ class Run:
 
     def shippable(self) -> Transceiver:
         """Return the averaged weights as they run without the aids of training."""
-        return folded(self.average, self._pass_images)
+        plain: Transceiver = folded(self.average, self._pass_images)
+        return plain
 
     def _pass_images(self, model: Transceiver) -> None:
         """Run fresh crops through the whole link."""

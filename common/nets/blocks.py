@@ -6,9 +6,12 @@ running statistics would differ between a 128-pixel crop and a whole frame.
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import leaky_relu
 
 #: Values a network is told besides features: normalised SNR and the modulation flag.
 NUM_CONDITIONS = 2
+#: Slope of the hidden activation of residual units below zero.
+HIDDEN_SLOPE = 0.1
 
 
 def normalise_snr_db(snr_db: Tensor) -> Tensor:
@@ -48,7 +51,10 @@ class ChannelAttention(nn.Module):
 
 
 class ResidualUnit(nn.Module):
-    """conv-ReLU-conv on a skip connection whose last layer starts at zero."""
+    """conv-leaky ReLU-conv on a skip connection whose last layer starts at zero.
+
+    With a plain ReLU most of the hidden units fell silent within some thousand steps, for good.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -59,7 +65,7 @@ class ResidualUnit(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Refine ``(B, C, H, W)``."""
-        refined: Tensor = x + self.conv2(torch.relu(self.conv1(x)))
+        refined: Tensor = x + self.conv2(leaky_relu(self.conv1(x), HIDDEN_SLOPE))
         return refined
 
 

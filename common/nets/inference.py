@@ -11,9 +11,15 @@ from typing import Protocol
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import logsigmoid
+from torch.nn.functional import leaky_relu, logsigmoid
 
-from semcast.common.nets.blocks import ChannelAttention, Stage, condition_vector, normalise_snr_db
+from semcast.common.nets.blocks import (
+    HIDDEN_SLOPE,
+    ChannelAttention,
+    Stage,
+    condition_vector,
+    normalise_snr_db,
+)
 from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import Decoder
 from semcast.common.nets.encoder import Encoder
@@ -179,7 +185,7 @@ class _Stage:
         gate = 2.0 * torch.sigmoid(self._attention.excite(hidden))
         x = x.mul_(gate.to(x.dtype)[:, :, None, None])
         for conv1, conv2 in self._units:
-            x = conv2(conv1(x).relu_()).add_(x)
+            x = conv2(leaky_relu(conv1(x), HIDDEN_SLOPE, inplace=True)).add_(x)
         return x
 
 
