@@ -1,8 +1,7 @@
 """``docs/results.md`` and the generated parts of README and ``docs/confidence.md``, from result files.
 
-Files are recognised by their names: ``codec_*``, ``trajectory_*``, ``pairs_*``, ``confidence_*``,
-``latency_*``, ``runtime_*``, ``recording_*``, ``endurance_*``, ``training_*`` and ``demo_*``. Each table is
-followed by its pictures, ``<name>-*.png``, and by the command, commit and machine that made it.
+Files are recognised by their names: ``<kind>_*.json``, see ``SECTIONS``. Each table is followed by its pictures,
+``<name>-*.png``, and by the command, commit and machine that made it.
 """
 
 import json
@@ -179,6 +178,19 @@ def _training(report: Report) -> Iterator[str]:
     yield f"\n{report['what'][0].upper()}{report['what'][1:]}."
 
 
+def _ablation(report: Report) -> Iterator[str]:
+    keys = {
+        "psnr_db": "PSNR dB",
+        "descriptor": "descriptor distance",
+        "corner_px": "corners move by px",
+        "ece": "ECE of confidence",
+        "spearman_corners": "Spearman, corners",
+    }
+    rows = [[row["loss"], *(number(row[key], 3) for key in keys)] for row in report["results"]]
+    yield from table(["loss", *keys.values()], rows)
+    yield f"\n{report['steps']} steps of {report['batch']} crops each; {report['what']}."
+
+
 def _recording(report: Report) -> Iterator[str]:
     rows = [
         ["share of a core", f"{report['core_share']:.1%}"],
@@ -202,6 +214,7 @@ SECTIONS: dict[str, tuple[str, Tables]] = {
     "runtime": ("How fast encoder and decoder are", _runtime),
     "recording": ("What recording costs", _recording),
     "endurance": ("Running for long", _endurance),
+    "ablation": ("What each term of the loss does", _ablation),
     "training": ("How the weights were trained", _training),
 }
 

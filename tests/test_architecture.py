@@ -14,7 +14,7 @@ MAY_IMPORT = {
     "agent": {"agent", "common", "channel"},
     "server": {"server", "common", "channel"},
     "training": {"training", "common", "channel"},
-    "evaluation": {"evaluation", "common", "channel", "agent", "server"},
+    "evaluation": {"evaluation", "common", "channel", "agent", "server", "training"},
 }
 HOMES = {
     "zenoh": {"common/transport.py"},
