@@ -1,7 +1,7 @@
 """``docs/results.md`` and the generated parts of README and ``docs/confidence.md``, from result files.
 
-Files are recognised by their names: ``<kind>_*.json``, see ``SECTIONS``. Each table is followed by its pictures,
-``<name>-*.png``, and by the command, commit and machine that made it.
+Files are recognised by their names, ``<kind>_*.json``, see ``SECTIONS``. Each table is followed by its
+pictures, ``<name>-*.png``, and by the command, commit and machine that made it.
 """
 
 import json
