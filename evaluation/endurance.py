@@ -8,7 +8,7 @@ adjustment in its own process.
 import os
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,11 @@ from semcast.common.trajectory_error import trajectory_summary
 from semcast.evaluation.pipeline import (
     UNUSED_LINK_FIELDS,
     FrameRun,
-    LinkedFrame,
     StreamSettings,
     open_stream,
     selected_frame_ids,
 )
+from semcast.evaluation.reconstruct import as_received
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.server.bundle_process import ProcessBundle
 from semcast.server.export import trajectory_of
@@ -97,7 +97,7 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
     sequence, codec = open_stream(settings, codec)
     link = settings.link_at(settings.snr_db[0])
     frames = [
-        frame
+        as_received(frame)
         for frame in FrameRun(
             sequence, selected_frame_ids(sequence, settings), codec, link, settings.seed, cache_bytes=0
         )
@@ -116,7 +116,7 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
     try:
         for k, index in enumerate(back_and_forth(len(frames), settings.frames)):
             since = time.perf_counter_ns()
-            reconstruction.process(_again(frames[index], k, k * interval_ns))
+            reconstruction.process(replace(frames[index], frame_id=k, t_source_ns=k * interval_ns))
             times_ms.append((time.perf_counter_ns() - since) * 1e-6)
             seen.append((k, index))
             if (k + 1) % settings.every == 0:
@@ -140,24 +140,11 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
     return dict(report)
 
 
-def _again(frame: LinkedFrame, frame_id: int, t_source_ns: int) -> DecodedFrame:
-    decoded = frame.decoded
-    assert decoded is not None
-    return DecodedFrame(
-        frame_id=frame_id,
-        t_source_ns=t_source_ns,
-        image=decoded.image,
-        confidence=decoded.confidence,
-        keypoint_confidence=decoded.keypoint_confidence,
-        slot_snr_db=frame.effective_snr_db,
-    )
-
-
 def _row(
     reconstruction: Reconstruction,
     times_ms: list[float],
     seen: list[tuple[int, int]],
-    frames: list[LinkedFrame],
+    frames: list[DecodedFrame],
     truth: Trajectory | None,
     interval_ns: int,
 ) -> dict[str, Any]:

@@ -66,6 +66,25 @@ class ReconstructedRun:
     num_landmarks: int
 
 
+def as_received(frame: LinkedFrame) -> DecodedFrame:
+    """Return what the server's decoder makes of a frame.
+
+    Raises:
+        ValueError: Nothing of it arrived.
+    """
+    decoded = frame.decoded
+    if decoded is None:
+        raise ValueError(f"frame {frame.frame_id} did not arrive")
+    return DecodedFrame(
+        frame_id=frame.frame_id,
+        t_source_ns=frame.t_source_ns,
+        image=decoded.image,
+        confidence=decoded.confidence,
+        keypoint_confidence=decoded.keypoint_confidence,
+        slot_snr_db=frame.effective_snr_db,
+    )
+
+
 def reconstruct(
     frames: Iterable[LinkedFrame],
     camera: Intrinsics,
@@ -113,15 +132,7 @@ def _process(
 ) -> FrameRow:
     decoded = frame.decoded
     assert decoded is not None
-    received = DecodedFrame(
-        frame_id=frame.frame_id,
-        t_source_ns=frame.t_source_ns,
-        image=decoded.image,
-        confidence=decoded.confidence,
-        keypoint_confidence=decoded.keypoint_confidence,
-        slot_snr_db=frame.effective_snr_db,
-    )
-    result = reconstruction.process(received)
+    result = reconstruction.process(as_received(frame))
     stage_ms = {**frame.stage_ms, **split_bundle(result.stage_ms, bundle.pop_elapsed_ms())}
     row = FrameRow(
         frame_id=frame.frame_id,
