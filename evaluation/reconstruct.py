@@ -132,7 +132,8 @@ def _process(
 ) -> FrameRow:
     decoded = frame.decoded
     assert decoded is not None
-    result = reconstruction.process(as_received(frame))
+    received = as_received(frame)
+    result = reconstruction.process(received)
     stage_ms = {**frame.stage_ms, **split_bundle(result.stage_ms, bundle.pop_elapsed_ms())}
     row = FrameRow(
         frame_id=frame.frame_id,
