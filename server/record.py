@@ -10,12 +10,16 @@ from typing import Any
 from semcast import __version__
 from semcast.common.config import to_toml
 from semcast.common.keys import DEFAULT_AGENT_ID, all_keys, camera_key, check_agent_id
+from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
 from semcast.common.recording import recording_metadata
 from semcast.common.transport import Session, open_session
+from semcast.common.wire import WireError, unpack
 
 CAMERA_TIMEOUT_S = 0.5
+#: Name of the metadata record of a stream, followed by its epoch.
+STREAM_METADATA = "semcast.stream"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +46,44 @@ def kind_of_key(key: str) -> str:
     return "symbols" if word in ("tx", "rx") else word
 
 
+class StreamNotes:
+    """Puts messages into a recording and, for each stream, what decodes it: a metadata record of its own.
+
+    Args:
+        recorder: Where to.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self._epochs: set[int] = set()
+
+    def put(self, key: str, payload: bytes) -> None:
+        """Record a message that arrived under a key."""
+        kind = kind_of_key(key)
+        if kind == "camera":
+            with contextlib.suppress(WireError):
+                self._note(unpack(payload, CameraInfo))
+        self._recorder.put(key, kind, payload)
+
+    def _note(self, camera: CameraInfo) -> None:
+        if camera.agent_epoch in self._epochs:
+            return
+        self._epochs.add(camera.agent_epoch)
+        values = {
+            "agent_id": camera.agent_id,
+            "codec": camera.codec,
+            "weights_digest": camera.digest,
+            "modulation": camera.modulation,
+            "source": camera.source_name,
+            "image_wh": "{}x{}".format(*camera.image_wh),
+        }
+        self._recorder.add_metadata(f"{STREAM_METADATA}.{camera.agent_epoch}", values)
+
+
 @contextlib.contextmanager
-def recording(session: Session, agent_id: str, file: Path, settings_toml: str) -> Iterator[Recorder]:
+def recording(
+    session: Session, agent_id: str, file: Path, settings_toml: str
+) -> Iterator[tuple[Recorder, StreamNotes]]:
     """Record all that is sent about one agent while the context lasts.
 
     Args:
@@ -56,10 +96,9 @@ def recording(session: Session, agent_id: str, file: Path, settings_toml: str) -
         SourceError: The file can't be written.
     """
     with Recorder(file, recording_metadata(settings_toml, __version__)) as recorder:
-        session.subscribe_keyed(
-            all_keys(agent_id), "every", lambda key, payload: recorder.put(key, kind_of_key(key), payload)
-        )
-        yield recorder
+        notes = StreamNotes(recorder)
+        session.subscribe_keyed(all_keys(agent_id), "every", notes.put)
+        yield recorder, notes
 
 
 def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any]:
@@ -75,11 +114,14 @@ def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any
     session = open_session(settings.network, stop)
     if session is None:
         return {"messages": 0, "bytes": 0, "drops": {}}
-    with session, recording(session, settings.agent_id, settings.file, to_toml(settings)) as recorder:
+    with (
+        session,
+        recording(session, settings.agent_id, settings.file, to_toml(settings)) as (recorder, notes),
+    ):
         # The camera was announced before we came.
         camera = session.request(camera_key(settings.agent_id), b"", CAMERA_TIMEOUT_S)
         if camera is not None:
-            recorder.put(camera_key(settings.agent_id), "camera", camera)
+            notes.put(camera_key(settings.agent_id), camera)
         stop.wait()
     return {
         "messages": recorder.num_written,

@@ -13,6 +13,7 @@ from semcast.agent.source_settings import SourceSettings
 from semcast.channel.emulator import run_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
+from semcast.common.codecs import load_codec
 from semcast.common.errors import SourceError
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recording import recover_file
@@ -65,6 +66,16 @@ def test_everything_that_was_sent_is_in_the_recording(recording):
     assert counts["semcast/agent0/tx/symbols"] >= FRAMES // 2
     assert counts["semcast/agent0/rx/symbols"] >= FRAMES // 2
     assert counts["semcast/agent0/camera"] >= 1
+    assert counts["semcast/agent0/source"] >= FRAMES // 2
+
+
+def test_the_recording_names_the_weights_that_decode_it(recording):
+    notes = {k: v for k, v in RecordingReader(recording).info().metadata.items() if "stream" in k}
+    (values,) = notes.values()
+    assert values["codec"] == "jpeg-ldpc"
+    assert values["weights_digest"] == load_codec("jpeg-ldpc").digest
+    assert values["image_wh"] == "490x148"
+    assert values["source"] == "kitti_06"
 
 
 def test_two_replays_give_the_same_files_and_another_channel_does_not(recording, tmp_path):
