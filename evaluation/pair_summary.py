@@ -161,7 +161,12 @@ def _time(cells: Sequence[Cell]) -> Iterator[str]:
     whole = [c for c in cells if not c.values["max_matches"]]
     names = [name for name in _METHODS if any(name in c.values["results"] for c in whole)]
     medians = [
-        [t["p50"] for c in whole if (t := c.values["results"].get(name, {}).get("cpu_ms"))] for name in names
+        [
+            t["p50"]
+            for c in whole
+            if (t := c.values["results"].get(name, {}).get("cpu_ms")) and t["p50"] is not None
+        ]
+        for name in names
     ]
     yield from table(names, [[number(float(np.median(m)), 1) if m else "-" for m in medians]])
 
