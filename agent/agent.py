@@ -62,14 +62,20 @@ class _Sending:
     """What both services share: one start of the agent on an open session."""
 
     def __init__(
-        self, session: Session, settings: AgentSettings, source: Source, codec: Codec, metrics: Metrics
+        self,
+        session: Session,
+        settings: AgentSettings,
+        source: Source,
+        codec: Codec,
+        metrics: Metrics,
+        stop: threading.Event,
     ) -> None:
         self.agent_epoch = time.time_ns()
         self.metrics = metrics
         self.lossless = settings.mode == "replay"
         self.feedback = LinkFeedback(self.agent_epoch, settings.snr_db, settings.feedback_max_age_s)
         self._settings = settings
-        self._rate = RateControl(settings.rate)
+        self._rate = RateControl(settings.rate, source.intrinsics.shape_hw)
         self._encoder = FrameEncoder(codec, self.agent_epoch, self.lossless)
         agent_id = settings.agent_id
         camera = pack(camera_info(settings, source, codec, self.agent_epoch))
@@ -78,7 +84,9 @@ class _Sending:
         self._symbols = session.publisher(tx_key(agent_id), "every" if self.lossless else "newest")
         session.publisher(camera_key(agent_id), "every").put(camera)
         self._originals = (
-            OriginalSharer(session, agent_id, self.agent_epoch, settings.share_source, self.lossless, metrics)
+            OriginalSharer(
+                session, agent_id, self.agent_epoch, settings.share_source, self.lossless, metrics, stop
+            )
             if settings.share_source != "off"
             else None
         )
@@ -256,7 +264,7 @@ def run_agent(
         source.close()
         return {**metrics.summary(), **summary}
     with session:
-        sending = _Sending(session, settings, source, codec, metrics)
+        sending = _Sending(session, settings, source, codec, metrics, stop)
         beat = StatusBeat(session, settings.agent_id, ROLE, metrics, lambda: sending.agent_epoch)
         session.declare_alive(settings.agent_id, ROLE)
         if settings.wait:

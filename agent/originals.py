@@ -1,5 +1,6 @@
 """Publishes original frames beside the symbols, not through the channel, so that a recording keeps them."""
 
+import logging
 import threading
 from typing import Literal
 
@@ -12,7 +13,9 @@ from semcast.common.mailbox import Mailbox
 from semcast.common.messages import SourceImage
 from semcast.common.metrics import Metrics
 from semcast.common.transport import Session
-from semcast.common.wire import pack
+from semcast.common.wire import WireError, pack
+
+logger = logging.getLogger(__name__)
 
 ImageFormat = Literal["jpeg", "png"]
 JPEG_QUALITY = 95
@@ -46,6 +49,7 @@ class OriginalSharer:
         lossless: ``put`` waits and every frame is shared; otherwise the sender never waits, and frames that
             come too fast are left out and counted as ``source_superseded``.
         metrics: Where to count.
+        stop: Ends waiting in ``put``.
 
     Raises:
         TransportError: The session is closed.
@@ -59,11 +63,13 @@ class OriginalSharer:
         image_format: ImageFormat,
         lossless: bool,
         metrics: Metrics,
+        stop: threading.Event,
     ) -> None:
         self._publisher = session.publisher(source_key(agent_id), "every" if lossless else "newest")
         self._agent_epoch = agent_epoch
         self._format = image_format
         self._metrics = metrics
+        self._stop = stop
         self._box: Mailbox[SourceFrame] = Mailbox(_QUEUE, "all" if lossless else "newest")
         self._thread = threading.Thread(target=self._run, name="semcast-originals", daemon=True)
         self._thread.start()
@@ -71,21 +77,35 @@ class OriginalSharer:
     def put(self, frame: SourceFrame) -> None:
         """Share a frame."""
         before = self._box.dropped
-        self._box.put(frame)
+        while not (self._box.put(frame, _POLL_S) or self._box.closed or self._stop.is_set()):
+            pass
         self._metrics.drop("source_superseded", self._box.dropped - before)
 
     def _run(self) -> None:
-        while not (self._box.closed and len(self._box) == 0):
-            frame = self._box.get(_POLL_S)
-            if frame is None:
-                continue
-            try:
-                with self._metrics.stage("share_source"):
-                    self._publisher.put(pack(source_image(frame, self._agent_epoch, self._format)))
-            except TransportError as err:
-                self._metrics.error(str(err))
-                return
-            self._metrics.count("source_shared")
+        try:
+            while not (self._box.closed and len(self._box) == 0):
+                frame = self._box.get(_POLL_S)
+                if frame is not None:
+                    self._share(frame)
+        except TransportError as err:
+            self._metrics.error(str(err))
+        except Exception as err:
+            logger.exception("sharing the originals failed")
+            self._metrics.error(f"sharing the originals failed: {err}")
+        finally:
+            self._box.close()
+
+    def _share(self, frame: SourceFrame) -> None:
+        try:
+            message = pack(source_image(frame, self._agent_epoch, self._format))
+        except (WireError, cv2.error) as err:
+            # Such as a frame of more than 16 MiB as PNG: the next one may be smaller.
+            self._metrics.drop("source_invalid")
+            self._metrics.error(str(err))
+            return
+        with self._metrics.stage("share_source"):
+            self._publisher.put(message)
+        self._metrics.count("source_shared")
 
     def close(self) -> None:
         """Send what is left and end the thread. Idempotent."""

@@ -69,6 +69,10 @@ class AgentSettings:
         check_agent_id(self.agent_id)
         if self.mode == "live" and self.source.pace == "receiver":
             raise ValueError("pace 'receiver' needs mode 'replay', got mode 'live'")
+        if self.mode == "replay" and self.rate == "auto":
+            raise ValueError(
+                "rate 'auto' needs mode 'live', got mode 'replay': frames are not to depend on timing"
+            )
         if self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
         low, high = SNR_RANGE_DB

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import DecodedImage, confidence_from_displacement_px, displacement_px
-from semcast.common.phy.slots import BLOCK_PX, USES_PER_BLOCK
+from semcast.common.messages import MAX_PAYLOAD_BYTES, MAX_SIDE_PX
+from semcast.common.phy.slots import BLOCK_PX, USES_PER_BLOCK, layout_for
 
 Rate = Literal["1/48", "1/32", "1/24", "1/16", "1/12", "1/8"]
 RATES: tuple[Rate, ...] = get_args(Rate)
@@ -81,14 +82,20 @@ def from_coded(decoded: DecodedImage, shape_hw: tuple[int, int]) -> DecodedImage
     )
 
 
-def slots_at(values: NDArray[np.float32], num_slots: int) -> NDArray[np.float32]:
+def slots_at(values: NDArray[np.float32], coded_height: int, height: int) -> NDArray[np.float32]:
     """Return one value per slot of the camera's grid from one per slot of the coded one.
 
     Of the coded slots a band overlaps the smallest value counts: nothing lost may look sound.
+
+    Args:
+        values: ``(S,)`` of the coded slots.
+        coded_height: Rows of the coded image in pixels.
+        height: Rows of the camera's image in pixels.
     """
-    if len(values) == num_slots:
+    if coded_height == height:
         return values
-    edges = np.arange(num_slots + 1) * len(values) / num_slots
+    num_slots = layout_for((height, 1)).num_slots
+    edges = np.minimum(BLOCK_PX * np.arange(num_slots + 1), height) * coded_height / height / BLOCK_PX
     return np.array(
         [
             values[math.floor(top) : max(math.ceil(bottom - 1e-9), math.floor(top) + 1)].min()
@@ -104,29 +111,43 @@ class RateControl:
     Args:
         rate: A fixed one, or ``auto``: as many uses as carry the information that the native rate carries at
             10 dB, so that a good link is not filled for nothing and a bad one gets more time.
+        shape_hw: Of the camera.
 
     Raises:
-        ValueError: There is no such rate.
+        ValueError: There is no such rate, or frames of this size are too large for the protocol at it.
     """
 
-    def __init__(self, rate: Rate | Literal["auto"]) -> None:
+    def __init__(self, rate: Rate | Literal["auto"], shape_hw: tuple[int, int]) -> None:
         if rate != "auto" and rate not in RATES:
             raise ValueError(f"rate must be auto or one of {', '.join(RATES)}, got {rate!r}")
+        self._rates = [known for known in RATES if _can_be_sent(coded_shape(shape_hw, known))]
+        if rate not in ("auto", *self._rates):
+            allowed = ", ".join(self._rates) or "none"
+            raise ValueError(f"rate must be one of {allowed} for frames of {shape_hw}, got {rate!r}")
         self._fixed = None if rate == "auto" else rate
-        self._step = RATES.index(NATIVE_RATE)
+        self._rate: Rate = min(self._rates, key=lambda known: abs(_log_uses(known) - _log_uses(NATIVE_RATE)))
 
     def choose(self, snr_db: float) -> Rate:
         """Return the rate for a link of this SNR."""
         if self._fixed is not None:
             return self._fixed
-        wanted = math.log(
-            uses_per_value(NATIVE_RATE) * _capacity_bits(_NATIVE_SNR_DB) / max(_capacity_bits(snr_db), 1e-6)
+        wanted = _log_uses(NATIVE_RATE) + math.log(
+            _capacity_bits(_NATIVE_SNR_DB) / max(_capacity_bits(snr_db), 1e-6)
         )
-        steps = [math.log(uses_per_value(rate)) for rate in RATES]
+        steps = [_log_uses(rate) for rate in self._rates]
         place = float(np.interp(wanted, steps, range(len(steps))))
-        if abs(place - self._step) > _HYSTERESIS:
-            self._step = round(place)
-        return RATES[self._step]
+        if abs(place - self._rates.index(self._rate)) > _HYSTERESIS:
+            self._rate = self._rates[round(place)]
+        return self._rate
+
+
+def _log_uses(rate: Rate) -> float:
+    return math.log(uses_per_value(rate))
+
+
+def _can_be_sent(coded_hw: tuple[int, int]) -> bool:
+    """Whether sides and received samples (float16 I and Q) are within the protocol's limits."""
+    return max(coded_hw) <= MAX_SIDE_PX and 4 * layout_for(coded_hw).num_uses <= MAX_PAYLOAD_BYTES
 
 
 def _capacity_bits(snr_db: float) -> float:

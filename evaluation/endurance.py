@@ -68,10 +68,11 @@ def back_and_forth(num_frames: int, total: int) -> Iterator[int]:
         yield lap[k % len(lap)]
 
 
-def resident_mb() -> float:
-    """Memory of this process in MB, as the operating system counts it; 0 where it does not say."""
+def resident_mb(pid: int | None = None) -> float:
+    """Memory of a process in MB, by default this one; 0 where the operating system does not say."""
     try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        statm = Path(f"/proc/{'self' if pid is None else pid}/statm").read_text(encoding="ascii")
+        pages = int(statm.split()[1])
     except (OSError, IndexError, ValueError):
         return 0.0
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
@@ -87,7 +88,8 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
     Returns:
         Provenance; ``results``, a row for every ``settings.every`` frames: ``frames`` so far,
         ``posed_share``, ``frame_ms_p50`` and ``frame_ms_p95`` (decoded frame to pose), ``landmarks``,
-        ``keyframes`` with observations, ``memory_mb``, and ``ate_percent`` of the row's frames where the
+        ``keyframes`` with observations, ``memory_mb`` and
+        ``bundle_memory_mb`` of the adjustments' process, and ``ate_percent`` of the row's frames where the
         recording has a truth; ``growth``: last row over the first of the second half.
 
     Raises:
@@ -110,9 +112,8 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
     rows: list[dict[str, Any]] = []
     times_ms: list[float] = []
     seen: list[tuple[int, int]] = []
-    reconstruction = Reconstruction(
-        sequence.intrinsics, settings.reconstruction, ProcessBundle(lossless=False)
-    )
+    bundle = ProcessBundle(lossless=False)
+    reconstruction = Reconstruction(sequence.intrinsics, settings.reconstruction, bundle)
     try:
         for k, index in enumerate(back_and_forth(len(frames), settings.frames)):
             since = time.perf_counter_ns()
@@ -120,12 +121,14 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
             times_ms.append((time.perf_counter_ns() - since) * 1e-6)
             seen.append((k, index))
             if (k + 1) % settings.every == 0:
-                rows.append(_row(reconstruction, times_ms, seen, frames, truth, interval_ns))
+                row = _row(reconstruction, times_ms, seen, frames, truth, interval_ns)
+                row["bundle_memory_mb"] = resident_mb(bundle.pid) if bundle.pid is not None else 0.0
+                rows.append(row)
                 times_ms, seen = [], []
     finally:
         reconstruction.close()
     middle, last = rows[len(rows) // 2], rows[-1]
-    keys = ("frame_ms_p50", "frame_ms_p95", "landmarks", "keyframes", "memory_mb")
+    keys = ("frame_ms_p50", "frame_ms_p95", "landmarks", "keyframes", "memory_mb", "bundle_memory_mb")
     report = json_ready(
         {
             **provenance(VERB, settings),

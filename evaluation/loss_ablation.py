@@ -47,7 +47,7 @@ _PIXEL_STEP, _CORNER_SHARE = 7, 0.05
 
 @torch.no_grad()
 def grade(model: Transceiver, images: list[NDArray[np.uint8]], sharpness: float) -> dict[str, float]:
-    """Send images over faded links at 6 dB and grade what arrives.
+    """Send images over links of 6 dB whose slots fade and sometimes are lost, and grade what arrives.
 
     Args:
         model: In evaluation mode.
@@ -128,14 +128,14 @@ def main() -> None:
     images = read_images(arguments.data / "valid")[:_VALID_IMAGES]
     results = run(settings, images)
     report = {
-        "command": f"make bench-loss DATA={arguments.data.name}",
+        "command": f"make bench-loss DATA={arguments.data.name} ARGS='--steps {arguments.steps}'",
         "commit": source_commit(),
         "seed": settings.seed,
         "machine": machine_kind(),
         "steps": arguments.steps,
         "batch": settings.batch,
         "descriptor_weight": _DESCRIPTOR,
-        "what": f"{len(images)} validation photos, 16-QAM, fading slots, {_SNR_DB:g} dB",
+        "what": f"{len(images)} validation photos, 16-QAM, fading and sometimes lost slots, {_SNR_DB:g} dB",
         "results": results,
     }
     write_json(arguments.json, json_ready(report))

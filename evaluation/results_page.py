@@ -5,7 +5,7 @@ pictures, ``<name>-*.png``, and by the command, commit and machine that made it.
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -151,6 +151,13 @@ def _runtime(report: Report) -> Iterator[str]:
     )
 
 
+def _sampled(rows: Sequence[Any], count: int) -> list[Any]:
+    """Return about so many of the rows, evenly spaced, the last one always."""
+    step = max(1, len(rows) // count)
+    chosen = sorted({*range(step - 1, len(rows), step), len(rows) - 1})
+    return [rows[k] for k in chosen]
+
+
 def _endurance(report: Report) -> Iterator[str]:
     body = [
         [
@@ -160,20 +167,18 @@ def _endurance(report: Report) -> Iterator[str]:
             number(row["frame_ms_p95"], 1),
             row["landmarks"],
             row["keyframes"],
-            number(row["memory_mb"], 0),
+            number(row["memory_mb"] + row["bundle_memory_mb"], 0),
             number(row.get("ate_percent")),
         ]
         for row in report["results"]
     ]
     head = ["frames", "posed", "p50 ms", "p95 ms", "landmarks", "keyframes", "memory MB", "ATE %"]
-    step = max(1, len(body) // 5)
-    yield from table(head, body[step - 1 :: step])
+    yield from table(head, _sampled(body, 5))
 
 
 def _training(report: Report) -> Iterator[str]:
     curve = report["curve"]
-    step = max(1, len(curve) // 8)
-    rows = [[r["step"], r["elapsed_s"], number(r["train_psnr_db"])] for r in curve[step - 1 :: step]]
+    rows = [[r["step"], r["elapsed_s"], number(r["train_psnr_db"])] for r in _sampled(curve, 8)]
     yield from table(["step", "seconds", "PSNR dB of training crops"], rows)
     yield f"\n{report['what'][0].upper()}{report['what'][1:]}."
 

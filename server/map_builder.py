@@ -46,7 +46,7 @@ class MapBuilder:
         self._version += 1
         self.world = WorldMap()
         self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
-        self.relocaliser = Relocaliser(self._camera, s.seed)
+        self.relocaliser = Relocaliser(self._camera, s.seed, s.max_features)
         self.submap = 0
         self.keyframe_covariance: Array | None = None
         self.num_inliers_at_keyframe = 0

@@ -18,7 +18,6 @@ from semcast.common.mailbox import Mailbox
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.phy.equaliser import equalise
-from semcast.common.phy.slots import layout_for
 from semcast.common.rate import belongs_to, slots_at
 from semcast.common.symbol_payload import lost_slots_of, slots_of
 from semcast.common.transport import Session
@@ -67,7 +66,7 @@ class ReceivedFrame:
         """``(num_slots,)`` effective SNR of each slot of the camera's grid, None when the frame was lost."""
         if self.received is None:
             return None
-        return slots_at(self.received.effective_snr_db, layout_for(self.camera.intrinsics.shape_hw).num_slots)
+        return slots_at(self.received.effective_snr_db, self.received.shape_hw[0], self.camera.image_wh[1])
 
 
 class Receiver:

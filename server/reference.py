@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.errors import ProtocolError, SourceError
+from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
-from semcast.common.messages import SourceImage
+from semcast.common.messages import CameraInfo, SourceImage
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
 from semcast.common.trajectory import Trajectory
-from semcast.common.wire import unpack
+from semcast.common.wire import WireError, unpack
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ class Reference:
         try:
             original = self._originals(frame_id)
             return psnr_db(original, x_hat) if original is not None else None
-        except (SourceError, ProtocolError, ValueError, IndexError) as err:
+        except (SourceError, ValueError, IndexError, cv2.error) as err:
             if not self._failed:
                 logger.warning("no PSNR: %s", err)
             self._failed = True
@@ -71,9 +71,9 @@ def sequence_reference(folder: Path, camera: Intrinsics) -> Reference:
     return Reference(lambda frame_id: sequence.image(frame_id, camera), sequence.groundtruth())
 
 
-def recording_reference(reader: RecordingReader, agent_epoch: int) -> Reference | None:
+def recording_reference(reader: RecordingReader, camera: CameraInfo) -> Reference | None:
     """Compare with the originals an agent shared (``--share-source``); None where the recording has none."""
-    images = _recorded_images(reader, agent_epoch)
+    images = _recorded_images(reader, camera)
     newest = next(images, None)
     if newest is None:
         return None
@@ -87,15 +87,20 @@ def recording_reference(reader: RecordingReader, agent_epoch: int) -> Reference 
     return Reference(original)
 
 
-def _recorded_images(reader: RecordingReader, agent_epoch: int) -> Iterator[SourceImage]:
+def _recorded_images(reader: RecordingReader, camera: CameraInfo) -> Iterator[SourceImage]:
+    """Yield the originals of a stream; what is no valid one is left out."""
     for message in reader.messages(frozenset({"source"})):
-        image = unpack(message.data, SourceImage)
-        if image.agent_epoch == agent_epoch:
+        try:
+            image = unpack(message.data, SourceImage)
+        except WireError:
+            continue
+        if image.agent_epoch == camera.agent_epoch and image.image_hw == camera.intrinsics.shape_hw:
             yield image
 
 
 def _pixels(image: SourceImage) -> NDArray[np.uint8]:
-    bgr = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    bgr = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags) if image.data else None
     if bgr is None:
         raise ValueError(f"the original of frame {image.frame_id} is no {image.image_format} image")
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

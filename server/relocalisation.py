@@ -18,9 +18,11 @@ Ids = NDArray[np.int64]
 
 #: Keyframes tried per frame; those not tried now get their turn on later frames.
 MAX_CANDIDATES = 4
-#: Agreeing matches that are worth a closer look, and agreeing landmarks that prove a place.
+#: Agreeing matches that are worth a closer look.
 _MIN_FIRST = 9
-MIN_INLIERS = 45
+#: Agreeing landmarks that prove a place, as a share of the keypoints followed at most, and its limits: fewer
+#: were found by chance where texture repeats.
+_MIN_INLIERS, _MAX_MIN_INLIERS, _MIN_INLIER_SHARE = 20, 45, 0.09
 #: Keyframes around the recognised one whose landmarks are looked for.
 _NEIGHBOURS = 5
 _SEARCH_ITERATIONS = 400
@@ -58,10 +60,12 @@ class Relocaliser:
     Args:
         camera: Pinhole.
         seed: Of the pose search.
+        max_features: Keypoints followed at most.
     """
 
-    def __init__(self, camera: Intrinsics, seed: int) -> None:
+    def __init__(self, camera: Intrinsics, seed: int, max_features: int) -> None:
         self._camera = camera
+        self._min_inliers = int(np.clip(_MIN_INLIER_SHARE * max_features, _MIN_INLIERS, _MAX_MIN_INLIERS))
         self._seed = seed
         self._describer = Describer()
         self._turn = 0
@@ -139,7 +143,7 @@ class Relocaliser:
         ids, known, points, expected = ids[in_view], known[in_view], points[in_view], expected[in_view]
         square = ((expected[:, None] - xy[None]) ** 2).sum(axis=2)
         point, row = np.nonzero(square < _GUIDED_RADIUS_PX**2)
-        if len(point) < MIN_INLIERS:
+        if len(point) < self._min_inliers:
             return None
         distance = hamming(known[point], descriptors[row])
         order = np.lexsort((row, distance, point))
@@ -147,11 +151,11 @@ class Relocaliser:
         best = order[first]
         best = best[distance[best] <= _GUIDED_MAX_BITS]
         point, row = point[best], row[best]
-        if len(point) < MIN_INLIERS:
+        if len(point) < self._min_inliers:
             return None
         sigma = np.full(len(point), sigma_px)
         refined = refine_pose(self._camera, T, points[point], xy[row], sigma, GATE_SIGMAS * sigma)
-        if refined.num_inliers < max(MIN_INLIERS, _MIN_GUIDED_SHARE * len(point)):
+        if refined.num_inliers < max(self._min_inliers, _MIN_GUIDED_SHARE * len(point)):
             return None
         good = refined.inliers
         return Place(
@@ -164,7 +168,7 @@ class Relocaliser:
 
     def _candidates(self, world: WorldMap, submaps: set[int] | None) -> list[Keyframe]:
         known = [k for k in world.keyframes if submaps is None or k.submap in submaps]
-        known = [k for k in known if len(k.descriptor_ids) >= MIN_INLIERS]
+        known = [k for k in known if len(k.descriptor_ids) >= _MIN_FIRST]
         newest, older = known[-2:], known[:-2]
         count = min(len(older), MAX_CANDIDATES - 2)
         turn = [older[-1 - (self._turn + k) % len(older)] for k in range(count)]

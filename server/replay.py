@@ -1,5 +1,6 @@
 """Replays a recording through the same decoder, tracker and outputs as the live server, without a network."""
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from semcast.common.keys import agent_of
 from semcast.common.messages import CameraInfo, SymbolFrame
 from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
+from semcast.common.rate import belongs_to
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.symbol_payload import data_symbols, lost_slots_of, slots_of
 from semcast.common.wire import unpack
@@ -28,6 +30,8 @@ from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Arrival, Outcome, Session, StreamIdentity
 from semcast.server.settings import ServerSettings, ViewSettings
 from semcast.server.viewer_choice import check_viewer, open_viewer
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +146,7 @@ def replay(
     reference = (
         sequence_reference(settings.reference, camera.intrinsics)
         if settings.reference is not None
-        else recording_reference(reader, camera.agent_epoch)
+        else recording_reference(reader, camera)
     )
     session = Session(server, identity, settings.out, reference)
     viewer = open_viewer(server, identity, reference.truth if reference is not None else None)
@@ -215,6 +219,14 @@ def _arrivals(
             or frame.agent_epoch != camera.agent_epoch
             or frame.frame_id <= last_id
         ):
+            continue
+        if frame.payload_format != "lost" and not belongs_to(frame.image_hw, camera.intrinsics.shape_hw):
+            logger.warning(
+                "frame %d of %s is left out: %s is no coded size of its camera",
+                frame.frame_id,
+                reader.path,
+                frame.image_hw,
+            )
             continue
         last_id = frame.frame_id
         first_ns = frame.t_source_ns if first_ns is None else first_ns

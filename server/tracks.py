@@ -194,6 +194,7 @@ class TrackTable:
         coasting = hidden & ~found.ok
         if found.ok.sum() < _MIN_FOUND_SHARE * max(1, count - int(hidden.sum())):
             jumped = self._jump(sight, found) if len(self._greys) else False
+            self._before = None  # a second look would be the same one
             coasting = self._hidden(sight, found, guess_xy) & ~found.ok if jumped else ~found.ok
         self._settle(sight, found, coasting)
         self.remember(sight)
@@ -215,12 +216,13 @@ class TrackTable:
         newest = self._greys.pop()
         found = _Found.nothing(self.xy)
         jumped = self._jump(sight, found)
+        hidden = self._hidden(sight, found, self.xy)
         self._greys.append(newest)
-        if not jumped:
+        if not jumped or found.ok.sum() <= (after["missed"] == 0).sum():
             for name, values in after.items():
                 setattr(self, name, values)
             return False
-        self._settle(sight, found, np.zeros(len(self), bool))
+        self._settle(sight, found, hidden & ~found.ok)
         return True
 
     def _hidden(self, sight: Sight, found: "_Found", guess_xy: Array) -> NDArray[np.bool_]:

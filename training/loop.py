@@ -33,6 +33,8 @@ from semcast.training.validation import validate
 logger = logging.getLogger(__name__)
 
 _VALID_IMAGES = 16
+#: Raised when the same weights mean another network.
+CHECKPOINT_FORMAT = 2
 #: Batches the means of hidden units are taken from, and a step no run gets to.
 _FOLD_BATCHES, _FOLD_STEP = 24, 2**40
 
@@ -114,6 +116,11 @@ class Run:
             raise CheckpointError(
                 f"checkpoint {self.checkpoint_path} can't be read: {type(err).__name__}"
             ) from err
+        if state.get("format") != CHECKPOINT_FORMAT:
+            raise CheckpointError(
+                f"checkpoint {self.checkpoint_path} must have format {CHECKPOINT_FORMAT}, got "
+                f"{state.get('format')}: the network has changed since"
+            )
         if state["architecture"] != self.settings.architecture:
             raise CheckpointError(
                 f"checkpoint {self.checkpoint_path} is of {state['architecture']}, "
@@ -145,6 +152,7 @@ class Run:
             return
         self.settings.out.mkdir(parents=True, exist_ok=True)
         state = {
+            "format": CHECKPOINT_FORMAT,
             "architecture": self.settings.architecture,
             "model": self.model.state_dict(),
             "average": self.average.state_dict(),

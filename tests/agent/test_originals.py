@@ -8,6 +8,7 @@ import pytest
 
 from semcast.agent.originals import OriginalSharer, source_image
 from semcast.agent.source import SourceFrame
+from semcast.common.errors import TransportError
 from semcast.common.keys import source_key
 from semcast.common.messages import SourceImage
 from semcast.common.metrics import Metrics
@@ -49,7 +50,7 @@ class SlowSession:
 
 def test_live_sharing_never_waits_and_counts_what_it_leaves_out():
     session, metrics = SlowSession(), Metrics("agent")
-    sharer = OriginalSharer(session, "agent0", 1, "jpeg", False, metrics)
+    sharer = OriginalSharer(session, "agent0", 1, "jpeg", False, metrics, threading.Event())
     for k in range(10):
         sharer.put(frame(k))
     session.go.set()
@@ -66,8 +67,46 @@ def test_live_sharing_never_waits_and_counts_what_it_leaves_out():
 def test_lossless_sharing_leaves_out_nothing():
     session, metrics = SlowSession(), Metrics("agent")
     session.go.set()
-    sharer = OriginalSharer(session, "agent0", 1, "jpeg", True, metrics)
+    sharer = OriginalSharer(session, "agent0", 1, "jpeg", True, metrics, threading.Event())
     for k in range(10):
         sharer.put(frame(k))
     sharer.close()
     assert (session.services, session.sent) == (["every"], list(range(10)))
+
+
+class BrokenSession(SlowSession):
+    """Its publisher fails."""
+
+    def put(self, payload):
+        raise TransportError("the session is closed")
+
+
+def test_a_sender_is_not_held_up_for_ever():
+    session, metrics, stop = SlowSession(), Metrics("agent"), threading.Event()
+    sharer = OriginalSharer(session, "agent0", 1, "jpeg", True, metrics, stop)
+    threading.Timer(0.3, stop.set).start()
+    for k in range(6):
+        sharer.put(frame(k))  # nothing is taken: only the stop lets the later ones through
+    session.go.set()
+    sharer.close()
+    assert session.sent[0] == 0
+
+    broken = OriginalSharer(BrokenSession(), "agent0", 1, "jpeg", True, metrics, threading.Event())
+    for k in range(6):
+        broken.put(frame(k))
+    broken.close()
+    assert metrics.status(1).last_error == "the session is closed"
+
+
+def test_a_frame_that_is_too_large_is_left_out(monkeypatch):
+    session, metrics = SlowSession(), Metrics("agent")
+    session.go.set()
+    monkeypatch.setattr(
+        "semcast.agent.originals.cv2.imencode", lambda *a: (True, np.zeros(17 * 1024**2, np.uint8))
+    )
+    sharer = OriginalSharer(session, "agent0", 1, "png", True, metrics, threading.Event())
+    sharer.put(frame(0))
+    sharer.put(frame(1))
+    sharer.close()
+    assert session.sent == []
+    assert metrics.summary()["drops"]["source_invalid"] == 2

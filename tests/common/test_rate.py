@@ -65,14 +65,32 @@ def test_displacement_grows_with_the_image_and_maps_get_its_size():
 
 def test_a_lost_slot_marks_every_band_it_touches():
     coded = np.array([10, 10, -20, 10], np.float32)  # the third quarter of the image
-    np.testing.assert_array_equal(slots_at(coded, 6), np.array([10, 10, 10, -20, -20, 10], np.float32))
-    np.testing.assert_array_equal(slots_at(coded, 8), np.repeat(coded, 2))
-    np.testing.assert_array_equal(slots_at(coded, 2), np.array([10, -20], np.float32))
-    assert slots_at(coded, 4) is coded
+    np.testing.assert_array_equal(slots_at(coded, 64, 96), np.array([10, 10, 10, -20, -20, 10], np.float32))
+    np.testing.assert_array_equal(slots_at(coded, 64, 128), np.repeat(coded, 2))
+    np.testing.assert_array_equal(slots_at(coded, 64, 32), np.array([10, -20], np.float32))
+    assert slots_at(coded, 64, 64) is coded
+
+
+@pytest.mark.parametrize("height", [90, 274, 370, 480])
+@pytest.mark.parametrize("rate", RATES)
+def test_no_row_of_a_lost_slot_looks_sound(height, rate):
+    coded_height = coded_shape((height, 900), rate)[0]
+    num_slots = layout_for((coded_height, 16)).num_slots
+    for lost in range(num_slots):
+        coded = np.where(np.arange(num_slots) == lost, -20.0, 10.0).astype(np.float32)
+        bands = slots_at(coded, coded_height, height)
+        assert len(bands) == layout_for((height, 16)).num_slots
+        # A row of the camera shows the coded rows it covers.
+        top = np.arange(height) * coded_height / height
+        bottom = (np.arange(height) + 1) * coded_height / height
+        touched = (bottom > 16 * lost + 1e-6) & (top < 16 * (lost + 1) - 1e-6)
+        marked = np.repeat(bands, 16)[:height] < 0
+        assert marked[touched].all()
+        assert marked.sum() <= touched.sum() + 32, "at most the bands at its edges are lost with it"
 
 
 def test_auto_spends_more_on_a_bad_link_and_does_not_flutter():
-    control = RateControl("auto")
+    control = RateControl("auto", (480, 640))
     assert control.choose(10.0) == "1/16"
     assert [control.choose(s) for s in (-10.0, 2.0, 30.0)] == ["1/8", "1/8", "1/48"]
     # 6 dB: 2.32 of 3.46 bits, so 1/10.7, between 1/12 and 1/8: either may stand.
@@ -80,9 +98,19 @@ def test_auto_spends_more_on_a_bad_link_and_does_not_flutter():
     for noise_db in np.linspace(-0.3, 0.3, 13):
         seen.add(control.choose(6.0 + float(noise_db)))
     assert len(seen) == 1
-    assert RateControl("1/24").choose(-10.0) == "1/24"
+    assert RateControl("1/24", (480, 640)).choose(-10.0) == "1/24"
     with pytest.raises(ValueError, match="rate must be auto or one of 1/48, .*, got '1/7'"):
-        RateControl("1/7")
+        RateControl("1/7", (480, 640))
+
+
+def test_rates_whose_frames_are_too_large_are_not_taken():
+    huge = (4000, 6000)
+    with pytest.raises(
+        ValueError, match=r"rate must be one of 1/48, .* for frames of \(4000, 6000\), got '1/8'"
+    ):
+        RateControl("1/8", huge)
+    control = RateControl("auto", huge)
+    assert uses_per_value(control.choose(-10.0)) < uses_per_value("1/8")
 
 
 def test_quality_rises_with_the_rate_under_one_set_of_weights():

@@ -4,9 +4,33 @@ from pathlib import Path
 
 import numpy as np
 
+from semcast.agent.originals import source_image
+from semcast.agent.source import SourceFrame
+from semcast.common.keys import source_key
+from semcast.common.messages import CameraInfo, SourceImage
+from semcast.common.recorder import Recorder
+from semcast.common.recording import recording_metadata
+from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
-from semcast.server.reference import sequence_reference
+from semcast.common.wire import pack
+from semcast.server.reference import recording_reference, sequence_reference
 
+CAMERA = CameraInfo(
+    agent_id="a",
+    agent_epoch=5,
+    fx=50.0,
+    fy=50.0,
+    cx=32.0,
+    cy=24.0,
+    image_wh=(64, 48),
+    nominal_rate_hz=1.0,
+    codec="x",
+    digest="",
+    modulation="16qam",
+    source_name="s",
+    num_frames=None,
+    lossless=False,
+)
 DEMO = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
 
 
@@ -30,3 +54,36 @@ def test_a_frame_without_original_has_no_psnr_and_is_reported_once(caplog):
         assert [reference.psnr_db(k, image).result(20) for k in (51, 52)] == [None, None]
     assert caplog.text.count("no PSNR") == 1
     reference.close()
+
+
+def write_originals(path, images):
+    """A recording whose agent shared these frames: id to bytes of the message, or an image."""
+    with Recorder(path, recording_metadata("", "0")) as recorder:
+        for frame_id, image in images:
+            data = image
+            if not isinstance(image, bytes):
+                frame = SourceFrame(
+                    frame_id=frame_id, t_source_ns=0, t_capture_ns=0, image=image, final=False
+                )
+                data = pack(source_image(frame, CAMERA.agent_epoch, "png"))
+            recorder.put(source_key("a"), "source", data)
+    return RecordingReader(path)
+
+
+def test_originals_in_a_recording_are_found_by_frame_and_bad_ones_are_left_out(tmp_path):
+    rng = np.random.default_rng(0)
+    one, three = rng.integers(0, 256, (2, 48, 64, 3), dtype=np.uint8)
+    other_size = np.zeros((24, 32, 3), np.uint8)
+    empty = SourceImage(agent_epoch=5, frame_id=4, image_hw=(48, 64), image_format="png", data=b"")
+    no_image = SourceImage(agent_epoch=5, frame_id=5, image_hw=(48, 64), image_format="png", data=b"x" * 99)
+    messages = [(0, b"junk"), (1, one), (2, other_size), (3, three), (4, pack(empty)), (5, pack(no_image))]
+    reference = recording_reference(write_originals(tmp_path / "r.mcap", messages), CAMERA)
+    found = [reference.psnr_db(k, one).result(20) for k in range(7)]
+    assert found[1] == 100.0
+    assert 5.0 < found[3] < 12.0
+    assert [found[k] for k in (0, 2, 4, 5, 6)] == [None] * 5
+    reference.close()
+
+
+def test_a_recording_without_originals_has_no_reference(tmp_path):
+    assert recording_reference(write_originals(tmp_path / "r.mcap", [(0, b"junk")]), CAMERA) is None

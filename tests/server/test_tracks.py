@@ -190,3 +190,16 @@ def test_a_second_look_starts_from_the_image_before():
     before = tracks.xy.copy()
     assert not tracks.follow_jump(sight), "only one second look at an image"
     np.testing.assert_array_equal(tracks.xy, before)
+
+
+def test_a_second_look_that_finds_less_changes_nothing():
+    tracks = begin()
+    lost = sight_at(24, lost=(0, 1, 2, 3, 4, 5))  # half of the image
+    tracks.follow(lost, tracks.xy - (4, 0))
+    coasting, visible = int((tracks.missed > 0).sum()), int(tracks.visible.sum())
+    assert coasting > 20
+    assert visible > 20
+    before = {name: getattr(tracks, name).copy() for name in ("ids", "xy", "missed")}
+    assert not tracks.follow_jump(lost)
+    for name, values in before.items():
+        np.testing.assert_array_equal(getattr(tracks, name), values)
