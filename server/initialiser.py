@@ -26,6 +26,8 @@ MAX_HISTORY = 300
 #: Keyframes of a new map at most.
 START_KEYFRAMES = 5
 MIN_POINTS = 40
+#: A start is better from so many points; fewer do when so many frames have waited for it.
+_PLENTY_OF_POINTS, _PATIENCE_FRAMES = 60, 12
 #: Share of the reference's tracks that must still be there; else the reference moves on.
 _MIN_SHARED = 0.12
 #: Median way of the tracks, as share of the image width, below which no start is tried.
@@ -109,7 +111,7 @@ class Initialiser:
         shared, row0, row1 = np.intersect1d(
             reference.ids, observed.ids, assume_unique=True, return_indices=True
         )
-        if len(shared) < MIN_POINTS:
+        if len(shared) < self._min_points():
             return None
         xy0, xy1 = reference.xy[row0], observed.xy[row1]
         flow_px = float(np.median(np.linalg.norm(xy1 - xy0, axis=1)))
@@ -133,8 +135,12 @@ class Initialiser:
             return None
         return self._build(found, shared[found.inliers], noise)
 
+    def _min_points(self) -> int:
+        """A start from a few points of a damaged image costs the whole map; waiting costs a few frames."""
+        return MIN_POINTS if len(self.history) >= _PATIENCE_FRAMES else _PLENTY_OF_POINTS
+
     def _is_good(self, found: TwoViewResult, num_shared: int) -> bool:
-        enough = int(found.inliers.sum()) >= max(MIN_POINTS, 0.5 * num_shared)
+        enough = int(found.inliers.sum()) >= max(self._min_points(), 0.5 * num_shared)
         return enough and found.model != "rotation" and found.parallax_deg > _MIN_MEDIAN_PARALLAX_DEG
 
     def _move_reference(self) -> None:
