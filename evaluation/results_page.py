@@ -246,13 +246,14 @@ def results_page(folder: Path = RESULTS) -> str:
 
 
 def readme_table(folder: Path = RESULTS) -> str:
-    """Return the README's short table: every trajectory cell of the default mode, one line each."""
+    """Return the README's short table: of every trajectory file the default mode at the lowest SNR."""
     rows = []
     for file in sorted(folder.glob("trajectory_*.json")):
         report = json.loads(file.read_text(encoding="utf-8"))
         channel = report["settings"]["link"]["channel"]
+        lowest_db = min((c["snr_db"] for c in report["cells"] if c["snr_db"] is not None), default=None)
         for cell in report["cells"]:
-            if cell["confidence"] == "robust":
+            if cell["confidence"] == "robust" and cell["snr_db"] == lowest_db:
                 link = "clean images" if cell["snr_db"] is None else f"{channel}, {cell['snr_db']:g} dB"
                 figures = (
                     number(cell["psnr_db"], 1),
