@@ -1,5 +1,6 @@
 """A trained transceiver behind the codec interface: numpy in, numpy out, on CPU or GPU."""
 
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -26,10 +27,18 @@ from semcast.common.shapes import check_shape
 
 #: No honest equaliser gives larger values; anything above is damage.
 _MAX_SYMBOL = 16.0
+#: Parts of the names of oneDNN's instruction sets that multiply bfloat16.
+_ISA_WITH_BFLOAT16 = ("BF16", "AMX", "FP16", "AVX10")
 
 
 def has_fast_bfloat16() -> bool:
-    """Tell whether this CPU multiplies bfloat16 in hardware (AVX512-BF16 or AMX)."""
+    """Tell whether this CPU multiplies bfloat16 in hardware (AVX512-BF16 or AMX), and oneDNN may use it.
+
+    Held to less by ``ONEDNN_MAX_CPU_ISA``, oneDNN would emulate it, far slower than float32.
+    """
+    allowed = os.environ.get("ONEDNN_MAX_CPU_ISA", os.environ.get("DNNL_MAX_CPU_ISA", "")).upper()
+    if allowed not in ("", "ALL", "DEFAULT") and not any(word in allowed for word in _ISA_WITH_BFLOAT16):
+        return False
     probe = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
     return bool(probe()) if probe is not None else False
 
