@@ -10,7 +10,7 @@ from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.codecs import Runtime
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import NetworkSettings
-from semcast.common.rate import NATIVE_RATE
+from semcast.common.rate import NATIVE_RATE, RateChoice
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class AgentSettings:
             "help": "SNR in dB to encode for in replay, and in live until the server reports the link's",
         },
     )
-    rate: Literal["auto", "1/48", "1/32", "1/24", "1/16", "1/12", "1/8"] = field(
+    rate: RateChoice = field(
         default=NATIVE_RATE,
         metadata={
             "help": "channel uses per pixel value; auto: fewer on a good link and more on a bad one, as the "

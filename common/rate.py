@@ -1,9 +1,9 @@
 """Channel uses per frame: one model serves several bandwidth ratios by the resolution at which it codes.
 
 The slot grid ties 48 channel uses to a block of 16x16 pixels, so a frame coded at ``sqrt(16 / n)`` of its
-size takes ``1/n`` complex uses per source value instead of 1/16. With the same weights this beats sending
-only the strongest latent channels by 0.8 to 1.0 dB (validation photographs, 10 dB SNR), reaches above 1/16
-too, and works for every codec. At 1/16 the image stays as it is.
+size takes ``1/n`` complex uses per source value instead of 1/16. With the same weights this was better than
+sending only the strongest directions of the latent, it reaches above 1/16 too, and works for every codec. At
+1/16 the image stays as it is.
 """
 
 import math
@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import DecodedImage, confidence_from_displacement_px, displacement_px
+from semcast.common.errors import ConfigError
 from semcast.common.messages import MAX_PAYLOAD_BYTES, MAX_SIDE_PX
 from semcast.common.phy.slots import BLOCK_PX, USES_PER_BLOCK, layout_for
 
 Rate = Literal["1/48", "1/32", "1/24", "1/16", "1/12", "1/8"]
+RateChoice = Literal["auto", Rate]
 RATES: tuple[Rate, ...] = get_args(Rate)
 NATIVE_RATE: Rate = "1/16"
 #: SNR at which ``RateControl`` takes the native rate.
@@ -114,16 +116,17 @@ class RateControl:
         shape_hw: Of the camera.
 
     Raises:
-        ValueError: There is no such rate, or frames of this size are too large for the protocol at it.
+        ValueError: There is no such rate.
+        ConfigError: Frames of this size are too large for the protocol at it.
     """
 
-    def __init__(self, rate: Rate | Literal["auto"], shape_hw: tuple[int, int]) -> None:
+    def __init__(self, rate: RateChoice, shape_hw: tuple[int, int]) -> None:
         if rate != "auto" and rate not in RATES:
             raise ValueError(f"rate must be auto or one of {', '.join(RATES)}, got {rate!r}")
         self._rates = [known for known in RATES if _can_be_sent(coded_shape(shape_hw, known))]
-        if rate not in ("auto", *self._rates):
+        if not self._rates or rate not in ("auto", *self._rates):
             allowed = ", ".join(self._rates) or "none"
-            raise ValueError(f"rate must be one of {allowed} for frames of {shape_hw}, got {rate!r}")
+            raise ConfigError(f"rate must be one of {allowed} for frames of {shape_hw}, got {rate!r}")
         self._fixed = None if rate == "auto" else rate
         self._rate: Rate = min(self._rates, key=lambda known: abs(_log_uses(known) - _log_uses(NATIVE_RATE)))
 

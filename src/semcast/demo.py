@@ -19,6 +19,7 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.network_settings import NetworkSettings
+from semcast.common.rate import NATIVE_RATE, RateChoice
 from semcast.common.sequence import open_sequence
 from semcast.common.transport import free_endpoint, open_session
 
@@ -47,8 +48,8 @@ class DemoSettings:
     )
     codec: str = field(default=DEFAULT_CODEC, metadata={"help": "codec by name, such as jpeg-ldpc"})
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
-    rate: Literal["auto", "1/48", "1/32", "1/24", "1/16", "1/12", "1/8"] = field(
-        default="1/16", metadata={"help": "channel uses per pixel value; auto: as the link needs"}
+    rate: RateChoice = field(
+        default=NATIVE_RATE, metadata={"help": "channel uses per pixel value; auto: as the link needs"}
     )
     snr_db: float = field(default=10.0, metadata={"help": "Es/N0 of the link in dB"})
     channel: str = field(

@@ -8,6 +8,7 @@ import pytest
 
 from semcast.common.codec import DecodedImage, displacement_px
 from semcast.common.codecs import load_codec
+from semcast.common.errors import ConfigError
 from semcast.common.image import psnr_db
 from semcast.common.phy.slots import layout_for
 from semcast.common.rate import (
@@ -106,9 +107,11 @@ def test_auto_spends_more_on_a_bad_link_and_does_not_flutter():
 def test_rates_whose_frames_are_too_large_are_not_taken():
     huge = (4000, 6000)
     with pytest.raises(
-        ValueError, match=r"rate must be one of 1/48, .* for frames of \(4000, 6000\), got '1/8'"
+        ConfigError, match=r"rate must be one of 1/48, .* for frames of \(4000, 6000\), got '1/8'"
     ):
         RateControl("1/8", huge)
+    with pytest.raises(ConfigError, match="rate must be one of none for frames of"):
+        RateControl("auto", (12000, 12000))
     control = RateControl("auto", huge)
     assert uses_per_value(control.choose(-10.0)) < uses_per_value("1/8")
 
