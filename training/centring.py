@@ -43,6 +43,37 @@ def centre_hidden(model: nn.Module) -> None:
         layer.register_forward_hook(_centre)
 
 
+def _means(model: nn.Module, run: Callable[[], object]) -> dict[nn.Conv2d, Tensor]:
+    """Mean over all batches of what each hidden layer adds to its bias."""
+    means: dict[nn.Conv2d, list[Tensor]] = {layer: [] for layer in hidden_layers(model)}
+
+    def note(layer: nn.Module, inputs: object, out: Tensor) -> None:
+        assert isinstance(layer, nn.Conv2d)
+        means[layer].append(_without_bias(layer, out))
+
+    # Before the centring hook, which a model in training has.
+    handles = [layer.register_forward_hook(note, prepend=True) for layer in means]
+    run()
+    for handle in handles:
+        handle.remove()
+    return {layer: torch.stack(seen).mean(dim=0) for layer, seen in means.items()}
+
+
+@torch.no_grad()
+def unfolded(model: M, run: Callable[[M], object]) -> M:
+    """Return a copy of a network without centring whose biases are those of a centred one; undoes ``folded``.
+
+    Args:
+        model: As it is shipped.
+        run: Runs many training images through the model it is given.
+    """
+    plain = copy.deepcopy(model).eval()
+    for layer, mean in _means(plain, lambda: run(plain)).items():
+        assert layer.bias is not None
+        layer.bias += mean
+    return plain
+
+
 @torch.no_grad()
 def folded(model: M, run: Callable[[M], object]) -> M:
     """Return a copy in evaluation mode that needs no centring: its biases hold the means.
@@ -52,18 +83,8 @@ def folded(model: M, run: Callable[[M], object]) -> M:
         run: Runs many training images through the model it is given.
     """
     plain = copy.deepcopy(model).train()
-    layers = hidden_layers(plain)
-    means: dict[nn.Module, list[Tensor]] = {layer: [] for layer in layers}
-
-    def note(layer: nn.Module, inputs: object, out: Tensor) -> None:
-        means[layer].append(_without_bias(layer, out))
-
-    for layer in layers:
-        # Before the centring hook, which the copy has from its original.
-        layer.register_forward_hook(note, prepend=True)
-    run(plain)
-    for layer in layers:
+    for layer, mean in _means(plain, lambda: run(plain)).items():
         layer._forward_hooks.clear()
         assert layer.bias is not None
-        layer.bias -= torch.stack(means[layer]).mean(dim=0)
+        layer.bias -= mean
     return plain.eval()

@@ -16,13 +16,14 @@ import torch
 import torch.distributed as dist
 
 from semcast.common.errors import CheckpointError
-from semcast.common.nets.checkpoint import save_transceiver
+from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS, channel_bandwidth_ratio
-from semcast.training.centring import centre_hidden, folded
+from semcast.training.centring import centre_hidden, folded, unfolded
 from semcast.training.channel import LinkDraw, draw_links, through_link
 from semcast.training.data import Batches, read_images
+from semcast.training.growing import grow
 from semcast.training.klt import start_from_klt
 from semcast.training.losses import transceiver_loss
 from semcast.training.masked import masked_image_loss
@@ -89,7 +90,10 @@ class Run:
         self.step, self.elapsed_s = 0, 0.0
         self.agreed_s = 0.0  # elapsed time all processes agree on, since the schedule depends on it
         checkpoint = self._read_checkpoint()
-        if checkpoint is None and settings.start == "klt":
+        if checkpoint is None and settings.grow_from is not None:
+            small, _ = load_transceiver(settings.grow_from)
+            grow(unfolded(small, self._pass_images), model)
+        elif checkpoint is None and settings.start == "klt":
             start_from_klt(model, self.images, torch.Generator().manual_seed(settings.seed))
         self.model = model.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         centre_hidden(self.model)
@@ -170,19 +174,22 @@ class Run:
         return plain
 
     def _pass_images(self, model: Transceiver) -> None:
-        """Run fresh crops through the whole link."""
+        """Run fresh crops, the same ones in every process, through the whole link."""
         settings = self.settings
+        crops = Batches(self.images, settings.crop, settings.batch, settings.seed)
+        device = next(model.parameters()).device
         blocks = settings.crop.size_px // BLOCK_PX
         generator = torch.Generator().manual_seed(settings.seed)
         for k in range(_FOLD_BATCHES):
-            x = self.batches.make(_FOLD_STEP + k).to(self.device).float() / 255.0
+            x = crops.make(_FOLD_STEP + k).to(device).float() / 255.0
             draw = draw_links(settings.channel, len(x), blocks, generator)
-            draw = LinkDraw(*(t.to(self.device) for t in vars(draw).values()))
+            draw = LinkDraw(*(t.to(device) for t in vars(draw).values()))
             noise = torch.randn((len(x), LATENT_CHANNELS, blocks, blocks), generator=generator)
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=settings.bf16):
+            with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
                 symbols = model.transmit(model.latent(x, draw.expected_snr_db, draw.is_qam), draw.is_qam)
-                y_rx, snr_db = through_link(symbols, draw, noise.to(self.device))
+                y_rx, snr_db = through_link(symbols, draw, noise.to(device))
                 model.receive(y_rx, snr_db, draw.is_qam)
+        crops.close()
 
     def export(self, valid: dict[str, float]) -> Path:
         """Write the averaged weights in half precision with their manifest."""
@@ -191,6 +198,8 @@ class Run:
         plain = json.loads(json.dumps(asdict(settings), default=str))
         for folder in ("data", "valid", "out"):
             plain.pop(folder)
+        if settings.grow_from is not None:
+            plain["grow_from"] = settings.grow_from.name
         save_transceiver(
             self.shippable(),
             weights,

@@ -38,6 +38,12 @@ class TrainSettings:
     clip: float = field(default=0.01, metadata={"help": "largest norm of the gradient"})
     ema: float = field(default=0.999, metadata={"help": "decay of the averaged weights that are shipped"})
     start: Literal["klt", "random"] = field(default="klt", metadata={"help": "linear layers at the start"})
+    grow_from: Path | None = field(
+        default=None,
+        metadata={
+            "help": "start as a trained network of the same kind and at most this size, a weights file"
+        },
+    )
     pretrain_share: float = field(
         default=0.0, metadata={"help": "first share of the run: fill in hidden patches, without a link (mae)"}
     )

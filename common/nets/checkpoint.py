@@ -15,7 +15,8 @@ from semcast.common.nets.registry import build, sizes_to_dict
 from semcast.common.nets.transceiver import Transceiver
 
 MAX_BYTES = 16 * 1024 * 1024
-FORMAT = 1
+#: Raised when keys of the manifest change, or when the same weights mean another network (2: leaky units).
+FORMAT = 2
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
