@@ -28,11 +28,13 @@ class DecodedArrival:
         arrival: As received.
         frame: Ready for the tracker; None when nothing arrived or nothing usable did.
         decode_ms: Duration of the decoder.
+        t_decoded_ns: Server clock (``perf_counter_ns``) when it was done.
     """
 
     arrival: ReceivedFrame
     frame: DecodedFrame | None
     decode_ms: float
+    t_decoded_ns: int
 
 
 class FrameDecoder:
@@ -102,14 +104,15 @@ class FrameDecoder:
         """
         message = arrival.message
         if arrival.received is None:
-            return DecodedArrival(arrival, None, 0.0)
+            return DecodedArrival(arrival, None, 0.0, time.perf_counter_ns())
         with self._lock:
             codec = self.codec_for(message.codec, message.modulation, message.digest)
             started_ns = time.perf_counter_ns()
             decoded = from_coded(codec.decode(arrival.received), arrival.camera.intrinsics.shape_hw)
-        decode_ms = (time.perf_counter_ns() - started_ns) * 1e-6
+        t_decoded_ns = time.perf_counter_ns()
+        decode_ms = (t_decoded_ns - started_ns) * 1e-6
         if decoded.outage:
-            return DecodedArrival(arrival, None, decode_ms)
+            return DecodedArrival(arrival, None, decode_ms, t_decoded_ns)
         frame = DecodedFrame(
             frame_id=message.frame_id,
             t_source_ns=message.t_source_ns,
@@ -118,4 +121,4 @@ class FrameDecoder:
             keypoint_confidence=decoded.keypoint_confidence,
             slot_snr_db=arrival.slot_snr_db,
         )
-        return DecodedArrival(arrival, frame, decode_ms)
+        return DecodedArrival(arrival, frame, decode_ms, t_decoded_ns)

@@ -1,4 +1,4 @@
-"""The start of a map: two views with parallax, the frames between them, and one adjustment of all.
+"""The start of a map: two views with parallax, the frames between them, and an adjustment of all.
 
 Standing still and turning on the spot give no depth; the start then waits. Frames that came before are kept,
 so that they get their poses as soon as there is a map.
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
+from semcast.server.bundle_problem import BundleProblem
 from semcast.server.pnp import refine_pose, search_pose
+from semcast.server.reversal import Side, decide
 from semcast.server.tracker import interpolate_pose
 from semcast.server.triangulation import Triangulation, triangulate
 from semcast.server.two_view import TwoViewResult, estimate_two_view
@@ -26,6 +28,11 @@ MAX_HISTORY = 300
 #: Keyframes of a new map at most.
 START_KEYFRAMES = 5
 MIN_POINTS = 40
+#: Two views of a scene with little perspective can't tell it from its mirror image in depth. They have to do
+#: where tracks don't last for three, which so many frames in vain have shown.
+_MIN_VIEWS, _FRAMES_IN_VAIN = 3, 4
+#: Points (the longest tracks) and steps for telling them apart.
+_MAX_DECIDING, _DECIDING_ITERATIONS = 150, 20
 #: A start is better from so many points; fewer do when so many frames have waited for it.
 _PLENTY_OF_POINTS, _PATIENCE_FRAMES = 60, 12
 #: Share of the reference's tracks that must still be there; else the reference moves on.
@@ -156,6 +163,8 @@ class Initialiser:
     def _build(self, found: TwoViewResult, ids: Ids, noise: NoiseModel) -> Start | None:
         """Triangulate, place the frames between, and triangulate again from all."""
         span = self.history[self._reference :]
+        if len(span) < _MIN_VIEWS and len(self.history) < _FRAMES_IN_VAIN:
+            return None
         first, last = span[0], span[-1]
         T_world = {0: np.eye(4), len(span) - 1: invert_transform(found.T_cam1_cam0)}
         points = self._triangulate([first, last], np.stack([np.eye(4), found.T_cam1_cam0]), ids, noise)
@@ -169,7 +178,11 @@ class Initialiser:
             if T_cam is not None:
                 T_world[k] = T_cam
         chosen = [span[k] for k in sorted(T_world)]
-        T_cam_world = invert_transform(np.stack([T_world[k] for k in sorted(T_world)]))
+        poses = np.stack([T_world[k] for k in sorted(T_world)])
+        side = self._decide(chosen, poses, noise)
+        if side is None:
+            return None
+        T_cam_world = invert_transform(side.T_world_cam)
         all_ids = np.unique(np.concatenate([o.ids for o in chosen]))
         points = self._triangulate(chosen, T_cam_world, all_ids, noise)
         good = self._passes(points, noise)
@@ -186,25 +199,44 @@ class Initialiser:
         mean = np.full(int(good.sum()), float(np.mean(np.concatenate(total))))
         return Start(keyframes, all_ids[good], scale * points.xyz[good], mean)
 
+    def _decide(self, views: list[Observed], T_world_cam: Array, noise: NoiseModel) -> Side | None:
+        """Adjust the start and its mirror image in depth; None while both fit the observations."""
+        all_ids, count = np.unique(np.concatenate([o.ids for o in views]), return_counts=True)
+        longest = np.lexsort((all_ids, -count))[:_MAX_DECIDING]
+        ids = np.sort(all_ids[longest[count[longest] >= 2]])
+        view, point, xy, sigma, confidence = _observations(views, ids, noise)
+        T_cam_world = invert_transform(T_world_cam)
+        points = triangulate(self._camera, T_cam_world, view, point, xy, sigma, len(ids))
+        if not points.in_front.any():
+            return None
+        # A point that fits nowhere begins at a usual depth: the other structure may have a place for it.
+        _, first = np.unique(point, return_index=True)
+        depth = float(np.median(points.xyz[points.in_front, 2]))
+        ray = self._camera.unproject(xy[first]) * depth
+        T = T_world_cam[view[first]]
+        along = np.einsum("pij,pj->pi", T[:, :3, :3], ray) + T[:, :3, 3]
+        problem = BundleProblem(
+            intrinsics=(self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy),
+            keyframe_ids=np.array([o.frame_id for o in views], dtype=np.int64),
+            T_world_cam=T_world_cam,
+            fixed=np.arange(len(views)) == 0,
+            keep_baseline=True,
+            landmark_ids=ids,
+            xyz=np.where(points.in_front[:, None], points.xyz, along),
+            view=view,
+            point=point,
+            xy=xy,
+            sigma_px=sigma,
+            confidence=confidence,
+            iterations=_DECIDING_ITERATIONS,
+        )
+        return decide(problem, at_last=len(self.history) >= _PATIENCE_FRAMES)
+
     def _triangulate(
         self, frames: list[Observed], T_cam_world: Array, ids: Ids, noise: NoiseModel
     ) -> Triangulation:
-        view, point, xy, sigma = [], [], [], []
-        for k, o in enumerate(frames):
-            _, row, row_o = np.intersect1d(ids, o.ids, assume_unique=True, return_indices=True)
-            view.append(np.full(len(row), k, np.intp))
-            point.append(row)
-            xy.append(o.xy[row_o])
-            sigma.append(noise.sigma_px(o.confidence[row_o]))
-        return triangulate(
-            self._camera,
-            T_cam_world,
-            np.concatenate(view),
-            np.concatenate(point),
-            np.concatenate(xy),
-            np.concatenate(sigma),
-            len(ids),
-        )
+        view, point, xy, sigma, _ = _observations(frames, ids, noise)
+        return triangulate(self._camera, T_cam_world, view, point, xy, sigma, len(ids))
 
     def _passes(self, points: Triangulation, noise: NoiseModel) -> NDArray[np.bool_]:
         return (
@@ -212,6 +244,21 @@ class Initialiser:
             & (points.parallax_deg > 0.5 * self._min_parallax_deg)
             & (points.error_sigma < 2.5)
         )
+
+
+def _observations(
+    frames: list[Observed], ids: Ids, noise: NoiseModel
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array, Array]:
+    """View, row into ``ids`` (ascending), pixel, sigma and confidence of all observations of ``ids``."""
+    view, point, xy, confidence = [], [], [], []
+    for k, o in enumerate(frames):
+        _, row, row_o = np.intersect1d(ids, o.ids, assume_unique=True, return_indices=True)
+        view.append(np.full(len(row), k, np.intp))
+        point.append(row.astype(np.intp))
+        xy.append(o.xy[row_o])
+        confidence.append(o.confidence[row_o])
+    total = np.concatenate(confidence)
+    return np.concatenate(view), np.concatenate(point), np.concatenate(xy), noise.sigma_px(total), total
 
 
 def _keyframe(o: Observed, T_world_cam: Array) -> Keyframe:

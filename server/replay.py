@@ -188,6 +188,7 @@ def _process(session: Session, decoded: DecodedArrival, drops: dict[str, int]) -
             snr_set_db=arrival.snr_db_set,
             snr_estimated_db=arrival.snr_db,
             t_arrival_ns=arrival.t_arrival_ns,
+            t_decoded_ns=decoded.t_decoded_ns,
             stage_ms={"decode": decoded.decode_ms},
             drops=drops,
         ),

@@ -270,6 +270,7 @@ class Server:
             snr_set_db=arrival.snr_db_set,
             snr_estimated_db=arrival.snr_db,
             t_arrival_ns=arrival.t_arrival_ns,
+            t_decoded_ns=decoded.t_decoded_ns,
             stage_ms={"equalise": arrival.equalise_ms, "decode": decoded.decode_ms},
             drops=self._metrics.drops,
         )

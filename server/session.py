@@ -86,6 +86,7 @@ class Arrival:
         snr_set_db: What the channel node says it applies, None where it says nothing.
         snr_estimated_db: What the receiver estimated.
         t_arrival_ns: Server clock (``perf_counter_ns``) when the frame arrived.
+        t_decoded_ns: The same when it was decoded; it may have waited for the tracker since.
         stage_ms: Stages before the tracker.
         drops: Frames that did not get this far, by reason, up to now.
     """
@@ -93,6 +94,7 @@ class Arrival:
     snr_set_db: float | None
     snr_estimated_db: float | None
     t_arrival_ns: int
+    t_decoded_ns: int
     stage_ms: Mapping[str, float]
     drops: Mapping[str, int]
 
@@ -209,7 +211,11 @@ class Session:
             psnr_db=psnr,
             confidence_mean=float(frame.confidence.mean()) if frame.confidence is not None else None,
             age_ms=(tracked_ns - arrival.t_arrival_ns) * 1e-6,
-            stage_ms={**arrival.stage_ms, **result.stage_ms},
+            stage_ms={
+                **arrival.stage_ms,
+                **result.stage_ms,
+                "decoded_to_pose": (tracked_ns - arrival.t_decoded_ns) * 1e-6,
+            },
         )
         self._record.add(row)
         if self._images is not None and (result.is_keyframe or self._settings.save_images == "all"):
