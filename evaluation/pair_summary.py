@@ -19,7 +19,9 @@ RIVAL = "poselib"
 PLAIN = "plain_ransac"
 #: The paper's claim is about links this bad.
 BAD_LINK_DB = 6.0
-_METHODS = ("plain_ransac", "opencv_ransac", "opencv_magsac", "poselib", "paper", "off", "robust")
+_METHODS = ("plain_ransac", "opencv_ransac", "opencv_magsac", "poselib", "paper", "off", "robust", "oracle")
+#: A cell is hard over a bad link where the rival is so far off.
+_HARD_DEG = 3.0
 _MISLEADING = ("constant", "shuffled", "inverted")
 
 
@@ -101,6 +103,20 @@ def _against_rival(cells: Sequence[Cell]) -> Iterator[str]:
         f"`{RIVAL}` and {_ratio(cells, 'robust', 'off'):.2f} times that of `off`; `paper` has "
         f"{_ratio(cells, 'paper', PLAIN):.2f} times that of `{PLAIN}`."
     )
+    hard = [c for c in cells if _is_hard(c)]
+    if hard:
+        ours, theirs, best = (_mean(c.mean(m) for c in hard) for m in ("robust", RIVAL, "oracle"))
+        yield (
+            f"In the {len(hard)} hard cells ({BAD_LINK_DB:g} dB and below, `{RIVAL}` {_HARD_DEG:g} degrees "
+            f"and more off) it has {_ratio(hard, 'robust', RIVAL):.2f} times the error of `{RIVAL}`, and "
+            f"`{RIVAL}` itself on the true inliers alone has {_ratio(hard, 'oracle', RIVAL):.2f} times it "
+            f"(`oracle`; means {number(ours, 1)}, {number(theirs, 1)} and {number(best, 1)} degrees)."
+        )
+
+
+def _is_hard(cell: Cell) -> bool:
+    rival = cell.mean(RIVAL)
+    return float(cell.values["snr_db"]) <= BAD_LINK_DB and rival is not None and rival >= _HARD_DEG
 
 
 def _against_plain(cells: Sequence[Cell]) -> Iterator[str]:

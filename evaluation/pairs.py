@@ -39,6 +39,7 @@ from semcast.evaluation.plots import plot_pair_errors
 from semcast.evaluation.pose_error import relative_pose_error
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.statistics import finite_mean, percentiles
+from semcast.server.agreement import neighbour_agreement
 from semcast.server.weighting import ConfidenceMode
 
 Array = NDArray[np.float64]
@@ -47,6 +48,8 @@ VERB = "eval pairs"
 #: Flags that have no meaning here.
 UNUSED_FIELDS = UNUSED_LINK_FIELDS
 _THINNING_STREAM = 0x7417
+#: PoseLib on the matches near their true epipolar lines: what no choice among matches can do better than.
+ORACLE = "oracle"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,9 +135,10 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
     Returns:
         Provenance and ``cells``, one per SNR, ``gap``, ``features`` and ``max_matches``: ``results`` (method
         -> ``rot_deg_mean``, ``rot_deg_median``, ``tdir_deg_mean``, ``tdir_deg_median``, ``auc5``, ``auc10``,
-        ``auc20``, ``num_failed`` and ``cpu_ms``, the processor time of the estimation), ``auroc`` (kind of
-        truth -> cue -> AUROC) with ``auroc_confidence`` for the codec's own confidence and epipolar truth,
-        and ``comparisons``: paired differences to ``off`` and the competitors with 95 % intervals.
+        ``auc20``, ``num_failed`` and ``cpu_ms``, the processor time of the estimation; ``oracle`` is PoseLib
+        on the true inliers alone), ``auroc`` (kind of truth -> cue -> AUROC) with ``auroc_confidence`` for
+        the codec's own confidence and epipolar truth, and ``comparisons``: paired differences to ``off`` and
+        the competitors with 95 % intervals.
         ``results``, ``auroc`` and ``auroc_confidence`` at the top level are over all cells together.
         A pair with a lost frame counts as failed under every method.
 
@@ -145,7 +149,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
     sequence, codec = open_stream(settings, codec)
     frame_ids = selected_frame_ids(sequence, settings)
     motions = {gap: true_motions(sequence, frame_ids, settings, gap) for gap in settings.gap}
-    methods = [*settings.confidence, *(COMPETITORS if settings.competitors else ())]
+    methods = [*settings.confidence, *((*COMPETITORS, ORACLE) if settings.competitors else ())]
     # Without a link the SNR changes nothing: one cell stands for all.
     snrs_db: tuple[float | None, ...] = settings.snr_db if codec is not None else (None,)
     variants = [
@@ -257,7 +261,8 @@ def _measure(
     for features in settings.features:
         if decoded0 is None or decoded1 is None:
             failed = relative_pose_error(None, pair.T_cam1_cam0)
-            lost = PairOutcome(dict.fromkeys(estimators, failed), {}, 0, {}, {})
+            names = [*estimators, *([ORACLE] if settings.competitors else [])]
+            lost = PairOutcome(dict.fromkeys(names, failed), {}, 0, {}, {})
             yield from ((_Variant(gap, features, count), lost) for count in settings.max_matches)
             continue
         found = match_pair(decoded0, decoded1, features, settings.max_features)
@@ -282,11 +287,16 @@ def _estimate(
     xy0, xy1 = matches.keypoints0_xy, matches.keypoints1_xy
     distance_px = epipolar_distance_px(xy0, xy1, pair.T_cam1_cam0, pair.camera)
     true_inlier = {"epipolar": distance_px < settings.inlier_px}
+    if settings.competitors:
+        right = matches.take(np.flatnonzero(true_inlier["epipolar"]))
+        T_oracle = competitor_estimator("poselib")(right, pair.camera, settings.threshold_px, seed)
+        errors[ORACLE] = relative_pose_error(T_oracle, pair.T_cam1_cam0)
     if matches.forward_backward_px is not None:
         error_px = track_error_px(xy0, xy1, pair.frame0.original, pair.frame1.original)
         true_inlier["track"] = error_px < settings.inlier_px
     geometric = match_confidence("robust", matches, seed).astype(np.float32)
-    cues = {**matches.cues, "geometric_confidence": geometric}
+    agreement = neighbour_agreement(xy0, xy1).astype(np.float32)
+    cues = {**matches.cues, "geometric_confidence": geometric, "neighbour_agreement": agreement}
     return PairOutcome(errors, cpu_ms, len(matches), cues, true_inlier)
 
 

@@ -41,9 +41,17 @@ def sampson_px(F: Array, keypoints0_xy: Array, keypoints1_xy: Array) -> Array:
     return np.asarray(algebraic / np.sqrt(np.maximum(square, 1e-18)))
 
 
-def msac_score(residual_px: Array, threshold_px: float) -> float:
-    """Mean truncated squared residual in units of the squared threshold: 0 is perfect, 1 is no inlier."""
-    return float(np.minimum(1.0, (residual_px / threshold_px) ** 2).mean()) if len(residual_px) else 1.0
+def msac_score(residual_px: Array, threshold_px: float, weight: Array | None = None) -> float:
+    """Mean truncated squared residual in units of the squared threshold: 0 is perfect, 1 is no inlier.
+
+    Args:
+        residual_px: ``(N,)``.
+        threshold_px: From which a residual counts in full.
+        weight: ``(N,)`` of the mean, None for equal ones.
+    """
+    if len(residual_px) == 0:
+        return 1.0
+    return float(np.average(np.minimum(1.0, (residual_px / threshold_px) ** 2), weights=weight))
 
 
 def depths(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> tuple[Array, Array]:

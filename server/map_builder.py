@@ -10,6 +10,7 @@ from semcast.common.geometry import invert_transform, make_transform
 from semcast.server import mapper
 from semcast.server.bundle_problem import BundleResult, BundleRunner
 from semcast.server.initialiser import Start
+from semcast.server.recall import SeenFrom, no_images
 from semcast.server.reconstruction_settings import ReconstructionSettings
 from semcast.server.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.tracks import Sight, TrackTable
@@ -50,6 +51,7 @@ class MapBuilder:
         self.submap = 0
         self.keyframe_covariance: Array | None = None
         self.num_inliers_at_keyframe = 0
+        self.images = no_images()
 
     def reference_keyframe(self) -> Keyframe | None:
         """Newest keyframe of the current submap."""
@@ -83,6 +85,7 @@ class MapBuilder:
             keyframe.submap = self.submap
             self.world.add_keyframe(keyframe)
         newest = start.keyframes[-1]
+        self.images.append(SeenFrom(newest.frame_id, sight.grey))
         newest.descriptor_ids, newest.descriptors = self.relocaliser.describe(
             sight.grey, newest.ids, newest.xy
         )
@@ -107,6 +110,7 @@ class MapBuilder:
         s, frame, world = self._settings, sight.frame, self.world
         visible = tracks.visible
         ids, xy = tracks.ids[visible], tracks.xy[visible]
+        self.images.append(SeenFrom(frame.frame_id, sight.grey))
         descriptor_ids, descriptors = self.relocaliser.describe(sight.grey, ids, xy)
         world.add_keyframe(
             Keyframe(

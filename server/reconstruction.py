@@ -15,6 +15,7 @@ from semcast.server.features import to_grey
 from semcast.server.initialiser import Initialiser, Observed, Start, pose_of
 from semcast.server.map_builder import MapBuilder
 from semcast.server.motion import ConstantVelocity
+from semcast.server.recall import recall_landmarks
 from semcast.server.reconstruction_settings import ReconstructionSettings
 from semcast.server.relocalisation import Place
 from semcast.server.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
@@ -34,6 +35,10 @@ _JOIN_INTERVAL = 3
 _START_LEVELS = 5
 #: Tracks a frame must have to count towards a new map.
 _MIN_TRACKS_TO_GIVE_UP = 50
+#: A pose that rests on fewer landmarks than this share of the tracks asks for more.
+_FEW_INLIERS_SHARE = 0.25
+#: How far from where they are expected lost landmarks are looked for, with a pose and with a prediction.
+_REACH_PX, _REACH_BLIND_PX = 6.0, 20.0
 #: Share of the landmarks in sight that must agree with a pose found without a prior.
 _MIN_SHARE_WHEN_LOST = 0.5
 
@@ -174,6 +179,7 @@ class Reconstruction:
         pose = self._pose(T_world_guess)
         if pose is None and self._tracks.follow_jump(sight):
             pose = self._pose(T_world_guess)
+        pose = self._with_more(sight, pose, T_world_guess)
         self._lap("pose", since)
         if pose is not None:
             return self._accept(sight, pose)
@@ -182,6 +188,26 @@ class Reconstruction:
         self._frames_lost = 0
         self._initialiser.clear()
         return self._find(sight)
+
+    def _with_more(
+        self, sight: Sight, pose: TrackedPose | None, T_world_guess: Array | None
+    ) -> TrackedPose | None:
+        """Look for landmarks that lost their track where a pose rests on few, and estimate it again."""
+        T_world_cam = T_world_guess if pose is None else pose.T_world_cam
+        few = _FEW_INLIERS_SHARE * self._settings.max_features
+        if T_world_cam is None or (pose is not None and pose.num_inliers >= few):
+            return pose
+        found = recall_landmarks(
+            self._camera,
+            self._map.world,
+            self._map.images,
+            self._tracks,
+            sight,
+            T_world_cam,
+            reach_px=_REACH_PX if pose is not None else _REACH_BLIND_PX,
+        )
+        again = self._pose(T_world_cam) if found else None
+        return pose if again is None else again
 
     def _accept(
         self, sight: Sight, pose: TrackedPose, backfilled: tuple[tuple[int, int, Array], ...] = ()

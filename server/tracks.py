@@ -263,6 +263,53 @@ class TrackTable:
         alive[ok] &= deduplicate(self.xy[ok])
         self.keep(alive)
 
+    def take_up(
+        self, sight: Sight, grey0: Grey, ids: Ids, xy0: Array, expected_xy: Array, reach_px: float
+    ) -> int:
+        """Bring tracks back that ended earlier, found from an older image.
+
+        Args:
+            sight: The newest image.
+            grey0: The older one.
+            ids: ``(N,)`` of the tracks, none of them alive.
+            xy0: ``(N, 2)`` where they are in ``grey0``.
+            expected_xy: ``(N, 2)`` where they should be now.
+            reach_px: A point further off is another one.
+
+        Returns:
+            How many were found.
+        """
+        points = track_points(grey0, sight.grey, xy0, expected_xy, max_level=1)
+        ok = points.ok & (np.linalg.norm(points.xy - expected_xy, axis=1) < reach_px)
+        ok &= ~sight.near_lost(points.xy, KLT_WINDOW_PX // 2 - 2)
+        xy = points.xy[ok]
+        taken = np.concatenate([self.xy[self.visible], xy])
+        ok[ok] = deduplicate(taken)[len(taken) - len(xy) :]
+        count = int(ok.sum())
+        if count == 0:
+            return 0
+        xy = points.xy[ok]
+        cues = self._cues(
+            sight, xy, points.forward_backward_px[ok], points.photometric_grey[ok], points.gradient_grey2[ok]
+        )
+        self.ids = np.concatenate([self.ids, ids[ok]])
+        self.xy = np.concatenate([self.xy, xy])
+        self.velocity = np.concatenate([self.velocity, self._usual_velocity(count)])
+        self.confidence = np.concatenate(
+            [self.confidence, observation_confidence(self._mode, cues, self._rng)]
+        )
+        self.age = np.concatenate([self.age, np.ones(count, np.int64)])
+        self.missed = np.concatenate([self.missed, np.zeros(count, np.int64)])
+        order = np.argsort(self.ids, kind="stable")
+        for name in _COLUMNS:
+            setattr(self, name, getattr(self, name)[order])
+        return count
+
+    def _usual_velocity(self, count: int) -> Array:
+        """Median velocity of the tracks in sight for ``count`` new ones, ``(count, 2)``."""
+        around = self.velocity[self.visible]
+        return np.tile(np.median(around, axis=0) if len(around) else np.zeros(2), (count, 1))
+
     def remember(self, sight: Sight) -> None:
         """Keep the image for tracks that are looked for in later ones."""
         self._greys = [*self._greys[-MAX_COAST:], sight.grey]
@@ -291,10 +338,8 @@ class TrackTable:
         cues = self._cues(sight, corners, np.full(count, 0.1), np.zeros(count), gradient)
         self.ids = np.concatenate([self.ids, self._next_id + np.arange(count, dtype=np.int64)])
         self._next_id += count
-        around = self.velocity[self.visible]
-        velocity = np.median(around, axis=0) if len(around) else np.zeros(2)
+        self.velocity = np.concatenate([self.velocity, self._usual_velocity(count)])
         self.xy = np.concatenate([self.xy, corners])
-        self.velocity = np.concatenate([self.velocity, np.tile(velocity, (count, 1))])
         self.confidence = np.concatenate(
             [self.confidence, observation_confidence(self._mode, cues, self._rng)]
         )

@@ -1,8 +1,9 @@
 """Relative pose of two images from matches.
 
-``robust``: PoseLib's LO-RANSAC twice, once drawing uniformly and once the trusted matches first, each at two
-thresholds, judged by a score that does not know confidence; then a refinement whose weights are fitted to
-this pair's own residuals. A misleading confidence can therefore cost time, hardly accuracy.
+``robust``: PoseLib's LO-RANSAC twice, once drawing uniformly from all matches and once the trusted ones first
+among those that move as their neighbours do, each at two thresholds. The poses are judged by a score that
+knows this agreement, but not confidence; then comes a refinement whose weights are fitted to this pair's own
+residuals. A misleading confidence can therefore cost time, hardly accuracy.
 """
 
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform, project_to_so3
+from semcast.server.agreement import neighbour_agreement
 from semcast.server.epipolar import (
     depths,
     fit_rotation,
@@ -34,6 +36,10 @@ MIN_MATCHES = 8
 #: Thresholds of the searches and of the score, in units of the one that is asked for.
 _THRESHOLD_FACTORS = (1.0, 2.0)
 _SCORE_FACTORS = (0.5, 1.0, 2.0, 4.0)
+#: A match that fewer of its neighbours agree with is left out of the second search and of the refinement.
+_MIN_AGREEMENT = 0.25
+#: Weight in the score against agreement: from the least at the first value to 1 at the second.
+_AGREEMENT_RANGE, _LEAST_WEIGHT = (0.1, 0.4), 0.05
 #: Points near the camera have larger errors and most of the information: the fitted beta overstates what
 #: confidence is worth, half of it does best.
 _BETA_SHARE = 0.5
@@ -49,7 +55,7 @@ class TwoViewResult:
     Attributes:
         T_cam1_cam0: ``(4, 4)``, translation of length 1 (of no meaning for ``rotation``).
         inliers: ``(N,)`` bool: near the epipolar geometry and in front of both cameras.
-        score: Confidence-free MSAC score of all matches, 0 is perfect.
+        score: Confidence-free MSAC score of all matches, weighted by agreement; 0 is perfect.
         model: ``rotation`` when turning alone explains the matches, ``homography`` when the pose came from
             one plane, else ``essential``.
         parallax_deg: Median angle between the rays of inliers.
@@ -82,8 +88,8 @@ def estimate_two_view(
         keypoints0_xy: ``(N, 2)`` pixels.
         keypoints1_xy: ``(N, 2)`` pixels, matched row by row.
         confidence: ``(N,)`` in [0, 1], from ``weighting``; None is the same as mode ``off``.
-        mode: ``paper`` is the paper's RANSAC; ``off`` searches uniformly alone; all others search in both
-            ways and refine with fitted weights.
+        mode: ``paper`` is the paper's RANSAC; ``off`` knows no confidence; all others search in both ways
+            and refine with fitted weights.
         threshold_px: Inlier threshold on the Sampson distance.
         seed: Of the searches.
         max_iterations: Hypotheses of one search at most.
@@ -103,37 +109,63 @@ def estimate_two_view(
             return None
         score = _score(camera, found.T_cam1_cam0, xy0, xy1, threshold_px)
         return _result(camera, found.T_cam1_cam0, xy0, xy1, threshold_px, score, choose_model)
-    informative = mode != "off" and confidence is not None and float(np.ptp(confidence)) > 1e-6
-    orders: list[NDArray[np.intp] | None] = [None]
-    if informative and confidence is not None:
-        orders.append(np.argsort(-confidence, kind="stable"))
-    budget = (seed, max_iterations, min_iterations)
+    if confidence is not None and (mode == "off" or float(np.ptp(confidence)) <= 1e-6):
+        confidence = None
+    agreement = neighbour_agreement(xy0, xy1)
+    kept = _kept(agreement)
+    low, high = _AGREEMENT_RANGE
+    weight = np.clip((agreement - low) / (high - low), _LEAST_WEIGHT, 1.0)
+    searches: list[tuple[NDArray[np.intp], bool]] = [(np.arange(len(xy0)), False)]
+    if confidence is not None:
+        searches.append((kept[np.argsort(-confidence[kept], kind="stable")], True))
+    elif len(kept) < len(xy0):
+        searches.append((kept, False))
     candidates = [
-        _search(camera, xy0, xy1, order, factor * threshold_px, *budget)
+        _search(
+            camera,
+            xy0[rows],
+            xy1[rows],
+            threshold_px=factor * threshold_px,
+            in_order=in_order,
+            seed=seed,
+            max_iterations=max_iterations,
+            min_iterations=min_iterations,
+        )
         for factor in _THRESHOLD_FACTORS
-        for order in orders
+        for rows, in_order in searches
     ]
     num_searched = len(candidates)
     if choose_model:
         candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
     scored = [
-        (_score(camera, turned, xy0, xy1, threshold_px), k, turned)
+        (_score(camera, turned, xy0, xy1, threshold_px, weight), k, turned)
         for k, T in enumerate(candidates)
         if T is not None
-        for turned in [in_front_sign(camera, T, xy0, xy1)]
+        for turned in [in_front_sign(camera, T, xy0[kept], xy1[kept])]
     ]
     if not scored:
         return None
     # A later candidate must be better by more than the score's own noise to displace the first.
     score, chosen, T = min(scored, key=lambda item: (item[0] * (1.0 if item[1] == 0 else 1.001), item[1]))
-    T = _refine(camera, T, xy0, xy1, confidence if informative else None, threshold_px)
+    trusted = None if confidence is None else confidence[kept]
+    T = _refine(camera, T, xy0[kept], xy1[kept], trusted, threshold_px)
     result = _result(camera, T, xy0, xy1, threshold_px, score, choose_model)
     if chosen >= num_searched and result.model == "essential":
         result = replace(result, model="homography")
     return result
 
 
-def _score(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float) -> float:
+def _kept(agreement: Array) -> NDArray[np.intp]:
+    """Matches that move like their neighbours; the better half where they are too few."""
+    kept = np.flatnonzero(agreement >= _MIN_AGREEMENT)
+    if len(kept) < MIN_MATCHES:
+        kept = np.sort(np.argsort(-agreement, kind="stable")[: max(MIN_MATCHES, len(agreement) // 2)])
+    return kept
+
+
+def _score(
+    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float, weight: Array | None = None
+) -> float:
     """MSAC score without confidence, in which a point clearly behind a camera is an outlier.
 
     It is the mean over several thresholds, because the noise of decoded images is not known beforehand.
@@ -141,7 +173,7 @@ def _score(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: f
     """
     residual = sampson_px(fundamental_matrix(camera, T), xy0, xy1)
     residual = np.where(_behind(camera, T, xy0, xy1, threshold_px), np.inf, residual)
-    return float(np.mean([msac_score(residual, factor * threshold_px) for factor in _SCORE_FACTORS]))
+    return float(np.mean([msac_score(residual, factor * threshold_px, weight) for factor in _SCORE_FACTORS]))
 
 
 def _behind(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float) -> NDArray[np.bool_]:
@@ -155,24 +187,24 @@ def _search(
     camera: Intrinsics,
     xy0: Array,
     xy1: Array,
-    order: NDArray[np.intp] | None,
+    *,
     threshold_px: float,
+    in_order: bool,
     seed: int,
     max_iterations: int,
     min_iterations: int,
 ) -> Array | None:
-    """PoseLib's LO-RANSAC; with an order its first matches are drawn first."""
+    """PoseLib's LO-RANSAC; in order, it draws the first matches first."""
     options = {
         "max_epipolar_error": threshold_px,
         "success_prob": 0.9999,
         "max_iterations": max_iterations,
         "min_iterations": min_iterations,
         "seed": seed,
-        "progressive_sampling": order is not None,
+        "progressive_sampling": in_order,
     }
     pinhole = poselib_camera(camera)
-    a, b = (xy0, xy1) if order is None else (xy0[order], xy1[order])
-    pose, info = poselib.estimate_relative_pose(a, b, pinhole, pinhole, options, {})
+    pose, info = poselib.estimate_relative_pose(xy0, xy1, pinhole, pinhole, options, {})
     t = np.asarray(pose.t, dtype=np.float64)
     length = float(np.linalg.norm(t))
     R = np.asarray(pose.R, dtype=np.float64)

@@ -28,7 +28,15 @@ def report(*cells):
     return {"sequence": "room", "settings": settings, "cells": list(cells)}
 
 
-ERRORS = {"plain_ransac": 20.0, "poselib": 8.0, "paper": 10.0, "off": 4.0, "robust": 4.0, "inverted": 6.0}
+ERRORS = {
+    "plain_ransac": 20.0,
+    "poselib": 8.0,
+    "paper": 10.0,
+    "off": 4.0,
+    "robust": 4.0,
+    "inverted": 6.0,
+    "oracle": 2.0,
+}
 
 
 def rows_of(text, first):
@@ -54,6 +62,7 @@ def test_figures_by_hand():
         "10.0",
         "4.0",
         "10.0",
+        "2.0",
         "1.00",
         "1",
         "1",
@@ -61,6 +70,9 @@ def test_figures_by_hand():
     # only the cell at 2 dB counts: 10 - 5 and 10 - 2 of rotation, 20 - 10 and 20 - 4 of direction
     assert gain == ["room, awgn; klt", "10.0", "+5.0", "+8.0", "20.0", "+10.0", "+16.0"]
     assert "`paper` has 0.50 times that of `plain_ransac`" in text
+    assert "In the 1 hard cells (6 dB and below" in text
+    assert "it has 0.50 times the error of `poselib`" in text
+    assert "on the true inliers alone has 0.25 times it" in text
     assert rows_of(text, "inverted") == [["inverted", "-2.0", "-2.0"]]
     assert rows_of(text, "robust") == [["robust", "-6.0", "-12.0"]]
     assert rows_of(text, "confidence |")[-1] == ["confidence", "0.25"]

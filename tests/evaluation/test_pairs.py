@@ -22,7 +22,7 @@ KEYS = {
     "num_failed",
     "cpu_ms",
 }
-METHODS = {"robust", "paper", "off", "plain_ransac", "opencv_ransac", "opencv_magsac", "poselib"}
+METHODS = {"robust", "paper", "off", "plain_ransac", "opencv_ransac", "opencv_magsac", "poselib", "oracle"}
 
 
 def settings(room, **values):

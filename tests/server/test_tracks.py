@@ -1,10 +1,16 @@
+"""Tracks from image to image, and landmarks that get their tracks back."""
+
 import cv2
 import numpy as np
 import pytest
 
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import make_transform
 from semcast.server.features import to_grey
+from semcast.server.recall import NUM_IMAGES, SeenFrom, no_images, recall_landmarks
 from semcast.server.state import DecodedFrame
 from semcast.server.tracks import MAX_COAST, Sight, TrackTable, usable_rows
+from semcast.server.world_map import Keyframe, WorldMap
 
 SHAPE = (192, 256)
 
@@ -203,3 +209,86 @@ def test_a_second_look_that_finds_less_changes_nothing():
     assert not tracks.follow_jump(lost)
     for name, values in before.items():
         np.testing.assert_array_equal(getattr(tracks, name), values)
+
+
+#: A wall at distance 1: moving by 1/200 moves the image by a pixel.
+CAMERA = Intrinsics(fx=200.0, fy=200.0, cx=128.0, cy=96.0, width=SHAPE[1], height=SHAPE[0])
+START_X = 20
+
+
+def pose_at(x):
+    return make_transform(np.eye(3), [(x - START_X) / 200.0, 0.0, 0.0])
+
+
+@pytest.fixture
+def mapped():
+    """A keyframe whose tracks are all landmarks, its image, and the tracks."""
+    tracks = begin(START_X)
+    world = WorldMap()
+    count = len(tracks)
+    world.add_keyframe(
+        Keyframe(
+            frame_id=0,
+            t_source_ns=0,
+            T_world_cam=pose_at(START_X),
+            submap=0,
+            ids=tracks.ids.copy(),
+            xy=tracks.xy.copy(),
+            confidence=tracks.confidence.copy(),
+            descriptor_ids=np.zeros(0, np.int64),
+            descriptors=np.zeros((0, 32), np.uint8),
+        )
+    )
+    xyz = CAMERA.unproject(tracks.xy)
+    world.add_landmarks(tracks.ids, xyz, np.zeros((count, 3), np.uint8), np.ones(count), 0, 0)
+    images = no_images()
+    images.append(SeenFrom(0, sight_at(START_X).grey))
+    return world, images, tracks
+
+
+def recall(mapped, sight, x, reach_px=6.0):
+    world, images, tracks = mapped
+    return recall_landmarks(CAMERA, world, images, tracks, sight, pose_at(x), reach_px=reach_px)
+
+
+def test_lost_landmarks_get_their_tracks_back(mapped):
+    _, _, tracks = mapped
+    ids, xy = tracks.ids.copy(), tracks.xy.copy()
+    tracks.keep(np.arange(len(tracks)) % 4 == 0)
+    kept = tracks.ids.copy()
+    sight = sight_at(30, frame_id=1)
+    tracks.follow(sight, tracks.xy - (10, 0))
+    found = recall(mapped, sight, 30)
+    assert found > 0.5 * (len(ids) - len(kept))
+    assert np.all(np.diff(tracks.ids) > 0)
+    back = ~np.isin(tracks.ids, kept)
+    assert back.sum() == found
+    where = xy[np.searchsorted(ids, tracks.ids[back])] - (10, 0)
+    assert np.abs(tracks.xy[back] - where).max() < 1.0
+    assert recall(mapped, sight, 30) == 0, "those found have a track now"
+
+
+def test_a_wrong_pose_finds_next_to_nothing(mapped):
+    _, _, tracks = mapped
+    count = len(tracks)
+    tracks.keep(np.zeros(count, bool))
+    sight = sight_at(30, frame_id=1)
+    assert recall(mapped, sight, 75) < 0.05 * count
+
+
+def test_nothing_is_found_where_nothing_arrived(mapped):
+    world, _, tracks = mapped
+    tracks.keep(np.zeros(len(tracks), bool))
+    sight = sight_at(24, frame_id=1, lost=(3, 4, 5, 6))
+    assert recall(mapped, sight, 24) > 0
+    assert not np.any((tracks.xy[:, 1] > 48) & (tracks.xy[:, 1] < 112))
+    tracks.keep(np.zeros(len(tracks), bool))
+    world.landmarks.keep(np.zeros(len(world.landmarks), bool))
+    assert recall(mapped, sight_at(24, frame_id=2), 24) == 0
+
+
+def test_old_images_are_forgotten():
+    images = no_images()
+    for k in range(NUM_IMAGES + 2):
+        images.append(SeenFrom(k, np.zeros((2, 2), np.uint8)))
+    assert [i.frame_id for i in images] == [2, 3, 4]
