@@ -12,6 +12,7 @@ from typing import Any
 from semcast.evaluation.markdown import number, table, with_part
 from semcast.evaluation.pair_summary import RIVAL, pair_summary
 from semcast.evaluation.plots import variant_name
+from semcast.evaluation.trajectory_summary import trajectory_summary
 
 RESULTS = Path("evaluation/results")
 PAGE = Path("docs/results.md")
@@ -266,9 +267,15 @@ def readme_table(folder: Path = RESULTS) -> str:
 
 
 def confidence_part(folder: Path = RESULTS) -> str:
-    """Return the generated part of the page on confidence."""
+    """Return the part of the page on confidence that is about pairs."""
     files = sorted(folder.glob("pairs_*.json"))
     return pair_summary(json.loads(file.read_text(encoding="utf-8")) for file in files)
+
+
+def trajectory_part(folder: Path = RESULTS) -> str:
+    """Return the part of the page on confidence that is about trajectories."""
+    files = sorted(folder.glob("trajectory_*.json"))
+    return trajectory_summary(json.loads(file.read_text(encoding="utf-8")) for file in files)
 
 
 if __name__ == "__main__":
@@ -276,5 +283,6 @@ if __name__ == "__main__":
     for page, name, part in (
         (README, "results", readme_table()),
         (CONFIDENCE_PAGE, "pairs", confidence_part()),
+        (CONFIDENCE_PAGE, "trajectories", trajectory_part()),
     ):
         page.write_text(with_part(page.read_text(encoding="utf-8"), name, part), encoding="utf-8")
