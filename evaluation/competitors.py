@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
-from semcast.server.ransac import confidence_ransac
+from semcast.server.geometry.ransac import confidence_ransac
 
 Array = NDArray[np.float64]
 

@@ -27,11 +27,11 @@ from semcast.evaluation.pipeline import (
 )
 from semcast.evaluation.reconstruct import as_received
 from semcast.evaluation.report import json_ready, provenance, write_json
-from semcast.server.bundle_process import ProcessBundle
-from semcast.server.export import trajectory_of
-from semcast.server.reconstruction import Reconstruction
-from semcast.server.reconstruction_settings import ReconstructionSettings
-from semcast.server.state import DecodedFrame
+from semcast.server.export.outputs import trajectory_of
+from semcast.server.mapping.bundle_process import ProcessBundle
+from semcast.server.mapping.reconstruction import Reconstruction
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.state import DecodedFrame
 
 VERB = "eval endurance"
 #: One run; its seed is also that of the search.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import DecodedImage
-from semcast.server.features import (
+from semcast.server.geometry.features import (
     corner_strength,
     deduplicate,
     detect_corners,
@@ -16,7 +16,7 @@ from semcast.server.features import (
     to_grey,
     track_points,
 )
-from semcast.server.weighting import fuse_confidence
+from semcast.server.geometry.weighting import fuse_confidence
 
 Array = NDArray[np.float64]
 Features = Literal["klt", "orb", "sift"]

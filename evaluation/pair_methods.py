@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.evaluation.competitors import COMPETITORS, CompetitorSettings
 from semcast.evaluation.pair_matches import PairMatches
-from semcast.server.two_view import estimate_two_view
-from semcast.server.weighting import (
+from semcast.server.geometry.two_view import estimate_two_view
+from semcast.server.geometry.weighting import (
     ConfidenceMode,
     KeypointCues,
     fuse_confidence,

@@ -13,7 +13,7 @@ from typing import Any
 from semcast.channel.settings import ChannelName, ChannelSettings
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.pairs import PairSettings, evaluate_pairs
-from semcast.server.weighting import ConfidenceMode
+from semcast.server.geometry.weighting import ConfidenceMode
 
 RESULTS = Path("evaluation/results")
 _ALL_MODES: tuple[ConfidenceMode, ...] = ("robust", "paper", "off", "constant", "shuffled", "inverted")

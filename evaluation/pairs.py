@@ -39,8 +39,8 @@ from semcast.evaluation.plots import plot_pair_errors
 from semcast.evaluation.pose_error import relative_pose_error
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.statistics import finite_mean, percentiles
-from semcast.server.agreement import neighbour_agreement
-from semcast.server.weighting import ConfidenceMode
+from semcast.server.geometry.agreement import neighbour_agreement
+from semcast.server.geometry.weighting import ConfidenceMode
 
 Array = NDArray[np.float64]
 

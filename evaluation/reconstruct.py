@@ -12,13 +12,13 @@ from semcast.common.image import psnr_db
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import ate, match_times
 from semcast.evaluation.pipeline import LinkedFrame
-from semcast.server.bundle import InlineBundle
-from semcast.server.bundle_problem import BundleProblem
-from semcast.server.export import trajectory_of
-from semcast.server.reconstruction import Reconstruction
-from semcast.server.reconstruction_settings import ReconstructionSettings
+from semcast.server.export.outputs import trajectory_of
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.reconstruction import Reconstruction
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
 from semcast.server.run_record import FrameRow, summarise
-from semcast.server.state import DecodedFrame, FrameResult, MapUpdate
 
 #: Called after each processed frame; may add stages of its own to the row's ``stage_ms``.
 FrameHook = Callable[[DecodedFrame, FrameResult, FrameRow, MapUpdate | None], None]

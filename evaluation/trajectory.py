@@ -23,8 +23,8 @@ from semcast.evaluation.plots import plot_top_view
 from semcast.evaluation.reconstruct import ReconstructedRun, reconstruct
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.statistics import paired_bootstrap
-from semcast.server.reconstruction_settings import ReconstructionSettings
-from semcast.server.weighting import ConfidenceMode
+from semcast.server.geometry.weighting import ConfidenceMode
+from semcast.server.mapping.settings import ReconstructionSettings
 
 VERB = "eval trajectory"
 #: Flags that this verb sets itself: the mode is a list here, the seed is that of the run.

@@ -12,8 +12,8 @@ from semcast.common.codec import LOST_SLOT_SNR_DB, Codec, Modulation, ReceivedIm
 from semcast.common.errors import CheckpointError
 from semcast.common.phy.slots import layout_for
 from semcast.common.rate import from_coded
+from semcast.server.mapping.state import DecodedFrame
 from semcast.server.receiver import ReceivedFrame
-from semcast.server.state import DecodedFrame
 
 logger = logging.getLogger(__name__)
 

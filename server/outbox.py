@@ -13,8 +13,8 @@ from semcast.common.messages import MapMessage, PoseMessage
 from semcast.common.metrics import Metrics
 from semcast.common.transport import Publisher, Session
 from semcast.common.wire import pack
+from semcast.server.mapping.state import FrameResult, MapUpdate
 from semcast.server.receiver import ReceivedFrame
-from semcast.server.state import FrameResult, MapUpdate
 
 logger = logging.getLogger(__name__)
 

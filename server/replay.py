@@ -24,12 +24,12 @@ from semcast.common.recording_reader import RecordingReader
 from semcast.common.symbol_payload import data_symbols, lost_slots_of, slots_of
 from semcast.common.wire import unpack
 from semcast.server.decoder import DecodedArrival, FrameDecoder
+from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.receiver import ReceivedFrame
-from semcast.server.reconstruction_settings import ReconstructionSettings
 from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Arrival, Outcome, Session, StreamIdentity
 from semcast.server.settings import ServerSettings, ViewSettings
-from semcast.server.viewer_choice import check_viewer, open_viewer
+from semcast.server.view.choice import check_viewer, open_viewer
 
 logger = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ import numpy as np
 from semcast.common.errors import SemcastError
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
-from semcast.server.export import percentiles, plain
+from semcast.server.export.outputs import percentiles, plain
 
 logger = logging.getLogger(__name__)
 

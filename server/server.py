@@ -20,19 +20,19 @@ from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
 from semcast.common.transport import open_session
 from semcast.common.wire import WireError, pack, unpack
-from semcast.server.bundle_problem import BundleRunner
 from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import DecodedArrival, FrameDecoder
+from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.outbox import Outbox
 from semcast.server.receiver import ReceivedFrame, Receiver
 from semcast.server.record import recording
 from semcast.server.reference import Reference, sequence_reference
 from semcast.server.session import Arrival, Outcome, Session, StreamIdentity, new_bundle
 from semcast.server.settings import ServerSettings
-from semcast.server.viewer_choice import check_viewer, open_viewer
+from semcast.server.view.choice import check_viewer, open_viewer
 
 if TYPE_CHECKING:  # Rerun is imported only when something is shown or recorded
-    from semcast.server.viewer_feed import ViewerFeed
+    from semcast.server.view.feed import ViewerFeed
 
 logger = logging.getLogger(__name__)
 

@@ -28,9 +28,6 @@ from semcast.common.run_folder import (
     write_run,
 )
 from semcast.common.trajectory import Trajectory, write_tum
-from semcast.server.bundle import InlineBundle
-from semcast.server.bundle_problem import BundleRunner
-from semcast.server.bundle_process import ProcessBundle
 from semcast.server.checkpoint import (
     Checkpoint,
     CheckpointHeader,
@@ -38,13 +35,16 @@ from semcast.server.checkpoint import (
     load_checkpoint,
     mismatch,
 )
-from semcast.server.export import trajectory_of, versions, write_json, write_ply
-from semcast.server.reconstruction import Reconstruction
+from semcast.server.export.outputs import trajectory_of, versions, write_json, write_ply
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.bundle_problem import BundleRunner
+from semcast.server.mapping.bundle_process import ProcessBundle
+from semcast.server.mapping.reconstruction import Reconstruction
+from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
 from semcast.server.reference import Reference
 from semcast.server.run_record import FrameRow, RunRecord, summarise
-from semcast.server.scene import FrameView
 from semcast.server.settings import ServerSettings
-from semcast.server.state import DecodedFrame, FrameResult, MapUpdate
+from semcast.server.view.scene import FrameView
 
 logger = logging.getLogger(__name__)
 

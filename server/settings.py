@@ -7,7 +7,7 @@ from typing import Literal
 from semcast.common.codec import Modulation
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import HubSettings
-from semcast.server.reconstruction_settings import ReconstructionSettings
+from semcast.server.mapping.settings import ReconstructionSettings
 
 View = Literal["auto", "native", "web", "file", "none"]
 

@@ -19,8 +19,8 @@ MAY_IMPORT = {
 HOMES = {
     "zenoh": {"common/transport.py"},
     "msgpack": {"common/wire.py"},
-    "gtsam": {"server/bundle.py"},
-    "rerun": {"server/viewer.py"},
+    "gtsam": {"server/mapping/bundle.py"},
+    "rerun": {"server/view/rerun_viewer.py"},
     "mcap": {"common/recording.py"},
     "onnxruntime": {"common/nets/onnx_encoder.py"},
     "onnx": {"training/onnx_export.py"},

@@ -14,7 +14,7 @@ from semcast.evaluation.pair_methods import (
     match_confidence,
 )
 from semcast.evaluation.pose_error import relative_pose_error
-from semcast.server.weighting import KeypointCues, geometric_confidence
+from semcast.server.geometry.weighting import KeypointCues, geometric_confidence
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
 T_CAM1_CAM0 = make_transform(exp_so3([0.02, 0.05, -0.01]), [0.5, 0.1, 0.05])

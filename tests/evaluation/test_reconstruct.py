@@ -5,7 +5,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.pipeline import FrameRun
 from semcast.evaluation.reconstruct import cut_to_frames, reconstruct, split_bundle
-from semcast.server.reconstruction_settings import ReconstructionSettings
+from semcast.server.mapping.settings import ReconstructionSettings
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 from semcast.common.errors import SemcastError
 from semcast.common.trajectory import Trajectory
-from semcast.server.export import write_json
+from semcast.server.export.outputs import write_json
 from semcast.server.run_record import FILE_NAME, FrameRow, RunRecord, read_rows, summarise, unposed_ranges
 
 

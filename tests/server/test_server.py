@@ -29,10 +29,10 @@ from semcast.common.symbol_payload import pack_iq, pack_lost
 from semcast.common.trajectory import read_tum
 from semcast.common.transport import open_client, open_hub
 from semcast.common.wire import pack, unpack
-from semcast.server.export import read_ply
+from semcast.server.export.outputs import read_ply
 from semcast.server.server import Server
 from semcast.server.settings import ServerSettings, ViewSettings
-from semcast.server.viewer_choice import keep_former
+from semcast.server.view.choice import keep_former
 
 DEMO = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
 RESIZE = 0.5

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write the export and name its files on stdout."""
     from semcast.common.run_folder import read_run
-    from semcast.server.export_run import export_run
+    from semcast.server.export.formats import export_run
 
     files = export_run(arguments.run, arguments.format, arguments.out)
     data = read_run(arguments.run)

@@ -1,0 +1,1 @@
+"""What a run leaves behind, and its forms for other tools."""

@@ -1,0 +1,70 @@
+"""Exports of a run folder by format name."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from semcast.common.errors import SemcastError, SourceError
+from semcast.common.run_folder import RunData, read_image_paths, read_run
+from semcast.server.export.colmap import write_colmap
+from semcast.server.export.nerfstudio import write_nerfstudio
+from semcast.server.export.outputs import write_ply
+from semcast.server.export.poses import write_run_kitti, write_run_tum
+
+#: Format -> what is written where, for the help.
+FORMATS = {
+    "tum": "FILE with 't tx ty tz qx qy qz qw' (evo)",
+    "kitti": "FILE with 3x4 poses, times and frame ids beside it (evo)",
+    "ply": "FILE with the points (CloudCompare, MeshLab, Open3D)",
+    "colmap": "FOLDER with sparse/0/*.txt and images/ (COLMAP, pycolmap)",
+    "nerfstudio": "FOLDER with transforms.json, points and images/ (nerfstudio, gsplat)",
+    "rrd": "FILE for the Rerun viewer",
+}
+
+
+def export_run(folder: Path, format_name: str, out: Path) -> list[Path]:
+    """Write a run in another tool's format; returns the files a person opens.
+
+    Args:
+        folder: A run folder.
+        format_name: One of ``FORMATS``.
+        out: File or folder, as ``FORMATS`` says.
+
+    Raises:
+        SourceError: The run can't be read, or lacks what the format needs.
+        SemcastError: ``out`` can't be written.
+    """
+    if format_name not in FORMATS:
+        raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {format_name!r}")
+    data = read_run(folder)
+    if len(data.frame_ids) == 0:
+        raise SourceError(f"{folder} has no posed frame, so there is nothing to export")
+    images = read_image_paths(folder)
+    if FORMATS[format_name].startswith("FILE") and out.is_dir():
+        raise SourceError(f"{out} is a folder; --format {format_name} writes a file")
+    if FORMATS[format_name].startswith("FOLDER") and out.is_file():
+        raise SourceError(f"{out} is a file; --format {format_name} writes a folder")
+    writers: dict[str, Callable[[], list[Path]]] = {
+        "tum": lambda: write_run_tum(out, data),
+        "kitti": lambda: write_run_kitti(out, data),
+        "ply": lambda: _write_run_ply(out, data),
+        "colmap": lambda: write_colmap(out, data, images),
+        "nerfstudio": lambda: write_nerfstudio(out, data, images),
+        "rrd": lambda: _write_run_rrd(out, folder, data, images),
+    }
+    try:
+        return writers[format_name]()
+    except (OSError, shutil.Error) as err:
+        raise SemcastError(f"{out} can't be written: {err}") from err
+
+
+def _write_run_ply(path: Path, data: RunData) -> list[Path]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_ply(path, data.xyz, data.rgb, data.confidence)
+    return [path]
+
+
+def _write_run_rrd(path: Path, folder: Path, data: RunData, images: dict[int, Path]) -> list[Path]:
+    from semcast.server.export.rrd import write_rrd  # loads rerun
+
+    return write_rrd(path, folder, data, images)

@@ -1,0 +1,71 @@
+"""``transforms.json`` as nerfstudio and gsplat read it: camera-to-world poses in OpenGL axes, points as PLY.
+
+nerfstudio's camera looks along -z with y up, and its world has z up
+(https://docs.nerf.studio/quickstart/data_conventions.html). Its pixel centres are at half integers.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from semcast.common.errors import SourceError
+from semcast.common.geometry import transform_points
+from semcast.common.run_folder import RunData, image_name
+from semcast.server.export.colmap import PIXEL_CENTRE, copy_images
+from semcast.server.export.outputs import write_ply
+
+#: OpenCV camera axes (x right, y down, z forward) in OpenGL ones (x right, y up, z backward).
+R_opencv_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
+#: Our world (first camera: y down, z forward) in a world with z up: x stays, forward becomes y.
+T_up_world = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+def write_nerfstudio(folder: Path, data: RunData, images: Mapping[int, Path]) -> list[Path]:
+    """Write ``transforms.json``, ``points3D.ply`` and ``images/`` of all posed frames whose image was kept.
+
+    Poses and points are in the world with z up; ``applied_transform`` says how it came from ours.
+
+    Raises:
+        SourceError: The run kept no images.
+    """
+    frame_ids = [k for k in data.frame_ids.tolist() if k in images]
+    if not frame_ids:
+        raise SourceError("the run kept no images, and nerfstudio needs them; run again with --save-images")
+    folder.mkdir(parents=True, exist_ok=True)
+    copy_images(images, frame_ids, folder / "images")
+    c = data.intrinsics
+    row_of = {frame_id: k for k, frame_id in enumerate(data.frame_ids.tolist())}
+    frames = []
+    for frame_id in frame_ids:
+        T_up_opengl = T_up_world @ data.T_world_cam[row_of[frame_id]] @ R_opencv_opengl
+        frames.append(
+            {"file_path": f"images/{image_name(frame_id)}", "transform_matrix": T_up_opengl.tolist()}
+        )
+    content = {
+        "camera_model": "OPENCV",
+        "w": c.width,
+        "h": c.height,
+        "fl_x": c.fx,
+        "fl_y": c.fy,
+        "cx": c.cx + PIXEL_CENTRE,
+        "cy": c.cy + PIXEL_CENTRE,
+        "k1": 0.0,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+        "applied_transform": T_up_world[:3].tolist(),
+        "ply_file_path": "points3D.ply",
+        "frames": frames,
+    }
+    transforms, points = folder / "transforms.json", folder / "points3D.ply"
+    transforms.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_ply(
+        points,
+        transform_points(T_up_world, data.xyz),
+        data.rgb,
+        data.confidence,
+        axes="z up, y forward of the first camera",
+    )
+    return [transforms, points]

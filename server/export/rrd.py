@@ -1,0 +1,78 @@
+"""A Rerun recording of a finished run: the one the server wrote, or one made from poses, images and map."""
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from semcast.common.errors import SourceError
+from semcast.common.run_folder import VIEWER_NAME, RunData
+from semcast.server.view.rerun_viewer import RerunStream
+from semcast.server.view.scene import Cursor, FrameView, Scene, compress_picture
+
+JPEG_QUALITY = 80
+CLOSE_DEADLINE_S = 30.0
+
+
+def write_rrd(path: Path, folder: Path, data: RunData, images: Mapping[int, Path]) -> list[Path]:
+    """Copy the run's own recording, plots included; without one, show its poses, kept images and points.
+
+    Args:
+        path: The ``.rrd`` file.
+        folder: The run folder.
+        data: Its reconstruction.
+        images: Frame id to file of the kept images.
+
+    Raises:
+        SourceError: An image can't be read, or the file can't be finished.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    recorded = folder / VIEWER_NAME
+    if recorded.is_file():
+        shutil.copyfile(recorded, path)
+        return [path]
+    stream = RerunStream(
+        recording_id=folder.name or "run",
+        camera=data.intrinsics,
+        has_truth=False,
+        has_confidence=False,
+        file=path,
+    )
+    scene, cursor = Scene(), Cursor()
+    scene.add_landmarks(data.landmark_ids, data.xyz, data.rgb, data.confidence, np.zeros(0, dtype=np.int64))
+    for frame_id, t_ns, T_world_cam in zip(
+        data.frame_ids.tolist(), data.t_source_ns.tolist(), data.T_world_cam, strict=True
+    ):
+        view = _view(data, frame_id, t_ns, T_world_cam, images.get(frame_id))
+        scene.add_frame(view)
+        if view.image is not None:
+            scene.set_picture(compress_picture(view, JPEG_QUALITY))
+        stream.write(scene.changes_since(cursor))
+    if not stream.close(CLOSE_DEADLINE_S):
+        raise SourceError(f"{path} could not be finished in {CLOSE_DEADLINE_S:g} s")
+    return [path]
+
+
+def _view(
+    data: RunData, frame_id: int, t_source_ns: int, T_world_cam: np.ndarray, path: Path | None
+) -> FrameView:
+    image = None
+    if path is not None:
+        bgr = cv2.imread(str(path))
+        if bgr is None:
+            raise SourceError(f"{path} can't be read as an image")
+        image = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    xy = data.observed_xy[data.observed_keyframe_ids == frame_id]
+    return FrameView(
+        frame_id=frame_id,
+        t_source_ns=t_source_ns,
+        T_world_cam=T_world_cam,
+        state="tracking",
+        scalars={},
+        image=image,
+        confidence=None,
+        keypoints_xy=xy,
+        keypoint_inlier=np.ones(len(xy), dtype=bool),
+    )

@@ -1,0 +1,1 @@
+"""Estimators without a state: two views, pose from points, triangulation, features, weights."""

@@ -1,0 +1,175 @@
+"""Two-view geometry: residuals of a relative pose, cheirality, and refinement."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, make_transform, project_to_so3, skew
+from semcast.server.geometry.weighting import HUBER_K
+
+Array = NDArray[np.float64]
+
+
+def essential_matrix(T_cam1_cam0: Array) -> Array:
+    """``E = [t]x R`` with ``p1^T E p0 = 0`` for rays ``p0`` and ``p1`` (Eq. 14)."""
+    return skew(T_cam1_cam0[:3, 3]) @ T_cam1_cam0[:3, :3]
+
+
+def fundamental_matrix(camera: Intrinsics, T_cam1_cam0: Array) -> Array:
+    """``F = K^-T [t]x R K^-1`` for pixels (Eq. 14)."""
+    K_inv = np.linalg.inv(camera.K)
+    return np.asarray(K_inv.T @ essential_matrix(T_cam1_cam0) @ K_inv)
+
+
+def sampson_px(F: Array, keypoints0_xy: Array, keypoints1_xy: Array) -> Array:
+    """Signed Sampson distance in pixels: first-order distance of a match to the epipolar constraint.
+
+    Args:
+        F: ``(3, 3)`` or ``(B, 3, 3)`` fundamental matrices.
+        keypoints0_xy: ``(N, 2)``.
+        keypoints1_xy: ``(N, 2)``.
+
+    Returns:
+        ``(N,)`` or ``(B, N)``.
+    """
+    x0 = np.concatenate([keypoints0_xy, np.ones((len(keypoints0_xy), 1))], axis=1)
+    x1 = np.concatenate([keypoints1_xy, np.ones((len(keypoints1_xy), 1))], axis=1)
+    line1 = x0 @ np.swapaxes(F, -1, -2)
+    line0 = x1 @ F
+    algebraic = (x1 * line1).sum(axis=-1)
+    square = line1[..., 0] ** 2 + line1[..., 1] ** 2 + line0[..., 0] ** 2 + line0[..., 1] ** 2
+    return np.asarray(algebraic / np.sqrt(np.maximum(square, 1e-18)))
+
+
+def msac_score(residual_px: Array, threshold_px: float, weight: Array | None = None) -> float:
+    """Mean truncated squared residual in units of the squared threshold: 0 is perfect, 1 is no inlier.
+
+    Args:
+        residual_px: ``(N,)``.
+        threshold_px: From which a residual counts in full.
+        weight: ``(N,)`` of the mean, None for equal ones.
+    """
+    if len(residual_px) == 0:
+        return 1.0
+    return float(np.average(np.minimum(1.0, (residual_px / threshold_px) ** 2), weights=weight))
+
+
+def depths(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> tuple[Array, Array]:
+    """Depths of matches along both rays by the midpoint method, ``(N,)`` each, for a unit baseline."""
+    ray0 = camera.unproject(xy0) @ T_cam1_cam0[:3, :3].T
+    ray1 = camera.unproject(xy1)
+    t = T_cam1_cam0[:3, 3]
+    a = (ray0 * ray0).sum(axis=1)
+    b = (ray0 * ray1).sum(axis=1)
+    c = (ray1 * ray1).sum(axis=1)
+    determinant = np.maximum(a * c - b * b, 1e-15)
+    ray0_t, ray1_t = ray0 @ t, ray1 @ t
+    return (b * ray1_t - c * ray0_t) / determinant, (a * ray1_t - b * ray0_t) / determinant
+
+
+def rays_angle_deg(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
+    """Angle between the two rays of each match, ``(N,)`` degrees: the parallax."""
+    ray0 = camera.unproject(xy0) @ T_cam1_cam0[:3, :3].T
+    ray1 = camera.unproject(xy1)
+    sine = np.linalg.norm(np.cross(ray0, ray1), axis=1)
+    return np.asarray(np.degrees(np.arctan2(sine, (ray0 * ray1).sum(axis=1))))
+
+
+def rotation_residual_px(camera: Intrinsics, R_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
+    """Distance in pixels between ``xy1`` and ``xy0`` turned by a rotation alone, ``(N,)``."""
+    turned = camera.unproject(xy0) @ R_cam1_cam0.T
+    z = np.maximum(turned[:, 2], 1e-6)
+    x = camera.fx * turned[:, 0] / z + camera.cx
+    y = camera.fy * turned[:, 1] / z + camera.cy
+    return np.asarray(np.hypot(x - xy1[:, 0], y - xy1[:, 1]))
+
+
+def fit_rotation(camera: Intrinsics, xy0: Array, xy1: Array, iterations: int = 8) -> Array:
+    """Rotation ``R_cam1_cam0`` that explains matches best, reweighted towards the majority."""
+    ray0, ray1 = camera.unproject(xy0), camera.unproject(xy1)
+    ray0 /= np.linalg.norm(ray0, axis=1, keepdims=True)
+    ray1 /= np.linalg.norm(ray1, axis=1, keepdims=True)
+    weight = np.ones(len(ray0))
+    R = np.eye(3)
+    for _ in range(iterations):
+        R = project_to_so3((ray1 * weight[:, None]).T @ ray0)
+        weight = 1.0 / (1.0 + rotation_residual_px(camera, R, xy0, xy1) ** 2)
+    return R
+
+
+def _tangent(t: Array) -> Array:
+    """Two directions across a unit vector, ``(2, 3)``."""
+    other = np.eye(3)[int(np.argmin(np.abs(t)))]
+    a = np.cross(t, other)
+    a /= np.linalg.norm(a)
+    return np.stack([a, np.cross(t, a)])
+
+
+def _moved(T: Array, step: Array) -> Array:
+    t = T[:3, 3] + step[3:] @ _tangent(T[:3, 3])
+    return make_transform(exp_so3(step[:3]) @ T[:3, :3], t / np.linalg.norm(t))
+
+
+def refine_relative_pose(
+    camera: Intrinsics,
+    T_cam1_cam0: Array,
+    xy0: Array,
+    xy1: Array,
+    sigma_px: Array,
+    *,
+    cut_sigmas: float = 4.0,
+    iterations: int = 10,
+) -> Array:
+    """Minimise the weighted Sampson distance over rotation and translation direction.
+
+    Args:
+        camera: Of both images.
+        T_cam1_cam0: Start, translation of length 1.
+        xy0: ``(N, 2)``.
+        xy1: ``(N, 2)``.
+        sigma_px: ``(N,)`` standard deviation of each match's Sampson distance.
+        cut_sigmas: Residuals beyond it pull no longer (Huber up to there).
+        iterations: Gauss-Newton steps at most.
+
+    Returns:
+        The refined pose; the start where it got no better.
+    """
+
+    def residual_of(T: Array) -> Array:
+        return sampson_px(fundamental_matrix(camera, T), xy0, xy1) / sigma_px
+
+    def cost_of(r: Array) -> float:
+        a = np.minimum(np.abs(r), cut_sigmas)
+        return float(np.where(a < HUBER_K, 0.5 * a * a, HUBER_K * (a - 0.5 * HUBER_K)).sum())
+
+    T = T_cam1_cam0.copy()
+    residual = residual_of(T)
+    cost = cost_of(residual)
+    damping = 1e-4
+    epsilon = 1e-6
+    for _ in range(iterations):
+        moved = [residual_of(_moved(T, epsilon * np.eye(5)[k])) for k in range(5)]
+        J = (np.stack(moved, axis=1) - residual[:, None]) / epsilon
+        size = np.abs(residual)
+        w = np.where(size < cut_sigmas, np.minimum(1.0, HUBER_K / np.maximum(size, 1e-9)), 0.0)
+        H = (J * w[:, None]).T @ J
+        g = -(J * w[:, None]).T @ residual
+        try:
+            step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-12 * np.eye(5), g)
+        except np.linalg.LinAlgError:
+            break
+        if not np.isfinite(step).all() or float(np.abs(step).max()) > 1.0:
+            break
+        candidate = _moved(T, np.asarray(step))
+        new_residual = residual_of(candidate)
+        new_cost = cost_of(new_residual)
+        if new_cost < cost:
+            gain = cost - new_cost
+            T, residual, cost, damping = candidate, new_residual, new_cost, damping * 0.3
+            if gain < 1e-6 * cost:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e3:
+                break
+    return make_transform(project_to_so3(T[:3, :3]), T[:3, 3])

@@ -1,0 +1,211 @@
+"""Pose of a camera from landmarks: weighted refinement with a covariance, and a search without a prior."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_se3, make_transform, project_to_so3
+from semcast.server.geometry.weighting import HUBER_K
+
+Array = NDArray[np.float64]
+
+#: Landmarks nearer than this to the camera plane (map units) have no usable projection.
+MIN_DEPTH_MAP = 1e-3
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A camera pose.
+
+    Attributes:
+        T_cam_world: ``(4, 4)``.
+        inliers: ``(N,)`` bool, in front of the camera and within the gate.
+        residual_px: ``(N,)`` reprojection errors, infinite behind the camera.
+        covariance: ``(6, 6)`` of a twist in the camera frame, rotation before translation; None where the
+            inliers do not fix the pose.
+    """
+
+    T_cam_world: Array
+    inliers: NDArray[np.bool_]
+    residual_px: Array
+    covariance: Array | None
+
+    @property
+    def num_inliers(self) -> int:
+        """Observations that agree with the pose."""
+        return int(self.inliers.sum())
+
+
+def project_with_jacobian(camera: Intrinsics, points_cam: Array) -> tuple[Array, Array]:
+    """Project points and differentiate by a twist that moves them, ``p' = exp(xi) p``.
+
+    Args:
+        camera: Pinhole.
+        points_cam: ``(N, 3)`` with positive depth.
+
+    Returns:
+        ``(N, 2)`` pixels and ``(N, 2, 6)`` derivatives, rotation before translation.
+    """
+    x, y, z = points_cam.T
+    inverse_z = 1.0 / z
+    u, v = x * inverse_z, y * inverse_z
+    J = np.zeros((len(points_cam), 2, 6))
+    J[:, 0, 0] = -camera.fx * u * v
+    J[:, 0, 1] = camera.fx * (1.0 + u * u)
+    J[:, 0, 2] = -camera.fx * v
+    J[:, 0, 3] = camera.fx * inverse_z
+    J[:, 0, 5] = -camera.fx * u * inverse_z
+    J[:, 1, 0] = -camera.fy * (1.0 + v * v)
+    J[:, 1, 1] = camera.fy * u * v
+    J[:, 1, 2] = camera.fy * u
+    J[:, 1, 4] = camera.fy * inverse_z
+    J[:, 1, 5] = -camera.fy * v * inverse_z
+    return np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1), J
+
+
+def reprojection_residual(
+    camera: Intrinsics, T_cam_world: Array, points_world: Array, keypoints_xy: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Observed minus projected, ``(N, 2)`` pixels, and which points are in front; zero where they are not."""
+    points_cam = points_world @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    front = points_cam[:, 2] > MIN_DEPTH_MAP
+    z = np.where(front, points_cam[:, 2], 1.0)
+    projected = np.stack(
+        [camera.fx * points_cam[:, 0] / z + camera.cx, camera.fy * points_cam[:, 1] / z + camera.cy], axis=1
+    )
+    return np.where(front[:, None], keypoints_xy - projected, 0.0), front
+
+
+def refine_pose(
+    camera: Intrinsics,
+    T_cam_world: Array,
+    points_world: Array,
+    keypoints_xy: Array,
+    sigma_px: Array,
+    gate_px: Array,
+    *,
+    iterations: int = 10,
+    prior_information: Array | None = None,
+) -> PoseEstimate:
+    """Minimise weighted reprojection errors under Huber's loss by Gauss-Newton over the pose alone.
+
+    Args:
+        camera: Pinhole.
+        T_cam_world: Start.
+        points_world: ``(N, 3)`` landmarks.
+        keypoints_xy: ``(N, 2)`` their observations.
+        sigma_px: ``(N,)`` standard deviation of each observation per coordinate.
+        gate_px: ``(N,)`` reprojection error up to which an observation is an inlier.
+        iterations: Steps at most; the last two without points outside the gate.
+        prior_information: ``(6, 6)`` that pulls towards the start, or None.
+
+    Returns:
+        The refined pose; the start with no inlier where nothing could be solved.
+    """
+    T_start = T_cam_world.copy()
+    T = T_start.copy()
+    weight = sigma_px**-2.0
+    hessian = np.zeros((6, 6))
+    offset = np.zeros(6)
+    for iteration in range(iterations):
+        points_cam = points_world @ T[:3, :3].T + T[:3, 3]
+        used = points_cam[:, 2] > MIN_DEPTH_MAP
+        if int(used.sum()) < 3:
+            return _without_inliers(T_start, len(points_world))
+        projected, J = project_with_jacobian(camera, points_cam[used])
+        residual = keypoints_xy[used] - projected
+        length = np.linalg.norm(residual, axis=1)
+        # Early steps are more tolerant, so that a poor start does not lose the points that would mend it.
+        widen = 4.0 if iteration < 2 else 1.0
+        k = HUBER_K * sigma_px[used] * widen
+        w = weight[used] * np.minimum(1.0, k / np.maximum(length, 1e-9))
+        if iteration >= 2:
+            w = np.where(length < 3.0 * gate_px[used], w, 0.0)
+        rows = J.reshape(-1, 6)
+        weighted = (rows * np.repeat(w, 2)[:, None]).T
+        hessian = weighted @ rows
+        gradient = weighted @ residual.ravel()
+        if prior_information is not None:
+            hessian = hessian + prior_information
+            gradient = gradient - prior_information @ offset
+        try:
+            step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) / 6.0 * np.eye(6), gradient)
+        except np.linalg.LinAlgError:
+            return _without_inliers(T_start, len(points_world))
+        if not np.isfinite(step).all():
+            return _without_inliers(T_start, len(points_world))
+        T = exp_se3(step) @ T
+        offset = offset + step
+        if iteration >= 3 and float(np.abs(step).max()) < 1e-6:
+            break
+    T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
+    residual, front = reprojection_residual(camera, T, points_world, keypoints_xy)
+    length = np.where(front, np.linalg.norm(residual, axis=1), np.inf)
+    return PoseEstimate(T, length < gate_px, length, _covariance(hessian))
+
+
+def _without_inliers(T_cam_world: Array, count: int) -> PoseEstimate:
+    return PoseEstimate(T_cam_world, np.zeros(count, bool), np.full(count, np.inf), None)
+
+
+def _covariance(hessian: Array) -> Array | None:
+    """Inverse of the information (Proposition 1), None where it is not positive definite."""
+    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    normalised = hessian / np.outer(scale, scale)
+    try:
+        if float(np.linalg.eigvalsh(normalised)[0]) < 1e-10:
+            return None
+        return np.asarray(np.linalg.inv(normalised) / np.outer(scale, scale))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def poselib_camera(camera: Intrinsics) -> dict[str, object]:
+    """A pinhole as PoseLib takes it."""
+    return {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "params": [camera.fx, camera.fy, camera.cx, camera.cy],
+    }
+
+
+def search_pose(
+    camera: Intrinsics,
+    points_world: Array,
+    keypoints_xy: Array,
+    sigma_px: Array,
+    gate_px: Array,
+    *,
+    seed: int,
+    min_inliers: int = 12,
+    max_iterations: int = 1000,
+) -> PoseEstimate | None:
+    """Find a pose without a prior by PoseLib's LO-RANSAC over three points, then refine it with weights.
+
+    It draws uniformly: three points are found soon, and a misleading order would cost the pose.
+
+    Returns:
+        The pose, or None when fewer than ``min_inliers`` agree.
+    """
+    if len(points_world) < max(4, min_inliers):
+        return None
+    threshold_px = float(np.clip(np.median(gate_px), 2.0, 8.0))
+    options = {
+        "max_reproj_error": threshold_px,
+        "max_iterations": max_iterations,
+        "min_iterations": 50,
+        "seed": seed,
+    }
+    found, info = poselib.estimate_absolute_pose(
+        keypoints_xy, points_world, poselib_camera(camera), options, {}
+    )
+    R, t = np.asarray(found.R, dtype=np.float64), np.asarray(found.t, dtype=np.float64)
+    if info["num_inliers"] < min_inliers or not (np.isfinite(R).all() and np.isfinite(t).all()):
+        return None
+    start = make_transform(project_to_so3(R), t)
+    estimate = refine_pose(camera, start, points_world, keypoints_xy, sigma_px, gate_px)
+    return estimate if estimate.num_inliers >= min_inliers else None

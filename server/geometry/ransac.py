@@ -1,0 +1,132 @@
+"""The paper's confidence-weighted RANSAC, to the letter (Sec. V-B, Eq. 14 to 20).
+
+Weighted sampling without replacement, algebraic residual, confidence-adaptive threshold, choice by the number
+of inliers. It is kept for comparison; ``two_view`` in mode ``robust`` is what the system runs on.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import make_transform
+from semcast.server.geometry.epipolar import depths, essential_matrix
+from semcast.server.geometry.weighting import adaptive_threshold, sampling_probability
+
+Array = NDArray[np.float64]
+
+#: Size of a minimal subset of the five-point algorithm.
+SUBSET_SIZE = 5
+
+
+@dataclass(frozen=True)
+class RansacResult:
+    """The model with the most inliers.
+
+    Attributes:
+        T_cam1_cam0: ``(4, 4)``, translation of length 1, decomposed from the winning matrix.
+        inliers: ``(N,)`` bool, ``r_i < delta_i``.
+        num_trials: Subsets drawn.
+    """
+
+    T_cam1_cam0: Array
+    inliers: NDArray[np.bool_]
+    num_trials: int
+
+
+def draw_weighted(
+    probability: Array, size: int, num_draws: int, rng: np.random.Generator
+) -> NDArray[np.intp]:
+    """Draw subsets without replacement, each next element in proportion to its probability.
+
+    Gumbel's trick: the ``size`` largest of ``log q_i + Gumbel noise`` are distributed exactly so.
+
+    Args:
+        probability: ``(N,)``, sums to 1; an element with 0 is drawn only when no other is left.
+        size: Elements of a subset, at most N.
+        num_draws: Number of subsets.
+        rng: Source of randomness.
+
+    Returns:
+        ``(num_draws, size)`` indices, in the order they were drawn.
+    """
+    with np.errstate(divide="ignore"):
+        log_q = np.log(probability)
+    log_q = np.where(np.isfinite(log_q), log_q, -1e9)
+    keys = log_q + rng.gumbel(size=(num_draws, len(probability)))
+    return np.asarray(np.argsort(-keys, axis=1, kind="stable")[:, :size])
+
+
+def algebraic_residual(E: Array, rays0: Array, rays1: Array) -> Array:
+    """``|p1^T E p0|`` (Eq. 18) for unit-depth rays: ``(N,)``, or ``(B, N)`` for ``(B, 3, 3)`` matrices."""
+    return np.asarray(np.abs((rays1 * (rays0 @ np.swapaxes(E, -1, -2))).sum(axis=-1)))
+
+
+def confidence_ransac(
+    camera: Intrinsics,
+    keypoints0_xy: Array,
+    keypoints1_xy: Array,
+    confidence: Array,
+    *,
+    delta0: float | None = None,
+    num_trials: int = 500,
+    seed: int = 0,
+) -> RansacResult | None:
+    """Estimate a relative pose as the paper does.
+
+    Args:
+        camera: Of both images.
+        keypoints0_xy: ``(N, 2)``.
+        keypoints1_xy: ``(N, 2)``, matched row by row.
+        confidence: ``(N,)`` fused confidence in [0, 1].
+        delta0: Base threshold of the algebraic residual on normalised coordinates; None takes one pixel
+            over the focal length.
+        num_trials: Subsets drawn.
+        seed: Of the sampler.
+
+    Returns:
+        The result, or None when no subset gave a model with more than five inliers.
+    """
+    if len(confidence) < SUBSET_SIZE + 1:
+        return None
+    delta0 = 1.0 / camera.fx if delta0 is None else delta0
+    rays0, rays1 = camera.unproject(keypoints0_xy), camera.unproject(keypoints1_xy)
+    delta = adaptive_threshold(confidence, delta0)
+    unit0 = rays0 / np.linalg.norm(rays0, axis=1, keepdims=True)
+    unit1 = rays1 / np.linalg.norm(rays1, axis=1, keepdims=True)
+    rng = np.random.default_rng(seed)
+    subsets = draw_weighted(sampling_probability(confidence), SUBSET_SIZE, num_trials, rng)
+    best: tuple[int, Array] | None = None
+    for subset in subsets:
+        poses = [
+            make_transform(pose.R, np.asarray(pose.t) / max(1e-12, float(np.linalg.norm(pose.t))))
+            for pose in poselib.relpose_5pt(unit0[subset], unit1[subset])
+        ]
+        poses = [T for T in poses if np.isfinite(T).all()]
+        if not poses:
+            continue
+        E = np.stack([essential_matrix(T) for T in poses])
+        counts = (algebraic_residual(E, rays0, rays1) < delta).sum(axis=1)
+        top = int(counts.argmax())
+        if best is None or counts[top] > best[0]:
+            best = (int(counts[top]), poses[top])
+    if best is None or best[0] <= SUBSET_SIZE:
+        return None
+    T_cam1_cam0 = best[1]
+    inliers = algebraic_residual(essential_matrix(T_cam1_cam0), rays0, rays1) < delta
+    T_cam1_cam0 = in_front(camera, T_cam1_cam0, keypoints0_xy[inliers], keypoints1_xy[inliers])
+    return RansacResult(T_cam1_cam0, inliers, num_trials)
+
+
+def in_front(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
+    """Of the four poses with the same essential matrix, the one with most points in front of both cameras."""
+    R, t = T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3]
+    twisted = (2.0 * np.outer(t, t) / float(t @ t) - np.eye(3)) @ R
+    candidates = [make_transform(r, sign * t) for r in (R, twisted) for sign in (1.0, -1.0)]
+    counts = []
+    for T in candidates:
+        depth0, depth1 = depths(camera, T, xy0, xy1)
+        counts.append(int(((depth0 > 0) & (depth1 > 0)).sum()))
+    return candidates[int(np.argmax(counts))]

@@ -1,0 +1,148 @@
+"""Points from rays: linear multi-view triangulation with refinement, and its checks."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Triangulation:
+    """Points and what speaks for them.
+
+    Attributes:
+        xyz: ``(P, 3)`` world frame.
+        parallax_deg: ``(P,)`` largest angle of a point's rays to its first ray.
+        error_sigma: ``(P,)`` root mean square reprojection error in standard deviations.
+        in_front: ``(P,)`` bool, positive depth in every view.
+    """
+
+    xyz: Array
+    parallax_deg: Array
+    error_sigma: Array
+    in_front: NDArray[np.bool_]
+
+
+def _sum_by(index: NDArray[np.intp], values: Array, count: int) -> Array:
+    """Sum rows of ``values`` that share an index."""
+    flat = values.reshape(len(values), -1)
+    columns = [np.bincount(index, weights=flat[:, k], minlength=count) for k in range(flat.shape[1])]
+    return np.stack(columns, axis=1).astype(np.float64).reshape(count, *values.shape[1:])
+
+
+def triangulate(
+    camera: Intrinsics,
+    T_cam_world: Array,
+    view: NDArray[np.intp],
+    point: NDArray[np.intp],
+    keypoints_xy: Array,
+    sigma_px: Array,
+    num_points: int,
+    *,
+    refinements: int = 3,
+) -> Triangulation:
+    """Triangulate many points, each from any number of views, all at once.
+
+    The start is the point nearest to all rays; Gauss-Newton steps on the weighted reprojection error follow.
+
+    Args:
+        camera: Pinhole.
+        T_cam_world: ``(V, 4, 4)`` poses of the views.
+        view: ``(M,)`` view of each observation.
+        point: ``(M,)`` point of each observation, in [0, num_points).
+        keypoints_xy: ``(M, 2)``.
+        sigma_px: ``(M,)`` standard deviations.
+        num_points: Number of points; one without two views gets a useless position and parallax 0.
+        refinements: Gauss-Newton steps.
+    """
+    R = T_cam_world[view, :3, :3]
+    t = T_cam_world[view, :3, 3]
+    rays_cam = camera.unproject(keypoints_xy)
+    ray = np.einsum("mji,mj->mi", R, rays_cam)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    centre = -np.einsum("mji,mj->mi", R, t)
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    w = sigma_px**-2.0
+    A = _sum_by(point, across * w[:, None, None], num_points)
+    b = _sum_by(point, np.einsum("mij,mj->mi", across, centre) * w[:, None], num_points)
+    xyz = _solve(A, b)
+    for _ in range(refinements):
+        points_cam = (R @ xyz[point][:, :, None])[..., 0] + t
+        z = np.maximum(points_cam[:, 2], MIN_DEPTH_MAP)
+        u, v = points_cam[:, 0] / z, points_cam[:, 1] / z
+        residual = keypoints_xy - np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1)
+        zero = np.zeros_like(z)
+        J_cam = np.stack(
+            [
+                np.stack([camera.fx / z, zero, -camera.fx * u / z], axis=1),
+                np.stack([zero, camera.fy / z, -camera.fy * v / z], axis=1),
+            ],
+            axis=1,
+        )
+        J = J_cam @ R
+        good = (points_cam[:, 2] > MIN_DEPTH_MAP) & np.isfinite(residual).all(axis=1)
+        step_w = np.where(good, w, 0.0)
+        H = _sum_by(point, np.swapaxes(J, 1, 2) @ (J * step_w[:, None, None]), num_points)
+        g = _sum_by(
+            point,
+            (np.swapaxes(J, 1, 2) @ (np.nan_to_num(residual) * step_w[:, None])[..., None])[..., 0],
+            num_points,
+        )
+        step = _solve(H, g)
+        # A step longer than half the distance to the cameras has left the linear range.
+        reach = 0.5 * np.linalg.norm(xyz - mean_centre(centre, point, num_points), axis=1)
+        length = np.linalg.norm(step, axis=1)
+        xyz = xyz + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
+    points_cam = (R @ xyz[point][:, :, None])[..., 0] + t
+    front = points_cam[:, 2] > MIN_DEPTH_MAP
+    z = np.where(front, points_cam[:, 2], 1.0)
+    projected = np.stack(
+        [camera.fx * points_cam[:, 0] / z + camera.cx, camera.fy * points_cam[:, 1] / z + camera.cy], axis=1
+    )
+    square = ((keypoints_xy - projected) ** 2).sum(axis=1) * w
+    count = np.bincount(point, minlength=num_points)
+    error = np.sqrt(np.bincount(point, weights=square, minlength=num_points) / np.maximum(1, 2 * count))
+    behind = np.bincount(point, weights=~front, minlength=num_points) > 0
+    good_point = np.isfinite(xyz).all(axis=1) & (count >= 2)
+    return Triangulation(
+        xyz=np.nan_to_num(xyz),
+        parallax_deg=np.where(good_point, parallax_deg(centre, np.nan_to_num(xyz), point, num_points), 0.0),
+        error_sigma=np.where(good_point, error, np.inf),
+        in_front=~behind & good_point,
+    )
+
+
+def mean_centre(centre: Array, point: NDArray[np.intp], num_points: int) -> Array:
+    """Mean camera centre of each point's views, ``(P, 3)``."""
+    count = np.maximum(1, np.bincount(point, minlength=num_points))
+    return _sum_by(point, centre, num_points) / count[:, None]
+
+
+def parallax_deg(centre: Array, xyz: Array, point: NDArray[np.intp], num_points: int) -> Array:
+    """Largest angle at each point between its first ray and any other, ``(P,)`` degrees."""
+    to_camera = centre - xyz[point]
+    to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
+    first = np.full(num_points, -1)
+    first[point[::-1]] = np.arange(len(point))[::-1]
+    reference = to_camera[first[point]]
+    sine = np.linalg.norm(np.cross(reference, to_camera), axis=1)
+    angle = np.degrees(np.arctan2(sine, (reference * to_camera).sum(axis=1)))
+    largest = np.zeros(num_points)
+    np.maximum.at(largest, point, angle)
+    return largest
+
+
+def _solve(A: Array, b: Array) -> Array:
+    """Solve ``(P, 3, 3)`` systems; singular ones give a damped answer."""
+    trace = np.trace(A, axis1=1, axis2=2)
+    damped = A + (1e-9 * trace + 1e-30)[:, None, None] * np.eye(3)
+    determinant = np.linalg.det(damped)
+    usable = np.isfinite(determinant) & (np.abs(determinant) > 1e-200) & np.isfinite(b).all(axis=1)
+    damped = np.where(usable[:, None, None], damped, np.eye(3))
+    solved = np.linalg.solve(damped, np.where(usable[:, None], b, 0.0)[..., None])[..., 0]
+    return np.asarray(np.where(usable[:, None], solved, 0.0))

@@ -1,0 +1,290 @@
+"""Relative pose of two images from matches.
+
+``robust``: PoseLib's LO-RANSAC twice, once drawing uniformly from all matches and once the trusted ones first
+among those that move as their neighbours do, each at two thresholds. The poses are judged by a score that
+knows this agreement, but not confidence; then comes a refinement whose weights are fitted to this pair's own
+residuals. A misleading confidence can therefore cost time, hardly accuracy.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import make_transform, project_to_so3
+from semcast.server.geometry.agreement import neighbour_agreement
+from semcast.server.geometry.epipolar import (
+    depths,
+    fit_rotation,
+    fundamental_matrix,
+    msac_score,
+    rays_angle_deg,
+    refine_relative_pose,
+    rotation_residual_px,
+    sampson_px,
+)
+from semcast.server.geometry.pnp import poselib_camera
+from semcast.server.geometry.ransac import confidence_ransac, in_front
+from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fit_noise
+
+Array = NDArray[np.float64]
+
+MIN_MATCHES = 8
+#: Thresholds of the searches and of the score, in units of the one that is asked for.
+_THRESHOLD_FACTORS = (1.0, 2.0)
+_SCORE_FACTORS = (0.5, 1.0, 2.0, 4.0)
+#: A match that fewer of its neighbours agree with is left out of the second search and of the refinement.
+_MIN_AGREEMENT = 0.25
+#: Weight in the score against agreement: from the least at the first value to 1 at the second.
+_AGREEMENT_RANGE, _LEAST_WEIGHT = (0.1, 0.4), 0.05
+#: Points near the camera have larger errors and most of the information: the fitted beta overstates what
+#: confidence is worth, half of it does best.
+_BETA_SHARE = 0.5
+_CUT_SIGMAS = 2.5
+_MIN_SIGMA_PX = 0.1
+Model = Literal["essential", "homography", "rotation"]
+
+
+@dataclass(frozen=True)
+class TwoViewResult:
+    """Relative pose of two images.
+
+    Attributes:
+        T_cam1_cam0: ``(4, 4)``, translation of length 1 (of no meaning for ``rotation``).
+        inliers: ``(N,)`` bool: near the epipolar geometry and in front of both cameras.
+        score: Confidence-free MSAC score of all matches, weighted by agreement; 0 is perfect.
+        model: ``rotation`` when turning alone explains the matches, ``homography`` when the pose came from
+            one plane, else ``essential``.
+        parallax_deg: Median angle between the rays of inliers.
+    """
+
+    T_cam1_cam0: Array
+    inliers: NDArray[np.bool_]
+    score: float
+    model: Model
+    parallax_deg: float
+
+
+def estimate_two_view(
+    camera: Intrinsics,
+    keypoints0_xy: Array,
+    keypoints1_xy: Array,
+    confidence: Array | None = None,
+    *,
+    mode: ConfidenceMode = "robust",
+    threshold_px: float = 1.0,
+    seed: int = 0,
+    max_iterations: int = 1000,
+    min_iterations: int = 150,
+    choose_model: bool = False,
+) -> TwoViewResult | None:
+    """Estimate the relative pose of two images.
+
+    Args:
+        camera: Of both images, without distortion.
+        keypoints0_xy: ``(N, 2)`` pixels.
+        keypoints1_xy: ``(N, 2)`` pixels, matched row by row.
+        confidence: ``(N,)`` in [0, 1], from ``weighting``; None is the same as mode ``off``.
+        mode: ``paper`` is the paper's RANSAC; ``off`` knows no confidence; all others search in both ways
+            and refine with fitted weights.
+        threshold_px: Inlier threshold on the Sampson distance.
+        seed: Of the searches.
+        max_iterations: Hypotheses of one search at most.
+        min_iterations: Hypotheses of one search at least.
+        choose_model: Also try a plane and a pure rotation, as a start of a map needs it.
+
+    Returns:
+        The result, or None with fewer than 8 matches or when nothing was found.
+    """
+    xy0 = np.ascontiguousarray(keypoints0_xy, dtype=np.float64)
+    xy1 = np.ascontiguousarray(keypoints1_xy, dtype=np.float64)
+    if len(xy0) < MIN_MATCHES or not (np.isfinite(xy0).all() and np.isfinite(xy1).all()):
+        return None
+    if mode == "paper" and confidence is not None:
+        found = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
+        if found is None:
+            return None
+        score = _score(camera, found.T_cam1_cam0, xy0, xy1, threshold_px)
+        return _result(camera, found.T_cam1_cam0, xy0, xy1, threshold_px, score, choose_model)
+    if confidence is not None and (mode == "off" or float(np.ptp(confidence)) <= 1e-6):
+        confidence = None
+    agreement = neighbour_agreement(xy0, xy1)
+    kept = _kept(agreement)
+    low, high = _AGREEMENT_RANGE
+    weight = np.clip((agreement - low) / (high - low), _LEAST_WEIGHT, 1.0)
+    searches: list[tuple[NDArray[np.intp], bool]] = [(np.arange(len(xy0)), False)]
+    if confidence is not None:
+        searches.append((kept[np.argsort(-confidence[kept], kind="stable")], True))
+    elif len(kept) < len(xy0):
+        searches.append((kept, False))
+    candidates = [
+        _search(
+            camera,
+            xy0[rows],
+            xy1[rows],
+            threshold_px=factor * threshold_px,
+            in_order=in_order,
+            seed=seed,
+            max_iterations=max_iterations,
+            min_iterations=min_iterations,
+        )
+        for factor in _THRESHOLD_FACTORS
+        for rows, in_order in searches
+    ]
+    num_searched = len(candidates)
+    if choose_model:
+        candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
+    scored = [
+        (_score(camera, turned, xy0, xy1, threshold_px, weight), k, turned)
+        for k, T in enumerate(candidates)
+        if T is not None
+        for turned in [in_front_sign(camera, T, xy0[kept], xy1[kept])]
+    ]
+    if not scored:
+        return None
+    # A later candidate must be better by more than the score's own noise to displace the first.
+    score, chosen, T = min(scored, key=lambda item: (item[0] * (1.0 if item[1] == 0 else 1.001), item[1]))
+    trusted = None if confidence is None else confidence[kept]
+    T = _refine(camera, T, xy0[kept], xy1[kept], trusted, threshold_px)
+    result = _result(camera, T, xy0, xy1, threshold_px, score, choose_model)
+    if chosen >= num_searched and result.model == "essential":
+        result = replace(result, model="homography")
+    return result
+
+
+def _kept(agreement: Array) -> NDArray[np.intp]:
+    """Matches that move like their neighbours; the better half where they are too few."""
+    kept = np.flatnonzero(agreement >= _MIN_AGREEMENT)
+    if len(kept) < MIN_MATCHES:
+        kept = np.sort(np.argsort(-agreement, kind="stable")[: max(MIN_MATCHES, len(agreement) // 2)])
+    return kept
+
+
+def _score(
+    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float, weight: Array | None = None
+) -> float:
+    """MSAC score without confidence, in which a point clearly behind a camera is an outlier.
+
+    It is the mean over several thresholds, because the noise of decoded images is not known beforehand.
+    The depths tell the two poses of a plane apart, which fit the epipolar constraint equally well.
+    """
+    residual = sampson_px(fundamental_matrix(camera, T), xy0, xy1)
+    residual = np.where(_behind(camera, T, xy0, xy1, threshold_px), np.inf, residual)
+    return float(np.mean([msac_score(residual, factor * threshold_px, weight) for factor in _SCORE_FACTORS]))
+
+
+def _behind(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float) -> NDArray[np.bool_]:
+    """Points behind a camera, beyond what noise does to points without parallax."""
+    depth0, depth1 = depths(camera, T, xy0, xy1)
+    sure = rays_angle_deg(camera, T, xy0, xy1) > np.degrees(2.0 * threshold_px / camera.fx)
+    return np.asarray(sure & ((depth0 <= 0) | (depth1 <= 0)))
+
+
+def _search(
+    camera: Intrinsics,
+    xy0: Array,
+    xy1: Array,
+    *,
+    threshold_px: float,
+    in_order: bool,
+    seed: int,
+    max_iterations: int,
+    min_iterations: int,
+) -> Array | None:
+    """PoseLib's LO-RANSAC; in order, it draws the first matches first."""
+    options = {
+        "max_epipolar_error": threshold_px,
+        "success_prob": 0.9999,
+        "max_iterations": max_iterations,
+        "min_iterations": min_iterations,
+        "seed": seed,
+        "progressive_sampling": in_order,
+    }
+    pinhole = poselib_camera(camera)
+    pose, info = poselib.estimate_relative_pose(xy0, xy1, pinhole, pinhole, options, {})
+    t = np.asarray(pose.t, dtype=np.float64)
+    length = float(np.linalg.norm(t))
+    R = np.asarray(pose.R, dtype=np.float64)
+    if info["num_inliers"] < 5 or not (np.isfinite(length) and np.isfinite(R).all()) or length == 0.0:
+        return None
+    return make_transform(project_to_so3(R), t / length)
+
+
+def _from_plane(
+    camera: Intrinsics, xy0: Array, xy1: Array, threshold_px: float, seed: int
+) -> list[Array | None]:
+    """Poses of the plane most matches lie on; none where no plane stands out."""
+    options = {"max_reproj_error": 2.0 * threshold_px, "max_iterations": 500, "seed": seed}
+    H, info = poselib.estimate_homography(xy0, xy1, options, {})
+    if info["num_inliers"] < max(MIN_MATCHES, 0.5 * len(xy0)) or not np.isfinite(H).all():
+        return []
+    on_plane = np.asarray(info["inliers"], dtype=bool)
+    K = camera.K
+    poses, _ = poselib.motion_from_homography(np.linalg.inv(K) @ np.asarray(H) @ K)
+    found: list[Array | None] = []
+    sigma_px = np.full(len(xy0), 0.5 * threshold_px)
+    for pose in poses:
+        t = np.asarray(pose.t, dtype=np.float64)
+        length = float(np.linalg.norm(t))
+        if not np.isfinite(length) or length < 1e-9 or not np.isfinite(pose.R).all():
+            continue
+        T = make_transform(project_to_so3(pose.R), t / length)
+        T = in_front(camera, T, xy0[on_plane], xy1[on_plane])
+        found.append(refine_relative_pose(camera, T, xy0, xy1, sigma_px))
+    return found
+
+
+def _refine(
+    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, confidence: Array | None, threshold_px: float
+) -> Array:
+    """Refine with the noise fitted to this pair; with equal weights where confidence tells nothing."""
+    residual = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
+    near = residual < 3.0 * threshold_px
+    if int(near.sum()) < MIN_MATCHES:
+        return T
+    sigma = np.ones(len(xy0))
+    model = fit_noise(confidence[near], residual[near]) if confidence is not None else None
+    if model is not None and confidence is not None:
+        sigma = NoiseModel(1.0, _BETA_SHARE * model.beta).sigma_px(confidence)
+    scale_px = float(np.median(residual[near] / sigma[near])) / 0.6745
+    return refine_relative_pose(
+        camera, T, xy0, xy1, max(scale_px, _MIN_SIGMA_PX) * sigma, cut_sigmas=_CUT_SIGMAS
+    )
+
+
+def _result(
+    camera: Intrinsics,
+    T: Array,
+    xy0: Array,
+    xy1: Array,
+    threshold_px: float,
+    score: float,
+    choose_model: bool,
+) -> TwoViewResult:
+    residual = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
+    near = residual < 2.0 * threshold_px
+    T = in_front_sign(camera, T, xy0[near], xy1[near])
+    depth0, depth1 = depths(camera, T, xy0, xy1)
+    inliers = near & (depth0 > 0) & (depth1 > 0)
+    angle = rays_angle_deg(camera, T, xy0, xy1)
+    model: Model = "essential"
+    if choose_model and near.any():
+        R = fit_rotation(camera, xy0[near], xy1[near])
+        turned = rotation_residual_px(camera, R, xy0[near], xy1[near]) < 3.0 * threshold_px
+        if turned.mean() > 0.8:
+            model = "rotation"
+    parallax = float(np.median(angle[inliers])) if inliers.any() else 0.0
+    return TwoViewResult(T, inliers, score, model, parallax)
+
+
+def in_front_sign(camera: Intrinsics, T: Array, xy0: Array, xy1: Array) -> Array:
+    """Turn the translation round when that puts more points in front of both cameras."""
+    turned = make_transform(T[:3, :3], -T[:3, 3])
+    counts = []
+    for candidate in (T, turned):
+        depth0, depth1 = depths(camera, candidate, xy0, xy1)
+        counts.append(int(((depth0 > 0) & (depth1 > 0)).sum()))
+    return turned if counts[1] > counts[0] else T

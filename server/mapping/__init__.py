@@ -1,0 +1,1 @@
+"""The reconstruction: tracks, the map as it grows, bundle adjustment, recognising places."""

@@ -1,0 +1,151 @@
+"""Bundle adjustment in a process of its own: GTSAM holds the interpreter lock while it works."""
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import time
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+
+from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
+
+logger = logging.getLogger(__name__)
+
+#: Longest wait for one adjustment, the start of the process included.
+DEADLINE_S = 30.0
+_CLOSE_DEADLINE_S = 3.0
+#: Starts in a row that lead to no result before the runner gives up for good.
+_MAX_FAILURES = 5
+
+
+def serve(connection: Connection) -> None:
+    """Answer problems until the other end closes; the body of the child process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from semcast.server.mapping.bundle import optimise
+
+    while True:
+        try:
+            problem = connection.recv()
+        except (EOFError, OSError):
+            return
+        if problem is None:
+            return
+        try:
+            connection.send(optimise(problem))
+        except (BrokenPipeError, OSError):
+            return
+
+
+class ProcessBundle:
+    """Adjusts in a child process that is started again when it dies.
+
+    Args:
+        lossless: ``take`` always waits for the result, so the same input gives the same map; otherwise it
+            returns at once and the result is applied when it is ready.
+    """
+
+    def __init__(self, *, lossless: bool = False) -> None:
+        self._lossless = lossless
+        self._context = multiprocessing.get_context("spawn")
+        self._process: SpawnProcess | None = None
+        self._connection: Connection | None = None
+        self._pending: BundleProblem | None = None
+        self._closed = False
+        self._failures = 0
+        self.num_restarts = 0
+        self._start()
+
+    @property
+    def busy(self) -> bool:
+        """A problem is under way."""
+        return self._pending is not None
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child."""
+        return self._process.pid if self._process is not None else None
+
+    def _start(self) -> None:
+        self._stop()
+        ours, theirs = self._context.Pipe()
+        self._process = self._context.Process(
+            target=serve, args=(theirs,), name="semcast-bundle", daemon=True
+        )
+        self._process.start()
+        theirs.close()
+        self._connection = ours
+
+    def _restart(self) -> None:
+        self._failures += 1
+        self.num_restarts += 1
+        logger.warning("the bundle adjustment process ended and is started again")
+        self._start()
+
+    def submit(self, problem: BundleProblem) -> bool:
+        """Send a problem to the child; False while it works on another or has failed for good."""
+        if self._closed or self._pending is not None or self._failures >= _MAX_FAILURES:
+            return False
+        for _ in range(2):
+            assert self._connection is not None
+            try:
+                if self._process is None or not self._process.is_alive():
+                    raise BrokenPipeError
+                self._connection.send(problem)
+                self._pending = problem
+                return True
+            except (BrokenPipeError, OSError):
+                self._restart()
+        return False
+
+    def take(self, wait: bool = False) -> BundleResult | None:
+        """Return the result, or None when it is not there yet or the child died over it.
+
+        A problem whose child died is sent once more when the result is waited for.
+        """
+        if self._pending is None or self._closed:
+            return None
+        wait = wait or self._lossless
+        deadline_s = time.monotonic() + DEADLINE_S
+        retries = 1
+        while True:
+            assert self._connection is not None
+            try:
+                timeout_s = max(0.0, deadline_s - time.monotonic()) if wait else 0.0
+                if not self._connection.poll(timeout_s):
+                    if not wait:
+                        return None
+                    raise TimeoutError
+                result = self._connection.recv()
+                self._pending, self._failures = None, 0
+                return result  # type: ignore[no-any-return]
+            except (EOFError, OSError):  # TimeoutError is an OSError
+                problem, self._pending = self._pending, None
+                self._restart()
+                if not wait or retries == 0 or problem is None or not self.submit(problem):
+                    self._pending = None
+                    return None
+                retries -= 1
+
+    def _stop(self) -> None:
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            with contextlib.suppress(OSError):
+                connection.send(None)
+            connection.close()
+        process, self._process = self._process, None
+        if process is not None:
+            process.join(_CLOSE_DEADLINE_S if self._pending is None else 0.1)
+            if process.is_alive():
+                process.kill()
+                process.join(_CLOSE_DEADLINE_S)
+            process.close()
+
+    def close(self) -> None:
+        """End the child. Idempotent."""
+        if not self._closed:
+            self._closed = True
+            self._stop()
+            self._pending = None

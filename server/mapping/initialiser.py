@@ -1,0 +1,303 @@
+"""The start of a map: two views with parallax, the frames between them, and an adjustment of all.
+
+Standing still and turning on the spot give no depth; the start then waits. Frames that came before are kept,
+so that they get their poses as soon as there is a map.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.pnp import refine_pose, search_pose
+from semcast.server.geometry.reversal import Side, decide
+from semcast.server.geometry.triangulation import Triangulation, triangulate
+from semcast.server.geometry.two_view import TwoViewResult, estimate_two_view
+from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
+from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.tracker import interpolate_pose
+from semcast.server.mapping.world_map import Keyframe
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Frames kept for poses in retrospect.
+MAX_HISTORY = 300
+#: Keyframes of a new map at most.
+START_KEYFRAMES = 5
+MIN_POINTS = 40
+#: Two views of a scene with little perspective can't tell it from its mirror image in depth. They have to do
+#: where tracks don't last for three, which so many frames in vain have shown.
+_MIN_VIEWS, _FRAMES_IN_VAIN = 3, 4
+#: Points (the longest tracks) and steps for telling them apart.
+_MAX_DECIDING, _DECIDING_ITERATIONS = 150, 20
+#: A start is better from so many points; fewer do when so many frames have waited for it.
+_PLENTY_OF_POINTS, _PATIENCE_FRAMES = 60, 12
+#: Share of the reference's tracks that must still be there; else the reference moves on.
+_MIN_SHARED = 0.12
+#: Median way of the tracks, as share of the image width, below which no start is tried.
+_MIN_FLOW_SHARE = 0.012
+#: Median angle between the rays of the two views.
+_MIN_MEDIAN_PARALLAX_DEG = 0.7
+
+
+@dataclass(frozen=True)
+class Observed:
+    """The tracks of one frame."""
+
+    frame_id: int
+    t_source_ns: int
+    ids: Ids
+    xy: Array
+    confidence: Array
+
+
+@dataclass(frozen=True)
+class Start:
+    """A new map in its own frame: the reference at the origin, median depth 1.
+
+    Attributes:
+        keyframes: In order of time, without descriptors.
+        ids: ``(P,)`` int64 landmarks.
+        xyz: ``(P, 3)``.
+        confidence: ``(P,)`` mean over observations.
+    """
+
+    keyframes: list[Keyframe]
+    ids: Ids
+    xyz: Array
+    confidence: Array
+
+
+class Initialiser:
+    """Collects frames until two of them start a map.
+
+    Args:
+        camera: Pinhole.
+        mode: Use of confidence.
+        min_parallax_deg: From which a point is triangulated.
+        seed: Of the searches.
+    """
+
+    def __init__(self, camera: Intrinsics, mode: ConfidenceMode, min_parallax_deg: float, seed: int) -> None:
+        self._camera = camera
+        self._mode: ConfidenceMode = mode
+        self._min_parallax_deg = min_parallax_deg
+        self._seed = seed
+        self.history: list[Observed] = []
+        self._reference = 0
+
+    def clear(self) -> None:
+        """Forget all frames."""
+        self.history = []
+        self._reference = 0
+
+    def add(self, observed: Observed, noise: NoiseModel, *, is_damaged: bool = False) -> Start | None:
+        """Take a frame and try to start a map with it.
+
+        Args:
+            observed: Its tracks.
+            noise: Of the observations.
+            is_damaged: Much of the image is missing: keep the frame, but do not start from it.
+
+        Returns:
+            The start, or None for now. On success ``history`` still holds the frames to be posed.
+        """
+        if len(observed.ids) < 8:
+            return None
+        self.history.append(observed)
+        if len(self.history) > MAX_HISTORY:
+            self.history.pop(0)
+            self._reference = max(0, self._reference - 1)
+        self._move_reference()
+        if is_damaged or self._reference == len(self.history) - 1:
+            return None
+        reference = self.history[self._reference]
+        shared, row0, row1 = np.intersect1d(
+            reference.ids, observed.ids, assume_unique=True, return_indices=True
+        )
+        if len(shared) < self._min_points():
+            return None
+        xy0, xy1 = reference.xy[row0], observed.xy[row1]
+        flow_px = float(np.median(np.linalg.norm(xy1 - xy0, axis=1)))
+        if flow_px < _MIN_FLOW_SHARE * self._camera.width:
+            return None
+        confidence = fuse_confidence(reference.confidence[row0], observed.confidence[row1])
+        threshold_px = float(np.clip(2.0 * noise.sigma0_px, 1.0, 3.0))
+        found = estimate_two_view(
+            self._camera,
+            xy0,
+            xy1,
+            confidence,
+            mode=self._mode,
+            threshold_px=threshold_px,
+            seed=self._seed,
+            min_iterations=200,
+            max_iterations=2000,
+            choose_model=True,
+        )
+        if found is None or not self._is_good(found, len(shared)):
+            return None
+        return self._build(found, shared[found.inliers], noise)
+
+    def _min_points(self) -> int:
+        """A start from a few points of a damaged image costs the whole map; waiting costs a few frames."""
+        return MIN_POINTS if len(self.history) >= _PATIENCE_FRAMES else _PLENTY_OF_POINTS
+
+    def _is_good(self, found: TwoViewResult, num_shared: int) -> bool:
+        enough = int(found.inliers.sum()) >= max(self._min_points(), 0.5 * num_shared)
+        return enough and found.model != "rotation" and found.parallax_deg > _MIN_MEDIAN_PARALLAX_DEG
+
+    def _move_reference(self) -> None:
+        """Let the reference be the oldest frame that still shares enough tracks with the newest."""
+        newest = self.history[-1]
+        while self._reference < len(self.history) - 1:
+            reference = self.history[self._reference]
+            shared = int(np.isin(reference.ids, newest.ids, assume_unique=True).sum())
+            if shared >= max(MIN_POINTS, _MIN_SHARED * len(reference.ids)):
+                return
+            self._reference += 1
+
+    def _build(self, found: TwoViewResult, ids: Ids, noise: NoiseModel) -> Start | None:
+        """Triangulate, place the frames between, and triangulate again from all."""
+        span = self.history[self._reference :]
+        if len(span) < _MIN_VIEWS and len(self.history) < _FRAMES_IN_VAIN:
+            return None
+        first, last = span[0], span[-1]
+        T_world = {0: np.eye(4), len(span) - 1: invert_transform(found.T_cam1_cam0)}
+        points = self._triangulate([first, last], np.stack([np.eye(4), found.T_cam1_cam0]), ids, noise)
+        good = self._passes(points, noise)
+        if int(good.sum()) < MIN_POINTS:
+            return None
+        between = np.unique(np.linspace(0, len(span) - 1, START_KEYFRAMES).round().astype(int))
+        for k in between[1:-1].tolist():
+            guess = interpolate_pose(T_world[0], T_world[len(span) - 1], k / (len(span) - 1))
+            T_cam = pose_of(self._camera, span[k], ids[good], points.xyz[good], noise, guess, self._seed)
+            if T_cam is not None:
+                T_world[k] = T_cam
+        chosen = [span[k] for k in sorted(T_world)]
+        poses = np.stack([T_world[k] for k in sorted(T_world)])
+        side = self._decide(chosen, poses, noise)
+        if side is None:
+            return None
+        T_cam_world = invert_transform(side.T_world_cam)
+        all_ids = np.unique(np.concatenate([o.ids for o in chosen]))
+        points = self._triangulate(chosen, T_cam_world, all_ids, noise)
+        good = self._passes(points, noise)
+        if int(good.sum()) < MIN_POINTS:
+            return None
+        scale = 1.0 / float(np.median(points.xyz[good, 2]))
+        if not 0 < scale < np.inf:
+            return None
+        keyframes = []
+        for o, T in zip(chosen, invert_transform(T_cam_world), strict=True):
+            T[:3, 3] *= scale
+            keyframes.append(_keyframe(o, T))
+        total = [o.confidence[np.isin(o.ids, all_ids[good])] for o in chosen]
+        mean = np.full(int(good.sum()), float(np.mean(np.concatenate(total))))
+        return Start(keyframes, all_ids[good], scale * points.xyz[good], mean)
+
+    def _decide(self, views: list[Observed], T_world_cam: Array, noise: NoiseModel) -> Side | None:
+        """Adjust the start and its mirror image in depth; None while both fit the observations."""
+        all_ids, count = np.unique(np.concatenate([o.ids for o in views]), return_counts=True)
+        longest = np.lexsort((all_ids, -count))[:_MAX_DECIDING]
+        ids = np.sort(all_ids[longest[count[longest] >= 2]])
+        view, point, xy, sigma, confidence = _observations(views, ids, noise)
+        T_cam_world = invert_transform(T_world_cam)
+        points = triangulate(self._camera, T_cam_world, view, point, xy, sigma, len(ids))
+        if not points.in_front.any():
+            return None
+        # A point that fits nowhere begins at a usual depth: the other structure may have a place for it.
+        _, first = np.unique(point, return_index=True)
+        depth = float(np.median(points.xyz[points.in_front, 2]))
+        ray = self._camera.unproject(xy[first]) * depth
+        T = T_world_cam[view[first]]
+        along = np.einsum("pij,pj->pi", T[:, :3, :3], ray) + T[:, :3, 3]
+        problem = BundleProblem(
+            intrinsics=(self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy),
+            keyframe_ids=np.array([o.frame_id for o in views], dtype=np.int64),
+            T_world_cam=T_world_cam,
+            fixed=np.arange(len(views)) == 0,
+            keep_baseline=True,
+            landmark_ids=ids,
+            xyz=np.where(points.in_front[:, None], points.xyz, along),
+            view=view,
+            point=point,
+            xy=xy,
+            sigma_px=sigma,
+            confidence=confidence,
+            iterations=_DECIDING_ITERATIONS,
+        )
+        return decide(problem, at_last=len(self.history) >= _PATIENCE_FRAMES)
+
+    def _triangulate(
+        self, frames: list[Observed], T_cam_world: Array, ids: Ids, noise: NoiseModel
+    ) -> Triangulation:
+        view, point, xy, sigma, _ = _observations(frames, ids, noise)
+        return triangulate(self._camera, T_cam_world, view, point, xy, sigma, len(ids))
+
+    def _passes(self, points: Triangulation, noise: NoiseModel) -> NDArray[np.bool_]:
+        return (
+            points.in_front
+            & (points.parallax_deg > 0.5 * self._min_parallax_deg)
+            & (points.error_sigma < 2.5)
+        )
+
+
+def _observations(
+    frames: list[Observed], ids: Ids, noise: NoiseModel
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array, Array]:
+    """View, row into ``ids`` (ascending), pixel, sigma and confidence of all observations of ``ids``."""
+    view, point, xy, confidence = [], [], [], []
+    for k, o in enumerate(frames):
+        _, row, row_o = np.intersect1d(ids, o.ids, assume_unique=True, return_indices=True)
+        view.append(np.full(len(row), k, np.intp))
+        point.append(row.astype(np.intp))
+        xy.append(o.xy[row_o])
+        confidence.append(o.confidence[row_o])
+    total = np.concatenate(confidence)
+    return np.concatenate(view), np.concatenate(point), np.concatenate(xy), noise.sigma_px(total), total
+
+
+def _keyframe(o: Observed, T_world_cam: Array) -> Keyframe:
+    return Keyframe(
+        frame_id=o.frame_id,
+        t_source_ns=o.t_source_ns,
+        T_world_cam=T_world_cam,
+        submap=0,
+        ids=o.ids,
+        xy=o.xy,
+        confidence=o.confidence,
+        descriptor_ids=np.zeros(0, np.int64),
+        descriptors=np.zeros((0, 32), np.uint8),
+    )
+
+
+def pose_of(
+    camera: Intrinsics,
+    observed: Observed,
+    ids: Ids,
+    xyz: Array,
+    noise: NoiseModel,
+    T_world_guess: Array,
+    seed: int,
+    min_inliers: int = 15,
+) -> Array | None:
+    """``T_world_cam`` of a kept frame from landmarks (``ids`` ascending), None where too few agree."""
+    _, row, row_o = np.intersect1d(ids, observed.ids, assume_unique=True, return_indices=True)
+    if len(row) < min_inliers:
+        return None
+    sigma = noise.sigma_px(observed.confidence[row_o])
+    gate = noise.threshold_px(observed.confidence[row_o])
+    estimate = refine_pose(camera, invert_transform(T_world_guess), xyz[row], observed.xy[row_o], sigma, gate)
+    if estimate.num_inliers < 0.5 * len(row):
+        searched = search_pose(
+            camera, xyz[row], observed.xy[row_o], sigma, gate, seed=seed, min_inliers=min_inliers
+        )
+        if searched is not None and searched.num_inliers > estimate.num_inliers:
+            estimate = searched
+    if estimate.num_inliers < min_inliers:
+        return None
+    return invert_transform(estimate.T_cam_world)

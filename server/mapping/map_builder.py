@@ -1,0 +1,230 @@
+"""The map as it grows: keyframes, their landmarks, adjustments, and submaps that are joined."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform, make_transform
+from semcast.server.geometry.weighting import OnlineNoise
+from semcast.server.mapping import mapper
+from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
+from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.recall import SeenFrom, no_images
+from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.tracks import Sight, TrackTable
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+
+#: Two keyframes this many steps apart give the scale of a new map its speed.
+_MAX_BRIDGE_S = 5.0
+
+
+class MapBuilder:
+    """Owns the map and everything that changes it.
+
+    Args:
+        camera: Pinhole.
+        settings: How.
+        bundle: Runs the adjustments.
+    """
+
+    def __init__(self, camera: Intrinsics, settings: ReconstructionSettings, bundle: BundleRunner) -> None:
+        self._camera = camera
+        self._settings = settings
+        self._bundle = bundle
+        self._version = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the map; an adjustment under way is not applied any more."""
+        s = self._settings
+        if self._bundle.busy:
+            self._bundle.take(wait=True)
+        self._version += 1
+        self.world = WorldMap()
+        self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
+        self.relocaliser = Relocaliser(self._camera, s.seed, s.max_features)
+        self.submap = 0
+        self.keyframe_covariance: Array | None = None
+        self.num_inliers_at_keyframe = 0
+        self.images = no_images()
+
+    def reference_keyframe(self) -> Keyframe | None:
+        """Newest keyframe of the current submap."""
+        return next((k for k in reversed(self.world.keyframes) if k.submap == self.submap), None)
+
+    def other_submaps(self) -> set[int]:
+        """Submaps that have keyframes, without the current one."""
+        return {k.submap for k in self.world.keyframes} - {self.submap}
+
+    def begin_submap(self) -> None:
+        """Let the next start be a submap of its own."""
+        self.submap = 1 + max(self.world.submap_of.values(), default=-1)
+
+    def take_start(
+        self, start: Start, sight: Sight, tracks: TrackTable, T_world_ref: Array, scale: float
+    ) -> None:
+        """Bring a new map in and adjust it at once.
+
+        Args:
+            start: The new map, reference at the origin.
+            sight: The newest image.
+            tracks: Tracks in it.
+            T_world_ref: Pose of the reference in the world.
+            scale: World units per unit of the start.
+        """
+        placed = make_transform(T_world_ref[:3, :3], T_world_ref[:3, 3])
+        for keyframe in start.keyframes:
+            T = keyframe.T_world_cam.copy()
+            T[:3, 3] *= scale
+            keyframe.T_world_cam = placed @ T
+            keyframe.submap = self.submap
+            self.world.add_keyframe(keyframe)
+        newest = start.keyframes[-1]
+        self.images.append(SeenFrom(newest.frame_id, sight.grey))
+        newest.descriptor_ids, newest.descriptors = self.relocaliser.describe(
+            sight.grey, newest.ids, newest.xy
+        )
+        xyz = scale * start.xyz @ placed[:3, :3].T + placed[:3, 3]
+        xy = np.full((len(start.ids), 2), -1.0)
+        seen = np.isin(start.ids, newest.ids, assume_unique=True)
+        xy[seen] = newest.xy[np.searchsorted(newest.ids, start.ids[seen])]
+        rgb = mapper.sample_colours(sight.frame.image, xy)
+        self.world.add_landmarks(start.ids, xyz, rgb, start.confidence, self.submap, newest.frame_id)
+        self._submit(start=True)
+        self.collect(wait=True)
+        mapper.add_landmarks(
+            self.world, self._camera, self.noise.model, sight.frame.image, self._settings.min_parallax_deg
+        )
+        self._submit(start=True)
+        self.collect(wait=True)
+        visible = tracks.ids[tracks.visible]
+        self.num_inliers_at_keyframe = int((self.world.landmarks.rows(visible) >= 0).sum())
+
+    def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
+        """Turn the newest frame into a keyframe, triangulate, and ask for an adjustment."""
+        s, frame, world = self._settings, sight.frame, self.world
+        visible = tracks.visible
+        ids, xy = tracks.ids[visible], tracks.xy[visible]
+        self.images.append(SeenFrom(frame.frame_id, sight.grey))
+        descriptor_ids, descriptors = self.relocaliser.describe(sight.grey, ids, xy)
+        world.add_keyframe(
+            Keyframe(
+                frame_id=frame.frame_id,
+                t_source_ns=frame.t_source_ns,
+                T_world_cam=T_world_cam,
+                submap=self.submap,
+                ids=ids,
+                xy=xy,
+                confidence=tracks.confidence[visible],
+                descriptor_ids=descriptor_ids,
+                descriptors=descriptors,
+            )
+        )
+        mapper.add_landmarks(world, self._camera, self.noise.model, frame.image, s.min_parallax_deg)
+        self.num_inliers_at_keyframe = int((world.landmarks.rows(ids) >= 0).sum())
+        world.bound(s.max_landmarks, s.max_keyframes, recent=min(40, s.max_keyframes // 2))
+        self._submit()
+
+    def _submit(self, *, start: bool = False) -> None:
+        if self._bundle.busy:
+            return
+        mine = sum(k.submap == self.submap for k in self.world.keyframes[-self._settings.window_size - 1 :])
+        problem = mapper.build_problem(
+            self.world,
+            self._camera,
+            self.noise.model,
+            self._settings.window_size,
+            start=start or mine <= self._settings.window_size // 2,
+            iterations=15 if start else 6,
+            map_version=self._version,
+        )
+        if problem is not None:
+            self._bundle.submit(problem)
+
+    def collect(self, *, wait: bool = False) -> BundleResult | None:
+        """Bring a finished adjustment into the map; the result, or None where there is none."""
+        result = self._bundle.take(wait=wait)
+        if result is None or result.problem.map_version != self._version:
+            return None
+        mapper.apply_result(self.world, result, self.noise)
+        self.keyframe_covariance = result.covariance
+        return result
+
+    def bridge(
+        self, T_world_guess: Array | None, speed_map_per_s: float, start: Start
+    ) -> tuple[Array, float]:
+        """Where a new submap begins and how large its unit is, as long as nothing better is known.
+
+        It begins where the camera was heading. Its unit makes the camera go on at its old speed, or, where it
+        stood or too long ago, makes things as far away as they were.
+        """
+        before = self.reference_before()
+        if T_world_guess is None or before is None:
+            return np.eye(4), 1.0
+        first, last = start.keyframes[0], start.keyframes[-1]
+        way = float(np.linalg.norm(last.T_world_cam[:3, 3] - first.T_world_cam[:3, 3]))
+        elapsed_s = (last.t_source_ns - first.t_source_ns) * 1e-9
+        depth = mapper.median_depth(self.world, before)
+        depth = depth if np.isfinite(depth) else 1.0
+        since_s = (first.t_source_ns - before.t_source_ns) * 1e-9
+        if since_s < _MAX_BRIDGE_S and way > 0 and speed_map_per_s * elapsed_s > 0.02 * depth:
+            scale = speed_map_per_s * elapsed_s / way
+            if 0.2 * depth < scale < 5.0 * depth:
+                return T_world_guess, scale
+        return T_world_guess, depth
+
+    def reference_before(self) -> Keyframe | None:
+        """Newest keyframe of any submap."""
+        return self.world.keyframes[-1] if self.world.keyframes else None
+
+    def join(
+        self,
+        place: Place,
+        T_world_cam: Array,
+        tracks: TrackTable,
+        on_moved: Callable[[float], None],
+    ) -> bool:
+        """Join the current submap to the one a place was recognised in.
+
+        Args:
+            place: The newest frame's place in the older submap.
+            T_world_cam: Its pose in the current one.
+            tracks: Its tracks.
+            on_moved: Called with the scale of the similarity after the map has moved.
+
+        Returns:
+            Whether they were joined.
+        """
+        visible = tracks.visible
+        found = submap_similarity(place, self.world, T_world_cam, tracks.ids[visible], tracks.xy[visible])
+        if found is None:
+            return False
+        scale, T_old_new = found
+        if self._bundle.busy:
+            self._bundle.take(wait=True)
+        self._version += 1
+        self.world.transform_submap(self.submap, place.submap, scale, T_old_new)
+        self.submap = place.submap
+        on_moved(scale)
+        return True
+
+    def pose_covariance(self, covariance_in_keyframe: Array | None, T_keyframe_cam: Array) -> Array | None:
+        """Covariance of a frame: that of its keyframe carried over, plus its own.
+
+        Args:
+            covariance_in_keyframe: ``(6, 6)`` of the frame relative to the map, in the camera frame.
+            T_keyframe_cam: Pose relative to the keyframe.
+        """
+        if covariance_in_keyframe is None or self.keyframe_covariance is None:
+            return covariance_in_keyframe
+        T = invert_transform(T_keyframe_cam)
+        R, t = T[:3, :3], T[:3, 3]
+        adjoint = np.zeros((6, 6))
+        adjoint[:3, :3] = adjoint[3:, 3:] = R
+        adjoint[3:, :3] = (np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])) @ R
+        return np.asarray(adjoint @ self.keyframe_covariance @ adjoint.T + covariance_in_keyframe)

@@ -1,0 +1,318 @@
+"""Keyframes into map: when to take one, new landmarks, culling, and the window for bundle adjustment."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.triangulation import triangulate
+from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
+from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Observations one adjustment takes at most; it has to be done before the next keyframe.
+MAX_OBSERVATIONS = 3500
+#: Landmarks further than this many median depths are as good as at infinity.
+_MAX_DEPTH_RATIO = 60.0
+#: Observations in a row that disagree before a landmark is given up.
+_MAX_MISSED = 4
+
+
+@dataclass(frozen=True)
+class KeyframeCues:
+    """What the keyframe rule looks at.
+
+    Attributes:
+        num_inliers: Landmarks that agree with the pose.
+        num_inliers_at_keyframe: The same right after the last keyframe.
+        num_visible: Tracks in sight.
+        max_features: Tracks wanted.
+        median_flow_px: Median way of tracks since the last keyframe.
+        width_px: Of the image.
+        frames_since: Frames since the last keyframe.
+        usable_share: Share of image rows that arrived.
+    """
+
+    num_inliers: int
+    num_inliers_at_keyframe: int
+    num_visible: int
+    max_features: int
+    median_flow_px: float
+    width_px: int
+    frames_since: int
+    usable_share: float
+
+
+def wants_keyframe(cues: KeyframeCues) -> bool:
+    """Decide on a keyframe: the view has changed, or landmarks are running out.
+
+    A frame of which much is missing becomes one only in need.
+    """
+    few = cues.num_inliers < 0.45 * cues.num_inliers_at_keyframe or cues.num_inliers < 40
+    if cues.usable_share < 0.5:
+        return few and cues.frames_since >= 5
+    if cues.median_flow_px < 0.004 * cues.width_px:
+        return False  # standing still brings neither parallax nor new views
+    thinned = cues.num_inliers < 0.75 * cues.num_inliers_at_keyframe
+    sparse = cues.num_visible < 0.6 * cues.max_features
+    moved = cues.median_flow_px > 0.045 * cues.width_px
+    changing = cues.frames_since >= 2 or cues.median_flow_px > 0.02 * cues.width_px
+    return few or moved or ((thinned or sparse) and changing)
+
+
+def keyframe_cues(
+    reference: Keyframe,
+    ids: Ids,
+    xy: Array,
+    *,
+    num_inliers: int,
+    num_inliers_at_keyframe: int,
+    max_features: int,
+    width_px: int,
+    frames_since: int,
+    usable_share: float,
+) -> KeyframeCues:
+    """Cues of a frame whose tracks ``ids`` (ascending) are at ``xy``, against its reference keyframe."""
+    _, row, row_k = np.intersect1d(ids, reference.ids, assume_unique=True, return_indices=True)
+    flow_px = np.linalg.norm(xy[row] - reference.xy[row_k], axis=1)
+    return KeyframeCues(
+        num_inliers=num_inliers,
+        num_inliers_at_keyframe=num_inliers_at_keyframe,
+        num_visible=len(ids),
+        max_features=max_features,
+        median_flow_px=float(np.median(flow_px)) if len(flow_px) else float(width_px),
+        width_px=width_px,
+        frames_since=frames_since,
+        usable_share=usable_share,
+    )
+
+
+def add_landmarks(
+    world: WorldMap,
+    camera: Intrinsics,
+    noise: NoiseModel,
+    image: NDArray[np.uint8],
+    min_parallax_deg: float,
+    *,
+    num_keyframes: int = 12,
+) -> int:
+    """Triangulate the tracks of the newest keyframe that are no landmarks yet; the number added.
+
+    A point must have its rays more than ``min_parallax_deg`` apart, be in front of all its cameras and
+    within 3 sigma of its observations.
+    """
+    newest = world.keyframes[-1]
+    wanted = newest.ids[world.landmarks.rows(newest.ids) < 0]
+    if len(wanted) == 0:
+        return 0
+    views = [k for k in world.keyframes[-num_keyframes:] if k.submap == newest.submap]
+    view, point, xy, confidence = gather_observations(views, wanted)
+    seen = np.bincount(point, minlength=len(wanted))
+    if not (seen >= 2).any():
+        return 0
+    T_cam_world = invert_transform(np.stack([k.T_world_cam for k in views]))
+    sigma = noise.sigma_px(confidence)
+    new = triangulate(camera, T_cam_world, view, point, xy, sigma, len(wanted))
+    depth = (new.xyz @ T_cam_world[-1, 2, :3]) + T_cam_world[-1, 2, 3]
+    reach = _MAX_DEPTH_RATIO * median_depth(world, newest)
+    # A fixed error in pixels is what an angle is compared with: noisy images need more parallax.
+    wanted_deg = max(min_parallax_deg, float(np.degrees(2.5 * np.median(sigma) / camera.fx)))
+    good = (
+        (seen >= 2)
+        & new.in_front
+        & (new.parallax_deg > wanted_deg)
+        & (new.error_sigma < 1.8)
+        & (depth < reach)
+    )
+    if not good.any():
+        return 0
+    ids = wanted[good]
+    row = np.searchsorted(newest.ids, ids)
+    total = np.bincount(point, weights=confidence, minlength=len(wanted))
+    world.add_landmarks(
+        ids,
+        new.xyz[good],
+        sample_colours(image, newest.xy[row]),
+        (total / np.maximum(1, seen))[good],
+        newest.submap,
+        newest.frame_id,
+    )
+    return len(ids)
+
+
+def sample_colours(image: NDArray[np.uint8], xy: Array) -> NDArray[np.uint8]:
+    """Colour of the nearest pixel, ``(N, 3)`` uint8; grey for points with a negative coordinate."""
+    height, width = image.shape[:2]
+    x = np.clip(np.rint(xy[:, 0]), 0, width - 1).astype(np.intp)
+    y = np.clip(np.rint(xy[:, 1]), 0, height - 1).astype(np.intp)
+    return np.where(np.any(xy < 0, axis=1, keepdims=True), np.uint8(128), image[y, x])
+
+
+def gather_observations(
+    views: list[Keyframe], ids: Ids
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+    """View, row into ``ids``, pixel and confidence of every observation of ``ids`` in the views.
+
+    ``ids`` must ascend.
+    """
+    view, point, xy, confidence = [], [], [], []
+    for k, keyframe in enumerate(views):
+        row = np.minimum(np.searchsorted(ids, keyframe.ids), max(0, len(ids) - 1))
+        hit = ids[row] == keyframe.ids if len(ids) else np.zeros(len(keyframe.ids), bool)
+        view.append(np.full(int(hit.sum()), k, np.intp))
+        point.append(row[hit].astype(np.intp))
+        xy.append(keyframe.xy[hit])
+        confidence.append(keyframe.confidence[hit])
+    return np.concatenate(view), np.concatenate(point), np.concatenate(xy), np.concatenate(confidence)
+
+
+def median_depth(world: WorldMap, keyframe: Keyframe) -> float:
+    """Median depth of a keyframe's landmarks in map units; infinite when it sees none."""
+    row = world.landmarks.rows(keyframe.ids)
+    row = row[row >= 0]
+    if len(row) == 0:
+        return float("inf")
+    T_cam_world = invert_transform(keyframe.T_world_cam)
+    depth = world.landmarks.xyz[row] @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    return float(np.median(np.maximum(depth, 1e-6)))
+
+
+def build_problem(
+    world: WorldMap,
+    camera: Intrinsics,
+    noise: NoiseModel,
+    window_size: int,
+    *,
+    start: bool = False,
+    iterations: int = 6,
+    map_version: int = 0,
+) -> BundleProblem | None:
+    """Collect the newest keyframes of the current submap and what they see.
+
+    Args:
+        world: The map.
+        camera: Pinhole.
+        noise: Gives each observation its sigma.
+        window_size: Keyframes at most.
+        start: The first adjustment of a new map: one pose and the baseline are held instead of two poses.
+        iterations: Steps at most.
+        map_version: Handed through.
+
+    Returns:
+        The problem, or None when there is nothing to adjust.
+    """
+    submap = world.keyframes[-1].submap
+    mine = [k for k in world.keyframes if k.submap == submap]
+    views = mine[-window_size:]
+    if len(views) < (2 if start else 3):
+        return None
+    ids = np.unique(np.concatenate([k.ids for k in views]))
+    ids = ids[world.landmarks.rows(ids) >= 0]
+    view, point, xy, confidence = gather_observations(views, ids)
+    count = np.bincount(point, minlength=len(ids))
+    if count.sum() > MAX_OBSERVATIONS:
+        # Long tracks tie the window together: they are kept first, ids break ties.
+        order = np.lexsort((ids, -count))
+        within = np.cumsum(count[order]) <= MAX_OBSERVATIONS
+        chosen = np.zeros(len(ids), bool)
+        chosen[order[within]] = True
+        count = np.where(chosen, count, 0)
+    used_points = np.flatnonzero(count >= 2)
+    if len(used_points) < 8:
+        return None
+    new_row = np.full(len(ids), -1, np.intp)
+    new_row[used_points] = np.arange(len(used_points))
+    kept = new_row[point] >= 0
+    fixed = np.zeros(len(views), bool)
+    fixed[: 1 if start else 2] = True
+    landmark_ids = ids[used_points]
+    return BundleProblem(
+        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+        keyframe_ids=np.array([k.frame_id for k in views], dtype=np.int64),
+        T_world_cam=np.stack([k.T_world_cam for k in views]),
+        fixed=fixed,
+        keep_baseline=start,
+        landmark_ids=landmark_ids,
+        xyz=world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
+        view=view[kept],
+        point=new_row[point[kept]],
+        xy=xy[kept],
+        sigma_px=noise.sigma_px(confidence[kept]),
+        confidence=confidence[kept],
+        iterations=iterations,
+        map_version=map_version,
+    )
+
+
+def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> None:
+    """Bring an adjustment into the map, which may have grown since it was asked.
+
+    Keyframes and landmarks that came later move rigidly with the last keyframe of the window. Observations
+    outside the gate are dropped, and landmarks left with fewer than two of them. The noise model is
+    fitted again.
+    """
+    problem = result.problem
+    if not result.ok:
+        return
+    last_id = int(problem.keyframe_ids[-1])
+    if last_id not in world.poses:
+        return
+    T_correction = result.T_world_cam[-1] @ invert_transform(world.poses[last_id])
+    submap = world.submap_of[last_id]
+    for keyframe in world.keyframes:
+        if keyframe.frame_id > last_id and keyframe.submap == submap:
+            world.move_keyframe(keyframe.frame_id, T_correction @ keyframe.T_world_cam)
+    marks = world.landmarks
+    later = marks.ids[(marks.born > last_id) & (marks.submap == submap)]
+    xyz = marks.xyz[marks.rows(later)]
+    world.move_landmarks(later, xyz @ T_correction[:3, :3].T + T_correction[:3, 3])
+    for frame_id, T_world_cam, fixed in zip(
+        problem.keyframe_ids.tolist(), result.T_world_cam, problem.fixed.tolist(), strict=True
+    ):
+        if not fixed:
+            world.move_keyframe(frame_id, T_world_cam)
+    world.move_landmarks(problem.landmark_ids, result.xyz)
+    known = np.isfinite(result.residual_px).all(axis=1)
+    size = np.linalg.norm(np.nan_to_num(result.residual_px), axis=1)
+    shrink = _shrinkage(problem, int(known.sum()))
+    mild = known & (size < 12.0 * problem.sigma_px)
+    noise.add(np.repeat(problem.confidence[mild], 2), np.abs(result.residual_px[mild]).ravel() / shrink)
+    bad = ~known | (size > 1.3 * noise.model.threshold_px(problem.confidence))
+    _drop(world, problem, bad)
+
+
+def _shrinkage(problem: BundleProblem, num_used: int) -> float:
+    """How much smaller residuals are than the noise, because unknowns were fitted to them."""
+    free = 6 * int((~problem.fixed).sum()) + 3 * len(problem.xyz)
+    return float(np.sqrt(max(0.1, 1.0 - free / max(1, 2 * num_used))))
+
+
+def _drop(world: WorldMap, problem: BundleProblem, bad: NDArray[np.bool_]) -> None:
+    """Forget observations, and landmarks that are left with too few."""
+    by_id = {k.frame_id: k for k in world.keyframes}
+    for k, frame_id in enumerate(problem.keyframe_ids.tolist()):
+        rows = np.flatnonzero(bad & (problem.view == k))
+        if len(rows) and frame_id in by_id:
+            keyframe = by_id[frame_id]
+            keyframe.drop_observations(np.isin(keyframe.ids, problem.landmark_ids[problem.point[rows]]))
+    left = np.bincount(problem.point[~bad], minlength=len(problem.xyz))
+    row = world.landmarks.rows(problem.landmark_ids[left < 2])
+    mask = np.zeros(len(world.landmarks), bool)
+    mask[row[row >= 0]] = True
+    world.remove_landmarks(mask)
+
+
+def note_sight(world: WorldMap, ids: Ids, agrees: NDArray[np.bool_], frame_id: int) -> None:
+    """Note which landmarks a frame saw and which of them agreed; those that keep disagreeing are removed."""
+    row = world.landmarks.rows(ids)
+    there = row >= 0
+    row, agrees = row[there], agrees[there]
+    world.landmarks.last_seen[row[agrees]] = frame_id
+    world.landmarks.num_missed[row[agrees]] = 0
+    world.landmarks.num_missed[row[~agrees]] += 1
+    world.remove_landmarks(world.landmarks.num_missed >= _MAX_MISSED)

@@ -1,0 +1,87 @@
+"""Landmarks that are in sight but have lost their track are looked for again, where the pose expects them.
+
+Rows that did not arrive, a blur or a jerk end tracks; their landmarks are still in the map. They are followed
+from the newest keyframes they were seen in, whose images are kept for this.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.features import Grey
+from semcast.server.mapping.tracks import Sight, TrackTable
+from semcast.server.mapping.world_map import WorldMap
+
+Array = NDArray[np.float64]
+
+#: Keyframes whose images are kept.
+NUM_IMAGES = 3
+#: A point is looked for no nearer to the border than this.
+_BORDER_PX = 8
+
+
+@dataclass(frozen=True)
+class SeenFrom:
+    """A keyframe and its image."""
+
+    frame_id: int
+    grey: Grey
+
+
+Images = deque[SeenFrom]
+
+
+def no_images() -> Images:
+    """Return an empty store; it forgets all but the newest images."""
+    return deque(maxlen=NUM_IMAGES)
+
+
+def recall_landmarks(
+    camera: Intrinsics,
+    world: WorldMap,
+    images: Images,
+    tracks: TrackTable,
+    sight: Sight,
+    T_world_cam: Array,
+    *,
+    reach_px: float,
+) -> int:
+    """Look for landmarks of the newest keyframes that have no track; each found one gets its track back.
+
+    Args:
+        camera: Pinhole.
+        world: The map.
+        images: Of the newest keyframes.
+        tracks: After the new image was followed; grows.
+        sight: The new image.
+        T_world_cam: Its pose, or the expected one.
+        reach_px: A point found further than this from where it is expected is another one.
+
+    Returns:
+        How many were found.
+    """
+    T_cam_world = invert_transform(T_world_cam)
+    height, width = sight.grey.shape
+    num_found = 0
+    for image in reversed(images):
+        keyframe = next((k for k in reversed(world.keyframes) if k.frame_id == image.frame_id), None)
+        if keyframe is None:
+            continue
+        row = world.landmarks.rows(keyframe.ids)
+        lost = np.flatnonzero((row >= 0) & ~np.isin(keyframe.ids, tracks.ids, assume_unique=True))
+        points_cam = world.landmarks.xyz[row[lost]] @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+        expected = camera.project(points_cam)
+        border = np.array([_BORDER_PX, _BORDER_PX])
+        inside = (expected >= border) & (expected < np.array([width, height]) - border)
+        in_sight = np.asarray(inside.all(axis=1))
+        in_sight[in_sight] &= ~sight.near_lost(expected[in_sight], _BORDER_PX)
+        lost, expected = lost[in_sight], expected[in_sight]
+        if len(lost):
+            num_found += tracks.take_up(
+                sight, image.grey, keyframe.ids[lost], keyframe.xy[lost], expected, reach_px
+            )
+    return num_found

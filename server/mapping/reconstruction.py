@@ -1,0 +1,474 @@
+"""The reconstruction: frames in, poses and a map out. One object per stream, used from one thread."""
+
+import logging
+import time
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.shapes import check_shape
+from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.motion import ConstantVelocity
+from semcast.server.mapping import mapper
+from semcast.server.mapping.bundle_problem import BundleRunner
+from semcast.server.mapping.initialiser import Initialiser, Observed, Start, pose_of
+from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.recall import recall_landmarks
+from semcast.server.mapping.relocalisation import Place
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
+from semcast.server.mapping.tracker import MIN_BELIEVED_SHARE, TrackedPose, expected_positions, track_pose
+from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
+
+__all__ = ["Reconstruction", "ReconstructionSettings"]
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+#: A frame with fewer rows than this share is kept for its pose, not to start a map from.
+_MIN_USABLE_SHARE = 0.5
+#: Keyframes between two attempts to recognise an older submap.
+_JOIN_INTERVAL = 3
+_START_LEVELS = 5
+#: Tracks a frame must have to count towards a new map.
+_MIN_TRACKS_TO_GIVE_UP = 50
+#: A pose that rests on fewer landmarks than this share of the tracks asks for more.
+_FEW_INLIERS_SHARE = 0.25
+#: How far from where they are expected lost landmarks are looked for, with a pose and with a prediction.
+_REACH_PX, _REACH_BLIND_PX = 6.0, 20.0
+#: Share of the landmarks in sight that must agree with a pose found without a prior.
+_MIN_SHARE_WHEN_LOST = 0.5
+
+
+class Reconstruction:
+    """Tracks the camera and maps what it sees.
+
+    Args:
+        camera: Of the decoded images, without distortion.
+        settings: How.
+        bundle: Runs the adjustments; closed with the reconstruction.
+
+    Raises:
+        ValueError: The camera has distortion.
+    """
+
+    def __init__(self, camera: Intrinsics, settings: ReconstructionSettings, bundle: BundleRunner) -> None:
+        if any(camera.distortion):
+            raise ValueError(f"camera must be without distortion, got {camera.distortion}")
+        self._camera = camera
+        self._settings = settings
+        self._bundle = bundle
+        self._map = MapBuilder(camera, settings, bundle)
+        self._map_epoch = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        s = self._settings
+        self._tracks = TrackTable(s.confidence, s.max_features, s.seed)
+        self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
+        self._motion = ConstantVelocity()
+        self._state = TrackingState.INITIALIZING
+        self._last_frame_id = -1
+        self._last_posed_id: int | None = None
+        self._frames_lost = 0
+        self._frames_since_keyframe = 0
+        self._keyframes_since_join = 0
+        self._stage_ms: dict[str, float] = {}
+
+    def reset(self) -> None:
+        """Forget the map; the next one has another epoch."""
+        self._map_epoch += 1
+        self._map.clear()
+        self._begin()
+
+    def close(self) -> None:
+        """End the bundle runner. Idempotent."""
+        self._bundle.close()
+
+    # -- frames ----------------------------------------------------------------------------------------
+
+    def process(self, frame: DecodedFrame) -> FrameResult:
+        """Track one frame and extend the map with it.
+
+        No image content makes it fail. A frame not newer than the last one is not tracked: its result has the
+        pose it got before, if any.
+
+        Raises:
+            ValueError: An array has another shape than the camera's image.
+        """
+        self._check(frame)
+        self._stage_ms = {}
+        if frame.frame_id <= self._last_frame_id:
+            return self._result(frame, self._map.world.pose_of_frame(frame.frame_id), None)
+        self._last_frame_id = frame.frame_id
+        self._collect()
+        since = time.perf_counter_ns()
+        sight = Sight(frame, to_grey(frame.image), usable_rows(frame, frame.image.shape[0]))
+        T_world_guess = self._motion.predict(frame.t_source_ns)
+        self._follow(sight, T_world_guess)
+        self._lap("track", since)
+        if self._state is TrackingState.TRACKING:
+            return self._track(sight, T_world_guess)
+        return self._find(sight)
+
+    def _check(self, frame: DecodedFrame) -> None:
+        height, width = self._camera.shape_hw
+        check_shape(frame.image, f"{height} {width} 3", "image")
+        for name in ("confidence", "keypoint_confidence"):
+            values = getattr(frame, name)
+            if values is not None:
+                check_shape(values, f"{height} {width}", name)
+
+    def _lap(self, stage: str, since_ns: int) -> None:
+        self._stage_ms[stage] = self._stage_ms.get(stage, 0.0) + (time.perf_counter_ns() - since_ns) * 1e-6
+
+    def _collect(self) -> None:
+        """Apply a finished adjustment, and let the motion go on from the corrected pose."""
+        since = time.perf_counter_ns()
+        result = self._map.collect()
+        if result is None:
+            return
+        self._stage_ms["bundle"] = result.elapsed_ms
+        self._moved(1.0)
+        self._lap("apply", since)
+
+    def _moved(self, scale: float) -> None:
+        """The map was moved: so is the last pose."""
+        if self._last_posed_id is not None:
+            T_world_last = self._map.world.pose_of_frame(self._last_posed_id)
+            if T_world_last is not None:
+                self._motion.correct(T_world_last, scale)
+
+    def _follow(self, sight: Sight, T_world_guess: Array | None) -> None:
+        tracks = self._tracks
+        if len(tracks) == 0:
+            tracks.remember(sight)
+            return
+        T_world_last = self._last_pose()
+        if self._state is TrackingState.TRACKING and T_world_guess is not None and T_world_last is not None:
+            guess = expected_positions(self._camera, self._map.world, tracks, T_world_guess, T_world_last)
+            tracks.follow(sight, guess)
+        else:
+            ahead = tracks.xy + tracks.velocity * (tracks.missed + 1)[:, None]
+            tracks.follow(sight, ahead, max_level=_START_LEVELS)
+
+    def _last_pose(self) -> Array | None:
+        return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
+
+    def _pose(
+        self, T_world_guess: Array | None, *, min_share: float = MIN_BELIEVED_SHARE
+    ) -> TrackedPose | None:
+        visible = self._tracks.visible
+        return track_pose(
+            self._camera,
+            self._map.world,
+            self._map.noise.model,
+            self._tracks.ids[visible],
+            self._tracks.xy[visible],
+            self._tracks.confidence[visible],
+            T_world_guess,
+            seed=self._settings.seed,
+            min_share=min_share,
+        )
+
+    def _track(self, sight: Sight, T_world_guess: Array | None) -> FrameResult:
+        since = time.perf_counter_ns()
+        pose = self._pose(T_world_guess)
+        if pose is None and self._tracks.follow_jump(sight):
+            pose = self._pose(T_world_guess)
+        pose = self._with_more(sight, pose, T_world_guess)
+        self._lap("pose", since)
+        if pose is not None:
+            return self._accept(sight, pose)
+        logger.debug("frame %d: tracking is lost", sight.frame.frame_id)
+        self._state = TrackingState.LOST
+        self._frames_lost = 0
+        self._initialiser.clear()
+        return self._find(sight)
+
+    def _with_more(
+        self, sight: Sight, pose: TrackedPose | None, T_world_guess: Array | None
+    ) -> TrackedPose | None:
+        """Look for landmarks that lost their track where a pose rests on few, and estimate it again."""
+        T_world_cam = T_world_guess if pose is None else pose.T_world_cam
+        few = _FEW_INLIERS_SHARE * self._settings.max_features
+        if T_world_cam is None or (pose is not None and pose.num_inliers >= few):
+            return pose
+        found = recall_landmarks(
+            self._camera,
+            self._map.world,
+            self._map.images,
+            self._tracks,
+            sight,
+            T_world_cam,
+            reach_px=_REACH_PX if pose is not None else _REACH_BLIND_PX,
+        )
+        again = self._pose(T_world_cam) if found else None
+        return pose if again is None else again
+
+    def _accept(
+        self, sight: Sight, pose: TrackedPose, backfilled: tuple[tuple[int, int, Array], ...] = ()
+    ) -> FrameResult:
+        """Take a pose: note it, weed out tracks that slipped, and make a keyframe where one is due."""
+        frame, tracks = sight.frame, self._tracks
+        reference = self._map.reference_keyframe()
+        assert reference is not None
+        self._state = TrackingState.TRACKING
+        self._frames_lost = 0
+        self._frames_since_keyframe += 1
+        self._last_posed_id = frame.frame_id
+        self._motion.observe(frame.t_source_ns, pose.T_world_cam)
+        self._map.world.add_frame(frame.frame_id, reference.frame_id, pose.T_world_cam)
+        mapper.note_sight(self._map.world, pose.ids, pose.inliers, frame.frame_id)
+        tracks.keep(~np.isin(tracks.ids, pose.ids[~pose.inliers], assume_unique=True))
+        is_keyframe = mapper.wants_keyframe(
+            mapper.keyframe_cues(
+                reference,
+                tracks.ids[tracks.visible],
+                tracks.xy[tracks.visible],
+                num_inliers=pose.num_inliers,
+                num_inliers_at_keyframe=self._map.num_inliers_at_keyframe,
+                max_features=self._settings.max_features,
+                width_px=self._camera.width,
+                frames_since=self._frames_since_keyframe,
+                usable_share=float(sight.usable.mean()),
+            )
+        )
+        if is_keyframe:
+            since = time.perf_counter_ns()
+            tracks.refill(sight)
+            self._map.make_keyframe(sight, tracks, pose.T_world_cam)
+            self._frames_since_keyframe = 0
+            self._lap("map", since)
+            self._try_to_join(sight, pose.T_world_cam)
+        T_world_cam = self._map.world.pose_of_frame(frame.frame_id)
+        return self._result(frame, T_world_cam, pose, is_keyframe=is_keyframe, backfilled=backfilled)
+
+    # -- starting and finding back -----------------------------------------------------------------------
+
+    def _find(self, sight: Sight) -> FrameResult:
+        """A frame without a running track: recognise a place, or work towards a new map."""
+        found = self._recover(sight)
+        if found is not None:
+            return self._accept(sight, found)
+        frame, tracks = sight.frame, self._tracks
+        if self._state is TrackingState.LOST:
+            # An empty image is no sign of another place: only frames with something to follow count.
+            self._frames_lost += int(len(tracks) >= _MIN_TRACKS_TO_GIVE_UP)
+            if self._frames_lost >= self._settings.lost_after_frames:
+                logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
+                self._state = TrackingState.INITIALIZING
+                self._map.begin_submap()
+                tracks.renew(self._map.world.landmarks.rows(tracks.ids) >= 0)
+                self._map_epoch += 1
+        since = time.perf_counter_ns()
+        tracks.refill(sight)
+        # Tracks of old landmarks serve to find back, not to start anew: a landmark has one id.
+        visible = tracks.visible & (self._map.world.landmarks.rows(tracks.ids) < 0)
+        observed = Observed(
+            frame.frame_id,
+            frame.t_source_ns,
+            tracks.ids[visible],
+            tracks.xy[visible],
+            tracks.confidence[visible],
+        )
+        waits = self._state is TrackingState.LOST or float(sight.usable.mean()) < _MIN_USABLE_SHARE
+        start = self._initialiser.add(observed, self._map.noise.model, is_damaged=waits)
+        self._lap("two_view", since)
+        if start is None:
+            return self._result(frame, None, None)
+        return self._begin_map(sight, start)
+
+    def _recover(self, sight: Sight) -> TrackedPose | None:
+        """Pose of a frame after tracking was lost: by tracks that are still alive, else by recognition."""
+        world = self._map.world
+        if not world.keyframes:
+            return None
+        since = time.perf_counter_ns()
+        pose = None
+        if self._state is TrackingState.LOST:
+            pose = self._pose(None, min_share=_MIN_SHARE_WHEN_LOST)
+        if pose is None:
+            pose = self._recognise(sight)
+        self._lap("relocalise", since)
+        return pose
+
+    def _recognise(self, sight: Sight) -> TrackedPose | None:
+        place = self._map.relocaliser.find(sight, self._map.world, self._map.noise.model)
+        if place is None:
+            return None
+        self._map.submap = place.submap
+        self._tracks.adopt(place.ids, place.xy, 0.5)
+        self._initialiser.clear()
+        self._motion.reset()
+        return self._pose(place.T_world_cam)
+
+    def _begin_map(self, sight: Sight, start: Start) -> FrameResult:
+        """Bring a start into the map and pose the frames that waited for it."""
+        since = time.perf_counter_ns()
+        first = start.keyframes[0]
+        guess = self._motion.predict(first.t_source_ns)
+        T_world_ref, scale = self._map.bridge(guess, self._motion.speed_map_per_s, start)
+        self._map.take_start(start, sight, self._tracks, T_world_ref, scale)
+        backfilled = self._backfill()
+        self._motion.reset()
+        for _, t_ns, T_world_cam in backfilled[-2:]:
+            self._motion.observe(t_ns, T_world_cam)
+        self._initialiser.clear()
+        self._frames_since_keyframe = 0
+        self._lap("two_view", since)
+        newest = self._map.world.pose_of_frame(sight.frame.frame_id)
+        pose = self._pose(newest)
+        if pose is None:
+            self._state = TrackingState.LOST
+            self._last_posed_id = sight.frame.frame_id
+            return self._result(sight.frame, newest, None, is_keyframe=True, backfilled=backfilled)
+        self._state = TrackingState.TRACKING
+        self._last_posed_id = sight.frame.frame_id
+        self._motion.observe(sight.frame.t_source_ns, pose.T_world_cam)
+        return self._result(sight.frame, newest, pose, is_keyframe=True, backfilled=backfilled)
+
+    def _backfill(self) -> tuple[tuple[int, int, Array], ...]:
+        """Pose the frames kept since the start was looked for, from the newest backwards."""
+        world = self._map.world
+        reference = self._map.reference_keyframe()
+        assert reference is not None
+        guess = reference.T_world_cam
+        posed = []
+        for observed in reversed(self._initialiser.history[:-1]):
+            if observed.frame_id in world.frames:
+                T_world_cam = world.pose_of_frame(observed.frame_id)
+            else:
+                T_world_cam = pose_of(
+                    self._camera,
+                    observed,
+                    world.landmarks.ids,
+                    world.landmarks.xyz,
+                    self._map.noise.model,
+                    guess,
+                    self._settings.seed,
+                )
+                if T_world_cam is not None:
+                    world.add_frame(observed.frame_id, reference.frame_id, T_world_cam)
+            if T_world_cam is not None:
+                guess = T_world_cam
+                posed.append((observed.frame_id, observed.t_source_ns, T_world_cam))
+        return tuple(reversed(posed))
+
+    def _try_to_join(self, sight: Sight, T_world_cam: Array) -> None:
+        """Look from time to time whether an older submap is in sight again."""
+        self._keyframes_since_join += 1
+        others = self._map.other_submaps()
+        if not others or self._keyframes_since_join < _JOIN_INTERVAL:
+            return
+        since = time.perf_counter_ns()
+        self._keyframes_since_join = 0
+        place: Place | None = self._map.relocaliser.find(
+            sight, self._map.world, self._map.noise.model, others
+        )
+        if place is not None and self._map.join(place, T_world_cam, self._tracks, self._moved):
+            logger.info("frame %d: submaps are joined", sight.frame.frame_id)
+        self._lap("relocalise", since)
+
+    # -- results ---------------------------------------------------------------------------------------
+
+    def _result(
+        self,
+        frame: DecodedFrame,
+        T_world_cam: Array | None,
+        pose: TrackedPose | None,
+        *,
+        is_keyframe: bool = False,
+        backfilled: tuple[tuple[int, int, Array], ...] = (),
+    ) -> FrameResult:
+        visible = self._tracks.visible
+        ids = self._tracks.ids[visible]
+        agrees = np.zeros(len(ids), bool)
+        if pose is not None:
+            agrees = np.isin(ids, pose.ids[pose.inliers], assume_unique=True)
+        covariance = None
+        if pose is not None and frame.frame_id in self._map.world.frames:
+            covariance = self._map.pose_covariance(pose.covariance, self._map.world.frames[frame.frame_id][1])
+        return FrameResult(
+            frame_id=frame.frame_id,
+            t_source_ns=frame.t_source_ns,
+            state=self._state,
+            T_world_cam=T_world_cam,
+            num_tracked=len(ids),
+            num_inliers=0 if pose is None else pose.num_inliers,
+            reprojection_error_px=None if pose is None else pose.median_error_px,
+            covariance=covariance,
+            is_keyframe=is_keyframe,
+            map_epoch=self._map_epoch,
+            keypoints_xy=self._tracks.xy[visible].astype(np.float32),
+            keypoint_inlier=agrees,
+            keypoint_confidence=self._tracks.confidence[visible].astype(np.float32),
+            backfilled=backfilled,
+            stage_ms=self._stage_ms,
+        )
+
+    def take_map_update(self) -> MapUpdate | None:
+        """What changed in the map since this was last called, None when nothing did."""
+        world = self._map.world
+        changed, removed, keyframes = world.take_changes()
+        if len(changed) + len(removed) + len(keyframes) == 0:
+            return None
+        row = world.landmarks.rows(changed)
+        return MapUpdate(
+            map_epoch=self._map_epoch,
+            ids=changed,
+            xyz=world.landmarks.xyz[row].copy(),
+            rgb=world.landmarks.rgb[row].copy(),
+            confidence=world.landmarks.confidence[row].copy(),
+            removed=removed,
+            keyframe_ids=keyframes,
+            keyframe_poses=np.array([world.poses[k] for k in keyframes.tolist()]).reshape(-1, 4, 4),
+        )
+
+    def final_trajectory(self) -> dict[int, Array]:
+        """Best current ``T_world_cam`` of all posed frames, by frame id; waits for a running adjustment."""
+        if self._map.collect(wait=True) is not None:
+            self._moved(1.0)
+        return self._map.world.trajectory()
+
+    def landmarks(
+        self,
+    ) -> tuple[NDArray[np.int64], Array, NDArray[np.uint8], NDArray[np.float32]]:
+        """All landmarks: ids ``(N,)``, world ``xyz (N, 3)``, ``rgb (N, 3)``, confidence ``(N,)``."""
+        marks = self._map.world.landmarks
+        return marks.ids.copy(), marks.xyz.copy(), marks.rgb.copy(), marks.confidence.copy()
+
+    def observations(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+        """All observations: landmark ids ``(M,)``, frame ids of keyframes ``(M,)``, pixels ``(M, 2)``."""
+        return self._map.world.observations()
+
+    def snapshot(self) -> dict[str, NDArray]:
+        """The map and what is needed to go on with it, as plain arrays."""
+        return {
+            **self._map.world.arrays(),
+            "noise": self._map.noise.state(),
+            "counters": np.array(
+                [self._map_epoch, self._map.submap, self._tracks.next_id, self._last_frame_id], dtype=np.int64
+            ),
+        }
+
+    def restore(self, arrays: Mapping[str, NDArray]) -> None:
+        """Go on with the map of a snapshot: the next frame is located in it as after a loss of tracking.
+
+        Raises:
+            KeyError: An array is missing.
+            ValueError: Arrays contradict each other.
+        """
+        counters = np.asarray(arrays["counters"])
+        if counters.shape != (4,) or np.asarray(arrays["noise"]).shape != (2,):
+            raise ValueError("counters and noise of a snapshot must have 4 and 2 values")
+        self._map.clear()
+        self._begin()
+        self._map.world.restore(dict(arrays))
+        self._map.noise.restore(np.asarray(arrays["noise"], dtype=np.float64))
+        self._map_epoch, self._map.submap, self._tracks.next_id, self._last_frame_id = counters.tolist()
+        if self._map.world.keyframes:
+            self._state = TrackingState.LOST

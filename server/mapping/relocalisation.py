@@ -1,0 +1,230 @@
+"""Where am I? Descriptors of the current image against keyframes, then PnP; and joining two submaps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.features import Describer, Grey, detect_corners, hamming, match_descriptors
+from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
+from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
+from semcast.server.mapping.tracks import Sight
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Keyframes tried per frame; those not tried now get their turn on later frames.
+MAX_CANDIDATES = 4
+#: Agreeing matches that are worth a closer look.
+_MIN_FIRST = 9
+#: Agreeing landmarks that prove a place, as a share of the keypoints followed at most, and its limits: fewer
+#: were found by chance where texture repeats.
+_MIN_INLIERS, _MAX_MIN_INLIERS, _MIN_INLIER_SHARE = 20, 45, 0.09
+#: Keyframes around the recognised one whose landmarks are looked for.
+_NEIGHBOURS = 5
+_SEARCH_ITERATIONS = 400
+_GUIDED_RADIUS_PX = 14.0
+_GUIDED_MAX_BITS = 70
+_MIN_GUIDED_SHARE = 0.35
+#: Octaves of the query, so that a view from nearer or further still matches.
+_OCTAVES = (0, 2, 4)
+#: Binary descriptors do not know the noise model: a match is good to about this.
+_MATCH_SIGMA_PX = 1.5
+
+
+@dataclass(frozen=True)
+class Place:
+    """A pose found without a prior.
+
+    Attributes:
+        T_world_cam: ``(4, 4)``.
+        keyframe_id: The keyframe that was recognised.
+        ids: ``(N,)`` landmarks that agree.
+        xy: ``(N, 2)`` where they are in the image.
+        submap: Of the keyframe.
+    """
+
+    T_world_cam: Array
+    keyframe_id: int
+    ids: Ids
+    xy: Array
+    submap: int
+
+
+class Relocaliser:
+    """Recognises keyframes.
+
+    Args:
+        camera: Pinhole.
+        seed: Of the pose search.
+        max_features: Keypoints followed at most.
+    """
+
+    def __init__(self, camera: Intrinsics, seed: int, max_features: int) -> None:
+        self._camera = camera
+        self._min_inliers = int(np.clip(_MIN_INLIER_SHARE * max_features, _MIN_INLIERS, _MAX_MIN_INLIERS))
+        self._seed = seed
+        self._describer = Describer()
+        self._turn = 0
+
+    def describe(self, grey: Grey, ids: Ids, xy: Array) -> tuple[Ids, NDArray[np.uint8]]:
+        """Descriptors of a keyframe's tracks: ids and ``(D, 32)`` uint8."""
+        rows, descriptors = self._describer.describe(grey, xy)
+        return ids[rows], descriptors
+
+    def find(
+        self, sight: Sight, world: WorldMap, noise: NoiseModel, submaps: set[int] | None = None
+    ) -> Place | None:
+        """Look for the place of an image among keyframes: the newest ones and, in turn, all others.
+
+        Args:
+            sight: The image.
+            world: The map.
+            noise: Of observations.
+            submaps: Only keyframes of these, None for all.
+        """
+        candidates = self._candidates(world, submaps)
+        if not candidates:
+            return None
+        usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
+        corners = detect_corners(sight.grey, 800, None, usable, cell_px=40).astype(np.float64)
+        rows, descriptors = self._describer.describe(sight.grey, corners, _OCTAVES)
+        if len(rows) < _MIN_FIRST:
+            return None
+        sigma_px = max(_MATCH_SIGMA_PX, noise.sigma0_px)
+        for keyframe in candidates:
+            ids, known = _pool(world, [keyframe])
+            mine, theirs = match_descriptors(descriptors, known)
+            found = self._search(world, ids[theirs], corners[rows[mine]], sigma_px)
+            if found is None:
+                continue
+            place = self._confirm(world, keyframe, found, corners[rows], descriptors, sigma_px)
+            if place is not None:
+                return place
+        return None
+
+    def _search(self, world: WorldMap, ids: Ids, xy: Array, sigma_px: float) -> PoseEstimate | None:
+        sigma = np.full(len(xy), sigma_px)
+        points = world.landmarks.xyz[world.landmarks.rows(ids)]
+        return search_pose(
+            self._camera,
+            points,
+            xy,
+            sigma,
+            GATE_SIGMAS * sigma,
+            seed=self._seed,
+            min_inliers=_MIN_FIRST,
+            max_iterations=_SEARCH_ITERATIONS,
+        )
+
+    def _confirm(
+        self,
+        world: WorldMap,
+        keyframe: Keyframe,
+        found: PoseEstimate,
+        xy: Array,
+        descriptors: NDArray[np.uint8],
+        sigma_px: float,
+    ) -> Place | None:
+        """Look for more landmarks where the pose expects them; a wrong pose finds few."""
+        near = sorted(
+            (k for k in world.keyframes if k.submap == keyframe.submap),
+            key=lambda k: abs(k.frame_id - keyframe.frame_id),
+        )[:_NEIGHBOURS]
+        ids, known = _pool(world, near)
+        points = world.landmarks.xyz[world.landmarks.rows(ids)]
+        T = found.T_cam_world
+        expected = self._camera.project(points @ T[:3, :3].T + T[:3, 3])
+        size = (self._camera.width, self._camera.height)
+        in_view = ((expected >= 0) & (expected < size)).all(axis=1)
+        ids, known, points, expected = ids[in_view], known[in_view], points[in_view], expected[in_view]
+        square = ((expected[:, None] - xy[None]) ** 2).sum(axis=2)
+        point, row = np.nonzero(square < _GUIDED_RADIUS_PX**2)
+        if len(point) < self._min_inliers:
+            return None
+        distance = hamming(known[point], descriptors[row])
+        order = np.lexsort((row, distance, point))
+        first = np.unique(point[order], return_index=True)[1]
+        best = order[first]
+        best = best[distance[best] <= _GUIDED_MAX_BITS]
+        point, row = point[best], row[best]
+        if len(point) < self._min_inliers:
+            return None
+        sigma = np.full(len(point), sigma_px)
+        refined = refine_pose(self._camera, T, points[point], xy[row], sigma, GATE_SIGMAS * sigma)
+        if refined.num_inliers < max(self._min_inliers, _MIN_GUIDED_SHARE * len(point)):
+            return None
+        good = refined.inliers
+        return Place(
+            invert_transform(refined.T_cam_world),
+            keyframe.frame_id,
+            ids[point][good],
+            xy[row][good],
+            keyframe.submap,
+        )
+
+    def _candidates(self, world: WorldMap, submaps: set[int] | None) -> list[Keyframe]:
+        known = [k for k in world.keyframes if submaps is None or k.submap in submaps]
+        known = [k for k in known if len(k.descriptor_ids) >= _MIN_FIRST]
+        newest, older = known[-2:], known[:-2]
+        count = min(len(older), MAX_CANDIDATES - 2)
+        turn = [older[-1 - (self._turn + k) % len(older)] for k in range(count)]
+        self._turn = (self._turn + count) % max(1, len(older))
+        return [*reversed(newest), *turn]
+
+
+def _pool(world: WorldMap, keyframes: list[Keyframe]) -> tuple[Ids, NDArray[np.uint8]]:
+    """Ids and descriptors of all landmarks in keyframes, of several descriptors the first."""
+    ids = np.concatenate([k.descriptor_ids for k in keyframes])
+    descriptors = np.concatenate([k.descriptors for k in keyframes])
+    known = np.flatnonzero(world.landmarks.rows(ids) >= 0)
+    unique, first = np.unique(ids[known], return_index=True)
+    return unique, descriptors[known[first]]
+
+
+def submap_similarity(
+    place: Place, world: WorldMap, T_world_cam_new: Array, ids_new: Ids, xy_new: Array, radius_px: float = 3.0
+) -> tuple[float, Array] | None:
+    """Similarity that brings the newer submap onto the older one, from one frame that sees both.
+
+    The pose gives rotation and translation; the scale is the ratio of depths of points that both maps know.
+
+    Args:
+        place: The frame's pose in the older submap.
+        world: The map.
+        T_world_cam_new: The frame's pose in the newer submap.
+        ids_new: ``(M,)`` tracks of the frame.
+        xy_new: ``(M, 2)`` where they are.
+        radius_px: Points nearer than this in the image are the same.
+
+    Returns:
+        ``(scale, T)`` with ``x_old = T @ (scale * x_new)``, or None when too few points are in both.
+    """
+    row_new = world.landmarks.rows(ids_new)
+    known = row_new >= 0
+    if int(known.sum()) < 8 or len(place.ids) < 8:
+        return None
+    square = ((place.xy[:, None] - xy_new[known][None]) ** 2).sum(axis=2)
+    nearest = square.argmin(axis=1)
+    close = square[np.arange(len(place.xy)), nearest] < radius_px**2
+    if int(close.sum()) < 8:
+        return None
+    T_cam_old = invert_transform(place.T_world_cam)
+    T_cam_new = invert_transform(T_world_cam_new)
+    xyz_old = world.landmarks.xyz[world.landmarks.rows(place.ids[close])]
+    xyz_new = world.landmarks.xyz[row_new[known][nearest[close]]]
+    depth_old = xyz_old @ T_cam_old[2, :3] + T_cam_old[2, 3]
+    depth_new = xyz_new @ T_cam_new[2, :3] + T_cam_new[2, 3]
+    valid = (depth_old > 1e-6) & (depth_new > 1e-6)
+    if int(valid.sum()) < 8:
+        return None
+    ratio = depth_old[valid] / depth_new[valid]
+    scale = float(np.median(ratio))
+    if float(np.median(np.abs(np.log(ratio / scale)))) > 0.25:
+        return None
+    T_scaled_cam = T_world_cam_new.copy()
+    T_scaled_cam[:3, 3] *= scale
+    return scale, place.T_world_cam @ invert_transform(T_scaled_cam)

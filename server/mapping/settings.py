@@ -1,0 +1,65 @@
+"""Settings of the reconstruction."""
+
+from dataclasses import dataclass, field
+from typing import get_args
+
+from semcast.server.geometry.weighting import ConfidenceMode
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructionSettings:
+    """How frames become a path and a map.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    confidence: ConfidenceMode = field(
+        default="robust",
+        metadata={"help": "use of confidence: robust, paper (equations to the letter), off, or an ablation"},
+    )
+    seed: int = field(default=0, metadata={"help": "seed of every random search"})
+    max_features: int = field(default=500, metadata={"help": "keypoints followed at most"})
+    window_size: int = field(default=10, metadata={"help": "keyframes in one bundle adjustment"})
+    max_landmarks: int = field(
+        default=20_000, metadata={"help": "landmarks kept at most; the longest unseen go first"}
+    )
+    max_keyframes: int = field(
+        default=300, metadata={"help": "keyframes kept with their observations; older ones are thinned out"}
+    )
+    sigma0_px: float = field(
+        default=0.7, metadata={"help": "noise of a fully trusted keypoint in pixels; the fit starts from it"}
+    )
+    beta: float = field(
+        default=2.0,
+        metadata={"help": "sigma^2 = sigma0^2 exp(beta (1 - c)): beta in paper mode; robust mode fits it"},
+    )
+    fit_noise: bool = field(
+        default=True, metadata={"help": "fit sigma0 (all modes but paper) and beta (robust) to residuals"}
+    )
+    min_parallax_deg: float = field(
+        default=1.0, metadata={"help": "angle between rays from which a point is triangulated"}
+    )
+    lost_after_frames: int = field(
+        default=10, metadata={"help": "frames without a pose after which a new map is begun"}
+    )
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        if self.confidence not in get_args(ConfidenceMode):
+            allowed = ", ".join(get_args(ConfidenceMode))
+            raise ValueError(f"confidence must be one of {allowed}, got {self.confidence!r}")
+        for name, low, high in (
+            ("seed", 0, 2**31 - 1),
+            ("max_features", 50, 5000),
+            ("window_size", 3, 30),
+            ("max_landmarks", 500, 1_000_000),
+            ("max_keyframes", 20, 100_000),
+            ("sigma0_px", 0.05, 20.0),
+            ("beta", 0.0, 8.0),
+            ("min_parallax_deg", 0.1, 10.0),
+            ("lost_after_frames", 1, 10_000),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f"{name} must be in [{low}, {high}], got {value}")

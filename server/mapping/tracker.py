@@ -1,0 +1,148 @@
+"""Pose of each frame from the landmarks it sees, with a motion prior."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, invert_transform, log_so3
+from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.tracks import TrackTable
+from semcast.server.mapping.world_map import WorldMap
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Agreeing landmarks a pose needs.
+MIN_INLIERS = 15
+#: With fewer inliers than this share, the start was poor: search without it.
+_MIN_INLIER_SHARE = 0.5
+#: Share of the landmarks in sight that must agree with a pose, when the frame before had one.
+MIN_BELIEVED_SHARE = 0.25
+
+
+@dataclass(frozen=True)
+class TrackedPose:
+    """The pose of one frame and what it rests on.
+
+    Attributes:
+        T_world_cam: ``(4, 4)``.
+        covariance: ``(6, 6)`` in the camera's frame, rotation before translation, or None.
+        ids: ``(N,)`` landmarks that were looked at.
+        inliers: ``(N,)`` bool, those that agree.
+        residual_px: ``(N,)`` reprojection errors.
+    """
+
+    T_world_cam: Array
+    covariance: Array | None
+    ids: Ids
+    inliers: NDArray[np.bool_]
+    residual_px: Array
+
+    @property
+    def num_inliers(self) -> int:
+        """Landmarks that agree."""
+        return int(self.inliers.sum())
+
+    @property
+    def median_error_px(self) -> float:
+        """Median reprojection error of those that agree."""
+        return float(np.median(self.residual_px[self.inliers])) if self.inliers.any() else float("inf")
+
+
+def expected_positions(
+    camera: Intrinsics, world: WorldMap, tracks: TrackTable, T_world_cam: Array, T_world_last: Array
+) -> Array:
+    """Where tracks are expected in a frame with a given pose, ``(N, 2)``.
+
+    Landmarks are projected. Other tracks are taken to be as far as the landmark next to them in the last
+    image; without any landmark they go on as they moved.
+    """
+    ahead = tracks.xy + tracks.velocity * (tracks.missed + 1)[:, None]
+    row = world.landmarks.rows(tracks.ids)
+    known = row >= 0
+    if int(known.sum()) < 5:
+        return ahead
+    T_cam_world = invert_transform(T_world_cam)
+    T_last_world = invert_transform(T_world_last)
+    xyz = world.landmarks.xyz[row[known]]
+    depth_last = xyz @ T_last_world[2, :3] + T_last_world[2, 3]
+    expected = ahead.copy()
+    expected[known] = _project(camera, T_cam_world, xyz, ahead[known])
+    unknown = np.flatnonzero(~known)
+    usable = np.flatnonzero(known)[depth_last > 1e-3]
+    depth_usable = depth_last[depth_last > 1e-3]
+    if len(unknown) and len(usable):
+        square = ((tracks.xy[unknown][:, None] - tracks.xy[usable][None]) ** 2).sum(axis=2)
+        depth = depth_usable[square.argmin(axis=1)]
+        rays = camera.unproject(tracks.xy[unknown]) * depth[:, None]
+        points = rays @ T_world_last[:3, :3].T + T_world_last[:3, 3]
+        expected[unknown] = _project(camera, T_cam_world, points, ahead[unknown])
+    return expected
+
+
+def _project(camera: Intrinsics, T_cam_world: Array, xyz: Array, otherwise: Array) -> Array:
+    points_cam = xyz @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    projected = camera.project(points_cam)
+    return np.where(np.isfinite(projected).all(axis=1, keepdims=True), projected, otherwise)
+
+
+def track_pose(
+    camera: Intrinsics,
+    world: WorldMap,
+    noise: NoiseModel,
+    ids: Ids,
+    xy: Array,
+    confidence: Array,
+    T_world_guess: Array | None,
+    *,
+    seed: int,
+    min_inliers: int = MIN_INLIERS,
+    min_share: float = MIN_BELIEVED_SHARE,
+) -> TrackedPose | None:
+    """Pose from the landmarks among the tracks of a frame.
+
+    Args:
+        camera: Pinhole.
+        world: The map.
+        noise: Gives each observation its sigma.
+        ids: ``(N,)`` tracks in sight.
+        xy: ``(N, 2)`` their positions.
+        confidence: ``(N,)`` of the positions.
+        T_world_guess: Expected pose, or None to search for it.
+        seed: Of the search.
+        min_inliers: Agreeing landmarks needed.
+        min_share: And their share of all that are in sight: fewer are a chance find.
+
+    Returns:
+        The pose, or None when too few landmarks agree with any.
+    """
+    row = world.landmarks.rows(ids)
+    known = row >= 0
+    if int(known.sum()) < min_inliers:
+        return None
+    points, observed = world.landmarks.xyz[row[known]], xy[known]
+    sigma, gate = noise.sigma_px(confidence[known]), noise.threshold_px(confidence[known])
+    best: PoseEstimate | None = None
+    if T_world_guess is not None:
+        best = refine_pose(camera, invert_transform(T_world_guess), points, observed, sigma, gate)
+    if best is None or best.num_inliers < max(min_inliers, _MIN_INLIER_SHARE * len(points)):
+        searched = search_pose(camera, points, observed, sigma, gate, seed=seed, min_inliers=min_inliers)
+        if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
+            best = searched
+    enough = max(min_inliers, min_share * len(points))
+    if best is None or best.num_inliers < enough or not np.isfinite(best.T_cam_world).all():
+        return None
+    T_world_cam = invert_transform(best.T_cam_world)
+    return TrackedPose(T_world_cam, best.covariance, ids[known], best.inliers, best.residual_px)
+
+
+def interpolate_pose(T_world_a: Array, T_world_b: Array, share: float) -> Array:
+    """Pose between two, rotation along the geodesic; ``share`` 0 is the first."""
+    R_a = T_world_a[:3, :3]
+    T = T_world_a.copy()
+    T[:3, :3] = R_a @ exp_so3(share * log_so3(R_a.T @ T_world_b[:3, :3]))
+    T[:3, 3] = (1.0 - share) * T_world_a[:3, 3] + share * T_world_b[:3, 3]
+    return T

@@ -1,0 +1,361 @@
+"""Keypoint tracks: points followed from image to image, with the confidence of their newest position."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.phy.slots import BLOCK_PX
+from semcast.server.geometry.features import (
+    KLT_WINDOW_PX,
+    Grey,
+    TrackedPoints,
+    corner_strength,
+    deduplicate,
+    detect_corners,
+    sample_map,
+    track_points,
+)
+from semcast.server.geometry.weighting import ConfidenceMode, KeypointCues, observation_confidence
+from semcast.server.geometry.wide_search import search_wide
+from semcast.server.mapping.state import DecodedFrame
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Slots at or below this SNR hold nothing of the image (a lost slot is at -20 dB).
+LOST_SLOT_DB = -15.0
+#: A track may be out of sight for so many frames, as long as the image is what is missing.
+MAX_COAST = 3
+#: Share of tracks that must be found again; below, the frame counts as damaged and all tracks coast.
+_MIN_FOUND_SHARE = 0.35
+
+
+def usable_rows(frame: DecodedFrame, height: int) -> NDArray[np.bool_]:
+    """Which rows of the image arrived, ``(H,)``; all where nothing is known about slots."""
+    usable = np.ones(height, bool)
+    if frame.slot_snr_db is not None:
+        snr = np.nan_to_num(np.asarray(frame.slot_snr_db, dtype=np.float64), nan=-99.0)
+        lost = np.repeat(snr <= LOST_SLOT_DB, BLOCK_PX)[:height]
+        usable[: len(lost)] = ~lost
+    return usable
+
+
+@dataclass(frozen=True)
+class Sight:
+    """An image as the tracks see it.
+
+    Attributes:
+        frame: As received.
+        grey: ``(H, W)``.
+        usable: ``(H,)`` bool, rows that arrived.
+    """
+
+    frame: DecodedFrame
+    grey: Grey
+    usable: NDArray[np.bool_]
+
+    def near_lost(self, xy: Array, margin_px: int) -> NDArray[np.bool_]:
+        """Which points have a lost row within the margin."""
+        if self.usable.all():
+            return np.zeros(len(xy), bool)
+        reach = np.convolve(~self.usable, np.ones(2 * margin_px + 1, int), mode="same") > 0
+        y = np.clip(np.rint(np.nan_to_num(xy[:, 1])), 0, len(self.usable) - 1).astype(np.intp)
+        return np.asarray(reach[y])
+
+
+#: After a jump a point is looked for no further than this from where descriptors put it.
+_MAX_FROM_JUMP_PX = 25.0
+#: What a track has, by attribute of ``TrackTable``.
+_COLUMNS = ("ids", "xy", "velocity", "confidence", "age", "missed")
+
+
+@dataclass
+class _Found:
+    """Where tracks were found, row by row, filled in step by step."""
+
+    ok: NDArray[np.bool_]
+    xy: Array
+    forward_backward: Array
+    photometric: Array
+    gradient: Array
+
+    @staticmethod
+    def nothing(xy: Array) -> "_Found":
+        count = len(xy)
+        return _Found(np.zeros(count, bool), xy.copy(), np.full(count, 9.0), np.zeros(count), np.zeros(count))
+
+    def take(self, rows: NDArray[np.intp], points: TrackedPoints) -> None:
+        self.ok[rows] = points.ok
+        self.xy[rows] = points.xy
+        self.forward_backward[rows] = points.forward_backward_px
+        self.photometric[rows] = points.photometric_grey
+        self.gradient[rows] = points.gradient_grey2
+
+
+class TrackTable:
+    """All tracks that are alive.
+
+    Attributes:
+        ids: ``(N,)`` int64, ascending.
+        xy: ``(N, 2)`` newest position, in the image of its last sight.
+        velocity: ``(N, 2)`` pixels per frame at the last sight.
+        confidence: ``(N,)`` of the newest position.
+        age: ``(N,)`` int64, frames it was seen in.
+        missed: ``(N,)`` int64, frames since its last sight; 0 is visible now.
+    """
+
+    def __init__(self, mode: ConfidenceMode, max_features: int, seed: int) -> None:
+        self._mode: ConfidenceMode = mode
+        self._max_features = max_features
+        self._rng = np.random.default_rng(seed)
+        self._next_id = 0
+        self._greys: list[Grey] = []
+        self._before: dict[str, Array] | None = None
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all tracks; ids go on."""
+        self.ids: Ids = np.zeros(0, np.int64)
+        self.xy: Array = np.zeros((0, 2))
+        self.velocity: Array = np.zeros((0, 2))
+        self.confidence: Array = np.zeros(0)
+        self.age: Ids = np.zeros(0, np.int64)
+        self.missed: Ids = np.zeros(0, np.int64)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def next_id(self) -> int:
+        """Id of the next track."""
+        return self._next_id
+
+    @next_id.setter
+    def next_id(self, value: int) -> None:
+        self._next_id = value
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        """Tracks seen in the newest image."""
+        return np.asarray(self.missed == 0)
+
+    def keep(self, mask: NDArray[np.bool_]) -> None:
+        """Forget tracks outside the mask."""
+        for name in _COLUMNS:
+            setattr(self, name, getattr(self, name)[mask])
+
+    def adopt(self, ids: Ids, xy: Array, confidence: float) -> None:
+        """Replace all tracks by points of the newest image, as after relocalisation.
+
+        Ids that occur twice are taken once.
+        """
+        self.ids, first = np.unique(ids, return_index=True)
+        self.xy = xy[first].copy()
+        count = len(first)
+        self.velocity = np.zeros((count, 2))
+        self.confidence = np.full(count, confidence)
+        self.age = np.ones(count, np.int64)
+        self.missed = np.zeros(count, np.int64)
+
+    def renew(self, mask: NDArray[np.bool_]) -> None:
+        """Give the tracks in the mask new ids, as if they began now."""
+        count = int(mask.sum())
+        self.ids = self.ids.copy()
+        self.ids[mask] = self._next_id + np.arange(count, dtype=np.int64)
+        self._next_id += count
+        order = np.argsort(self.ids, kind="stable")
+        for name in _COLUMNS:
+            setattr(self, name, getattr(self, name)[order])
+
+    def follow(self, sight: Sight, guess_xy: Array, max_level: int = 3) -> None:
+        """Look for every track in a new image.
+
+        A track that runs into rows that did not arrive coasts: it is looked for again from the image it was
+        last seen in. When hardly any is found, the image jumped, and tracks are found by descriptors; or it
+        is at fault, and all coast.
+
+        Args:
+            sight: The new image.
+            guess_xy: ``(N, 2)`` expected positions.
+            max_level: KLT pyramid levels.
+        """
+        count = len(self)
+        self._before = {name: getattr(self, name).copy() for name in _COLUMNS}
+        found = _Found.nothing(self.xy)
+        for back in range(min(len(self._greys), MAX_COAST + 1)):
+            rows = np.flatnonzero(self.missed == back)
+            if len(rows):
+                points = track_points(
+                    self._greys[-1 - back], sight.grey, self.xy[rows], guess_xy[rows], max_level=max_level
+                )
+                found.take(rows, points)
+        hidden = self._hidden(sight, found, guess_xy)
+        coasting = hidden & ~found.ok
+        if found.ok.sum() < _MIN_FOUND_SHARE * max(1, count - int(hidden.sum())):
+            jumped = self._jump(sight, found) if len(self._greys) else False
+            self._before = None  # a second look would be the same one
+            coasting = self._hidden(sight, found, guess_xy) & ~found.ok if jumped else ~found.ok
+        self._settle(sight, found, coasting)
+        self.remember(sight)
+
+    def follow_jump(self, sight: Sight) -> bool:
+        """Look again for what ``follow`` just looked for, by descriptors.
+
+        For an image in which tracks were found, but not where they are. Without success all stays as it was.
+
+        Returns:
+            Whether more was found.
+        """
+        if self._before is None or len(self._greys) < 2:
+            return False
+        after = {name: getattr(self, name) for name in _COLUMNS}
+        for name, values in self._before.items():
+            setattr(self, name, values)
+        self._before = None
+        newest = self._greys.pop()
+        found = _Found.nothing(self.xy)
+        jumped = self._jump(sight, found)
+        hidden = self._hidden(sight, found, self.xy)
+        self._greys.append(newest)
+        if not jumped or found.ok.sum() <= (after["missed"] == 0).sum():
+            for name, values in after.items():
+                setattr(self, name, values)
+            return False
+        self._settle(sight, found, hidden & ~found.ok)
+        return True
+
+    def _hidden(self, sight: Sight, found: "_Found", guess_xy: Array) -> NDArray[np.bool_]:
+        """Which tracks are, or would be, next to rows that did not arrive; none of them counts as found."""
+        hidden = sight.near_lost(np.where(found.ok[:, None], found.xy, guess_xy), KLT_WINDOW_PX // 2 - 2)
+        found.ok &= ~hidden
+        return hidden
+
+    def _jump(self, sight: Sight, found: "_Found") -> bool:
+        """Find tracks of the last image by descriptors, where that finds more; whether it did."""
+        rows = np.flatnonzero(self.missed == 0)
+        usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
+        jump = search_wide(self._greys[-1], sight.grey, self.xy[rows], usable)
+        if jump is None:
+            return False
+        points = track_points(self._greys[-1], sight.grey, self.xy[rows], jump, max_level=1)
+        # Points that left the image were clipped to its border and found something else there.
+        near = np.linalg.norm(points.xy - jump, axis=1) < _MAX_FROM_JUMP_PX
+        if (points.ok & near).sum() <= found.ok[rows].sum():
+            return False
+        found.take(rows, replace(points, ok=points.ok & near))
+        return True
+
+    def _settle(self, sight: Sight, found: "_Found", coasting: NDArray[np.bool_]) -> None:
+        """Move tracks to where they were found, and forget those that neither were nor coast."""
+        ok = found.ok
+        steps = (self.missed + 1)[:, None]
+        self.velocity = np.where(ok[:, None], (found.xy - self.xy) / steps, self.velocity)
+        self.xy = np.where(ok[:, None], found.xy, self.xy)
+        self.age = self.age + ok
+        self.missed = np.where(ok, 0, self.missed + 1)
+        cues = self._cues(
+            sight, found.xy[ok], found.forward_backward[ok], found.photometric[ok], found.gradient[ok]
+        )
+        self.confidence = self.confidence.copy()
+        self.confidence[ok] = observation_confidence(self._mode, cues, self._rng)
+        alive = ok | (coasting & (self.missed <= MAX_COAST))
+        alive[ok] &= deduplicate(self.xy[ok])
+        self.keep(alive)
+
+    def take_up(
+        self, sight: Sight, grey0: Grey, ids: Ids, xy0: Array, expected_xy: Array, reach_px: float
+    ) -> int:
+        """Bring tracks back that ended earlier, found from an older image.
+
+        Args:
+            sight: The newest image.
+            grey0: The older one.
+            ids: ``(N,)`` of the tracks, none of them alive.
+            xy0: ``(N, 2)`` where they are in ``grey0``.
+            expected_xy: ``(N, 2)`` where they should be now.
+            reach_px: A point further off is another one.
+
+        Returns:
+            How many were found.
+        """
+        points = track_points(grey0, sight.grey, xy0, expected_xy, max_level=1)
+        ok = points.ok & (np.linalg.norm(points.xy - expected_xy, axis=1) < reach_px)
+        ok &= ~sight.near_lost(points.xy, KLT_WINDOW_PX // 2 - 2)
+        xy = points.xy[ok]
+        taken = np.concatenate([self.xy[self.visible], xy])
+        ok[ok] = deduplicate(taken)[len(taken) - len(xy) :]
+        count = int(ok.sum())
+        if count == 0:
+            return 0
+        xy = points.xy[ok]
+        cues = self._cues(
+            sight, xy, points.forward_backward_px[ok], points.photometric_grey[ok], points.gradient_grey2[ok]
+        )
+        self.ids = np.concatenate([self.ids, ids[ok]])
+        self.xy = np.concatenate([self.xy, xy])
+        self.velocity = np.concatenate([self.velocity, self._usual_velocity(count)])
+        self.confidence = np.concatenate(
+            [self.confidence, observation_confidence(self._mode, cues, self._rng)]
+        )
+        self.age = np.concatenate([self.age, np.ones(count, np.int64)])
+        self.missed = np.concatenate([self.missed, np.zeros(count, np.int64)])
+        order = np.argsort(self.ids, kind="stable")
+        for name in _COLUMNS:
+            setattr(self, name, getattr(self, name)[order])
+        return count
+
+    def _usual_velocity(self, count: int) -> Array:
+        """Median velocity of the tracks in sight for ``count`` new ones, ``(count, 2)``."""
+        around = self.velocity[self.visible]
+        return np.tile(np.median(around, axis=0) if len(around) else np.zeros(2), (count, 1))
+
+    def remember(self, sight: Sight) -> None:
+        """Keep the image for tracks that are looked for in later ones."""
+        self._greys = [*self._greys[-MAX_COAST:], sight.grey]
+
+    def refill(self, sight: Sight) -> int:
+        """Start new tracks where there are none; the number started.
+
+        ``remember`` or ``follow`` must have taken the image before.
+        """
+        wanted = self._max_features - int(self.visible.sum())
+        if wanted < self._max_features // 20:
+            return 0
+        usable = None
+        if not sight.usable.all():
+            rows = np.convolve(~sight.usable, np.ones(KLT_WINDOW_PX, int), mode="same") == 0
+            usable = np.repeat(rows[:, None], sight.grey.shape[1], axis=1)
+        height, width = sight.grey.shape
+        cell_px = int(np.clip(np.sqrt(height * width / max(1.0, self._max_features / 2.5)), 16, 96))
+        strength = corner_strength(sight.grey)
+        found = detect_corners(sight.grey, wanted, self.xy[self.visible], usable, cell_px, strength)
+        corners: Array = found.astype(np.float64)
+        count = len(corners)
+        if count == 0:
+            return 0
+        gradient = sample_map(strength, corners)
+        cues = self._cues(sight, corners, np.full(count, 0.1), np.zeros(count), gradient)
+        self.ids = np.concatenate([self.ids, self._next_id + np.arange(count, dtype=np.int64)])
+        self._next_id += count
+        self.velocity = np.concatenate([self.velocity, self._usual_velocity(count)])
+        self.xy = np.concatenate([self.xy, corners])
+        self.confidence = np.concatenate(
+            [self.confidence, observation_confidence(self._mode, cues, self._rng)]
+        )
+        self.age = np.concatenate([self.age, np.ones(count, np.int64)])
+        self.missed = np.concatenate([self.missed, np.zeros(count, np.int64)])
+        return count
+
+    @staticmethod
+    def _cues(
+        sight: Sight, xy: Array, forward_backward: Array, photometric: Array, gradient: Array
+    ) -> KeypointCues:
+        pixel, keypoint = sight.frame.confidence, sight.frame.keypoint_confidence
+        return KeypointCues(
+            pixel_confidence=None if pixel is None else sample_map(pixel, xy),
+            keypoint_confidence=None if keypoint is None else sample_map(keypoint, xy),
+            gradient_grey2=gradient,
+            forward_backward_px=forward_backward,
+            photometric_grey=photometric,
+        )

@@ -1,0 +1,270 @@
+"""Feeds viewers beside the tracker, which only drops its results into a queue and never waits.
+
+Two threads: one owns the scene and writes the ``.rrd`` file, one serves the live viewer. A live viewer may
+be missing, frozen, killed or late: the second thread waits for it and then sends the whole scene anew.
+"""
+
+import logging
+import os
+import sys
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Literal
+
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import ConfigError
+from semcast.common.trajectory import Trajectory
+from semcast.server.mapping.state import MapUpdate
+from semcast.server.settings import ViewSettings
+from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
+from semcast.server.view.rerun_viewer import Delivery, RerunStream
+from semcast.server.view.scene import Cursor, FrameView, Scene, compress_picture
+
+logger = logging.getLogger(__name__)
+
+MAX_PENDING = 4096
+PROBE_INTERVAL_S = 0.25
+SUPERVISE_INTERVAL_S = 0.2
+FLUSH_TIMEOUT_S = 1.0
+ALIGN_INTERVAL_S = 1.0
+FILE_FLUSH_INTERVAL_S = 1.0
+JOIN_DEADLINE_S = 5.0
+
+
+def resolve_view(view: str, *, has_folder: bool) -> str:
+    """Turn ``auto`` into ``native`` where a window can open, else ``file`` or ``none``; others stay."""
+    if view != "auto":
+        return view
+    windowed = sys.platform in ("darwin", "win32") or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    )
+    return "native" if windowed else "file" if has_folder else "none"
+
+
+def check_view(settings: ViewSettings, *, has_folder: bool) -> None:
+    """Check early that what is asked for can be shown.
+
+    Raises:
+        ConfigError: ``file`` without an output folder, or no viewer is installed.
+    """
+    view = resolve_view(settings.view, has_folder=has_folder)
+    if view == "file" and not has_folder:
+        raise ConfigError("view file needs an output folder: give --out DIR")
+    if view in ("native", "web"):
+        rerun_binary()
+
+
+class ViewerFeed:
+    """Shows a run in Rerun: live, as a file, or both.
+
+    Args:
+        settings: What to show where.
+        camera: Intrinsics of the decoded images.
+        recording_id: Names the run; a restarted server that uses the same one continues in the same viewer.
+        truth: True path with the sequence's times, or None.
+        has_confidence: Whether frames carry confidence maps.
+        file: Where the recording goes, or None for no file.
+        process: The viewer to look after; None makes one as ``settings.view`` says.
+
+    Raises:
+        ConfigError: A viewer can't be started, or ``file`` is missing for ``--view file``.
+    """
+
+    def __init__(
+        self,
+        settings: ViewSettings,
+        camera: Intrinsics,
+        recording_id: str,
+        *,
+        truth: Trajectory | None = None,
+        has_confidence: bool = True,
+        file: Path | None = None,
+        process: ViewerProcess | None = None,
+    ) -> None:
+        self._settings = settings
+        self._camera = camera
+        self._recording_id = recording_id
+        self._has_truth = truth is not None
+        self._has_confidence = has_confidence
+        self._scene = Scene(truth)
+        self._scene_lock = threading.Lock()
+        self._pending: deque[tuple[FrameView, MapUpdate | None, bool]] = deque(maxlen=MAX_PENDING)
+        self._newest: FrameView | None = None
+        self._queue_lock = threading.Lock()
+        self._work = threading.Event()
+        self._live_work = threading.Event()
+        self._stopping = threading.Event()
+        self._drained = threading.Event()
+        self._last_picture_s = -1e9
+        self._last_align_s = -1e9
+        self.num_connections = 0
+        check_view(settings, has_folder=file is not None)
+        view = resolve_view(settings.view, has_folder=file is not None)
+        self._file = self._open_stream(file) if file is not None else None
+        self._process = process
+        if process is None and view in ("native", "web"):
+            kind: Literal["native", "web"] = "web" if view == "web" else "native"
+            self._process = ViewerProcess(kind, settings.port, settings.web_port, settings.memory_limit)
+        self._threads = [threading.Thread(target=self._run_scene, name="semcast-scene", daemon=True)]
+        if self._process is not None:
+            self._process.start()
+            self._threads.append(threading.Thread(target=self._run_live, name="semcast-viewer", daemon=True))
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def url(self) -> str | None:
+        """Where the live viewer is, None without one."""
+        return self._process.url if self._process is not None else None
+
+    def submit(self, view: FrameView, update: MapUpdate | None = None, *, new_map: bool = False) -> None:
+        """Show a frame and what changed in the map before it. Returns at once.
+
+        Of images waiting to be shown only the newest is kept; poses, plot values and map changes all are.
+
+        Args:
+            view: The processed frame.
+            update: Map changes up to and including this frame.
+            new_map: The map was started anew just before this frame.
+        """
+        with self._queue_lock:
+            self._pending.append((view.without_image(), update, new_map))
+            self._newest = view
+        self._work.set()
+
+    def _open_stream(self, file: Path | None) -> RerunStream:
+        return RerunStream(
+            recording_id=self._recording_id,
+            camera=self._camera,
+            has_truth=self._has_truth,
+            has_confidence=self._has_confidence,
+            file=file,
+            port=self._settings.port,
+        )
+
+    def _run_scene(self) -> None:
+        """Own the scene: take what was submitted, compress images, write the file."""
+        cursor = Cursor()
+        last_flush_s = time.monotonic()
+        while True:
+            self._work.wait(0.2)
+            self._work.clear()
+            last_round = self._stopping.is_set()
+            try:
+                self._take_pending(last_round)
+                if self._file is not None:
+                    with self._scene_lock:
+                        changes = self._scene.changes_since(cursor)
+                    self._file.write(changes)
+                    if time.monotonic() - last_flush_s > FILE_FLUSH_INTERVAL_S:
+                        self._file.flush(FLUSH_TIMEOUT_S)
+                        last_flush_s = time.monotonic()
+            except Exception:
+                logger.exception("the viewer scene failed on an update, which is left out")
+            self._live_work.set()
+            if last_round:
+                self._drained.set()
+                return
+
+    def _take_pending(self, force: bool) -> None:
+        """Apply what was submitted; ``force`` shows the last image even when it is early."""
+        with self._queue_lock:
+            items = list(self._pending)
+            self._pending.clear()
+            newest = self._newest
+            now = time.monotonic()
+            if newest is not None and not force and now - self._last_picture_s < self._image_interval_s:
+                newest = None
+            elif newest is not None:
+                self._newest = None
+        picture = None
+        if newest is not None and newest.image is not None:
+            self._last_picture_s = now
+            picture = compress_picture(newest, self._settings.jpeg_quality)
+        with self._scene_lock:
+            for view, update, new_map in items:
+                if new_map:
+                    self._scene.start_new_map()
+                if update is not None:
+                    self._scene.set_keyframes(update.keyframe_ids, update.keyframe_poses)
+                    self._scene.add_landmarks(
+                        update.ids, update.xyz, update.rgb, update.confidence, update.removed
+                    )
+                self._scene.add_frame(view)
+            if picture is not None:
+                self._scene.set_picture(picture)
+            if self._has_truth and items and (force or now - self._last_align_s > ALIGN_INTERVAL_S):
+                self._last_align_s = now
+                self._scene.align_truth()
+
+    @property
+    def _image_interval_s(self) -> float:
+        return 1.0 / self._settings.image_rate_hz
+
+    def _run_live(self) -> None:
+        """Serve the live viewer: wait for it, send it everything, then what changes."""
+        assert self._process is not None
+        stream: RerunStream | None = None
+        cursor = Cursor()
+        stalled = False
+        last_supervised_s = -1e9
+        while True:
+            last_round = self._drained.is_set()
+            if time.monotonic() - last_supervised_s > SUPERVISE_INTERVAL_S:
+                last_supervised_s = time.monotonic()
+                self._supervise()
+            if stream is None and not last_round and is_listening(self._settings.port):
+                stream, cursor = self._open_stream(None), Cursor()
+                self.num_connections += 1
+                logger.info("viewer connected on port %d", self._settings.port)
+            if stream is not None:
+                if not stalled:
+                    with self._scene_lock:
+                        changes = self._scene.changes_since(cursor)
+                    if not changes.empty:
+                        stream.write(changes)
+                delivery = stream.flush(FLUSH_TIMEOUT_S)
+                if delivery is Delivery.SEVERED:
+                    logger.info("viewer is gone, the stream goes on")
+                    stream.close()
+                    stream = None
+                elif (delivery is Delivery.STALLED) != stalled:
+                    stalled = not stalled
+                    logger.info("viewer %s", "does not answer, sending waits" if stalled else "answers again")
+            if last_round:
+                break
+            self._live_work.wait(PROBE_INTERVAL_S if stream is None else self._image_interval_s)
+            self._live_work.clear()
+        if stalled:
+            self._process.close()
+        if stream is not None and not stream.close():
+            logger.warning("the viewer is frozen and was left as it is")
+
+    def _supervise(self) -> None:
+        assert self._process is not None
+        try:
+            self._process.supervise()
+        except ConfigError as err:
+            logger.warning("%s", err)
+
+    def close(self, *, leave_window: bool = False) -> None:
+        """Write what is pending, finish the file and end the viewer. Idempotent.
+
+        Args:
+            leave_window: Leave a native window open so that the result can be looked at.
+        """
+        if self._stopping.is_set():
+            return
+        self._stopping.set()
+        self._work.set()
+        for thread in self._threads:
+            thread.join(JOIN_DEADLINE_S)
+        if self._process is not None:
+            if leave_window and self._process.kind == "native":
+                self._process.release()
+            self._process.close()
+        if self._file is not None:
+            self._file.flush(JOIN_DEADLINE_S)
+            self._file.close()

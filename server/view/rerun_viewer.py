@@ -1,0 +1,287 @@
+"""The scene in Rerun: layout, entities and the stream to a viewer or a file. The only home of ``rerun``."""
+
+import logging
+import threading
+import time
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from semcast.common.camera import Intrinsics
+from semcast.server.view.scene import Changes, Picture, PointChunk, Row, confidence_colours
+
+logger = logging.getLogger(__name__)
+
+APPLICATION_ID = "semcast"
+
+BACKGROUND = (14, 17, 23)
+PATH_COLOUR = (255, 170, 40)
+TRUTH_COLOUR = (150, 160, 180)
+INLIER_COLOUR = (80, 230, 120)
+OTHER_COLOUR = (240, 120, 70)
+
+#: Plot path to (name in the legend, colour); other paths get a colour of Rerun's choice.
+SERIES = {
+    "link/snr_set_db": ("SNR set", (130, 140, 160)),
+    "link/snr_estimated_db": ("SNR estimated", (90, 170, 255)),
+    "link/psnr_db": ("PSNR of the image", (255, 170, 40)),
+    "tracking/tracked": ("tracked", (130, 140, 160)),
+    "tracking/inliers": ("inliers", (80, 230, 120)),
+    "error/reprojection_error_px": ("reprojection error", (255, 120, 90)),
+    "drops/all": ("all", (240, 120, 70)),
+    "latency/decode_ms": ("decode", (90, 170, 255)),
+    "latency/track_ms": ("track", (80, 230, 120)),
+    "latency/map_ms": ("map", (200, 130, 255)),
+    "latency/arrival_to_pose_ms": ("arrival to pose", (255, 170, 40)),
+}
+
+
+class Delivery(Enum):
+    """What became of the data logged so far."""
+
+    DONE = "done"
+    STALLED = "stalled"
+    SEVERED = "severed"
+
+
+def blueprint(has_truth: bool, has_confidence: bool) -> rrb.Blueprint:
+    """Return the layout: the scene at the left, images at the right, plots below."""
+    dark = rrb.Background(color=BACKGROUND)
+    scene = rrb.Spatial3DView(
+        name="Camera and map" + (" (grey: ground truth)" if has_truth else ""),
+        origin="/world",
+        contents=["+ $origin/**", "- /world/camera/image/keypoints/**"],
+        background=dark,
+        line_grid=False,
+        overrides={"/world/map_colour": rrb.EntityBehavior(visible=False)},
+        eye_controls=rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, tracking_entity="/world/spectator"),
+    )
+    pictures: list[rrb.Spatial2DView] = [
+        rrb.Spatial2DView(
+            name="Received image (green: keypoints that carry the pose)",
+            origin="/world/camera/image",
+            background=dark,
+        )
+    ]
+    if has_confidence:
+        pictures.append(
+            rrb.Spatial2DView(
+                name="Confidence (turquoise: trusted, red: not)", origin="/confidence", background=dark
+            )
+        )
+    plots = [
+        rrb.TimeSeriesView(
+            name=name,
+            origin=f"/plots/{origin}",
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+            axis_y=rrb.ScalarAxis(zoom_lock=False),
+        )
+        for name, origin in (
+            ("SNR and PSNR (dB)", "link"),
+            ("Keypoints", "tracking"),
+            ("Reprojection error (px)", "error"),
+            ("Latency of the stages (ms)", "latency"),
+            ("Frames dropped, by reason", "drops"),
+        )
+    ]
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(scene, rrb.Vertical(*pictures), column_shares=[5, 3]),
+            rrb.Horizontal(*plots),
+            row_shares=[7, 3],
+        ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="frame", play_state="following"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+class RerunStream:
+    """One way out of the scene: a file or a viewer. Used from one thread.
+
+    Args:
+        recording_id: The same for all streams of one run, so a viewer that saw one knows the other.
+        camera: Intrinsics of the images.
+        has_truth: Whether a true path will be shown.
+        has_confidence: Whether there will be confidence maps.
+        file: Write to this file; None sends to a viewer.
+        port: Where the viewer listens, on loopback.
+    """
+
+    def __init__(
+        self,
+        *,
+        recording_id: str,
+        camera: Intrinsics,
+        has_truth: bool,
+        has_confidence: bool,
+        file: Path | None = None,
+        port: int = 9876,
+    ) -> None:
+        self._camera = camera
+        self._named: set[str] = set()
+        self._stream: rr.RecordingStream | None = rr.RecordingStream(
+            APPLICATION_ID, recording_id=recording_id
+        )
+        if file is not None:
+            self._stream.save(file)
+        else:
+            self._stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
+        self._stream.send_blueprint(blueprint(has_truth, has_confidence))
+        self._stream.log("world", rr.ViewCoordinates.RDF, static=True)
+        self._stream.log(
+            "world/spectator",
+            rr.Pinhole(
+                fov_y=np.radians(60.0),
+                aspect_ratio=1.5,
+                camera_xyz=rr.ViewCoordinates.RDF,
+                image_plane_distance=1e-6,
+            ),
+            static=True,
+        )
+        self._log_pinhole(0.3)
+
+    def _log_pinhole(self, frustum_size: float) -> None:
+        self._open().log(
+            "world/camera/image",
+            rr.Pinhole(
+                image_from_camera=self._camera.K,
+                resolution=[self._camera.width, self._camera.height],
+                camera_xyz=rr.ViewCoordinates.RDF,
+                image_plane_distance=frustum_size,
+                color=PATH_COLOUR,
+            ),
+            static=True,
+        )
+
+    def _open(self) -> rr.RecordingStream:
+        if self._stream is None:
+            raise ValueError("the stream is closed")
+        return self._stream
+
+    def write(self, changes: Changes) -> None:
+        """Log what changed; returns before it has arrived."""
+        stream = self._open()
+        if changes.cleared:
+            for path in ("world/trajectory", "world/map_confidence", "world/map_colour", "world/truth"):
+                stream.log(path, rr.Clear(recursive=True))
+        if changes.frustum_size is not None and changes.frustum_size > 0:
+            self._log_pinhole(changes.frustum_size)
+        if changes.rows:
+            last = changes.rows[-1]
+            stream.set_time("frame", sequence=last.frame_id)
+            stream.set_time("source_time", duration=last.t_source_ns * 1e-9)
+            self._write_rows(changes.rows)
+        for idx, strips in changes.segments.items():
+            stream.log(
+                f"world/trajectory/{idx:04d}",
+                rr.LineStrips3D(strips, colors=PATH_COLOUR, radii=rr.Radius.ui_points(2.0)),
+            )
+        if changes.truth is not None:
+            stream.log(
+                "world/truth",
+                rr.LineStrips3D([changes.truth], colors=TRUTH_COLOUR, radii=rr.Radius.ui_points(1.2)),
+            )
+        for chunk in changes.chunks:
+            self._write_points(chunk)
+        if changes.picture is not None:
+            self._write_picture(changes.picture)
+
+    def _write_rows(self, rows: list[Row]) -> None:
+        """Send poses and plot values as columns, each at its own frame and time."""
+        posed = [row for row in rows if row.T_world_cam is not None]
+        if posed:
+            T_world_cam = np.array([row.T_world_cam for row in posed])
+            times = _time_columns(posed)
+            T_world_eye = np.array([row.T_world_eye for row in posed])
+            for path, T in (("world/camera", T_world_cam), ("world/spectator", T_world_eye)):
+                columns = rr.Transform3D.columns(translation=T[:, :3, 3], mat3x3=T[:, :3, :3])
+                self._open().send_columns(path, indexes=times, columns=columns)
+        for path in sorted({path for row in rows for path in row.scalars}):
+            having = [row for row in rows if path in row.scalars]
+            self._name_series(path)
+            values = [row.scalars[path] for row in having]
+            self._open().send_columns(
+                f"plots/{path}", indexes=_time_columns(having), columns=rr.Scalars.columns(scalars=values)
+            )
+
+    def _name_series(self, path: str) -> None:
+        if path in self._named:
+            return
+        self._named.add(path)
+        name, colour = SERIES.get(path, (path.split("/")[-1].removesuffix("_ms").replace("_", " "), None))
+        self._open().log(f"plots/{path}", rr.SeriesLines(names=name, colors=colour, widths=1.8), static=True)
+
+    def _write_points(self, chunk: PointChunk) -> None:
+        radius = rr.Radius.ui_points(2.2)
+        by_confidence = confidence_colours(chunk.confidence)
+        for path, colours in (("map_confidence", by_confidence), ("map_colour", chunk.rgb)):
+            self._open().log(
+                f"world/{path}/{chunk.idx:04d}", rr.Points3D(chunk.xyz, colors=colours, radii=radius)
+            )
+
+    def _write_picture(self, picture: Picture) -> None:
+        stream = self._open()
+        stream.set_time("frame", sequence=picture.frame_id)
+        stream.set_time("source_time", duration=picture.t_source_ns * 1e-9)
+        stream.log(
+            "world/camera/image", rr.EncodedImage(contents=picture.image_jpeg, media_type="image/jpeg")
+        )
+        colours = np.where(picture.keypoint_inlier[:, None], INLIER_COLOUR, OTHER_COLOUR).astype(np.uint8)
+        stream.log(
+            "world/camera/image/keypoints",
+            rr.Points2D(picture.keypoints_xy + 0.5, colors=colours, radii=rr.Radius.ui_points(2.0)),
+        )
+        if picture.confidence_jpeg is not None:
+            stream.log(
+                "confidence", rr.EncodedImage(contents=picture.confidence_jpeg, media_type="image/jpeg")
+            )
+
+    def flush(self, timeout_s: float) -> Delivery:
+        """Wait until all logged data went out, and say how that ended.
+
+        A frozen viewer takes the whole timeout; a dead one fails at once.
+        """
+        started = time.monotonic()
+        try:
+            self._open().flush(timeout_sec=timeout_s)
+        except RuntimeError as err:
+            waited_s = time.monotonic() - started
+            logger.debug("viewer stream after %.2f s: %s", waited_s, err)
+            return Delivery.STALLED if waited_s >= 0.9 * timeout_s else Delivery.SEVERED
+        return Delivery.DONE
+
+    def close(self, deadline_s: float = 3.0) -> bool:
+        """Finish the file or connection; False when a frozen viewer made it impossible in time.
+
+        The SDK waits without limit for a frozen viewer, also at interpreter exit. Its last reference is
+        therefore dropped on a thread that may be left behind, and its exit handler is removed then.
+        """
+        if self._stream is None:
+            return True
+        box = [self._stream]
+        self._stream = None
+
+        def drop() -> None:
+            box[0].disconnect()
+            box.clear()
+
+        thread = threading.Thread(target=drop, name="semcast-viewer-close", daemon=True)
+        thread.start()
+        thread.join(deadline_s)
+        if thread.is_alive():
+            rr.unregister_shutdown()
+            return False
+        return True
+
+
+def _time_columns(rows: list[Row]) -> list[rr.TimeColumn]:
+    return [
+        rr.TimeColumn("frame", sequence=[row.frame_id for row in rows]),
+        rr.TimeColumn("source_time", duration=[row.t_source_ns * 1e-9 for row in rows]),
+    ]

@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import (
+    angle_between_deg,
+    exp_so3,
+    make_transform,
+    rotation_angle_deg,
+    transform_points,
+)
+from semcast.server.geometry.epipolar import (
+    depths,
+    essential_matrix,
+    fit_rotation,
+    fundamental_matrix,
+    msac_score,
+    rays_angle_deg,
+    refine_relative_pose,
+    rotation_residual_px,
+    sampson_px,
+)
+
+CAMERA = Intrinsics(fx=500, fy=480, cx=320, cy=240, width=640, height=480)
+
+
+def make_pair(rng, num=200, noise_px=0.0, angle_rad=0.1):
+    T = make_transform(exp_so3(rng.normal(0, angle_rad, 3)), rng.normal(0, 1, 3))
+    T[:3, 3] /= np.linalg.norm(T[:3, 3])
+    points = rng.uniform((-3, -2, 5), (3, 2, 12), (num, 3))
+    xy0, xy1 = CAMERA.project(points), CAMERA.project(transform_points(T, points))
+    noise = rng.normal(0, 1, (2, num, 2)) * noise_px
+    return T, points, xy0 + noise[0], xy1 + noise[1]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_exact_matches_lie_on_the_epipolar_geometry(seed):
+    T, points, xy0, xy1 = make_pair(np.random.default_rng(seed))
+    assert np.abs(sampson_px(fundamental_matrix(CAMERA, T), xy0, xy1)).max() < 1e-8
+    rays0, rays1 = CAMERA.unproject(xy0), CAMERA.unproject(xy1)
+    assert np.abs(np.einsum("ni,ij,nj->n", rays1, essential_matrix(T), rays0)).max() < 1e-12
+    depth0, depth1 = depths(CAMERA, T, xy0, xy1)
+    assert np.allclose(depth0, points[:, 2])
+    assert np.allclose(depth1, transform_points(T, points)[:, 2])
+
+
+def test_sampson_is_the_distance_from_a_horizontal_epipolar_line():
+    # Sideways motion: matches stay on their row. A row difference of 1 px is shared by both images.
+    T = make_transform(np.eye(3), (1, 0, 0))
+    square = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
+    residual = sampson_px(fundamental_matrix(square, T), np.array([[300.0, 200]]), np.array([[350.0, 201]]))
+    assert abs(residual[0]) == pytest.approx(1 / np.sqrt(2))
+
+
+def test_sampson_of_many_matrices_is_that_of_each():
+    rng = np.random.default_rng(0)
+    pairs = [make_pair(rng) for _ in range(3)]
+    F = np.stack([fundamental_matrix(CAMERA, T) for T, *_ in pairs])
+    _, _, xy0, xy1 = pairs[0]
+    assert np.allclose(sampson_px(F, xy0, xy1), [sampson_px(f, xy0, xy1) for f in F])
+
+
+def test_msac_by_hand():
+    assert msac_score(np.array([0.0, 1.0, 5.0, -2.0]), 2.0) == pytest.approx((0 + 0.25 + 1 + 1) / 4)
+    assert msac_score(np.zeros(0), 1.0) == 1.0
+
+
+def test_parallax_of_a_point_ahead():
+    # Camera 1 sits 1 to the right of camera 0; a point 1 ahead of it is seen under 45 degrees from camera 0.
+    T = make_transform(np.eye(3), (-1, 0, 0))
+    xy0, xy1 = CAMERA.project([[1.0, 0, 1]]), CAMERA.project([[0.0, 0, 1]])
+    assert rays_angle_deg(CAMERA, T, xy0, xy1)[0] == pytest.approx(45.0)
+
+
+def test_rotation_alone_is_found():
+    rng = np.random.default_rng(1)
+    R = exp_so3((0.02, -0.1, 0.03))
+    points = rng.uniform((-3, -2, 5), (3, 2, 12), (80, 3))
+    xy0, xy1 = CAMERA.project(points), CAMERA.project(points @ R.T)
+    xy1[:20] += rng.uniform(-50, 50, (20, 2))
+    found = fit_rotation(CAMERA, xy0, xy1)
+    assert rotation_angle_deg(found @ R.T) < 0.01
+    assert rotation_residual_px(CAMERA, found, xy0, xy1)[20:].max() < 0.2
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_refinement_reaches_the_truth_on_exact_matches(seed):
+    rng = np.random.default_rng(seed)
+    T, _, xy0, xy1 = make_pair(rng)
+    t = T[:3, 3] + rng.normal(0, 0.05, 3)
+    start = make_transform(exp_so3(rng.normal(0, 0.02, 3)) @ T[:3, :3], t / np.linalg.norm(t))
+    found = refine_relative_pose(
+        CAMERA, start, xy0, xy1, np.full(len(xy0), 2.0), cut_sigmas=50, iterations=20
+    )
+    assert rotation_angle_deg(found[:3, :3] @ T[:3, :3].T) < 1e-3
+    assert angle_between_deg(found[:3, 3], T[:3, 3]) < 1e-2
+
+
+def test_weights_help_when_they_are_right():
+    errors = {"weighted": [], "equal": []}
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        T, _, xy0, xy1 = make_pair(rng, num=80)
+        sigma = np.where(np.arange(80) % 2, 0.2, 3.0)
+        xy1 = xy1 + rng.normal(0, 1, xy1.shape) * sigma[:, None]
+        for name, s in (("weighted", sigma), ("equal", np.full(80, 1.5))):
+            found = refine_relative_pose(CAMERA, T, xy0, xy1, s, cut_sigmas=9, iterations=20)
+            errors[name].append(angle_between_deg(found[:3, 3], T[:3, 3]))
+    assert np.mean(errors["weighted"]) < 0.5 * np.mean(errors["equal"])

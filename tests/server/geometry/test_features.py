@@ -1,0 +1,151 @@
+import cv2
+import numpy as np
+import pytest
+
+from semcast.server.geometry.features import (
+    BORDER_PX,
+    Describer,
+    corner_strength,
+    deduplicate,
+    detect_corners,
+    hamming,
+    match_descriptors,
+    sample_map,
+    to_grey,
+    track_points,
+)
+
+
+def texture(seed=0, shape=(240, 320)):
+    """Noise at several scales: like photographs, it has something on every level of a pyramid."""
+    rng = np.random.default_rng(seed)
+    noise = np.zeros(shape, np.float32)
+    for sigma in (2.0, 5.0, 12.0):
+        layer = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), None, sigma)
+        noise += layer / layer.std()
+    return np.clip((noise - noise.mean()) / noise.std() * 45 + 128, 0, 255).astype(np.uint8)
+
+
+def shifted(grey, dx, dy):
+    M = np.array([[1, 0, dx], [0, 1, dy]], dtype=np.float64)
+    return cv2.warpAffine(grey, M, grey.shape[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+
+def test_grey_weighs_green_most():
+    image = np.zeros((1, 3, 3), np.uint8)
+    image[0, 0, 0] = image[0, 1, 1] = image[0, 2, 2] = 255
+    assert to_grey(image).tolist() == [[76, 150, 29]]
+
+
+def test_corner_strength_by_hand():
+    # A ramp of 3 grey levels per pixel in x only has no corner; in x and y alone 9 each along both.
+    ramp = np.tile((3 * np.arange(60)).astype(np.uint8), (60, 1))
+    assert corner_strength(ramp)[30, 30] == pytest.approx(0.0, abs=1e-4)
+    chequer = np.where((np.indices((60, 60)) // 5).sum(axis=0) % 2 == 0, 0, 40).astype(np.uint8)
+    assert corner_strength(chequer)[10, 10] > 20
+
+
+def test_corners_are_spread_and_away_from_the_border():
+    corners = detect_corners(texture(), 200)
+    assert corners.shape[1] == 2
+    assert 120 <= len(corners) <= 200
+    assert corners.dtype == np.float32
+    assert np.all(corners >= BORDER_PX - 3.5)
+    assert np.all(corners < np.array([320, 240]) - BORDER_PX + 3.5)
+    quarters = np.histogram2d(corners[:, 0], corners[:, 1], bins=(2, 2), range=((0, 320), (0, 240)))[0]
+    assert quarters.min() > 0.5 * quarters.max()
+
+
+def test_corners_keep_away_from_those_there_and_from_lost_rows():
+    grey = texture()
+    first = detect_corners(grey, 100)
+    usable = np.ones(grey.shape, bool)
+    usable[96:160] = False
+    more = detect_corners(grey, 100, first.astype(float), usable)
+    distance = np.linalg.norm(first[:, None] - more[None], axis=2).min()
+    assert distance > 3.5
+    assert not np.any((more[:, 1] >= 96 + 3.5) & (more[:, 1] < 160 - 3.5))
+
+
+def test_an_empty_image_has_no_corners():
+    assert detect_corners(np.zeros((100, 100), np.uint8), 50).shape == (0, 2)
+    assert detect_corners(np.full((100, 100), 255, np.uint8), 50).shape == (0, 2)
+    assert detect_corners(texture(), 0).shape == (0, 2)
+    assert detect_corners(np.zeros((10, 10), np.uint8), 50).shape == (0, 2)
+
+
+@pytest.mark.parametrize(("shift", "share"), [((3.4, -2.6), 0.9), ((28.0, 11.0), 0.7)])
+def test_points_are_followed_to_a_fraction_of_a_pixel(shift, share):
+    grey0 = texture()
+    grey1 = shifted(grey0, *shift)
+    corners = detect_corners(grey0, 150).astype(np.float64)
+    inside = np.all((corners + shift > 14) & (corners + shift < np.array([306, 226])), axis=1)
+    corners = corners[inside]
+    found = track_points(grey0, grey1, corners, corners)
+    assert found.ok.mean() > share
+    error = np.linalg.norm(found.xy - corners - shift, axis=1)[found.ok]
+    assert np.median(error) < 0.1
+    assert np.median(found.forward_backward_px[found.ok]) < 0.1
+    assert np.all(found.gradient_grey2[found.ok] > 0)
+
+
+def test_gradient_of_tracking_is_that_of_the_corner_strength():
+    grey = texture()
+    corners = detect_corners(grey, 100).astype(np.float64)
+    found = track_points(grey, grey, corners, corners, window_px=21)
+    strength = sample_map(corner_strength(grey, block_px=21), corners)
+    ratio = found.gradient_grey2[found.ok] / strength[found.ok]
+    assert np.median(ratio) == pytest.approx(1.0, rel=0.15)
+
+
+def test_points_without_a_counterpart_are_not_ok():
+    corners = detect_corners(texture(0), 150).astype(np.float64)
+    found = track_points(texture(0), texture(1), corners, corners)
+    assert found.ok.mean() < 0.2
+
+
+def test_tracking_takes_any_input():
+    grey = texture()
+    assert len(track_points(grey, grey, np.zeros((0, 2)), np.zeros((0, 2))).ok) == 0
+    assert not track_points(grey, grey[:100], np.ones((3, 2)), np.ones((3, 2))).ok.any()
+    odd = np.array([[np.nan, 5.0], [1e9, -1e9], [50.0, 50.0]])
+    found = track_points(grey, grey, np.full((3, 2), 50.0), odd)
+    assert np.isfinite(found.xy).all()
+    flat = np.zeros_like(grey)
+    assert not track_points(flat, flat, np.full((3, 2), 50.0), np.full((3, 2), 50.0)).ok.any()
+
+
+def test_sampling_takes_the_nearest_pixel_and_counts_nan_as_nothing():
+    values = np.array([[0.1, 0.2], [0.3, np.nan]], np.float32)
+    xy = np.array([[0.4, 0.4], [0.6, 0.0], [-5.0, 9.0], [1.0, 1.0], [np.nan, 0.0]])
+    assert np.allclose(sample_map(values, xy), [0.1, 0.2, 0.3, 0.0, 0.1])
+
+
+def test_of_points_in_one_cell_one_stays():
+    keep = deduplicate(np.array([[1.0, 1], [2, 2], [9, 9], [9.5, 9]]))
+    assert keep.tolist() == [True, False, True, False]
+
+
+def test_descriptors_match_across_a_shift_and_a_change_of_size():
+    grey0 = texture(shape=(360, 480))
+    describer = Describer()
+    corners = detect_corners(grey0, 150).astype(np.float64)
+    rows, descriptors = describer.describe(grey0, corners)
+    for factor, octaves in ((1.0, (0,)), (1.44, (0, 2))):
+        grey1 = cv2.resize(grey0, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+        moved = (corners + 0.5) * factor - 0.5
+        rows1, descriptors1 = describer.describe(grey1, moved, octaves)
+        mine, theirs = match_descriptors(descriptors1, descriptors)
+        right = rows1[mine] == rows[theirs]
+        assert len(mine) > 40
+        assert right.mean() > 0.9
+
+
+def test_hamming_by_hand_and_no_descriptors():
+    a = np.array([[0b1010, 255], [0, 0]], np.uint8)
+    b = np.array([[0b0110, 255], [1, 3]], np.uint8)
+    assert hamming(a, b).tolist() == [2, 3]
+    rows, descriptors = Describer().describe(texture(), np.zeros((0, 2)))
+    assert rows.shape == (0,)
+    assert descriptors.shape == (0, 32)
+    assert len(match_descriptors(descriptors, descriptors)[0]) == 0

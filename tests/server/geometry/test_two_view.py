@@ -1,0 +1,126 @@
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import (
+    angle_between_deg,
+    exp_so3,
+    make_transform,
+    rotation_angle_deg,
+    transform_points,
+)
+from semcast.server.geometry.two_view import estimate_two_view
+
+CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
+FAST = {"min_iterations": 100, "max_iterations": 1000}
+
+
+def make_matches(seed, num=200, outlier_share=0.3, noise_px=0.5, t=None, plane=False):
+    rng = np.random.default_rng(seed)
+    T = make_transform(exp_so3(rng.normal(0, 0.05, 3)), rng.normal(0, 1, 3) if t is None else t)
+    points = rng.uniform((-3, -2, 5), (3, 2, 12), (num, 3))
+    if plane:
+        points[:, 2] = 6 + 0.3 * points[:, 0]
+    xy0, xy1 = CAMERA.project(points), CAMERA.project(transform_points(T, points))
+    xy1 = xy1 + rng.normal(0, noise_px, xy1.shape)
+    is_outlier = rng.random(num) < outlier_share
+    xy1[is_outlier] += rng.uniform(-60, 60, (int(is_outlier.sum()), 2))
+    return T, xy0, xy1, is_outlier
+
+
+def errors_deg(found, T):
+    return (
+        rotation_angle_deg(found.T_cam1_cam0[:3, :3] @ T[:3, :3].T),
+        angle_between_deg(found.T_cam1_cam0[:3, 3], T[:3, 3]),
+    )
+
+
+@pytest.mark.parametrize("mode", ["robust", "off", "paper", "shuffled"])
+@pytest.mark.parametrize("seed", range(2))
+def test_the_pose_is_found_in_every_mode(mode, seed):
+    T, xy0, xy1, is_outlier = make_matches(seed)
+    confidence = np.where(is_outlier, 0.3, 0.9)
+    found = estimate_two_view(CAMERA, xy0, xy1, confidence, mode=mode, seed=seed, **FAST)
+    assert found is not None
+    rotation, direction = errors_deg(found, T)
+    loose = 4.0 if mode == "paper" else 1.0
+    assert rotation < 0.6 * loose
+    assert direction < 3.0 * loose
+    assert np.linalg.norm(found.T_cam1_cam0[:3, 3]) == pytest.approx(1.0)
+    if mode != "paper":
+        assert found.inliers[~is_outlier].mean() > 0.85
+        assert found.inliers[is_outlier].mean() < 0.15
+
+
+def test_misleading_confidence_does_not_harm():
+    worse = []
+    for seed in range(8):
+        T, xy0, xy1, is_outlier = make_matches(seed, outlier_share=0.5)
+        lie = np.where(is_outlier, 0.95, 0.1)
+        robust = estimate_two_view(CAMERA, xy0, xy1, lie, seed=seed, **FAST)
+        plain = estimate_two_view(CAMERA, xy0, xy1, None, seed=seed, **FAST)
+        assert robust is not None
+        assert plain is not None
+        worse.append(errors_deg(robust, T)[1] - errors_deg(plain, T)[1])
+    assert np.mean(worse) < 0.2
+
+
+def test_right_confidence_helps_where_matches_are_few_and_unequal():
+    gain = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        T, xy0, xy1, _ = make_matches(seed, num=60, outlier_share=0.0, noise_px=0.0, t=(0.5, 0.1, 0.2))
+        sigma = np.where(rng.random(60) < 0.5, 0.15, 2.5)
+        xy1 = xy1 + rng.normal(0, 1, xy1.shape) * sigma[:, None]
+        confidence = 1 / (1 + sigma)
+        robust = estimate_two_view(CAMERA, xy0, xy1, confidence, seed=seed, **FAST)
+        plain = estimate_two_view(CAMERA, xy0, xy1, None, seed=seed, **FAST)
+        assert robust is not None
+        assert plain is not None
+        gain.append((errors_deg(robust, T)[1], errors_deg(plain, T)[1]))
+    ours, theirs = np.mean(gain, axis=0)
+    assert ours < 0.8 * theirs
+
+
+def test_turning_on_the_spot_is_recognised():
+    _, xy0, xy1, _ = make_matches(0, t=(0.0, 0.0, 0.0), outlier_share=0.1)
+    found = estimate_two_view(CAMERA, xy0, xy1, choose_model=True, **FAST)
+    assert found is None or found.model == "rotation"
+
+
+def test_standing_still_is_a_rotation_by_nothing():
+    _, xy0, _, _ = make_matches(0)
+    noise = np.random.default_rng(0).normal(0, 0.2, xy0.shape)
+    found = estimate_two_view(CAMERA, xy0, xy0 + noise, choose_model=True, **FAST)
+    assert found is None or found.model == "rotation"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_plane_gives_a_pose_with_its_points_in_front(seed):
+    T, xy0, xy1, _ = make_matches(seed, t=(0.8, 0.1, 0.1), plane=True, outlier_share=0.1)
+    found = estimate_two_view(CAMERA, xy0, xy1, choose_model=True, seed=seed, **FAST)
+    assert found is not None
+    assert found.model != "rotation"
+    assert found.inliers.mean() > 0.7
+    rotation, direction = errors_deg(found, T)
+    assert rotation < 3
+    assert direction < 15
+
+
+def test_degenerate_matches_give_none_or_a_finite_pose():
+    assert estimate_two_view(CAMERA, np.zeros((4, 2)), np.zeros((4, 2))) is None
+    assert estimate_two_view(CAMERA, np.full((20, 2), np.nan), np.zeros((20, 2))) is None
+    same = np.full((30, 2), 100.0)
+    line = np.stack([np.linspace(10, 600, 30), np.full(30, 50.0)], axis=1)
+    for xy in (same, line):
+        for mode in ("robust", "paper"):
+            found = estimate_two_view(
+                CAMERA, xy, xy + 1.0, np.linspace(0.1, 1, 30), mode=mode, choose_model=True, **FAST
+            )
+            assert found is None or np.isfinite(found.T_cam1_cam0).all()
+
+
+def test_the_same_seed_gives_the_same_result():
+    _, xy0, xy1, is_outlier = make_matches(3)
+    a, b = (estimate_two_view(CAMERA, xy0, xy1, 1.0 - 0.5 * is_outlier, seed=7, **FAST) for _ in range(2))
+    assert np.array_equal(a.T_cam1_cam0, b.T_cam1_cam0)

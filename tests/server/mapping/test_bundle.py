@@ -1,0 +1,213 @@
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
+from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
+from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.bundle_process import ProcessBundle
+
+FX, FY, CX, CY = INTRINSICS = (500.0, 480.0, 320.0, 240.0)
+
+
+def make_problem(seed=0, num_views=6, num_points=60, noise_px=0.3, shake=0.02, sigma_px=None, **changes):
+    """A window with known truth whose start is shaken; the two oldest poses are exact and fixed."""
+    rng = np.random.default_rng(seed)
+    T_world_cam = np.stack(
+        [
+            make_transform(exp_so3(rng.normal(0, 0.03, 3)), (0.4 * k, 0.1 * rng.normal(), 0.1 * k))
+            for k in range(num_views)
+        ]
+    )
+    xyz = rng.uniform((-2, -1.5, 5), (4, 1.5, 12), (num_points, 3))
+    view, point = (a.ravel() for a in np.meshgrid(np.arange(num_views), np.arange(num_points), indexing="ij"))
+    cam = np.stack([transform_points(invert_transform(T), xyz) for T in T_world_cam]).reshape(-1, 3)
+    xy = np.stack([FX * cam[:, 0] / cam[:, 2] + CX, FY * cam[:, 1] / cam[:, 2] + CY], axis=1)
+    sigma = np.full(len(xy), noise_px) if sigma_px is None else sigma_px(view, point, rng)
+    xy = xy + rng.normal(0, 1, xy.shape) * sigma[:, None]
+    start = np.stack(
+        [T if k < 2 else T @ exp_se3(rng.normal(0, shake, 6)) for k, T in enumerate(T_world_cam)]
+    )
+    values = {
+        "intrinsics": INTRINSICS,
+        "keyframe_ids": np.arange(num_views),
+        "T_world_cam": start,
+        "fixed": np.arange(num_views) < 2,
+        "keep_baseline": False,
+        "landmark_ids": np.arange(num_points),
+        "xyz": xyz + rng.normal(0, shake, xyz.shape),
+        "view": view,
+        "point": point,
+        "xy": xy,
+        "sigma_px": np.maximum(sigma, 0.1),
+        "confidence": np.ones(len(xy)),
+        "iterations": 12,
+    }
+    return BundleProblem(**{**values, **changes}), T_world_cam, xyz
+
+
+def pose_error(result, truth):
+    return np.linalg.norm(result.T_world_cam[:, :3, 3] - truth[:, :3, 3], axis=1).max()
+
+
+def test_an_exact_window_is_recovered():
+    problem, T_world_cam, xyz = make_problem(noise_px=0.0)
+    result = optimise(problem)
+    assert result.ok
+    assert pose_error(result, T_world_cam) < 1e-4
+    assert np.abs(result.xyz - xyz).max() < 1e-3
+    assert np.abs(result.residual_px).max() < 1e-2
+    assert np.array_equal(result.T_world_cam[:2], problem.T_world_cam[:2])
+
+
+def test_one_fixed_pose_and_the_baseline_hold_the_gauge():
+    problem, T_world_cam, _ = make_problem(noise_px=0.0)
+    exact = T_world_cam[[0, -1]]
+    start = problem.T_world_cam.copy()
+    start[-1] = exact[-1] @ exp_se3([0.01, -0.01, 0.01, 0, 0, 0])
+    problem = BundleProblem(
+        **{
+            **vars(problem),
+            "T_world_cam": start,
+            "fixed": np.arange(6) < 1,
+            "keep_baseline": True,
+            "iterations": 30,
+        }
+    )
+    result = optimise(problem)
+    assert result.ok
+    assert pose_error(result, T_world_cam) < 1e-2
+
+
+def test_right_weights_give_smaller_errors_than_equal_ones():
+    errors = []
+    for seed in range(4):
+        truth_sigma = lambda view, point, rng: np.where(point % 3 == 0, 0.15, 3.0)  # noqa: E731
+        weighted, T_world_cam, _ = make_problem(seed, sigma_px=truth_sigma)
+        equal = BundleProblem(**{**vars(weighted), "sigma_px": np.full(len(weighted.xy), 1.0)})
+        errors.append([pose_error(optimise(p), T_world_cam) for p in (weighted, equal)])
+    ours, theirs = np.mean(errors, axis=0)
+    assert ours < 0.5 * theirs
+
+
+def test_residuals_show_the_outlier():
+    problem, _, _ = make_problem(noise_px=0.2)
+    xy = problem.xy.copy()
+    xy[7] += (40.0, 0.0)
+    result = optimise(BundleProblem(**{**vars(problem), "xy": xy}))
+    size = np.linalg.norm(result.residual_px, axis=1)
+    assert int(np.nanargmax(size)) == 7
+    assert np.median(size) < 0.6
+
+
+def test_covariance_is_that_of_the_last_pose():
+    tight, loose = (optimise(make_problem(noise_px=s)[0]) for s in (0.2, 0.8))
+    assert tight.covariance is not None
+    assert loose.covariance is not None
+    assert tight.covariance.shape == (6, 6)
+    ratio = np.sqrt(np.diag(loose.covariance) / np.diag(tight.covariance))
+    assert np.allclose(ratio, 4.0, rtol=0.25)  # sigma is rounded to steps of 1.37
+
+
+def test_a_point_behind_a_camera_is_left_out():
+    problem, T_world_cam, _ = make_problem(noise_px=0.1)
+    xyz = problem.xyz.copy()
+    xyz[0] = (0, 0, -5)
+    result = optimise(BundleProblem(**{**vars(problem), "xyz": xyz}))
+    assert result.ok
+    assert pose_error(result, T_world_cam) < 0.05
+    assert np.isnan(result.residual_px[problem.point == 0]).all()
+    assert np.array_equal(result.xyz[0], xyz[0])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"fixed": np.zeros(6, bool)},
+        {"xyz": np.full((60, 3), (0.0, 0.0, -4.0))},
+        {"xy": np.full((360, 2), np.nan)},
+        {"T_world_cam": np.stack([np.eye(4)] * 6), "xyz": np.full((60, 3), (0.0, 0.0, 5.0))},
+        {"T_world_cam": np.stack([1.3 * np.eye(4)] * 6)},
+        {"xy": np.concatenate([np.zeros((300, 2)), np.full((60, 2), np.nan)])},
+        {"view": np.repeat(np.arange(6), 60) % 5},
+    ],
+    ids=["no gauge", "all behind", "nan", "no parallax", "no rotations", "nothing seen last", "unseen pose"],
+)
+def test_degenerate_windows_end_without_an_exception(changes):
+    problem, _, _ = make_problem()
+    result = optimise(BundleProblem(**{**vars(problem), **changes}))
+    assert np.isfinite(result.xyz).all()
+    assert np.isfinite(result.T_world_cam).all()
+    if not result.ok:
+        assert np.array_equal(result.xyz, result.problem.xyz)
+
+
+def test_sigmas_share_sixteen_models():
+    sigmas, step = quantised_sigma(np.array([0.0001, 0.1, 1.0, 12.0, 500.0]))
+    assert len(sigmas) == 16
+    assert step.tolist()[:2] == [0, 0]
+    assert step.tolist()[3:] == [15, 15]
+    assert sigmas[step[2]] == pytest.approx(1.0, rel=0.2)
+
+
+def test_residuals_by_hand():
+    problem, _, _ = make_problem()
+    one = BundleProblem(
+        **{**vars(problem), "view": np.array([0]), "point": np.array([0]), "xy": np.array([[330.0, 235.0]])}
+    )
+    residual, front = residuals_px(one, np.eye(4)[None], np.array([[0.0, 0.0, 2.0]]))
+    assert residual.tolist() == [[10.0, -5.0]]
+    assert front.tolist() == [True]
+
+
+def test_inline_gives_the_same_bits_again():
+    results = []
+    for _ in range(2):
+        runner = InlineBundle()
+        assert runner.submit(make_problem()[0])
+        assert runner.busy
+        assert not runner.submit(make_problem()[0])
+        results.append(runner.take())
+        assert runner.take() is None
+    assert np.array_equal(results[0].T_world_cam, results[1].T_world_cam)
+    assert np.array_equal(results[0].xyz, results[1].xyz)
+
+
+def test_the_process_gives_what_inline_gives_and_survives_a_kill():
+    problem, _, _ = make_problem()
+    inline = optimise(problem)
+    runner = ProcessBundle(lossless=True)
+    try:
+        assert runner.submit(problem)
+        result = runner.take()
+        assert result is not None
+        assert np.array_equal(result.T_world_cam, inline.T_world_cam)
+        before = runner.pid
+        os.kill(before, signal.SIGKILL)
+        assert runner.submit(problem) or runner.submit(problem)
+        result = runner.take()
+        assert result is not None
+        assert np.array_equal(result.xyz, inline.xyz)
+        assert runner.pid != before
+        assert runner.num_restarts >= 1
+    finally:
+        runner.close()
+        runner.close()
+    assert not runner.submit(problem)
+    assert runner.take() is None
+
+
+def test_live_process_never_waits_unless_asked():
+    runner = ProcessBundle()
+    try:
+        assert runner.take() is None
+        assert runner.submit(make_problem()[0])
+        assert runner.busy
+        result = runner.take() or runner.take(wait=True)
+        assert result is not None
+        assert result.ok
+        assert not runner.busy
+    finally:
+        runner.close()

@@ -1,0 +1,78 @@
+"""When a map may begin, and from what."""
+
+import numpy as np
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, invert_transform, make_transform
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.initialiser import Initialiser, Observed
+
+CAMERA = Intrinsics(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
+NOISE = NoiseModel(1.0, 0.0)
+
+
+def ride(num_frames, num_points=150, step_m=0.12, noise_px=0.3, seed=0):
+    """Frames of a camera that moves sideways, and their true poses."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform([-3.0, -2.0, 3.0], [3.0, 2.0, 7.0], (num_points, 3))
+    frames, poses = [], []
+    for k in range(num_frames):
+        T_world_cam = make_transform(exp_so3(np.array([0.0, 0.01 * k, 0.0])), [step_m * k, 0.0, 0.0])
+        T = invert_transform(T_world_cam)
+        xy = CAMERA.project(xyz @ T[:3, :3].T + T[:3, 3])
+        seen = ((xy > 0) & (xy < [640, 480])).all(axis=1)
+        xy = xy[seen] + noise_px * rng.standard_normal((int(seen.sum()), 2))
+        frames.append(Observed(k, k * 100_000_000, np.flatnonzero(seen), xy, np.ones(len(xy))))
+        poses.append(T_world_cam)
+    return frames, poses
+
+
+def begin(frames, *, is_damaged=lambda k: False):
+    """Index of the frame a map began with, and the map; None without one."""
+    initialiser = Initialiser(CAMERA, "off", 1.0, 0)
+    for k, frame in enumerate(frames):
+        start = initialiser.add(frame, NOISE, is_damaged=is_damaged(k))
+        if start is not None:
+            return k, start
+    return None
+
+
+def test_a_map_begins_from_three_views_with_the_true_motion():
+    frames, poses = ride(6)
+    k, start = begin(frames)
+    assert k == 2, "two views can't tell depth from its mirror image"
+    assert len(start.keyframes) == 3
+    true_way = (invert_transform(poses[0]) @ poses[k])[:3, 3]
+    way = start.keyframes[-1].T_world_cam[:3, 3]
+    assert way @ true_way / np.linalg.norm(way) / np.linalg.norm(true_way) > 0.99
+    assert np.isclose(np.median(start.xyz[:, 2]), 1.0)
+
+
+def test_few_points_wait_for_more_but_not_for_ever():
+    frames, _ = ride(16, num_points=55, step_m=0.05)
+    k, _ = begin(frames)
+    assert k >= 11
+    k, _ = begin(ride(16, num_points=150, step_m=0.05)[0])
+    assert k < 11
+
+
+def test_two_views_do_where_tracks_last_no_longer():
+    frames, _ = ride(8, step_m=0.3)
+    renewed = [
+        Observed(f.frame_id, f.t_source_ns, f.ids + 1000 * (k // 2), f.xy, f.confidence)
+        for k, f in enumerate(frames)
+    ]
+    k, start = begin(renewed)
+    assert k == 3, "the second pair of views"
+    assert len(start.keyframes) == 2
+
+
+def test_standing_still_and_damaged_images_begin_nothing():
+    still, _ = ride(10, step_m=0.0)
+    still = [
+        Observed(f.frame_id, f.t_source_ns, still[0].ids, still[0].xy, still[0].confidence) for f in still
+    ]
+    assert begin(still) is None
+    frames, _ = ride(6)
+    k, _ = begin(frames, is_damaged=lambda k: k == 2)
+    assert k == 3

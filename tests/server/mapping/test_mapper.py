@@ -1,0 +1,189 @@
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
+from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
+from semcast.server.mapping.bundle import optimise
+from semcast.server.mapping.mapper import (
+    KeyframeCues,
+    add_landmarks,
+    apply_result,
+    build_problem,
+    note_sight,
+    wants_keyframe,
+)
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
+NOISE = NoiseModel(0.5, 0.0)
+IMAGE = np.full((480, 640, 3), (10, 20, 30), np.uint8)
+
+
+def make_world(num_keyframes=5, num_points=80, noise_px=0.2, step=0.3, seed=0, shake=0.0):
+    rng = np.random.default_rng(seed)
+    world = WorldMap()
+    points = rng.uniform((-2, -1.5, 5), (3, 1.5, 10), (num_points, 3))
+    truth = []
+    for k in range(num_keyframes):
+        centre = (step * k, 0.15 * step * rng.normal(), 0.15 * step * k)
+        T = make_transform(exp_so3(rng.normal(0, 0.02, 3)), centre)
+        truth.append(T)
+        xy = CAMERA.project(transform_points(invert_transform(T), points)) + rng.normal(
+            0, noise_px, (num_points, 2)
+        )
+        shaken = T @ exp_se3(rng.normal(0, shake, 6)) if k >= 2 else T
+        world.add_keyframe(
+            Keyframe(
+                frame_id=10 * k,
+                t_source_ns=k,
+                T_world_cam=shaken,
+                submap=0,
+                ids=np.arange(num_points),
+                xy=xy,
+                confidence=np.full(num_points, 0.8),
+                descriptor_ids=np.zeros(0, np.int64),
+                descriptors=np.zeros((0, 32), np.uint8),
+            )
+        )
+    return world, points, np.stack(truth)
+
+
+def cues(**changes):
+    values = {
+        "num_inliers": 200,
+        "num_inliers_at_keyframe": 220,
+        "num_visible": 450,
+        "max_features": 500,
+        "median_flow_px": 10.0,
+        "width_px": 640,
+        "frames_since": 3,
+        "usable_share": 1.0,
+    }
+    return KeyframeCues(**{**values, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "wanted"),
+    [
+        ({}, False),
+        ({"median_flow_px": 40.0}, True),
+        ({"num_inliers": 150}, True),
+        ({"num_inliers": 150, "frames_since": 1}, False),
+        ({"num_visible": 200}, True),
+        ({"num_inliers": 30}, True),
+        ({"num_inliers": 30, "median_flow_px": 0.5}, False),
+        ({"median_flow_px": 40.0, "usable_share": 0.3}, False),
+        ({"num_inliers": 30, "usable_share": 0.3, "frames_since": 6}, True),
+    ],
+)
+def test_the_keyframe_rule(changes, wanted):
+    assert wants_keyframe(cues(**changes)) is wanted
+
+
+def test_tracks_with_parallax_become_landmarks():
+    world, points, _ = make_world()
+    assert add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0) == len(world.landmarks) > 70
+    row = world.landmarks.rows(np.arange(len(points)))
+    error = np.linalg.norm(world.landmarks.xyz[row[row >= 0]] - points[row >= 0], axis=1)
+    assert np.median(error) < 0.03
+    inside = np.all(world.keyframes[-1].xy[world.landmarks.ids] >= 0, axis=1)
+    assert np.all(world.landmarks.rgb[inside] == (10, 20, 30))
+    assert np.allclose(world.landmarks.confidence, 0.8)
+    assert add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0) == 0
+
+
+def test_without_parallax_nothing_is_triangulated():
+    world, _, _ = make_world(step=0.001)
+    assert add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0) == 0
+
+
+def test_a_slipped_track_is_no_landmark():
+    world, _, _ = make_world()
+    world.keyframes[-1].xy[:10] += 12.0
+    add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)
+    assert np.all(world.landmarks.rows(np.arange(10)) == -1)
+
+
+def test_an_adjustment_mends_shaken_poses():
+    world, _, truth = make_world(8, 150, shake=0.01)
+    add_landmarks(world, CAMERA, NoiseModel(6.0, 0.0), IMAGE, 0.5)
+    before = np.abs(np.stack([k.T_world_cam for k in world.keyframes]) - truth).max()
+    world.add_frame(73, 70, world.poses[70])
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    assert problem is not None
+    assert problem.fixed.tolist() == [True, True] + [False] * 6
+    noise = OnlineNoise("robust", 0.5, 0.0, True)
+    apply_result(world, optimise(problem), noise)
+    after = np.abs(np.stack([k.T_world_cam for k in world.keyframes]) - truth).max()
+    assert after < 0.2 * before
+    assert np.allclose(world.pose_of_frame(73), world.poses[70])
+    assert noise.model.sigma0_px < 0.5
+
+
+def test_what_came_after_the_question_moves_with_the_answer():
+    world, _, _ = make_world(5, 100, shake=0.01)
+    add_landmarks(world, CAMERA, NoiseModel(6.0, 0.0), IMAGE, 0.5)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    assert problem is not None
+    late = Keyframe(
+        **{
+            **vars(world.keyframes[-1]),
+            "frame_id": 50,
+            "T_world_cam": world.poses[40] @ exp_se3(np.full(6, 0.1)),
+        }
+    )
+    world.add_keyframe(late)
+    relative = invert_transform(world.poses[40]) @ world.poses[50]
+    mark = transform_points(invert_transform(world.poses[50]), [[0.0, 0, 3]])
+    world.add_landmarks(
+        np.array([500]), np.array([[0.0, 0, 3]]), np.zeros((1, 3), np.uint8), np.ones(1), 0, 50
+    )
+    apply_result(world, optimise(problem), OnlineNoise("off", 0.5, 0.0, True))
+    assert np.allclose(invert_transform(world.poses[40]) @ world.poses[50], relative)
+    moved = world.landmarks.xyz[world.landmarks.rows(np.array([500]))]
+    assert np.allclose(transform_points(invert_transform(world.poses[50]), moved), mark)
+
+
+def test_outliers_of_an_adjustment_are_dropped():
+    world, _, _ = make_world(6, 100)
+    add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)
+    chosen = world.landmarks.ids[3]
+    world.keyframes[3].xy[chosen] += 25.0
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    apply_result(world, optimise(problem), OnlineNoise("off", 0.5, 0.0, True))
+    assert chosen not in world.keyframes[3].ids
+    assert chosen in world.keyframes[2].ids
+    assert world.landmarks.rows(np.array([chosen]))[0] >= 0
+
+
+def test_a_large_window_is_cut_to_the_longest_tracks():
+    world, _, _ = make_world(10, 600)
+    add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)
+    for keyframe in world.keyframes[:6]:
+        keyframe.drop_observations(keyframe.ids % 2 == 1)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    assert problem is not None
+    assert len(problem.xy) <= 3500
+    assert (problem.landmark_ids % 2 == 0).sum() >= (world.landmarks.ids % 2 == 0).sum() - 1
+
+
+def test_a_landmark_that_keeps_disagreeing_is_given_up():
+    world, _, _ = make_world()
+    add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)
+    bad = world.landmarks.ids[[5]]
+    for frame_id in range(3):
+        note_sight(world, bad, np.array([False]), frame_id)
+    note_sight(world, bad, np.array([True]), 3)
+    for frame_id in range(4, 8):
+        assert world.landmarks.rows(bad)[0] >= 0
+        note_sight(world, bad, np.array([False]), frame_id)
+    assert world.landmarks.rows(bad)[0] == -1
+
+
+def test_there_is_nothing_to_adjust_at_first():
+    world, _, _ = make_world(2)
+    assert build_problem(world, CAMERA, NOISE, 10) is None
+    add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)
+    assert build_problem(world, CAMERA, NOISE, 10) is None
+    assert build_problem(world, CAMERA, NOISE, 10, start=True) is not None

@@ -1,0 +1,294 @@
+"""Tracks from image to image, and landmarks that get their tracks back."""
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import make_transform
+from semcast.server.geometry.features import to_grey
+from semcast.server.mapping.recall import NUM_IMAGES, SeenFrom, no_images, recall_landmarks
+from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.tracks import MAX_COAST, Sight, TrackTable, usable_rows
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+SHAPE = (192, 256)
+
+
+def big_texture():
+    rng = np.random.default_rng(3)
+    noise = sum(
+        layer / layer.std()
+        for layer in (
+            cv2.GaussianBlur(rng.standard_normal((400, 500)).astype(np.float32), None, s) for s in (2, 5, 12)
+        )
+    )
+    return np.clip(noise * 30 + 128, 0, 255).astype(np.uint8)
+
+
+TEXTURE = big_texture()
+
+
+def sight_at(x, y=20, frame_id=0, lost=(), **changes):
+    """The texture as a camera sees it that moved by x and y; slots in ``lost`` are grey."""
+    image = np.repeat(TEXTURE[y : y + SHAPE[0], x : x + SHAPE[1], None], 3, axis=2).copy()
+    snr = np.full(SHAPE[0] // 16, 20.0, np.float32)
+    for slot in lost:
+        image[16 * slot : 16 * slot + 16] = 128
+        snr[slot] = -20
+    frame = DecodedFrame(frame_id, frame_id * 10**8, image, slot_snr_db=snr, **changes)
+    return Sight(frame, to_grey(image), usable_rows(frame, SHAPE[0]))
+
+
+def begin(x=20, **changes):
+    tracks = TrackTable("robust", 150, 0)
+    sight = sight_at(x, **changes)
+    tracks.remember(sight)
+    tracks.refill(sight)
+    return tracks
+
+
+def test_usable_rows_follow_the_slots():
+    frame = DecodedFrame(
+        0, 0, np.zeros((40, 8, 3), np.uint8), slot_snr_db=np.array([5, -20, np.nan], np.float32)
+    )
+    rows = usable_rows(frame, 40)
+    assert rows[:16].all()
+    assert not rows[16:].any()
+    assert usable_rows(DecodedFrame(0, 0, frame.image), 40).all()
+
+
+def test_tracks_keep_their_ids_and_follow_the_image():
+    tracks = begin()
+    ids, xy = tracks.ids.copy(), tracks.xy.copy()
+    tracks.follow(sight_at(26), tracks.xy)
+    stayed = np.isin(ids, tracks.ids)
+    assert stayed.mean() > 0.8
+    assert np.median(np.abs(tracks.xy - (xy[stayed] - (6, 0)))) < 0.1
+    assert np.allclose(np.median(tracks.velocity, axis=0), (-6, 0), atol=0.1)
+    assert np.all((tracks.confidence > 0) & (tracks.confidence <= 1))
+    tracks.keep(tracks.xy[:, 0] < 128)
+    assert tracks.refill(sight_at(26)) > 0
+    assert np.all(np.diff(tracks.ids) > 0)
+
+
+def test_tracks_in_a_lost_slot_coast_and_come_back():
+    tracks = begin()
+    in_band = (tracks.xy[:, 1] > 66) & (tracks.xy[:, 1] < 90)
+    band_ids = tracks.ids[in_band]
+    assert len(band_ids) >= 5
+    tracks.follow(sight_at(23, lost=(4, 5)), tracks.xy)
+    coasting = tracks.ids[~tracks.visible]
+    assert np.isin(band_ids, coasting).all()
+    tracks.follow(sight_at(26), tracks.xy + tracks.velocity)
+    assert np.isin(band_ids, tracks.ids[tracks.visible]).mean() > 0.6
+
+
+def test_nothing_coasts_for_ever():
+    tracks = begin()
+    for k in range(MAX_COAST + 1):
+        tracks.follow(sight_at(20, lost=range(12), frame_id=k), tracks.xy)
+    assert len(tracks) == 0
+
+
+def test_no_corner_is_taken_near_a_lost_slot():
+    tracks = begin(lost=(5,))
+    assert not np.any((tracks.xy[:, 1] > 80 - 6) & (tracks.xy[:, 1] < 96 + 6))
+
+
+def test_a_damaged_frame_makes_all_tracks_coast():
+    tracks = begin()
+    count = len(tracks)
+    noise = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+    frame = DecodedFrame(1, 1, noise)
+    tracks.follow(Sight(frame, to_grey(noise), np.ones(SHAPE[0], bool)), tracks.xy)
+    assert len(tracks) > 0.8 * count
+    tracks.follow(sight_at(22), tracks.xy)
+    assert tracks.visible.sum() > 0.6 * count
+
+
+def test_low_confidence_in_the_maps_lowers_that_of_tracks():
+    high, low = (
+        begin(confidence=np.full(SHAPE, c, np.float32), keypoint_confidence=np.full(SHAPE, k, np.float32))
+        for c, k in ((0.9, 0.9), (0.2, 0.3))
+    )
+    assert low.confidence.mean() < 0.6 * high.confidence.mean()
+
+
+def test_nan_maps_give_finite_confidence():
+    tracks = begin(
+        confidence=np.full(SHAPE, np.nan, np.float32), keypoint_confidence=np.full(SHAPE, np.nan, np.float32)
+    )
+    assert np.isfinite(tracks.confidence).all()
+
+
+def test_new_ids_are_higher_than_all_others():
+    tracks = begin()
+    highest = tracks.ids.max()
+    xy = {i: tuple(p) for i, p in zip(tracks.ids.tolist(), tracks.xy, strict=True)}
+    mask = tracks.ids % 2 == 0
+    renewed = tracks.xy[mask]
+    tracks.renew(mask)
+    assert np.all(np.diff(tracks.ids) > 0)
+    assert np.array_equal(np.sort(tracks.xy[tracks.ids > highest], axis=0), np.sort(renewed, axis=0))
+    assert all(xy[i] == tuple(p) for i, p in zip(tracks.ids, tracks.xy, strict=True) if i <= highest)
+
+
+def test_adopted_points_replace_all_tracks():
+    tracks = begin()
+    tracks.adopt(np.array([9, 4, 9]), np.array([[1.0, 1], [2, 2], [3, 3]]), 0.5)
+    assert tracks.ids.tolist() == [4, 9]
+    assert tracks.xy.tolist() == [[2, 2], [1, 1]]
+    assert tracks.visible.all()
+
+
+def test_off_ignores_the_maps():
+    tracks = TrackTable("off", 100, 0)
+    sight = sight_at(20, confidence=np.full(SHAPE, 0.1, np.float32))
+    tracks.remember(sight)
+    tracks.refill(sight)
+    assert np.all(tracks.confidence == 1.0)
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_an_empty_image_has_no_tracks(value):
+    image = np.full((*SHAPE, 3), value, np.uint8)
+    sight = Sight(DecodedFrame(0, 0, image), to_grey(image), np.ones(SHAPE[0], bool))
+    tracks = TrackTable("robust", 100, 0)
+    tracks.remember(sight)
+    assert tracks.refill(sight) == 0
+    tracks.follow(sight, tracks.xy)
+    assert len(tracks) == 0
+
+
+def test_tracks_are_found_again_after_a_jump_beyond_the_pyramid():
+    tracks = begin(x=20, y=10)
+    ids, xy = tracks.ids.copy(), tracks.xy.copy()
+    tracks.follow(sight_at(135, 75), tracks.xy, max_level=2)
+    visible = tracks.visible
+    assert visible.sum() > 25
+    was = xy[np.searchsorted(ids, tracks.ids[visible])]
+    error = np.linalg.norm(tracks.xy[visible] - (was - (115, 65)), axis=1)
+    assert (error < 0.5).mean() > 0.95
+    assert visible.all(), "what a jump does not find is gone, it does not coast"
+
+
+def test_another_place_is_no_jump():
+    tracks = begin()
+    count = len(tracks)
+    other = sight_at(20)
+    frame = DecodedFrame(1, 10**8, np.ascontiguousarray(other.frame.image[::-1, ::-1]))
+    tracks.follow(Sight(frame, to_grey(frame.image), other.usable), tracks.xy)
+    assert len(tracks) > 0.9 * count
+    assert tracks.visible.sum() < 0.2 * count
+
+
+def test_a_second_look_starts_from_the_image_before():
+    tracks = begin()
+    ids, xy = tracks.ids.copy(), tracks.xy.copy()
+    sight = sight_at(90)
+    assert not TrackTable("robust", 150, 0).follow_jump(sight), "nothing was followed yet"
+    tracks.follow(sight, tracks.xy - (70, 0))
+    tracks.xy = tracks.xy + 11.0  # as if they had slipped
+    assert tracks.follow_jump(sight)
+    was = xy[np.searchsorted(ids, tracks.ids)]
+    assert np.median(np.linalg.norm(tracks.xy - (was - (70, 0)), axis=1)) < 0.3
+    before = tracks.xy.copy()
+    assert not tracks.follow_jump(sight), "only one second look at an image"
+    np.testing.assert_array_equal(tracks.xy, before)
+
+
+def test_a_second_look_that_finds_less_changes_nothing():
+    tracks = begin()
+    lost = sight_at(24, lost=(0, 1, 2, 3, 4, 5))  # half of the image
+    tracks.follow(lost, tracks.xy - (4, 0))
+    coasting, visible = int((tracks.missed > 0).sum()), int(tracks.visible.sum())
+    assert coasting > 20
+    assert visible > 20
+    before = {name: getattr(tracks, name).copy() for name in ("ids", "xy", "missed")}
+    assert not tracks.follow_jump(lost)
+    for name, values in before.items():
+        np.testing.assert_array_equal(getattr(tracks, name), values)
+
+
+#: A wall at distance 1: moving by 1/200 moves the image by a pixel.
+CAMERA = Intrinsics(fx=200.0, fy=200.0, cx=128.0, cy=96.0, width=SHAPE[1], height=SHAPE[0])
+START_X = 20
+
+
+def pose_at(x):
+    return make_transform(np.eye(3), [(x - START_X) / 200.0, 0.0, 0.0])
+
+
+@pytest.fixture
+def mapped():
+    """A keyframe whose tracks are all landmarks, its image, and the tracks."""
+    tracks = begin(START_X)
+    world = WorldMap()
+    count = len(tracks)
+    world.add_keyframe(
+        Keyframe(
+            frame_id=0,
+            t_source_ns=0,
+            T_world_cam=pose_at(START_X),
+            submap=0,
+            ids=tracks.ids.copy(),
+            xy=tracks.xy.copy(),
+            confidence=tracks.confidence.copy(),
+            descriptor_ids=np.zeros(0, np.int64),
+            descriptors=np.zeros((0, 32), np.uint8),
+        )
+    )
+    xyz = CAMERA.unproject(tracks.xy)
+    world.add_landmarks(tracks.ids, xyz, np.zeros((count, 3), np.uint8), np.ones(count), 0, 0)
+    images = no_images()
+    images.append(SeenFrom(0, sight_at(START_X).grey))
+    return world, images, tracks
+
+
+def recall(mapped, sight, x, reach_px=6.0):
+    world, images, tracks = mapped
+    return recall_landmarks(CAMERA, world, images, tracks, sight, pose_at(x), reach_px=reach_px)
+
+
+def test_lost_landmarks_get_their_tracks_back(mapped):
+    _, _, tracks = mapped
+    ids, xy = tracks.ids.copy(), tracks.xy.copy()
+    tracks.keep(np.arange(len(tracks)) % 4 == 0)
+    kept = tracks.ids.copy()
+    sight = sight_at(30, frame_id=1)
+    tracks.follow(sight, tracks.xy - (10, 0))
+    found = recall(mapped, sight, 30)
+    assert found > 0.5 * (len(ids) - len(kept))
+    assert np.all(np.diff(tracks.ids) > 0)
+    back = ~np.isin(tracks.ids, kept)
+    assert back.sum() == found
+    where = xy[np.searchsorted(ids, tracks.ids[back])] - (10, 0)
+    assert np.abs(tracks.xy[back] - where).max() < 1.0
+    assert recall(mapped, sight, 30) == 0, "those found have a track now"
+
+
+def test_a_wrong_pose_finds_next_to_nothing(mapped):
+    _, _, tracks = mapped
+    count = len(tracks)
+    tracks.keep(np.zeros(count, bool))
+    sight = sight_at(30, frame_id=1)
+    assert recall(mapped, sight, 75) < 0.05 * count
+
+
+def test_nothing_is_found_where_nothing_arrived(mapped):
+    world, _, tracks = mapped
+    tracks.keep(np.zeros(len(tracks), bool))
+    sight = sight_at(24, frame_id=1, lost=(3, 4, 5, 6))
+    assert recall(mapped, sight, 24) > 0
+    assert not np.any((tracks.xy[:, 1] > 48) & (tracks.xy[:, 1] < 112))
+    tracks.keep(np.zeros(len(tracks), bool))
+    world.landmarks.keep(np.zeros(len(world.landmarks), bool))
+    assert recall(mapped, sight_at(24, frame_id=2), 24) == 0
+
+
+def test_old_images_are_forgotten():
+    images = no_images()
+    for k in range(NUM_IMAGES + 2):
+        images.append(SeenFrom(k, np.zeros((2, 2), np.uint8)))
+    assert [i.frame_id for i in images] == [2, 3, 4]

@@ -1,0 +1,153 @@
+import numpy as np
+import pytest
+
+from semcast.common.geometry import exp_se3, invert_transform, transform_points
+from semcast.server.mapping.world_map import Keyframe, Landmarks, WorldMap
+
+
+def add(landmarks, ids, submap=0, frame_id=0):
+    ids = np.array(ids, np.int64)
+    xyz = np.stack([ids, ids, ids], axis=1).astype(float)
+    landmarks.add(ids, xyz, np.full((len(ids), 3), 7, np.uint8), np.ones(len(ids)), submap, frame_id)
+
+
+def make_keyframe(frame_id, ids, submap=0, seed=0):
+    rng = np.random.default_rng(seed + frame_id)
+    ids = np.array(ids, np.int64)
+    return Keyframe(
+        frame_id=frame_id,
+        t_source_ns=frame_id * 10,
+        T_world_cam=exp_se3(rng.normal(0, 0.3, 6)),
+        submap=submap,
+        ids=ids,
+        xy=rng.uniform(0, 100, (len(ids), 2)),
+        confidence=rng.uniform(0, 1, len(ids)),
+        descriptor_ids=ids[::2],
+        descriptors=rng.integers(0, 256, (len(ids[::2]), 32), dtype=np.uint8),
+    )
+
+
+def make_world():
+    world = WorldMap()
+    for k in range(4):
+        world.add_keyframe(make_keyframe(10 * k, range(k, k + 6), submap=k // 2))
+        world.add_frame(10 * k + 3, 10 * k, world.poses[10 * k] @ exp_se3(np.full(6, 0.1)))
+    add_world(world, [1, 2, 3], 0, 10)
+    add_world(world, [5, 6], 1, 30)
+    return world
+
+
+def add_world(world, ids, submap, frame_id):
+    ids = np.array(ids, np.int64)
+    xyz = np.random.default_rng(int(ids.sum())).normal(0, 2, (len(ids), 3))
+    world.add_landmarks(ids, xyz, np.zeros((len(ids), 3), np.uint8), np.ones(len(ids)), submap, frame_id)
+
+
+def test_landmarks_stay_sorted_and_are_found_by_id():
+    landmarks = Landmarks()
+    assert landmarks.rows(np.array([4])).tolist() == [-1]
+    add(landmarks, [5, 9])
+    add(landmarks, [1, 7])
+    assert landmarks.ids.tolist() == [1, 5, 7, 9]
+    assert landmarks.xyz[:, 0].tolist() == [1, 5, 7, 9]
+    assert landmarks.rows(np.array([9, 2, 1])).tolist() == [3, -1, 0]
+    landmarks.keep(landmarks.ids > 4)
+    assert landmarks.ids.tolist() == [5, 7, 9]
+    assert len(landmarks.born) == len(landmarks) == 3
+
+
+def test_frames_follow_their_keyframe():
+    world = make_world()
+    before = world.pose_of_frame(13)
+    T = exp_se3([0.1, 0, 0.2, 1, 2, 3])
+    world.move_keyframe(10, T @ world.poses[10])
+    assert np.allclose(world.pose_of_frame(13), T @ before)
+    assert world.pose_of_frame(99) is None
+    assert list(world.trajectory()) == [0, 3, 10, 13, 20, 23, 30, 33]
+
+
+def test_changes_are_reported_once():
+    world = make_world()
+    changed, removed, keyframes = world.take_changes()
+    assert changed.tolist() == [1, 2, 3, 5, 6]
+    assert removed.tolist() == []
+    assert keyframes.tolist() == [0, 10, 20, 30]
+    assert sum(len(part) for part in world.take_changes()) == 0
+    world.move_landmarks(np.array([2, 77]), np.ones((2, 3)))
+    world.remove_landmarks(world.landmarks.ids == 3)
+    changed, removed, _ = world.take_changes()
+    assert changed.tolist() == [2]
+    assert removed.tolist() == [3]
+
+
+def test_a_landmark_that_comes_back_is_not_reported_as_removed():
+    world = make_world()
+    world.take_changes()
+    world.remove_landmarks(world.landmarks.ids == 3)
+    add_world(world, [3], 0, 40)
+    changed, removed, _ = world.take_changes()
+    assert changed.tolist() == [3]
+    assert removed.tolist() == []
+
+
+def test_a_similarity_moves_everything_of_a_submap_alike():
+    world = make_world()
+    scale, T = 2.5, exp_se3([0.3, -0.2, 0.1, 4, 5, 6])
+    row = world.landmarks.rows(np.array([5, 6]))
+    seen_before = transform_points(invert_transform(world.pose_of_frame(33)), world.landmarks.xyz[row])
+    others = {k: world.pose_of_frame(k) for k in (0, 3, 13)}
+    world.transform_submap(1, 0, scale, T)
+    seen_after = transform_points(invert_transform(world.pose_of_frame(33)), world.landmarks.xyz[row])
+    assert np.allclose(seen_after, scale * seen_before)
+    assert np.allclose(world.pose_of_frame(33)[:3, :3] @ world.pose_of_frame(33)[:3, :3].T, np.eye(3))
+    assert all(np.array_equal(world.pose_of_frame(k), T_k) for k, T_k in others.items())
+    assert set(world.submap_of.values()) == {0}
+    assert {k.submap for k in world.keyframes} == {0}
+    assert set(world.landmarks.submap.tolist()) == {0}
+
+
+def test_the_map_is_bounded():
+    world = WorldMap()
+    for k in range(60):
+        world.add_keyframe(make_keyframe(k, range(5 * k, 5 * k + 8)))
+        add_world(world, range(5 * k, 5 * k + 5), 0, k)
+        world.bound(max_landmarks=100, max_keyframes=30, recent=10)
+        assert len(world.landmarks) <= 100
+        assert len(world.keyframes) <= 30
+    assert [k.frame_id for k in world.keyframes[-10:]] == list(range(50, 60))
+    assert world.landmarks.ids.min() > 150
+    assert len(world.trajectory()) == 60
+
+
+def test_observations_are_those_of_landmarks():
+    ids, frames, xy = make_world().observations()
+    assert set(ids.tolist()) <= {1, 2, 3, 5, 6}
+    assert len(ids) == len(frames) == len(xy)
+    assert sorted(frames[ids == 3].tolist()) == [0, 10, 20, 30]
+
+
+def test_arrays_bring_the_map_back():
+    world = make_world()
+    arrays = world.arrays()
+    assert all(isinstance(a, np.ndarray) and not a.dtype.hasobject for a in arrays.values())
+    again = WorldMap()
+    again.restore(arrays)
+    for name, array in again.arrays().items():
+        assert np.array_equal(array, arrays[name]), name
+    assert again.keyframes[2].submap == 1
+
+
+def test_contradicting_arrays_are_refused():
+    arrays = make_world().arrays()
+    with pytest.raises(ValueError, match="refers to keyframe 999"):
+        WorldMap().restore({**arrays, "frames.keyframe_id": arrays["frames.keyframe_id"] * 0 + 999})
+    missing = {k: v for k, v in arrays.items() if k != "landmarks.xyz"}
+    with pytest.raises(KeyError):
+        WorldMap().restore(missing)
+
+
+def test_an_empty_map_travels_too():
+    world = WorldMap()
+    world.restore(WorldMap().arrays())
+    assert world.trajectory() == {}
+    assert len(world.observations()[0]) == 0

@@ -1,0 +1,254 @@
+"""Viewers: what lands in the file, and that a dead, frozen or late viewer never holds the tracker up."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import ConfigError
+from semcast.common.geometry import make_transform
+from semcast.server.settings import ViewSettings
+from semcast.server.view.scene import FrameView
+
+pytest.importorskip("rerun")
+
+from semcast.server.view.feed import ViewerFeed, resolve_view
+from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
+
+CAMERA = Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
+DEADLINE_S = 20.0
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def wait_until(condition, what):
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {DEADLINE_S} s: {what}"
+        time.sleep(0.01)
+
+
+def frame(k):
+    rng = np.random.default_rng(k)
+    return FrameView(
+        frame_id=k,
+        t_source_ns=k * 100_000_000,
+        T_world_cam=make_transform(np.eye(3), (0.0, 0.0, 0.1 * k)),
+        state="tracking",
+        scalars={"link/psnr_db": 20.0 + k, "drops/stale": float(k // 3)},
+        image=rng.integers(0, 255, (48, 64, 3), dtype=np.uint8),
+        confidence=rng.random((48, 64), dtype=np.float32),
+        keypoints_xy=rng.random((20, 2), dtype=np.float32) * 40,
+        keypoint_inlier=rng.random(20) < 0.5,
+    )
+
+
+class Update:
+    """What the reconstruction hands over, one landmark per frame."""
+
+    def __init__(self, k):
+        self.ids = np.array([k], np.int64)
+        self.xyz = np.array([[0.0, 0.0, 5.0 + k]])
+        self.rgb = np.full((1, 3), 200, np.uint8)
+        self.confidence = np.full(1, 0.5, np.float32)
+        self.removed = np.zeros(0, np.int64)
+        self.keyframe_ids = np.array([k], np.int64)
+        self.keyframe_poses = make_transform(np.eye(3), (0.0, 0.0, 0.1 * k))[None]
+
+
+def rerun_output(*arguments):
+    done = subprocess.run(
+        [str(rerun_binary()), *arguments], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+class Proxy(ViewerProcess):
+    """A real Rerun server without window or browser: takes the stream like a viewer does."""
+
+    def _arguments(self):
+        return [*self._command, "--bind", "127.0.0.1", "--port", str(self._port), "--serve-grpc"]
+
+
+@pytest.fixture
+def feed_and_proxy():
+    port = free_port()
+    process = Proxy("web", port, free_port(), "64MB")
+    feed = ViewerFeed(ViewSettings(view="web", port=port), CAMERA, "test-live", process=process)
+    yield feed, process, port
+    feed.close()
+    assert not is_listening(port)
+
+
+def test_the_file_can_be_read_back_and_holds_everything(tmp_path):
+    file = tmp_path / "run.rrd"
+    feed = ViewerFeed(ViewSettings(view="file", image_rate_hz=60), CAMERA, "test-file", file=file)
+    for k in range(5):
+        feed.submit(frame(k), Update(k))
+    feed.close()
+    rerun_output("rrd", "verify", str(file))
+    text = rerun_output("rrd", "print", "-vv", str(file))
+    for entity in (
+        "/world/camera/image",
+        "/world/camera/image/keypoints",
+        "/world/trajectory/0000",
+        "/world/map_confidence/0000",
+        "/world/map_colour/0000",
+        "/confidence",
+        "/plots/link/psnr_db",
+        "/plots/drops/stale",
+    ):
+        assert entity in text, entity
+
+
+def test_file_mode_without_a_folder_is_a_clear_error():
+    with pytest.raises(ConfigError, match="--out"):
+        ViewerFeed(ViewSettings(view="file"), CAMERA, "x")
+
+
+def test_auto_opens_a_window_only_where_there_is_a_display(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert resolve_view("auto", has_folder=True) == "file"
+    assert resolve_view("auto", has_folder=False) == "none"
+    monkeypatch.setenv("DISPLAY", ":7")
+    assert resolve_view("auto", has_folder=False) == "native"
+    assert resolve_view("web", has_folder=False) == "web"
+
+
+def test_a_killed_viewer_is_back_soon_and_gets_the_stream_again(feed_and_proxy):
+    feed, process, _ = feed_and_proxy
+    wait_until(lambda: feed.num_connections == 1, "first connection")
+    feed.submit(frame(0))
+    first = process.pid
+    os.kill(first, signal.SIGKILL)
+    killed_s = time.monotonic()
+    k = 1
+    while feed.num_connections < 2:
+        feed.submit(frame(k))
+        k += 1
+        assert time.monotonic() - killed_s < DEADLINE_S
+        time.sleep(0.02)
+    assert time.monotonic() - killed_s < 5.0
+    assert process.pid != first
+
+
+def test_a_frozen_viewer_never_holds_up_the_tracker(feed_and_proxy):
+    feed, process, _ = feed_and_proxy
+    wait_until(lambda: feed.num_connections == 1, "first connection")
+    os.kill(process.pid, signal.SIGSTOP)
+    slowest_s = 0.0
+    started_s = time.monotonic()
+    k = 0
+    while time.monotonic() - started_s < 1.0:
+        before = time.perf_counter()
+        feed.submit(frame(k), Update(k))
+        slowest_s = max(slowest_s, time.perf_counter() - before)
+        k += 1
+        time.sleep(0.01)
+    assert k > 40
+    assert slowest_s < 0.1
+    closing_s = time.monotonic()
+    feed.close()
+    assert time.monotonic() - closing_s < 10.0
+    assert process.pid is None
+
+
+def test_a_viewer_opened_by_hand_later_gets_the_whole_scene(tmp_path):
+    port, saved = free_port(), tmp_path / "late.rrd"
+
+    class Absent(Proxy):
+        def start(self):
+            self._done = True
+
+    feed = ViewerFeed(
+        ViewSettings(view="web", port=port), CAMERA, "late", process=Absent("web", port, 1, "64MB")
+    )
+    feed.submit(frame(0), Update(0))
+    late = subprocess.Popen(
+        [str(rerun_binary()), "--bind", "127.0.0.1", "--port", str(port), "--save", str(saved)],
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        wait_until(lambda: feed.num_connections == 1, "the late viewer")
+        feed.submit(frame(1), Update(1))
+        wait_until(lambda: saved.exists() and b"map_confidence" in saved.read_bytes(), "scene at the viewer")
+    finally:
+        feed.close()
+        assert late.poll() is None, "a viewer that is not ours was ended"
+        os.killpg(late.pid, signal.SIGKILL)
+        late.wait(10)
+
+
+def test_a_viewer_that_cannot_start_is_given_up_with_its_last_words(caplog):
+    script = "import sys; sys.exit('no display here')"
+    process = ViewerProcess("native", free_port(), 1, "1GB", command=(sys.executable, "-c", script))
+    process.start()
+    with caplog.at_level("WARNING"):
+        deadline = time.monotonic() + DEADLINE_S
+        while "no display here" not in caplog.text and time.monotonic() < deadline:
+            process.supervise()
+            time.sleep(0.02)
+    assert "no display here" in caplog.text
+    process.close()
+
+
+def test_a_window_the_user_closed_stays_closed():
+    process = ViewerProcess("native", free_port(), 1, "1GB", command=(sys.executable, "-c", ""))
+    process.start()
+    wait_until(lambda: process.supervise() or process.pid is None, "the end of the child")
+    process.supervise()
+    assert process.pid is None
+    process.close()
+
+
+def test_a_window_is_left_open_for_the_user_when_asked():
+    sleeper = (sys.executable, "-c", "import time; time.sleep(60)")
+    for leave, expected in ((True, None), (False, -signal.SIGTERM)):
+        port = free_port()
+        process = ViewerProcess("native", port, 1, "1GB", command=sleeper)
+        feed = ViewerFeed(ViewSettings(view="native", port=port), CAMERA, "left", process=process)
+        child = process._child
+        feed.close(leave_window=leave)
+        child.returncode = None
+        if expected is None:
+            assert child.poll() is None
+            os.killpg(child.pid, signal.SIGKILL)
+            child.wait(10)
+        else:
+            assert not is_listening(port)
+            with pytest.raises(ProcessLookupError):
+                os.kill(child.pid, 0)
+            child.returncode = expected
+
+
+def test_closing_takes_the_whole_process_group():
+    script = "import subprocess,sys,time;print(subprocess.Popen(['sleep','60']).pid);time.sleep(60)"
+    process = ViewerProcess("native", free_port(), 1, "1GB", command=(sys.executable, "-c", script))
+    process.start()
+    group = process.pid
+    process.close()
+
+    def gone():
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return True
+        return False
+
+    wait_until(gone, "end of the group")
+    process.close()

@@ -1,0 +1,204 @@
+"""The scene hands out exactly what a viewer has not seen."""
+
+import numpy as np
+import pytest
+
+from semcast.common.geometry import exp_se3, exp_so3, make_transform
+from semcast.common.trajectory import Trajectory
+from semcast.server.mapping.landmark_table import CHUNK_LANDMARKS, LandmarkTable
+from semcast.server.view.scene import (
+    SEGMENT_POSES,
+    Cursor,
+    FrameView,
+    Scene,
+    align_poses,
+    compress_picture,
+    confidence_colours,
+)
+from semcast.server.view.spectator import Spectator, look_at
+
+
+def view(frame_id, T=None, backfilled=(), **scalars):
+    return FrameView(
+        frame_id=frame_id,
+        t_source_ns=frame_id * 100_000_000,
+        T_world_cam=T,
+        state="tracking" if T is not None else "lost",
+        scalars=scalars,
+        image=np.full((16, 16, 3), 7, np.uint8),
+        confidence=np.full((16, 16), 0.5, np.float32),
+        keypoints_xy=np.zeros((3, 2), np.float32),
+        keypoint_inlier=np.array([True, False, True]),
+        backfilled=backfilled,
+    )
+
+
+def at(x):
+    return make_transform(np.eye(3), (float(x), 0.0, 0.0))
+
+
+def points(ids):
+    ids = np.asarray(ids, np.int64)
+    xyz = np.stack([ids, ids, ids], axis=1).astype(float)
+    return ids, xyz, np.full((len(ids), 3), 9, np.uint8), np.full(len(ids), 0.5, np.float32)
+
+
+NONE = np.zeros(0, np.int64)
+
+
+def test_a_second_look_without_news_is_empty():
+    scene, cursor = Scene(), Cursor()
+    scene.add_frame(view(0, at(0)))
+    scene.add_landmarks(*points([1, 2]), NONE)
+    assert not scene.changes_since(cursor).empty
+    assert scene.changes_since(cursor).empty
+
+
+def test_only_the_newest_segment_is_sent_again():
+    scene, cursor = Scene(), Cursor()
+    for k in range(2 * SEGMENT_POSES):
+        scene.add_frame(view(k, at(k)))
+    assert set(scene.changes_since(cursor).segments) == {0, 1}
+    scene.add_frame(view(2 * SEGMENT_POSES, at(2 * SEGMENT_POSES)))
+    changes = scene.changes_since(cursor)
+    assert set(changes.segments) == {2}
+    # It joins the segment before, so the drawn line has no gap.
+    assert changes.segments[2][0][:, 0].tolist() == [2 * SEGMENT_POSES - 1, 2 * SEGMENT_POSES]
+
+
+def test_a_late_viewer_gets_everything():
+    scene, early = Scene(), Cursor()
+    for k in range(5):
+        scene.add_frame(view(k, at(k), **{"link/psnr_db": float(k)}))
+        scene.changes_since(early)
+    changes = scene.changes_since(Cursor())
+    assert [row.scalars["link/psnr_db"] for row in changes.rows] == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert changes.segments[0][0][:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+
+
+def test_frames_move_with_the_keyframe_they_hang_on():
+    scene, cursor = Scene(), Cursor()
+    scene.set_keyframes(np.array([0]), at(0)[None])
+    scene.add_frame(view(0, at(0)))
+    scene.add_frame(view(1, at(1)))
+    scene.set_keyframes(np.array([2]), at(2)[None])
+    scene.add_frame(view(2, at(2)))
+    scene.changes_since(cursor)
+    turned = make_transform(exp_so3([0.0, 0.0, np.pi / 2]), (0.0, 5.0, 0.0))
+    scene.set_keyframes(np.array([0]), turned[None])
+    expected = [[0.0, 5.0, 0.0], [0.0, 6.0, 0.0], [2.0, 0.0, 0.0]]
+    np.testing.assert_allclose(scene.poses()[:, :3, 3], expected, atol=1e-12)
+    np.testing.assert_allclose(scene.changes_since(cursor).segments[0][0], expected, atol=1e-6)
+
+
+def test_frames_posed_later_take_their_place_in_the_line():
+    scene = Scene()
+    scene.add_frame(view(0))
+    scene.add_frame(view(1))
+    scene.add_frame(view(2, at(2), backfilled=((0, 0, at(0)), (1, 1, at(1)))))
+    assert scene.poses()[:, 0, 3].tolist() == [0.0, 1.0, 2.0]
+
+
+def test_the_line_is_cut_where_tracking_was_lost():
+    scene = Scene()
+    for k in (0, 1):
+        scene.add_frame(view(k, at(k)))
+    scene.add_frame(view(2))
+    for k in (3, 4):
+        scene.add_frame(view(k, at(k)))
+    strips = scene.changes_since(Cursor()).segments[0]
+    assert [strip[:, 0].tolist() for strip in strips] == [[0.0, 1.0], [3.0, 4.0]]
+
+
+def test_a_new_map_clears_the_old_one_and_keeps_the_plots():
+    scene, cursor = Scene(), Cursor()
+    scene.add_frame(view(0, at(0), **{"link/psnr_db": 1.0}))
+    scene.add_landmarks(*points([1]), NONE)
+    scene.changes_since(cursor)
+    scene.start_new_map()
+    scene.add_frame(view(1, at(7), **{"link/psnr_db": 2.0}))
+    changes = scene.changes_since(cursor)
+    assert changes.cleared
+    assert changes.chunks == []
+    assert len(scene.changes_since(Cursor()).rows) == 2
+
+
+def test_only_touched_chunks_are_sent_and_removed_landmarks_are_gone():
+    table = LandmarkTable()
+    table.update(*points(np.arange(2 * CHUNK_LANDMARKS)))
+    before = list(table.chunk_versions)
+    table.update(*points([CHUNK_LANDMARKS + 1]))
+    assert [a == b for a, b in zip(before, table.chunk_versions, strict=True)] == [True, False]
+    table.remove(np.array([0, 99_999]))
+    assert len(table) == 2 * CHUNK_LANDMARKS - 1
+    assert table.chunk(0)[0][:, 0].min() == 1.0
+
+
+def test_landmarks_in_any_order_land_at_their_own_coordinates():
+    table, rng = LandmarkTable(), np.random.default_rng(0)
+    ids = rng.permutation(3000)
+    for part in np.array_split(ids, 7):
+        table.update(*points(part))
+    xyz = np.concatenate([table.chunk(k)[0] for k in range(len(table.chunk_versions))])
+    assert xyz[:, 0].tolist() == sorted(ids.tolist())
+
+
+def test_the_truth_is_fitted_to_the_map_even_on_a_straight_line():
+    truth = Trajectory(np.arange(6) * 0.1, np.array([at(k) for k in range(6)]))
+    R, t = exp_so3([0.2, 0.1, -0.4]), np.array([3.0, 2.0, 1.0])
+    scene = Scene(truth)
+    for k in range(6):
+        T = make_transform(R, 0.5 * R @ truth.positions[k] + t)
+        scene.add_frame(view(k, T))
+    scene.align_truth()
+    aligned = scene.changes_since(Cursor()).truth
+    np.testing.assert_allclose(aligned, 0.5 * truth.positions @ R.T + t, atol=1e-6)
+
+
+def test_cameras_that_stand_or_move_against_each_other_have_no_fit():
+    forth, back = np.array([at(k) for k in range(4)]), np.array([at(-k) for k in range(4)])
+    assert align_poses(forth, back) is None
+    assert align_poses(forth[:1], forth[:1]) is None
+    assert align_poses(np.array([at(0)] * 4), forth) is None
+
+
+def test_the_frustum_follows_the_size_of_the_scene_in_steps():
+    scene, cursor = Scene(), Cursor()
+    scene.add_frame(view(0, at(0)))
+    ids, _, rgb, confidence = points([1])
+    scene.add_landmarks(ids, np.array([[0.0, 0.0, 10.0]]), rgb, confidence, NONE)
+    assert scene.changes_since(cursor).frustum_size == pytest.approx(1.5)
+    scene.add_landmarks(ids, np.array([[0.0, 0.0, 11.0]]), rgb, confidence, NONE)
+    assert scene.changes_since(cursor).frustum_size is None
+    scene.add_landmarks(ids, np.array([[0.0, 0.0, 100.0]]), rgb, confidence, NONE)
+    assert scene.changes_since(cursor).frustum_size == pytest.approx(15.0)
+
+
+def test_the_spectator_looks_at_the_camera_from_behind_and_settles():
+    spectator, T = Spectator(), exp_se3([0.3, 0.2, -0.5, 1.0, 2.0, 3.0])
+    for _ in range(200):
+        T_world_eye = spectator.follow(T, 4.0)
+    np.testing.assert_allclose(T_world_eye[:3, :3] @ T_world_eye[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T_world_eye[:3, :3]) == pytest.approx(1.0)
+    in_eye = np.linalg.inv(T_world_eye) @ T
+    assert in_eye[2, 3] > 0
+    assert abs(in_eye[0, 3]) < in_eye[2, 3]
+    jumped = spectator.follow(make_transform(T[:3, :3], T[:3, 3] + [100.0, 0.0, 0.0]), 4.0)
+    assert 10.0 < np.linalg.norm(jumped[:3, 3] - T_world_eye[:3, 3]) < 20.0
+
+
+def test_looking_straight_down_is_still_a_rotation():
+    T = look_at(np.zeros(3), np.array([0.0, 1.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+
+
+def test_pictures_are_jpeg_and_bad_confidence_is_shown_as_none():
+    picture = compress_picture(view(0), 80)
+    assert picture.image_jpeg[:2] == picture.confidence_jpeg[:2] == b"\xff\xd8"
+    assert picture.keypoint_inlier.tolist() == [True, False, True]
+    colours = confidence_colours(np.array([[0.0, 1.0], [2.0, np.nan]], np.float32))
+    assert colours[0].tolist() == [[165, 30, 75], [40, 200, 220]]
+    assert colours[1].tolist() == [[40, 200, 220], [165, 30, 75]]
+    with pytest.raises(ValueError, match="must have an image"):
+        compress_picture(view(0).without_image(), 80)
