@@ -6,7 +6,9 @@ from semcast.common.nets.modulation import (
     CLIP,
     analog_symbols,
     carrier_pattern,
+    demodulate,
     nearest_level,
+    soft_levels,
     undo_analog,
 )
 from semcast.common.phy.qam import pam_levels
@@ -65,3 +67,48 @@ def test_a_frame_of_which_nothing_arrived_stays_finite():
     back, scale = undo_analog(zeros, torch.full((1, 1, 2, 2), 0.0099))
     assert torch.isfinite(back).all()
     assert torch.isfinite(scale).all()
+
+
+@pytest.mark.parametrize("snr_db", [-20.0, 0.0, 8.0, 14.0, 30.0])
+def test_soft_levels_are_the_posterior_mean(snr_db):
+    generator = torch.Generator().manual_seed(1)
+    snr = torch.tensor(10 ** (snr_db / 10), dtype=torch.float64)
+    noise_var = 0.5 / snr
+    levels = torch.from_numpy(pam_levels()).double()
+    received = levels[torch.randint(4, (1, 6, 20, 20), generator=generator)]
+    received = received + noise_var.sqrt() * torch.randn(received.shape, generator=generator)
+    weight = torch.softmax(-(received[..., None] - levels).square() / (2 * noise_var), dim=-1)
+    expected = (weight * levels).sum(dim=-1).float()
+    shrink = (snr / (1 + snr)).float().expand(1, 1, 20, 20)
+    found = soft_levels((received * snr / (1 + snr)).float(), shrink)
+    torch.testing.assert_close(found, expected, atol=2e-3, rtol=0)
+
+
+def test_soft_levels_have_less_error_than_the_equaliser_alone():
+    generator = torch.Generator().manual_seed(2)
+    sent = torch.from_numpy(pam_levels())[torch.randint(4, (1, 94, 30, 30), generator=generator)]
+    errors = {}
+    for snr_db in (2.0, 8.0, 14.0):
+        snr = 10 ** (snr_db / 10)
+        noisy = sent + (0.5 / snr) ** 0.5 * torch.randn(sent.shape, generator=generator)
+        shrink = torch.full((1, 1, 30, 30), snr / (1 + snr))
+        linear = (noisy * shrink - sent).square().mean()
+        errors[snr_db] = (soft_levels(noisy * shrink, shrink) - sent).square().mean() / linear
+    assert errors[2.0] < 1.0
+    assert errors[8.0] < 0.97
+    assert errors[14.0] < 0.6
+
+
+def test_nothing_arrived_means_nothing_is_known():
+    assert soft_levels(torch.zeros(1, 2, 3, 3), torch.zeros(1, 1, 3, 3)).abs().max() == 0.0
+
+
+def test_a_batch_of_both_modulations_is_that_of_each():
+    generator = torch.Generator().manual_seed(3)
+    y = 0.5 * torch.randn(2, 94, 4, 4, generator=generator)
+    shrink = torch.full((2, 1, 4, 4), 0.8)
+    both, scale = demodulate(y, shrink, torch.tensor([1.0, 0.0]))
+    qam, one = demodulate(y[:1], shrink[:1], torch.ones(1))
+    analog, factor = demodulate(y[1:], shrink[1:], torch.zeros(1))
+    torch.testing.assert_close(both, torch.cat((qam, analog)))
+    torch.testing.assert_close(scale, torch.cat((one, factor)))
