@@ -194,8 +194,8 @@ def test_a_manifest_that_does_not_fit_is_refused_in_one_line(weights, changes, m
 def test_missing_weights_say_what_is_shipped(tmp_path):
     with pytest.raises(CheckpointError, match="no trained weights for 'nonsense'; shipped are"):
         weights_path("nonsense")
-    with pytest.raises(CheckpointError, match="no trained weights for '3dcsc'"):
-        NeuralCodec.load("3dcsc")
+    with pytest.raises(CheckpointError, match="no trained weights for '3dcsc-huge'"):
+        NeuralCodec.load("3dcsc-huge")
     with pytest.raises(CheckpointError, match="do not exist"):
         weights_path(tmp_path / "none.safetensors")
 

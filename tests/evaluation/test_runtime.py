@@ -28,7 +28,7 @@ def test_all_variants_are_timed(tmp_path):
 
 
 def test_a_codec_without_weights_is_one_clear_error():
-    with pytest.raises(SemcastError, match="no variant ran: .*no trained weights for '3dcsc'"):
-        evaluate_runtime(RuntimeSettings(codecs=("3dcsc",), threads=(1,), rounds=1))
+    with pytest.raises(SemcastError, match="no variant ran: .*no trained weights for '3dcsc-huge'"):
+        evaluate_runtime(RuntimeSettings(codecs=("3dcsc-huge",), threads=(1,), rounds=1))
     with pytest.raises(ValueError, match="threads must be at least 1"):
         RuntimeSettings(threads=(0,))
