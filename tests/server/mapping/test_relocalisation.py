@@ -1,0 +1,76 @@
+"""A place is recognised by enough landmarks, and not by a chance find of a few."""
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.server.geometry.features import detect_corners
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.relocalisation import Relocaliser
+from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.tracks import Sight
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+CAMERA = Intrinsics(fx=300.0, fy=300.0, cx=160.0, cy=120.0, width=320, height=240)
+NOISE = NoiseModel(1.0, 0.0)
+
+
+def texture():
+    rng = np.random.default_rng(5)
+    noise = rng.standard_normal((240, 320)).astype(np.float32)
+    layers = [cv2.GaussianBlur(noise, None, s) for s in (1.5, 4.0, 9.0)]
+    return np.clip(sum(layer / layer.std() for layer in layers) * 30 + 128, 0, 255).astype(np.uint8)
+
+
+GREY = texture()
+SIGHT = Sight(DecodedFrame(1, 10**8, np.repeat(GREY[..., None], 3, axis=2)), GREY, np.ones(240, bool))
+
+
+def wall(relocaliser, num_landmarks):
+    """A map of one keyframe that sees landmarks on a wall at distance 1."""
+    corners = detect_corners(GREY, 800, None, None, 40).astype(np.float64)
+    ids = np.arange(len(corners))
+    described, descriptors = relocaliser.describe(GREY, ids, corners)
+    chosen = described[np.linspace(0, len(described) - 1, num_landmarks).astype(int)]
+    world = WorldMap()
+    world.add_keyframe(
+        Keyframe(
+            frame_id=0,
+            t_source_ns=0,
+            T_world_cam=np.eye(4),
+            submap=0,
+            ids=chosen,
+            xy=corners[chosen],
+            confidence=np.ones(num_landmarks),
+            descriptor_ids=chosen,
+            descriptors=descriptors[np.isin(described, chosen)],
+        )
+    )
+    colour = np.zeros((num_landmarks, 3), np.uint8)
+    world.add_landmarks(chosen, CAMERA.unproject(corners[chosen]), colour, np.ones(num_landmarks), 0, 0)
+    return world
+
+
+def test_a_place_is_recognised():
+    relocaliser = Relocaliser(CAMERA, 0, 500)
+    place = relocaliser.find(SIGHT, wall(relocaliser, 120), NOISE)
+    assert place is not None
+    assert len(place.ids) > 80
+    np.testing.assert_allclose(place.T_world_cam, np.eye(4), atol=0.01)
+
+
+@pytest.mark.parametrize(("max_features", "is_enough"), [(100, True), (500, False)])
+def test_thirty_landmarks_are_enough_only_where_few_are_followed(max_features, is_enough):
+    relocaliser = Relocaliser(CAMERA, 0, max_features)
+    place = relocaliser.find(SIGHT, wall(relocaliser, 32), NOISE)
+    assert (place is not None) is is_enough
+
+
+def test_another_image_is_no_place():
+    relocaliser = Relocaliser(CAMERA, 0, 100)
+    world = wall(relocaliser, 120)
+    other = np.ascontiguousarray(GREY[::-1, ::-1])
+    sight = Sight(DecodedFrame(1, 10**8, np.repeat(other[..., None], 3, axis=2)), other, np.ones(240, bool))
+    place = relocaliser.find(sight, world, NOISE)
+    assert place is None or abs(place.T_world_cam[0, 0] + 1.0) < 0.05, "the image turned by 180 degrees"
