@@ -48,7 +48,7 @@ VERB = "eval pairs"
 #: Flags that have no meaning here.
 UNUSED_FIELDS = UNUSED_LINK_FIELDS
 _THINNING_STREAM = 0x7417
-#: PoseLib on the matches near their true epipolar lines: what no choice among matches can do better than.
+#: PoseLib on the matches near their true epipolar lines alone: about what a perfect choice among them gives.
 ORACLE = "oracle"
 
 

@@ -29,11 +29,17 @@ class Pairing:
         title: Recording, channel and SNR.
         ours_percent: ``(S,)`` ATE in percent of the path of the mode in question.
         theirs_percent: ``(S,)`` of the one it is compared with.
+        ours_posed: Mean share of frames with a pose, over all runs.
+        theirs_posed: The same.
+        num_failed: Runs without a trajectory in either mode; they are in no other figure.
     """
 
     title: str
     ours_percent: Array
     theirs_percent: Array
+    ours_posed: float = 1.0
+    theirs_posed: float = 1.0
+    num_failed: int = 0
 
 
 def pairings_of(
@@ -42,19 +48,25 @@ def pairings_of(
     """Return all cells of reports of ``semcast eval trajectory`` that have both modes and enough seeds."""
     found = []
     for report in reports:
-        runs: dict[float, dict[str, dict[int, float | None]]] = {}
+        runs: dict[float, dict[str, dict[int, Mapping[str, Any]]]] = {}
         for cell in report["cells"]:
             if cell["snr_db"] is not None:
-                of_mode = {run["seed"]: run["ate_percent"] for run in cell["runs"]}
+                of_mode = {run["seed"]: run for run in cell["runs"]}
                 runs.setdefault(cell["snr_db"], {})[cell["confidence"]] = of_mode
         for snr_db, modes in runs.items():
             a, b = modes.get(ours, {}), modes.get(theirs, {})
-            both = [(a[s], b[s]) for s in sorted(a) if a[s] is not None and b.get(s) is not None]
-            if len(both) >= MIN_SEEDS:
-                values = np.array(both, dtype=np.float64)
-                link = report["settings"]["link"]["channel"]
-                title = f"{report['sequence']}, {link}, {snr_db:g} dB"
-                found.append(Pairing(title, values[:, 0], values[:, 1]))
+            shared = sorted(a.keys() & b.keys())
+            both = [(a[s]["ate_percent"], b[s]["ate_percent"]) for s in shared]
+            known = [pair for pair in both if None not in pair]
+            if len(known) < MIN_SEEDS:
+                continue
+            # An error of exactly 0 has no logarithm.
+            values = np.maximum(np.array(known, dtype=np.float64), 1e-6)
+            settings = report["settings"]
+            title = f"{report['sequence']}, {settings['codec']}, {settings['link']['channel']}, {snr_db:g} dB"
+            posed = [float(np.mean([runs_of[s]["completeness"] for s in shared])) for runs_of in (a, b)]
+            num_failed = len(both) - len(known)
+            found.append(Pairing(title, values[:, 0], values[:, 1], posed[0], posed[1], num_failed))
     return found
 
 
@@ -84,11 +96,15 @@ def _lines(pairings: Sequence[Pairing]) -> Iterator[str]:
     yield "its 95 % interval over seeds.\n"
     rows = []
     for p in pairings:
+        sides = ((p.ours_percent, p.ours_posed), (p.theirs_percent, p.theirs_posed))
         figures = [
-            number(float(f(v)), 2) for v in (p.ours_percent, p.theirs_percent) for f in (np.median, np.max)
+            text
+            for values, posed in sides
+            for text in (number(float(np.median(values))), number(float(values.max())), f"{posed:.1%}")
         ]
-        rows.append([p.title, str(len(p.ours_percent)), *figures, _with_interval([p])])
-    head = ["recording, link", "seeds", "robust, median", "worst", "off, median", "worst", "ratio"]
+        rows.append([p.title, str(len(p.ours_percent)), str(p.num_failed), *figures, _with_interval([p])])
+    names = (f"{mode}, {what}" for mode in ("robust", "off") for what in ("median", "worst", "posed"))
+    head = ["recording, link", "runs", "failed", *names, "ratio"]
     yield from table(head, rows)
     yield f"\nOver all {len(pairings)} rows: {_with_interval(pairings)}."
 

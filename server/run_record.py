@@ -42,7 +42,7 @@ class FrameRow:
         psnr_db: Of the decoded image, where the original is known.
         confidence_mean: Mean of the confidence map.
         age_ms: From arrival at the server to the pose.
-        stage_ms: Duration of each stage.
+        stage_ms: Duration of each stage, and ``decoded_to_pose`` from the end of the decoder to the pose.
     """
 
     frame_id: int

@@ -52,6 +52,26 @@ def test_imports_go_one_way(folder):
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.parametrize(
+    ("folder", "may_import"),
+    [
+        ("geometry", {"geometry"}),
+        ("mapping", {"geometry", "mapping"}),
+        ("view", {"mapping", "view"}),
+        ("export", {"export", "view"}),
+    ],
+)
+def test_the_servers_folders_are_layers(folder, may_import):
+    inner = {"geometry", "mapping", "view", "export"}
+    wrong = []
+    for path in python_files(f"server/{folder}"):
+        for name in imports_of(path):
+            parts = name.split(".")
+            if parts[:2] == ["semcast", "server"] and parts[2] in inner - may_import:
+                wrong.append(f"{path.relative_to(ROOT)} imports {name}")
+    assert not wrong, "\n".join(wrong)
+
+
 @pytest.mark.parametrize("library", sorted(HOMES))
 def test_each_outside_library_has_one_home(library):
     users = {

@@ -1,7 +1,7 @@
 """Starting a network from a smaller one of its kind: it computes the same at first, with room for more.
 
-The weights of the smaller network become a corner of the larger one's. What is new is read by nothing old
-(zeros), but reads everything itself (fresh random weights), so it has a gradient from the first step on
+The weights of the smaller network become a corner of the larger one's. What is new reads everything (fresh
+random weights) and is read by nothing old at first: those weights are zero, and learn from the first step on
 (function-preserving growth, Chen, Goodfellow and Shlens 2016).
 """
 
@@ -67,4 +67,3 @@ def grow(small: Transceiver, large: Transceiver) -> None:
             new[:rows] = 0.0
             places = _places(_parts(name, old.shape[1], was), _parts(name, new.shape[1], own))
             new[:rows].index_copy_(1, places, old)
-    large.load_state_dict(ours)

@@ -15,8 +15,9 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from semcast.common.errors import CheckpointError
+from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
+from semcast.common.nets.encoder import Encoder
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS, channel_bandwidth_ratio
@@ -91,7 +92,12 @@ class Run:
         self.agreed_s = 0.0  # elapsed time all processes agree on, since the schedule depends on it
         checkpoint = self._read_checkpoint()
         if checkpoint is None and settings.grow_from is not None:
-            small, _ = load_transceiver(settings.grow_from)
+            small, manifest = load_transceiver(settings.grow_from)
+            if not (isinstance(small.encoder, Encoder) and isinstance(model.encoder, Encoder)):
+                raise ConfigError(
+                    "grow_from must hold a 3dcsc network and architecture must be one, got "
+                    f"{manifest.architecture} and {settings.architecture}"
+                )
             grow(unfolded(small, self._pass_images), model)
         elif checkpoint is None and settings.start == "klt":
             start_from_klt(model, self.images, torch.Generator().manual_seed(settings.seed))
@@ -335,6 +341,7 @@ def train(
     Raises:
         SourceError: There are no images.
         CheckpointError: The checkpoint in ``out`` belongs to another architecture or is damaged.
+        ConfigError: ``start`` or ``grow_from`` does not suit the architecture.
     """
     world = int(os.environ.get("WORLD_SIZE", "1"))
     joined = world > 1 and not dist.is_initialized()

@@ -55,7 +55,8 @@ class TwoViewResult:
     Attributes:
         T_cam1_cam0: ``(4, 4)``, translation of length 1 (of no meaning for ``rotation``).
         inliers: ``(N,)`` bool: near the epipolar geometry and in front of both cameras.
-        score: Confidence-free MSAC score of all matches, weighted by agreement; 0 is perfect.
+        score: Confidence-free MSAC score of all matches, weighted by agreement except under ``paper``; 0 is
+            perfect.
         model: ``rotation`` when turning alone explains the matches, ``homography`` when the pose came from
             one plane, else ``essential``.
         parallax_deg: Median angle between the rays of inliers.

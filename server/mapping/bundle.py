@@ -107,7 +107,7 @@ def optimise(problem: BundleProblem) -> BundleResult:
             points = np.unique(problem.point[used])
             xyz[points] = np.array([solved.atPoint3(L(p)) for p in points.tolist()])
             ok = bool(np.isfinite(T_world_cam).all() and np.isfinite(xyz).all())
-            if ok:
+            if ok and problem.with_covariance:
                 covariance = _covariance(graph, solved, len(T_world_cam) - 1)
         if not ok:
             T_world_cam, xyz = problem.T_world_cam.copy(), problem.xyz.copy()

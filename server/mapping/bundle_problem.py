@@ -29,6 +29,7 @@ class BundleProblem:
         confidence: ``(M,)`` of each observation, handed through.
         iterations: Levenberg-Marquardt steps at most.
         map_version: Handed through; a result for another map is not applied.
+        with_covariance: Whether the covariance of the last pose is wanted.
     """
 
     intrinsics: tuple[float, float, float, float]
@@ -45,6 +46,7 @@ class BundleProblem:
     confidence: Array
     iterations: int = 6
     map_version: int = 0
+    with_covariance: bool = True
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.pnp import refine_pose, search_pose
-from semcast.server.geometry.reversal import Side, decide
 from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import TwoViewResult, estimate_two_view
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.reversal import Side, decide
 from semcast.server.mapping.tracker import interpolate_pose
 from semcast.server.mapping.world_map import Keyframe
 
@@ -29,8 +29,10 @@ MAX_HISTORY = 300
 START_KEYFRAMES = 5
 MIN_POINTS = 40
 #: Two views of a scene with little perspective can't tell it from its mirror image in depth. They have to do
-#: where tracks don't last for three, which so many frames in vain have shown.
-_MIN_VIEWS, _FRAMES_IN_VAIN = 3, 4
+#: where tracks don't last for three, as so many attempts have shown.
+_MIN_VIEWS, _MAX_TOO_SHORT = 3, 2
+#: After so many starts that could have been either, the better one is taken.
+_MAX_UNDECIDED = 10
 #: Points (the longest tracks) and steps for telling them apart.
 _MAX_DECIDING, _DECIDING_ITERATIONS = 150, 20
 #: A start is better from so many points; fewer do when so many frames have waited for it.
@@ -88,11 +90,15 @@ class Initialiser:
         self._seed = seed
         self.history: list[Observed] = []
         self._reference = 0
+        self._num_undecided = 0
+        self._num_too_short = 0
 
     def clear(self) -> None:
         """Forget all frames."""
         self.history = []
         self._reference = 0
+        self._num_undecided = 0
+        self._num_too_short = 0
 
     def add(self, observed: Observed, noise: NoiseModel, *, is_damaged: bool = False) -> Start | None:
         """Take a frame and try to start a map with it.
@@ -163,8 +169,6 @@ class Initialiser:
     def _build(self, found: TwoViewResult, ids: Ids, noise: NoiseModel) -> Start | None:
         """Triangulate, place the frames between, and triangulate again from all."""
         span = self.history[self._reference :]
-        if len(span) < _MIN_VIEWS and len(self.history) < _FRAMES_IN_VAIN:
-            return None
         first, last = span[0], span[-1]
         T_world = {0: np.eye(4), len(span) - 1: invert_transform(found.T_cam1_cam0)}
         points = self._triangulate([first, last], np.stack([np.eye(4), found.T_cam1_cam0]), ids, noise)
@@ -177,6 +181,10 @@ class Initialiser:
             T_cam = pose_of(self._camera, span[k], ids[good], points.xyz[good], noise, guess, self._seed)
             if T_cam is not None:
                 T_world[k] = T_cam
+        if len(T_world) < _MIN_VIEWS:
+            self._num_too_short += 1
+            if self._num_too_short <= _MAX_TOO_SHORT:
+                return None
         chosen = [span[k] for k in sorted(T_world)]
         poses = np.stack([T_world[k] for k in sorted(T_world)])
         side = self._decide(chosen, poses, noise)
@@ -230,7 +238,9 @@ class Initialiser:
             confidence=confidence,
             iterations=_DECIDING_ITERATIONS,
         )
-        return decide(problem, at_last=len(self.history) >= _PATIENCE_FRAMES)
+        side = decide(problem, at_last=self._num_undecided >= _MAX_UNDECIDED)
+        self._num_undecided += int(side is None)
+        return side
 
     def _triangulate(
         self, frames: list[Observed], T_cam_world: Array, ids: Ids, noise: NoiseModel

@@ -48,8 +48,9 @@ def recall_landmarks(
     sight: Sight,
     T_world_cam: Array,
     *,
+    submap: int,
     reach_px: float,
-) -> int:
+) -> NDArray[np.int64]:
     """Look for landmarks of the newest keyframes that have no track; each found one gets its track back.
 
     Args:
@@ -59,17 +60,18 @@ def recall_landmarks(
         tracks: After the new image was followed; grows.
         sight: The new image.
         T_world_cam: Its pose, or the expected one.
+        submap: The current one; landmarks of others are not in the same world.
         reach_px: A point found further than this from where it is expected is another one.
 
     Returns:
-        How many were found.
+        Ids of the tracks that were found.
     """
     T_cam_world = invert_transform(T_world_cam)
     height, width = sight.grey.shape
-    num_found = 0
+    found = [np.zeros(0, np.int64)]
     for image in reversed(images):
         keyframe = next((k for k in reversed(world.keyframes) if k.frame_id == image.frame_id), None)
-        if keyframe is None:
+        if keyframe is None or keyframe.submap != submap:
             continue
         row = world.landmarks.rows(keyframe.ids)
         lost = np.flatnonzero((row >= 0) & ~np.isin(keyframe.ids, tracks.ids, assume_unique=True))
@@ -81,7 +83,6 @@ def recall_landmarks(
         in_sight[in_sight] &= ~sight.near_lost(expected[in_sight], _BORDER_PX)
         lost, expected = lost[in_sight], expected[in_sight]
         if len(lost):
-            num_found += tracks.take_up(
-                sight, image.grey, keyframe.ids[lost], keyframe.xy[lost], expected, reach_px
-            )
-    return num_found
+            seen = keyframe.ids[lost], keyframe.xy[lost]
+            found.append(tracks.take_up(sight, image.grey, *seen, expected, reach_px))
+    return np.concatenate(found)

@@ -197,17 +197,22 @@ class Reconstruction:
         few = _FEW_INLIERS_SHARE * self._settings.max_features
         if T_world_cam is None or (pose is not None and pose.num_inliers >= few):
             return pose
-        found = recall_landmarks(
+        recalled = recall_landmarks(
             self._camera,
             self._map.world,
             self._map.images,
             self._tracks,
             sight,
             T_world_cam,
+            submap=self._map.submap,
             reach_px=_REACH_PX if pose is not None else _REACH_BLIND_PX,
         )
-        again = self._pose(T_world_cam) if found else None
-        return pose if again is None else again
+        again = self._pose(T_world_cam) if len(recalled) else None
+        if again is not None and (pose is None or again.num_inliers > pose.num_inliers):
+            return again
+        # What was recalled has proved nothing.
+        self._tracks.keep(~np.isin(self._tracks.ids, recalled))
+        return pose
 
     def _accept(
         self, sight: Sight, pose: TrackedPose, backfilled: tuple[tuple[int, int, Array], ...] = ()

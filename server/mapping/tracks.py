@@ -265,7 +265,7 @@ class TrackTable:
 
     def take_up(
         self, sight: Sight, grey0: Grey, ids: Ids, xy0: Array, expected_xy: Array, reach_px: float
-    ) -> int:
+    ) -> Ids:
         """Bring tracks back that ended earlier, found from an older image.
 
         Args:
@@ -277,7 +277,7 @@ class TrackTable:
             reach_px: A point further off is another one.
 
         Returns:
-            How many were found.
+            Ids of those that were found.
         """
         points = track_points(grey0, sight.grey, xy0, expected_xy, max_level=1)
         ok = points.ok & (np.linalg.norm(points.xy - expected_xy, axis=1) < reach_px)
@@ -286,13 +286,14 @@ class TrackTable:
         taken = np.concatenate([self.xy[self.visible], xy])
         ok[ok] = deduplicate(taken)[len(taken) - len(xy) :]
         count = int(ok.sum())
+        taken_up: Ids = ids[ok]
         if count == 0:
-            return 0
+            return taken_up
         xy = points.xy[ok]
         cues = self._cues(
             sight, xy, points.forward_backward_px[ok], points.photometric_grey[ok], points.gradient_grey2[ok]
         )
-        self.ids = np.concatenate([self.ids, ids[ok]])
+        self.ids = np.concatenate([self.ids, taken_up])
         self.xy = np.concatenate([self.xy, xy])
         self.velocity = np.concatenate([self.velocity, self._usual_velocity(count)])
         self.confidence = np.concatenate(
@@ -303,7 +304,7 @@ class TrackTable:
         order = np.argsort(self.ids, kind="stable")
         for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[order])
-        return count
+        return taken_up
 
     def _usual_velocity(self, count: int) -> Array:
         """Median velocity of the tracks in sight for ``count`` new ones, ``(count, 2)``."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from semcast.common.geometry import invert_transform, project_to_so3
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import match_times
-from semcast.server.mapping.landmark_table import LandmarkTable
+from semcast.server.view.landmark_table import LandmarkTable
 from semcast.server.view.spectator import Spectator
 
 Array = NDArray[np.float64]

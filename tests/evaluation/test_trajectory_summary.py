@@ -7,18 +7,27 @@ from semcast.evaluation.trajectory_summary import Pairing, pairings_of, ratio_in
 
 
 def cell(mode, ate_percent, snr_db=6.0):
-    runs = [{"seed": k, "ate_percent": value} for k, value in enumerate(ate_percent)]
+    runs = [
+        {"seed": k, "ate_percent": v, "completeness": 0.0 if v is None else 1.0}
+        for k, v in enumerate(ate_percent)
+    ]
     return {"snr_db": snr_db, "confidence": mode, "runs": runs}
 
 
 def report(*cells):
-    return {"sequence": "room", "settings": {"link": {"channel": "erasure"}}, "cells": list(cells)}
+    return {
+        "sequence": "room",
+        "settings": {"codec": "c", "link": {"channel": "erasure"}},
+        "cells": list(cells),
+    }
 
 
 def test_runs_are_paired_by_seed_and_failed_ones_left_out():
     ours, theirs = [1.0, 2.0, None, 1.0, 1.0, 4.0], [2.0, 2.0, 3.0, 4.0, 1.0, 2.0]
     (found,) = pairings_of([report(cell("robust", ours), cell("off", theirs))])
-    assert found.title == "room, erasure, 6 dB"
+    assert found.title == "room, c, erasure, 6 dB"
+    assert found.num_failed == 1
+    assert (found.ours_posed, found.theirs_posed) == (pytest.approx(5 / 6), 1.0)
     np.testing.assert_array_equal(found.ours_percent, [1, 2, 1, 1, 4])
     np.testing.assert_array_equal(found.theirs_percent, [2, 2, 4, 1, 2])
 
@@ -45,12 +54,15 @@ def test_the_ratio_is_that_of_a_typical_run_and_its_interval_holds_it():
 def test_the_table():
     text = trajectory_summary([report(cell("robust", [1.0, 1.0, 1.0, 1.0, 5.0]), cell("off", [2.0] * 5))])
     row = next(line for line in text.splitlines() if line.startswith("| room"))
-    assert [p.strip() for p in row.strip("|").split("|")][:6] == [
-        "room, erasure, 6 dB",
+    assert [p.strip() for p in row.strip("|").split("|")][:9] == [
+        "room, c, erasure, 6 dB",
         "5",
+        "0",
         "1.00",
         "5.00",
+        "100.0%",
         "2.00",
         "2.00",
+        "100.0%",
     ]
     assert "Over all 1 rows: 0.69 (" in text

@@ -11,10 +11,11 @@ CAMERA = Intrinsics(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=48
 NOISE = NoiseModel(1.0, 0.0)
 
 
-def ride(num_frames, num_points=150, step_m=0.12, noise_px=0.3, seed=0):
+def ride(num_frames, num_points=150, step_m=0.12, noise_px=0.3, seed=0, depth_m=5.0):
     """Frames of a camera that moves sideways, and their true poses."""
     rng = np.random.default_rng(seed)
-    xyz = rng.uniform([-3.0, -2.0, 3.0], [3.0, 2.0, 7.0], (num_points, 3))
+    size = 0.2 * depth_m
+    xyz = rng.uniform([-3 * size, -2 * size, 3 * size], [3 * size, 2 * size, 7 * size], (num_points, 3))
     frames, poses = [], []
     for k in range(num_frames):
         T_world_cam = make_transform(exp_so3(np.array([0.0, 0.01 * k, 0.0])), [step_m * k, 0.0, 0.0])
@@ -63,12 +64,12 @@ def test_two_views_do_where_tracks_last_no_longer():
         for k, f in enumerate(frames)
     ]
     k, start = begin(renewed)
-    assert k == 3, "the second pair of views"
+    assert k == 5, "the third pair of views"
     assert len(start.keyframes) == 2
 
 
 def test_standing_still_and_damaged_images_begin_nothing():
-    still, _ = ride(10, step_m=0.0)
+    still, _ = ride(20, step_m=0.0)
     still = [
         Observed(f.frame_id, f.t_source_ns, still[0].ids, still[0].xy, still[0].confidence) for f in still
     ]
@@ -76,3 +77,14 @@ def test_standing_still_and_damaged_images_begin_nothing():
     frames, _ = ride(6)
     k, _ = begin(frames, is_damaged=lambda k: k == 2)
     assert k == 3
+
+
+def test_standing_still_first_does_not_wear_out_the_patience():
+    """With hardly any perspective nothing is decided, however many frames came before."""
+    far, _ = ride(8, step_m=4.0, depth_m=150.0, noise_px=0.8)
+    first = far[0]
+    still = [Observed(k - 30, (k - 30) * 10**8, first.ids, first.xy, first.confidence) for k in range(30)]
+    initialiser = Initialiser(CAMERA, "off", 1.0, 0)
+    assert all(initialiser.add(frame, NOISE) is None for frame in still)
+    undecided = [initialiser.add(frame, NOISE) for frame in far[1:4]]
+    assert undecided[0] is None

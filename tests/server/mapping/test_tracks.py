@@ -248,7 +248,9 @@ def mapped():
 
 def recall(mapped, sight, x, reach_px=6.0):
     world, images, tracks = mapped
-    return recall_landmarks(CAMERA, world, images, tracks, sight, pose_at(x), reach_px=reach_px)
+    found = recall_landmarks(CAMERA, world, images, tracks, sight, pose_at(x), submap=0, reach_px=reach_px)
+    assert np.isin(found, tracks.ids).all()
+    return len(found)
 
 
 def test_lost_landmarks_get_their_tracks_back(mapped):
@@ -285,6 +287,14 @@ def test_nothing_is_found_where_nothing_arrived(mapped):
     tracks.keep(np.zeros(len(tracks), bool))
     world.landmarks.keep(np.zeros(len(world.landmarks), bool))
     assert recall(mapped, sight_at(24, frame_id=2), 24) == 0
+
+
+def test_landmarks_of_another_submap_stay_where_they_are(mapped):
+    world, images, tracks = mapped
+    tracks.keep(np.zeros(len(tracks), bool))
+    sight = sight_at(24, frame_id=1)
+    found = recall_landmarks(CAMERA, world, images, tracks, sight, pose_at(24), submap=1, reach_px=6.0)
+    assert len(found) == len(tracks) == 0
 
 
 def test_old_images_are_forgotten():

@@ -5,7 +5,7 @@ import pytest
 
 from semcast.common.geometry import exp_se3, exp_so3, make_transform
 from semcast.common.trajectory import Trajectory
-from semcast.server.mapping.landmark_table import CHUNK_LANDMARKS, LandmarkTable
+from semcast.server.view.landmark_table import CHUNK_LANDMARKS, LandmarkTable
 from semcast.server.view.scene import (
     SEGMENT_POSES,
     Cursor,

@@ -5,8 +5,8 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
-from semcast.server.geometry.reversal import decide, mirrored
 from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.reversal import decide, mirrored
 
 
 def scene(*, focal_px, depth, noise_px=0.0, num_views=4, turn_deg=8.0, seed=0):
