@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from semcast.common.errors import SemcastError
 
 _MARKERS = "os^Dv<>P*X"
+#: More curves than these leave no room for their names between them.
+_MAX_IN_AXES = 5
 
 
 def _new_figure(width_in: float = 5.0, height_in: float = 3.6) -> tuple[Figure, Axes]:
@@ -78,7 +80,7 @@ def plot_against_snr(
         ValueError: A curve has another length than ``snr_db``.
         SemcastError: The file can't be written.
     """
-    figure, axes = _new_figure()
+    figure, axes = _new_figure(6.4 if len(curves) > _MAX_IN_AXES else 5.0)
     for k, (name, values) in enumerate(curves.items()):
         if len(values) != len(snr_db):
             raise ValueError(f"curve {name!r} must have {len(snr_db)} values, got {len(values)}")
@@ -90,7 +92,10 @@ def plot_against_snr(
     axes.set(xlabel="SNR (dB)", ylabel=y_label, title=title)
     if from_zero:
         axes.set_ylim(bottom=0.0)
-    axes.legend(fontsize="small")
+    if len(curves) > _MAX_IN_AXES:
+        figure.legend(fontsize="small", loc="outside right upper")
+    else:
+        axes.legend(fontsize="small")
     save_figure(figure, path)
 
 
