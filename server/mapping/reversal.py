@@ -24,7 +24,7 @@ _CUT_SIGMAS = 3.0
 _MIN_DEPTH_SHARE = 0.2
 #: The worse structure must cost so many times the better one. Chosen on starts over poor links, where wrong
 #: decisions had ratios below this and most right ones clearly more.
-_CLEAR_RATIO = 1.6
+_CLEAR_RATIO = 1.3
 #: Directions of the last camera nearer to each other than this are one structure.
 _SAME_WAY_DEG = 20.0
 
@@ -98,7 +98,9 @@ def decide(problem: BundleProblem, *, at_last: bool = False) -> Side | None:
         at_last: Take the better one in any case.
     """
     problem = replace(problem, with_covariance=False)
-    start, mirror = adjusted(problem), adjusted(mirrored(problem))
+    start = adjusted(problem)
+    # Mirrored after its adjustment: from a rough start the mirror image ends in a worse minimum than its own.
+    mirror = adjusted(mirrored(replace(problem, T_world_cam=start.T_world_cam, xyz=start.xyz)))
     if not start.ok and not at_last:
         return None  # an adjustment that failed says nothing against the structure it began with
     better, worse = sorted((start, mirror), key=lambda side: side.cost)
