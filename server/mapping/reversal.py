@@ -99,8 +99,10 @@ def decide(problem: BundleProblem, *, at_last: bool = False) -> Side | None:
     """
     problem = replace(problem, with_covariance=False)
     start = adjusted(problem)
-    # Mirrored after its adjustment: from a rough start the mirror image ends in a worse minimum than its own.
-    mirror = adjusted(mirrored(replace(problem, T_world_cam=start.T_world_cam, xyz=start.xyz)))
+    # Neither mirror image leads to its own minimum every time: that of a rough start where the start is the
+    # wrong structure in part, that of the adjusted one where the adjustment has stretched it.
+    after = replace(problem, T_world_cam=start.T_world_cam, xyz=start.xyz)
+    mirror = min((adjusted(mirrored(p)) for p in (problem, after)), key=lambda side: side.cost)
     if not start.ok and not at_last:
         return None  # an adjustment that failed says nothing against the structure it began with
     better, worse = sorted((start, mirror), key=lambda side: side.cost)
