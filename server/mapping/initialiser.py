@@ -34,7 +34,7 @@ _MIN_VIEWS, _MAX_TOO_SHORT = 3, 2
 #: After so many starts that could have been either, the better one is taken.
 _MAX_UNDECIDED = 10
 #: Points (the longest tracks) and steps for telling them apart.
-_MAX_DECIDING, _DECIDING_ITERATIONS = 150, 20
+_MAX_DECIDING, _DECIDING_ITERATIONS = 90, 15
 #: A start is better from so many points; fewer do when so many frames have waited for it.
 _PLENTY_OF_POINTS, _PATIENCE_FRAMES = 60, 12
 #: Share of the reference's tracks that must still be there; else the reference moves on.

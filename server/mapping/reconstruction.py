@@ -36,7 +36,7 @@ _START_LEVELS = 5
 #: Tracks a frame must have to count towards a new map.
 _MIN_TRACKS_TO_GIVE_UP = 50
 #: A pose that rests on fewer landmarks than this share of the tracks asks for more.
-_FEW_INLIERS_SHARE = 0.25
+_FEW_INLIERS_SHARE = 0.2
 #: How far from where they are expected lost landmarks are looked for, with a pose and with a prediction.
 _REACH_PX, _REACH_BLIND_PX = 6.0, 20.0
 #: Share of the landmarks in sight that must agree with a pose found without a prior.
