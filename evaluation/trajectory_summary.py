@@ -26,7 +26,7 @@ class Pairing:
     """The runs of two modes over the same links.
 
     Attributes:
-        title: Recording, channel and SNR.
+        title: Recording, codec, channel and SNR.
         ours_percent: ``(S,)`` ATE in percent of the path of the mode in question.
         theirs_percent: ``(S,)`` of the one it is compared with.
         ours_posed: Mean share of frames with a pose, over all runs.

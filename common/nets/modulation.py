@@ -104,8 +104,8 @@ def demodulate(y_rx: Tensor, shrink: Tensor, is_qam: Tensor) -> tuple[Tensor, Te
 def soft_levels(y_rx: Tensor, shrink: Tensor) -> Tensor:
     """Mean of the 4-PAM level that was sent given what was received, all levels alike before.
 
-    The MMSE equaliser treats a symbol as Gaussian; that it can only be one of four levels removes more of the
-    noise: at 14 dB nearly all of it. Where nothing arrived the mean is 0.
+    The MMSE equaliser treats a symbol as Gaussian; that it can only be one of four levels leaves a quarter
+    less squared error at 10 dB and two thirds less at 14 dB. Where nothing arrived the mean is 0.
 
     Args:
         y_rx: ``(B, C, h, w)`` MMSE-equalised values.

@@ -16,6 +16,7 @@ from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import TwoViewResult, estimate_two_view
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.mapper import gather_observations
 from semcast.server.mapping.reversal import Side, decide
 from semcast.server.mapping.tracker import interpolate_pose
 from semcast.server.mapping.world_map import Keyframe
@@ -74,7 +75,7 @@ class Start:
 
 
 class Initialiser:
-    """Collects frames until two of them start a map.
+    """Collects frames until some of them start a map.
 
     Args:
         camera: Pinhole.
@@ -212,7 +213,8 @@ class Initialiser:
         all_ids, count = np.unique(np.concatenate([o.ids for o in views]), return_counts=True)
         longest = np.lexsort((all_ids, -count))[:_MAX_DECIDING]
         ids = np.sort(all_ids[longest[count[longest] >= 2]])
-        view, point, xy, sigma, confidence = _observations(views, ids, noise)
+        view, point, xy, confidence = gather_observations(views, ids)
+        sigma = noise.sigma_px(confidence)
         T_cam_world = invert_transform(T_world_cam)
         points = triangulate(self._camera, T_cam_world, view, point, xy, sigma, len(ids))
         if not points.in_front.any():
@@ -245,7 +247,8 @@ class Initialiser:
     def _triangulate(
         self, frames: list[Observed], T_cam_world: Array, ids: Ids, noise: NoiseModel
     ) -> Triangulation:
-        view, point, xy, sigma, _ = _observations(frames, ids, noise)
+        view, point, xy, confidence = gather_observations(frames, ids)
+        sigma = noise.sigma_px(confidence)
         return triangulate(self._camera, T_cam_world, view, point, xy, sigma, len(ids))
 
     def _passes(self, points: Triangulation, noise: NoiseModel) -> NDArray[np.bool_]:
@@ -254,21 +257,6 @@ class Initialiser:
             & (points.parallax_deg > 0.5 * self._min_parallax_deg)
             & (points.error_sigma < 2.5)
         )
-
-
-def _observations(
-    frames: list[Observed], ids: Ids, noise: NoiseModel
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array, Array]:
-    """View, row into ``ids`` (ascending), pixel, sigma and confidence of all observations of ``ids``."""
-    view, point, xy, confidence = [], [], [], []
-    for k, o in enumerate(frames):
-        _, row, row_o = np.intersect1d(ids, o.ids, assume_unique=True, return_indices=True)
-        view.append(np.full(len(row), k, np.intp))
-        point.append(row.astype(np.intp))
-        xy.append(o.xy[row_o])
-        confidence.append(o.confidence[row_o])
-    total = np.concatenate(confidence)
-    return np.concatenate(view), np.concatenate(point), np.concatenate(xy), noise.sigma_px(total), total
 
 
 def _keyframe(o: Observed, T_world_cam: Array) -> Keyframe:

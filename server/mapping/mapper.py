@@ -1,6 +1,8 @@
 """Keyframes into map: when to take one, new landmarks, culling, and the window for bundle adjustment."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,8 +155,24 @@ def sample_colours(image: NDArray[np.uint8], xy: Array) -> NDArray[np.uint8]:
     return np.where(np.any(xy < 0, axis=1, keepdims=True), np.uint8(128), image[y, x])
 
 
+class Seen(Protocol):
+    """What a view saw: a keyframe, or a frame that waits for a map."""
+
+    @property
+    def ids(self) -> Ids:
+        """``(M,)`` tracks."""
+
+    @property
+    def xy(self) -> Array:
+        """``(M, 2)`` pixels."""
+
+    @property
+    def confidence(self) -> Array:
+        """``(M,)``."""
+
+
 def gather_observations(
-    views: list[Keyframe], ids: Ids
+    views: Sequence[Seen], ids: Ids
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
     """View, row into ``ids``, pixel and confidence of every observation of ``ids`` in the views.
 

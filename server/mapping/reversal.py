@@ -85,6 +85,7 @@ def _across(direction: Array) -> Array:
 def adjusted(problem: BundleProblem) -> Side:
     """Adjust one of the two structures to all observations."""
     result = optimise(problem)
+    # All observations anew: those that could not be used at the start count as well.
     residual, _ = residuals_px(problem, result.T_world_cam, result.xyz)
     size = np.linalg.norm(np.nan_to_num(residual, nan=1e6), axis=1) / problem.sigma_px
     return Side(result.T_world_cam, result.xyz, float((np.minimum(size, _CUT_SIGMAS) ** 2).sum()), result.ok)
@@ -99,12 +100,12 @@ def decide(problem: BundleProblem, *, at_last: bool = False) -> Side | None:
     """
     problem = replace(problem, with_covariance=False)
     start = adjusted(problem)
+    if not start.ok and not at_last:
+        return None  # an adjustment that failed says nothing against the structure it began with
     # Neither mirror image leads to its own minimum every time: that of a rough start where the start is the
     # wrong structure in part, that of the adjusted one where the adjustment has stretched it.
     after = replace(problem, T_world_cam=start.T_world_cam, xyz=start.xyz)
     mirror = min((adjusted(mirrored(p)) for p in (problem, after)), key=lambda side: side.cost)
-    if not start.ok and not at_last:
-        return None  # an adjustment that failed says nothing against the structure it began with
     better, worse = sorted((start, mirror), key=lambda side: side.cost)
     if at_last or worse.cost >= _CLEAR_RATIO * better.cost or _is_same(better, worse):
         return better

@@ -285,31 +285,31 @@ class TrackTable:
         xy = points.xy[ok]
         taken = np.concatenate([self.xy[self.visible], xy])
         ok[ok] = deduplicate(taken)[len(taken) - len(xy) :]
-        count = int(ok.sum())
         taken_up: Ids = ids[ok]
-        if count == 0:
+        if len(taken_up) == 0:
             return taken_up
         xy = points.xy[ok]
         cues = self._cues(
             sight, xy, points.forward_backward_px[ok], points.photometric_grey[ok], points.gradient_grey2[ok]
         )
-        self.ids = np.concatenate([self.ids, taken_up])
-        self.xy = np.concatenate([self.xy, xy])
-        self.velocity = np.concatenate([self.velocity, self._usual_velocity(count)])
-        self.confidence = np.concatenate(
-            [self.confidence, observation_confidence(self._mode, cues, self._rng)]
-        )
-        self.age = np.concatenate([self.age, np.ones(count, np.int64)])
-        self.missed = np.concatenate([self.missed, np.zeros(count, np.int64)])
-        order = np.argsort(self.ids, kind="stable")
-        for name in _COLUMNS:
-            setattr(self, name, getattr(self, name)[order])
+        self._append(taken_up, xy, cues)
         return taken_up
 
-    def _usual_velocity(self, count: int) -> Array:
-        """Median velocity of the tracks in sight for ``count`` new ones, ``(count, 2)``."""
+    def _append(self, ids: Ids, xy: Array, cues: KeypointCues) -> None:
+        """Add tracks seen in the newest image, which are taken to move like those around; ids stay sorted."""
         around = self.velocity[self.visible]
-        return np.tile(np.median(around, axis=0) if len(around) else np.zeros(2), (count, 1))
+        usual = np.median(around, axis=0) if len(around) else np.zeros(2)
+        new = {
+            "ids": ids,
+            "xy": xy,
+            "velocity": np.tile(usual, (len(ids), 1)),
+            "confidence": observation_confidence(self._mode, cues, self._rng),
+            "age": np.ones(len(ids), np.int64),
+            "missed": np.zeros(len(ids), np.int64),
+        }
+        order = np.argsort(np.concatenate([self.ids, ids]), kind="stable")
+        for name in _COLUMNS:
+            setattr(self, name, np.concatenate([getattr(self, name), new[name]])[order])
 
     def remember(self, sight: Sight) -> None:
         """Keep the image for tracks that are looked for in later ones."""
@@ -337,15 +337,8 @@ class TrackTable:
             return 0
         gradient = sample_map(strength, corners)
         cues = self._cues(sight, corners, np.full(count, 0.1), np.zeros(count), gradient)
-        self.ids = np.concatenate([self.ids, self._next_id + np.arange(count, dtype=np.int64)])
+        self._append(self._next_id + np.arange(count, dtype=np.int64), corners, cues)
         self._next_id += count
-        self.velocity = np.concatenate([self.velocity, self._usual_velocity(count)])
-        self.xy = np.concatenate([self.xy, corners])
-        self.confidence = np.concatenate(
-            [self.confidence, observation_confidence(self._mode, cues, self._rng)]
-        )
-        self.age = np.concatenate([self.age, np.ones(count, np.int64)])
-        self.missed = np.concatenate([self.missed, np.zeros(count, np.int64)])
         return count
 
     @staticmethod

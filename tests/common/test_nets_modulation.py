@@ -95,8 +95,8 @@ def test_soft_levels_have_less_error_than_the_equaliser_alone():
         linear = (noisy * shrink - sent).square().mean()
         errors[snr_db] = (soft_levels(noisy * shrink, shrink) - sent).square().mean() / linear
     assert errors[2.0] < 1.0
-    assert errors[8.0] < 0.97
-    assert errors[14.0] < 0.6
+    assert errors[8.0] < 0.9
+    assert errors[14.0] < 0.35
 
 
 def test_nothing_arrived_means_nothing_is_known():

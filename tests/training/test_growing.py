@@ -44,7 +44,7 @@ def test_a_grown_network_computes_what_the_small_one_does():
             torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
-def test_what_is_new_has_a_gradient():
+def test_what_reads_the_new_units_has_a_gradient():
     small = trained(SMALL)
     large = build_3dcsc(LARGE)
     grow(small, large)

@@ -11,11 +11,10 @@ CAMERA = Intrinsics(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=48
 NOISE = NoiseModel(1.0, 0.0)
 
 
-def ride(num_frames, num_points=150, step_m=0.12, noise_px=0.3, seed=0, depth_m=5.0):
+def ride(num_frames, num_points=150, step_m=0.12, noise_px=0.3, seed=0):
     """Frames of a camera that moves sideways, and their true poses."""
     rng = np.random.default_rng(seed)
-    size = 0.2 * depth_m
-    xyz = rng.uniform([-3 * size, -2 * size, 3 * size], [3 * size, 2 * size, 7 * size], (num_points, 3))
+    xyz = rng.uniform([-3.0, -2.0, 3.0], [3.0, 2.0, 7.0], (num_points, 3))
     frames, poses = [], []
     for k in range(num_frames):
         T_world_cam = make_transform(exp_so3(np.array([0.0, 0.01 * k, 0.0])), [step_m * k, 0.0, 0.0])
@@ -79,12 +78,17 @@ def test_standing_still_and_damaged_images_begin_nothing():
     assert k == 3
 
 
-def test_standing_still_first_does_not_wear_out_the_patience():
-    """With hardly any perspective nothing is decided, however many frames came before."""
-    far, _ = ride(8, step_m=4.0, depth_m=150.0, noise_px=0.8)
-    first = far[0]
+def test_standing_still_first_does_not_wear_out_the_patience(monkeypatch):
+    asked = []
+
+    def never(problem, *, at_last):
+        asked.append(at_last)
+
+    monkeypatch.setattr("semcast.server.mapping.initialiser.decide", never)
+    moving, _ = ride(16, step_m=0.05)
+    first = moving[0]
     still = [Observed(k - 30, (k - 30) * 10**8, first.ids, first.xy, first.confidence) for k in range(30)]
-    initialiser = Initialiser(CAMERA, "off", 1.0, 0)
-    assert all(initialiser.add(frame, NOISE) is None for frame in still)
-    undecided = [initialiser.add(frame, NOISE) for frame in far[1:4]]
-    assert undecided[0] is None
+    assert begin([*still, *moving[1:]]) is None
+    assert len(asked) > 10
+    assert asked[:10] == [False] * 10
+    assert asked[10] is True
