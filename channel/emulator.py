@@ -41,7 +41,7 @@ class Emulator:
         session: Open.
         settings: Of the process.
         metrics: Where to count. Drops: ``superseded`` by a newer frame while busy, ``lost`` on the air,
-            ``missing`` (gaps in what arrived from the agent), ``protocol``, ``overflow`` (too many are delayed).
+            ``missing`` (gaps in what the agent sent), ``protocol``, ``overflow`` (too many are delayed).
     """
 
     def __init__(self, session: Session, settings: EmulatorSettings, metrics: Metrics) -> None:

@@ -15,9 +15,9 @@ from semcast.server.geometry.pnp import refine_pose, search_pose
 from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import TwoViewResult, estimate_two_view
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
+from semcast.server.mapping.ambiguity import Side, decide
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.mapper import gather_observations
-from semcast.server.mapping.reversal import Side, decide
 from semcast.server.mapping.tracker import interpolate_pose
 from semcast.server.mapping.world_map import Keyframe
 

@@ -1,0 +1,131 @@
+"""The second structure of a flat scene: two images of a plane fit another pose before another plane as well.
+
+A homography comes from two pairs of pose and plane, and often both lie in front of the cameras
+(Longuet-Higgins 1986). While a camera moves on evenly, further views tell them apart only slowly: to first
+order every image of the one motion is an image of the other. So at the start of a map the other pair is
+adjusted as well.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform, project_to_so3
+from semcast.server.geometry.pnp import refine_pose
+from semcast.server.mapping.bundle_problem import BundleProblem
+
+Array = NDArray[np.float64]
+
+#: A scene is flat where a homography explains so many of the points, each to so many standard deviations.
+_MIN_SHARE, _CUT_SIGMAS = 0.75, 3.0
+_MIN_POINTS = 12
+#: Share of the points that must lie in front of both cameras.
+_MIN_IN_FRONT = 0.9
+
+
+def twin(problem: BundleProblem) -> BundleProblem | None:
+    """Return the same problem started from the other pose and plane, None where there is no other.
+
+    Args:
+        problem: At least two views of a new map. Points are taken where the first and the last view see them.
+    """
+    last = len(problem.T_world_cam) - 1
+    of_first, of_last = problem.view == 0, problem.view == last
+    _, row0, row1 = np.intersect1d(problem.point[of_first], problem.point[of_last], return_indices=True)
+    if len(row0) < _MIN_POINTS:
+        return None
+    fx, fy, cx, cy = problem.intrinsics
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    xy0, xy1 = problem.xy[of_first][row0], problem.xy[of_last][row1]
+    reach_px = _CUT_SIGMAS * float(np.median(problem.sigma_px))
+    H, info = poselib.estimate_homography(xy0, xy1, {"max_reproj_error": reach_px, "seed": 0}, {})
+    if info["num_inliers"] < max(_MIN_POINTS, _MIN_SHARE * len(row0)) or not np.isfinite(H).all():
+        return None
+    flat = np.asarray(info["inliers"], dtype=bool)
+    found = _other_pose(np.linalg.inv(K) @ np.asarray(H) @ K, problem, _rays(K, xy0[flat]))
+    if found is None:
+        return None
+    R, t, normal = found
+    return _on_plane(problem, K, R, t, normal)
+
+
+def _rays(K: Array, xy: Array) -> Array:
+    return np.column_stack((xy, np.ones(len(xy)))) @ np.linalg.inv(K).T
+
+
+def _other_pose(H: Array, problem: BundleProblem, rays: Array) -> tuple[Array, Array, Array] | None:
+    """Rotation, translation (plane at distance 1) and normal of the pair that is not the present one."""
+    poses, normals = poselib.motion_from_homography(H)
+    T_now = invert_transform(problem.T_world_cam[-1]) @ problem.T_world_cam[0]
+    possible = []
+    for pose, n in zip(poses, normals, strict=True):
+        R, t, normal = project_to_so3(np.asarray(pose.R)), np.asarray(pose.t), np.asarray(n)
+        if not (np.isfinite(R).all() and np.isfinite(t).all() and np.isfinite(normal).all()):
+            continue
+        height = rays @ normal
+        seen = rays @ R.T + height[:, None] * t  # times the depth, which has the sign of the height
+        in_front = (height > 0.0) & (seen[:, 2] > 0.0)
+        if np.linalg.norm(t) > 1e-9 and in_front.mean() >= _MIN_IN_FRONT:
+            possible.append((float(np.linalg.norm(log_so3(T_now[:3, :3].T @ R))), R, t, normal))
+    if len(possible) < 2:
+        return None
+    _, R, t, normal = max(possible, key=lambda one: one[0])
+    return R, t, normal
+
+
+def _on_plane(problem: BundleProblem, K: Array, R: Array, t: Array, normal: Array) -> BundleProblem:
+    """Put all points on the plane and the views between where those ask for them."""
+    T_world_first = problem.T_world_cam[0]
+    baseline = np.linalg.norm((invert_transform(T_world_first) @ problem.T_world_cam[-1])[:3, 3])
+    distance = float(baseline / np.linalg.norm(t))
+    T_last = invert_transform(make_transform(R, distance * t))
+    fx, fy, cx, cy = problem.intrinsics
+    camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=round(2.0 * cx), height=round(2.0 * cy))
+    num_views = len(problem.T_world_cam)
+    poses = [np.eye(4)]
+    # The plane is n^T X = distance in the first camera's frame; a ray meets it from any pose.
+    xyz = np.full((len(problem.xyz), 3), np.nan)
+    _place(xyz, problem, K, 0, np.eye(4), normal, distance)
+    for k in range(1, num_views):
+        share = k / (num_views - 1)
+        T = make_transform(exp_so3(share * log_so3(T_last[:3, :3])), share * T_last[:3, 3])
+        if k < num_views - 1:
+            rows = np.flatnonzero((problem.view == k) & np.isfinite(xyz[problem.point, 0]))
+            if len(rows) >= _MIN_POINTS:
+                gate = np.full(len(rows), 10.0 * float(np.median(problem.sigma_px)))
+                estimate = refine_pose(
+                    camera, invert_transform(T), xyz[problem.point[rows]], problem.xy[rows],
+                    problem.sigma_px[rows], gate,
+                )  # fmt: skip
+                T = invert_transform(estimate.T_cam_world)
+        else:
+            T = T_last
+        poses.append(T)
+        _place(xyz, problem, K, k, T, normal, distance)
+    xyz = np.where(np.isfinite(xyz), xyz, normal * distance)
+    return replace(
+        problem,
+        T_world_cam=T_world_first @ np.stack(poses),
+        xyz=xyz @ T_world_first[:3, :3].T + T_world_first[:3, 3],
+    )
+
+
+def _place(
+    xyz: Array,
+    problem: BundleProblem,
+    K: Array,
+    view: int,
+    T_first_cam: Array,
+    normal: Array,
+    distance: float,
+) -> None:
+    """Give the points a view sees, and no view before it, their place on the plane."""
+    rows = np.flatnonzero((problem.view == view) & ~np.isfinite(xyz[problem.point, 0]))
+    rays = _rays(K, problem.xy[rows]) @ T_first_cam[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (distance - T_first_cam[:3, 3] @ normal) / (rays @ normal)
+    good = np.isfinite(depth) & (depth > 0.0)
+    xyz[problem.point[rows[good]]] = T_first_cam[:3, 3] + depth[good, None] * rays[good]
