@@ -32,8 +32,10 @@ MIN_POINTS = 40
 #: Two views of a scene with little perspective can't tell it from its mirror image in depth. They have to do
 #: where tracks don't last for three, as so many attempts have shown.
 _MIN_VIEWS, _MAX_TOO_SHORT = 3, 2
-#: After so many starts that could have been either, the better one is taken.
-_MAX_UNDECIDED = 10
+#: After so many starts that could have been one or the other, or so many frames, the better one is taken.
+_MAX_UNDECIDED, _MAX_UNDECIDED_FRAMES = 12, 60
+#: What decides grows with the way of the tracks: it is looked at again when that is so many times as long.
+_RETRY_GROWTH = 1.15
 #: Points (the longest tracks) and steps for telling them apart.
 _MAX_DECIDING, _DECIDING_ITERATIONS = 90, 15
 #: A start is better from so many points; fewer do when so many frames have waited for it.
@@ -89,17 +91,19 @@ class Initialiser:
         self._mode: ConfidenceMode = mode
         self._min_parallax_deg = min_parallax_deg
         self._seed = seed
-        self.history: list[Observed] = []
-        self._reference = 0
-        self._num_undecided = 0
-        self._num_too_short = 0
+        self._begin()
 
     def clear(self) -> None:
         """Forget all frames."""
-        self.history = []
+        self._begin()
+
+    def _begin(self) -> None:
+        self.history: list[Observed] = []
         self._reference = 0
-        self._num_undecided = 0
         self._num_too_short = 0
+        self._num_undecided = 0
+        self._num_since_undecided = 0
+        self._undecided_flow_px = 0.0
 
     def add(self, observed: Observed, noise: NoiseModel, *, is_damaged: bool = False) -> Start | None:
         """Take a frame and try to start a map with it.
@@ -129,7 +133,7 @@ class Initialiser:
             return None
         xy0, xy1 = reference.xy[row0], observed.xy[row1]
         flow_px = float(np.median(np.linalg.norm(xy1 - xy0, axis=1)))
-        if flow_px < _MIN_FLOW_SHARE * self._camera.width:
+        if flow_px < _MIN_FLOW_SHARE * self._camera.width or not self._is_new_evidence(flow_px):
             return None
         confidence = fuse_confidence(reference.confidence[row0], observed.confidence[row1])
         threshold_px = float(np.clip(2.0 * noise.sigma0_px, 1.0, 3.0))
@@ -147,7 +151,20 @@ class Initialiser:
         )
         if found is None or not self._is_good(found, len(shared)):
             return None
-        return self._build(found, shared[found.inliers], noise)
+        start = self._build(found, shared[found.inliers], noise)
+        if self._num_undecided:
+            self._undecided_flow_px = flow_px
+        return start
+
+    def _is_new_evidence(self, flow_px: float) -> bool:
+        """Whether a start that could not be decided is worth another look, with tracks of this length."""
+        if not self._num_undecided:
+            return True
+        self._num_since_undecided += 1
+        return self._is_overdue() or flow_px >= _RETRY_GROWTH * self._undecided_flow_px
+
+    def _is_overdue(self) -> bool:
+        return self._num_undecided >= _MAX_UNDECIDED or self._num_since_undecided >= _MAX_UNDECIDED_FRAMES
 
     def _min_points(self) -> int:
         """A start from a few points of a damaged image costs the whole map; waiting costs a few frames."""
@@ -166,6 +183,7 @@ class Initialiser:
             if shared >= max(MIN_POINTS, _MIN_SHARED * len(reference.ids)):
                 return
             self._reference += 1
+            self._undecided_flow_px = 0.0
 
     def _build(self, found: TwoViewResult, ids: Ids, noise: NoiseModel) -> Start | None:
         """Triangulate, place the frames between, and triangulate again from all."""
@@ -240,7 +258,7 @@ class Initialiser:
             confidence=confidence,
             iterations=_DECIDING_ITERATIONS,
         )
-        side = decide(problem, at_last=self._num_undecided >= _MAX_UNDECIDED)
+        side = decide(problem, at_last=self._is_overdue())
         self._num_undecided += int(side is None)
         return side
 

@@ -19,11 +19,14 @@ from semcast.server.mapping.bundle_problem import BundleProblem
 
 Array = NDArray[np.float64]
 
-#: A scene is flat where a homography explains so many of the points, each to so many standard deviations.
-_MIN_SHARE, _CUT_SIGMAS = 0.75, 3.0
+#: A scene may be flat where a homography explains so many of the points, each to so many standard deviations.
+#: Generous, since a twin that does not fit is found out by its cost.
+_MIN_SHARE, _CUT_SIGMAS = 0.5, 4.0
 _MIN_POINTS = 12
-#: Share of the points that must lie in front of both cameras.
-_MIN_IN_FRONT = 0.9
+#: Share of the points that must lie in front of both cameras: noise tilts a plane seen at a low angle.
+_MIN_IN_FRONT = 0.75
+#: Ways of the camera nearer to each other than this are the present structure, not another.
+_SAME_WAY_DEG = 5.0
 
 
 def twin(problem: BundleProblem) -> BundleProblem | None:
@@ -60,20 +63,20 @@ def _other_pose(H: Array, problem: BundleProblem, rays: Array) -> tuple[Array, A
     """Rotation, translation (plane at distance 1) and normal of the pair that is not the present one."""
     poses, normals = poselib.motion_from_homography(H)
     T_now = invert_transform(problem.T_world_cam[-1]) @ problem.T_world_cam[0]
-    possible = []
+    way_now = -T_now[:3, :3].T @ T_now[:3, 3]
+    found, furthest = None, np.cos(np.radians(_SAME_WAY_DEG)) * np.linalg.norm(way_now)
     for pose, n in zip(poses, normals, strict=True):
         R, t, normal = project_to_so3(np.asarray(pose.R)), np.asarray(pose.t), np.asarray(n)
-        if not (np.isfinite(R).all() and np.isfinite(t).all() and np.isfinite(normal).all()):
+        length = float(np.linalg.norm(t))
+        if not (np.isfinite(R).all() and np.isfinite(length) and np.isfinite(normal).all() and length > 1e-9):
             continue
         height = rays @ normal
         seen = rays @ R.T + height[:, None] * t  # times the depth, which has the sign of the height
         in_front = (height > 0.0) & (seen[:, 2] > 0.0)
-        if np.linalg.norm(t) > 1e-9 and in_front.mean() >= _MIN_IN_FRONT:
-            possible.append((float(np.linalg.norm(log_so3(T_now[:3, :3].T @ R))), R, t, normal))
-    if len(possible) < 2:
-        return None
-    _, R, t, normal = max(possible, key=lambda one: one[0])
-    return R, t, normal
+        alike = float(way_now @ (-R.T @ t)) / length
+        if in_front.mean() >= _MIN_IN_FRONT and alike < furthest:
+            found, furthest = (R, t, normal), alike
+    return found
 
 
 def _on_plane(problem: BundleProblem, K: Array, R: Array, t: Array, normal: Array) -> BundleProblem:

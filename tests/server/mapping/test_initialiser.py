@@ -78,17 +78,47 @@ def test_standing_still_and_damaged_images_begin_nothing():
     assert k == 3
 
 
-def test_standing_still_first_does_not_wear_out_the_patience(monkeypatch):
+def never_decided(monkeypatch):
+    """Let no start be decided; the list says for each attempt whether it was to be the last."""
     asked = []
 
     def never(problem, *, at_last):
         asked.append(at_last)
 
     monkeypatch.setattr("semcast.server.mapping.initialiser.decide", never)
-    moving, _ = ride(16, step_m=0.05)
-    first = moving[0]
-    still = [Observed(k - 30, (k - 30) * 10**8, first.ids, first.xy, first.confidence) for k in range(30)]
-    assert begin([*still, *moving[1:]]) is None
-    assert len(asked) > 10
-    assert asked[:10] == [False] * 10
-    assert asked[10] is True
+    return asked
+
+
+def same_view(frame, num_frames, first_id):
+    return [
+        Observed(first_id + k, (first_id + k) * 10**8, frame.ids, frame.xy, frame.confidence)
+        for k in range(num_frames)
+    ]
+
+
+def test_standing_still_first_does_not_wear_out_the_patience(monkeypatch):
+    asked = never_decided(monkeypatch)
+    moving, _ = ride(40, step_m=0.05)
+    assert begin([*same_view(moving[0], 30, -30), *moving[1:]]) is None
+    assert len(asked) > 12
+    assert asked[:12] == [False] * 12
+    assert asked[12] is True
+
+
+def test_a_start_is_looked_at_again_when_the_tracks_have_become_longer(monkeypatch):
+    asked = never_decided(monkeypatch)
+    moving, _ = ride(8, step_m=0.05)
+    begin(moving)
+    so_far = len(asked)
+    assert so_far > 3
+    asked.clear()
+    begin([*moving, *same_view(moving[-1], 20, 8)])
+    assert len(asked) == so_far
+
+
+def test_a_camera_that_stops_too_early_gets_the_better_start_in_the_end(monkeypatch):
+    asked = never_decided(monkeypatch)
+    moving, _ = ride(6, step_m=0.05)
+    begin([*moving, *same_view(moving[-1], 62, 6)])
+    assert asked[0] is False
+    assert asked[-1] is True
