@@ -260,6 +260,8 @@ class PoseMessage:
         state: Of the tracker.
         covariance: 6x6, row by row, rotation before translation, or None.
         map_epoch: Counts map resets; poses of two epochs have unrelated world frames.
+        submap: Part of the map the frame belongs to. A new part's place and scale in the world are guessed
+            until it meets an older one and becomes part of it.
     """
 
     version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
@@ -273,6 +275,7 @@ class PoseMessage:
     num_inliers: int = field(metadata=_COUNT)
     covariance: tuple[float, ...] | None = field(metadata=rule(Maybe(Many(Number(), count=36))))
     map_epoch: int = field(metadata=_COUNT)
+    submap: int = field(default=0, metadata=_COUNT)
 
 
 @dataclass(frozen=True, kw_only=True)

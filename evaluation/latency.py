@@ -82,6 +82,7 @@ class ViewStage:
         view = frame_view(frame, result, row, {})
         if update is not None:
             self._scene.set_keyframes(update.keyframe_ids, update.keyframe_poses)
+            self._scene.move_frames(update.frame_ids, update.frame_poses)
             self._scene.add_landmarks(update.ids, update.xyz, update.rgb, update.confidence, update.removed)
         self._scene.add_frame(view.without_image())
         self._scene.set_picture(compress_picture(view, self._quality))

@@ -63,6 +63,7 @@ class Outbox:
                 num_inliers=0,
                 covariance=None,
                 map_epoch=result.map_epoch,
+                submap=result.submap,
             )
             self._box.put((self._pose, message))
         self._box.put((self._pose, pose_message(arrival, result)))
@@ -97,6 +98,7 @@ def pose_message(arrival: ReceivedFrame, result: FrameResult) -> PoseMessage:
         num_inliers=result.num_inliers,
         covariance=tuple(covariance.ravel().tolist()) if covariance is not None and known else None,
         map_epoch=result.map_epoch,
+        submap=result.submap,
     )
 
 

@@ -74,9 +74,10 @@ def decide(problem: BundleProblem, *, at_last: bool = False) -> Side | None:
         others.append(flat)
     sides = sorted((start, *(adjusted(p) for p in others)), key=lambda side: side.cost)
     best, rest = sides[0], [side for side in sides[1:] if not _is_same(sides[0], side)]
-    if at_last or not rest or rest[0].cost >= _CLEAR_RATIO * best.cost:
+    if at_last:
         return best
-    return None
+    is_clear = not rest or (rest[0].ok and rest[0].cost >= _CLEAR_RATIO * best.cost)
+    return best if best.ok and is_clear else None
 
 
 def _is_same(a: Side, b: Side) -> bool:

@@ -54,9 +54,12 @@ def _build(
         if problem.fixed[k]:
             graph.add(gtsam.PriorFactorPose3(X(k), pose, fixed_noise))
     if problem.keep_baseline and len(problem.T_world_cam) > 1:
-        baseline = float(np.linalg.norm(problem.T_world_cam[-1, :3, 3] - problem.T_world_cam[0, :3, 3]))
+        away = np.linalg.norm(problem.T_world_cam[:, :3, 3] - problem.T_world_cam[0, :3, 3], axis=1)
+        # The longest one: a camera that came back to where it began would say nothing about the scale.
+        furthest = int(away.argmax())
+        baseline = float(away[furthest])
         noise = gtsam.noiseModel.Isotropic.Sigma(1, max(1e-4 * baseline, 1e-9))
-        graph.add(gtsam.RangeFactorPose3(X(0), X(len(problem.T_world_cam) - 1), baseline, noise))
+        graph.add(gtsam.RangeFactorPose3(X(0), X(furthest), baseline, noise))
     for p in np.unique(problem.point[used]).tolist():
         values.insert(L(p), problem.xyz[p])
     sigmas, step = quantised_sigma(problem.sigma_px)

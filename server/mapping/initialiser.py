@@ -4,7 +4,7 @@ Standing still and turning on the spot give no depth; the start then waits. Fram
 so that they get their poses as soon as there is a map.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,6 +104,15 @@ class Initialiser:
         self._num_undecided = 0
         self._num_since_undecided = 0
         self._undecided_flow_px = 0.0
+
+    @property
+    def oldest_id(self) -> int | None:
+        """Smallest id of a track in the history, None where there is none."""
+        return min((int(o.ids[0]) for o in self.history), default=None)
+
+    def renew(self, added: int) -> None:
+        """Give all tracks of the history new ids, ``added`` more than before."""
+        self.history = [replace(o, ids=o.ids + added) for o in self.history]
 
     def add(self, observed: Observed, noise: NoiseModel, *, is_damaged: bool = False) -> Start | None:
         """Take a frame and try to start a map with it.

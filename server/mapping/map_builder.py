@@ -14,6 +14,7 @@ from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.recall import SeenFrom, no_images
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.tracks import Sight, TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -49,7 +50,7 @@ class MapBuilder:
         self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
         self.relocaliser = Relocaliser(self._camera, s.seed, s.max_features)
         self.submap = 0
-        self.keyframe_covariance: Array | None = None
+        self._adjusted: tuple[int, Array] | None = None
         self.num_inliers_at_keyframe = 0
         self.images = no_images()
 
@@ -63,7 +64,12 @@ class MapBuilder:
 
     def begin_submap(self) -> None:
         """Let the next start be a submap of its own."""
-        self.submap = 1 + max(self.world.submap_of.values(), default=-1)
+        self.enter(1 + max(self.world.submap_of.values(), default=-1))
+
+    def enter(self, submap: int) -> None:
+        """Go on in a submap."""
+        self._adjusted = None  # of a keyframe elsewhere, or in another unit
+        self.submap = submap
 
     def take_start(
         self, start: Start, sight: Sight, tracks: TrackTable, T_world_ref: Array, scale: float
@@ -133,7 +139,7 @@ class MapBuilder:
     def _submit(self, *, start: bool = False) -> None:
         if self._bundle.busy:
             return
-        mine = sum(k.submap == self.submap for k in self.world.keyframes[-self._settings.window_size - 1 :])
+        mine = sum(k.submap == self.submap for k in self.world.keyframes)
         problem = mapper.build_problem(
             self.world,
             self._camera,
@@ -152,7 +158,8 @@ class MapBuilder:
         if result is None or result.problem.map_version != self._version:
             return None
         mapper.apply_result(self.world, result, self.noise)
-        self.keyframe_covariance = result.covariance
+        if result.covariance is not None:
+            self._adjusted = (int(result.problem.keyframe_ids[-1]), result.covariance)
         return result
 
     def bridge(
@@ -209,22 +216,45 @@ class MapBuilder:
             self._bundle.take(wait=True)
         self._version += 1
         self.world.transform_submap(self.submap, place.submap, scale, T_old_new)
-        self.submap = place.submap
+        self.enter(place.submap)
         on_moved(scale)
         return True
 
-    def pose_covariance(self, covariance_in_keyframe: Array | None, T_keyframe_cam: Array) -> Array | None:
-        """Covariance of a frame: that of its keyframe carried over, plus its own.
+    def take_update(self, map_epoch: int) -> MapUpdate | None:
+        """What changed in the map since this was last called, None when nothing did."""
+        world = self.world
+        changed, removed, keyframes, frames = world.take_changes()
+        if len(changed) + len(removed) + len(keyframes) == 0:
+            return None
+        row = world.landmarks.rows(changed)
+        return MapUpdate(
+            map_epoch=map_epoch,
+            ids=changed,
+            xyz=world.landmarks.xyz[row].copy(),
+            rgb=world.landmarks.rgb[row].copy(),
+            confidence=world.landmarks.confidence[row].copy(),
+            removed=removed,
+            keyframe_ids=keyframes,
+            keyframe_poses=np.array([world.poses[k] for k in keyframes.tolist()]).reshape(-1, 4, 4),
+            frame_ids=frames,
+            frame_poses=np.array([world.pose_of_frame(k) for k in frames.tolist()]).reshape(-1, 4, 4),
+        )
+
+    def pose_covariance(self, covariance_in_map: Array | None, T_world_cam: Array) -> Array | None:
+        """Covariance of a frame: that of the last adjusted keyframe carried over, plus its own.
 
         Args:
-            covariance_in_keyframe: ``(6, 6)`` of the frame relative to the map, in the camera frame.
-            T_keyframe_cam: Pose relative to the keyframe.
+            covariance_in_map: ``(6, 6)`` of the frame relative to the map, in the camera frame.
+            T_world_cam: Its pose.
         """
-        if covariance_in_keyframe is None or self.keyframe_covariance is None:
-            return covariance_in_keyframe
-        T = invert_transform(T_keyframe_cam)
+        if covariance_in_map is None or self._adjusted is None:
+            return covariance_in_map
+        keyframe_id, covariance = self._adjusted
+        if self.world.submap_of[keyframe_id] != self.submap:
+            return covariance_in_map
+        T = invert_transform(T_world_cam) @ self.world.poses[keyframe_id]
         R, t = T[:3, :3], T[:3, 3]
         adjoint = np.zeros((6, 6))
         adjoint[:3, :3] = adjoint[3:, 3:] = R
         adjoint[3:, :3] = (np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])) @ R
-        return np.asarray(adjoint @ self.keyframe_covariance @ adjoint.T + covariance_in_keyframe)
+        return np.asarray(adjoint @ covariance @ adjoint.T + covariance_in_map)

@@ -86,7 +86,7 @@ def _on_plane(problem: BundleProblem, K: Array, R: Array, t: Array, normal: Arra
     distance = float(baseline / np.linalg.norm(t))
     T_last = invert_transform(make_transform(R, distance * t))
     fx, fy, cx, cy = problem.intrinsics
-    camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=round(2.0 * cx), height=round(2.0 * cy))
+    camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=1, height=1)  # a pose does not ask for the size
     num_views = len(problem.T_world_cam)
     poses = [np.eye(4)]
     # The plane is n^T X = distance in the first camera's frame; a ray meets it from any pose.

@@ -41,6 +41,8 @@ _FEW_INLIERS_SHARE = 0.2
 _REACH_PX, _REACH_BLIND_PX = 6.0, 20.0
 #: Share of the landmarks in sight that must agree with a pose found without a prior.
 _MIN_SHARE_WHEN_LOST = 0.5
+#: Of a keypoint by which a place was recognised, until it is followed.
+_RECOGNISED_CONFIDENCE = 0.5
 
 
 class Reconstruction:
@@ -161,14 +163,26 @@ class Reconstruction:
     def _pose(
         self, T_world_guess: Array | None, *, min_share: float = MIN_BELIEVED_SHARE
     ) -> TrackedPose | None:
-        visible = self._tracks.visible
+        tracks, visible = self._tracks, self._tracks.visible
+        return self._pose_from(
+            tracks.ids[visible], tracks.xy[visible], tracks.confidence[visible], T_world_guess, min_share
+        )
+
+    def _pose_from(
+        self,
+        ids: NDArray[np.int64],
+        xy: Array,
+        confidence: Array,
+        T_world_guess: Array | None,
+        min_share: float = MIN_BELIEVED_SHARE,
+    ) -> TrackedPose | None:
         return track_pose(
             self._camera,
             self._map.world,
             self._map.noise.model,
-            self._tracks.ids[visible],
-            self._tracks.xy[visible],
-            self._tracks.confidence[visible],
+            ids,
+            xy,
+            confidence,
             T_world_guess,
             seed=self._settings.seed,
             min_share=min_share,
@@ -266,9 +280,7 @@ class Reconstruction:
             if self._frames_lost >= self._settings.lost_after_frames:
                 logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
                 self._state = TrackingState.INITIALIZING
-                self._map.begin_submap()
-                tracks.renew(self._map.world.landmarks.rows(tracks.ids) >= 0)
-                self._map_epoch += 1
+                self._begin_submap()
         since = time.perf_counter_ns()
         tracks.refill(sight)
         # Tracks of old landmarks serve to find back, not to start anew: a landmark has one id.
@@ -286,6 +298,15 @@ class Reconstruction:
         if start is None:
             return self._result(frame, None, None)
         return self._begin_map(sight, start)
+
+    def _begin_submap(self) -> None:
+        """Let the next start be a part of its own that shares no track with what came before.
+
+        Keyframes hold tracks without a landmark too: if one got its landmark in the new part, the old part
+        would be recognised by it, wherever the camera is.
+        """
+        self._map.begin_submap()
+        self._initialiser.renew(self._tracks.renew(self._initialiser.oldest_id))
 
     def _recover(self, sight: Sight) -> TrackedPose | None:
         """Pose of a frame after tracking was lost: by tracks that are still alive, else by recognition."""
@@ -305,11 +326,15 @@ class Reconstruction:
         place = self._map.relocaliser.find(sight, self._map.world, self._map.noise.model)
         if place is None:
             return None
-        self._map.submap = place.submap
-        self._tracks.adopt(place.ids, place.xy, 0.5)
-        self._initialiser.clear()
-        self._motion.reset()
-        return self._pose(place.T_world_cam)
+        # Nothing is given up for a place before there is a pose in it.
+        confidence = np.full(len(place.ids), _RECOGNISED_CONFIDENCE)
+        pose = self._pose_from(place.ids, place.xy, confidence, place.T_world_cam)
+        if pose is not None:
+            self._map.enter(place.submap)
+            self._tracks.adopt(place.ids, place.xy, _RECOGNISED_CONFIDENCE)
+            self._initialiser.clear()
+            self._motion.reset()
+        return pose
 
     def _begin_map(self, sight: Sight, start: Start) -> FrameResult:
         """Bring a start into the map and pose the frames that waited for it."""
@@ -396,7 +421,7 @@ class Reconstruction:
             agrees = np.isin(ids, pose.ids[pose.inliers], assume_unique=True)
         covariance = None
         if pose is not None and frame.frame_id in self._map.world.frames:
-            covariance = self._map.pose_covariance(pose.covariance, self._map.world.frames[frame.frame_id][1])
+            covariance = self._map.pose_covariance(pose.covariance, pose.T_world_cam)
         return FrameResult(
             frame_id=frame.frame_id,
             t_source_ns=frame.t_source_ns,
@@ -408,6 +433,7 @@ class Reconstruction:
             covariance=covariance,
             is_keyframe=is_keyframe,
             map_epoch=self._map_epoch,
+            submap=self._map.submap,
             keypoints_xy=self._tracks.xy[visible].astype(np.float32),
             keypoint_inlier=agrees,
             keypoint_confidence=self._tracks.confidence[visible].astype(np.float32),
@@ -417,21 +443,7 @@ class Reconstruction:
 
     def take_map_update(self) -> MapUpdate | None:
         """What changed in the map since this was last called, None when nothing did."""
-        world = self._map.world
-        changed, removed, keyframes = world.take_changes()
-        if len(changed) + len(removed) + len(keyframes) == 0:
-            return None
-        row = world.landmarks.rows(changed)
-        return MapUpdate(
-            map_epoch=self._map_epoch,
-            ids=changed,
-            xyz=world.landmarks.xyz[row].copy(),
-            rgb=world.landmarks.rgb[row].copy(),
-            confidence=world.landmarks.confidence[row].copy(),
-            removed=removed,
-            keyframe_ids=keyframes,
-            keyframe_poses=np.array([world.poses[k] for k in keyframes.tolist()]).reshape(-1, 4, 4),
-        )
+        return self._map.take_update(self._map_epoch)
 
     def final_trajectory(self) -> dict[int, Array]:
         """Best current ``T_world_cam`` of all posed frames, by frame id; waits for a running adjustment."""

@@ -54,7 +54,9 @@ class FrameResult:
         covariance: ``(6, 6)`` of the pose in the camera frame, rotation before translation (gtsam's order),
             or None.
         is_keyframe: Whether it became a keyframe.
-        map_epoch: Counts maps; it grows when a new map is begun.
+        map_epoch: Counts resets; poses of two epochs have unrelated world frames.
+        submap: Part of the map the frame belongs to. A new part's place and scale in the world are guessed
+            until it meets an older one and becomes part of it.
         keypoints_xy: ``(N, 2)`` float32 pixels.
         keypoint_inlier: ``(N,)`` bool, agrees with the pose.
         keypoint_confidence: ``(N,)`` float32 in [0, 1], the confidence its weight is made of.
@@ -72,6 +74,7 @@ class FrameResult:
     covariance: Array | None
     is_keyframe: bool
     map_epoch: int
+    submap: int
     keypoints_xy: NDArray[np.float32]
     keypoint_inlier: NDArray[np.bool_]
     keypoint_confidence: NDArray[np.float32]
@@ -92,6 +95,8 @@ class MapUpdate:
         removed: ``(M,)`` int64, landmarks that are gone.
         keyframe_ids: ``(K,)`` int64 frame ids of keyframes added or moved.
         keyframe_poses: ``(K, 4, 4)`` their ``T_world_cam``.
+        frame_ids: ``(F,)`` int64, frames that moved otherwise than with their keyframe: when submaps joined.
+        frame_poses: ``(F, 4, 4)`` their ``T_world_cam``.
     """
 
     map_epoch: int
@@ -102,3 +107,5 @@ class MapUpdate:
     removed: NDArray[np.int64]
     keyframe_ids: NDArray[np.int64]
     keyframe_poses: Array
+    frame_ids: NDArray[np.int64]
+    frame_poses: Array

@@ -158,15 +158,18 @@ class TrackTable:
         self.age = np.ones(count, np.int64)
         self.missed = np.zeros(count, np.int64)
 
-    def renew(self, mask: NDArray[np.bool_]) -> None:
-        """Give the tracks in the mask new ids, as if they began now."""
-        count = int(mask.sum())
-        self.ids = self.ids.copy()
-        self.ids[mask] = self._next_id + np.arange(count, dtype=np.int64)
-        self._next_id += count
-        order = np.argsort(self.ids, kind="stable")
-        for name in _COLUMNS:
-            setattr(self, name, getattr(self, name)[order])
+    def renew(self, oldest_id: int | None = None) -> int:
+        """Give all tracks new ids, as if they began now; returns what was added to each.
+
+        Args:
+            oldest_id: Ids from this one on become new by the same sum elsewhere too.
+        """
+        known = [self._next_id, *self.ids[:1].tolist()]
+        added = self._next_id - min(known if oldest_id is None else [*known, oldest_id])
+        self.ids = self.ids + added
+        self._next_id += added
+        self._before = None
+        return added
 
     def follow(self, sight: Sight, guess_xy: Array, max_level: int = 3) -> None:
         """Look for every track in a new image.

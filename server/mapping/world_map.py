@@ -142,6 +142,7 @@ class WorldMap:
         self.frames: dict[int, tuple[int, Array]] = {}
         self._changed: set[int] = set()
         self._moved_keyframes: set[int] = set()
+        self._frames_moved = False
         self._removed: set[int] = set()
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
@@ -202,6 +203,7 @@ class WorldMap:
         for keyframe in self.keyframes:
             if keyframe.submap == submap:
                 keyframe.submap = into
+        self._frames_moved = True
         for frame_id, (keyframe_id, T_keyframe_cam) in self.frames.items():
             if keyframe_id in moved:
                 T = T_keyframe_cam.copy()
@@ -246,15 +248,20 @@ class WorldMap:
             xy.append(keyframe.xy[seen])
         return np.concatenate(ids), np.concatenate(frames), np.concatenate(xy)
 
-    def take_changes(self) -> tuple[Ids, Ids, Ids]:
-        """Ids of landmarks that were added or moved, of those removed, and keyframes added or moved."""
+    def take_changes(self) -> tuple[Ids, Ids, Ids, Ids]:
+        """Ids of landmarks added or moved, of removed ones, of keyframes added or moved, and of frames moved.
+
+        Frames move with their keyframe without being named; they are named when they moved otherwise.
+        """
         removed = np.array(sorted(self._removed), dtype=np.int64)
         removed = removed[self.landmarks.rows(removed) < 0]
         changed = np.array(sorted(self._changed), dtype=np.int64)
         changed = changed[self.landmarks.rows(changed) >= 0]
         moved = np.array(sorted(self._moved_keyframes), dtype=np.int64)
+        frames = np.array(sorted(self.frames) if self._frames_moved else [], dtype=np.int64)
         self._changed, self._removed, self._moved_keyframes = set(), set(), set()
-        return changed, removed, moved
+        self._frames_moved = False
+        return changed, removed, moved, frames
 
     def arrays(self) -> dict[str, NDArray]:
         """Everything as plain arrays, for a checkpoint."""

@@ -189,6 +189,7 @@ class ViewerFeed:
                     self._scene.start_new_map()
                 if update is not None:
                     self._scene.set_keyframes(update.keyframe_ids, update.keyframe_poses)
+                    self._scene.move_frames(update.frame_ids, update.frame_poses)
                     self._scene.add_landmarks(
                         update.ids, update.xyz, update.rgb, update.confidence, update.removed
                     )

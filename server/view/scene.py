@@ -209,15 +209,25 @@ class Scene:
         if place < len(self._frame_ids) and self._frame_ids[place] == frame_id:
             return
         reference = self._newest_keyframe
-        T_ref_world = (
-            invert_transform(self._keyframes[reference]) if reference in self._keyframes else np.eye(4)
-        )
         self._frame_ids.insert(place, frame_id)
         self._times_ns.insert(place, t_source_ns)
         self._references.insert(place, reference)
         self._breaks.insert(place, self._lost_since_pose and place == len(self._breaks))
-        self._T_ref_cam.insert(place, T_ref_world @ T_world_cam)
+        self._T_ref_cam.insert(place, self._in_keyframe(reference, T_world_cam))
         self._touch_segments(range(place // SEGMENT_POSES, (len(self._frame_ids) - 1) // SEGMENT_POSES + 1))
+
+    def _in_keyframe(self, keyframe_id: int, T_world_cam: Array) -> Array:
+        known = self._keyframes.get(keyframe_id)
+        return T_world_cam if known is None else invert_transform(known) @ T_world_cam
+
+    def move_frames(self, ids: NDArray[np.int64], T_world_cam: Array) -> None:
+        """Set the poses ``(F, 4, 4)`` of frames that did not just move with a keyframe."""
+        for frame_id, T in zip(ids.tolist(), T_world_cam, strict=True):
+            place = bisect_left(self._frame_ids, frame_id)
+            if place < len(self._frame_ids) and self._frame_ids[place] == frame_id:
+                self._T_ref_cam[place] = self._in_keyframe(self._references[place], T)
+        if len(ids):
+            self._touch_segments(range((len(self._frame_ids) - 1) // SEGMENT_POSES + 1))
 
     def _touch_segments(self, indices: Sequence[int]) -> None:
         for k in indices:

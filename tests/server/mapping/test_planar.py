@@ -1,5 +1,7 @@
 """The other pose and plane that explain two images of a flat scene."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from semcast.common.geometry import invert_transform
@@ -47,13 +49,7 @@ def test_views_between_are_placed_where_the_plane_asks_for_them(wall, projected)
 def test_a_world_frame_that_is_not_the_first_camera_changes_nothing(wall):
     truth = wall()
     T = truth.T_world_cam[2]
-    moved = type(truth)(
-        **{
-            **vars(truth),
-            "T_world_cam": T @ truth.T_world_cam,
-            "xyz": truth.xyz @ T[:3, :3].T + T[:3, 3],
-        }
-    )
+    moved = replace(truth, T_world_cam=T @ truth.T_world_cam, xyz=truth.xyz @ T[:3, :3].T + T[:3, 3])
     a, b = twin(truth), twin(moved)
     np.testing.assert_allclose(T @ a.T_world_cam, b.T_world_cam, atol=1e-6)
     back = invert_transform(T)
@@ -73,12 +69,13 @@ def test_a_scene_with_depth_has_no_twin_and_moving_straight_at_a_wall_neither(ar
 def test_too_few_common_points_have_no_twin(wall):
     truth = wall()
     keep = (truth.view != 0) | (truth.point < 8)
-    few = type(truth)(
-        **{
-            **vars(truth),
-            **{
-                name: getattr(truth, name)[keep] for name in ("view", "point", "xy", "sigma_px", "confidence")
-            },
-        }
-    )
+    rows = ("view", "point", "xy", "sigma_px", "confidence")
+    few = replace(truth, **{name: getattr(truth, name)[keep] for name in rows})
     assert twin(few) is None
+
+
+def test_a_principal_point_outside_the_image_is_no_obstacle(wall, direction_error_deg):
+    truth = wall()
+    fx, fy, cx, cy = truth.intrinsics
+    shifted = replace(truth, intrinsics=(fx, fy, cx - 400.0, cy - 300.0), xy=truth.xy - [400.0, 300.0])
+    assert direction_error_deg(twin(shifted).T_world_cam, twin(truth).T_world_cam) < 0.1

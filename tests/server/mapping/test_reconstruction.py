@@ -10,6 +10,7 @@ from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
+from semcast.server.mapping.relocalisation import Place, Relocaliser
 from semcast.server.mapping.state import DecodedFrame, TrackingState
 
 CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
@@ -211,7 +212,8 @@ def test_another_place_becomes_a_map_of_its_own(room):
     sequence = images[:8] + other[:8]
     results = [reconstruction.process(frame_of(k, image)) for k, image in enumerate(sequence)]
     assert results[-1].state is TrackingState.TRACKING
-    assert results[-1].map_epoch == 1
+    assert (results[7].submap, results[-1].submap) == (0, 1)
+    assert results[-1].map_epoch == 0
     assert len(reconstruction.final_trajectory()) >= len(sequence) - 4
 
 
@@ -228,6 +230,51 @@ def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog):
     trajectory = reconstruction.final_trajectory()
     assert len(trajectory) >= len(x) - 3
     assert ate_percent(trajectory, truth) < 1.0
+
+
+def turning_away():
+    """Sideways, then a turn on the spot until all landmarks are out of view, then sideways again."""
+    poses = [make_transform(np.eye(3), (0.12 * k, 0.02 * np.sin(k), 0.0)) for k in range(10)]
+    position, yaw = poses[-1][:3, 3], 0.0
+    for _ in range(34):
+        yaw -= np.radians(2.0)
+        poses.append(make_transform(exp_so3((0.0, yaw, 0.0)), position))
+    for k in range(18):
+        away = np.array([0.15 * (k + 1), 0.03 * np.sin(k), -0.05 * (k + 1)])
+        poses.append(make_transform(exp_so3((0.0, yaw, 0.0)), position + away))
+    return poses
+
+
+def test_a_part_begun_after_a_turn_is_not_taken_for_the_old_one(caplog):
+    # Many tracks survive the turn, but no landmark does.
+    truth = turning_away()
+    reconstruction = make(lost_after_frames=4)
+    with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
+        results = [reconstruction.process(frame_of(k, render(T))) for k, T in enumerate(truth)]
+    assert "a new map is begun" in caplog.text
+    assert results[-1].state is TrackingState.TRACKING
+    assert results[-1].submap == 1
+    assert "joined" not in caplog.text
+    world = reconstruction._map.world
+    for keyframe in world.keyframes:
+        row = world.landmarks.rows(keyframe.ids)
+        assert (world.landmarks.submap[row[row >= 0]] == keyframe.submap).all()
+
+
+def test_a_place_without_a_pose_gives_nothing_up(room, monkeypatch):
+    _, images = room
+    reconstruction = make(lost_after_frames=2)
+    other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
+    for k, image in enumerate(images[:8] + other[:2]):
+        result = reconstruction.process(frame_of(k, image))
+    assert result.state is TrackingState.INITIALIZING
+    ids = reconstruction.landmarks()[0]
+    rng = np.random.default_rng(0)
+    nowhere = Place(np.eye(4), 3, ids[:60], rng.uniform(20, 200, (60, 2)), 0)
+    monkeypatch.setattr(Relocaliser, "find", lambda *_, **__: nowhere)
+    results = [reconstruction.process(frame_of(10 + k, other[2 + k])) for k in range(4)]
+    assert results[-1].state is TrackingState.TRACKING
+    assert [r.submap for r in results] == [1] * 4
 
 
 def test_noise_of_every_kind_is_survived(room):

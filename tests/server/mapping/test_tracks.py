@@ -124,14 +124,22 @@ def test_nan_maps_give_finite_confidence():
 
 def test_new_ids_are_higher_than_all_others():
     tracks = begin()
-    highest = tracks.ids.max()
-    xy = {i: tuple(p) for i, p in zip(tracks.ids.tolist(), tracks.xy, strict=True)}
-    mask = tracks.ids % 2 == 0
-    renewed = tracks.xy[mask]
-    tracks.renew(mask)
-    assert np.all(np.diff(tracks.ids) > 0)
-    assert np.array_equal(np.sort(tracks.xy[tracks.ids > highest], axis=0), np.sort(renewed, axis=0))
-    assert all(xy[i] == tuple(p) for i, p in zip(tracks.ids, tracks.xy, strict=True) if i <= highest)
+    before, next_id, xy = tracks.ids, tracks.next_id, tracks.xy
+    added = tracks.renew(oldest_id=int(before[0]))
+    assert np.array_equal(tracks.ids, before + added)
+    assert np.array_equal(tracks.xy, xy)
+    assert tracks.ids.min() >= next_id
+    assert tracks.next_id > tracks.ids.max()
+
+
+def test_ids_kept_elsewhere_become_new_by_the_same_sum():
+    tracks = begin()
+    tracks.keep(tracks.ids >= 20)
+    next_id, gone = tracks.next_id, 7
+    added = tracks.renew(oldest_id=gone)
+    assert gone + added >= next_id
+    assert gone + added not in tracks.ids
+    assert tracks.next_id > tracks.ids.max()
 
 
 def test_adopted_points_replace_all_tracks():

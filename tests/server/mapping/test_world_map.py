@@ -68,14 +68,15 @@ def test_frames_follow_their_keyframe():
 
 def test_changes_are_reported_once():
     world = make_world()
-    changed, removed, keyframes = world.take_changes()
+    changed, removed, keyframes, frames = world.take_changes()
     assert changed.tolist() == [1, 2, 3, 5, 6]
     assert removed.tolist() == []
     assert keyframes.tolist() == [0, 10, 20, 30]
+    assert frames.tolist() == []
     assert sum(len(part) for part in world.take_changes()) == 0
     world.move_landmarks(np.array([2, 77]), np.ones((2, 3)))
     world.remove_landmarks(world.landmarks.ids == 3)
-    changed, removed, _ = world.take_changes()
+    changed, removed, _, _ = world.take_changes()
     assert changed.tolist() == [2]
     assert removed.tolist() == [3]
 
@@ -85,7 +86,7 @@ def test_a_landmark_that_comes_back_is_not_reported_as_removed():
     world.take_changes()
     world.remove_landmarks(world.landmarks.ids == 3)
     add_world(world, [3], 0, 40)
-    changed, removed, _ = world.take_changes()
+    changed, removed, _, _ = world.take_changes()
     assert changed.tolist() == [3]
     assert removed.tolist() == []
 
@@ -96,7 +97,9 @@ def test_a_similarity_moves_everything_of_a_submap_alike():
     row = world.landmarks.rows(np.array([5, 6]))
     seen_before = transform_points(invert_transform(world.pose_of_frame(33)), world.landmarks.xyz[row])
     others = {k: world.pose_of_frame(k) for k in (0, 3, 13)}
+    world.take_changes()
     world.transform_submap(1, 0, scale, T)
+    assert world.take_changes()[3].tolist() == sorted(world.frames)
     seen_after = transform_points(invert_transform(world.pose_of_frame(33)), world.landmarks.xyz[row])
     assert np.allclose(seen_after, scale * seen_before)
     assert np.allclose(world.pose_of_frame(33)[:3, :3] @ world.pose_of_frame(33)[:3, :3].T, np.eye(3))

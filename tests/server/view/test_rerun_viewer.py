@@ -64,6 +64,8 @@ class Update:
         self.removed = np.zeros(0, np.int64)
         self.keyframe_ids = np.array([k], np.int64)
         self.keyframe_poses = make_transform(np.eye(3), (0.0, 0.0, 0.1 * k))[None]
+        self.frame_ids = np.zeros(0, np.int64)
+        self.frame_poses = np.zeros((0, 4, 4))
 
 
 def rerun_output(*arguments):

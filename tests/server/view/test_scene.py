@@ -91,6 +91,19 @@ def test_frames_move_with_the_keyframe_they_hang_on():
     np.testing.assert_allclose(scene.changes_since(cursor).segments[0][0], expected, atol=1e-6)
 
 
+def test_frames_that_moved_otherwise_are_set_anew():
+    scene, cursor = Scene(), Cursor()
+    scene.set_keyframes(np.array([0]), at(0)[None])
+    for k in range(3):
+        scene.add_frame(view(k, at(k)))
+    scene.changes_since(cursor)
+    # The map grew three times as large: a keyframe's pose alone does not say so.
+    scene.set_keyframes(np.array([0]), at(0)[None])
+    scene.move_frames(np.array([0, 1, 2, 7]), np.stack([at(0), at(3), at(6), at(9)]))
+    np.testing.assert_allclose(scene.poses()[:, 0, 3], [0.0, 3.0, 6.0], atol=1e-12)
+    np.testing.assert_allclose(scene.changes_since(cursor).segments[0][0][:, 0], [0.0, 3.0, 6.0], atol=1e-6)
+
+
 def test_frames_posed_later_take_their_place_in_the_line():
     scene = Scene()
     scene.add_frame(view(0))

@@ -1,0 +1,135 @@
+"""What the map asks of bundle adjustment, and what it tells about a pose."""
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, invert_transform, make_transform, transform_points
+from semcast.server.mapping.bundle import optimise
+from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.tracks import Sight
+from semcast.server.mapping.world_map import Keyframe
+
+CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
+IMAGE = np.full((480, 640, 3), 90, np.uint8)
+
+
+class Asked:
+    """Keeps what it is asked; answers with the adjustment."""
+
+    def __init__(self):
+        self.problems = []
+
+    @property
+    def busy(self):
+        return False
+
+    def submit(self, problem):
+        self.problems.append(problem)
+        return True
+
+    def take(self, wait=False):
+        return optimise(self.problems[-1]) if self.problems else None
+
+    def close(self):
+        pass
+
+
+class NewestFrame:
+    """The tracks of a frame."""
+
+    def __init__(self, ids, xy):
+        self.ids, self.xy = ids, xy
+        self.visible = np.ones(len(ids), bool)
+        self.confidence = np.full(len(ids), 0.8)
+
+
+@pytest.fixture
+def builder():
+    return MapBuilder(CAMERA, ReconstructionSettings(), Asked())
+
+
+def add_part(builder, submap, num_keyframes, first_id, seed=0):
+    """Keyframes that go sideways, 10 cm each, and the points they see."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform((-2, -1.5, 5), (4, 1.5, 10), (80, 3))
+    ids = 1000 * submap + np.arange(80)
+    for k in range(num_keyframes):
+        builder.world.add_keyframe(keyframe(first_id + k, submap, ids, pose(0.1 * k), xyz))
+    builder.world.add_landmarks(ids, xyz, np.zeros((80, 3), np.uint8), np.ones(80), submap, first_id)
+    return ids, xyz
+
+
+def pose(x, angle=0.0):
+    return make_transform(exp_so3((0.0, angle, 0.0)), (x, 0.01 * np.sin(9 * x), 0.0))
+
+
+def seen(xyz, T_world_cam):
+    return CAMERA.project(transform_points(invert_transform(T_world_cam), xyz))
+
+
+def keyframe(frame_id, submap, ids, T_world_cam, xyz):
+    return Keyframe(
+        frame_id=frame_id,
+        t_source_ns=frame_id,
+        T_world_cam=T_world_cam,
+        submap=submap,
+        ids=ids,
+        xy=seen(xyz, T_world_cam),
+        confidence=np.full(len(ids), 0.8),
+        descriptor_ids=np.zeros(0, np.int64),
+        descriptors=np.zeros((0, 32), np.uint8),
+    )
+
+
+def test_coming_back_to_an_old_part_keeps_its_scale(builder):
+    ids, xyz = add_part(builder, 0, 20, 0)
+    add_part(builder, 1, 12, 100, seed=1)
+    builder.enter(0)
+    first_of_window = builder.world.keyframes[11].T_world_cam
+    truth = first_of_window @ make_transform(np.eye(3), (0.02, 0.0, 0.0))
+    wrong = truth @ make_transform(np.eye(3), (0.01, 0.0, 0.0))
+    sight = Sight(DecodedFrame(200, 200, IMAGE), IMAGE[..., 0], np.ones(480, bool))
+    before = builder.world.landmarks.xyz[builder.world.landmarks.rows(ids)].copy()
+    builder.make_keyframe(sight, NewestFrame(ids, seen(xyz, truth)), wrong)
+    builder.collect(wait=True)
+    after = builder.world.landmarks.xyz[builder.world.landmarks.rows(ids)]
+    np.testing.assert_allclose(after, before, atol=0.02)
+    np.testing.assert_allclose(builder.world.poses[200], truth, atol=1e-3)
+
+
+def test_a_young_map_keeps_its_scale_when_the_camera_comes_back_to_its_beginning(builder):
+    ids, xyz = add_part(builder, 0, 4, 0)
+    truth = pose(0.003)
+    sight = Sight(DecodedFrame(9, 9, IMAGE), IMAGE[..., 0], np.ones(480, bool))
+    builder.make_keyframe(sight, NewestFrame(ids, seen(xyz, truth)), pose(0.013))
+    builder.collect(wait=True)
+    after = builder.world.landmarks.xyz[builder.world.landmarks.rows(ids)]
+    assert np.median(after[:, 2] / xyz[:, 2]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_covariance_is_carried_from_the_adjusted_keyframe_along_the_way_to_the_frame(builder):
+    add_part(builder, 0, 6, 0)
+    builder._submit()
+    builder.collect(wait=True)
+    here = builder.world.poses[5]
+    nothing = np.zeros((6, 6))
+    at_keyframe = builder.pose_covariance(nothing, here)
+    along = builder.pose_covariance(nothing, here @ make_transform(np.eye(3), (0.0, 0.0, 30.0)))
+    # Turning by a small angle about x or y moves what is 30 units ahead by 30 times the angle.
+    lever = at_keyframe[3:5, 3:5].trace() + 900.0 * at_keyframe[:2, :2].trace()
+    cross = 60.0 * (at_keyframe[1, 3] - at_keyframe[0, 4])
+    assert along[3:5, 3:5].trace() == pytest.approx(lever + cross, rel=1e-6)
+    assert lever > 5.0 * at_keyframe[3:5, 3:5].trace()
+
+
+def test_covariance_of_another_part_is_not_carried_over(builder):
+    add_part(builder, 0, 6, 0)
+    builder._submit()
+    builder.collect(wait=True)
+    own = 1e-6 * np.eye(6)
+    assert builder.pose_covariance(own, builder.world.poses[5]).trace() > own.trace()
+    builder.begin_submap()
+    np.testing.assert_array_equal(builder.pose_covariance(own, np.eye(4)), own)
