@@ -15,7 +15,7 @@ from semcast.agent.settings import AgentSettings
 from semcast.agent.source import Source, SourceFrame, open_source
 from semcast.common.codec import Codec
 from semcast.common.codecs import load_codec
-from semcast.common.errors import TransportError
+from semcast.common.errors import SourceError, TransportError
 from semcast.common.keys import camera_key, flow_key, link_key, tx_key
 from semcast.common.messages import CameraInfo, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
@@ -236,7 +236,7 @@ def run_agent(
         Counts, drops by reason and stage times, with ``agent_epoch``, ``source`` and ``complete``.
 
     Raises:
-        SourceError: The source can't be read.
+        SourceError: The source can't be read, or failed later; what it gave before that was sent.
         ConfigError: The codec is unknown.
         CheckpointError: Its weights are missing or damaged.
         TransportError: Its port is taken, where it is the hub.
@@ -278,8 +278,9 @@ def run_agent(
                 _send_lossless(sending, capture, session, settings.agent_id, stop)
             else:
                 _send_live(sending, capture, stop)
+            capture.raise_failure()
             summary.update(agent_epoch=sending.agent_epoch, complete=capture.ended and not stop.is_set())
-        except TransportError as err:
+        except (SourceError, TransportError) as err:
             metrics.error(str(err))
             raise
         finally:

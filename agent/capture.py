@@ -48,19 +48,21 @@ class Capture:
 
     @property
     def ended(self) -> bool:
-        """Whether the source is at its end and everything was taken."""
+        """Whether the source is at its end or has failed, and everything before that was taken."""
         return self._box.closed and len(self._box) == 0
 
     def get(self, timeout_s: float) -> SourceFrame | None:
-        """Return the next frame, None when there was none in time or the source has ended.
+        """Return the next frame, None when there was none in time or ``ended``."""
+        return self._box.get(timeout_s)
+
+    def raise_failure(self) -> None:
+        """Raise what the source failed with, if it did: the caller decides what is still sent before.
 
         Raises:
-            SourceError: The source failed, and all frames before that were taken.
+            SourceError: The source failed.
         """
-        frame = self._box.get(timeout_s)
-        if frame is None and self._error is not None:
+        if self._error is not None:
             raise self._error
-        return frame
 
     def close(self) -> None:
         """End the thread and free the source. Idempotent."""

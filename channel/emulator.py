@@ -77,14 +77,19 @@ class Emulator:
             self._metrics.error(str(err))
             return
         self._metrics.count("received")
-        if frame.agent_epoch == self._arrived_epoch and frame.seq > self._arrived_seq:
-            self._metrics.drop("missing", frame.seq - self._arrived_seq)
-        self._arrived_epoch, self._arrived_seq = frame.agent_epoch, frame.seq + 1
+        self._count_missing(frame)
         # A lossless agent never has more frames under way than this; a live one is served its newest.
         self._box.resize(_REPLAY_CAPACITY if frame.lossless else 1)
         before = self._box.dropped
         self._box.put(frame)
         self._metrics.drop("superseded", self._box.dropped - before)
+
+    def _count_missing(self, frame: SymbolFrame) -> None:
+        """Count the frames before this one that never came; what is sent again opens no gap."""
+        if frame.agent_epoch != self._arrived_epoch:
+            self._arrived_epoch, self._arrived_seq = frame.agent_epoch, frame.seq
+        self._metrics.drop("missing", max(0, frame.seq - self._arrived_seq))
+        self._arrived_seq = max(self._arrived_seq, frame.seq + 1)
 
     def work(self, stop: threading.Event) -> None:
         """Carry frames until ``stop`` is set."""

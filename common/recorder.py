@@ -1,5 +1,6 @@
 """Records messages beside a running system: a bounded queue and a thread, so the live path never waits."""
 
+import itertools
 import logging
 import threading
 import time
@@ -16,6 +17,24 @@ logger = logging.getLogger(__name__)
 QUEUE_BYTES = 64 * 1024**2
 
 
+def set_aside(path: Path) -> Path | None:
+    """Rename a file that is not empty to the first free ``<stem>.<n><suffix>``.
+
+    Returns:
+        Its new name, None where there was nothing to keep.
+
+    Raises:
+        OSError: It can't be renamed.
+    """
+    if not path.is_file() or path.stat().st_size == 0:
+        return None
+    names = (path.with_name(f"{path.stem}.{n}{path.suffix}") for n in itertools.count(1))
+    kept = next(name for name in names if not name.exists())
+    path.rename(kept)
+    logger.warning("%s was there already and is kept as %s", path, kept.name)
+    return kept
+
+
 class Recorder:
     """Takes messages from any thread and writes them on its own.
 
@@ -23,7 +42,8 @@ class Recorder:
     once and later messages are counted as dropped.
 
     Args:
-        path: File to write; replaced when it exists.
+        path: File to write. One that is there and not empty is kept under another name: it may be the
+            recording of a process that was killed, whose restart this is.
         header: See ``recording_metadata``.
         queue_bytes: Payload that may wait for the disk.
         stream: Written instead of ``path``, for tests.
@@ -53,7 +73,10 @@ class Recorder:
         self.error: str | None = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = stream if stream is not None else path.open("wb")
+            if stream is None:
+                set_aside(path)
+                stream = path.open("wb")
+            self._stream = stream
             self._writer = RecordingWriter(self._stream, header)
         except OSError as err:
             raise SourceError(f"{path} can't be written: {err}") from err

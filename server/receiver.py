@@ -247,20 +247,31 @@ class Receiver:
         """
         deadline_s = time.monotonic() + timeout_s
         while not self._stopping.is_set():
-            entry = (
-                self._held
-                if self._held is not None
-                else self._box.get(max(0.0, deadline_s - time.monotonic()))
-            )
+            entry = self._take_held() or self._box.get(max(0.0, deadline_s - time.monotonic()))
             if entry is None:
                 return None
-            self._held = None
             frame = self._prepare(*entry)
             if frame is not None:
                 return frame
             if self._held is not None and time.monotonic() >= deadline_s:
                 return None
         return None
+
+    def _take_held(self) -> tuple[SymbolFrame, int] | None:
+        """Return the frame that waits for its camera.
+
+        An agent that was restarted never says what the camera of its former start was: that start's frame is
+        dropped, or none of the new one would ever be reached.
+        """
+        held, self._held = self._held, None
+        if held is None:
+            return None
+        with self._lock:
+            current = held[0].agent_epoch == self._arrivals.epoch
+        if not current:
+            self._metrics.drop("epoch")
+            return None
+        return held
 
     def _prepare(self, message: SymbolFrame, arrival_ns: int) -> ReceivedFrame | None:
         age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())

@@ -36,11 +36,21 @@ class Reference:
         self.truth = truth
         self._originals = originals
         self._failed = False
+        self._job: Future[float | None] | None = None
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="semcast-reference")
 
-    def psnr_db(self, frame_id: int, x_hat: NDArray[np.uint8]) -> "Future[float | None]":
-        """Compare a decoded image with its original; None where there is none or it can't be read."""
-        return self._pool.submit(self._compare, frame_id, x_hat)
+    def psnr_db(self, frame_id: int, x_hat: NDArray[np.uint8]) -> "Future[float | None] | None":
+        """Compare a decoded image with its original.
+
+        Returns:
+            The PSNR, of which None says that there is no original or it can't be read. No future while the
+            comparison before is still under way: waiting images would pile up where originals are read
+            slower than frames come. Belongs to one thread.
+        """
+        if self._job is not None and not self._job.done():
+            return None
+        self._job = self._pool.submit(self._compare, frame_id, x_hat)
+        return self._job
 
     def _compare(self, frame_id: int, x_hat: NDArray[np.uint8]) -> float | None:
         try:

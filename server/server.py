@@ -2,9 +2,12 @@
 
 import contextlib
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,6 +47,10 @@ FINAL_IDLE_S = 0.5
 #: The last frame may be lost on the air: so many frames from the end count as the end once the agent is gone.
 NEARLY_FINAL_FRAMES = 10
 AGENT_GONE_S = 2.0
+#: How long after a restart of the agent its former start's frames may still come: above any channel's delay.
+STRAGGLER_NS = 20_000_000_000
+#: How long a control request waits to be served; a busy server answers that it will be.
+SERVE_WAIT_S = 2.0
 
 
 class Server:
@@ -51,6 +58,7 @@ class Server:
 
     A restarted agent begins a new map in the same folder; what the former one left is moved to
     ``previous-<n>/``. A restarted server goes on with the map of its checkpoint if the agent is the same.
+    Files that can't be written are reported and the stream goes on; they are an error at the end of ``run``.
 
     Args:
         settings: What to do.
@@ -71,7 +79,9 @@ class Server:
         self._session: Session | None = None
         self._viewer: ViewerFeed | None = None
         self._reference: Reference | None = None
-        self._requests: set[str] = set()
+        self._former_epochs: set[int] = set()
+        self._begun_ns = 0
+        self._requests: dict[str, Future[str]] = {}
         self._announced: CameraInfo | None = None
         self._inbox_lock = threading.Lock()
         self._drops_before: dict[str, int] = {}
@@ -120,11 +130,14 @@ class Server:
                 raise ConfigError(f"{settings.out} can't be made a folder for outputs: {err}") from err
         if settings.reference is not None:
             open_sequence(settings.reference)
-        self._spare_bundle = new_bundle(settings)
+        self._spare_bundle = self._new_bundle()
         check_viewer(settings)
         if settings.codec is not None:
             codec = self._decoder.load(settings.codec, settings.modulation)
             self._decoder.warm_up(codec.name, settings.modulation, codec.digest, WARM_UP_SHAPE_HW)
+
+    def _new_bundle(self) -> BundleRunner:
+        return new_bundle(self._settings, self._metrics.error)
 
     def _close_spare(self) -> None:
         bundle, self._spare_bundle = self._spare_bundle, None
@@ -158,11 +171,18 @@ class Server:
             return pack(ControlReply(ok=False, error=str(err)))
         if request.op not in ("get", "reset", "save"):
             return pack(ControlReply(ok=False, error=f"op must be get, reset or save, got {request.op}"))
-        if request.op != "get":
-            with self._inbox_lock:
-                self._requests.add(request.op)
+        error = self._ask(request.op) if request.op != "get" else ""
         values = {"mode": self._settings.mode, "view": self._settings.view.view}
-        return pack(ControlReply(ok=True, settings=values))
+        return pack(ControlReply(ok=not error, error=error[:1000], settings=values))
+
+    def _ask(self, op: str) -> str:
+        """Hand a request to the thread that serves it; return what went wrong, empty as far as is known."""
+        with self._inbox_lock:
+            served = self._requests.setdefault(op, Future())
+        try:
+            return served.result(SERVE_WAIT_S)
+        except FutureTimeoutError:
+            return ""
 
     def run(self, stop: threading.Event) -> dict[str, Any]:
         """Serve until the source ends, ``stop`` is set or a time limit passes; outputs are always written.
@@ -173,6 +193,7 @@ class Server:
         Raises:
             ConfigError: The viewer can't be started.
             SourceError: The reference can't be read.
+            SemcastError: The outputs can't be written.
         """
         started_s = last_frame_s = time.monotonic()
         try:
@@ -208,16 +229,33 @@ class Server:
 
     def _serve_requests(self) -> None:
         with self._inbox_lock:
-            requests, self._requests = self._requests, set()
-        if self._session is None:
-            return
-        if "reset" in requests:
-            logger.info("map reset on request")
-            self._session.restart_map()
-            self._new_map = True
-        if "save" in requests:
-            self._session.save_checkpoint()
-            self._session.write_results(self._settings.out)
+            requests, self._requests = self._requests, {}
+        for op, serve in (("reset", self._reset), ("save", self._save)):
+            if op in requests:
+                requests[op].set_result(serve(self._session) if self._session is not None else "")
+
+    def _reset(self, session: Session) -> str:
+        logger.info("map reset on request")
+        session.restart_map()
+        self._new_map = True
+        return ""
+
+    def _save(self, session: Session) -> str:
+        """Write all outputs now; return what went wrong."""
+        out = self._settings.out
+        session.save_checkpoint()
+        try:
+            session.write_results(out)
+        except (OSError, SemcastError) as err:
+            return self._tell_not_written(out, err)
+        return ""
+
+    def _tell_not_written(self, folder: Path | None, err: Exception) -> str:
+        """Report outputs that the stream goes on without."""
+        text = _not_written(folder, err)
+        logger.error("%s", text)
+        self._metrics.error(text)
+        return text
 
     def _prepare(self) -> None:
         """Begin on an announced stream, so that codec, viewer and map are ready for its first frame."""
@@ -244,6 +282,9 @@ class Server:
         """Track one frame, send and show what came of it. One bad frame never stops the stream."""
         message = decoded.arrival.message
         session = self._session
+        if self._is_straggler(decoded.arrival):
+            self._metrics.drop("epoch")
+            return
         if session is None or session.identity.agent_epoch != message.agent_epoch:
             session = self._begin(decoded.arrival.camera)
         self._complete = message.final
@@ -263,6 +304,20 @@ class Server:
             self._metrics.error(f"frame {message.frame_id}: {err}")
             return
         self._spread(decoded, outcome)
+
+    def _is_straggler(self, arrival: ReceivedFrame) -> bool:
+        """Tell whether a frame is of a former start of the agent, while there is none of the present one yet.
+
+        Such a frame was decoded, or on its way, when the present start was announced. If frames of the former
+        one keep coming, it is the one that lives.
+        """
+        session = self._session
+        return (
+            session is not None
+            and session.last_frame_id < 0
+            and arrival.message.agent_epoch in self._former_epochs
+            and arrival.t_arrival_ns - self._begun_ns < STRAGGLER_NS
+        )
 
     def _arrival_of(self, decoded: DecodedArrival) -> Arrival:
         arrival = decoded.arrival
@@ -303,12 +358,13 @@ class Server:
         former, self._session = self._session, None
         if former is not None:
             logger.info("the agent was started again: a new map is begun")
-            self._end(former, self._folder_for_former())
+            self._end_former(former)
+        self._former_epochs.discard(identity.agent_epoch)
         self._complete = self._nearly_final = False
         if self._settings.reference is not None and self._reference is None:
             self._reference = sequence_reference(self._settings.reference, identity.camera)
-        bundle, self._spare_bundle = self._spare_bundle, None
-        self._session = Session(self._settings, identity, self._settings.out, self._reference, bundle)
+        self._session = self._new_session(identity, goes_on=former is not None)
+        self._begun_ns = time.perf_counter_ns()
         self._drops_before = self._metrics.drops if former is not None else {}
         if former is not None and former.identity.camera != identity.camera:
             self._close_viewer()
@@ -322,6 +378,18 @@ class Server:
             *(self._agent_id, camera.source_name, width, height, camera.codec, self._settings.mode),
         )
         return self._session
+
+    def _new_session(self, identity: StreamIdentity, *, goes_on: bool) -> Session:
+        """Return the session of a stream; a server that ``goes_on`` keeps it in memory if need be."""
+        out = self._settings.out
+        bundle, self._spare_bundle = self._spare_bundle or self._new_bundle(), None
+        try:
+            return Session(self._settings, identity, out, self._reference, bundle)
+        except (OSError, SemcastError) as err:
+            if not goes_on:
+                raise
+            self._tell_not_written(out, err)
+        return Session(self._settings, identity, None, self._reference, self._new_bundle())
 
     def _open_viewer(self, identity: StreamIdentity, resumed: bool) -> None:
         truth = self._reference.truth if self._reference is not None else None
@@ -342,28 +410,41 @@ class Server:
         if out is None:
             return None
         n = 1
-        while (out / f"previous-{n}").exists():
+        while os.path.lexists(out / f"previous-{n}"):  # Path.exists raises where it may not look
             n += 1
         return out / f"previous-{n}"
+
+    def _end_former(self, former: Session) -> None:
+        """Write what the agent's start before leaves behind; that it can't be written ends no stream."""
+        if former.last_frame_id >= 0:
+            self._former_epochs.clear()
+        self._former_epochs.add(former.identity.agent_epoch)
+        folder = self._folder_for_former()
+        try:
+            self._end(former, folder)
+        except (OSError, SemcastError) as err:
+            self._tell_not_written(folder, err)
 
     def _end(self, session: Session, folder: Path | None) -> dict[str, Any]:
         """Write what a stream leaves behind into a folder and release it."""
         try:
             if not self._complete:
                 session.save_checkpoint()
-            summary = session.write_outputs(folder, self._drops(), complete=self._complete)
+            return session.write_outputs(folder, self._drops(), complete=self._complete)
         finally:
             session.close()
-        if folder is not None and folder != self._settings.out:
-            session.move_records(folder)
-        return summary
+            if folder is not None and folder != self._settings.out:
+                session.move_records(folder)
 
     def _finish(self) -> dict[str, Any]:
         """End the present stream; a server that heard of none has an empty summary."""
         session, self._session = self._session, None
         if session is None:
             return {}
-        summary = self._end(session, self._settings.out)
+        try:
+            summary = self._end(session, self._settings.out)
+        except OSError as err:
+            raise SemcastError(_not_written(self._settings.out, err)) from err
         if self._settings.out is not None:
             logger.info("outputs are in %s", self._settings.out)
         return summary
@@ -380,6 +461,10 @@ class Server:
             reference.close()
 
 
+def _not_written(folder: Path | None, err: Exception) -> str:
+    return f"outputs can't be written to {folder}: {err}"
+
+
 def run_server(settings: ServerSettings, stop_event: threading.Event) -> dict[str, Any]:
     """Serve one agent until its source ends, ``stop_event`` is set or a time limit passes.
 
@@ -394,6 +479,7 @@ def run_server(settings: ServerSettings, stop_event: threading.Event) -> dict[st
         TransportError: The port is taken, or no hub was found.
         ConfigError: The viewer can't be started or a codec is unknown.
         SourceError: The reference can't be read.
+        SemcastError: The outputs can't be written.
     """
     network = open_session(settings.network, stop_event)
     if network is None:

@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from dataclasses import dataclass, replace
@@ -117,6 +117,10 @@ class Session:
         folder: Where outputs go, or None.
         reference: Originals and truth, or None.
         bundle: A runner made ahead by ``new_bundle``, which the session closes; None makes one.
+
+    Raises:
+        OSError: The folder can't be made.
+        SemcastError: It can't be written into, or rows in it can't be read.
     """
 
     def __init__(
@@ -131,7 +135,6 @@ class Session:
         self.identity = identity
         self._folder = folder
         self._reference = reference
-        lossless = settings.mode == "replay"
         bundle = bundle if bundle is not None else new_bundle(settings)
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
         self._t_source_ns: dict[int, int] = {}
@@ -140,17 +143,27 @@ class Session:
         self._last_checkpoint_s = time.monotonic()
         self._checkpoints: CheckpointWriter | None = None
         self._images: ImageWriter | None = None
+        self._record = RunRecord(None)
         self.resumed = False
         if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            self.resumed = settings.resume and self._restore(folder / CHECKPOINT_NAME)
-            self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME)
-            if settings.save_images != "none":
-                self._images = ImageWriter(folder, lossless=lossless)
-        self._record = RunRecord(folder, resume=self.resumed)
+            try:
+                self._open(folder)
+            except BaseException:
+                self.close()
+                raise
         self._t_source_ns.update((row.frame_id, row.t_source_ns) for row in self._record.rows())
         #: Poses of a restored map that the viewer has not seen yet.
         self._restored = self._reconstruction.final_trajectory() if self.resumed else {}
+
+    def _open(self, folder: Path) -> None:
+        """Take up what a folder holds of this stream, and begin to write into it."""
+        settings = self._settings
+        folder.mkdir(parents=True, exist_ok=True)
+        self.resumed = settings.resume and self._restore(folder / CHECKPOINT_NAME)
+        self._record = RunRecord(folder, resume=self.resumed)
+        self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME)
+        if settings.save_images != "none":
+            self._images = ImageWriter(folder, lossless=settings.mode == "replay")
 
     @property
     def last_frame_id(self) -> int:
@@ -236,6 +249,7 @@ class Session:
         try:
             return quality.result(timeout=None if self._settings.mode == "replay" else LIVE_PSNR_WAIT_S)
         except FutureTimeoutError:
+            quality.cancel()
             return None
 
     def save_checkpoint(self) -> None:
@@ -267,6 +281,10 @@ class Session:
             folder: Where to, or None to only make the summary.
             drops: Frames that never reached the tracker, by reason.
             complete: The source came to its end, so all its frames count for completeness.
+
+        Raises:
+            OSError: A file can't be written.
+            SemcastError: The rows of the run can't be read back.
         """
         poses, trajectory, num_landmarks = self.write_results(folder)
         truth = self._reference.truth if self._reference is not None else None
@@ -293,7 +311,11 @@ class Session:
         return summary
 
     def write_results(self, folder: Path | None) -> tuple[Mapping[int, Array], Trajectory, int]:
-        """Write trajectory, map and reconstruction; return poses, trajectory and number of landmarks."""
+        """Write trajectory, map and reconstruction; return poses, trajectory and number of landmarks.
+
+        Raises:
+            OSError: A file can't be written.
+        """
         poses = self._reconstruction.final_trajectory()
         trajectory = trajectory_of(poses, self._t_source_ns)
         ids, xyz, rgb, confidence = self._reconstruction.landmarks()
@@ -357,11 +379,16 @@ class Session:
         self._reconstruction.close()
 
 
-def new_bundle(settings: ServerSettings) -> BundleRunner:
-    """Return a runner of bundle adjustments as the settings want it."""
+def new_bundle(settings: ServerSettings, on_give_up: Callable[[str], None] | None = None) -> BundleRunner:
+    """Return a runner of bundle adjustments as the settings want it.
+
+    Args:
+        settings: Of the server.
+        on_give_up: Is told why, when nothing will be adjusted any more.
+    """
     if settings.bundle == "inline":
         return InlineBundle()
-    return ProcessBundle(lossless=settings.mode == "replay")
+    return ProcessBundle(lossless=settings.mode == "replay", on_give_up=on_give_up)
 
 
 def frame_view(

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
@@ -16,8 +17,11 @@ logger = logging.getLogger(__name__)
 #: Longest wait for one adjustment, the start of the process included.
 DEADLINE_S = 30.0
 _CLOSE_DEADLINE_S = 3.0
-#: Starts in a row that lead to no result before the runner gives up for good.
+#: Failures in a row, with no result between them, after which the runner gives up for good.
 _MAX_FAILURES = 5
+GIVEN_UP = (
+    f"the bundle adjustment process failed {_MAX_FAILURES} times in a row: the map is no longer adjusted"
+)
 
 
 def serve(connection: Connection) -> None:
@@ -45,10 +49,12 @@ class ProcessBundle:
     Args:
         lossless: ``take`` always waits for the result, so the same input gives the same map; otherwise it
             returns at once and the result is applied when it is ready.
+        on_give_up: Is told why, once, when the child dies so often that it is not started again.
     """
 
-    def __init__(self, *, lossless: bool = False) -> None:
+    def __init__(self, *, lossless: bool = False, on_give_up: Callable[[str], None] | None = None) -> None:
         self._lossless = lossless
+        self._on_give_up = on_give_up
         self._context = multiprocessing.get_context("spawn")
         self._process: SpawnProcess | None = None
         self._connection: Connection | None = None
@@ -64,8 +70,13 @@ class ProcessBundle:
         return self._pending is not None
 
     @property
+    def given_up(self) -> bool:
+        """The child died too often: nothing is adjusted any more."""
+        return self._failures >= _MAX_FAILURES
+
+    @property
     def pid(self) -> int | None:
-        """Process id of the child."""
+        """Process id of the child, None where there is none any more."""
         return self._process.pid if self._process is not None else None
 
     def _start(self) -> None:
@@ -80,15 +91,26 @@ class ProcessBundle:
 
     def _restart(self) -> None:
         self._failures += 1
+        if self.given_up:
+            self._give_up()
+            return
         self.num_restarts += 1
         logger.warning("the bundle adjustment process ended and is started again")
         self._start()
 
+    def _give_up(self) -> None:
+        self._stop()
+        logger.error("%s", GIVEN_UP)
+        if self._on_give_up is not None:
+            self._on_give_up(GIVEN_UP)
+
     def submit(self, problem: BundleProblem) -> bool:
         """Send a problem to the child; False while it works on another or has failed for good."""
-        if self._closed or self._pending is not None or self._failures >= _MAX_FAILURES:
+        if self._closed or self._pending is not None:
             return False
         for _ in range(2):
+            if self.given_up:
+                return False
             assert self._connection is not None
             try:
                 if self._process is None or not self._process.is_alive():

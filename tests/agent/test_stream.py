@@ -1,6 +1,7 @@
 """Agent, channel and receiver together over loopback, started, slowed down, killed and restarted."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from semcast.agent.source_settings import SourceSettings
 from semcast.channel.emulator import run_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
+from semcast.common.errors import SourceError
 from semcast.common.keys import status_key
 from semcast.common.messages import StatusMessage
 from semcast.common.metrics import Metrics
@@ -277,6 +279,42 @@ def test_a_source_that_fails_ends_the_agent_with_its_error(bench, tmp_path):
     failing = bench._thread(lambda stop: run_agent(settings, stop, bench.codec))
     failing.join(10)
     assert "there is no such folder" in str(failing.error)
+
+
+class AfterTheSource:
+    """Encodes nothing before the source has ended."""
+
+    def __init__(self, codec, until):
+        self.name, self.digest = codec.name, codec.digest
+        self._codec, self._until = codec, until
+
+    def encode(self, image, snr_db):
+        self._until(lambda: all(thread.name != "semcast-capture" for thread in threading.enumerate()))
+        return self._codec.encode(image, snr_db)
+
+
+@pytest.mark.parametrize("mode", ["live", "replay"])
+def test_a_source_that_fails_while_a_frame_is_encoded_is_no_end_of_it(
+    bench, recording, tmp_path, until, mode
+):
+    bench.recording = shutil.copytree(recording, tmp_path / "damaged")
+    for k in range(2, 12):
+        (bench.recording / "images" / f"{k:06d}.png").write_bytes(b"")
+    bench.codec = AfterTheSource(bench.codec, until)
+    statuses = []
+    bench.hub.subscribe(
+        status_key("agent0", "agent"), "every", lambda p: statuses.append(unpack(p, StatusMessage))
+    )
+    bench.channel()
+    receiver = bench.receiver(mode)
+    agent = bench.agent(mode)
+    frames = take(receiver, count=2 if mode == "replay" else 1)
+    agent.join(10)
+    assert isinstance(agent.error, SourceError)
+    assert "000011.png" in str(agent.error)
+    until(lambda: statuses[-1].last_error == str(agent.error))
+    assert statuses[-1].counts["sent"] == 2
+    assert {f.message.frame_id for f in frames} <= {0, 1}
 
 
 def test_an_agent_without_a_hub_can_be_stopped(recording, codec):

@@ -192,6 +192,16 @@ def test_replay_loses_nothing_even_in_a_burst_and_live_counts_what_it_drops(ends
     assert 2 <= sum(f.agent_epoch == 2 for f in e.received) <= carried
 
 
+def test_frames_that_are_sent_again_are_not_taken_for_gaps(ends, make):
+    e = ends()
+    for seq in (0, 1, 2, 3, 1, 2, 4, 5, 8):
+        e.pass_one(make(seq, lossless=True))
+    for seq in (3, 4, 6):
+        e.pass_one(make(seq, epoch=2, lossless=True))
+    e.close()
+    assert e.summary["drops"] == {"missing": 3}, "6 and 7 of the first start, 5 of the second"
+
+
 def test_delay_is_added(ends, make):
     e = ends(delay_ms=150.0)
     started_s = time.monotonic()

@@ -232,6 +232,25 @@ def test_the_recorder_writes_from_its_thread_and_counts(tmp_path):
     assert json.dumps(info.metadata)
 
 
+def test_a_recording_that_is_there_is_kept(tmp_path):
+    path = tmp_path / "run.mcap"
+    for k in range(3):
+        with Recorder(path, HEADER) as recorder:
+            recorder.put("semcast/a/pose", "pose", bytes([k]))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.1.mcap", "run.2.mcap", "run.mcap"]
+    names = ("run.1.mcap", "run.2.mcap", "run.mcap")
+    contents = [[m.data for m in RecordingReader(tmp_path / name).messages()] for name in names]
+    assert contents == [[b"\x00"], [b"\x01"], [b"\x02"]]
+
+
+def test_an_empty_file_is_written_over(tmp_path):
+    path = tmp_path / "run.mcap"
+    path.touch()
+    with Recorder(path, HEADER):
+        pass
+    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+
+
 class SlowStream(io.BytesIO):
     """Waits at the first chunk until it is let go."""
 

@@ -281,6 +281,17 @@ def test_replay_keeps_a_frame_until_the_camera_is_known(ends, make):
     assert e.metrics.drops == {}
 
 
+def test_replay_drops_a_frame_whose_agent_was_restarted_before_its_camera_was_known(ends, make):
+    e = ends("replay")
+    e.put(make(0, lossless=True), make(1, lossless=True))
+    until(lambda: e.receiver._arrivals.arrived_seq == 2)
+    assert e.receiver.next(0.05) is None
+    e.answer_camera(camera(EPOCH + 1, lossless=True))
+    e.put(make(0, epoch=EPOCH + 1, lossless=True))
+    assert e.receiver.next(5).message.agent_epoch == EPOCH + 1
+    assert e.metrics.drops == {"epoch": 2}
+
+
 def test_presence_of_the_others_is_known(ends):
     e = ends()
     e.client.declare_alive("a", "agent")

@@ -1,5 +1,6 @@
 """Image quality against the recorded originals."""
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from semcast.common.recording import recording_metadata
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
 from semcast.common.wire import pack
-from semcast.server.reference import recording_reference, sequence_reference
+from semcast.server.reference import Reference, recording_reference, sequence_reference
 
 CAMERA = CameraInfo(
     agent_id="a",
@@ -53,6 +54,24 @@ def test_a_frame_without_original_has_no_psnr_and_is_reported_once(caplog):
     with caplog.at_level("WARNING"):
         assert [reference.psnr_db(k, image).result(20) for k in (51, 52)] == [None, None]
     assert caplog.text.count("no PSNR") == 1
+    reference.close()
+
+
+def test_only_one_comparison_is_under_way():
+    image, asked, readable = np.zeros((8, 8, 3), np.uint8), [], threading.Event()
+
+    def original(frame_id):
+        asked.append(frame_id)
+        readable.wait(20)
+        return image
+
+    reference = Reference(original)
+    first = reference.psnr_db(0, image)
+    assert [reference.psnr_db(k, image) for k in range(1, 20)] == [None] * 19
+    readable.set()
+    assert first.result(20) == 100.0
+    assert reference.psnr_db(20, image).result(20) == 100.0
+    assert asked == [0, 20]
     reference.close()
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from semcast.common.codec import DecodedImage, EncodedImage
-from semcast.common.errors import CheckpointError, ConfigError, SourceError
+from semcast.common.errors import CheckpointError, ConfigError, SemcastError, SourceError
 from semcast.common.keys import camera_key, control_key, flow_key, pose_key, rx_key
 from semcast.common.messages import (
     CameraInfo,
@@ -29,7 +29,8 @@ from semcast.common.symbol_payload import pack_iq, pack_lost
 from semcast.common.trajectory import read_tum
 from semcast.common.transport import open_client, open_hub
 from semcast.common.wire import pack, unpack
-from semcast.server.export.outputs import read_ply
+from semcast.server.export.outputs import read_ply, write_ply
+from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server
 from semcast.server.settings import ServerSettings, ViewSettings
 from semcast.server.view.choice import keep_former
@@ -170,6 +171,10 @@ class Radio:
             else:
                 self.send(k, **changes)
                 self.wait(lambda k=k: k in self.posed_ids(), f"an answer to frame {k}")
+
+    def ask(self, op):
+        answer = self.session.request(control_key(AGENT, "server"), pack(ControlRequest(op=op)), DEADLINE_S)
+        return unpack(answer, ControlReply)
 
     def close(self):
         self.session.close()
@@ -342,24 +347,137 @@ def test_control_requests_reset_and_save(tmp_path, hub, sequence, pictures):
     radio = Radio(endpoint, sequence, codec, 100)
     radio.stream(range(10))
 
-    def ask(op):
-        answer = radio.session.request(control_key(AGENT, "server"), pack(ControlRequest(op=op)), DEADLINE_S)
-        return unpack(answer, ControlReply)
-
     epoch = radio.poses[-1].map_epoch
-    assert ask("get").settings["mode"] == "live"
-    assert not ask("explode").ok
-    assert ask("save").ok
+    assert radio.ask("get").settings["mode"] == "live"
+    assert not radio.ask("explode").ok
+    assert radio.ask("save").ok
     deadline = time.monotonic() + DEADLINE_S
     while not (tmp_path / "map.ply").exists():
         assert time.monotonic() < deadline
         time.sleep(0.01)
     assert not (tmp_path / "summary.json").exists()
-    assert ask("reset").ok
+    assert radio.ask("reset").ok
     radio.stream(range(10, 14))
     assert radio.poses[-1].map_epoch == epoch + 1
     running.finish(stop=True)
     radio.close()
+
+
+def test_a_save_that_fails_is_answered_and_the_stream_goes_on(
+    tmp_path, hub, sequence, pictures, caplog, monkeypatch
+):
+    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
+    session, endpoint = hub
+    codec = IndexCodec(pictures)
+    (tmp_path / "map.ply").mkdir()
+    running = Running(session, codec, out=tmp_path)
+    radio = Radio(endpoint, sequence, codec, 100)
+    radio.stream([0, 1])
+    reply = radio.ask("save")
+    assert not reply.ok
+    assert reply.error.startswith(f"outputs can't be written to {tmp_path}: ")
+    assert "map.ply" in reply.error
+    assert reply.error in caplog.text
+    assert running.server._metrics.status(100).last_error == reply.error
+    radio.stream([2, 3])
+    with pytest.raises(SemcastError, match="map.ply"):
+        running.finish(stop=True)
+    radio.close()
+
+
+def test_a_former_start_that_cannot_be_written_does_not_stop_the_new_one(
+    tmp_path, hub, sequence, pictures, caplog, monkeypatch
+):
+    def full(path, *rest):
+        if path.parent.name == "previous-1":
+            raise OSError(28, "No space left on device")
+        write_ply(path, *rest)
+
+    monkeypatch.setattr("semcast.server.session.write_ply", full)
+    session, endpoint = hub
+    codec = IndexCodec(pictures)
+    running = Running(session, codec, out=tmp_path)
+    for epoch, num_frames in ((100, 6), (200, 4)):
+        radio = Radio(endpoint, sequence, codec, epoch)
+        radio.stream(range(num_frames))
+        radio.close()
+    assert running.finish(stop=True)["frames"]["tracked"] == 4
+    former = tmp_path / "previous-1"
+    assert f"outputs can't be written to {former}: [Errno 28] No space left on device" in caplog.text
+    assert len((former / "frames.jsonl").read_text().splitlines()) == 6, "what was written is kept"
+    assert len((tmp_path / "frames.jsonl").read_text().splitlines()) == 4
+    assert running.server._metrics.counts["errors"] == 1
+
+
+def test_a_new_start_that_cannot_be_written_is_kept_in_memory(tmp_path, hub, sequence, pictures, caplog):
+    session, endpoint = hub
+    codec = IndexCodec(pictures)
+    running = Running(session, codec, out=tmp_path, bundle="process")
+    first = Radio(endpoint, sequence, codec, 100)
+    first.stream(range(6))
+    first.close()
+    (tmp_path / "frames.jsonl.tmp").mkdir()
+    second = Radio(endpoint, sequence, codec, 200)
+    second.stream(range(4))
+    second.close()
+    assert running.finish(stop=True)["frames"]["tracked"] == 4
+    assert "frames.jsonl can't be written" in caplog.text
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"]["tracked"] == 4
+    assert not (tmp_path / "frames.jsonl").exists()
+
+
+def test_a_late_frame_of_the_former_start_does_not_end_the_new_one(tmp_path, hub, sequence, pictures):
+    session, endpoint = hub
+    codec = IndexCodec(pictures)
+    running = Running(session, codec, out=tmp_path)
+    first = Radio(endpoint, sequence, codec, 100)
+    first.stream(range(4))
+    second = Radio(endpoint, sequence, codec, 200)
+    second.wait(lambda: second.allowed > 0, "the server is ready for the new start")
+    first.send(4)
+    running.wait_for_drop("epoch")
+    second.stream(range(4))
+    summary = running.finish(stop=True)
+    first.close()
+    second.close()
+    assert summary["frames"]["tracked"] == 4
+    assert summary["drops"]["epoch"] == 1
+    assert not (tmp_path / "previous-2").exists()
+
+
+def test_a_former_start_that_goes_on_sending_is_taken_up_again(hub, sequence, pictures, monkeypatch):
+    monkeypatch.setattr("semcast.server.server.STRAGGLER_NS", 0)
+    session, endpoint = hub
+    codec = IndexCodec(pictures)
+    running = Running(session, codec)
+    first = Radio(endpoint, sequence, codec, 100)
+    first.stream(range(4))
+    second = Radio(endpoint, sequence, codec, 200)
+    second.wait(lambda: second.allowed > 0, "the server is ready for the new start")
+    second.close()
+    first.stream(range(4, 8))
+    assert running.finish(stop=True)["frames"]["tracked"] == 4
+    first.close()
+
+
+def test_a_start_with_an_earlier_clock_is_followed_after_a_silence(hub, sequence, pictures, monkeypatch):
+    monkeypatch.setattr("semcast.server.arrival._SILENCE_NS", 0)
+    session, endpoint = hub
+    codec = IndexCodec(pictures)
+    running = Running(session, codec)
+    for epoch, num_frames in ((200, 4), (100, 6)):
+        radio = Radio(endpoint, sequence, codec, epoch)
+        radio.stream(range(num_frames))
+        radio.close()
+    assert running.finish(stop=True)["frames"]["tracked"] == 6
+
+
+def test_a_bundle_adjustment_that_gave_up_is_in_the_status(hub):
+    session, _ = hub
+    running = Running(session, None, bundle="process", duration_s=0.1)
+    running.server._spare_bundle._give_up()
+    assert running.server._metrics.status(0).last_error == GIVEN_UP
+    running.finish()
 
 
 def test_a_server_that_hears_nothing_ends_with_its_time_limit(hub):

@@ -1,0 +1,59 @@
+"""The child process of bundle adjustment when it keeps dying."""
+
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+
+from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.bundle_process import GIVEN_UP, ProcessBundle
+
+#: Nothing of it is looked at: the child is killed before it has read it.
+PROBLEM = BundleProblem(
+    intrinsics=(1.0, 1.0, 0.0, 0.0),
+    keyframe_ids=np.zeros(1, np.int64),
+    T_world_cam=np.eye(4)[None],
+    fixed=np.ones(1, bool),
+    keep_baseline=False,
+    landmark_ids=np.zeros(0, np.int64),
+    xyz=np.zeros((0, 3)),
+    view=np.zeros(0, np.intp),
+    point=np.zeros(0, np.intp),
+    xy=np.zeros((0, 2)),
+    sigma_px=np.zeros(0),
+    confidence=np.zeros(0),
+)
+DEADLINE_S = 30.0
+
+
+def take_what_a_killed_child_left(runner):
+    os.kill(runner.pid, signal.SIGKILL)
+    end_s, tick = time.monotonic() + DEADLINE_S, threading.Event()
+    while runner.busy:
+        assert time.monotonic() < end_s, f"the end of the child was not seen within {DEADLINE_S} s"
+        assert runner.take() is None
+        tick.wait(0.005)
+
+
+def test_a_child_that_keeps_dying_is_given_up_with_one_clear_error(caplog):
+    told = []
+    runner = ProcessBundle(on_give_up=told.append)
+    try:
+        for _ in range(4):
+            assert runner.submit(PROBLEM)
+            take_what_a_killed_child_left(runner)
+        assert not runner.given_up
+        os.kill(runner.pid, signal.SIGKILL)
+        runner._process.join(DEADLINE_S)
+        for _ in range(3):
+            assert not runner.submit(PROBLEM)
+            assert runner.take(wait=True) is None
+        assert runner.given_up
+        assert (runner.pid, runner.busy, runner.num_restarts) == (None, False, 4)
+        assert told == [GIVEN_UP]
+        assert caplog.text.count(GIVEN_UP) == 1
+        assert caplog.text.count("is started again") == 4
+    finally:
+        runner.close()
