@@ -32,6 +32,10 @@ class CompetitorSettings:
     seed: int = 0
 
 
+#: By default OpenCV ignores points more than 50 baselines away when it chooses among the four poses, and with
+#: short baselines finds none at all.
+_ANY_DISTANCE = 1e9
+
 Competitor = Callable[[Array, Array, Intrinsics, CompetitorSettings], Array | None]
 
 
@@ -55,8 +59,9 @@ def _opencv(
         # USAC gives None or an empty matrix when it finds nothing; the 5-point solver may stack solutions.
         if E is None or E.ndim != 2 or E.shape[1] != 3 or len(E) < 3 or not np.isfinite(E).all():
             return None
-        num_good, R_cam1_cam0, t_cam1_cam0, _ = cv2.recoverPose(
-            E[:3], keypoints0_xy, keypoints1_xy, K, mask=None if inliers is None else inliers.copy()
+        mask = None if inliers is None else inliers.copy()
+        num_good, R_cam1_cam0, t_cam1_cam0, _, _ = cv2.recoverPose(
+            E[:3], keypoints0_xy, keypoints1_xy, K, distanceThresh=_ANY_DISTANCE, mask=mask
         )
     except cv2.error:
         return None

@@ -56,6 +56,12 @@ class Cell:
         return None
 
 
+def is_silent(cell: Cell) -> bool:
+    """Whether no pair of images arrived: every method is then 90 degrees off, which compares nothing."""
+    num_pairs = max(int(result["num_pairs"]) for result in cell.values["results"].values())
+    return int(cell.values["num_pairs_lost"]) >= num_pairs
+
+
 def cells_of(reports: Iterable[Mapping[str, Any]]) -> list[Cell]:
     """Return all cells of reports of ``semcast eval pairs``; those without a link are left out."""
     return [
@@ -72,10 +78,12 @@ def pair_summary(reports: Iterable[Mapping[str, Any]]) -> str:
     Args:
         reports: Results of ``semcast eval pairs`` with all modes and competitors.
     """
-    cells = cells_of(reports)
+    every = cells_of(reports)
+    cells = [c for c in every if not is_silent(c)]
     if not cells:
         return ""
     parts = [
+        _left_out(len(every) - len(cells)),
         _against_rival(cells),
         _against_plain(cells),
         _misleading(cells),
@@ -83,6 +91,11 @@ def pair_summary(reports: Iterable[Mapping[str, Any]]) -> str:
         _time(cells),
     ]
     return "\n".join(line for part in parts for line in (*part, ""))
+
+
+def _left_out(num_silent: int) -> Iterator[str]:
+    silent = f" The {num_silent} cells in which no image arrived are left out." if num_silent else ""
+    yield f"A pair of which an image was lost, or for which nothing was found, counts as 90 degrees.{silent}"
 
 
 def _against_rival(cells: Sequence[Cell]) -> Iterator[str]:

@@ -38,3 +38,15 @@ def test_too_few_or_degenerate_matches_give_none_or_a_pose_and_never_raise(name)
     same = np.tile([[100.0, 100.0]], (20, 1))
     pose = COMPETITORS[name](same, same, CAMERA, CompetitorSettings())
     assert pose is None or (pose.shape == (4, 4) and np.isfinite(pose).all())
+
+
+@pytest.mark.parametrize("name", COMPETITORS)
+def test_points_far_away_for_the_baseline_count(name, rng):
+    # Depths of 80 to 200 baselines, as between neighbouring frames.
+    T = make_transform(exp_so3([0.0, 0.002, 0.0]), [0.05, 0.0, 0.0])
+    points_cam0 = rng.uniform([-3, -2, 4], [3, 2, 10], (400, 3))
+    points_cam1 = transform_points(T, points_cam0)
+    pose = COMPETITORS[name](
+        CAMERA.project(points_cam0), CAMERA.project(points_cam1), CAMERA, CompetitorSettings()
+    )
+    assert relative_pose_error(pose, T).tdir_deg < 20.0

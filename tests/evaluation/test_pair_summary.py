@@ -6,7 +6,13 @@ from semcast.evaluation.pair_summary import cells_of, pair_summary
 
 def cell(snr_db, errors_deg, interval=(-1.0, 1.0), **values):
     results = {
-        mode: {"rot_deg_mean": e / 2, "tdir_deg_mean": e, "auc10": 100 - e, "cpu_ms": {"p50": 7.0}}
+        mode: {
+            "rot_deg_mean": e / 2,
+            "tdir_deg_mean": e,
+            "auc10": 100 - e,
+            "cpu_ms": {"p50": 7.0},
+            "num_pairs": 20,
+        }
         for mode, e in errors_deg.items()
     }
     low, high = interval
@@ -16,6 +22,7 @@ def cell(snr_db, errors_deg, interval=(-1.0, 1.0), **values):
         "features": "klt",
         "max_matches": 0,
         "gap": 1,
+        "num_pairs_lost": 3,
         "results": results,
         "auroc": {"epipolar": {"confidence": 0.25}},
         "comparisons": [{**paired, "paired": {"low": low, "high": high}}],
@@ -89,3 +96,10 @@ def test_a_part_of_a_page_is_replaced_and_markers_are_needed():
     with pytest.raises(ValueError, match="<!-- y -->"):
         with_part(page, "y", "new")
     assert list(table(["a"], [["1"]])) == ["| a |", "|---|", "| 1 |"]
+
+
+def test_a_cell_in_which_nothing_arrived_is_left_out_and_said():
+    silent = cell(6.0, dict.fromkeys(ERRORS, 90.0), num_pairs_lost=20)
+    with_it, without = (pair_summary([report(cell(2.0, ERRORS), *more)]) for more in ((silent,), ()))
+    assert "The 1 cells in which no image arrived are left out." in with_it
+    assert with_it.replace(" The 1 cells in which no image arrived are left out.", "") == without
