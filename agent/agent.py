@@ -54,6 +54,7 @@ def camera_info(settings: AgentSettings, source: Source, codec: Codec, agent_epo
         modulation=settings.modulation,
         source_name=source.name[:200],
         num_frames=source.num_frames,
+        last_frame_id=source.last_frame_id,
         lossless=settings.mode == "replay",
     )
 

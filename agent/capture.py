@@ -11,6 +11,10 @@ from semcast.common.metrics import Metrics
 logger = logging.getLogger(__name__)
 
 
+#: How long the end of the thread is waited for: above the time a network camera may take for a read.
+_JOIN_S = 6.0
+
+
 class Capture:
     """Frames of a source, ahead of the encoder.
 
@@ -68,5 +72,7 @@ class Capture:
         """End the thread and free the source. Idempotent."""
         self._stopping.set()
         self._box.close()
-        self._thread.join(5.0)
-        self._source.close()
+        self._thread.join(_JOIN_S)
+        # A camera that hangs in a read can't be freed under it; the end of the process does.
+        if not self._thread.is_alive():
+            self._source.close()

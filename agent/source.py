@@ -58,6 +58,10 @@ class Source(Protocol):
         """Of a finite source whose length is known."""
 
     @property
+    def last_frame_id(self) -> int | None:
+        """Of the last frame, where ``num_frames`` is known."""
+
+    @property
     def rate_hz(self) -> float:
         """Frames per second it aims at; 0 where the receiver sets the pace."""
 
@@ -153,6 +157,11 @@ class RecordedSource:
         return len(self._sequence) if self._settings.repeat == "once" else None
 
     @property
+    def last_frame_id(self) -> int | None:
+        """Of the last frame of the only pass."""
+        return int(self._sequence.frame_ids[-1]) if self._settings.repeat == "once" else None
+
+    @property
     def rate_hz(self) -> float:
         """Usual frames per second at this pace."""
         if self._settings.pace == "receiver":
@@ -205,11 +214,16 @@ class RecordedSource:
         """Nothing to free."""
 
 
+def is_camera_number(text: str) -> bool:
+    """Tell whether this is a number under which OpenCV may know a camera: it takes 32 bits."""
+    return text.isascii() and text.isdecimal() and len(text) < 10
+
+
 def open_source(settings: SourceSettings) -> Source:
     """Open what ``settings.source`` names.
 
-    A number is a camera, something with ``://`` an address, a folder or ``.json`` file a recording, any other
-    file a video.
+    Something with ``://`` is an address, a folder or ``.json`` file a recording, any other file a video. A
+    number is a camera unless a folder or file has that name.
 
     Raises:
         SourceError: It can't be opened, or its camera is unknown.
@@ -217,9 +231,9 @@ def open_source(settings: SourceSettings) -> Source:
     from semcast.agent.video import LiveSource, VideoSource
 
     text = settings.source
-    if text.isdigit() or "://" in text:
-        return LiveSource(settings)
     path = Path(text)
+    if "://" in text or (is_camera_number(text) and not path.exists()):
+        return LiveSource(settings)
     if path.is_file() and path.suffix.lower() != ".json":
         return VideoSource(settings)
     sequence = open_sequence(

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.agent.source import Pacer, SourceFrame
+from semcast.agent.source import Pacer, SourceFrame, is_camera_number
 from semcast.agent.source_settings import SourceSettings
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import HOW_TO_GIVE
@@ -35,7 +35,7 @@ def public_name(source: str) -> str:
 def _open(source: str, live: bool) -> cv2.VideoCapture:
     if not live:
         capture = cv2.VideoCapture(source)
-    elif source.isdigit():
+    elif is_camera_number(source):
         capture = cv2.VideoCapture(int(source))
     else:
         # Without limits a camera that is switched off holds the thread for half a minute.
@@ -144,6 +144,12 @@ class VideoSource(_Captured):
         return count if most is None else min(count, most)
 
     @property
+    def last_frame_id(self) -> int | None:
+        """Of the last frame that will be sent: ids are places in the file."""
+        count = self.num_frames
+        return None if count is None else max(0, count - 1) * self._settings.stride
+
+    @property
     def rate_hz(self) -> float:
         """Frames per second at this pace."""
         if self._settings.pace == "receiver":
@@ -220,6 +226,11 @@ class LiveSource(_Captured):
     def num_frames(self) -> int | None:
         """As many as were asked for, or None: no end."""
         return self._settings.max_frames
+
+    @property
+    def last_frame_id(self) -> int | None:
+        """Not known: a camera's images are counted as they come."""
+        return None
 
     @property
     def rate_hz(self) -> float:

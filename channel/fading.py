@@ -2,7 +2,7 @@
 
 Memory follows Clarke's model: a sum of plane waves from random directions, which makes the gain a plain
 function of time with the autocorrelation ``J0(2 pi doppler_hz tau)``. Nothing is carried from frame to frame,
-so a lost frame or a restarted process does not change the fading that later frames see.
+so a lost frame does not change the fading that later frames see. Time counts from the first frame of a link.
 """
 
 import numpy as np

@@ -1,7 +1,8 @@
 """Channel models by name. A model draws, for one frame, what happens to each of its slots.
 
-Models keep no random state: a frame's draw depends on seed, frame number and time alone, so losing a frame or
-restarting the channel changes nothing about the others.
+Models keep no random state: a frame's draw depends on seed, frame number and time alone, so losing a frame
+changes nothing about the others. Time counts from the first frame of a link: a restarted channel begins its
+SNR trace and its Doppler fading anew.
 """
 
 from collections.abc import Callable

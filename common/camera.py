@@ -4,6 +4,7 @@ Pixel centres have integer coordinates: the image spans ``[-0.5, width - 0.5]``.
 """
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,20 @@ from numpy.typing import ArrayLike, NDArray
 from semcast.common.errors import SourceError
 
 Array = NDArray[np.float64]
+
+#: Coefficients of OpenCV's models that are known here: none, radial-tangential, with k3, rational.
+_DISTORTION_COUNTS = (0, 4, 5, 8)
+_DISTORTION_KEYS = ("distortion", "distortion_coeffs", "distortion_coefficients")
+
+
+def known_distortion(coefficients: Iterable[Any]) -> tuple[float, ...]:
+    """Return coefficients of a file without the trailing zeros of a longer model than was fitted.
+
+    OpenCV writes its rational model as 14 coefficients, of which the last 6 (thin prism, tilt) are zero.
+    """
+    values = tuple(float(value) for value in coefficients)
+    fitting = (n for n in _DISTORTION_COUNTS if n <= len(values) and not any(values[n:]))
+    return values[: next(fitting, len(values))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +69,7 @@ class Intrinsics:
         for name in ("width", "height"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1 pixel, got {getattr(self, name)}")
-        if len(self.distortion) not in (0, 4, 5, 8) or not np.all(np.isfinite(self.distortion)):
+        if len(self.distortion) not in _DISTORTION_COUNTS or not np.all(np.isfinite(self.distortion)):
             raise ValueError(f"distortion must be 0, 4, 5 or 8 finite values, got {self.distortion}")
 
     @property
@@ -112,12 +127,14 @@ class Intrinsics:
     def from_dict(values: dict[str, Any]) -> "Intrinsics":
         """Build from a mapping with fx, fy, cx, cy, width, height and optionally ``distortion``.
 
-        ``distortion_coeffs`` is read as another name of ``distortion``; other keys are notes and ignored.
+        ``distortion_coeffs`` and ``distortion_coefficients`` are read as other names of ``distortion``; other
+        keys are notes and ignored.
 
         Raises:
             SourceError: A key is missing or a value is out of range.
         """
         try:
+            distortion = next((values[key] for key in _DISTORTION_KEYS if values.get(key)), ())
             return Intrinsics(
                 fx=float(values["fx"]),
                 fy=float(values["fy"]),
@@ -125,13 +142,11 @@ class Intrinsics:
                 cy=float(values["cy"]),
                 width=int(values["width"]),
                 height=int(values["height"]),
-                distortion=tuple(
-                    float(k) for k in values.get("distortion") or values.get("distortion_coeffs") or ()
-                ),
+                distortion=known_distortion(distortion),
             )
         except KeyError as err:
             raise SourceError(f"intrinsics need fx fy cx cy width height, missing {err}") from err
-        except (TypeError, ValueError) as err:
+        except (TypeError, ValueError, OverflowError) as err:
             raise SourceError(f"intrinsics are not valid: {err}") from err
 
     @staticmethod
@@ -142,12 +157,15 @@ class Intrinsics:
             SourceError: The file is missing, not JSON, or not valid intrinsics.
         """
         try:
-            values = json.loads(path.read_text(encoding="utf-8"))
+            values = json.loads(path.read_text(encoding="utf-8-sig"))
         except (OSError, ValueError) as err:
             raise SourceError(f"{path} can't be read as intrinsics: {err}") from err
         if not isinstance(values, dict):
             raise SourceError(f"{path} must hold a JSON object, got {type(values).__name__}")
-        return Intrinsics.from_dict(values)
+        try:
+            return Intrinsics.from_dict(values)
+        except SourceError as err:
+            raise SourceError(f"{path}: {err}") from err
 
     def save(self, path: Path) -> None:
         """Write ``intrinsics.json``."""

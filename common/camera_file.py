@@ -1,22 +1,43 @@
-"""Intrinsics from a file: ``intrinsics.json``, or YAML as OpenCV, ROS, EuRoC and ORB-SLAM write it.
+"""Intrinsics from a file: ``intrinsics.json``, or YAML as OpenCV, ROS, EuRoC, Kalibr and ORB-SLAM write it.
 
-Only the part of YAML that calibration files use is read: nested keys and numbers, alone or in ``[...]``
-lists. Principal points keep the file's value: these tools count pixels from their centres, as we do.
+Only the part of YAML that calibration files use is read: nested keys and numbers, alone, in ``[...]`` lists
+or in lists of one ``- number`` a line. A YAML library would not spare us this: what OpenCV writes
+(``%YAML:1.0``, ``!!opencv-matrix``) is not YAML to them. Principal points keep the file's value: these tools
+count pixels from their centres, as we do.
 """
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics
+from semcast.common.camera import Intrinsics, known_distortion
 from semcast.common.errors import SourceError
 
 _LINE = re.compile(r"^(?P<indent> *)(?P<key>[A-Za-z_][\w.\- ]*?) *:(?: +|$)(?P<value>.*)$")
-_PINHOLE_DISTORTION = ("radtan", "radial-tangential", "plumb_bob", "rational_polynomial", "none", "")
+_ITEM = re.compile(r"^(?P<indent> *)(?:- +)+(?P<value>.*)$")
 _SIZE_KEYS = (("image_width", "image_height"), ("Camera.width", "Camera.height"), ("width", "height"))
+_MATRIX_KEYS = ("camera_matrix", "K", "Camera_Matrix", "cameraMatrix")
+_DISTORTION_KEYS = (
+    "distortion_coefficients",
+    "distortion_coeffs",
+    "Distortion_Coefficients",
+    "dist_coeffs",
+    "distCoeffs",
+    "D",
+)
+_LENS_WORDS = ("radtan", "radial-tangential", "plumb_bob", "rational_polynomial", "none")
+#: What keys that name a camera or lens model may say, in small letters.
+_PINHOLE_WORDS = {
+    "distortion_model": _LENS_WORDS,
+    "distortion_type": _LENS_WORDS,
+    "camera_model": ("pinhole", "opencv", "perspective"),
+    "Camera.type": ("pinhole", "rectified"),
+    "fisheye_model": ("0",),
+}
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -29,10 +50,11 @@ def read_intrinsics(path: Path) -> Intrinsics:
         return Intrinsics.load(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise SourceError(f"intrinsics must be a .json, .yaml or .yml file, got {path}")
-    values = read_flat_yaml(path)
+    # Kalibr puts each camera of a rig under its own heading.
+    values = {key.removeprefix("cam0/"): value for key, value in read_flat_yaml(path).items()}
     try:
         return _intrinsics_from_yaml(values)
-    except (KeyError, TypeError, ValueError, IndexError) as err:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as err:
         what = f"{err} is missing" if isinstance(err, KeyError) else str(err)
         raise SourceError(f"{path} holds no usable intrinsics: {what}") from err
 
@@ -40,42 +62,58 @@ def read_intrinsics(path: Path) -> Intrinsics:
 def read_flat_yaml(path: Path) -> dict[str, Any]:
     """Read nested ``key: value`` lines into one mapping with keys joined by ``/``.
 
-    Values are floats, lists of floats, or the bare text. Lists of other lists and anything else that
-    calibration files don't hold is kept as text.
+    Values are floats, lists of floats (lists of lists are strung together), or the bare text: "" for a key
+    that only heads others. Anything else that calibration files don't hold is kept as text.
 
     Raises:
         SourceError: The file can't be read.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        # Some editors put a byte order mark first, which would become part of the first key.
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as err:
         raise SourceError(f"{path} can't be read: {err}") from err
     values: dict[str, Any] = {}
     parents: list[tuple[int, str]] = []
-    pending: str | None = None
-    text = ""
-    for line in lines:
-        line = re.sub(r"(^|\s)#.*$", "", line).rstrip()
-        if pending is not None:
-            text += " " + line.strip()
-        else:
-            match = _LINE.match(line)
-            if match is None:
-                continue
+    for line in _whole_lines(text):
+        item, match = _ITEM.match(line), _LINE.match(line)
+        if item is not None:
+            # Items may stand right under their key, without being set in further.
+            while parents and parents[-1][0] > len(item["indent"]):
+                parents.pop()
+            key = "/".join(name for _, name in parents)
+            values[key] = _with_item(values.get(key), item["value"])
+        elif match is not None:
             indent = len(match["indent"])
             while parents and parents[-1][0] >= indent:
                 parents.pop()
-            pending = "/".join([*(name for _, name in parents), match["key"]])
-            text = re.sub(r"^!!\S+\s*", "", match["value"].strip())
-            if not text:
+            value = re.sub(r"^!!\S+\s*", "", match["value"].strip())
+            values["/".join([*(name for _, name in parents), match["key"]])] = _value(value)
+            if not value:
                 parents.append((indent, match["key"]))
-                pending = None
-                continue
-        if text.count("[") > text.count("]"):
-            continue
-        values[pending] = _value(text)
-        pending = None
     return values
+
+
+def _whole_lines(text: str) -> Iterator[str]:
+    """Yield lines without comments; a ``[...]`` list that goes over several lines comes as one."""
+    whole = ""
+    for line in text.splitlines():
+        line = re.sub(r"(^|\s)#.*$", "", line).rstrip()
+        whole = f"{whole} {line.strip()}" if whole else line
+        if whole.count("[") <= whole.count("]"):
+            yield whole
+            whole = ""
+    if whole:
+        yield whole
+
+
+def _with_item(value: Any, text: str) -> Any:
+    """Return a list with one more item, itself a number or a list; text where an item is neither."""
+    item = _value(text)
+    before = [] if value in (None, "") else value
+    if not isinstance(before, list) or isinstance(item, str):
+        return f"- {text}"
+    return [*before, *(item if isinstance(item, list) else [item])]
 
 
 def _value(text: str) -> Any:
@@ -99,7 +137,7 @@ def transform_from_yaml(values: dict[str, Any], key: str) -> NDArray[np.float64]
         ValueError: It has not 16 numbers.
     """
     numbers = values.get(f"{key}/data", values.get(key))
-    if numbers is None:
+    if numbers in (None, ""):
         return None
     matrix = np.asarray(numbers, dtype=np.float64)
     if matrix.shape != (16,) or not np.isfinite(matrix).all():
@@ -108,44 +146,64 @@ def transform_from_yaml(values: dict[str, Any], key: str) -> NDArray[np.float64]
 
 
 def _intrinsics_from_yaml(values: dict[str, Any]) -> Intrinsics:
-    model = str(values.get("distortion_model", "")).lower()
-    if model not in _PINHOLE_DISTORTION:
-        raise ValueError(f"distortion_model must be radial-tangential, got {model!r}")
+    _check_pinhole(values)
     width, height = _size(values)
     if "Camera.fx" in values or "Camera1.fx" in values:
         prefix = "Camera." if "Camera.fx" in values else "Camera1."
         fx, fy, cx, cy = (float(values[prefix + name]) for name in ("fx", "fy", "cx", "cy"))
-        names = [n for n in ("k1", "k2", "p1", "p2", "k3") if prefix + n in values]
-        distortion = [float(values[prefix + n]) for n in names]
-    elif isinstance(values.get("intrinsics"), list):
-        fx, fy, cx, cy = values["intrinsics"]
-        distortion = values.get("distortion_coefficients", [])
+        distortion = _orbslam_distortion(values, prefix)
+    elif "intrinsics" in values:
+        fx, fy, cx, cy = _numbers(values, ("intrinsics",), 4)
+        distortion = _distortion(values)
     else:
-        K = _first(values, "camera_matrix/data", "K/data", "Camera_Matrix/data", "cameraMatrix/data")
-        fx, cx, fy, cy = K[0], K[2], K[4], K[5]
-        distortion = _first(
-            values,
-            "distortion_coefficients/data",
-            "Distortion_Coefficients/data",
-            "dist_coeffs/data",
-            "distCoeffs/data",
-            "D/data",
-            default=[],
-        )
-    if not any(distortion):
-        distortion = []
+        fx, _, cx, _, fy, cy, *_ = _numbers(values, _MATRIX_KEYS, 9)
+        distortion = _distortion(values)
     return Intrinsics(
-        fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=tuple(float(d) for d in distortion)
+        fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=known_distortion(distortion)
     )
 
 
-def _first(values: dict[str, Any], *keys: str, default: Any = None) -> Any:
-    for key in keys:
-        if isinstance(values.get(key), list):
-            return values[key]
-    if default is None:
-        raise KeyError(keys[0].split("/")[0])
-    return default
+def _check_pinhole(values: dict[str, Any]) -> None:
+    for key, allowed in _PINHOLE_WORDS.items():
+        word = str(values.get(key, "")).lower().removesuffix(".0")
+        if word and word not in allowed:
+            raise ValueError(f"{key} must be a pinhole camera's ({', '.join(allowed)}), got {word!r}")
+
+
+def _list(values: dict[str, Any], keys: tuple[str, ...]) -> list[float] | None:
+    places = (place for key in keys for place in (f"{key}/data", key))
+    return next((values[place] for place in places if isinstance(values.get(place), list)), None)
+
+
+def _numbers(values: dict[str, Any], keys: tuple[str, ...], count: int) -> list[float]:
+    found = _list(values, keys)
+    there = next((key for key in keys if key in values), None)
+    if there is None:
+        raise KeyError(keys[0])
+    if found is None or len(found) != count:
+        got = found or values.get(f"{there}/data", values[there])
+        raise ValueError(f"{there} must be a list of {count} numbers, got {got!r}")
+    return found
+
+
+def _orbslam_distortion(values: dict[str, Any], prefix: str) -> list[float]:
+    # Only its fisheye model has a fourth radial coefficient.
+    if values.get(f"{prefix}k4"):
+        raise ValueError(f"{prefix}k4 must be 0 for a pinhole camera, got {values[f'{prefix}k4']}")
+    return [float(values.get(prefix + name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")]
+
+
+def _distortion(values: dict[str, Any]) -> list[float]:
+    """Return the coefficients; none only where no key speaks of distortion, never for want of reading it."""
+    found = _list(values, _DISTORTION_KEYS)
+    if found is not None:
+        return found
+    for key, value in values.items():
+        is_spoken_of = key in _DISTORTION_KEYS or re.match("dist(?!ance)", key.lower())
+        if is_spoken_of and key not in _PINHOLE_WORDS:
+            known = ", ".join(_DISTORTION_KEYS)
+            raise ValueError(f"{key} must be a list of numbers named {known}, got {value!r}")
+    return []
 
 
 def _size(values: dict[str, Any]) -> tuple[int, int]:

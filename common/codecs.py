@@ -39,6 +39,14 @@ def available_codecs() -> list[str]:
     return [*_shipped_weights(), *_conventional_names()]
 
 
+def _choose_runtime(runtime: Runtime, weights: Path | None) -> Literal["torch", "onnx"]:
+    """Return torch where it is installed, unless the weights are an exported encoder."""
+    if runtime != "auto":
+        return runtime
+    is_exported = weights is not None and weights.suffix == ".onnx"
+    return "torch" if find_spec("torch") is not None and not is_exported else "onnx"
+
+
 def _onnx_encoder(source: str | Path, modulation: Modulation, num_threads: int | None) -> Codec:
     if find_spec("onnxruntime") is None:
         raise ConfigError(
@@ -48,6 +56,36 @@ def _onnx_encoder(source: str | Path, modulation: Modulation, num_threads: int |
     from semcast.common.nets.onnx_encoder import OnnxEncoder
 
     return OnnxEncoder(source, modulation, num_threads)
+
+
+def codec_of_weights(weights: Path, runtime: Runtime = "auto") -> str:
+    """Return the name of the learned codec that weights belong to.
+
+    Raises:
+        ConfigError: The runtime is not installed.
+        CheckpointError: The weights are missing or damaged.
+    """
+    if _choose_runtime(runtime, weights) == "onnx":
+        return _onnx_encoder(weights, "16qam", 1).name
+    from semcast.common.nets.checkpoint import read_manifest, weights_path
+
+    return read_manifest(weights_path(weights)).architecture
+
+
+def _load_learned(
+    source: str | Path,
+    runtime: Literal["torch", "onnx"],
+    modulation: Modulation,
+    num_threads: int | None,
+    device: Literal["auto", "cpu", "cuda"],
+) -> Codec:
+    if runtime == "onnx":
+        if device == "cuda":
+            raise ConfigError("device must be auto or cpu with the onnx runtime, got 'cuda'")
+        return _onnx_encoder(source, modulation, num_threads)
+    from semcast.common.nets.codec import NeuralCodec
+
+    return NeuralCodec.load(source, modulation=modulation, num_threads=num_threads, device=device)
 
 
 def load_codec(
@@ -66,13 +104,13 @@ def load_codec(
         modulation: ``"16qam"`` or ``"analog"``.
         num_threads: CPU threads of a learned codec; None leaves the library's choice.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``, for learned codecs.
-        weights: File to take instead of the shipped weights of a learned codec.
+        weights: File to take instead of the shipped weights of a learned codec; it must be of that codec.
         runtime: What computes a learned codec: ``torch``; ``onnx``, which can only encode; ``auto``: torch
             where it is installed.
 
     Raises:
-        ConfigError: The name or modulation is unknown, weights were given for a codec without any, or the
-            runtime is not installed.
+        ConfigError: The name or modulation is unknown, weights were given for a codec without any or are
+            another codec's, or the runtime or device is not there.
         CheckpointError: The weights are missing or damaged.
     """
     if modulation not in MODULATIONS:
@@ -80,14 +118,10 @@ def load_codec(
         raise ConfigError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}{hint}")
     if name in LEARNED_CODECS or name in _shipped_weights():
         source = name if weights is None else weights
-        if runtime == "auto":
-            is_exported = weights is not None and weights.suffix == ".onnx"
-            runtime = "torch" if find_spec("torch") is not None and not is_exported else "onnx"
-        if runtime == "onnx":
-            return _onnx_encoder(source, modulation, num_threads)
-        from semcast.common.nets.codec import NeuralCodec
-
-        codec: Codec = NeuralCodec.load(source, modulation=modulation, num_threads=num_threads, device=device)
+        chosen = _choose_runtime(runtime, weights)
+        codec = _load_learned(source, chosen, modulation, num_threads, device)
+        if weights is not None and codec.name != name:
+            raise ConfigError(f"codec must be {codec.name!r}, that of the weights {weights}, got {name!r}")
         return codec
     conventional = _conventional_names()
     if name not in conventional:

@@ -1,7 +1,8 @@
 """Settings: frozen dataclasses filled from a TOML file first, then from command-line flags.
 
 A settings class is a frozen, keyword-only dataclass whose fields carry ``metadata={"help": "..."}``. A field
-may itself be such a dataclass: its fields become flags of the same command and a table in the TOML file.
+may itself be such a dataclass: its fields become flags of the same command and a table in the TOML file. The
+file may also name them without the table, by their flag: ``snr_db = 4`` is ``[link]`` with ``snr_db = 4``.
 """
 
 import argparse
@@ -10,13 +11,25 @@ import difflib
 import tomllib
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from semcast.common.errors import ConfigError
 
 S = TypeVar("S")
+
+
+class MissingSettingError(ConfigError):
+    """A setting without a default was not given: wrong usage of a command.
+
+    Attributes:
+        name: Dotted name of the setting, or what the command line calls it.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"{name} is required")
+        self.name = name
 
 
 def near_match(word: str, allowed: list[str]) -> str:
@@ -39,9 +52,17 @@ def _nested(annotation: Any) -> type | None:
     return plain if isinstance(plain, type) and dataclasses.is_dataclass(plain) else None
 
 
+def _fields(cls: type) -> list["dataclasses.Field[Any]"]:
+    return [field for field in dataclasses.fields(cls) if field.init]
+
+
 def _annotations(cls: type) -> dict[str, Any]:
     hints = typing.get_type_hints(cls)
-    return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.init}
+    return {field.name: hints[field.name] for field in _fields(cls)}
+
+
+def _no_table(name: str, value: Any) -> ConfigError:
+    return ConfigError(f"{name} must be a table of settings, got {value!r}")
 
 
 def _check(name: str, value: Any, annotation: Any) -> Any:
@@ -67,29 +88,73 @@ def _check(name: str, value: Any, annotation: Any) -> Any:
         return float(value)
     if plain in (int, bool, str) and type(value) is plain:
         return value
+    if _nested(plain) is not None:
+        if isinstance(value, plain):
+            return value
+        raise _no_table(name, value)
     wanted = getattr(plain, "__name__", str(plain))
     raise ConfigError(f"{name} must be of type {wanted}, got {value!r}")
 
 
-def build_settings(cls: type[S], values: Mapping[str, Any], where: str = "") -> S:
-    """Build a settings object from a mapping, nested mappings for nested settings.
+def check_values(cls: type, values: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """Return the values in the types of the settings; nested settings stay mappings, ranges stay unchecked.
 
     Raises:
-        ConfigError: A key is unknown (with a near match), a value has the wrong type or is out of range.
+        ConfigError: A key is unknown (with a near match) or a value has the wrong type.
     """
     annotations = _annotations(cls)
-    resolved: dict[str, Any] = {}
+    checked: dict[str, Any] = {}
     for key, value in values.items():
         if key not in annotations:
             hint = near_match(key, list(annotations))
             raise ConfigError(f"unknown setting {where + key!r}{hint}")
         nested = _nested(annotations[key])
         if nested is not None and isinstance(value, Mapping):
-            resolved[key] = build_settings(nested, value, f"{where}{key}.")
-        elif nested is not None and isinstance(value, nested):
-            resolved[key] = value
+            checked[key] = check_values(nested, value, f"{where}{key}.")
         else:
-            resolved[key] = _check(where + key, value, annotations[key])
+            checked[key] = _check(where + key, value, annotations[key])
+    return checked
+
+
+def _default_of(field: "dataclasses.Field[Any]") -> Any:
+    """Return the default of a field, ``dataclasses.MISSING`` where there is none."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
+
+
+def _value_in(owner: Any, field: "dataclasses.Field[Any]") -> Any:
+    """Return a field's value in ``owner``, an object of its class, or its default where there is no owner."""
+    return _default_of(field) if owner is dataclasses.MISSING else getattr(owner, field.name)
+
+
+def build_settings(cls: type[S], values: Mapping[str, Any]) -> S:
+    """Build a settings object from a mapping, nested mappings for nested settings.
+
+    Raises:
+        ConfigError: A key is unknown (with a near match), a value has the wrong type or is out of range.
+        MissingSettingError: A value without a default is missing.
+    """
+    return _construct(cls, check_values(cls, values))
+
+
+def _construct(
+    cls: type[S], checked: Mapping[str, Any], where: str = "", default: Any = dataclasses.MISSING
+) -> S:
+    """Build settings from checked values; what was not given is taken from ``default``, if there is one."""
+    annotations = _annotations(cls)
+    resolved: dict[str, Any] = {}
+    for field in _fields(cls):
+        nested = _nested(annotations[field.name])
+        fallback = _value_in(default, field)
+        value = checked.get(field.name, fallback)
+        if value is dataclasses.MISSING:
+            if nested is None:
+                raise MissingSettingError(where + field.name)
+            value = {}
+        if nested is not None and isinstance(value, Mapping):
+            value = _construct(nested, value, f"{where}{field.name}.", fallback)
+        resolved[field.name] = value
     try:
         return cls(**resolved)
     except (TypeError, ValueError) as err:
@@ -120,10 +185,7 @@ def _flag_options(annotation: Any) -> dict[str, Any]:
     return {"type": plain, "metavar": {int: "N", float: "X", Path: "PATH", str: "NAME"}.get(plain, "VALUE")}
 
 
-def _default_text(field: "dataclasses.Field[Any]") -> str:
-    default = field.default
-    if default is dataclasses.MISSING and field.default_factory is not dataclasses.MISSING:
-        default = field.default_factory()
+def _default_text(default: Any) -> str:
     if default is dataclasses.MISSING:
         return " (required)"
     if default is None or default == ():
@@ -133,74 +195,151 @@ def _default_text(field: "dataclasses.Field[Any]") -> str:
     return f" (default {default})"
 
 
-def add_flags(
-    parser: argparse.ArgumentParser, cls: type, skip: frozenset[str] = frozenset(), _prefix: str = ""
-) -> None:
+@dataclasses.dataclass(frozen=True)
+class _Flag:
+    """A setting as the command line takes it."""
+
+    dotted: str
+    field: "dataclasses.Field[Any]"
+    annotation: Any
+    default: Any
+
+    @property
+    def is_positional(self) -> bool:
+        return bool(self.field.metadata.get("positional"))
+
+    @property
+    def name(self) -> str:
+        """What a settings file may call it at its top level."""
+        return str(self.field.metadata.get("flag", self.field.name))
+
+    @property
+    def shown(self) -> str:
+        """What a user types: ``--expect-snr-db``, or ``FILE`` for an argument without a flag."""
+        return self.name.upper() if self.is_positional else "--" + self.name.replace("_", "-")
+
+
+def _flags_of(
+    cls: type, skip: frozenset[str], prefix: str = "", owner: Any = dataclasses.MISSING
+) -> Iterator[_Flag]:
+    """Yield every setting the command line takes; ``owner`` holds the defaults of a nested class."""
+    annotations = _annotations(cls)
+    for field in _fields(cls):
+        dotted = prefix + field.name
+        if dotted in skip:
+            continue
+        nested, default = _nested(annotations[field.name]), _value_in(owner, field)
+        if nested is not None:
+            yield from _flags_of(nested, skip, f"{dotted}.", default)
+        else:
+            yield _Flag(dotted, field, annotations[field.name], default)
+
+
+def add_flags(parser: argparse.ArgumentParser, cls: type, skip: frozenset[str] = frozenset()) -> None:
     """Add one flag per field, nested settings flattened; absent flags leave no value behind.
 
-    A field with ``positional`` in its metadata is an argument without a flag.
+    A field with ``positional`` in its metadata is an argument without a flag; absent, it leaves None.
 
     Args:
         parser: Where the flags go.
         cls: A settings class.
         skip: Dotted field names the command fills itself.
     """
+    for flag in _flags_of(cls, skip):
+        text = (str(flag.field.metadata.get("help", "")) + _default_text(flag.default)).replace("%", "%%")
+        options = _flag_options(flag.annotation)
+        if flag.is_positional:
+            # Optional for argparse, since a settings file may give it; a missing one is missed later. Python
+            # 3.11 would turn SUPPRESS, a string, into a value of the argument's type.
+            options = {"nargs": "?", "metavar": flag.shown, "type": options["type"]}
+            parser.add_argument(flag.dotted, default=None, help=text, **options)
+        else:
+            parser.add_argument(flag.shown, dest=flag.dotted, default=argparse.SUPPRESS, help=text, **options)
+
+
+def _table(values: dict[str, Any], path: Sequence[str]) -> dict[str, Any]:
+    """Return the table at a path, made where it is missing.
+
+    Raises:
+        ConfigError: A plain value stands there.
+    """
+    for depth, name in enumerate(path, start=1):
+        values = values.setdefault(name, {})
+        if not isinstance(values, dict):
+            raise _no_table(".".join(path[:depth]), values)
+    return values
+
+
+def _into_tables(cls: type, given: Mapping[str, Any], skip: frozenset[str]) -> dict[str, Any]:
+    """Move what a file names by its flag into the table of the setting; the rest stays where it is.
+
+    Raises:
+        ConfigError: A name is neither a flag's nor a field's, or one setting has two values.
+    """
     annotations = _annotations(cls)
-    for field in dataclasses.fields(cls):
-        dotted = _prefix + field.name
-        if not field.init or dotted in skip:
-            continue
-        nested = _nested(annotations[field.name])
-        if nested is not None:
-            add_flags(parser, nested, skip, f"{dotted}.")
-            continue
-        text = str(field.metadata.get("help", "")).replace("%", "%%") + _default_text(field).replace(
-            "%", "%%"
-        )
-        if field.metadata.get("positional"):
-            # Optional for argparse, since a settings file may give it; a missing one is missed later.
-            options = {
-                "metavar": field.name.upper(),
-                "nargs": "?",
-                "type": _flag_options(annotations[field.name])["type"],
-            }
-            parser.add_argument(dotted, default=argparse.SUPPRESS, help=text, **options)
-            continue
-        parser.add_argument(
-            "--" + field.metadata.get("flag", field.name).replace("_", "-"),
-            dest=dotted,
-            default=argparse.SUPPRESS,
-            help=text,
-            **_flag_options(annotations[field.name]),
-        )
+    flags = {flag.name: flag.dotted for flag in _flags_of(cls, skip)}
+    values: dict[str, Any] = {}
+    named_by_flag: dict[str, Any] = {}
+    for key, value in given.items():
+        is_table = isinstance(value, Mapping) and _nested(annotations.get(key)) is not None
+        if key in flags and not is_table:
+            named_by_flag[key] = value
+        elif key in annotations:
+            values[key] = value
+        else:
+            raise ConfigError(f"unknown setting {key!r}{near_match(key, [*flags, *annotations])}")
+    for key, value in named_by_flag.items():
+        *tables, name = flags[key].split(".")
+        other = _table(values, tables).setdefault(name, value)
+        if other != value:
+            raise ConfigError(f"{key} and {flags[key]} are one setting, got {value!r} and {other!r}")
+    return values
 
 
-def settings_from(cls: type[S], arguments: argparse.Namespace, config: Path | None = None, **fixed: Any) -> S:
-    """Merge defaults, a TOML file and flags, in this order, into a settings object.
+def given_values(
+    cls: type, arguments: argparse.Namespace, config: Path | None = None, skip: frozenset[str] = frozenset()
+) -> dict[str, Any]:
+    """Merge a TOML file and flags, which win, into the values that were given; defaults are left out.
 
     Args:
         cls: The settings class ``add_flags`` was called with.
-        arguments: What ``parse_args`` returned; names that are no field of ``cls`` are left alone.
-        config: A TOML file, or None.
-        **fixed: Values the command itself sets.
+        arguments: What ``parse_args`` returned; names that are no flag of ``cls`` are left alone.
+        config: A TOML file, or None. It may give a setting in its table, by its flag's name at the top level,
+            or both ways with the same value.
+        skip: As given to ``add_flags``.
+
+    Returns:
+        Checked values as ``build_settings`` takes them, those of nested settings in mappings.
 
     Raises:
-        ConfigError: See ``build_settings`` and ``read_toml``.
+        ConfigError: See ``check_values`` and ``read_toml``; or a file gives one setting two values.
     """
-    values = read_toml(config) if config is not None else {}
-    for dotted, value in vars(arguments).items():
-        *tables, key = dotted.split(".")
-        owner: type | None = cls
-        for table in tables:
-            owner = _nested(_annotations(owner)[table]) if owner and table in _annotations(owner) else None
-        if owner is None or key not in _annotations(owner):
-            continue
-        target = values
-        for table in tables:
-            target = target.setdefault(table, {})
-        target[key] = value
-    values.update(fixed)
-    return build_settings(cls, values)
+    values = {} if config is None else _into_tables(cls, read_toml(config), skip)
+    for flag in _flags_of(cls, skip):
+        value = getattr(arguments, flag.dotted, None)
+        if value is not None:
+            *tables, key = flag.dotted.split(".")
+            _table(values, tables)[key] = value
+    return check_values(cls, values)
+
+
+def settings_from(
+    cls: type[S],
+    arguments: argparse.Namespace,
+    config: Path | None = None,
+    skip: frozenset[str] = frozenset(),
+) -> S:
+    """Merge defaults, a TOML file and flags, in this order, into a settings object; see ``given_values``.
+
+    Raises:
+        ConfigError: See ``given_values`` and ``build_settings``.
+        MissingSettingError: A value without a default was not given; the error names its flag.
+    """
+    try:
+        return build_settings(cls, given_values(cls, arguments, config, skip))
+    except MissingSettingError as err:
+        shown = {flag.dotted: flag.shown for flag in _flags_of(cls, skip)}
+        raise MissingSettingError(shown.get(err.name, err.name)) from err
 
 
 def settings_to_dict(settings: Any) -> dict[str, Any]:

@@ -74,6 +74,7 @@ class CameraInfo:
         modulation: How symbols travel.
         source_name: What the frames come from, for people.
         num_frames: Frames of a finite source, or None.
+        last_frame_id: Of its last frame, or None where that is not known.
         lossless: Replay service (every frame, in order) instead of live (newest wins).
     """
 
@@ -92,6 +93,7 @@ class CameraInfo:
     modulation: Modulation = field(metadata=rule(Choice(MODULATIONS)))
     source_name: str = field(metadata=rule(Text(200)))
     num_frames: int | None = field(metadata=rule(Maybe(WholeNumber())))
+    last_frame_id: int | None = field(default=None, metadata=rule(Maybe(WholeNumber())))
     lossless: bool = field(metadata=rule(Flag()))
 
     @property

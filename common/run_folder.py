@@ -23,6 +23,8 @@ import os
 import queue
 import threading
 import zipfile
+from collections import deque
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -47,6 +49,8 @@ RECONSTRUCTION_NAME = "reconstruction.npz"
 IMAGES_NAME = "images"
 
 FORMAT = 1
+#: Frames that may wait for a map to begin, whose start can make keyframes of them.
+MAX_PROVISIONAL = 300
 MAX_UNPACKED_BYTES = 4 * 1024**3
 _HEADER = "header"
 
@@ -202,11 +206,27 @@ def read_image_paths(folder: Path) -> dict[int, Path]:
     return {int(p.stem): p for p in sorted(images.glob("*.jpg")) if p.stem.isdigit()}
 
 
+@dataclass(frozen=True)
+class _Image:
+    frame_id: int
+    image: NDArray[np.uint8]
+    provisional: bool
+
+
+def remove_outputs(folder: Path) -> None:
+    """Remove what an earlier run left in a folder and a new one would be mixed with; say what can't be."""
+    results = [folder / name for name in (TRAJECTORY_NAME, MAP_NAME, RECONSTRUCTION_NAME, SUMMARY_NAME)]
+    for old in (*results, *read_image_paths(folder).values()):
+        try:
+            old.unlink(missing_ok=True)
+        except OSError as err:
+            logger.warning("%s is of an earlier run and can't be removed: %s", old, err)
+
+
 class ImageWriter:
     """Writes decoded images into ``images/`` on its own thread, so that tracking does not wait for the disk.
 
-    Images of an earlier run in the same folder are removed first. A full disk is reported once; the stream
-    goes on without images.
+    A full disk is reported once; the stream goes on without images.
 
     Args:
         folder: The run folder.
@@ -222,50 +242,80 @@ class ImageWriter:
         self._images = folder / IMAGES_NAME
         self._lossless = lossless
         self._quality = quality
-        self._queue: queue.Queue[tuple[int, NDArray[np.uint8]] | None] = queue.Queue(capacity)
+        self._queue: queue.Queue[_Image | frozenset[int] | None] = queue.Queue(capacity)
         self.num_written = 0
         self.num_dropped = 0
         try:
             self._images.mkdir(parents=True, exist_ok=True)
-            for old in read_image_paths(folder).values():
-                old.unlink()
         except OSError as err:
             raise SourceError(f"{self._images} can't be written: {err}") from err
         self._closed = False
+        self._provisional: deque[int] = deque()
         self._thread = threading.Thread(target=self._run, name="semcast-images", daemon=True)
         self._thread.start()
 
-    def put(self, frame_id: int, image: NDArray[np.uint8]) -> None:
-        """Queue one ``(H, W, 3)`` uint8 RGB image; the caller must not change it afterwards."""
+    def put(self, frame_id: int, image: NDArray[np.uint8], *, provisional: bool = False) -> None:
+        """Queue one image; the caller must not change it afterwards.
+
+        Args:
+            frame_id: Names the file.
+            image: ``(H, W, 3)`` uint8 RGB.
+            provisional: ``settle`` will say whether it is kept; of many only the newest are.
+        """
         if self._closed:
             return
+        item = _Image(frame_id, image, provisional)
         if self._lossless:
-            self._queue.put((frame_id, image))
+            self._queue.put(item)
             return
         try:
-            self._queue.put_nowait((frame_id, image))
+            self._queue.put_nowait(item)
         except queue.Full:
             self.num_dropped += 1
+
+    def settle(self, kept: Collection[int]) -> None:
+        """Remove the provisional images of all other frames."""
+        if not self._closed:
+            self._queue.put(frozenset(kept))
 
     def _run(self) -> None:
         failed = False
         while (item := self._queue.get()) is not None:
-            frame_id, image = item
+            if isinstance(item, frozenset):
+                self._drop_provisional(item)
+                continue
             if failed:
                 self.num_dropped += 1
                 continue
             try:
-                good, data = cv2.imencode(
-                    ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, self._quality]
-                )
-                if not good:
-                    raise OSError("OpenCV could not encode the image")
-                (self._images / image_name(frame_id)).write_bytes(data.tobytes())
-                self.num_written += 1
+                self._write(item)
             except (OSError, cv2.error) as err:
                 failed = True
                 self.num_dropped += 1
                 logger.warning("%s can't be written: %s; the run goes on without images", self._images, err)
+        self._drop_provisional(frozenset())
+
+    def _write(self, item: _Image) -> None:
+        bgr = cv2.cvtColor(item.image, cv2.COLOR_RGB2BGR)
+        good, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])
+        if not good:
+            raise OSError("OpenCV could not encode the image")
+        (self._images / image_name(item.frame_id)).write_bytes(data.tobytes())
+        self.num_written += 1
+        if item.provisional:
+            self._provisional.append(item.frame_id)
+            if len(self._provisional) > MAX_PROVISIONAL:
+                self._remove(self._provisional.popleft())
+
+    def _drop_provisional(self, kept: frozenset[int]) -> None:
+        for frame_id in self._provisional:
+            if frame_id not in kept:
+                self._remove(frame_id)
+        self._provisional.clear()
+
+    def _remove(self, frame_id: int) -> None:
+        with contextlib.suppress(OSError):
+            (self._images / image_name(frame_id)).unlink()
 
     def close(self, deadline_s: float = 30.0) -> None:
         """Write what waits and end the thread. Idempotent."""

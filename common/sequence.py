@@ -11,10 +11,15 @@ from semcast.common.camera_settings import HOW_TO_GIVE, CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.geometry import exp_so3, log_so3, make_transform
 from semcast.common.sequence_layouts import Layout, SequenceFiles, ns_to_seconds, read_layout
+from semcast.common.sequence_sizes import size_in_header_wh
 from semcast.common.trajectory import Trajectory
 
 #: Poses further apart than this many frames are not interpolated between.
 _MAX_GAP_FRAMES = 2.0
+#: The first image that can be read tells the size; so many unreadable ones may come before it.
+_MAX_BAD_AT_START = 9
+#: Resampling and sharpening leave pictures of 0..1 or 0..255 with values above, but hardly by this factor.
+_OVERSHOOT = 2.0
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -33,15 +38,19 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if raw is None:
         raise SourceError(f"{path} is not a readable image (damaged, or of an unknown format)")
-    return as_rgb(raw)
+    try:
+        return as_rgb(raw)
+    except SourceError as err:
+        raise SourceError(f"{path}: {err}") from err
 
 
 def as_rgb(raw: NDArray) -> NDArray[np.uint8]:
-    """Turn what OpenCV reads (grey, BGR or BGRA, 8 or 16 bit) into ``(H, W, 3)`` uint8 RGB."""
-    if raw.dtype == np.uint16:
-        raw = (raw >> 8).astype(np.uint8)
-    elif raw.dtype != np.uint8:
-        raw = np.clip(np.asarray(raw, dtype=np.float64) * 255.0, 0, 255).astype(np.uint8)
+    """Turn what OpenCV reads (grey, BGR or BGRA, of any number type) into ``(H, W, 3)`` uint8 RGB.
+
+    Raises:
+        SourceError: The values are neither those of 0..1 nor of 0..255, nor 16-bit.
+    """
+    raw = _as_bytes(raw)
     if raw.ndim == 2 or raw.shape[2] == 1:
         return np.asarray(cv2.cvtColor(raw, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
     if raw.shape[2] == 4:
@@ -49,6 +58,21 @@ def as_rgb(raw: NDArray) -> NDArray[np.uint8]:
         laid = (raw[:, :, 2::-1].astype(np.uint16) * alpha + 255 * (255 - alpha) + 127) // 255
         return laid.astype(np.uint8)
     return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def _as_bytes(raw: NDArray) -> NDArray[np.uint8]:
+    """Bring values to 0..255; where white is, the type tells for 8 and 16 bit, else the values themselves."""
+    if raw.dtype == np.uint8:
+        return raw
+    if raw.dtype == np.uint16:
+        return (raw >> 8).astype(np.uint8)
+    values = np.asarray(raw, dtype=np.float64)
+    brightest = float(values.max(where=np.isfinite(values), initial=0.0))
+    if brightest > 255.0 * _OVERSHOOT:
+        raise SourceError(f"values must be in 0..1 or 0..255, got up to {brightest:g}")
+    scale = 255.0 if raw.dtype.kind == "f" and brightest <= _OVERSHOOT else 1.0
+    scaled = np.nan_to_num(values * scale, nan=0.0, posinf=255.0, neginf=0.0)
+    return np.rint(np.clip(scaled, 0.0, 255.0)).astype(np.uint8)
 
 
 class ImageRectifier:
@@ -123,6 +147,7 @@ class Sequence:
         self.times_ns: NDArray[np.int64] = files.times_ns[kept]
         self._paths = files.image_paths[kept]
         self._stored_wh = size_wh
+        self._distortion = camera.distortion if camera is not None else ()
         self._size_wh = resized_wh(*size_wh, resize)
         self._camera = camera.undistorted().scaled_to(*self._size_wh) if camera is not None else None
         self._rectify = ImageRectifier(camera, self._size_wh)
@@ -151,6 +176,11 @@ class Sequence:
             raise SourceError(f"the camera of {self.name} is unknown: {HOW_TO_GIVE}")
         return self._camera
 
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """OpenCV coefficients of the images as stored, which ``image`` removes; empty without distortion."""
+        return self._distortion
+
     def image(self, index: int, camera: Intrinsics | None = None) -> NDArray[np.uint8]:
         """Return frame ``index`` as ``(H, W, 3)`` uint8 RGB, undistorted and resized.
 
@@ -160,17 +190,13 @@ class Sequence:
 
         Raises:
             IndexError: There is no such frame.
-            SourceError: The file is missing, damaged or of another size than the first one.
+            SourceError: The file is missing, damaged or of another size than the first readable one.
             ValueError: ``camera`` is not a resized version of this one.
         """
         if not 0 <= index < len(self._paths):
             raise IndexError(f"frame must be in [0, {len(self._paths) - 1}], got {index}")
         raw = read_image(self._paths[index])
-        if (raw.shape[1], raw.shape[0]) != self._stored_wh:
-            raise SourceError(
-                f"{self._paths[index]} is {raw.shape[1]}x{raw.shape[0]}, "
-                f"the first image of the sequence is {self._stored_wh[0]}x{self._stored_wh[1]}"
-            )
+        self._check_size(self._paths[index], (raw.shape[1], raw.shape[0]))
         image = self._rectify(raw)
         if camera is None or (camera.width, camera.height) == self._size_wh:
             return image
@@ -179,6 +205,41 @@ class Sequence:
             if not np.allclose(same.K, camera.K, rtol=0.01, atol=1.0):
                 raise ValueError(f"camera must be {self.name}'s own at another size, {same}, got {camera}")
         return resized(image, (camera.width, camera.height))
+
+    def refused_images(self, most_decoded: int = 100) -> tuple[list[str], int]:
+        """Tell cheaply which images ``image`` would refuse.
+
+        PNG and JPEG files that look whole are believed what they state; others are decoded.
+
+        Args:
+            most_decoded: Decode at most so many.
+
+        Returns:
+            One message for each image refused, and how many images were not looked at.
+        """
+        messages: list[str] = []
+        num_decoded = num_skipped = 0
+        for path in self._paths:
+            size_wh = size_in_header_wh(path)
+            if size_wh is None and num_decoded == most_decoded:
+                num_skipped += 1
+                continue
+            try:
+                if size_wh is None:
+                    num_decoded += 1
+                    height, width = read_image(path).shape[:2]
+                    size_wh = (width, height)
+                self._check_size(path, size_wh)
+            except SourceError as err:
+                messages.append(str(err))
+        return messages, num_skipped
+
+    def _check_size(self, path: Path, size_wh: tuple[int, int]) -> None:
+        if size_wh != self._stored_wh:
+            raise SourceError(
+                f"{path} is {size_wh[0]}x{size_wh[1]}, "
+                f"the first readable image of the sequence is {self._stored_wh[0]}x{self._stored_wh[1]}"
+            )
 
     def groundtruth(self) -> Trajectory | None:
         """Return the true camera poses, None where there are none.
@@ -276,7 +337,7 @@ def open_sequence(
     if not rate_hz > 0:
         raise ValueError(f"rate_hz must be positive, got {rate_hz:g}")
     files = read_layout(Path(path), layout, rate_hz)
-    height, width = read_image(files.image_paths[0]).shape[:2]
+    width, height = _first_size_wh(files.image_paths)
     camera = intrinsics.resolve(width, height) if isinstance(intrinsics, CameraSettings) else intrinsics
     if camera is None:
         camera = files.camera(width, height)
@@ -287,3 +348,17 @@ def open_sequence(
         )
     stop = None if max_frames is None else max_frames * stride
     return Sequence(files, camera, (width, height), resize, slice(None, stop, stride))
+
+
+def _first_size_wh(paths: tuple[Path, ...]) -> tuple[int, int]:
+    """Return the size of the first image that can be read: one damaged file does not spoil the rest."""
+    first_error: SourceError | None = None
+    for path in paths[: _MAX_BAD_AT_START + 1]:
+        try:
+            height, width = read_image(path).shape[:2]
+        except SourceError as err:
+            first_error = first_error or err
+        else:
+            return width, height
+    assert first_error is not None, "a layout has at least one image"
+    raise first_error

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics
+from semcast.common.camera import Intrinsics, known_distortion
 from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transform_from_yaml
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
@@ -25,6 +25,8 @@ Layout = Literal["auto", "native", "tum", "kitti", "euroc", "transforms", "folde
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 _TRANSFORMS_NAMES = ("transforms.json", "transforms_test.json", "transforms_train.json")
 _CALIBRATION_NAMES = ("intrinsics.json", "intrinsics.yaml", "camera.yaml", "calibration.yaml", "sensor.yaml")
+#: Models that undistortion turns into a pinhole; nerfstudio's others are fisheyes and panoramas.
+_PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Calibration published with the TUM RGB-D benchmark (Sturm et al. 2012), which its folders don't hold.
 _TUM_CAMERAS = {
@@ -56,7 +58,9 @@ class SequenceFiles:
 
 def natural_key(name: str) -> list[tuple[int, int | str]]:
     """Sort key by which ``r_2`` comes before ``r_10``."""
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.split(r"(\d+)", name) if part]
+    parts = re.split(r"([0-9]+)", name)
+    # Every second part is what the pattern caught; isdigit would also take signs that int can't read.
+    return [(0, int(part)) if k % 2 else (1, part) for k, part in enumerate(parts) if part]
 
 
 def seconds_to_ns(text: str) -> int:
@@ -82,10 +86,9 @@ def find_layout(path: Path) -> Layout:
     Raises:
         SourceError: There is no such folder, or it holds nothing known.
     """
-    if path.is_file() and path.suffix.lower() == ".json":
+    _check_there(path)
+    if path.is_file():
         return "transforms"
-    if not path.is_dir():
-        raise SourceError(f"no sequence at {path}: there is no such folder")
     if _euroc_camera_folder(path) is not None:
         return "euroc"
     if (path / "rgb.txt").is_file():
@@ -97,7 +100,7 @@ def find_layout(path: Path) -> Layout:
         return "native"
     if has_transforms:
         return "transforms"
-    if _images_in(path):
+    if images_in(path):
         return "folder"
     raise SourceError(
         f"no sequence at {path}: expected images/ (native), rgb.txt (TUM), image_2/ or image_0/ (KITTI), "
@@ -124,8 +127,7 @@ def read_layout(path: Path, layout: Layout, rate_hz: float) -> SequenceFiles:
         "transforms": _read_transforms,
         "folder": _read_folder,
     }
-    if not path.exists():
-        raise SourceError(f"no sequence at {path}: there is no such folder")
+    _check_there(path)
     files = readers[find_layout(path) if layout == "auto" else layout](path, rate_hz)
     if not files.image_paths:
         raise SourceError(f"no images in {path}")
@@ -139,7 +141,23 @@ def read_layout(path: Path, layout: Layout, rate_hz: float) -> SequenceFiles:
     return files
 
 
-def _images_in(folder: Path) -> tuple[Path, ...]:
+def _check_there(path: Path) -> None:
+    if path.is_file():
+        if path.suffix.lower() != ".json":
+            raise SourceError(
+                f"a sequence must be a folder or a transforms .json file, got the file {path}: "
+                f"videos go through 'semcast agent --source {path}'"
+            )
+    elif not path.is_dir():
+        raise SourceError(f"no sequence at {path}: there is no such folder")
+
+
+def images_in(folder: Path) -> tuple[Path, ...]:
+    """Return the image files of a folder in the natural order of their names.
+
+    Raises:
+        SourceError: The folder can't be read.
+    """
     try:
         found = [
             p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")
@@ -185,18 +203,21 @@ def _truth_beside(folder: Path) -> Trajectory | None:
     return read_tum(path) if path.is_file() else None
 
 
+def _times_beside(folder: Path, num_images: int, rate_hz: float) -> NDArray[np.int64]:
+    path = folder / "times.txt"
+    return _read_times_ns(path) if path.is_file() else _nominal_times_ns(num_images, rate_hz)
+
+
 def _read_native(path: Path, rate_hz: float) -> SequenceFiles:
-    images = _images_in(path / "images")
-    times_path = path / "times.txt"
-    times_ns = _read_times_ns(times_path) if times_path.is_file() else _nominal_times_ns(len(images), rate_hz)
-    return SequenceFiles(
-        path.resolve().name, images, times_ns, _calibration_beside(path), _truth_beside(path)
-    )
+    return _with_what_lies_beside(path, images_in(path / "images"), rate_hz)
 
 
 def _read_folder(path: Path, rate_hz: float) -> SequenceFiles:
-    images = _images_in(path)
-    times_ns = _nominal_times_ns(len(images), rate_hz)
+    return _with_what_lies_beside(path, images_in(path), rate_hz)
+
+
+def _with_what_lies_beside(path: Path, images: tuple[Path, ...], rate_hz: float) -> SequenceFiles:
+    times_ns = _times_beside(path, len(images), rate_hz)
     return SequenceFiles(
         path.resolve().name, images, times_ns, _calibration_beside(path), _truth_beside(path)
     )
@@ -237,9 +258,8 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
     camera_idx = _kitti_camera(path)
     if camera_idx is None:
         raise SourceError(f"{path} must have image_2 or image_0 to be a KITTI sequence")
-    images = _images_in(path / f"image_{camera_idx}")
-    times_path = path / "times.txt"
-    times_ns = _read_times_ns(times_path) if times_path.is_file() else _nominal_times_ns(len(images), rate_hz)
+    images = images_in(path / f"image_{camera_idx}")
+    times_ns = _times_beside(path, len(images), rate_hz)
     projection = _kitti_projection(path / "calib.txt", camera_idx)
     name = path.resolve().name
     places = (path / "poses.txt", path / f"{name}.txt", path.resolve().parents[1] / "poses" / f"{name}.txt")
@@ -363,7 +383,12 @@ def _transforms_image(folder: Path, name: str) -> Path:
 
 
 def _transforms_camera(values: dict[str, Any], width: int, height: int) -> Intrinsics | None:
-    """Read the pinhole; these files count pixels from their corners, so principal points move by half."""
+    """Read the pinhole; these files count pixels from their corners, so principal points move by half.
+
+    Raises:
+        ValueError: It is no pinhole, or a value is out of range.
+    """
+    _check_pinhole(values)
     width, height = int(values.get("w", width)), int(values.get("h", height))
     if "fl_x" in values:
         fx = float(values["fl_x"])
@@ -371,8 +396,7 @@ def _transforms_camera(values: dict[str, Any], width: int, height: int) -> Intri
         fx = 0.5 * width / float(np.tan(0.5 * float(values["camera_angle_x"])))
     else:
         return None
-    names = ("k1", "k2", "p1", "p2", "k3") if values.get("k3") else ("k1", "k2", "p1", "p2")
-    distortion = tuple(float(values.get(name, 0.0)) for name in names)
+    distortion = known_distortion(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     return Intrinsics(
         fx=fx,
         fy=float(values.get("fl_y", fx)),
@@ -380,5 +404,14 @@ def _transforms_camera(values: dict[str, Any], width: int, height: int) -> Intri
         cy=float(values.get("cy", height / 2)) - 0.5,
         width=width,
         height=height,
-        distortion=distortion if any(distortion) else (),
+        distortion=distortion,
     )
+
+
+def _check_pinhole(values: dict[str, Any]) -> None:
+    model = values.get("camera_model")
+    if model and str(model).upper() not in _PINHOLE_MODELS:
+        raise ValueError(f"camera_model must be one of {', '.join(_PINHOLE_MODELS)}, got {model!r}")
+    for key in ("is_fisheye", "k4"):
+        if values.get(key):
+            raise ValueError(f"{key} must be absent or 0 for a pinhole camera, got {values[key]!r}")

@@ -57,7 +57,7 @@ def read_tum(path: Path) -> Trajectory:
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as err:
+    except (OSError, UnicodeDecodeError) as err:
         raise SourceError(f"{path} can't be read: {err}") from err
     times: list[float] = []
     poses: list[NDArray[np.float64]] = []

@@ -125,7 +125,9 @@ def read_images(folder: Path, max_images: int | None = None) -> dict[str, NDArra
 def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = None) -> dict[str, Any]:
     """Send every image through every codec at every SNR and measure what arrives.
 
-    A lost frame or an outage counts with the grey picture the receiver shows then, and in ``outage``.
+    A lost frame or an outage counts with the grey picture the receiver shows then, and in ``outage``. The
+    transmitter is told the SNR that is set, as a perfect report of the mean; in ``eval trajectory`` and live
+    it is told what the receiver estimates.
 
     Args:
         settings: What to measure.
@@ -156,11 +158,12 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
     results = []
     for snr_db in settings.snr_db:
         samples: dict[str, list[_Sample]] = {codec.name: [] for codec in codecs}
+        # One link per codec for all images, so that traces and fading go on from image to image; all see the
+        # same noise, which belongs to the image's number.
+        links = {c.name: Link(replace(settings.link, snr_db=snr_db), settings.seed) for c in codecs}
         for k, (name, image) in enumerate(images.items()):
             for codec in codecs:
-                samples[codec.name].append(
-                    _run(codec, image, replace(settings.link, snr_db=snr_db), k, settings)
-                )
+                samples[codec.name].append(_run(codec, image, links[codec.name], k, settings))
             if snr_db == strip_snr_db and len(strip) < _STRIP_IMAGES:
                 strip.append(_strip_row(name, image, {n: s[-1] for n, s in samples.items()}))
         results += [_row(name, snr_db, list(images), rows) for name, rows in samples.items()]
@@ -181,13 +184,9 @@ def _warm_up(codecs: Sequence[Codec], image: NDArray[np.uint8]) -> None:
             codec.decode(received)
 
 
-def _run(
-    codec: Codec, image: NDArray[np.uint8], channel: ChannelSettings, k: int, settings: CodecSettings
-) -> _Sample:
-    # A link of its own per image: traces and fading see the time of the image and not of the run.
-    link = Link(channel, settings.seed)
+def _run(codec: Codec, image: NDArray[np.uint8], link: Link, k: int, settings: CodecSettings) -> _Sample:
     start_ns = time.perf_counter_ns()
-    encoded = codec.encode(to_coded(image, settings.rate), channel.snr_db)
+    encoded = codec.encode(to_coded(image, settings.rate), link.settings.snr_db)
     encode_ms = (time.perf_counter_ns() - start_ns) * 1e-6
     equalised = link.receive(encoded, k * _FRAME_INTERVAL_S, k, perfect_csi=settings.perfect_csi)
     times_ms = {"encode": encode_ms}

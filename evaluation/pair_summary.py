@@ -105,6 +105,7 @@ def _against_rival(cells: Sequence[Cell]) -> Iterator[str]:
     for title, group in _grouped(cells, lambda c: f"{c.title}; {variant_name(c.values)}").items():
         figures = [number(_mean(c.mean(m) for c in group), 1) for m in _METHODS]
         paired = [p for c in group if (p := c.interval("robust", RIVAL)) is not None]
+        paired = [p for p in paired if p["low"] is not None]
         better = sum(p["high"] < 0 for p in paired)
         worse = sum(p["low"] > 0 for p in paired)
         ratio = number(_ratio(group, "robust", RIVAL))

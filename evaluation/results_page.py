@@ -26,7 +26,8 @@ HEAD = """# Results
 
 Written by `make results-page` from `evaluation/results/*.json`; each file holds the command, the seed, the
 commit and the machine. Trajectory errors are after alignment by a similarity, always with completeness (share
-of frames with a pose). PSNR of an outage counts the grey picture the receiver shows then (12.8 dB on Kodak).
+of frames with a pose). In the codec tables PSNR of an outage counts the grey picture the receiver shows then
+(12.8 dB on Kodak); elsewhere PSNR is a mean over the frames that could be decoded.
 What the figures mean and what limits them is in [reading the results](reading-results.md).
 """
 

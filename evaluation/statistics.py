@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 
 #: Resamples of a bootstrap: the 95 % bounds are then steady to a few percent of their width.
 NUM_RESAMPLES = 2000
+#: Samples from which an interval is given.
+MIN_SAMPLES = 5
 
 
 def average_ranks(values: ArrayLike) -> Array:
@@ -121,7 +123,7 @@ class PairedDifference:
 
     Attributes:
         difference: Mean of a minus mean of b.
-        low: Lower bound of the interval of the difference.
+        low: Lower bound of the interval of the difference; None with too few samples for one.
         high: Upper bound.
         ratio: Mean of a over mean of b; None when b's mean is zero.
         ratio_low: Lower bound of the ratio; None when some resample has a zero mean of b.
@@ -130,8 +132,8 @@ class PairedDifference:
     """
 
     difference: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
     ratio: float | None
     ratio_low: float | None
     ratio_high: float | None
@@ -160,7 +162,8 @@ def paired_bootstrap(
         num_resamples: Resamples drawn.
 
     Returns:
-        The difference with its interval, or None for no samples.
+        The difference with its interval (without one below ``MIN_SAMPLES``: resampling one or two values
+        says nothing about the others that could have come), or None for no samples.
 
     Raises:
         ValueError: Shapes differ, a value is not finite, or ``level`` or ``block`` is out of range.
@@ -179,6 +182,10 @@ def paired_bootstrap(
         return None
     x, y = x.reshape(len(x), -1).mean(axis=1), y.reshape(len(y), -1).mean(axis=1)
     num_samples = len(x)
+    difference = float(x.mean() - y.mean())
+    ratio = float(x.mean() / y.mean()) if y.mean() != 0 else None
+    if num_samples < MIN_SAMPLES:
+        return PairedDifference(difference, None, None, ratio, None, None, num_samples)
     block = min(block, num_samples)
     num_blocks = -(-num_samples // block)
     starts = rng.integers(num_samples, size=(num_resamples, num_blocks, 1))
@@ -186,10 +193,9 @@ def paired_bootstrap(
     mean_x, mean_y = x[idx].mean(axis=1), y[idx].mean(axis=1)
     tails = 100 * np.array([(1 - level) / 2, (1 + level) / 2])
     low, high = np.percentile(mean_x - mean_y, tails)
-    ratio = float(x.mean() / y.mean()) if y.mean() != 0 else None
     bounds = np.percentile(mean_x / mean_y, tails) if np.all(mean_y != 0) else (None, None)
     return PairedDifference(
-        difference=float(x.mean() - y.mean()),
+        difference=difference,
         low=float(low),
         high=float(high),
         ratio=ratio,

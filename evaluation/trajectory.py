@@ -134,7 +134,7 @@ def _cell(snr_db: float | None, mode: str, runs: list[dict[str, Any]]) -> dict[s
 
 
 def _comparisons(cells: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]:
-    """Pair each mode with ``off`` over the seeds in which both have an error."""
+    """Pair each mode with ``off`` over the seeds in which both have an error; say how many have not."""
     found = []
     for cell in cells:
         rival = next((c for c in cells if c["snr_db"] == cell["snr_db"] and c["confidence"] == "off"), None)
@@ -153,6 +153,7 @@ def _comparisons(cells: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]
                 "against": "off",
                 "figure": "ate_rmse_m",
                 "paired": paired_bootstrap(ours, theirs, np.random.default_rng(seed)),
+                "num_left_out": len(cell["runs"]) - len(pairs),
             }
         )
     return found

@@ -31,7 +31,7 @@ class Pairing:
         theirs_percent: ``(S,)`` of the one it is compared with.
         ours_posed: Mean share of frames with a pose, over all runs.
         theirs_posed: The same.
-        num_failed: Runs without a trajectory in either mode; they are in no other figure.
+        num_failed: Runs without a trajectory in either mode; their errors are in no other figure.
     """
 
     title: str

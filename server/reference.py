@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
+from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
 from semcast.common.messages import CameraInfo, SourceImage
@@ -67,17 +68,18 @@ class Reference:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
-def sequence_reference(folder: Path, camera: Intrinsics) -> Reference:
+def sequence_reference(folder: Path, camera: Intrinsics, given: CameraSettings | None = None) -> Reference:
     """Compare with the recorded sequence the agent reads.
 
     Args:
         folder: In any layout ``open_sequence`` knows.
         camera: Intrinsics of the decoded images; originals are brought to this camera.
+        given: What the agent was told about the sequence's camera, None or empty: the sequence's own.
 
     Raises:
         SourceError: The folder is no sequence.
     """
-    sequence = open_sequence(folder)
+    sequence = open_sequence(folder, given)
     return Reference(lambda frame_id: sequence.image(frame_id, camera), sequence.groundtruth())
 
 

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
+from semcast.common.camera_settings import CameraSettings
 from semcast.common.codecs import load_codec
-from semcast.common.errors import SourceError
+from semcast.common.config import to_toml
+from semcast.common.errors import SemcastError, SourceError
 from semcast.common.keys import agent_of
 from semcast.common.messages import CameraInfo, SymbolFrame
 from semcast.common.phy.equaliser import equalise
@@ -64,6 +66,9 @@ class ReplaySettings:
             "help": "recorded sequence the agent sent: gives PSNR and ground truth; without it PSNR comes "
             "from originals in the recording (agent --share-source)"
         },
+    )
+    camera: CameraSettings = field(
+        default=CameraSettings(), metadata={"help": "camera of the reference, where it does not say it"}
     )
     pace: float = field(
         default=0.0,
@@ -144,11 +149,11 @@ def replay(
         num_frames=camera.num_frames,
     )
     reference = (
-        sequence_reference(settings.reference, camera.intrinsics)
+        sequence_reference(settings.reference, camera.intrinsics, settings.camera)
         if settings.reference is not None
         else recording_reference(reader, camera)
     )
-    session = Session(server, identity, settings.out, reference)
+    session = Session(server, identity, settings.out, reference, settings_toml=to_toml(settings))
     viewer = open_viewer(server, identity, reference.truth if reference is not None else None)
     stop = stop if stop is not None else threading.Event()
     drops: dict[str, int] = {}
@@ -170,7 +175,10 @@ def replay(
                 on_frame(arrival.message.frame_id)
         if not processed:
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
-        return session.write_outputs(settings.out, drops, complete=True)
+        try:
+            return session.write_outputs(settings.out, drops, complete=True)
+        except OSError as err:
+            raise SemcastError(f"outputs can't be written to {settings.out}: {err}") from err
     finally:
         session.close()
         if viewer is not None:

@@ -44,7 +44,8 @@ CAMERA_TIMEOUT_S = 0.5
 WARM_UP_SHAPE_HW = (256, 384)
 #: How long stragglers are waited for after the source's last frame.
 FINAL_IDLE_S = 0.5
-#: The last frame may be lost on the air: so many frames from the end count as the end once the agent is gone.
+#: The last frame may be lost on the air: so many from the end, or the last fifth, count as the end once the
+#: agent is gone.
 NEARLY_FINAL_FRAMES = 10
 AGENT_GONE_S = 2.0
 #: How long after a restart of the agent its former start's frames may still come: above any channel's delay.
@@ -129,7 +130,7 @@ class Server:
             except OSError as err:
                 raise ConfigError(f"{settings.out} can't be made a folder for outputs: {err}") from err
         if settings.reference is not None:
-            open_sequence(settings.reference)
+            open_sequence(settings.reference, settings.camera)
         self._spare_bundle = self._new_bundle()
         check_viewer(settings)
         if settings.codec is not None:
@@ -288,8 +289,7 @@ class Server:
         if session is None or session.identity.agent_epoch != message.agent_epoch:
             session = self._begin(decoded.arrival.camera)
         self._complete = message.final
-        num_frames = decoded.arrival.camera.num_frames
-        self._nearly_final = num_frames is not None and message.frame_id >= num_frames - NEARLY_FINAL_FRAMES
+        self._nearly_final = _is_nearly_final(message.frame_id, decoded.arrival.camera)
         if decoded.frame is None:
             self._metrics.drop("lost_on_air" if decoded.arrival.received is None else "outage")
             return
@@ -362,7 +362,9 @@ class Server:
         self._former_epochs.discard(identity.agent_epoch)
         self._complete = self._nearly_final = False
         if self._settings.reference is not None and self._reference is None:
-            self._reference = sequence_reference(self._settings.reference, identity.camera)
+            self._reference = sequence_reference(
+                self._settings.reference, identity.camera, self._settings.camera
+            )
         self._session = self._new_session(identity, goes_on=former is not None)
         self._begun_ns = time.perf_counter_ns()
         self._drops_before = self._metrics.drops if former is not None else {}
@@ -459,6 +461,16 @@ class Server:
         reference, self._reference = self._reference, None
         if reference is not None:
             reference.close()
+
+
+def _is_nearly_final(frame_id: int, camera: CameraInfo) -> bool:
+    """Whether a frame is among the last of a finite source, whose ids may count in steps."""
+    if camera.num_frames is None:
+        return False
+    last_id = camera.last_frame_id if camera.last_frame_id is not None else camera.num_frames - 1
+    step = max(1, last_id // max(1, camera.num_frames - 1))
+    nearly = min(NEARLY_FINAL_FRAMES, max(1, camera.num_frames // 5))
+    return frame_id > last_id - nearly * step
 
 
 def _not_written(folder: Path | None, err: Exception) -> str:

@@ -25,6 +25,7 @@ from semcast.common.run_folder import (
     TRAJECTORY_NAME,
     ImageWriter,
     RunData,
+    remove_outputs,
     write_run,
 )
 from semcast.common.trajectory import Trajectory, write_tum
@@ -40,7 +41,7 @@ from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.reconstruction import Reconstruction
-from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
+from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.reference import Reference
 from semcast.server.run_record import FrameRow, RunRecord, summarise
 from semcast.server.settings import ServerSettings
@@ -117,6 +118,7 @@ class Session:
         folder: Where outputs go, or None.
         reference: Originals and truth, or None.
         bundle: A runner made ahead by ``new_bundle``, which the session closes; None makes one.
+        settings_toml: Settings of the program for the run's records; None takes ``settings``.
 
     Raises:
         OSError: The folder can't be made.
@@ -130,8 +132,10 @@ class Session:
         folder: Path | None,
         reference: Reference | None,
         bundle: BundleRunner | None = None,
+        settings_toml: str | None = None,
     ) -> None:
         self._settings = settings
+        self._settings_toml = settings_toml if settings_toml is not None else to_toml(settings)
         self.identity = identity
         self._folder = folder
         self._reference = reference
@@ -160,6 +164,8 @@ class Session:
         settings = self._settings
         folder.mkdir(parents=True, exist_ok=True)
         self.resumed = settings.resume and self._restore(folder / CHECKPOINT_NAME)
+        if not self.resumed:
+            remove_outputs(folder)
         self._record = RunRecord(folder, resume=self.resumed)
         self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME)
         if settings.save_images != "none":
@@ -231,8 +237,7 @@ class Session:
             },
         )
         self._record.add(row)
-        if self._images is not None and (result.is_keyframe or self._settings.save_images == "all"):
-            self._images.put(frame.frame_id, frame.image)
+        self._keep_image(frame, result, update)
         self._map_epoch = result.map_epoch
         if time.monotonic() - self._last_checkpoint_s >= self._settings.checkpoint_interval_s:
             self.save_checkpoint()
@@ -242,6 +247,18 @@ class Session:
             view = replace(view, backfilled=(*restored, *view.backfilled))
             self._restored = {}
         return Outcome(result, update, view)
+
+    def _keep_image(self, frame: DecodedFrame, result: FrameResult, update: MapUpdate | None) -> None:
+        """Keep the decoded image where the settings want it. A start makes keyframes of earlier frames."""
+        if self._images is None:
+            return
+        waits = result.state is TrackingState.INITIALIZING
+        if result.is_keyframe or waits or self._settings.save_images == "all":
+            self._images.put(
+                frame.frame_id, frame.image, provisional=waits and self._settings.save_images == "keyframes"
+            )
+        if result.backfilled and update is not None:
+            self._images.settle(update.keyframe_ids.tolist())
 
     def _await(self, quality: "Future[float | None] | None") -> float | None:
         if quality is None:
@@ -321,7 +338,7 @@ class Session:
         ids, xyz, rgb, confidence = self._reconstruction.landmarks()
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / SETTINGS_NAME).write_text(to_toml(self._settings), encoding="utf-8")
+            (folder / SETTINGS_NAME).write_text(self._settings_toml, encoding="utf-8")
             write_tum(folder / TRAJECTORY_NAME, trajectory)
             write_ply(folder / MAP_NAME, xyz, rgb, confidence)
             self._write_run(folder, poses, ids, xyz, rgb, confidence)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import Modulation
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import HubSettings
@@ -81,6 +82,7 @@ class ServerSettings:
         threads: CPU threads of the decoder.
         device: Where the decoder runs.
         reference: The recorded sequence the agent sends, for PSNR and true path.
+        camera: Of the reference, where it does not say it or the agent uses another.
         bundle: Where bundle adjustment runs: a process of its own, or inline.
         checkpoint_interval_s: How much of the map a killed server may lose.
         resume: Go on with the map in ``out`` when it belongs to the same stream.
@@ -111,6 +113,9 @@ class ServerSettings:
     device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "device of the decoder"})
     reference: Path | None = field(
         default=None, metadata={"help": "recorded sequence the agent sends: gives PSNR and ground truth"}
+    )
+    camera: CameraSettings = field(
+        default=CameraSettings(), metadata={"help": "camera of the reference, where it does not say it"}
     )
     bundle: Literal["process", "inline"] = field(
         default="process", metadata={"help": "bundle adjustment in a process of its own, or between frames"}

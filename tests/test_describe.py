@@ -2,6 +2,7 @@
 
 import io
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,6 +18,12 @@ from semcast.server.run_record import FrameRow, RunRecord
 
 def text_of(path):
     return "\n".join(f"{head}\n" + "\n".join(f"{k}: {v}" for k, v in lines) for head, lines in describe(path))
+
+
+def write_images(folder, count, suffix=".png"):
+    folder.mkdir(exist_ok=True)
+    for k in range(count):
+        cv2.imwrite(str(folder / f"{k}{suffix}"), np.zeros((48, 64, 3), np.uint8))
 
 
 def write_recording(path, cut=0):
@@ -97,17 +104,56 @@ def test_a_run_is_described(run_folder):
 
 
 def test_a_folder_of_photos_says_what_is_missing(tmp_path):
-    for k in range(3):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((48, 64, 3), np.uint8))
+    write_images(tmp_path, 3)
     text = text_of(tmp_path)
     assert "images: 3, 64x48 px" in text
     assert "camera: unknown" in text
     assert "intrinsics.json" in text
 
 
-def test_shipped_weights_are_described():
-    from pathlib import Path
+def test_distortion_of_the_images_as_stored_is_shown(tmp_path):
+    write_images(tmp_path, 2)
+    camera = {"fx": 50, "fy": 50, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48}
+    (tmp_path / "intrinsics.json").write_text(json.dumps({**camera, "distortion": [-0.25, 0.08, 0, 0.0012]}))
+    assert "cy 23.5 px, with distortion -0.25 0.08 0 0.0012" in text_of(tmp_path)
+    (tmp_path / "intrinsics.json").write_text(json.dumps(camera))
+    assert "with distortion" not in text_of(tmp_path)
 
+
+def test_images_that_will_be_refused_are_named(tmp_path, capsys):
+    write_images(tmp_path, 4)
+    cv2.imwrite(str(tmp_path / "2.png"), np.zeros((64, 48, 3), np.uint8))
+    text = text_of(tmp_path)
+    assert "images: 4, 64x48 px" in text
+    assert "refused: 1 of these images" in text
+    assert "2.png is 48x64, the first readable image of the sequence is 64x48" in text
+    for k in range(4, 12):
+        (tmp_path / f"[{k}].jpg").write_bytes(b"broken")
+    assert main(["info", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "9 of these images" in shown
+    assert "/[4].jpg is not a readable image" in "".join(line.strip() for line in shown.splitlines())
+    assert "and 4 more" in shown
+
+
+def test_images_beyond_a_quick_look_are_counted(tmp_path):
+    write_images(tmp_path, 103, suffix=".bmp")
+    text = text_of(tmp_path)
+    assert "not looked at: 3 images" in text
+    assert "refused" not in text
+
+
+def test_a_transforms_file_is_described_like_its_folder(tmp_path):
+    write_images(tmp_path / "test", 2)
+    frames = [{"file_path": f"test/{k}", "transform_matrix": np.eye(4).tolist()} for k in range(2)]
+    document = {"camera_angle_x": 0.8, "frames": frames}
+    (tmp_path / "transforms_test.json").write_text(json.dumps(document))
+    text = text_of(tmp_path / "transforms_test.json")
+    assert "images: 2, 64x48 px" in text
+    assert text.splitlines()[1:] == text_of(tmp_path).splitlines()[1:]
+
+
+def test_shipped_weights_are_described():
     text = text_of(Path("3dcsc-lite"))
     assert "channel uses: 0.0625" in text
     assert "made by" in text
@@ -120,6 +166,13 @@ def test_what_it_does_not_know_is_one_clear_error(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(SemcastError, match="must be a recording"):
         describe(path)
+
+
+def test_what_is_not_there_is_said_to_be_neither_file_nor_folder_nor_codec(tmp_path):
+    with pytest.raises(SemcastError, match="there is no file or folder .*/nowhere: it must be a recording"):
+        describe(tmp_path / "nowhere")
+    with pytest.raises(SemcastError, match="no file, folder or codec nowhere: .*shipped are: .*3dcsc-lite"):
+        describe(Path("nowhere"))
 
 
 def test_plots_of_a_run_with_truth(run_folder, tmp_path, capsys):

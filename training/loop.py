@@ -90,6 +90,7 @@ class Run:
         self.valid_images = read_images(settings.valid)[:_VALID_IMAGES] if settings.valid else []
         self.step, self.elapsed_s = 0, 0.0
         self.agreed_s = 0.0  # elapsed time all processes agree on, since the schedule depends on it
+        self._is_asked_to_stop = self.agreed_stop = False
         checkpoint = self._read_checkpoint()
         if checkpoint is None and settings.grow_from is not None:
             small, manifest = load_transceiver(settings.grow_from)
@@ -273,17 +274,22 @@ class Run:
         self._update_average()
         return logs | {"loss": loss.detach(), "grad_norm": norm.detach()}
 
+    def ask_to_stop(self) -> None:
+        """Stop as soon as all processes know: at once where there is one, else after the next step."""
+        self._is_asked_to_stop = True
+        self.agreed_stop = self.agreed_stop or self.world == 1
+
     def _share_gradients(self) -> None:
         if self.world == 1:
             self.agreed_s = self.elapsed_s
             return
         # Heads have no gradient in some steps, the same ones in every process.
         grads = [p.grad for p in self.model.parameters() if p.grad is not None]
-        clock = torch.tensor([self.elapsed_s], device=self.device)
+        clock = torch.tensor([self.elapsed_s, float(self._is_asked_to_stop)], device=self.device)
         flat = torch.cat([*(g.reshape(-1) for g in grads), clock])
         dist.all_reduce(flat)
         flat /= self.world
-        self.agreed_s = float(flat[-1])
+        self.agreed_s, self.agreed_stop = float(flat[-2]), float(flat[-1]) > 0.0
         start = 0
         for grad in grads:
             grad.copy_(flat[start : start + grad.numel()].view_as(grad))
@@ -336,7 +342,7 @@ def train(
     Args:
         settings: Of the run.
         on_progress: Called every ``log_every`` steps in the first process.
-        should_stop: Asked after every step; with several processes all must answer alike.
+        should_stop: Asked before every step; with several processes the first one to say so stops all.
 
     Raises:
         SourceError: There are no images.
@@ -365,7 +371,11 @@ def _train(
     valid: dict[str, float] = {}
     logger.info("training %s from step %d on %s", settings.architecture, run.step, run.device)
     try:
-        while run.share_done() < 1.0 and not (should_stop is not None and should_stop()):
+        while run.share_done() < 1.0:
+            if should_stop is not None and should_stop():
+                run.ask_to_stop()
+            if run.agreed_stop:
+                break
             start_s = time.perf_counter()
             rows.append(run.one_step())
             run.elapsed_s += time.perf_counter() - start_s

@@ -17,6 +17,7 @@ from semcast.common.codec import (
     ReceivedImage,
     confidence_from_displacement_px,
 )
+from semcast.common.errors import ConfigError
 from semcast.common.nets.checkpoint import Manifest, load_transceiver, weights_path
 from semcast.common.nets.inference import inference_net
 from semcast.common.nets.latent import latent_from_symbols, symbols_from_latent
@@ -24,6 +25,8 @@ from semcast.common.nets.modulation import modulate
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, layout_for
 from semcast.common.shapes import check_shape
+
+Device = Literal["auto", "cpu", "cuda"]
 
 #: No honest equaliser gives larger values; anything above is damage.
 _MAX_SYMBOL = 16.0
@@ -41,6 +44,16 @@ def has_fast_bfloat16() -> bool:
         return False
     probe = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
     return bool(probe()) if probe is not None else False
+
+
+def check_device(device: Device) -> None:
+    """Make sure that a device which is asked for is there.
+
+    Raises:
+        ConfigError: There is no such device.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device must be auto or cpu on this machine, which has no usable GPU, got 'cuda'")
 
 
 class NeuralCodec:
@@ -77,7 +90,7 @@ class NeuralCodec:
         name_or_path: str | Path = "3dcsc-lite",
         modulation: Modulation = "16qam",
         num_threads: int | None = None,
-        device: Literal["auto", "cpu", "cuda"] = "auto",
+        device: Device = "auto",
     ) -> "NeuralCodec":
         """Load shipped weights by name, or any weights file with its manifest beside it.
 
@@ -89,14 +102,14 @@ class NeuralCodec:
 
         Raises:
             CheckpointError: There are no such weights, or they do not fit their manifest.
-            ValueError: The modulation, number of threads or device is not usable.
+            ConfigError: There is no such device.
+            ValueError: The modulation or number of threads is not usable.
         """
         if num_threads is not None:
             if num_threads < 1:
                 raise ValueError(f"num_threads must be >= 1, got {num_threads}")
             torch.set_num_threads(num_threads)
-        if device == "cuda" and not torch.cuda.is_available():
-            raise ValueError("device must be auto or cpu on this machine, got 'cuda'")
+        check_device(device)
         use_cuda = device == "cuda" or (device == "auto" and torch.cuda.is_available())
         model, manifest = load_transceiver(weights_path(name_or_path))
         return cls(model, manifest, modulation, torch.device("cuda" if use_cuda else "cpu"))

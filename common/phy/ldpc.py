@@ -163,7 +163,7 @@ def _update_row(
 
 
 def _failed(belief: NDArray[np.float32], rows: tuple[tuple[tuple[int, int], ...], ...]) -> NDArray[np.bool_]:
-    """Return ``(B,)`` flags of blocks with an unsatisfied check or an undecided bit in a check."""
+    """Return ``(B,)`` flags of blocks with an unsatisfied check; undecided bits read as 0, a CRC decides."""
     hard = (belief < 0).view(np.uint8)
     failed = np.zeros(belief.shape[1:], dtype=np.uint8)
     syndrome = np.empty_like(failed)

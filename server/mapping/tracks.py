@@ -164,8 +164,8 @@ class TrackTable:
         Args:
             oldest_id: Ids from this one on become new by the same sum elsewhere too.
         """
-        known = [self._next_id, *self.ids[:1].tolist()]
-        added = self._next_id - min(known if oldest_id is None else [*known, oldest_id])
+        first_id = int(self.ids[0]) if len(self.ids) else self._next_id
+        added = self._next_id - min(first_id, self._next_id if oldest_id is None else oldest_id)
         self.ids = self.ids + added
         self._next_id += added
         self._before = None

@@ -39,14 +39,13 @@ def open_viewer(
         truth: True path, or None.
         resumed: Keep the ``run.rrd`` that is there under another name.
     """
-    view, out = settings.view.view, settings.out
-    if view == "none":
+    file = settings.out / VIEWER_NAME if settings.out is not None else None
+    if not _is_shown(settings):
+        if file is not None and not resumed:
+            file.unlink(missing_ok=True)  # it would show another run
         return None
-    from semcast.server.view.feed import ViewerFeed, resolve_view
+    from semcast.server.view.feed import ViewerFeed
 
-    if resolve_view(view, has_folder=out is not None) == "none":
-        return None
-    file = out / VIEWER_NAME if out is not None else None
     if file is not None and resumed:
         keep_former(file)
     viewer = ViewerFeed(
@@ -55,6 +54,14 @@ def open_viewer(
     if viewer.url is not None:
         logger.info("viewer: %s", viewer.url)
     return viewer
+
+
+def _is_shown(settings: ServerSettings) -> bool:
+    if settings.view.view == "none":
+        return False
+    from semcast.server.view.feed import resolve_view
+
+    return resolve_view(settings.view.view, has_folder=settings.out is not None) != "none"
 
 
 def keep_former(file: Path) -> None:

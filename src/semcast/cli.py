@@ -12,7 +12,7 @@ import traceback
 from collections.abc import Sequence
 
 from semcast import SemcastError, __version__
-from semcast.common.config import near_match
+from semcast.common.config import MissingSettingError, near_match
 
 #: verb -> (module in semcast.commands, one line of help)
 VERBS: dict[str, tuple[str, str]] = {
@@ -90,6 +90,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = verb_parser(verb).parse_args(words[1:])
         return int(arguments.command(arguments))
+    except MissingSettingError as err:
+        print(f"semcast {verb}: {err}", file=sys.stderr)
+        return EXIT_USAGE
     except SemcastError as err:
         if debug:
             traceback.print_exc()

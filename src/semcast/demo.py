@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from semcast.common.camera_file import read_intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.errors import ConfigError, SemcastError, TransportError
@@ -114,8 +113,7 @@ def role_commands(
     program = [sys.executable, "-m", "semcast"]
     meet = ["--agent-id", AGENT_ID, "--connect", endpoint]
     server = [*program, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
-    if not _changes_pixels(settings.camera):
-        server += ["--reference", str(sequence)]
+    server += ["--reference", str(sequence), *_camera_flags(settings.camera)]
     server += ["--confidence", settings.confidence, "--view", settings.view]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
     server += ["--save-images", settings.save_images]
@@ -130,7 +128,7 @@ def role_commands(
 
 
 def _camera_flags(camera: CameraSettings) -> list[str]:
-    """Return the flags that give the agent the same camera."""
+    """Return the flags that give a process the same camera."""
     words: list[str] = []
     for entry in fields(camera):
         value = getattr(camera, entry.name)
@@ -138,13 +136,6 @@ def _camera_flags(camera: CameraSettings) -> list[str]:
             values = value if isinstance(value, tuple) else (value,)
             words += ["--" + entry.name.replace("_", "-"), *(str(v) for v in values)]
     return words
-
-
-def _changes_pixels(camera: CameraSettings) -> bool:
-    """Tell whether the agent removes distortion: the recorded images still have it and are no reference."""
-    if camera.intrinsics is not None:
-        return bool(read_intrinsics(camera.intrinsics).distortion)
-    return bool(camera.distortion)
 
 
 class Role:
@@ -224,11 +215,11 @@ def run_demo(
     stop: threading.Event,
     tell: Callable[[str], None],
     progress: Callable[[Mapping[str, Any]], None],
-) -> dict[str, Any] | None:
+) -> tuple[dict[str, Any] | None, str | None]:
     """Run the three processes until the server has written its summary, or until ``stop``.
 
-    A process that dies does not end the demo: its command line is told, so that it can be started again by
-    hand, and the stream goes on when it is.
+    A process that is killed does not end the demo: its command line is told, so that it can be started again
+    by hand, and the stream goes on when it is. An agent that gives up does: its source would fail again.
 
     Args:
         settings: What to run.
@@ -237,7 +228,7 @@ def run_demo(
         progress: Takes the newest row of ``frames.jsonl``.
 
     Returns:
-        The server's summary, or None when it never wrote one.
+        The server's summary, or None when it never wrote one, and what ended the run early, or None.
 
     Raises:
         SemcastError: A process could not be started.
@@ -259,7 +250,7 @@ def run_demo(
         network = NetworkSettings(connect=(endpoint,))
         session = open_session(network, stop, START_DEADLINE_S)
         if session is None:
-            return None
+            return None, None
         with session:
             session.watch_alive(AGENT_ID, alive.on_change)
             for name, child in children.items():
@@ -267,7 +258,7 @@ def run_demo(
                     child.start()
                 alive.wait_for(name, child, stop)
                 tell(f"{name} is up: {shlex.join(child.command)}")
-            _watch(settings.out, children, alive, summary_file, stop, tell, progress)
+            error = _watch(settings.out, children, alive, summary_file, stop, tell, progress)
     except TransportError as err:
         if children["server"].returncode is not None:
             raise SemcastError(f"server did not start: {children['server'].last_words()}") from err
@@ -275,7 +266,8 @@ def run_demo(
     finally:
         for name in ("agent", "channel", "server"):
             children[name].stop()
-    return json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
+    summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
+    return summary, error
 
 
 def _watch(
@@ -286,8 +278,8 @@ def _watch(
     stop: threading.Event,
     tell: Callable[[str], None],
     progress: Callable[[Mapping[str, Any]], None],
-) -> None:
-    """Follow the rows the server writes until its summary is there."""
+) -> str | None:
+    """Follow the rows the server writes until its summary is there; tell what made the agent give up."""
     rows = out / "frames.jsonl"
     read_bytes = 0
     page: str | None = None
@@ -298,6 +290,8 @@ def _watch(
             code = child.returncode
             if code and not child.told:
                 child.told = True
+                if child.name == "agent" and code > 0:
+                    return child.last_words()
                 how = (
                     f"was killed by signal {-code}"
                     if code < 0
@@ -316,3 +310,4 @@ def _watch(
                 progress(json.loads(line))
         with alive.changed:
             alive.changed.wait(0.1)
+    return None

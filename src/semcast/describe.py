@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from semcast.common.errors import SemcastError, SourceError
+from semcast.common.errors import CheckpointError, SemcastError, SourceError
 from semcast.common.recording_reader import RECORDING_METADATA, RecordingReader
 from semcast.common.run_folder import (
     FRAMES_NAME,
@@ -28,8 +28,8 @@ def describe(path: Path) -> list[Section]:
     """Say what a path holds.
 
     Args:
-        path: A recording (``.mcap``), a run folder, a sequence folder, or weights (``.safetensors`` or a
-            shipped name such as ``3dcsc-lite``).
+        path: A recording (``.mcap``), a run folder, a sequence folder, a transforms ``.json`` file, or
+            weights (``.safetensors`` or a shipped name such as ``3dcsc-lite``).
 
     Raises:
         SemcastError: It is none of these, or damaged.
@@ -40,16 +40,23 @@ def describe(path: Path) -> list[Section]:
         return describe_sequence(path)
     if path.suffix == ".mcap":
         return describe_recording(path)
-    if path.suffix in (".safetensors", "") and (path.suffix or not path.exists()):
+    if path.suffix == ".safetensors" or _is_bare_name(path):
         return describe_weights(path)
     if path.is_file():
+        if path.suffix.lower() == ".json":
+            return describe_sequence(path)
         with path.open("rb") as file:
             if file.read(5) == b"\x89MCAP":
                 return describe_recording(path)
+    got = f"{path} is another kind of file" if path.exists() else f"there is no file or folder {path}"
     raise SourceError(
-        f"{path} must be a recording (.mcap), a folder that --out wrote, a sequence folder, or weights "
-        f"(.safetensors), got {'another kind of file' if path.exists() else 'nothing at that path'}"
+        f"{got}: it must be a recording (.mcap), a folder that --out wrote, a sequence folder or transforms "
+        ".json, or weights (.safetensors or a shipped name)"
     )
+
+
+def _is_bare_name(path: Path) -> bool:
+    return not path.suffix and len(path.parts) == 1 and not path.exists()
 
 
 def describe_recording(path: Path) -> list[Section]:
@@ -139,13 +146,15 @@ def describe_sequence(path: Path) -> list[Section]:
 
     sequence = open_sequence(path)
     facts = [("images", f"{len(sequence)}, {sequence.size_wh[0]}x{sequence.size_wh[1]} px")]
+    facts += _refused(*sequence.refused_images())
     times_s = sequence.times_ns * 1e-9
     if len(times_s) > 1:
         rate_hz = (len(times_s) - 1) / (times_s[-1] - times_s[0])
         facts.append(("time", f"{times_s[-1] - times_s[0]:.1f} s, {rate_hz:.1f} images a second"))
     try:
         camera = sequence.intrinsics
-        distortion = ", with distortion" if camera.distortion else ""
+        coefficients = " ".join(f"{k:.4g}" for k in sequence.distortion)
+        distortion = f", with distortion {coefficients}" if coefficients else ""
         facts.append(
             (
                 "camera",
@@ -159,11 +168,26 @@ def describe_sequence(path: Path) -> list[Section]:
     return [(f"sequence {path}", facts)]
 
 
+def _refused(messages: list[str], num_skipped: int, most: int = 5) -> list[tuple[str, str]]:
+    """List images that can't be used, the first few by name."""
+    facts = [("", message) for message in messages[:most]]
+    if len(messages) > most:
+        facts.append(("", f"and {len(messages) - most} more"))
+    if messages:
+        facts.insert(0, ("refused", f"{len(messages)} of these images"))
+    if num_skipped:
+        facts.append(("not looked at", f"{num_skipped} images, to be quick"))
+    return facts
+
+
 def describe_weights(path: Path) -> list[Section]:
     """Say what weights are, how they were made and what they reached."""
     from semcast.common.nets.checkpoint import read_manifest, weights_path
 
-    file = weights_path(path if path.suffix else str(path))
+    try:
+        file = weights_path(path if path.suffix else str(path))
+    except CheckpointError as err:
+        raise SourceError(f"there is no file, folder or codec {path}: {err}") from err
     manifest = read_manifest(file)
     low_db, high_db = manifest.snr_range_db
     facts = [

@@ -106,6 +106,28 @@ def test_rendered_pictures_give_the_camera_they_were_rendered_with(tmp_path, pic
     assert cv2.imread(str(out.with_suffix(".png"))).shape == (360, 960, 3)
 
 
+def turned_by_note(jpeg, orientation):
+    """Put an EXIF note before a JPEG's content that says how to turn it for people."""
+    entry = b"II*\0\x08\0\0\0\x01\0" + b"\x12\x01\x03\0\x01\0\0\0" + bytes([orientation, 0, 0, 0]) + bytes(4)
+    note = b"Exif\0\0" + entry
+    return jpeg[:2] + b"\xff\xe1" + (2 + len(note)).to_bytes(2, "big") + note + jpeg[2:]
+
+
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_pictures_are_calibrated_as_stored_however_their_notes_turn_them(
+    tmp_path, pictures, orientation, capsys
+):
+    for k, picture in enumerate(pictures):
+        jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+        (tmp_path / f"{k:02d}.jpg").write_bytes(turned_by_note(jpeg, orientation))
+    assert cv2.imread(str(tmp_path / "00.jpg"))[0, 0, 0] == pictures[0][-1, -1, 0], "the note is understood"
+    out = tmp_path / "intrinsics.json"
+    assert main(["calibrate", str(tmp_path), "--distortion", "radtan4", "--out", str(out)]) == 0
+    found = Intrinsics.load(out)
+    assert (found.width, found.height) == (480, 360)
+    assert [found.cx, found.cy] == pytest.approx([TRUE.cx, TRUE.cy], abs=1.5)
+
+
 def test_exact_corners_give_the_exact_camera_and_no_error():
     result = calibrate(exact_views(), BOARD, (480, 360), "radtan4")
     assert result.rms_px < 1e-3
@@ -177,7 +199,8 @@ def test_too_few_views_are_an_error():
         (["{}"], "there is no picture"),
         (["{}/blank"], "count inner"),
         (["{}/mixed"], "one camera"),
-        (["{}/broken"], "can't be read"),
+        (["{}/broken"], "a.jpg is not a readable image"),
+        (["{}/blank", "--picture", "{}/p.json"], "picture must be an image file (.png"),
         (["--camera", "{}/no.mp4"], "can't be opened"),
     ],
 )
@@ -195,6 +218,14 @@ def test_mistakes_are_one_clear_line(tmp_path, capsys, words, message):
     assert main(["calibrate", *words, *out]) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out.json").exists()
+
+
+@pytest.mark.parametrize("name", ["x.png", "x.yaml", "x"])
+def test_a_result_is_not_written_to_a_file_of_another_kind(tmp_path, capsys, name):
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((60, 80, 3), 200, dtype=np.uint8))
+    assert main(["calibrate", str(tmp_path / "0.png"), "--out", str(tmp_path / name)]) == 1
+    assert f"out must be a .json file, got {tmp_path / name}" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["0.png"]
 
 
 def test_a_video_of_the_board_stands_for_a_live_camera(tmp_path, pictures, capsys):

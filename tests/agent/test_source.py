@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from semcast.agent.source import MAX_BAD_IN_A_ROW, Pacer, open_source, playback_order
+from semcast.agent.source import MAX_BAD_IN_A_ROW, Pacer, is_camera_number, open_source, playback_order
 from semcast.agent.source_settings import SourceSettings
 from semcast.agent.video import public_name
 from semcast.common.camera_settings import CameraSettings
@@ -125,6 +125,15 @@ def test_a_damaged_image_is_left_out_and_many_end_the_source(recording, tmp_path
         play(fast(folder))
 
 
+def test_a_damaged_first_image_is_left_out_like_any_other(recording, tmp_path, caplog):
+    folder = tmp_path / "damaged"
+    shutil.copytree(recording, folder)
+    (folder / "images" / "000000.png").write_bytes(b"broken")
+    _, frames = play(fast(folder))
+    assert [f.frame_id for f in frames] == list(range(1, 12))
+    assert "frame 0 is left out" in caplog.text
+
+
 def test_a_video_file_is_played(video):
     source, frames = play(fast(video, camera=PINHOLE, stride=2))
     assert [f.frame_id for f in frames] == [0, 2, 4, 6, 8]
@@ -159,6 +168,9 @@ def test_a_video_needs_a_camera_that_fits(video, tmp_path):
     )
     with pytest.raises(SourceError, match="intrinsics are for 640x480 images, .* gives 64x48"):
         open_source(fast(beside))
+    (tmp_path / "steps.json").write_text('{"title": "a film"}')
+    with pytest.raises(SourceError, match="steps.json: intrinsics need .*, missing 'fx'"):
+        open_source(fast(beside))
 
 
 def test_what_can_not_be_opened_is_said(tmp_path):
@@ -167,6 +179,21 @@ def test_what_can_not_be_opened_is_said(tmp_path):
         open_source(fast(tmp_path / "notes.txt", camera=PINHOLE))
     with pytest.raises(SourceError, match="there is no such folder"):
         open_source(fast(tmp_path / "nowhere"))
+
+
+def test_a_number_is_a_camera_unless_something_has_that_name(recording, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(recording, "2024")
+    assert open_source(fast("2024")).name == "2024"
+    with pytest.raises(SourceError, match="camera 2025 can't be opened"):
+        open_source(fast("2025", camera=PINHOLE))
+
+
+@pytest.mark.parametrize("text", ["2²", "²", "٣", "20240101123000"])
+def test_what_only_looks_like_a_camera_number_is_a_folder(text):
+    assert not is_camera_number(text)
+    with pytest.raises(SourceError, match=f"no sequence at {text}: there is no such folder"):
+        open_source(fast(text))
 
 
 def test_an_address_is_shown_without_its_password():

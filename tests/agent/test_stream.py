@@ -312,7 +312,7 @@ def test_a_source_that_fails_while_a_frame_is_encoded_is_no_end_of_it(
     agent.join(10)
     assert isinstance(agent.error, SourceError)
     assert "000011.png" in str(agent.error)
-    until(lambda: statuses[-1].last_error == str(agent.error))
+    until(lambda: bool(statuses) and statuses[-1].last_error == str(agent.error))
     assert statuses[-1].counts["sent"] == 2
     assert {f.message.frame_id for f in frames} <= {0, 1}
 

@@ -58,6 +58,17 @@ def test_a_frame_is_the_same_after_lost_frames_and_restarts(channel, slots):
     assert not np.array_equal(Link(settings, 6).transmit(slots, 0.0, 0).slots_rx, frames[0].slots_rx)
 
 
+def test_fading_with_doppler_is_the_same_after_lost_frames_and_starts_with_the_link(slots):
+    settings = ChannelSettings(channel="rayleigh", doppler_hz=20.0)
+    whole, gaps, late = (Link(settings, 5) for _ in range(3))
+    gains = [whole.transmit(slots, 0.1 * k, k).truth.h for k in range(4)]
+    gaps.transmit(slots, 0.0, 0)
+    np.testing.assert_array_equal(gaps.transmit(slots, 0.1 * 3, 3).truth.h, gains[3])
+    assert np.abs(gains[3] - gains[0]).max() > 0.1
+    # A link that comes in later counts time from there.
+    np.testing.assert_allclose(np.abs(late.transmit(slots, 0.1 * 3, 3).truth.h), np.abs(gains[0]), rtol=1e-5)
+
+
 def test_rayleigh_gains_are_what_the_receiver_estimates(slots, encoded):
     link = Link(ChannelSettings(channel="rayleigh", snr_db=25.0), 2)
     truth = link.transmit(slots, 0.0, 0).truth

@@ -57,7 +57,36 @@ def test_bad_values_are_named(tmp_path, change, message):
 
 def test_a_missing_key_or_file_is_named(tmp_path):
     (tmp_path / "i.json").write_text('{"fx": 1}')
-    with pytest.raises(SourceError, match="missing 'fy'"):
+    with pytest.raises(SourceError, match="i.json: intrinsics need fx .*, missing 'fy'"):
         Intrinsics.load(tmp_path / "i.json")
     with pytest.raises(SourceError, match="can't be read"):
         Intrinsics.load(tmp_path / "none.json")
+
+
+RATIONAL = [0.1, -0.2, 0.001, 0.002, 0.3, 0.4, 0.5, 0.6]
+
+
+@pytest.mark.parametrize(
+    ("written", "kept"),
+    [
+        ([*RATIONAL, *[0.0] * 6], 8),
+        ([*RATIONAL, *[0.0] * 4], 8),
+        ([*RATIONAL[:5], 0.0, 0.0, 0.0], 5),
+        ([0.1, -0.2, 0.0, 0.0, 0.0], 4),
+        ([0.0] * 5, 0),
+    ],
+)
+@pytest.mark.parametrize("key", ["distortion", "distortion_coeffs", "distortion_coefficients"])
+def test_zeros_of_a_longer_distortion_model_are_left_off(written, kept, key):
+    values = {name: value for name, value in CAMERA.to_dict().items() if name != "distortion"}
+    assert Intrinsics.from_dict({**values, key: written}).distortion == tuple(written[:kept])
+
+
+def test_a_longer_distortion_model_that_is_used_is_refused():
+    with pytest.raises(SourceError, match="distortion must be 0, 4, 5 or 8 finite values"):
+        Intrinsics.from_dict({**CAMERA.to_dict(), "distortion": [*RATIONAL, 0.0, 0.0, 0.01, 0.0]})
+
+
+def test_a_byte_order_mark_does_not_matter(tmp_path):
+    (tmp_path / "i.json").write_text(json.dumps(CAMERA.to_dict()), encoding="utf-8-sig")
+    assert Intrinsics.load(tmp_path / "i.json") == CAMERA

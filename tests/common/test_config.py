@@ -1,5 +1,6 @@
 import argparse
 import dataclasses
+import re
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,7 +8,14 @@ from typing import Literal
 
 import pytest
 
-from semcast.common.config import add_flags, build_settings, settings_from, to_toml
+from semcast.common.config import (
+    MissingSettingError,
+    add_flags,
+    build_settings,
+    given_values,
+    settings_from,
+    to_toml,
+)
 from semcast.common.errors import ConfigError
 
 
@@ -31,10 +39,54 @@ class Node:
     radio: Radio = Radio()
 
 
-def parse(argv, config=None, **fixed):
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    fx: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    camera: str = field(metadata={"help": "number of the camera"})
+    lens: Lens = Lens()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Antenna:
+    band: Literal["low", "high"] = field(default="low", metadata={"flag": "radio_band"})
+    gain_db: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sender:
+    file: Path = field(default=Path("run.mcap"), metadata={"positional": True})
+    camera: Camera
+    antenna: Antenna = Antenna(band="high")
+    snr_db: float = field(default=1.0, metadata={"flag": "expect_snr_db"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reader:
+    file: Path = field(metadata={"positional": True})
+
+
+def arguments_of(cls, argv):
     parser = argparse.ArgumentParser()
-    add_flags(parser, Node)
-    return settings_from(Node, parser.parse_args(argv), config, **fixed)
+    add_flags(parser, cls)
+    return parser.parse_args(argv)
+
+
+def parse(argv, config=None, cls=Node):
+    return settings_from(cls, arguments_of(cls, argv), config)
+
+
+@pytest.fixture
+def toml(tmp_path):
+    def write(text):
+        path = tmp_path / "settings.toml"
+        path.write_text(text)
+        return path
+
+    return write
 
 
 def test_flags_win_over_the_file_and_the_file_over_defaults(tmp_path):
@@ -87,3 +139,96 @@ def test_help_lists_every_field(capsys):
     for name in [f.name for f in dataclasses.fields(Node) if f.name != "radio"] + ["snr_db"]:
         assert "--" + name.replace("_", "-") in text
     assert "20 % is" in text
+
+
+def test_an_argument_that_is_not_given_leaves_default_and_file_alone(toml):
+    sender = ["--camera", "0"]
+    assert parse(sender, cls=Sender).file == Path("run.mcap")
+    assert parse(sender, toml('file = "mine.mcap"'), cls=Sender).file == Path("mine.mcap")
+    assert parse([*sender, "given.mcap"], toml('file = "mine.mcap"'), cls=Sender).file == Path("given.mcap")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'camera = "2"\nfx = 7.0\nexpect_snr_db = 3\nradio_band = "low"',
+        'snr_db = 3\n[camera]\ncamera = "2"\n[camera.lens]\nfx = 7\n[antenna]\nband = "low"',
+        'camera = "2"\nfx = 7\nsnr_db = 3\nradio_band = "low"\n[antenna]\ngain_db = 0.0',
+        'camera = "2"\nfx = 7\nsnr_db = 3\nexpect_snr_db = 3.0\nradio_band = "low"\n[antenna]\nband = "low"',
+    ],
+)
+def test_a_file_names_settings_by_their_flag_or_in_their_table(toml, text):
+    camera = Camera(camera="2", lens=Lens(fx=7.0))
+    assert parse([], toml(text), Sender) == Sender(camera=camera, snr_db=3.0, antenna=Antenna(band="low"))
+
+
+def test_a_setting_the_command_fills_itself_has_no_name_at_the_top_level(toml):
+    skip = frozenset({"radio.snr_db"})
+    with pytest.raises(ConfigError, match="unknown setting 'snr_db'"):
+        settings_from(Node, argparse.Namespace(), toml("snr_db = 4"), skip)
+
+
+def test_flags_win_over_a_file_that_names_settings_by_their_flag(toml):
+    got = parse(["--camera", "3", "--fx", "9"], toml('camera = "2"\nfx = 7.0'), cls=Sender)
+    assert got.camera == Camera(camera="3", lens=Lens(fx=9.0))
+
+
+@pytest.mark.parametrize(
+    ("cls", "text", "message"),
+    [
+        (Node, "snr_db = 4\n[radio]\nsnr_db = 5", "snr_db and radio.snr_db are one setting, got 4 and 5"),
+        (Sender, "expect_snr_db = 4\nsnr_db = 5", "expect_snr_db and snr_db are one setting, got 4 and 5"),
+        (Sender, 'camera = "0"\nfx = "far"', "camera.lens.fx must be of type float, got 'far'"),
+        (Node, "snr_bd = 4", "unknown setting 'snr_bd', did you mean 'snr_db'"),
+        (Sender, "exepct_snr = 4", "unknown setting 'exepct_snr', did you mean 'expect_snr_db'"),
+        (Node, 'radio = "awgn"', "radio must be a table of settings, got 'awgn'"),
+        (Node, 'radio = "awgn"\nsnr_db = 4', "radio must be a table of settings, got 'awgn'"),
+        (Node, "[snr_db]\nvalue = 4", "radio.snr_db must be of type float, got {'value': 4}"),
+        (Sender, "[camera]\ncamera = '0'\nlens = 3", "camera.lens must be a table of settings, got 3"),
+    ],
+)
+def test_a_file_that_contradicts_itself_or_the_settings_is_one_clear_error(toml, cls, text, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        parse([], toml(text), cls)
+
+
+@pytest.mark.parametrize(
+    ("cls", "text", "words", "message"),
+    [
+        (Node, 'radio = "awgn"', ["--snr-db", "4"], "radio must be a table of settings, got 'awgn'"),
+        (Sender, "[camera]\nlens = 3", ["--fx", "4"], "camera.lens must be a table of settings, got 3"),
+    ],
+)
+def test_a_flag_of_a_table_that_is_a_plain_value_in_the_file_is_one_clear_error(
+    toml, cls, text, words, message
+):
+    with pytest.raises(ConfigError, match=message):
+        parse(words, toml(text), cls)
+
+
+def test_a_missing_setting_is_named_as_the_command_line_names_it():
+    with pytest.raises(MissingSettingError, match="^--camera is required$"):
+        parse([], cls=Sender)
+    with pytest.raises(MissingSettingError, match="^FILE is required$"):
+        parse([], cls=Reader)
+    with pytest.raises(MissingSettingError, match="^camera.camera is required$"):
+        build_settings(Sender, {"camera": {"lens": {"fx": 2.0}}})
+
+
+def test_given_values_hold_no_defaults(toml):
+    arguments = arguments_of(Sender, ["--fx", "9", "mine.mcap"])
+    given = given_values(Sender, arguments, toml('radio_band = "low"\nsnr_db = 5'))
+    assert given == {
+        "camera": {"lens": {"fx": 9.0}},
+        "file": Path("mine.mcap"),
+        "antenna": {"band": "low"},
+        "snr_db": 5.0,
+    }
+
+
+def test_one_value_of_a_table_keeps_the_defaults_its_owner_gives_the_others(capsys):
+    words = ["--camera", "0", "--gain-db", "3"]
+    assert parse(words, cls=Sender).antenna == Antenna(band="high", gain_db=3.0)
+    with pytest.raises(SystemExit):
+        arguments_of(Sender, ["--help"])
+    assert "(default high)" in capsys.readouterr().out

@@ -13,6 +13,7 @@ from semcast.common.run_folder import (
     RunData,
     read_image_paths,
     read_run,
+    remove_outputs,
     write_run,
 )
 
@@ -106,17 +107,57 @@ def test_a_pickle_inside_is_not_executed(tmp_path):
         assert "xyz.npy" in archive.namelist()
 
 
-def test_images_are_written_by_frame_id_and_old_ones_removed(tmp_path):
-    for run in range(2):
-        with ImageWriter(tmp_path, lossless=True, capacity=1) as writer:
-            for k in range(4 - run):
-                writer.put(10 * k, np.full((16, 24, 3), (200, 40 * k, 20), dtype=np.uint8))
-        assert writer.num_written == 4 - run
+def picture(k):
+    return np.full((16, 24, 3), (200, 40 * k, 20), dtype=np.uint8)
+
+
+def test_images_are_written_by_frame_id(tmp_path):
+    with ImageWriter(tmp_path, lossless=True, capacity=1) as writer:
+        for k in range(3):
+            writer.put(10 * k, picture(k))
+    assert writer.num_written == 3
     paths = read_image_paths(tmp_path)
     assert list(paths) == [0, 10, 20]
     rgb = cv2.cvtColor(cv2.imread(str(paths[20])), cv2.COLOR_BGR2RGB)
     assert rgb.shape == (16, 24, 3)
     np.testing.assert_allclose(rgb.reshape(-1, 3).mean(axis=0), (200, 80, 20), atol=3)
+
+
+def test_a_writer_that_goes_on_keeps_what_is_there(tmp_path):
+    for first in (0, 5):
+        with ImageWriter(tmp_path, lossless=True) as writer:
+            writer.put(first, picture(1))
+    assert list(read_image_paths(tmp_path)) == [0, 5]
+
+
+def test_provisional_images_stay_when_they_are_settled_for(tmp_path):
+    with ImageWriter(tmp_path, lossless=True) as writer:
+        for k in range(5):
+            writer.put(k, picture(k), provisional=True)
+        writer.put(5, picture(5))
+        writer.settle([0, 3])
+        writer.put(6, picture(6), provisional=True)
+    assert list(read_image_paths(tmp_path)) == [0, 3, 5]
+
+
+def test_only_the_newest_provisional_images_wait(tmp_path, monkeypatch):
+    monkeypatch.setattr("semcast.common.run_folder.MAX_PROVISIONAL", 3)
+    with ImageWriter(tmp_path, lossless=True) as writer:
+        for k in range(6):
+            writer.put(k, picture(k), provisional=True)
+        writer.settle(range(6))
+    assert list(read_image_paths(tmp_path)) == [3, 4, 5]
+
+
+def test_results_of_an_earlier_run_are_removed_and_nothing_else(tmp_path):
+    with ImageWriter(tmp_path, lossless=True) as writer:
+        writer.put(7, picture(1))
+    for name in ("trajectory.tum", "map.ply", "summary.json", "notes.txt", "run.mcap", "images/mine.txt"):
+        (tmp_path / name).write_text("x")
+    remove_outputs(tmp_path)
+    left = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
+    assert left == ["images/mine.txt", "notes.txt", "run.mcap"]
+    remove_outputs(tmp_path / "not_there")
 
 
 def test_a_folder_that_vanishes_is_counted_and_does_not_raise(tmp_path):

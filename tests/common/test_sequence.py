@@ -8,7 +8,8 @@ from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, quat_wxyz_from_rotation
-from semcast.common.sequence import as_rgb, open_sequence, truth_at_frames
+from semcast.common.sequence import as_rgb, open_sequence, read_image, truth_at_frames
+from semcast.common.sequence_layouts import natural_key
 from semcast.common.trajectory import Trajectory, write_tum
 
 CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
@@ -89,6 +90,33 @@ def test_grey_sixteen_bit_and_transparent_images_become_rgb():
     np.testing.assert_array_equal(as_rgb(bgra), [[[30, 20, 10], [255, 255, 255], [204, 204, 204]]])
 
 
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([0.0, 0.5, 1.0], [0, 128, 255]),
+        ([0.0, 100.0, 255.0], [0, 100, 255]),
+        ([-3.0, np.nan, 200.0], [0, 0, 200]),
+        ([-np.inf, np.inf, 1.0], [0, 255, 255]),
+        ([0.2, 1.0, 1.1], [51, 255, 255]),
+        ([99.6, 255.0, 260.0], [100, 255, 255]),
+    ],
+)
+def test_floats_count_to_1_or_to_255_as_their_values_tell(tmp_path, values, expected):
+    cv2.imwrite(str(tmp_path / "a.tif"), np.array([values], dtype=np.float32))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif")[0, :, 0], expected)
+
+
+def test_whole_numbers_of_any_type_count_to_255(tmp_path):
+    np.testing.assert_array_equal(as_rgb(np.array([[0, 1, 2]], dtype=np.int32))[0, :, 0], [0, 1, 2])
+    np.testing.assert_array_equal(as_rgb(np.array([[-5, 90, 255]], dtype=np.int16))[0, :, 0], [0, 90, 255])
+
+
+def test_floats_of_another_range_are_refused_by_the_name_of_their_file(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.tif"), np.array([[0.0, 4000.0]], dtype=np.float32))
+    with pytest.raises(SourceError, match=r"a.tif: values must be in 0..1 or 0..255, got up to 4000"):
+        read_image(tmp_path / "a.tif")
+
+
 def test_undistortion_moves_points_to_where_the_pinhole_has_them(tmp_path):
     camera = Intrinsics(
         fx=300.0, fy=300.0, cx=159.5, cy=119.5, width=320, height=240, distortion=(-0.25, 0.08, 0.001, -0.002)
@@ -105,6 +133,7 @@ def test_undistortion_moves_points_to_where_the_pinhole_has_them(tmp_path):
     cv2.imwrite(str(tmp_path / "images" / "0.png"), image)
     sequence = open_sequence(tmp_path, camera)
     assert sequence.intrinsics.distortion == ()
+    assert sequence.distortion == camera.distortion
     weight = sequence.image(0)[:, :, 0].astype(float)
     centre_xy = [(weight * xs).sum() / weight.sum(), (weight * ys).sum() / weight.sum()]
     expected_xy = sequence.intrinsics.project(point_cam)[0]
@@ -221,6 +250,60 @@ def test_a_transforms_file_with_pinhole_numbers_counts_from_pixel_corners(tmp_pa
     assert open_sequence(tmp_path / "transforms.json").intrinsics == CAMERA
 
 
+def transforms_folder(folder, **document):
+    write_images(folder / "images", 1)
+    frames = [{"file_path": "images/000000.png", "transform_matrix": np.eye(4).tolist()}]
+    known = {"fl_x": 30, "fl_y": 31, "cx": 16, "cy": 12, "w": 32, "h": 24, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps({**known, **document}))
+    return folder
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", None])
+def test_a_transforms_file_of_a_pinhole_model_is_read(tmp_path, model):
+    folder = transforms_folder(tmp_path, camera_model=model, k1=0.1, k4=0.0, is_fisheye=False)
+    assert open_sequence(folder).distortion == (0.1, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        (
+            {"camera_model": "OPENCV_FISHEYE", "k1": 0.1},
+            "camera_model must be one of OPENCV, .*'OPENCV_FISHEYE'",
+        ),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be one of OPENCV, .*'EQUIRECTANGULAR'"),
+        ({"camera_model": "OPENCV", "k4": 0.01}, "k4 must be absent or 0 for a pinhole camera, got 0.01"),
+        ({"is_fisheye": True}, "is_fisheye must be absent or 0 for a pinhole camera, got True"),
+    ],
+)
+def test_a_transforms_file_of_another_model_is_refused(tmp_path, document, message):
+    with pytest.raises(SourceError, match=f"transforms.json holds no usable intrinsics: {message}"):
+        open_sequence(transforms_folder(tmp_path, **document))
+
+
+def test_times_beside_the_images_of_a_folder_are_read(tmp_path):
+    write_images(tmp_path, 3, "img{:d}.png")
+    (tmp_path / "times.txt").write_text("0.5\n0.75\n2\n")
+    np.testing.assert_array_equal(open_sequence(tmp_path).times_ns, [500_000_000, 750_000_000, 2_000_000_000])
+
+
+def test_names_with_signs_that_are_no_digits_of_a_number_are_sorted(tmp_path):
+    names = ["a10.png", "a2.png", "a²3.png", "²1.png", "٣.png"]
+    assert sorted(names, key=natural_key) == ["a2.png", "a10.png", "a²3.png", "²1.png", "٣.png"]
+    for name in names:
+        cv2.imwrite(str(tmp_path / name), np.zeros((24, 32, 3), np.uint8))
+    assert len(open_sequence(tmp_path)) == 5
+
+
+@pytest.mark.parametrize("layout", ["auto", "native"])
+def test_a_video_is_sent_to_where_videos_go(tmp_path, layout):
+    (tmp_path / "normal.mp4").write_bytes(b"video")
+    with pytest.raises(
+        SourceError, match="got the file .*normal.mp4: videos go through 'semcast agent --source"
+    ):
+        open_sequence(tmp_path / "normal.mp4", layout=layout)
+
+
 def test_a_folder_of_images_needs_a_camera_only_when_it_is_asked_for_one(tmp_path):
     write_images(tmp_path, 3, "img{:d}.jpg")
     sequence = open_sequence(tmp_path, rate_hz=5.0)
@@ -263,7 +346,9 @@ def test_a_fisheye_calibration_is_refused(tmp_path):
         "resolution: [32, 24]\nintrinsics: [30, 31, 15.5, 11.5]\ndistortion_model: equidistant\n"
         "distortion_coefficients: [0.1, 0.2, 0.3, 0.4]\n"
     )
-    with pytest.raises(SourceError, match="distortion_model must be radial-tangential, got 'equidistant'"):
+    with pytest.raises(
+        SourceError, match="distortion_model must be a pinhole camera's .*, got 'equidistant'"
+    ):
         CameraSettings(intrinsics=tmp_path / "camera.yaml").resolve(32, 24)
 
 
@@ -288,8 +373,9 @@ def damage_size(folder):
     return folder
 
 
-def damage_first_image(folder):
-    (folder / "images" / "000000.png").write_bytes(b"not an image")
+def damage_all_images(folder):
+    for path in (folder / "images").iterdir():
+        path.write_bytes(b"not an image")
     return folder
 
 
@@ -314,7 +400,7 @@ def damage_number(folder):
         (damage_missing, "there is no such folder"),
         (damage_empty, "expected images/ .native."),
         (damage_size, "intrinsics of walk are for 64x48 images, its images are 32x24"),
-        (damage_first_image, "is not a readable image"),
+        (damage_all_images, "000000.png is not a readable image"),
         (damage_times, "one time per image, got 2 times and 5 images"),
         (damage_order, "must strictly increase"),
         (damage_number, "time must be a number of seconds, got 'one'"),
@@ -325,6 +411,27 @@ def test_what_is_wrong_with_a_recording_is_said(native, damage, message):
         open_sequence(damage(native))
 
 
+def test_a_damaged_first_image_is_an_error_of_that_frame_alone(native):
+    (native / "images" / "000000.png").write_bytes(b"")
+    sequence = open_sequence(native)
+    assert (len(sequence), sequence.size_wh) == (5, (32, 24))
+    with pytest.raises(SourceError, match="000000.png is not a readable image"):
+        sequence.image(0)
+    assert sequence.image(1).shape == (24, 32, 3)
+
+
+def test_images_that_would_be_refused_are_found_beforehand(native):
+    (native / "images" / "000001.png").write_bytes(b"broken")
+    write_images(native / "other", 1, size=(10, 12))
+    (native / "other" / "000000.png").rename(native / "images" / "000003.png")
+    messages, num_skipped = open_sequence(native).refused_images()
+    assert "000001.png is not a readable image" in messages[0]
+    assert "000003.png is 12x10, the first readable image" in messages[1]
+    assert (len(messages), num_skipped) == (2, 0)
+    messages, num_skipped = open_sequence(native).refused_images(most_decoded=0)
+    assert (len(messages), num_skipped) == (1, 1), "only the damaged one must be decoded"
+
+
 def test_a_damaged_image_in_the_middle_is_an_error_of_that_frame_alone(native):
     (native / "images" / "000002.png").write_bytes(b"")
     write_images(native / "other", 1, size=(10, 10))
@@ -332,7 +439,9 @@ def test_a_damaged_image_in_the_middle_is_an_error_of_that_frame_alone(native):
     sequence = open_sequence(native)
     with pytest.raises(SourceError, match="000002.png is not a readable image"):
         sequence.image(2)
-    with pytest.raises(SourceError, match="000003.png is 10x10, the first image of the sequence is 32x24"):
+    with pytest.raises(
+        SourceError, match="000003.png is 10x10, the first readable image of the sequence is 32x24"
+    ):
         sequence.image(3)
     assert sequence.image(4).shape == (24, 32, 3)
 

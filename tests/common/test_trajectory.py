@@ -29,6 +29,12 @@ def test_a_bad_line_is_named(tmp_path, line):
         read_tum(tmp_path / "t.tum")
 
 
+def test_a_file_that_is_no_text_is_named(tmp_path):
+    (tmp_path / "t.tum").write_bytes("1 0 0 0 0 0 0 1 # Straße\n".encode("latin-1"))
+    with pytest.raises(SourceError, match="t.tum can't be read: .*utf-8"):
+        read_tum(tmp_path / "t.tum")
+
+
 def test_times_must_increase(tmp_path):
     (tmp_path / "t.tum").write_text("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
     with pytest.raises(SourceError, match="strictly increase"):

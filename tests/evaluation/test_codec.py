@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.errors import ConfigError, SourceError
 from semcast.evaluation.codec import CodecSettings, evaluate_codec, read_images
@@ -76,6 +77,25 @@ def test_the_same_seed_gives_the_same_figures(folder, report):
         CodecSettings(images=folder, codec=("jpeg-amc",), snr_db=(3.0,), max_images=2, seed=0)
     )
     assert again["results"][0]["images"] == rows(report[1])["jpeg-amc", 3.0]["images"]
+
+
+def test_traces_and_fading_go_on_from_image_to_image(folder, monkeypatch):
+    seen = []
+    transmit = Link.transmit
+
+    def watched(self, *arguments):
+        sent = transmit(self, *arguments)
+        seen.append((sent.snr_db_set, complex(sent.truth.h[0])))
+        return sent
+
+    monkeypatch.setattr(Link, "transmit", watched)
+    for link in (
+        ChannelSettings(channel="trace", trace="ramp", trace_end_db=0.0, trace_s=1.0),
+        ChannelSettings(channel="rayleigh", doppler_hz=20.0),
+    ):
+        seen.clear()
+        evaluate_codec(CodecSettings(images=folder, codec=("jpeg-ldpc",), snr_db=(12.0,), link=link))
+        assert len(set(seen[-2:])) == 2
 
 
 def test_a_lost_frame_counts_as_an_outage(folder):

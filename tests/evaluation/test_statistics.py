@@ -120,11 +120,14 @@ def test_blocks_widen_the_interval_of_correlated_rows(rng):
 
 
 def test_bootstrap_ratio_and_bad_input(rng):
-    result = paired_bootstrap([1.0, 2.0, 3.0], [2.0, 4.0, 6.0], rng)
+    result = paired_bootstrap([1.0, 2.0, 3.0, 4.0, 5.0], [2.0, 4.0, 6.0, 8.0, 10.0], rng)
     assert result.ratio == pytest.approx(0.5)
     assert (result.ratio_low, result.ratio_high) == (pytest.approx(0.5), pytest.approx(0.5))
     assert paired_bootstrap([1.0, 1.0], [0.0, 0.0], rng).ratio is None
     assert paired_bootstrap([], [], rng) is None
+    few = paired_bootstrap([1.0, 2.0, 3.0, 4.0], [2.0, 4.0, 6.0, 8.0], rng)
+    assert (few.difference, few.ratio, few.num_samples) == (-2.5, 0.5, 4)
+    assert (few.low, few.high, few.ratio_low, few.ratio_high) == (None,) * 4
     with pytest.raises(ValueError, match="share a shape"):
         paired_bootstrap([1.0], [1.0, 2.0], rng)
     with pytest.raises(ValueError, match="finite"):

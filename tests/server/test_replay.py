@@ -14,6 +14,7 @@ from semcast.channel.emulator import run_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.common.codecs import load_codec
+from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import SourceError
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recording import recover_file
@@ -95,6 +96,7 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
     )
     replay(lossy)
     assert (tmp_path / "c" / "trajectory.tum").read_bytes() != first
+    assert build_settings(ReplaySettings, read_toml(tmp_path / "c" / "settings.toml")) == lossy
 
 
 def test_recorded_originals_give_the_same_psnr_as_the_sequence(recording, tmp_path):

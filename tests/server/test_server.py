@@ -5,6 +5,7 @@ import json
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ from semcast.common.transport import open_client, open_hub
 from semcast.common.wire import pack, unpack
 from semcast.server.export.outputs import read_ply, write_ply
 from semcast.server.mapping.bundle_process import GIVEN_UP
-from semcast.server.server import Server
+from semcast.server.server import Server, _is_nearly_final
 from semcast.server.settings import ServerSettings, ViewSettings
 from semcast.server.view.choice import keep_former
 
@@ -547,3 +548,19 @@ def test_former_recordings_are_not_overwritten(tmp_path):
 
 def test_the_hub_is_on_loopback_unless_told_otherwise():
     assert HubSettings().listen == ("tcp/127.0.0.1:7447",)
+
+
+@pytest.mark.parametrize(
+    ("num_frames", "last_id", "frame_id", "is_near"),
+    [
+        (51, None, 41, True),
+        (51, None, 40, False),
+        (13, 48, 44, True),  # every fourth frame of 51
+        (13, 48, 40, False),
+        (13, 48, 24, False),
+        (None, None, 10**6, False),
+    ],
+)
+def test_the_last_frames_are_known_by_their_ids(num_frames, last_id, frame_id, is_near):
+    camera = SimpleNamespace(num_frames=num_frames, last_frame_id=last_id)
+    assert _is_nearly_final(frame_id, camera) is is_near

@@ -2,11 +2,14 @@
 
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from semcast.common.camera import Intrinsics
+from semcast.common.run_folder import read_image_paths, read_run
+from semcast.common.sequence import open_sequence
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.reference import Reference
 from semcast.server.session import Arrival, Session, StreamIdentity
@@ -15,6 +18,7 @@ from semcast.server.settings import ServerSettings
 CAMERA = Intrinsics(fx=60, fy=60, cx=47.5, cy=31.5, width=96, height=64)
 IDENTITY = StreamIdentity(agent_id="a", agent_epoch=5, codec="x", digest="", camera=CAMERA, num_frames=None)
 IMAGE = np.full((64, 96, 3), 99, np.uint8)
+DEMO = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
 
 
 @pytest.fixture
@@ -66,3 +70,61 @@ def test_a_slow_reference_holds_only_the_frame_up_that_asked_it(process, monkeyp
 def test_in_replay_every_frame_waits_for_its_psnr(process):
     one = process(Reference(lambda frame_id: IMAGE), mode="replay")
     assert [one(k) for k in range(3)] == [100.0] * 3
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return open_sequence(DEMO, resize=0.35)
+
+
+def run_session(demo, folder, frame_ids, epoch=5, settings_toml=None, **settings):
+    """A session over some frames of the demo; ends with its outputs unless it is ``killed``."""
+    killed = settings.pop("killed", False)
+    identity = StreamIdentity(
+        agent_id="a", agent_epoch=epoch, codec="x", digest="", camera=demo.intrinsics, num_frames=None
+    )
+    session = Session(
+        ServerSettings(bundle="inline", out=folder, **settings),
+        identity,
+        folder,
+        None,
+        settings_toml=settings_toml,
+    )
+    for k in frame_ids:
+        now_ns = time.perf_counter_ns()
+        frame = DecodedFrame(k, int(demo.times_ns[k]), demo.image(k), None)
+        session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}))
+    if killed:
+        session.save_checkpoint()
+    else:
+        session.write_outputs(folder, {}, complete=True)
+    session.close()
+    return session
+
+
+def test_every_keyframe_has_its_image_also_those_the_map_began_with(demo, tmp_path):
+    run_session(demo, tmp_path, range(12), save_images="keyframes")
+    keyframes = read_run(tmp_path).keyframe_ids.tolist()
+    assert keyframes[0] == 0
+    assert list(read_image_paths(tmp_path)) == keyframes
+
+
+def test_all_images_are_kept_where_all_are_wanted(demo, tmp_path):
+    run_session(demo, tmp_path, range(8), save_images="all")
+    assert list(read_image_paths(tmp_path)) == list(range(8))
+
+
+def test_a_resumed_session_keeps_the_images_and_a_new_one_does_not(demo, tmp_path):
+    run_session(demo, tmp_path, range(8), save_images="keyframes", killed=True)
+    before = list(read_image_paths(tmp_path))
+    assert before
+    resumed = run_session(demo, tmp_path, range(8, 20), save_images="keyframes")
+    assert resumed.resumed
+    assert set(before) < set(read_image_paths(tmp_path))
+    run_session(demo, tmp_path, range(3), epoch=6, save_images="none")
+    assert not read_image_paths(tmp_path)
+
+
+def test_the_records_hold_the_settings_of_the_program(demo, tmp_path):
+    run_session(demo, tmp_path, range(3), settings_toml="pace = 2.0\n")
+    assert (tmp_path / "settings.toml").read_text() == "pace = 2.0\n"

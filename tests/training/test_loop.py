@@ -191,7 +191,7 @@ def test_every_shipped_settings_file_is_valid():
 
 
 _WORKER = """
-import sys
+import os, sys
 from pathlib import Path
 import torch
 import semcast.common.nets.registry as registry
@@ -202,26 +202,38 @@ from semcast.training.settings import TrainSettings
 torch.set_num_threads(1)
 sizes = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
 registry._entries = lambda: (registry.Architecture("3dcsc", sizes, build_3dcsc),)
-train(TrainSettings(architecture="3dcsc", data=Path(sys.argv[1]), out=Path(sys.argv[2]), batch=2, steps=2,
-                    bf16=False, device="cpu", crop=CropSettings(size_px=32)))
+settings = TrainSettings(architecture="3dcsc", data=Path(sys.argv[1]), out=Path(sys.argv[2]), batch=2,
+                         steps=int(sys.argv[3]), bf16=False, device="cpu", crop=CropSettings(size_px=32))
+train(settings, should_stop=lambda: os.environ["RANK"] == sys.argv[4])
 """
 
 
-@pytest.mark.slow
-def test_two_processes_train_one_model(photos, tmp_path):
+def in_two_processes(photos, out, *, steps, stopped_rank):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     link = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2", "OMP_NUM_THREADS": "1"}
-    out = tmp_path / "run"
+    arguments = [str(photos), str(out), str(steps), str(stopped_rank)]
     started = [
         subprocess.Popen(
-            [sys.executable, "-c", _WORKER, str(photos), str(out)],
+            [sys.executable, "-c", _WORKER, *arguments],
             env=os.environ | link | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
         )
         for rank in (0, 1)
     ]
     assert [process.wait(timeout=120) for process in started] == [0, 0]
-    manifest = json.loads((out / "3dcsc.json").read_text())
-    assert manifest["made_by"]["processes"] == 2
-    assert manifest["made_by"]["samples"] == 8
+    return json.loads((out / "3dcsc.json").read_text())["made_by"]
+
+
+@pytest.mark.slow
+def test_two_processes_train_one_model(photos, tmp_path):
+    made_by = in_two_processes(photos, tmp_path / "run", steps=2, stopped_rank=None)
+    assert made_by["processes"] == 2
+    assert made_by["samples"] == 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rank", [0, 1])
+def test_two_processes_stop_together_when_one_is_told_to(photos, tmp_path, rank):
+    made_by = in_two_processes(photos, tmp_path / "run", steps=1000, stopped_rank=rank)
+    assert made_by["steps"] == 1

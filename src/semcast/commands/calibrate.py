@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from semcast.agent.calibrate import BoardView
 
-IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
 #: A live view is tried every this many frames: finding the board takes longer than a frame.
 LIVE_STRIDE = 5
 
@@ -77,10 +76,12 @@ def image_files(paths: list[Path]) -> list[Path]:
     Raises:
         SourceError: A path does not exist, or there is no picture.
     """
+    from semcast.common.sequence_layouts import images_in
+
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            files += sorted(p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+            files += images_in(path)
         elif path.is_file():
             files.append(path)
         else:
@@ -91,26 +92,23 @@ def image_files(paths: list[Path]) -> list[Path]:
 
 
 def read_pictures(files: list[Path]) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
-    """Yield name and RGB image of each file; all must have one size.
+    """Yield name and RGB image of each file, turned as a sequence of them would be; all must have one size.
 
     Raises:
         SourceError: A file is no picture, or sizes differ.
     """
-    import cv2
-    import numpy as np
+    from semcast.common.sequence import read_image
 
     size = None
     for file in files:
-        bgr = cv2.imread(str(file), cv2.IMREAD_COLOR)
-        if bgr is None:
-            raise SourceError(f"{file} can't be read as a picture")
-        if size is not None and bgr.shape[:2] != size:
+        image = read_image(file)
+        if size is not None and image.shape[:2] != size:
             raise SourceError(
-                f"{file} is {bgr.shape[1]}x{bgr.shape[0]}, the ones before are {size[1]}x{size[0]}: "
+                f"{file} is {image.shape[1]}x{image.shape[0]}, the ones before are {size[1]}x{size[0]}: "
                 "all pictures must come from one camera held one way"
             )
-        size = bgr.shape[:2]
-        yield file.name, np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        size = image.shape[:2]
+        yield file.name, image
 
 
 def camera_pictures(camera: str) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
@@ -122,7 +120,9 @@ def camera_pictures(camera: str) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
     import cv2
     import numpy as np
 
-    capture = cv2.VideoCapture(int(camera) if camera.isdigit() else camera)
+    from semcast.agent.source import is_camera_number
+
+    capture = cv2.VideoCapture(int(camera) if is_camera_number(camera) else camera)
     try:
         if not capture.isOpened():
             raise SourceError(f"camera {camera!r} can't be opened")
@@ -180,6 +180,15 @@ def _collect(
     return views, sample
 
 
+def _check_outputs(out: Path, picture: Path) -> None:
+    from semcast.common.sequence_layouts import IMAGE_SUFFIXES
+
+    if out.suffix.lower() != ".json":
+        raise ConfigError(f"out must be a .json file, got {out}")
+    if picture.suffix.lower() not in IMAGE_SUFFIXES:
+        raise ConfigError(f"picture must be an image file ({', '.join(IMAGE_SUFFIXES)}), got {picture}")
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate, write intrinsics and picture, and print the result."""
     board = parse_board(arguments.board)
@@ -187,13 +196,14 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError("give either pictures of a chessboard or --camera")
     if arguments.views < 4:
         raise ConfigError(f"views must be at least 4, got {arguments.views}")
+    picture = arguments.picture or arguments.out.with_suffix(".png")
+    _check_outputs(arguments.out, picture)
     import cv2
 
     from semcast.agent.calibrate import calibrate, calibration_picture
 
     views, sample = _collect(arguments, board)
     result = calibrate(views, board, (sample.shape[1], sample.shape[0]), arguments.distortion)
-    picture = arguments.picture or arguments.out.with_suffix(".png")
     try:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
         result.intrinsics.save(arguments.out)

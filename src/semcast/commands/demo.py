@@ -53,6 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     talk = Console(stderr=True)
     frames = len(open_sequence(settings.sequence or default_sequence()))
     result: dict[str, Any] = {}
+    failures: list[str] = []
 
     def work(stop: threading.Event) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -65,12 +66,17 @@ def run(arguments: argparse.Namespace) -> int:
                 text = f"{row['state']:<12} {row['num_inliers']:>4} inliers{quality}"
                 bar.update(task, completed=row["frame_id"] + 1, description=text)
 
-            summary = run_demo(
+            summary, error = run_demo(
                 settings, stop, lambda line: talk.print(line, highlight=False, soft_wrap=True), show
             )
             result.update(summary or {})
+            if error is not None:
+                failures.append(error)
 
     code = run_until_stopped(work)
+    if failures:
+        talk.print(f"the agent gave up: {failures[0]}", highlight=False, soft_wrap=True)
+        code = code or 1
     if not result:
         talk.print("no summary was written; the logs of the three processes say why:", settings.out / "logs")
         return code or 1

@@ -25,9 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the export and name its files on stdout."""
+    from semcast.common.errors import ConfigError
     from semcast.common.run_folder import read_run
     from semcast.server.export.formats import export_run
 
+    if arguments.out.resolve() == arguments.run.resolve():
+        raise ConfigError(f"--out must be another place than the run itself, got {arguments.out}")
     files = export_run(arguments.run, arguments.format, arguments.out)
     data = read_run(arguments.run)
     print(

@@ -22,11 +22,12 @@ def run(arguments: argparse.Namespace) -> int:
 
     from semcast.describe import describe
 
-    console = Console(highlight=False)
+    # Names of files may hold brackets, which are no markup.
+    console = Console(highlight=False, markup=False)
     for heading, lines in describe(arguments.path):
         if not lines:
             continue
-        console.print(heading, style="bold", markup=False, soft_wrap=True)
+        console.print(heading, style="bold", soft_wrap=True)
         table = Table.grid(padding=(0, 2))
         table.add_column(style="dim", no_wrap=True)
         table.add_column(overflow="fold")

@@ -36,13 +36,13 @@ def run(arguments: argparse.Namespace) -> int:
     folder: Path = arguments.run
     truth = None
     if arguments.truth is not None:
-        is_file = arguments.truth.is_file()
-        truth = read_tum(arguments.truth) if is_file else open_sequence(arguments.truth).groundtruth()
+        is_tum = arguments.truth.is_file() and arguments.truth.suffix.lower() != ".json"
+        truth = read_tum(arguments.truth) if is_tum else open_sequence(arguments.truth).groundtruth()
         if truth is None:
             raise SourceError(f"{arguments.truth} is a sequence without a true path")
     else:
         reference = read_summary(folder).get("settings", {}).get("reference")
-        if reference and Path(reference).is_dir():
+        if reference and Path(reference).exists():
             truth = open_sequence(Path(reference)).groundtruth()
         elif reference:
             logger.warning("the sequence %s is gone: no true path is drawn; give it by --truth", reference)

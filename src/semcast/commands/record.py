@@ -1,6 +1,7 @@
 """``semcast record``: keep everything a running system sends in one file."""
 
 import argparse
+import sys
 import threading
 
 from semcast.commands.running import add_settings, read_settings, run_until_stopped
@@ -18,6 +19,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     def work(stop: threading.Event) -> None:
         done = run_record(settings, stop)
+        if not done["messages"] and not done["drops"]:
+            print("nothing was recorded: no message came before the end", file=sys.stderr)
+            return
         dropped = f", {sum(done['drops'].values())} dropped" if done["drops"] else ""
         print(f"{settings.file}: {done['messages']} messages, {done['bytes'] / 1e6:.1f} MB{dropped}")
 

@@ -8,22 +8,31 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from semcast.common.config import add_flags, settings_from
+from semcast.common.config import add_flags, given_values, settings_from
 
 S = TypeVar("S")
 
 
 def add_settings(parser: argparse.ArgumentParser, cls: type, skip: frozenset[str] = frozenset()) -> None:
-    """Add ``--config`` and one flag per setting of ``cls``."""
+    """Add ``--config`` and one flag per setting of ``cls`` but those to skip, which are the command's own."""
     parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="TOML file with any of these settings; flags win over it"
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="TOML file with any of these settings, written as snr_db for --snr-db; flags win over it",
     )
+    parser.set_defaults(skipped_settings=skip)
     add_flags(parser, cls, skip)
 
 
-def read_settings(cls: type[S], arguments: argparse.Namespace, **fixed: Any) -> S:
+def read_settings(cls: type[S], arguments: argparse.Namespace) -> S:
     """Build the settings that ``add_settings`` declared."""
-    return settings_from(cls, arguments, arguments.config, **fixed)
+    return settings_from(cls, arguments, arguments.config, arguments.skipped_settings)
+
+
+def read_given(cls: type, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return what was given of the settings that ``add_settings`` declared; see ``given_values``."""
+    return given_values(cls, arguments, arguments.config, arguments.skipped_settings)
 
 
 class Interrupted:

@@ -15,4 +15,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until the source ends or the process is stopped; outputs are always written."""
     settings = read_settings(ServerSettings, arguments)
+    if settings.device == "cuda":
+        # Without --codec the decoder is loaded when the first frame arrives: too late to say this.
+        from semcast.common.nets.codec import check_device
+
+        check_device(settings.device)
     return run_until_stopped(lambda stop: run_server(settings, stop))

@@ -1,0 +1,62 @@
+"""A codec by name and weights by file agree, or one line says that they do not."""
+
+import shutil
+
+import pytest
+import torch
+
+from semcast.common.codecs import codec_of_weights, load_codec
+from semcast.common.errors import CheckpointError, ConfigError
+from semcast.common.nets.checkpoint import save_transceiver
+from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.training.onnx_export import export_encoder
+
+TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """The weights of a small ``3dcsc``, and its encoder as ONNX."""
+    torch.manual_seed(0)
+    weights = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    facts = {"architecture": "3dcsc", "sizes": TINY, "cbr": 1 / 16, "snr_range_db": (0.0, 14.0)}
+    save_transceiver(build_3dcsc(TINY), weights, made_by={"steps": 0}, **facts)
+    return {"torch": weights, "onnx": export_encoder(weights, weights.with_suffix(".onnx"))}
+
+
+@pytest.mark.parametrize("kind", ["torch", "onnx"])
+def test_weights_of_another_codec_than_the_named_one_are_refused(files, kind):
+    assert load_codec("3dcsc", weights=files[kind], runtime="auto").name == "3dcsc"
+    with pytest.raises(ConfigError) as caught:
+        load_codec("3dcsc-lite", weights=files[kind], runtime="auto")
+    assert str(caught.value) == f"codec must be '3dcsc', that of the weights {files[kind]}, got '3dcsc-lite'"
+
+
+@pytest.mark.parametrize("kind", ["torch", "onnx"])
+def test_weights_say_which_codec_they_are_of(files, kind):
+    assert codec_of_weights(files[kind]) == "3dcsc"
+
+
+@pytest.mark.parametrize("name", ["none.safetensors", "none.onnx"])
+def test_missing_weights_are_one_clear_error(tmp_path, name):
+    with pytest.raises(CheckpointError, match="none"):
+        codec_of_weights(tmp_path / name)
+
+
+def test_damaged_weights_are_one_clear_error(files, tmp_path):
+    cut = tmp_path / "cut.safetensors"
+    shutil.copy(files["torch"].with_suffix(".json"), cut.with_suffix(".json"))
+    cut.write_bytes(files["torch"].read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="the manifest says"):
+        codec_of_weights(cut)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_gpu_that_is_not_there_is_one_clear_error(files):
+    with pytest.raises(ConfigError, match="device must be auto or cpu on this machine.* got 'cuda'"):
+        load_codec("3dcsc", weights=files["torch"], device="cuda")
+
+
+def test_the_onnx_runtime_does_not_pretend_to_use_a_gpu(files):
+    with pytest.raises(ConfigError, match="device must be auto or cpu with the onnx runtime, got 'cuda'"):
+        load_codec("3dcsc", weights=files["onnx"], runtime="auto", device="cuda")

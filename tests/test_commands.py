@@ -1,0 +1,237 @@
+"""What each verb makes of its arguments, and what it says when it can't."""
+
+import argparse
+import importlib.metadata
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from semcast.agent.settings import AgentSettings
+from semcast.agent.source_settings import SourceSettings
+from semcast.channel.emulator import run_channel
+from semcast.channel.emulator_settings import EmulatorSettings
+from semcast.channel.settings import ChannelSettings
+from semcast.cli import main, verb_parser
+from semcast.commands.agent import settings_of
+from semcast.commands.doctor import check_packages
+from semcast.commands.evaluate import EVALUATIONS
+from semcast.commands.running import read_given, read_settings
+from semcast.common.config import to_toml
+from semcast.common.network_settings import NetworkSettings
+from semcast.common.transport import free_endpoint, open_hub
+from semcast.demo import DemoSettings
+from semcast.server.record import RecordSettings
+from semcast.server.replay import ReplaySettings
+from semcast.server.settings import ServerSettings
+from semcast.training.settings import TrainSettings
+
+SETTINGS = {
+    ("agent",): AgentSettings,
+    ("channel", "run"): EmulatorSettings,
+    ("server",): ServerSettings,
+    ("demo",): DemoSettings,
+    ("record",): RecordSettings,
+    ("replay",): ReplaySettings,
+    ("train",): TrainSettings,
+    **{("eval", what): row[0] for what, row in EVALUATIONS.items()},
+}
+
+
+def parser_of(verb, *words):
+    parser = verb_parser(verb)
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            return action.choices[words[0]]
+    return parser
+
+
+def sample(action):
+    """A value for an option: words of a command line and a value of TOML."""
+    if isinstance(action, argparse.BooleanOptionalAction):
+        return [action.option_strings[0]], "true"
+    value = next(iter(action.choices)) if action.choices else {int: 3, float: 1.5}.get(action.type, "some")
+    text = json.dumps(value)
+    return [*action.option_strings, str(value)], f"[{text}]" if action.nargs == "+" else text
+
+
+@pytest.mark.parametrize("words", SETTINGS, ids=" ".join)
+def test_a_settings_file_takes_every_flag_of_the_verb_by_its_name(words, tmp_path):
+    line, lines = [], []
+    for action in parser_of(*words)._actions:
+        if action.dest in ("help", "debug", "config", "action"):
+            continue
+        given, value = sample(action)
+        name = action.option_strings[0].removeprefix("--") if action.option_strings else action.dest
+        line += given
+        lines.append(f"{name.replace('-', '_')} = {value}\n")
+    file = tmp_path / "settings.toml"
+    file.write_text("".join(lines))
+    verb, cls = verb_parser(words[0]), SETTINGS[words]
+    by_flags = read_given(cls, verb.parse_args([*words[1:], *line]))
+    assert read_given(cls, verb.parse_args([*words[1:], "--config", str(file)])) == by_flags
+
+
+@pytest.mark.parametrize("words", SETTINGS, ids=" ".join)
+def test_settings_that_a_verb_wrote_down_give_the_same_again(words, tmp_path):
+    cls, parser = SETTINGS[words], verb_parser(words[0])
+    # Whatever is required: a source, a sequence, images or a recording.
+    needed = {
+        "source": SourceSettings(source="0"), "sequence": Path("s"), "images": Path("i"), "file": Path("f"),
+    }  # fmt: skip
+    required = {f.name: needed[f.name] for f in fields(cls) if f.default is f.default_factory}
+    settings = cls(**required)
+    file = tmp_path / "settings.toml"
+    file.write_text(to_toml(settings))
+    assert read_settings(cls, parser.parse_args([*words[1:], "--config", str(file)])) == settings
+
+
+def test_record_writes_run_mcap_unless_told_otherwise(tmp_path):
+    file = tmp_path / "settings.toml"
+    file.write_text('file = "mine.mcap"\n')
+    for words, expected in (([], "run.mcap"), (["--config", str(file)], "mine.mcap"), (["x.mcap"], "x.mcap")):
+        arguments = verb_parser("record").parse_args(words)
+        assert read_settings(RecordSettings, arguments).file == Path(expected)
+
+
+@pytest.mark.parametrize(
+    ("words", "missing"),
+    [
+        (["agent"], "--source"),
+        (["eval", "trajectory"], "--sequence"),
+        (["eval", "codec"], "--images"),
+        (["eval", "recording"], "FILE"),
+        (["replay"], "FILE"),
+    ],
+)
+def test_a_missing_setting_is_wrong_usage(words, missing, capsys):
+    assert main(words) == 2
+    assert capsys.readouterr().err == f"semcast {words[0]}: {missing} is required\n"
+
+
+@pytest.fixture
+def channel():
+    """The endpoint of a running channel with long bursts."""
+    hub, endpoint = open_hub()
+    stop = threading.Event()
+    link = ChannelSettings(burst_slots=20.0)
+    settings = EmulatorSettings(agent_id="a", link=link, network=NetworkSettings(connect=(endpoint,)))
+    thread = threading.Thread(target=run_channel, args=(settings, stop))
+    thread.start()
+    end_s = time.monotonic() + 15.0
+    while "channel" not in hub.alive_roles("a"):
+        assert time.monotonic() < end_s, "the channel did not start"
+    yield endpoint
+    stop.set()
+    thread.join(10)
+    hub.close()
+
+
+def test_set_is_checked_against_the_running_channel(channel, tmp_path, capsys):
+    words = ["channel", "set", "--agent-id", "a", "--connect", channel]
+    assert main([*words, "--channel", "burst", "--slot-loss", "0.9"]) == 0
+    now = json.loads(capsys.readouterr().out)
+    assert (now["channel"], now["slot_loss"], now["burst_slots"]) == ("burst", 0.9, 20.0)
+    assert main([*words, "--burst-slots", "4"]) == 1
+    assert "burst_slots must be at least 9 for a slot_loss of 0.9, got 4" in capsys.readouterr().err
+    file = tmp_path / "settings.toml"
+    file.write_text("snr_db = 3\nslot_loss = 0.4\n")
+    assert main([*words, "--config", str(file), "--slot-loss", "0.5"]) == 0
+    now = json.loads(capsys.readouterr().out)
+    assert (now["snr_db"], now["slot_loss"], now["burst_slots"]) == (3.0, 0.5, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("snr_bd = 3", "unknown setting 'snr_bd', did you mean 'snr_db'"),
+        ("snr_db = 'low'", "link.snr_db must be of type float, got 'low'"),
+        ("", "set needs a value to change"),
+    ],
+)
+def test_set_refuses_what_no_channel_takes_without_asking_one(tmp_path, capsys, text, message):
+    file = tmp_path / "settings.toml"
+    file.write_text(text)
+    assert main(["channel", "set", "--connect", free_endpoint(), "--config", str(file)]) == 1
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.weights
+def test_weights_decide_on_the_codec_unless_one_is_named(tmp_path):
+    def codec(*words):
+        return settings_of(verb_parser("agent").parse_args(["--source", "0", *words])).codec
+
+    file = tmp_path / "settings.toml"
+    file.write_text('codec = "3dcsc"\n')
+    assert codec() == "3dcsc-lite"
+    assert codec("--weights", "cnn") == "cnn"
+    assert codec("--weights", "cnn", "--codec", "3dcsc-lite") == "3dcsc-lite"
+    assert codec("--weights", "cnn", "--config", str(file)) == "3dcsc"
+
+
+def test_a_server_without_a_gpu_says_so_at_once(capsys):
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    assert main(["server", "--device", "cuda"]) == 1
+    assert "device must be auto or cpu on this machine" in capsys.readouterr().err
+
+
+def test_doctor_says_what_runs_an_agent_without_torch(monkeypatch):
+    def missing(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "version", missing)
+    texts = {finding.what: finding.text for finding in check_packages()}
+    assert "extra 'edge'" in texts["onnxruntime"]
+    assert "without onnxruntime" in texts["torch"]
+
+
+@pytest.mark.weights
+def test_doctor_loads_what_an_agent_without_torch_sends_with():
+    code = """
+import sys
+sys.modules["torch"] = None
+from semcast.commands.doctor import check_weights
+print([finding.verdict for finding in check_weights() if finding.what == "codec 3dcsc-lite"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "['good']\n", done.stderr
+
+
+def test_a_run_is_not_exported_onto_itself(tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    out = tmp_path / "run" / ".." / "run"
+    assert main(["export", str(tmp_path / "run"), "--format", "colmap", "--out", str(out)]) == 1
+    err = capsys.readouterr().err
+    assert "--out must be another place than the run itself, got" in err
+    assert err.count("\n") == 1
+
+
+def test_a_recorder_that_met_nobody_says_that_nothing_was_recorded(tmp_path, capsys):
+    file = tmp_path / "keep.mcap"
+    file.write_bytes(b"an older recording")
+    before, tick = signal.getsignal(signal.SIGINT), threading.Event()
+
+    def interrupt():
+        end_s = time.monotonic() + 15.0
+        while signal.getsignal(signal.SIGINT) is before and time.monotonic() < end_s:
+            tick.wait(0.005)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    assert main(["record", str(file), "--connect", free_endpoint()]) == 130
+    thread.join()
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "nothing was recorded" in shown.err
+    assert file.read_bytes() == b"an older recording"
