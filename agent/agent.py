@@ -288,4 +288,5 @@ def run_agent(
             capture.close()
             sending.close()
             beat.close()
+            logger.info("%s", metrics.closing_line("sent"))
     return {**metrics.summary(), **summary}

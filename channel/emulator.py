@@ -206,6 +206,7 @@ def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, 
         finally:
             emulator.close()
             beat.close()
+            logger.info("%s", metrics.closing_line("carried"))
     return metrics.summary()
 
 

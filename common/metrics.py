@@ -83,6 +83,11 @@ class Metrics:
         with self._lock:
             return dict(self._counts)
 
+    def closing_line(self, event: str) -> str:
+        """Say how often something happened and what was dropped, for the end of a process."""
+        drops = ", ".join(f"{number} {reason}" for reason, number in sorted(self.drops.items()) if number)
+        return f"{self.counts.get(event, 0)} frames {event}; dropped: {drops or 'none'}"
+
     @staticmethod
     def _forget(times_ns: deque[int], now_ns: int) -> None:
         while times_ns and now_ns - times_ns[0] > RATE_WINDOW_S * 1e9:

@@ -237,9 +237,15 @@ class Session:
     def declare_alive(self, agent_id: str, role: str) -> None:
         """Show that a role is alive, until the session is closed or its process dies.
 
+        Warns when there is one already: two agents of one name take the receiver from each other.
+
         Raises:
             TransportError: The session is closed.
         """
+        if role in self.alive_roles(agent_id):
+            logger.warning(
+                "%s of %r is there already: stop one of the two or give it another --agent-id", role, agent_id
+            )
         key = alive_key(agent_id, role)
         self._tokens.append(self._declare(lambda: self._session.liveliness().declare_token(key), key))
 

@@ -81,3 +81,12 @@ def test_the_status_travels(metrics, clock):
     assert status.drops == {"stale": 1}
     assert status.stages_ms == {"encode": (4.0, 4.0, 4.0)}
     assert metrics.summary()["stage_ms"]["encode"] == {"p50": 4.0, "p95": 4.0, "max": 4.0}
+
+
+def test_the_closing_line_says_what_was_dropped(metrics):
+    metrics.count("sent", 45)
+    assert metrics.closing_line("sent") == "45 frames sent; dropped: none"
+    metrics.drop("superseded", 6)
+    metrics.drop("missing", 1)
+    metrics.drop("missing", -1)
+    assert metrics.closing_line("sent") == "45 frames sent; dropped: 6 superseded"

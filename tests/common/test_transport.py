@@ -130,6 +130,17 @@ def test_presence_is_seen_from_anywhere_and_ends_with_the_session(hub, pair):
     assert alive_roles(hub[1], "a") == {"server"}
 
 
+def test_a_second_agent_of_the_same_name_is_warned_of(pair, caplog):
+    one, other = pair
+    one.declare_alive("a", "agent")
+    other.declare_alive("a", "channel")
+    other.declare_alive("b", "agent")
+    until(lambda: other.alive_roles("a") == {"agent", "channel"})
+    assert not caplog.records
+    other.declare_alive("a", "agent")
+    assert "agent of 'a' is there already" in caplog.text
+
+
 def test_clients_survive_a_hub_that_is_killed():
     endpoint = free_endpoint()
     network = NetworkSettings(connect=(endpoint,))
