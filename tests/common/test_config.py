@@ -8,14 +8,8 @@ from typing import Literal
 
 import pytest
 
-from semcast.common.config import (
-    MissingSettingError,
-    add_flags,
-    build_settings,
-    given_values,
-    settings_from,
-    to_toml,
-)
+from semcast.common.config import MissingSettingError, build_settings, to_toml
+from semcast.common.config_flags import add_flags, given_values, settings_from
 from semcast.common.errors import ConfigError
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from semcast.common.config import add_flags, settings_from
+from semcast.common.config_flags import add_flags, settings_from
 from semcast.evaluation import confidence, latency, pairs, trajectory
 from semcast.evaluation.report import command_line
 

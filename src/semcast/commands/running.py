@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from semcast.common.config import add_flags, given_values, settings_from
+from semcast.common.config_flags import add_flags, given_values, settings_from
 
 S = TypeVar("S")
 
