@@ -203,7 +203,7 @@ def read_image_paths(folder: Path) -> dict[int, Path]:
     images = folder / IMAGES_NAME
     if not images.is_dir():
         return {}
-    return {int(p.stem): p for p in sorted(images.glob("*.jpg")) if p.stem.isdigit()}
+    return {int(p.stem): p for p in sorted(images.glob("*.jpg")) if p.stem.isdecimal()}
 
 
 @dataclass(frozen=True)

@@ -130,6 +130,13 @@ def test_a_writer_that_goes_on_keeps_what_is_there(tmp_path):
     assert list(read_image_paths(tmp_path)) == [0, 5]
 
 
+def test_files_of_other_names_are_no_images_of_the_run(tmp_path):
+    (tmp_path / "images").mkdir()
+    for name in ("000003.jpg", "1\u00b20.jpg", "mine.jpg"):
+        (tmp_path / "images" / name).write_bytes(b"x")
+    assert list(read_image_paths(tmp_path)) == [3]
+
+
 def test_provisional_images_stay_when_they_are_settled_for(tmp_path):
     with ImageWriter(tmp_path, lossless=True) as writer:
         for k in range(5):

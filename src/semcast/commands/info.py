@@ -10,7 +10,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "path",
         type=Path,
         metavar="PATH",
-        help="recording (.mcap), folder that --out wrote, sequence folder, weights (.safetensors) or the "
+        help="recording (.mcap), folder that --out wrote, sequence folder or transforms.json, weights (.safetensors) or the "
         "name of shipped weights",
     )
 
