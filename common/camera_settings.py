@@ -27,7 +27,8 @@ class CameraSettings:
     """
 
     intrinsics: Path | None = field(
-        default=None, metadata={"help": "calibration: intrinsics.json, or YAML of OpenCV, ROS, Kalibr or EuRoC"}
+        default=None,
+        metadata={"help": "calibration: intrinsics.json, or YAML of OpenCV, ROS, Kalibr or EuRoC"},
     )
     fx: float | None = field(default=None, metadata={"help": "focal length in pixels, horizontal"})
     fy: float | None = field(default=None, metadata={"help": "focal length in pixels, vertical"})

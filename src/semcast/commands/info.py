@@ -10,8 +10,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "path",
         type=Path,
         metavar="PATH",
-        help="recording (.mcap), folder that --out wrote, sequence folder or transforms.json, weights (.safetensors) or the "
-        "name of shipped weights",
+        help="recording (.mcap), folder that --out wrote, sequence folder or transforms.json, "
+        "weights (.safetensors) or the name of shipped weights",
     )
 
 
