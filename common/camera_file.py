@@ -199,7 +199,7 @@ def _distortion(values: dict[str, Any]) -> list[float]:
     if found is not None:
         return found
     for key, value in values.items():
-        is_spoken_of = key in _DISTORTION_KEYS or re.match("dist(?!ance)", key.lower())
+        is_spoken_of = key in _DISTORTION_KEYS or re.match("distor|dist_?coef", key.lower())
         if is_spoken_of and key not in _PINHOLE_WORDS:
             known = ", ".join(_DISTORTION_KEYS)
             raise ValueError(f"{key} must be a list of numbers named {known}, got {value!r}")

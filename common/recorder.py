@@ -43,7 +43,7 @@ class Recorder:
 
     Args:
         path: File to write. One that is there and not empty is kept under another name: it may be the
-            recording of a process that was killed, whose restart this is.
+            recording of a process that was killed, whose restart this is. Without a message no file is left.
         header: See ``recording_metadata``.
         queue_bytes: Payload that may wait for the disk.
         stream: Written instead of ``path``, for tests.
@@ -71,10 +71,12 @@ class Recorder:
         self.bytes_written = 0
         self.drops: Counter[str] = Counter()
         self.error: str | None = None
+        self._former: Path | None = None
+        self._is_own = stream is None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if stream is None:
-                set_aside(path)
+            if self._is_own:
+                self._former = set_aside(path)
                 stream = path.open("wb")
             self._stream = stream
             self._writer = RecordingWriter(self._stream, header)
@@ -165,8 +167,16 @@ class Recorder:
         if not already and not self._thread.is_alive():
             try:
                 self._stream.close()
+                self._drop_empty()
             except OSError as err:
                 logger.error("closing %s failed: %s", self._path, err)
+
+    def _drop_empty(self) -> None:
+        """Leave things as they were where nothing came: a start that fails must not move a good recording."""
+        if self._is_own and self.num_written == 0 and self.error is None:
+            self._path.unlink(missing_ok=True)
+            if self._former is not None:
+                self._former.rename(self._path)
 
     def __enter__(self) -> "Recorder":
         return self

@@ -47,6 +47,7 @@ FRAMES_NAME = "frames.jsonl"
 VIEWER_NAME = "run.rrd"
 RECONSTRUCTION_NAME = "reconstruction.npz"
 IMAGES_NAME = "images"
+CHECKPOINT_NAME = "checkpoint.npz"
 
 FORMAT = 1
 #: Frames that may wait for a map to begin, whose start can make keyframes of them.
@@ -213,16 +214,6 @@ class _Image:
     provisional: bool
 
 
-def remove_outputs(folder: Path) -> None:
-    """Remove what an earlier run left in a folder and a new one would be mixed with; say what can't be."""
-    results = [folder / name for name in (TRAJECTORY_NAME, MAP_NAME, RECONSTRUCTION_NAME, SUMMARY_NAME)]
-    for old in (*results, *read_image_paths(folder).values()):
-        try:
-            old.unlink(missing_ok=True)
-        except OSError as err:
-            logger.warning("%s is of an earlier run and can't be removed: %s", old, err)
-
-
 class ImageWriter:
     """Writes decoded images into ``images/`` on its own thread, so that tracking does not wait for the disk.
 
@@ -242,7 +233,10 @@ class ImageWriter:
         self._images = folder / IMAGES_NAME
         self._lossless = lossless
         self._quality = quality
-        self._queue: queue.Queue[_Image | frozenset[int] | None] = queue.Queue(capacity)
+        self._queue: queue.Queue[_Image | None] = queue.Queue(capacity)
+        #: What is kept of the provisional images written so far; not in the queue, which may be full.
+        self._settled: deque[tuple[int, frozenset[int]]] = deque()
+        self._num_put = 0
         self.num_written = 0
         self.num_dropped = 0
         try:
@@ -265,25 +259,22 @@ class ImageWriter:
         if self._closed:
             return
         item = _Image(frame_id, image, provisional)
-        if self._lossless:
-            self._queue.put(item)
-            return
         try:
-            self._queue.put_nowait(item)
+            self._queue.put(item, block=self._lossless)
+            self._num_put += 1
         except queue.Full:
             self.num_dropped += 1
 
     def settle(self, kept: Collection[int]) -> None:
-        """Remove the provisional images of all other frames."""
-        if not self._closed:
-            self._queue.put(frozenset(kept))
+        """Remove the provisional images of all other frames put so far. Returns at once."""
+        self._settled.append((self._num_put, frozenset(kept)))
 
     def _run(self) -> None:
-        failed = False
+        failed, num_taken = False, 0
         while (item := self._queue.get()) is not None:
-            if isinstance(item, frozenset):
-                self._drop_provisional(item)
-                continue
+            while self._settled and self._settled[0][0] <= num_taken:
+                self._drop_provisional(self._settled.popleft()[1])
+            num_taken += 1
             if failed:
                 self.num_dropped += 1
                 continue
@@ -293,6 +284,8 @@ class ImageWriter:
                 failed = True
                 self.num_dropped += 1
                 logger.warning("%s can't be written: %s; the run goes on without images", self._images, err)
+        while self._settled:
+            self._drop_provisional(self._settled.popleft()[1])
         self._drop_provisional(frozenset())
 
     def _write(self, item: _Image) -> None:
@@ -307,7 +300,7 @@ class ImageWriter:
             if len(self._provisional) > MAX_PROVISIONAL:
                 self._remove(self._provisional.popleft())
 
-    def _drop_provisional(self, kept: frozenset[int]) -> None:
+    def _drop_provisional(self, kept: Collection[int]) -> None:
         for frame_id in self._provisional:
             if frame_id not in kept:
                 self._remove(frame_id)

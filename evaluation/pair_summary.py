@@ -94,7 +94,7 @@ def pair_summary(reports: Iterable[Mapping[str, Any]]) -> str:
 
 
 def _left_out(num_silent: int) -> Iterator[str]:
-    silent = f" The {num_silent} cells in which no image arrived are left out." if num_silent else ""
+    silent = f" Left out: {num_silent} cell(s) in which no pair arrived." if num_silent else ""
     yield f"A pair of which an image was lost, or for which nothing was found, counts as 90 degrees.{silent}"
 
 

@@ -86,7 +86,8 @@ def _pairs(report: Report) -> Iterator[str]:
 def _interval(cell: Mapping[str, Any]) -> str:
     for c in cell["comparisons"]:
         if (c["mode"], c["against"], c["figure"]) == ("robust", RIVAL, "tdir_deg_mean") and c["paired"]:
-            return f"{c['paired']['low']:+.1f} .. {c['paired']['high']:+.1f}"
+            low, high = c["paired"]["low"], c["paired"]["high"]
+            return "-" if low is None else f"{low:+.1f} .. {high:+.1f}"
     return "-"
 
 

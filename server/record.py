@@ -89,7 +89,7 @@ def recording(
     Args:
         session: Open network session; what it sends itself is recorded too.
         agent_id: Whose stream.
-        file: Recording to write; replaced when it exists.
+        file: Recording to write; one that is there is kept under another name.
         settings_toml: Resolved settings of the program, kept in the recording.
 
     Raises:

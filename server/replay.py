@@ -15,7 +15,6 @@ from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codecs import load_codec
-from semcast.common.config import to_toml
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.keys import agent_of
 from semcast.common.messages import CameraInfo, SymbolFrame
@@ -23,9 +22,11 @@ from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.rate import belongs_to
 from semcast.common.recording_reader import RecordingReader
+from semcast.common.run_folder import IMAGES_NAME
 from semcast.common.symbol_payload import data_symbols, lost_slots_of, slots_of
 from semcast.common.wire import unpack
 from semcast.server.decoder import DecodedArrival, FrameDecoder
+from semcast.server.former_run import check_not_foreign
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.receiver import ReceivedFrame
 from semcast.server.reference import recording_reference, sequence_reference
@@ -137,6 +138,8 @@ def replay(
         view=settings.view,
     )
     check_viewer(server)
+    if settings.out is not None and settings.save_images != "none":
+        check_not_foreign(settings.out, IMAGES_NAME)
     decoder = FrameDecoder(
         lambda name, modulation: load_codec(name, modulation=modulation, num_threads=settings.threads)
     )
@@ -153,7 +156,7 @@ def replay(
         if settings.reference is not None
         else recording_reference(reader, camera)
     )
-    session = Session(server, identity, settings.out, reference, settings_toml=to_toml(settings))
+    session = Session(server, identity, settings.out, reference, program=settings)
     viewer = open_viewer(server, identity, reference.truth if reference is not None else None)
     stop = stop if stop is not None else threading.Event()
     drops: dict[str, int] = {}

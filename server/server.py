@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.keys import camera_key, control_key
 from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
 from semcast.common.metrics import Metrics
+from semcast.common.run_folder import IMAGES_NAME
 from semcast.common.sequence import open_sequence
 from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
@@ -25,6 +25,7 @@ from semcast.common.transport import open_session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import DecodedArrival, FrameDecoder
+from semcast.server.former_run import check_not_foreign, free_folder
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.outbox import Outbox
 from semcast.server.receiver import ReceivedFrame, Receiver
@@ -44,8 +45,8 @@ CAMERA_TIMEOUT_S = 0.5
 WARM_UP_SHAPE_HW = (256, 384)
 #: How long stragglers are waited for after the source's last frame.
 FINAL_IDLE_S = 0.5
-#: The last frame may be lost on the air: so many from the end, or the last fifth, count as the end once the
-#: agent is gone.
+#: The last frame may be lost on the air: the last so many, or the last fifth where that is fewer, count as
+#: the end once the agent is gone.
 NEARLY_FINAL_FRAMES = 10
 AGENT_GONE_S = 2.0
 #: How long after a restart of the agent its former start's frames may still come: above any channel's delay.
@@ -129,6 +130,8 @@ class Server:
                 settings.out.mkdir(parents=True, exist_ok=True)
             except OSError as err:
                 raise ConfigError(f"{settings.out} can't be made a folder for outputs: {err}") from err
+            if settings.save_images != "none":
+                check_not_foreign(settings.out, IMAGES_NAME)
         if settings.reference is not None:
             open_sequence(settings.reference, settings.camera)
         self._spare_bundle = self._new_bundle()
@@ -407,21 +410,13 @@ class Server:
         now = self._metrics.drops
         return {reason: n for reason in now if (n := now[reason] - self._drops_before.get(reason, 0)) > 0}
 
-    def _folder_for_former(self) -> Path | None:
-        out = self._settings.out
-        if out is None:
-            return None
-        n = 1
-        while os.path.lexists(out / f"previous-{n}"):  # Path.exists raises where it may not look
-            n += 1
-        return out / f"previous-{n}"
-
     def _end_former(self, former: Session) -> None:
         """Write what the agent's start before leaves behind; that it can't be written ends no stream."""
         if former.last_frame_id >= 0:
             self._former_epochs.clear()
         self._former_epochs.add(former.identity.agent_epoch)
-        folder = self._folder_for_former()
+        out = self._settings.out
+        folder = free_folder(out) if out is not None else None
         try:
             self._end(former, folder)
         except (OSError, SemcastError) as err:
@@ -465,9 +460,9 @@ class Server:
 
 def _is_nearly_final(frame_id: int, camera: CameraInfo) -> bool:
     """Whether a frame is among the last of a finite source, whose ids may count in steps."""
-    if camera.num_frames is None:
+    last_id = camera.last_frame_id
+    if camera.num_frames is None or last_id is None:
         return False
-    last_id = camera.last_frame_id if camera.last_frame_id is not None else camera.num_frames - 1
     step = max(1, last_id // max(1, camera.num_frames - 1))
     nearly = min(NEARLY_FINAL_FRAMES, max(1, camera.num_frames // 5))
     return frame_id > last_id - nearly * step

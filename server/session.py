@@ -17,6 +17,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.config import settings_to_dict, to_toml
 from semcast.common.errors import CheckpointError, SemcastError
 from semcast.common.run_folder import (
+    CHECKPOINT_NAME,
     FRAMES_NAME,
     IMAGES_NAME,
     MAP_NAME,
@@ -25,7 +26,6 @@ from semcast.common.run_folder import (
     TRAJECTORY_NAME,
     ImageWriter,
     RunData,
-    remove_outputs,
     write_run,
 )
 from semcast.common.trajectory import Trajectory, write_tum
@@ -37,6 +37,7 @@ from semcast.server.checkpoint import (
     mismatch,
 )
 from semcast.server.export.outputs import trajectory_of, versions, write_json, write_ply
+from semcast.server.former_run import set_aside
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.bundle_process import ProcessBundle
@@ -51,7 +52,6 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-CHECKPOINT_NAME = "checkpoint.npz"
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
 #: Stages in the viewer's plot; all of them are in ``frames.jsonl`` and the summary.
@@ -118,7 +118,7 @@ class Session:
         folder: Where outputs go, or None.
         reference: Originals and truth, or None.
         bundle: A runner made ahead by ``new_bundle``, which the session closes; None makes one.
-        settings_toml: Settings of the program for the run's records; None takes ``settings``.
+        program: Settings of the program for the run's records; None takes ``settings``.
 
     Raises:
         OSError: The folder can't be made.
@@ -132,10 +132,10 @@ class Session:
         folder: Path | None,
         reference: Reference | None,
         bundle: BundleRunner | None = None,
-        settings_toml: str | None = None,
+        program: Any = None,
     ) -> None:
         self._settings = settings
-        self._settings_toml = settings_toml if settings_toml is not None else to_toml(settings)
+        self._program = program if program is not None else settings
         self.identity = identity
         self._folder = folder
         self._reference = reference
@@ -165,7 +165,7 @@ class Session:
         folder.mkdir(parents=True, exist_ok=True)
         self.resumed = settings.resume and self._restore(folder / CHECKPOINT_NAME)
         if not self.resumed:
-            remove_outputs(folder)
+            set_aside(folder)
         self._record = RunRecord(folder, resume=self.resumed)
         self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME)
         if settings.save_images != "none":
@@ -252,7 +252,7 @@ class Session:
         """Keep the decoded image where the settings want it. A start makes keyframes of earlier frames."""
         if self._images is None:
             return
-        waits = result.state is TrackingState.INITIALIZING
+        waits = result.state is not TrackingState.TRACKING  # a later part of the map begins from lost frames
         if result.is_keyframe or waits or self._settings.save_images == "all":
             self._images.put(
                 frame.frame_id, frame.image, provisional=waits and self._settings.save_images == "keyframes"
@@ -322,7 +322,7 @@ class Session:
         }
         summary["resumed"] = self.resumed
         summary["versions"] = versions()
-        summary["settings"] = settings_to_dict(self._settings)
+        summary["settings"] = settings_to_dict(self._program)
         if folder is not None:
             write_json(folder / SUMMARY_NAME, summary)
         return summary
@@ -338,7 +338,7 @@ class Session:
         ids, xyz, rgb, confidence = self._reconstruction.landmarks()
         if folder is not None:
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / SETTINGS_NAME).write_text(self._settings_toml, encoding="utf-8")
+            (folder / SETTINGS_NAME).write_text(to_toml(self._program), encoding="utf-8")
             write_tum(folder / TRAJECTORY_NAME, trajectory)
             write_ply(folder / MAP_NAME, xyz, rgb, confidence)
             self._write_run(folder, poses, ids, xyz, rgb, confidence)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.errors import SemcastError
+from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recording_reader import RecordingReader
 from semcast.demo import DemoSettings, real_time_resize, role_commands, run_demo
 from semcast.server.replay import ReplaySettings, replay
@@ -54,6 +54,16 @@ def test_a_role_that_can_not_start_ends_the_demo_with_its_own_words(tmp_path):
     settings = DemoSettings(codec="no-such-codec", view="none", resize=0.25, out=tmp_path)
     with pytest.raises(SemcastError, match="did not start: .*no-such-codec"):
         run_demo(settings, threading.Event(), lambda line: None, lambda row: None)
+
+
+def test_a_folder_with_images_no_run_wrote_is_no_place_for_outputs(tmp_path):
+    sequence = tmp_path / "sequence"
+    shutil.copytree(SEQUENCE, sequence)
+    before = sorted(p.name for p in sequence.rglob("*"))
+    settings = DemoSettings(sequence=sequence, codec="jpeg-ldpc", view="none", out=sequence)
+    with pytest.raises(ConfigError, match="out must not hold images that no run wrote"):
+        run_demo(settings, threading.Event(), lambda line: None, lambda row: None)
+    assert sorted(p.name for p in sequence.rglob("*")) == before
 
 
 @pytest.mark.slow

@@ -192,6 +192,7 @@ class Initialiser:
             if shared >= max(MIN_POINTS, _MIN_SHARED * len(reference.ids)):
                 return
             self._reference += 1
+            # Its tracks begin anew. Attempts are counted on: a fast camera would never use them up.
             self._undecided_flow_px = 0.0
 
     def _build(self, found: TwoViewResult, ids: Ids, noise: NoiseModel) -> Start | None:
@@ -236,7 +237,7 @@ class Initialiser:
         return Start(keyframes, all_ids[good], scale * points.xyz[good], mean)
 
     def _decide(self, views: list[Observed], T_world_cam: Array, noise: NoiseModel) -> Side | None:
-        """Adjust the start and its mirror image in depth; None while both fit the observations."""
+        """Adjust the start and the structures it may be mistaken for; None while several fit."""
         all_ids, count = np.unique(np.concatenate([o.ids for o in views]), return_counts=True)
         longest = np.lexsort((all_ids, -count))[:_MAX_DECIDING]
         ids = np.sort(all_ids[longest[count[longest] >= 2]])

@@ -51,8 +51,8 @@ def twin(problem: BundleProblem) -> BundleProblem | None:
     found = _other_pose(np.linalg.inv(K) @ np.asarray(H) @ K, problem, _rays(K, xy0[flat]))
     if found is None:
         return None
-    R, t, normal = found
-    return _on_plane(problem, K, R, t, normal)
+    R_last_first, t_last_first, normal = found
+    return _on_plane(problem, K, R_last_first, t_last_first, normal)
 
 
 def _rays(K: Array, xy: Array) -> Array:
@@ -66,10 +66,11 @@ def _other_pose(H: Array, problem: BundleProblem, rays: Array) -> tuple[Array, A
     way_now = -T_now[:3, :3].T @ T_now[:3, 3]
     found, furthest = None, np.cos(np.radians(_SAME_WAY_DEG)) * np.linalg.norm(way_now)
     for pose, n in zip(poses, normals, strict=True):
-        R, t, normal = project_to_so3(np.asarray(pose.R)), np.asarray(pose.t), np.asarray(n)
+        t, normal = np.asarray(pose.t), np.asarray(n)
         length = float(np.linalg.norm(t))
-        if not (np.isfinite(R).all() and np.isfinite(length) and np.isfinite(normal).all() and length > 1e-9):
+        if not (np.isfinite(pose.R).all() and np.isfinite(normal).all() and 1e-9 < length < np.inf):
             continue
+        R = project_to_so3(np.asarray(pose.R))
         height = rays @ normal
         seen = rays @ R.T + height[:, None] * t  # times the depth, which has the sign of the height
         in_front = (height > 0.0) & (seen[:, 2] > 0.0)
@@ -79,12 +80,14 @@ def _other_pose(H: Array, problem: BundleProblem, rays: Array) -> tuple[Array, A
     return found
 
 
-def _on_plane(problem: BundleProblem, K: Array, R: Array, t: Array, normal: Array) -> BundleProblem:
+def _on_plane(
+    problem: BundleProblem, K: Array, R_last_first: Array, t_last_first: Array, normal: Array
+) -> BundleProblem:
     """Put all points on the plane and the views between where those ask for them."""
     T_world_first = problem.T_world_cam[0]
     baseline = np.linalg.norm((invert_transform(T_world_first) @ problem.T_world_cam[-1])[:3, 3])
-    distance = float(baseline / np.linalg.norm(t))
-    T_last = invert_transform(make_transform(R, distance * t))
+    distance = float(baseline / np.linalg.norm(t_last_first))
+    T_last = invert_transform(make_transform(R_last_first, distance * t_last_first))
     fx, fy, cx, cy = problem.intrinsics
     camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=1, height=1)  # a pose does not ask for the size
     num_views = len(problem.T_world_cam)

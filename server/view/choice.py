@@ -41,8 +41,6 @@ def open_viewer(
     """
     file = settings.out / VIEWER_NAME if settings.out is not None else None
     if not _is_shown(settings):
-        if file is not None and not resumed:
-            file.unlink(missing_ok=True)  # it would show another run
         return None
     from semcast.server.view.feed import ViewerFeed
 

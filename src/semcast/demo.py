@@ -19,8 +19,10 @@ from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.rate import NATIVE_RATE, RateChoice
+from semcast.common.run_folder import IMAGES_NAME, SUMMARY_NAME
 from semcast.common.sequence import open_sequence
 from semcast.common.transport import free_endpoint, open_session
+from semcast.server.former_run import check_not_foreign, discard
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
 START_DEADLINE_S = 60.0
@@ -236,8 +238,9 @@ def run_demo(
     sequence = settings.sequence or default_sequence()
     settings.out.mkdir(parents=True, exist_ok=True)
     summary_file = settings.out / "summary.json"
-    for stale in (summary_file, settings.out / "checkpoint.npz", settings.out / "frames.jsonl"):
-        stale.unlink(missing_ok=True)
+    for name in (SUMMARY_NAME, IMAGES_NAME):
+        check_not_foreign(settings.out, name)
+    discard(settings.out)
     logs = settings.out / "logs"
     logs.mkdir(exist_ok=True)
     endpoint = free_endpoint()

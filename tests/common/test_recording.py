@@ -246,9 +246,23 @@ def test_a_recording_that_is_there_is_kept(tmp_path):
 def test_an_empty_file_is_written_over(tmp_path):
     path = tmp_path / "run.mcap"
     path.touch()
+    with Recorder(path, HEADER) as recorder:
+        recorder.put("semcast/a/pose", "pose", b"x")
+    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_a_recorder_that_heard_nothing_leaves_all_as_it_was(tmp_path):
+    path = tmp_path / "run.mcap"
     with Recorder(path, HEADER):
         pass
+    assert not list(tmp_path.iterdir())
+    with Recorder(path, HEADER) as recorder:
+        recorder.put("semcast/a/pose", "pose", b"x")
+    for _ in range(2):
+        with Recorder(path, HEADER):
+            pass
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+    assert [m.data for m in RecordingReader(path).messages()] == [b"x"]
 
 
 class SlowStream(io.BytesIO):

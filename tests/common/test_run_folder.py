@@ -1,4 +1,5 @@
 import dataclasses
+import threading
 import zipfile
 
 import cv2
@@ -13,7 +14,6 @@ from semcast.common.run_folder import (
     RunData,
     read_image_paths,
     read_run,
-    remove_outputs,
     write_run,
 )
 
@@ -156,15 +156,23 @@ def test_only_the_newest_provisional_images_wait(tmp_path, monkeypatch):
     assert list(read_image_paths(tmp_path)) == [3, 4, 5]
 
 
-def test_results_of_an_earlier_run_are_removed_and_nothing_else(tmp_path):
-    with ImageWriter(tmp_path, lossless=True) as writer:
-        writer.put(7, picture(1))
-    for name in ("trajectory.tum", "map.ply", "summary.json", "notes.txt", "run.mcap", "images/mine.txt"):
-        (tmp_path / name).write_text("x")
-    remove_outputs(tmp_path)
-    left = sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file())
-    assert left == ["images/mine.txt", "notes.txt", "run.mcap"]
-    remove_outputs(tmp_path / "not_there")
+def test_settling_never_waits_for_the_disk(tmp_path, monkeypatch):
+    may_write = threading.Event()
+    write = ImageWriter._write
+
+    def slow(self, item):
+        may_write.wait(30)
+        write(self, item)
+
+    monkeypatch.setattr(ImageWriter, "_write", slow)
+    with ImageWriter(tmp_path, lossless=False, capacity=2) as writer:
+        for k in range(8):
+            writer.put(k, picture(k), provisional=True)
+        writer.settle(range(8))
+        assert not may_write.is_set()
+        may_write.set()
+    assert len(read_image_paths(tmp_path)) == writer.num_written >= 2
+    assert writer.num_written + writer.num_dropped == 8
 
 
 def test_a_folder_that_vanishes_is_counted_and_does_not_raise(tmp_path):

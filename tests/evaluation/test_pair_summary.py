@@ -101,5 +101,5 @@ def test_a_part_of_a_page_is_replaced_and_markers_are_needed():
 def test_a_cell_in_which_nothing_arrived_is_left_out_and_said():
     silent = cell(6.0, dict.fromkeys(ERRORS, 90.0), num_pairs_lost=20)
     with_it, without = (pair_summary([report(cell(2.0, ERRORS), *more)]) for more in ((silent,), ()))
-    assert "The 1 cells in which no image arrived are left out." in with_it
-    assert with_it.replace(" The 1 cells in which no image arrived are left out.", "") == without
+    assert "Left out: 1 cell(s) in which no pair arrived." in with_it
+    assert with_it.replace(" Left out: 1 cell(s) in which no pair arrived.", "") == without

@@ -553,11 +553,12 @@ def test_the_hub_is_on_loopback_unless_told_otherwise():
 @pytest.mark.parametrize(
     ("num_frames", "last_id", "frame_id", "is_near"),
     [
-        (51, None, 41, True),
-        (51, None, 40, False),
+        (51, 50, 41, True),
+        (51, 50, 40, False),
         (13, 48, 44, True),  # every fourth frame of 51
         (13, 48, 40, False),
         (13, 48, 24, False),
+        (100, None, 495, False),  # a camera's images are counted as they come
         (None, None, 10**6, False),
     ],
 )

@@ -1,5 +1,6 @@
 """One start of an agent, frame by frame, without a network."""
 
+import json
 import threading
 import time
 from pathlib import Path
@@ -8,10 +9,13 @@ import numpy as np
 import pytest
 
 from semcast.common.camera import Intrinsics
+from semcast.common.config import build_settings, read_toml
 from semcast.common.run_folder import read_image_paths, read_run
 from semcast.common.sequence import open_sequence
+from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.reference import Reference
+from semcast.server.replay import ReplaySettings
 from semcast.server.session import Arrival, Session, StreamIdentity
 from semcast.server.settings import ServerSettings
 
@@ -77,9 +81,10 @@ def demo():
     return open_sequence(DEMO, resize=0.35)
 
 
-def run_session(demo, folder, frame_ids, epoch=5, settings_toml=None, **settings):
+def run_session(demo, folder, frame_ids, epoch=5, program=None, **settings):
     """A session over some frames of the demo; ends with its outputs unless it is ``killed``."""
     killed = settings.pop("killed", False)
+    picture = settings.pop("picture", lambda demo, k: demo.image(k))
     identity = StreamIdentity(
         agent_id="a", agent_epoch=epoch, codec="x", digest="", camera=demo.intrinsics, num_frames=None
     )
@@ -88,11 +93,11 @@ def run_session(demo, folder, frame_ids, epoch=5, settings_toml=None, **settings
         identity,
         folder,
         None,
-        settings_toml=settings_toml,
+        program=program,
     )
     for k in frame_ids:
         now_ns = time.perf_counter_ns()
-        frame = DecodedFrame(k, int(demo.times_ns[k]), demo.image(k), None)
+        frame = DecodedFrame(k, int(demo.times_ns[k]), picture(demo, k), None)
         session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}))
     if killed:
         session.save_checkpoint()
@@ -114,17 +119,39 @@ def test_all_images_are_kept_where_all_are_wanted(demo, tmp_path):
     assert list(read_image_paths(tmp_path)) == list(range(8))
 
 
-def test_a_resumed_session_keeps_the_images_and_a_new_one_does_not(demo, tmp_path):
+def turned(demo, k):
+    """The demo, and from its eighth frame on another place: its images upside down."""
+    image = demo.image(k)
+    return image if k < 8 else np.ascontiguousarray(image[::-1, ::-1])
+
+
+def test_every_keyframe_of_a_later_part_has_its_image_too(demo, tmp_path):
+    reconstruction = ReconstructionSettings(lost_after_frames=4)
+    run_session(
+        demo, tmp_path, range(20), picture=turned, save_images="keyframes", reconstruction=reconstruction
+    )
+    keyframes = read_run(tmp_path).keyframe_ids.tolist()
+    assert min(k for k in keyframes if k >= 8) < 12, "the part began with frames that were lost"
+    assert list(read_image_paths(tmp_path)) == keyframes
+
+
+def test_a_resumed_session_goes_on_with_what_is_there_and_a_new_one_sets_it_aside(demo, tmp_path):
     run_session(demo, tmp_path, range(8), save_images="keyframes", killed=True)
     before = list(read_image_paths(tmp_path))
     assert before
     resumed = run_session(demo, tmp_path, range(8, 20), save_images="keyframes")
     assert resumed.resumed
-    assert set(before) < set(read_image_paths(tmp_path))
+    after = list(read_image_paths(tmp_path))
+    assert set(before) < set(after)
+    trajectory = (tmp_path / "trajectory.tum").read_bytes()
     run_session(demo, tmp_path, range(3), epoch=6, save_images="none")
     assert not read_image_paths(tmp_path)
+    assert list(read_image_paths(tmp_path / "previous-1")) == after
+    assert (tmp_path / "previous-1" / "trajectory.tum").read_bytes() == trajectory
 
 
 def test_the_records_hold_the_settings_of_the_program(demo, tmp_path):
-    run_session(demo, tmp_path, range(3), settings_toml="pace = 2.0\n")
-    assert (tmp_path / "settings.toml").read_text() == "pace = 2.0\n"
+    program = ReplaySettings(file=Path("run.mcap"), pace=2.0)
+    run_session(demo, tmp_path, range(3), program=program)
+    assert build_settings(ReplaySettings, read_toml(tmp_path / "settings.toml")) == program
+    assert json.loads((tmp_path / "summary.json").read_text())["settings"]["pace"] == 2.0

@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from semcast.commands.demo import summary_table
-from semcast.commands.running import add_settings, read_settings, run_until_stopped
+from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
 from semcast.server.replay import ReplaySettings, replay
 
 #: A recording is replayed in order and at once; the seed is that of channel and estimation alike.
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Replay and print the figures."""
     settings = read_settings(ReplaySettings, arguments)
-    if settings.symbols is None and any(name.startswith("link.") for name in vars(arguments)):
+    if settings.symbols is None and "link" in read_given(ReplaySettings, arguments):
         settings = replace(settings, symbols="transmitted")  # a channel asked for by its default values
     talk = Console(stderr=True)
     summary: dict[str, Any] = {}

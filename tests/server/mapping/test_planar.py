@@ -56,14 +56,10 @@ def test_a_world_frame_that_is_not_the_first_camera_changes_nothing(wall):
     np.testing.assert_allclose(b.xyz @ back[:3, :3].T + back[:3, 3], a.xyz, atol=1e-6)
 
 
-def test_a_scene_with_depth_has_no_twin_and_moving_straight_at_a_wall_neither(arc, wall, direction_error_deg):
+def test_a_scene_with_depth_has_no_twin_and_moving_straight_at_a_wall_neither(arc, wall):
     assert twin(arc(focal_px=600.0, depth=4.0)) is None
     normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
-    ahead = twin(wall(way=tuple(0.4 * normal), turn_deg=(0.0, 0.0, 0.0)))
-    assert (
-        ahead is None
-        or direction_error_deg(ahead.T_world_cam, wall(way=tuple(0.4 * normal)).T_world_cam) < 2.0
-    )
+    assert twin(wall(way=tuple(0.4 * normal), turn_deg=(0.0, 0.0, 0.0))) is None
 
 
 def test_too_few_common_points_have_no_twin(wall):

@@ -1,0 +1,76 @@
+"""An output folder that is not empty."""
+
+import pytest
+
+from semcast.common.errors import ConfigError
+from semcast.server.former_run import check_not_foreign, discard, is_run, set_aside
+
+OURS = ("trajectory.tum", "map.ply", "summary.json", "settings.toml", "frames.jsonl", "run.rrd")
+THEIRS = ("groundtruth.txt", "intrinsics.json", "run.mcap")
+
+
+def fill(folder, names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(name)
+
+
+def files_of(folder):
+    return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+
+
+def test_a_former_run_is_moved_as_a_whole_and_nothing_else(tmp_path):
+    for n in (1, 2):
+        fill(tmp_path, [*OURS, "images/000003.jpg"])
+        fill(tmp_path, THEIRS)
+        set_aside(tmp_path)
+        assert not is_run(tmp_path)
+        assert files_of(tmp_path / f"previous-{n}") == sorted([*OURS, "images/000003.jpg"])
+    assert set(THEIRS) <= set(files_of(tmp_path))
+
+
+@pytest.mark.parametrize("act", [set_aside, discard])
+def test_a_folder_no_run_has_written_into_is_left_alone(tmp_path, act):
+    # A recorded sequence, a cloud and pictures of somebody else.
+    fill(tmp_path, ["images/000000.jpg", "images/000001.jpg", "map.ply", "frames.jsonl.txt", *THEIRS])
+    before = files_of(tmp_path)
+    act(tmp_path)
+    act(tmp_path / "not_there")
+    assert files_of(tmp_path) == before
+
+
+def test_an_empty_row_file_alone_is_no_run(tmp_path):
+    (tmp_path / "frames.jsonl").touch()
+    set_aside(tmp_path)
+    assert files_of(tmp_path) == ["frames.jsonl"]
+
+
+def test_a_discarded_run_leaves_what_is_not_its_own(tmp_path):
+    fill(tmp_path, [*OURS, *THEIRS, "images/000003.jpg", "images/mine.jpg"])
+    discard(tmp_path)
+    assert files_of(tmp_path) == sorted([*THEIRS, "images/mine.jpg"])
+
+
+def test_names_of_ours_that_no_run_wrote_are_refused(tmp_path):
+    check_not_foreign(tmp_path, "images")
+    (tmp_path / "images").mkdir()
+    check_not_foreign(tmp_path, "images")
+    fill(tmp_path, ["images/000000.jpg"])
+    with pytest.raises(ConfigError, match=r"out must not hold images that no run wrote"):
+        check_not_foreign(tmp_path, "images")
+    fill(tmp_path, OURS)
+    check_not_foreign(tmp_path, "images")
+
+
+def test_what_can_not_be_moved_is_told(tmp_path, caplog):
+    fill(tmp_path, OURS)
+    (tmp_path / "previous-1").symlink_to(tmp_path / "nowhere")
+    set_aside(tmp_path)
+    assert is_run(tmp_path / "previous-2")
+    fill(tmp_path, OURS)
+    tmp_path.chmod(0o500)
+    try:
+        set_aside(tmp_path)
+    finally:
+        tmp_path.chmod(0o700)
+    assert is_run(tmp_path) == ("can't be set aside" in caplog.text)
