@@ -75,7 +75,7 @@ class Recorder:
         self._is_own = stream is None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if self._is_own:
+            if stream is None:
                 self._former = set_aside(path)
                 stream = path.open("wb")
             self._stream = stream
