@@ -14,6 +14,9 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.errors import ConfigError, SemcastError, TransportError
@@ -31,6 +34,9 @@ STOP_DEADLINE_S = 15.0
 AGENT_ID = "demo"
 #: Image size at which agent, channel, server and viewer together keep up at 10 Hz on two cores.
 REAL_TIME_PIXELS = 250_000
+#: Images a second that are sent by default, about. More than can be served are dropped at random, and
+#: following a camera over gaps costs more than following every image.
+REAL_TIME_HZ = 12.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +75,12 @@ class DemoSettings:
             "help": "factor on the image size; by default what two cores can serve at 10 frames a second"
         },
     )
+    stride: int | None = field(
+        default=None,
+        metadata={
+            "help": "send every Nth image; by default as many a second as two cores can serve (about 12)"
+        },
+    )
     save_images: Literal["none", "keyframes", "all"] = field(
         default="keyframes", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
@@ -85,6 +97,8 @@ class DemoSettings:
             raise ValueError(f"snr_db must be in [-5, 30], got {self.snr_db:g}")
         if self.resize is not None and not 0.05 <= self.resize <= 1.0:
             raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
+        if self.stride is not None and self.stride < 1:
+            raise ValueError(f"stride must be at least 1, got {self.stride}")
 
 
 def default_sequence() -> Path:
@@ -108,8 +122,16 @@ def real_time_resize(shape_hw: tuple[int, int]) -> float:
     return min(1.0, round(math.sqrt(REAL_TIME_PIXELS / (height * width)), 2))
 
 
+def real_time_stride(times_ns: NDArray[np.int64]) -> int:
+    """Return the step between images that are sent, so that there are no more a second than can be served."""
+    if len(times_ns) < 2:
+        return 1
+    usual_s = float(np.median(np.diff(times_ns))) * 1e-9
+    return max(1, math.floor(1.0 / (usual_s * REAL_TIME_HZ) + 0.5)) if usual_s > 0.0 else 1
+
+
 def role_commands(
-    settings: DemoSettings, sequence: Path, resize: float, endpoint: str
+    settings: DemoSettings, sequence: Path, resize: float, stride: int, endpoint: str
 ) -> dict[str, list[str]]:
     """Return the command line of each role, in the order they are started."""
     program = [sys.executable, "-m", "semcast"]
@@ -125,7 +147,8 @@ def role_commands(
     channel += ["--seed", str(settings.seed)]
     agent = [*program, "agent", *meet, "--source", str(sequence), "--codec", settings.codec]
     agent += ["--rate", settings.rate]
-    agent += ["--modulation", settings.modulation, "--resize", f"{resize:g}", *_camera_flags(settings.camera)]
+    agent += ["--modulation", settings.modulation, "--resize", f"{resize:g}", "--stride", str(stride)]
+    agent += _camera_flags(settings.camera)
     return {"server": server, "channel": channel, "agent": agent}
 
 
@@ -244,8 +267,12 @@ def run_demo(
     logs = settings.out / "logs"
     logs.mkdir(exist_ok=True)
     endpoint = free_endpoint()
-    resize = settings.resize or real_time_resize(open_sequence(sequence, settings.camera).intrinsics.shape_hw)
-    commands = role_commands(settings, sequence, resize, endpoint)
+    recorded = open_sequence(sequence, settings.camera)
+    resize = settings.resize or real_time_resize(recorded.intrinsics.shape_hw)
+    stride = settings.stride or real_time_stride(recorded.times_ns)
+    if stride > 1:
+        tell(f"one image in {stride} is sent; --stride 1 sends all")
+    commands = role_commands(settings, sequence, resize, stride, endpoint)
     children = {name: Role(name, command, logs / f"{name}.log") for name, command in commands.items()}
     alive = Alive(set(), threading.Condition())
     try:
