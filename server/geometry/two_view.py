@@ -225,8 +225,7 @@ def _from_plane(
     on_plane = np.asarray(info["inliers"], dtype=bool)
     K = camera.K
     poses, _ = poselib.motion_from_homography(np.linalg.inv(K) @ np.asarray(H) @ K)
-    found: list[Array | None] = []
-    sigma_px = np.full(len(xy0), 0.5 * threshold_px)
+    starts: list[Array] = []
     for pose in poses:
         t = np.asarray(pose.t, dtype=np.float64)
         length = float(np.linalg.norm(t))
@@ -234,8 +233,11 @@ def _from_plane(
             continue
         T = make_transform(project_to_so3(pose.R), t / length)
         T = in_front(camera, T, xy0[on_plane], xy1[on_plane])
-        found.append(refine_relative_pose(camera, T, xy0, xy1, sigma_px))
-    return found
+        # Each pose comes twice, with the plane before and behind the camera.
+        if not any(np.allclose(T, other, atol=1e-6) for other in starts):
+            starts.append(T)
+    sigma_px = np.full(len(xy0), 0.5 * threshold_px)
+    return [refine_relative_pose(camera, T, xy0, xy1, sigma_px) for T in starts]
 
 
 def _refine(
