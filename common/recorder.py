@@ -1,6 +1,5 @@
 """Records messages beside a running system: a bounded queue and a thread, so the live path never waits."""
 
-import itertools
 import logging
 import threading
 import time
@@ -10,29 +9,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 from semcast.common.errors import SourceError
+from semcast.common.former_file import keep_former
 from semcast.common.recording import FLUSH_INTERVAL_S, RecordingWriter
 
 logger = logging.getLogger(__name__)
 
 QUEUE_BYTES = 64 * 1024**2
-
-
-def set_aside(path: Path) -> Path | None:
-    """Rename a file that is not empty to the first free ``<stem>.<n><suffix>``.
-
-    Returns:
-        Its new name, None where there was nothing to keep.
-
-    Raises:
-        OSError: It can't be renamed.
-    """
-    if not path.is_file() or path.stat().st_size == 0:
-        return None
-    names = (path.with_name(f"{path.stem}.{n}{path.suffix}") for n in itertools.count(1))
-    kept = next(name for name in names if not name.exists())
-    path.rename(kept)
-    logger.warning("%s was there already and is kept as %s", path, kept.name)
-    return kept
 
 
 class Recorder:
@@ -76,7 +58,7 @@ class Recorder:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if stream is None:
-                self._former = set_aside(path)
+                self._former = keep_former(path)
                 stream = path.open("wb")
             self._stream = stream
             self._writer = RecordingWriter(self._stream, header)

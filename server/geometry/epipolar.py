@@ -105,7 +105,7 @@ def _tangent(t: Array) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    # numpy's own is made for stacks of vectors and takes twenty times as long for one.
+    # numpy's own is made for stacks of vectors and takes far longer for a single one.
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 

@@ -91,13 +91,10 @@ class Initialiser:
         self._mode: ConfidenceMode = mode
         self._min_parallax_deg = min_parallax_deg
         self._seed = seed
-        self._begin()
+        self.clear()
 
     def clear(self) -> None:
         """Forget all frames."""
-        self._begin()
-
-    def _begin(self) -> None:
         self.history: list[Observed] = []
         self._reference = 0
         self._num_too_short = 0

@@ -13,9 +13,10 @@ import poselib
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform, project_to_so3
+from semcast.common.geometry import invert_transform, make_transform, project_to_so3
 from semcast.server.geometry.pnp import refine_pose
 from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.tracker import interpolate_pose
 
 Array = NDArray[np.float64]
 
@@ -41,22 +42,19 @@ def twin(problem: BundleProblem) -> BundleProblem | None:
     if len(row0) < _MIN_POINTS:
         return None
     fx, fy, cx, cy = problem.intrinsics
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=1, height=1)  # nothing here asks for the size
     xy0, xy1 = problem.xy[of_first][row0], problem.xy[of_last][row1]
     reach_px = _CUT_SIGMAS * float(np.median(problem.sigma_px))
     H, info = poselib.estimate_homography(xy0, xy1, {"max_reproj_error": reach_px, "seed": 0}, {})
     if info["num_inliers"] < max(_MIN_POINTS, _MIN_SHARE * len(row0)) or not np.isfinite(H).all():
         return None
     flat = np.asarray(info["inliers"], dtype=bool)
-    found = _other_pose(np.linalg.inv(K) @ np.asarray(H) @ K, problem, _rays(K, xy0[flat]))
+    K = camera.K
+    found = _other_pose(np.linalg.inv(K) @ np.asarray(H) @ K, problem, camera.unproject(xy0[flat]))
     if found is None:
         return None
     R_last_first, t_last_first, normal = found
-    return _on_plane(problem, K, R_last_first, t_last_first, normal)
-
-
-def _rays(K: Array, xy: Array) -> Array:
-    return np.column_stack((xy, np.ones(len(xy)))) @ np.linalg.inv(K).T
+    return _on_plane(problem, camera, R_last_first, t_last_first, normal)
 
 
 def _other_pose(H: Array, problem: BundleProblem, rays: Array) -> tuple[Array, Array, Array] | None:
@@ -81,23 +79,20 @@ def _other_pose(H: Array, problem: BundleProblem, rays: Array) -> tuple[Array, A
 
 
 def _on_plane(
-    problem: BundleProblem, K: Array, R_last_first: Array, t_last_first: Array, normal: Array
+    problem: BundleProblem, camera: Intrinsics, R_last_first: Array, t_last_first: Array, normal: Array
 ) -> BundleProblem:
     """Put all points on the plane and the views between where those ask for them."""
     T_world_first = problem.T_world_cam[0]
     baseline = np.linalg.norm((invert_transform(T_world_first) @ problem.T_world_cam[-1])[:3, 3])
     distance = float(baseline / np.linalg.norm(t_last_first))
     T_last = invert_transform(make_transform(R_last_first, distance * t_last_first))
-    fx, fy, cx, cy = problem.intrinsics
-    camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=1, height=1)  # a pose does not ask for the size
     num_views = len(problem.T_world_cam)
     poses = [np.eye(4)]
     # The plane is n^T X = distance in the first camera's frame; a ray meets it from any pose.
     xyz = np.full((len(problem.xyz), 3), np.nan)
-    _place(xyz, problem, K, 0, np.eye(4), normal, distance)
+    _place(xyz, problem, camera, 0, np.eye(4), normal, distance)
     for k in range(1, num_views):
-        share = k / (num_views - 1)
-        T = make_transform(exp_so3(share * log_so3(T_last[:3, :3])), share * T_last[:3, 3])
+        T = interpolate_pose(np.eye(4), T_last, k / (num_views - 1))
         if k < num_views - 1:
             rows = np.flatnonzero((problem.view == k) & np.isfinite(xyz[problem.point, 0]))
             if len(rows) >= _MIN_POINTS:
@@ -107,10 +102,8 @@ def _on_plane(
                     problem.sigma_px[rows], gate,
                 )  # fmt: skip
                 T = invert_transform(estimate.T_cam_world)
-        else:
-            T = T_last
         poses.append(T)
-        _place(xyz, problem, K, k, T, normal, distance)
+        _place(xyz, problem, camera, k, T, normal, distance)
     xyz = np.where(np.isfinite(xyz), xyz, normal * distance)
     return replace(
         problem,
@@ -122,7 +115,7 @@ def _on_plane(
 def _place(
     xyz: Array,
     problem: BundleProblem,
-    K: Array,
+    camera: Intrinsics,
     view: int,
     T_first_cam: Array,
     normal: Array,
@@ -130,7 +123,7 @@ def _place(
 ) -> None:
     """Give the points a view sees, and no view before it, their place on the plane."""
     rows = np.flatnonzero((problem.view == view) & ~np.isfinite(xyz[problem.point, 0]))
-    rays = _rays(K, problem.xy[rows]) @ T_first_cam[:3, :3].T
+    rays = camera.unproject(problem.xy[rows]) @ T_first_cam[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (distance - T_first_cam[:3, 3] @ normal) / (rays @ normal)
     good = np.isfinite(depth) & (depth > 0.0)

@@ -1,10 +1,9 @@
 """Whether a run is shown, where, and under which name; Rerun is imported only when something is shown."""
 
-import contextlib
 import logging
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from semcast.common.former_file import keep_former
 from semcast.common.run_folder import VIEWER_NAME
 from semcast.common.trajectory import Trajectory
 from semcast.server.session import StreamIdentity
@@ -60,12 +59,3 @@ def _is_shown(settings: ServerSettings) -> bool:
     from semcast.server.view.feed import resolve_view
 
     return resolve_view(settings.view.view, has_folder=settings.out is not None) != "none"
-
-
-def keep_former(file: Path) -> None:
-    """Rename an existing file to ``<stem>-<n><suffix>`` so that it is not overwritten."""
-    n = 1
-    while (former := file.with_name(f"{file.stem}-{n}{file.suffix}")).exists():
-        n += 1
-    with contextlib.suppress(FileNotFoundError):
-        file.rename(former)

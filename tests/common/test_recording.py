@@ -237,8 +237,8 @@ def test_a_recording_that_is_there_is_kept(tmp_path):
     for k in range(3):
         with Recorder(path, HEADER) as recorder:
             recorder.put("semcast/a/pose", "pose", bytes([k]))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.1.mcap", "run.2.mcap", "run.mcap"]
-    names = ("run.1.mcap", "run.2.mcap", "run.mcap")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run-1.mcap", "run-2.mcap", "run.mcap"]
+    names = ("run-1.mcap", "run-2.mcap", "run.mcap")
     contents = [[m.data for m in RecordingReader(tmp_path / name).messages()] for name in names]
     assert contents == [[b"\x00"], [b"\x01"], [b"\x02"]]
 

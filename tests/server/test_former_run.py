@@ -62,15 +62,18 @@ def test_names_of_ours_that_no_run_wrote_are_refused(tmp_path):
     check_not_foreign(tmp_path, "images")
 
 
-def test_what_can_not_be_moved_is_told(tmp_path, caplog):
+def test_a_name_that_is_taken_is_passed_over(tmp_path):
     fill(tmp_path, OURS)
     (tmp_path / "previous-1").symlink_to(tmp_path / "nowhere")
     set_aside(tmp_path)
     assert is_run(tmp_path / "previous-2")
-    fill(tmp_path, OURS)
-    tmp_path.chmod(0o500)
-    try:
-        set_aside(tmp_path)
-    finally:
-        tmp_path.chmod(0o700)
-    assert is_run(tmp_path) == ("can't be set aside" in caplog.text)
+
+
+def test_what_can_not_be_moved_is_told_and_stays(tmp_path, caplog, monkeypatch):
+    fill(tmp_path, [*OURS, "file"])
+    monkeypatch.setattr(
+        "semcast.server.former_run.free_folder", lambda folder: folder / "file" / "previous-1"
+    )
+    set_aside(tmp_path)
+    assert "can't be set aside" in caplog.text
+    assert files_of(tmp_path) == sorted([*OURS, "file"])

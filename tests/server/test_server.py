@@ -5,13 +5,12 @@ import json
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from semcast.common.codec import DecodedImage, EncodedImage
-from semcast.common.errors import CheckpointError, ConfigError, SemcastError, SourceError
+from semcast.common.errors import SemcastError
 from semcast.common.keys import camera_key, control_key, flow_key, pose_key, rx_key
 from semcast.common.messages import (
     CameraInfo,
@@ -21,7 +20,7 @@ from semcast.common.messages import (
     PoseMessage,
     SymbolFrame,
 )
-from semcast.common.network_settings import HubSettings, NetworkSettings
+from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.phy.slots import layout_for
 from semcast.common.run_folder import read_run
@@ -32,9 +31,8 @@ from semcast.common.transport import open_client, open_hub
 from semcast.common.wire import pack, unpack
 from semcast.server.export.outputs import read_ply, write_ply
 from semcast.server.mapping.bundle_process import GIVEN_UP
-from semcast.server.server import Server, _is_nearly_final
+from semcast.server.server import Server
 from semcast.server.settings import ServerSettings, ViewSettings
-from semcast.server.view.choice import keep_former
 
 DEMO = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
 RESIZE = 0.5
@@ -496,72 +494,3 @@ def test_a_silent_stream_ends_with_the_idle_limit_and_its_outputs(tmp_path, hub,
     assert running.finish()["frames"]["tracked"] == 3
     assert (tmp_path / "summary.json").exists()
     radio.close()
-
-
-def test_a_codec_asked_for_at_the_start_must_exist(hub):
-    def load(name, modulation):
-        raise CheckpointError(f"no weights of {name}")
-
-    session, _ = hub
-    with pytest.raises(CheckpointError, match="no weights of nothing"):
-        Server(ServerSettings(agent_id=AGENT, codec="nothing"), session, load)
-
-
-def test_what_cannot_work_is_said_before_the_server_shows_itself(hub, tmp_path):
-    session, _ = hub
-    (tmp_path / "file").write_text("")
-    for changes, error, text in (
-        ({"reference": tmp_path / "nowhere"}, SourceError, "nowhere"),
-        ({"out": tmp_path / "file"}, ConfigError, "folder for outputs"),
-        ({"view": ViewSettings(view="file")}, ConfigError, "--out"),
-    ):
-        with pytest.raises(error, match=text):
-            Server(ServerSettings(agent_id=AGENT, bundle="inline", **changes), session)
-    assert session.alive_roles(AGENT) == set()
-
-
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"threads": 0}, "threads must be at least 1, got 0"),
-        ({"checkpoint_interval_s": 0.0}, r"checkpoint_interval_s must be in \[0.1, 3600\]"),
-        ({"duration_s": -1.0}, "duration_s must be positive"),
-        ({"save_images": "all"}, "save_images needs out"),
-        ({"agent_id": "a/b"}, "agent_id must be"),
-    ],
-)
-def test_settings_out_of_range_say_so(changes, text):
-    with pytest.raises(ValueError, match=text):
-        ServerSettings(**changes)
-
-
-def test_former_recordings_are_not_overwritten(tmp_path):
-    file = tmp_path / "run.rrd"
-    keep_former(file)
-    for text in ("one", "two"):
-        file.write_text(text)
-        keep_former(file)
-    assert (tmp_path / "run-1.rrd").read_text() == "one"
-    assert (tmp_path / "run-2.rrd").read_text() == "two"
-    assert not file.exists()
-
-
-def test_the_hub_is_on_loopback_unless_told_otherwise():
-    assert HubSettings().listen == ("tcp/127.0.0.1:7447",)
-
-
-@pytest.mark.parametrize(
-    ("num_frames", "last_id", "frame_id", "is_near"),
-    [
-        (51, 50, 41, True),
-        (51, 50, 40, False),
-        (13, 48, 44, True),  # every fourth frame of 51
-        (13, 48, 40, False),
-        (13, 48, 24, False),
-        (100, None, 495, False),  # a camera's images are counted as they come
-        (None, None, 10**6, False),
-    ],
-)
-def test_the_last_frames_are_known_by_their_ids(num_frames, last_id, frame_id, is_near):
-    camera = SimpleNamespace(num_frames=num_frames, last_frame_id=last_id)
-    assert _is_nearly_final(frame_id, camera) is is_near

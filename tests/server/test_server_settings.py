@@ -1,0 +1,76 @@
+"""What a server refuses before it begins, and what it takes for the end of a stream."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from semcast.common.errors import CheckpointError, ConfigError, SourceError
+from semcast.common.network_settings import HubSettings
+from semcast.common.transport import open_hub
+from semcast.server.server import Server, _is_nearly_final
+from semcast.server.settings import ServerSettings, ViewSettings
+
+AGENT = "cam0"
+
+
+@pytest.fixture
+def session():
+    opened, _ = open_hub()
+    yield opened
+    opened.close()
+
+
+def test_a_codec_asked_for_at_the_start_must_exist(session):
+    def load(name, modulation):
+        raise CheckpointError(f"no weights of {name}")
+
+    with pytest.raises(CheckpointError, match="no weights of nothing"):
+        Server(ServerSettings(agent_id=AGENT, codec="nothing"), session, load)
+
+
+def test_what_cannot_work_is_said_before_the_server_shows_itself(session, tmp_path):
+    (tmp_path / "file").write_text("")
+    for changes, error, text in (
+        ({"reference": tmp_path / "nowhere"}, SourceError, "nowhere"),
+        ({"out": tmp_path / "file"}, ConfigError, "folder for outputs"),
+        ({"view": ViewSettings(view="file")}, ConfigError, "--out"),
+    ):
+        with pytest.raises(error, match=text):
+            Server(ServerSettings(agent_id=AGENT, bundle="inline", **changes), session)
+    assert session.alive_roles(AGENT) == set()
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"threads": 0}, "threads must be at least 1, got 0"),
+        ({"checkpoint_interval_s": 0.0}, r"checkpoint_interval_s must be in \[0.1, 3600\]"),
+        ({"duration_s": -1.0}, "duration_s must be positive"),
+        ({"save_images": "all"}, "save_images needs out"),
+        ({"agent_id": "a/b"}, "agent_id must be"),
+    ],
+)
+def test_settings_out_of_range_say_so(changes, text):
+    with pytest.raises(ValueError, match=text):
+        ServerSettings(**changes)
+
+
+def test_the_hub_is_on_loopback_unless_told_otherwise():
+    assert HubSettings().listen == ("tcp/127.0.0.1:7447",)
+
+
+@pytest.mark.parametrize(
+    ("num_frames", "last_id", "frame_id", "is_near"),
+    [
+        (51, 50, 41, True),
+        (51, 50, 40, False),
+        (13, 48, 44, True),  # every fourth frame of 51
+        (13, 48, 40, False),
+        (13, 48, 24, False),
+        (100, None, 495, False),  # a camera's images are counted as they come
+        (None, None, 10**6, False),
+    ],
+)
+def test_the_last_frames_are_known_by_their_ids(num_frames, last_id, frame_id, is_near):
+    camera = SimpleNamespace(num_frames=num_frames, last_frame_id=last_id)
+    assert _is_nearly_final(frame_id, camera) is is_near
