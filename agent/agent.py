@@ -10,6 +10,7 @@ from typing import Any
 from semcast.agent.capture import Capture
 from semcast.agent.encoder import FrameEncoder, LinkFeedback
 from semcast.agent.originals import OriginalSharer
+from semcast.agent.pace_control import PaceControl
 from semcast.agent.replay_window import ReplayWindow
 from semcast.agent.settings import AgentSettings
 from semcast.agent.source import Source, SourceFrame, open_source
@@ -75,6 +76,8 @@ class _Sending:
         self.metrics = metrics
         self.lossless = settings.mode == "replay"
         self.feedback = LinkFeedback(self.agent_epoch, settings.snr_db, settings.feedback_max_age_s)
+        follows = settings.follow_server and not self.lossless
+        self._pace = PaceControl(self.agent_epoch, source.rate_hz) if follows else None
         self._settings = settings
         self._rate = RateControl(settings.rate, source.intrinsics.shape_hw)
         self._encoder = FrameEncoder(codec, self.agent_epoch, self.lossless)
@@ -99,12 +102,18 @@ class _Sending:
             self.refuse(err)
             return
         self.feedback.update(report)
+        if self._pace is not None:
+            self._pace.on_report(report)
         self.metrics.count("link_reports")
 
     def refuse(self, err: WireError) -> None:
         """Count a message that is not valid."""
         self.metrics.drop("protocol")
         self.metrics.error(str(err))
+
+    def wants(self, frame: SourceFrame) -> bool:
+        """Tell whether a frame of the source is to be sent; in replay all are."""
+        return self._pace is None or self._pace.wants(frame.t_capture_ns)
 
     def encode(self, frame: SourceFrame) -> SymbolFrame:
         """Encode for the link as it is now; in replay for a fixed SNR, so that runs repeat exactly."""
@@ -273,7 +282,7 @@ def run_agent(
             if not sending.lossless:
                 _wait_until_ready(session, settings.agent_id, sending.agent_epoch, stop)
         logger.info("sending %s with %s, %s", source.name, codec.name, settings.mode)
-        capture = Capture(source, "all" if sending.lossless else "newest", metrics)
+        capture = Capture(source, "all" if sending.lossless else "newest", metrics, sending.wants)
         try:
             if sending.lossless:
                 _send_lossless(sending, capture, session, settings.agent_id, stop)

@@ -2,6 +2,7 @@
 
 import logging
 import threading
+from collections.abc import Callable
 
 from semcast.agent.source import Source, SourceFrame
 from semcast.common.errors import SourceError
@@ -22,10 +23,19 @@ class Capture:
         source: Is read by the thread alone, until ``close``.
         policy: ``newest`` keeps one frame and counts what it replaces as ``superseded``; ``all`` waits.
         metrics: Where to count.
+        wants: Tells of each frame whether it is to be sent; the others are counted as ``thinned``. The last
+            frame of a source is not asked for: it ends the stream. None wants all.
     """
 
-    def __init__(self, source: Source, policy: Policy, metrics: Metrics) -> None:
+    def __init__(
+        self,
+        source: Source,
+        policy: Policy,
+        metrics: Metrics,
+        wants: Callable[[SourceFrame], bool] | None = None,
+    ) -> None:
         self._source = source
+        self._wants = wants
         self._metrics = metrics
         self._box: Mailbox[SourceFrame] = Mailbox(1, policy)
         self._stopping = threading.Event()
@@ -37,6 +47,9 @@ class Capture:
         try:
             for frame in self._source.frames(self._stopping):
                 self._metrics.count("captured")
+                if not (frame.final or self._wants is None or self._wants(frame)):
+                    self._metrics.drop("thinned")
+                    continue
                 before = self._box.dropped
                 self._box.put(frame)
                 self._metrics.drop("superseded", self._box.dropped - before)

@@ -60,6 +60,12 @@ class AgentSettings:
             "them: jpeg (quality 95) or png (lossless)"
         },
     )
+    follow_server: bool = field(
+        default=True,
+        metadata={
+            "help": "live: send only one frame in 2, 3, ... while the server can't keep up with every one"
+        },
+    )
     wait: bool = field(
         default=True, metadata={"help": "send nothing until channel and server are there for the first time"}
     )

@@ -207,7 +207,15 @@ class SourceImage:
 
 @dataclass(frozen=True, kw_only=True)
 class LinkReport:
-    """Receiver to agent: how good the link was for a frame, with the agent's own capture time for the age."""
+    """Receiver to agent: how good the link was for a frame that is decoded, and how many were passed over.
+
+    Attributes:
+        agent_epoch: Whose frame.
+        frame_id: Of the frame.
+        snr_db_estimate: The receiver's estimate of the link's SNR.
+        t_capture_ns: The agent's own time of capture, for the age.
+        num_superseded: Frames of this epoch that arrived and were passed over so far, since newer ones came.
+    """
 
     version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("link")
@@ -215,6 +223,7 @@ class LinkReport:
     frame_id: int = field(metadata=_COUNT)
     snr_db_estimate: float = field(metadata=_DB)
     t_capture_ns: int = field(metadata=_TIME_NS)
+    num_superseded: int = field(metadata=_COUNT)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -109,6 +109,7 @@ class Receiver:
         self._held: tuple[SymbolFrame, int] | None = None
         self._cameras: dict[int, CameraInfo] = {}
         self._snr_set: OrderedDict[tuple[int, int], float] = OrderedDict()
+        self._num_superseded = 0
         self._roles: set[str] = set()
         self._told: set[str] = set()
         self._link = session.publisher(link_key(agent_id), "newest")
@@ -208,10 +209,13 @@ class Receiver:
             if taken and new_epoch:
                 dropped = self._box.clear()
                 self._metrics.drop("epoch", dropped)
+                self._num_superseded = 0
             if taken:
                 before = self._box.dropped
                 self._box.put((frame, arrival_ns))
-                self._metrics.drop("superseded", self._box.dropped - before)
+                superseded = self._box.dropped - before
+                self._num_superseded += superseded
+                self._metrics.drop("superseded", superseded)
         if self._mode == "replay":
             self._send_flow()
 
@@ -342,11 +346,15 @@ class Receiver:
             return self._cameras.get(epoch)
 
     def _report(self, message: SymbolFrame, snr_db: float) -> None:
+        with self._lock:
+            current = message.agent_epoch == self._arrivals.epoch
+            num_superseded = self._num_superseded if current else 0
         report = LinkReport(
             agent_epoch=message.agent_epoch,
             frame_id=message.frame_id,
             snr_db_estimate=float(np.clip(snr_db, -100.0, 100.0)),
             t_capture_ns=message.t_capture_ns,
+            num_superseded=num_superseded,
         )
         try:
             self._link.put(pack(report))

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.agent.pace_control import start_stride
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.errors import ConfigError, SemcastError, TransportError
@@ -34,9 +35,6 @@ STOP_DEADLINE_S = 15.0
 AGENT_ID = "demo"
 #: Image size at which agent, channel, server and viewer together keep up at 10 Hz on two cores.
 REAL_TIME_PIXELS = 250_000
-#: Images a second that are sent by default, about. More than can be served are dropped at random, and
-#: following a camera over gaps costs more than following every image.
-REAL_TIME_HZ = 12.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,10 +122,8 @@ def real_time_resize(shape_hw: tuple[int, int]) -> float:
 
 def real_time_stride(times_ns: NDArray[np.int64]) -> int:
     """Return the step between images that are sent, so that there are no more a second than can be served."""
-    if len(times_ns) < 2:
-        return 1
-    usual_s = float(np.median(np.diff(times_ns))) * 1e-9
-    return max(1, math.floor(1.0 / (usual_s * REAL_TIME_HZ) + 0.5)) if usual_s > 0.0 else 1
+    usual_s = float(np.median(np.diff(times_ns))) * 1e-9 if len(times_ns) > 1 else 0.0
+    return start_stride(1.0 / usual_s) if usual_s > 0.0 else 1
 
 
 def role_commands(

@@ -16,7 +16,13 @@ class Clock:
 
 
 def report(frame_id, snr_db, t_capture_ns=10**12, epoch=1):
-    return LinkReport(agent_epoch=epoch, frame_id=frame_id, snr_db_estimate=snr_db, t_capture_ns=t_capture_ns)
+    return LinkReport(
+        agent_epoch=epoch,
+        frame_id=frame_id,
+        snr_db_estimate=snr_db,
+        t_capture_ns=t_capture_ns,
+        num_superseded=0,
+    )
 
 
 def test_the_newest_report_counts_while_it_is_fresh():

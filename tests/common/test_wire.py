@@ -41,7 +41,9 @@ def examples():
             uses_per_slot=LAYOUT.uses_per_slot, direction="rx", payload_format="iq16",
             payload=bytes(4 * LAYOUT.num_uses), slot_lost=b"\x80", lossless=True, final=True,
         ),
-        LinkReport(agent_epoch=1, frame_id=0, snr_db_estimate=-3.25, t_capture_ns=1),
+        LinkReport(
+            agent_epoch=1, frame_id=0, snr_db_estimate=-3.25, t_capture_ns=1, num_superseded=2
+        ),
         FlowMessage(agent_epoch=0, next_seq=4, arrived_seq=6, window=4),
         ChannelReport(
             agent_epoch=1, frame_id=2, channel="awgn", snr_db_set=2.0, num_slots=24, num_slots_lost=1,

@@ -133,6 +133,8 @@ def test_a_frame_is_equalised_and_reported(ends, make, sent):
 def test_a_slow_live_consumer_gets_the_newest_and_drops_are_counted_exactly(ends, make):
     e = ends()
     e.answer_camera(camera())
+    reports = []
+    e.client.subscribe(link_key("a"), "every", reports.append)
     ids = []
     # What came before the first frame seen of an agent is nobody's loss, so that one goes alone.
     e.put(make(0))
@@ -145,6 +147,10 @@ def test_a_slow_live_consumer_gets_the_newest_and_drops_are_counted_exactly(ends
     # What the ring itself threw away, should this machine be that busy, shows as missing.
     drops = e.metrics.drops
     assert e.metrics.counts["delivered"] + drops["superseded"] + drops.get("missing", 0) == 100
+    until(lambda: len(reports) == 4)
+    told = [unpack(report, LinkReport).num_superseded for report in reports]
+    assert told == sorted(told)
+    assert told[-1] == drops["superseded"]
 
 
 def test_age_stays_within_two_frames_behind_a_consumer_five_times_too_slow(ends, make):

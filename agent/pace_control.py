@@ -1,0 +1,118 @@
+"""How many of the camera's frames are sent: every one, or one in two, three, ... if the server can't keep up.
+
+Frames that a server passes over because newer ones came have cost encoding and air time for nothing, and it
+is chance which ones they are. One in n, evenly spaced, costs less and is easier to follow.
+"""
+
+import logging
+import math
+import threading
+from collections import deque
+
+from semcast.common.messages import LinkReport
+
+logger = logging.getLogger(__name__)
+
+#: Frames a second that two cores can decode, track and map, about: a stream begins with so many.
+START_HZ = 12.0
+MAX_STRIDE = 10
+#: Reports a decision is made from, at least and at most, and how many of the worst count for nothing: a
+#: busy moment, such as the start of a map, says nothing about the pace.
+_MIN_REPORTS, _MAX_REPORTS, _NUM_WORST = 12, 16, 3
+#: The first reports of a stream count for nothing: beginning a map takes longer than following.
+_WARM_UP = 20
+#: Part of a frame by which the stride that is needed may exceed a whole number. Some frames passed over are
+#: better than a pace far below what the server can do, which the next whole number may be.
+_TOLERANCE = 0.4
+#: Reports without a frame passed over until more frames are tried; a failure doubles it, up to this factor.
+_PATIENCE = 30
+_MAX_FACTOR = 16
+
+
+def start_stride(rate_hz: float) -> int:
+    """Return the step between frames that makes about ``START_HZ`` of a source's rate; 1 for rate 0."""
+    return min(MAX_STRIDE, max(1, math.floor(rate_hz / START_HZ + 0.5)))
+
+
+class PaceControl:
+    """Chooses which frames of a live source are sent. ``on_report`` and ``wants`` may come from two threads.
+
+    Args:
+        agent_epoch: Reports of another epoch are ignored.
+        rate_hz: Frames a second of the source, 0 if it is not known.
+    """
+
+    def __init__(self, agent_epoch: int, rate_hz: float) -> None:
+        self._agent_epoch = agent_epoch
+        self._lock = threading.Lock()
+        self._stride = start_stride(rate_hz)
+        self._not_sent = self._stride - 1  # the first frame is sent at once
+        self._last: LinkReport | None = None
+        self._valid_from_ns: int | None = None
+        self._passed_over: deque[int] = deque(maxlen=_MAX_REPORTS)
+        self._quiet = 0
+        self._num_reports = self._since_change = 0
+        self._is_trial = False
+        self._factor = 1
+
+    @property
+    def stride(self) -> int:
+        """One frame of so many is sent."""
+        with self._lock:
+            return self._stride
+
+    def wants(self, t_capture_ns: int) -> bool:
+        """Count one frame of the source and tell whether it is to be sent.
+
+        Args:
+            t_capture_ns: When it was captured, on the clock of the reports.
+        """
+        with self._lock:
+            self._not_sent += 1
+            if self._not_sent < self._stride:
+                return False
+            self._not_sent = 0
+            if self._valid_from_ns is None:
+                self._valid_from_ns = t_capture_ns
+            return True
+
+    def on_report(self, report: LinkReport) -> None:
+        """Take what the server says about a frame it is to decode, and change the stride if it is time."""
+        if report.agent_epoch != self._agent_epoch:
+            return
+        with self._lock:
+            last = self._last
+            if last is not None and report.frame_id <= last.frame_id:
+                return
+            self._last = report
+            # Frames passed over before this one were captured after the last one reported on.
+            if last is None or self._valid_from_ns is None or last.t_capture_ns < self._valid_from_ns:
+                return
+            self._num_reports += 1
+            if self._num_reports <= _WARM_UP:
+                return
+            # A server that was started again counts from 0.
+            passed_over = max(0, report.num_superseded - last.num_superseded)
+            self._passed_over.append(passed_over)
+            self._quiet = 0 if passed_over else self._quiet + 1
+            self._since_change += 1
+            self._decide()
+
+    def _decide(self) -> None:
+        usual = sorted(self._passed_over)[:-_NUM_WORST]
+        needed = self._stride * (1.0 + sum(usual) / max(1, len(usual)))
+        stride = min(math.ceil(needed - _TOLERANCE), 2 * self._stride, MAX_STRIDE)
+        if stride > self._stride and len(self._passed_over) >= _MIN_REPORTS:
+            if self._is_trial:
+                failed = self._since_change <= _PATIENCE
+                self._factor = min(2 * self._factor, _MAX_FACTOR) if failed else 1
+            self._change(stride, is_trial=False)
+        elif self._stride > 1 and self._quiet >= _PATIENCE * self._factor:
+            self._change(self._stride - 1, is_trial=True)
+
+    def _change(self, stride: int, *, is_trial: bool) -> None:
+        self._stride, self._is_trial = stride, is_trial
+        self._valid_from_ns = None
+        self._passed_over.clear()
+        self._quiet = self._since_change = 0
+        logger.info("sending %s", "every frame" if stride == 1 else f"one frame in {stride}")

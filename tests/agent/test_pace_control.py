@@ -1,0 +1,132 @@
+"""The agent's pace against a simulated server that takes so long for a frame and keeps the newest waiting."""
+
+import numpy as np
+import pytest
+
+from semcast.agent.pace_control import MAX_STRIDE, PaceControl, start_stride
+from semcast.common.messages import LinkReport
+
+PERIOD_S = 1 / 30
+
+
+def report(frame_id, num_superseded, epoch=1):
+    return LinkReport(
+        agent_epoch=epoch,
+        frame_id=frame_id,
+        snr_db_estimate=10.0,
+        t_capture_ns=round(frame_id * PERIOD_S * 1e9),
+        num_superseded=num_superseded,
+    )
+
+
+class Server:
+    """Serves one frame at a time; a newer one replaces the one that waits."""
+
+    def __init__(self, pace, service_s):
+        self.pace, self.service_s = pace, service_s
+        self.free_s = 0.0
+        self.waiting = None
+        self.superseded = 0
+        self.served = []
+
+    def put(self, frame_id, now_s):
+        self.advance(now_s)
+        if self.waiting is not None:
+            self.superseded += 1
+        self.waiting = frame_id
+        self.advance(now_s)
+
+    def advance(self, now_s):
+        if self.waiting is not None and self.free_s <= now_s:
+            started_s = max(self.free_s, self.waiting * PERIOD_S)
+            self.pace.on_report(report(self.waiting, self.superseded))
+            self.served.append(self.waiting)
+            self.free_s = started_s + self.service_s(started_s)
+            self.waiting = None
+
+
+def run(service_s, seconds, lost=0.0, rate_hz=0.0):
+    """Return the pace, the server and the stride at every frame of a 30 Hz source; it need not be known."""
+    pace = PaceControl(1, rate_hz)
+    server = Server(pace, service_s)
+    rng = np.random.default_rng(0)
+    strides = []
+    for frame_id in range(round(seconds / PERIOD_S)):
+        if pace.wants(round(frame_id * PERIOD_S * 1e9)) and rng.random() >= lost:
+            server.put(frame_id, frame_id * PERIOD_S)
+        server.advance(frame_id * PERIOD_S)
+        strides.append(pace.stride)
+    return pace, server, np.array(strides)
+
+
+@pytest.mark.parametrize(
+    ("service_ms", "stride"), [(20, 1), (30, 1), (35, 1), (40, 1), (55, 2), (100, 3), (165, 4)]
+)
+def test_the_stride_is_what_the_server_can_serve(service_ms, stride):
+    _, server, strides = run(lambda now_s: service_ms * 1e-3, 20)
+    assert np.median(strides[60:]) == stride
+    after = strides[150:]
+    assert np.mean(after == stride) > 0.6, "more is tried seldom"
+    gaps = np.diff(server.served[-40:])
+    assert np.mean(gaps == stride) > 0.7, "evenly spaced"
+
+
+def test_trials_of_more_become_rare_when_they_fail():
+    _, _, strides = run(lambda now_s: 0.060, 300)
+    trials = np.flatnonzero((strides[1:] == 1) & (strides[:-1] == 2))
+    early, late = np.sum(trials < 30 * 60), np.sum(trials >= 30 * 240)
+    assert early >= 3
+    assert 1 <= late <= 3
+
+
+def test_the_stride_comes_back_when_the_server_has_time_again():
+    _, _, strides = run(lambda now_s: 0.160 if now_s < 10 else 0.015, 60)
+    assert strides[: 10 * 30].max() == 4
+    assert strides[-1] == 1
+
+
+def test_one_busy_moment_and_frames_lost_on_the_air_change_nothing():
+    busy = (5.0, 5.6)
+    _, server, strides = run(lambda now_s: 0.25 if busy[0] <= now_s < busy[1] else 0.02, 20, lost=0.3)
+    assert server.superseded >= 5
+    assert set(strides) == {1}
+
+
+def test_a_stride_has_an_end():
+    pace, _, strides = run(lambda now_s: 1.0, 120)
+    assert pace.stride == strides.max() == MAX_STRIDE
+
+
+def test_reports_of_others_and_old_ones_count_for_nothing():
+    pace = PaceControl(1, 0.0)
+    assert pace.wants(0)
+    for k in range(1, 40):
+        pace.on_report(report(k, 3 * k, epoch=2))
+    pace.on_report(report(50, 0))
+    for k in range(1, 40):
+        pace.on_report(report(k, 3 * k))
+    assert pace.stride == 1
+    for k in range(51, 70):
+        pace.on_report(report(k, 1000 - k))
+    assert pace.stride == 1, "a server that counts from 0 again has passed over nothing"
+    for k in range(70, 90):
+        pace.on_report(report(k, 1000 + k))
+    assert pace.stride > 1
+
+
+def test_a_fast_source_begins_with_what_two_cores_can_serve_and_goes_up():
+    assert [start_stride(rate_hz) for rate_hz in (0, 5, 10, 15, 20, 30, 60, 1000)] == [
+        1,
+        1,
+        1,
+        1,
+        2,
+        3,
+        5,
+        MAX_STRIDE,
+    ]
+    pace = PaceControl(1, 30.0)
+    assert [pace.wants(k) for k in range(7)] == [True, False, False, True, False, False, True]
+    _, server, strides = run(lambda now_s: 0.02, 20, rate_hz=30.0)
+    assert (strides[0], strides[-1]) == (3, 1)
+    assert server.superseded == 0
