@@ -2,33 +2,21 @@ import shutil
 import threading
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recording_reader import RecordingReader
-from semcast.demo import DemoSettings, real_time_resize, real_time_stride, role_commands, run_demo
+from semcast.demo import DemoSettings, Playback, agent_command, role_commands, run_demo
 from semcast.server.replay import ReplaySettings, replay
 
 SEQUENCE = Path(__file__).resolve().parents[1] / "deploy" / "demo" / "kitti_06"
 
 
-def test_large_images_are_brought_down_and_small_ones_left_alone():
-    assert real_time_resize((480, 500)) == 1.0
-    assert real_time_resize((1000, 1000)) == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize(
-    ("rate_hz", "stride"), [(5, 1), (10, 1), (15, 1), (20, 2), (25, 2), (30, 3), (60, 5)]
-)
-def test_as_many_images_are_sent_as_can_be_served(rate_hz, stride):
-    assert real_time_stride((np.arange(50) * 1e9 / rate_hz).astype(np.int64)) == stride
-
-
-def test_one_image_or_no_times_are_sent_as_they_are():
-    assert real_time_stride(np.zeros(1, np.int64)) == 1
-    assert real_time_stride(np.zeros(9, np.int64)) == 1
+def commands_of(settings):
+    endpoint = "tcp/127.0.0.1:1"
+    agent = agent_command(settings, SEQUENCE, endpoint, Playback(0.5, 1, 8.0, 0.8))
+    return {**role_commands(settings, SEQUENCE, endpoint), "agent": agent}
 
 
 def test_every_setting_reaches_a_process(tmp_path):
@@ -36,19 +24,15 @@ def test_every_setting_reaches_a_process(tmp_path):
         codec="webp-ldpc", modulation="analog", snr_db=3, channel="burst", confidence="paper", view="web",
         seed=7, out=tmp_path / "o",
     )  # fmt: skip
-    words = [
-        w
-        for command in role_commands(settings, SEQUENCE, 0.5, 1, "tcp/127.0.0.1:1").values()
-        for w in command
-    ]
-    for value in ("webp-ldpc", "analog", "3", "burst", "paper", "web", "7", "0.5", str(tmp_path / "o")):
+    words = [w for command in commands_of(settings).values() for w in command]
+    for value in ("webp-ldpc", "analog", "3", "burst", "paper", "web", "7", "0.5", "8", str(tmp_path / "o")):
         assert value in words
 
 
 def test_the_camera_reaches_the_agent_and_the_reference_it_is_compared_with(tmp_path):
     def commands(**camera):
         settings = DemoSettings(camera=CameraSettings(**camera), out=tmp_path)
-        return role_commands(settings, SEQUENCE, 0.5, 1, "tcp/127.0.0.1:1")
+        return commands_of(settings)
 
     plain = commands(focal_35mm=26.0)
     bent = commands(fx=500.0, fy=500.0, cx=320.0, cy=240.0, distortion=(0.1, 0.0, 0.0, 0.0))
@@ -67,7 +51,7 @@ def test_bad_settings_are_refused_before_anything_starts(values, message):
 
 
 def test_a_role_that_can_not_start_ends_the_demo_with_its_own_words(tmp_path):
-    settings = DemoSettings(codec="no-such-codec", view="none", resize=0.25, out=tmp_path)
+    settings = DemoSettings(codec="no-such-codec", view="none", resize=0.25, rate_hz=10.0, out=tmp_path)
     with pytest.raises(SemcastError, match="did not start: .*no-such-codec"):
         run_demo(settings, threading.Event(), lambda line: None, lambda row: None)
 

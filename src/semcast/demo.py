@@ -1,7 +1,6 @@
 """The demo: server, channel and agent as three real processes on loopback, until the sequence ends."""
 
 import json
-import math
 import re
 import shlex
 import signal
@@ -9,13 +8,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcast.agent.pace_control import start_stride
 from semcast.common.camera_settings import CameraSettings
@@ -24,8 +22,9 @@ from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.rate import NATIVE_RATE, RateChoice
 from semcast.common.run_folder import IMAGES_NAME, SUMMARY_NAME
-from semcast.common.sequence import open_sequence
+from semcast.common.sequence import Sequence, open_sequence
 from semcast.common.transport import free_endpoint, open_session
+from semcast.real_time import plan_for
 from semcast.server.former_run import check_not_foreign, discard
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
@@ -33,8 +32,7 @@ START_DEADLINE_S = 60.0
 #: How long a role may take to write everything after it was asked to stop.
 STOP_DEADLINE_S = 15.0
 AGENT_ID = "demo"
-#: Image size at which agent, channel, server and viewer together keep up at 10 Hz on two cores.
-REAL_TIME_PIXELS = 250_000
+_PROGRAM = (sys.executable, "-m", "semcast")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,15 +67,15 @@ class DemoSettings:
     )
     resize: float | None = field(
         default=None,
-        metadata={
-            "help": "factor on the image size; by default what two cores can serve at 10 frames a second"
-        },
+        metadata={"help": "factor on the image size; by default what this machine can serve"},
     )
     stride: int | None = field(
         default=None,
-        metadata={
-            "help": "send every Nth image; by default as many a second as two cores can serve (about 12)"
-        },
+        metadata={"help": "send every Nth image; by default so many that about 12 a second remain"},
+    )
+    rate_hz: float | None = field(
+        default=None,
+        metadata={"help": "images a second; by default as recorded, or as many as this machine can serve"},
     )
     save_images: Literal["none", "keyframes", "all"] = field(
         default="keyframes", metadata={"help": "decoded images kept in the output folder, for exports"}
@@ -97,6 +95,8 @@ class DemoSettings:
             raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
         if self.stride is not None and self.stride < 1:
             raise ValueError(f"stride must be at least 1, got {self.stride}")
+        if self.rate_hz is not None and not 0.01 <= self.rate_hz <= 1000.0:
+            raise ValueError(f"rate_hz must be in [0.01, 1000], got {self.rate_hz:g}")
 
 
 def default_sequence() -> Path:
@@ -114,38 +114,47 @@ def default_sequence() -> Path:
     )
 
 
-def real_time_resize(shape_hw: tuple[int, int]) -> float:
-    """Return the factor, at most 1, that brings an image down to ``REAL_TIME_PIXELS``."""
-    height, width = shape_hw
-    return min(1.0, round(math.sqrt(REAL_TIME_PIXELS / (height * width)), 2))
+@dataclass(frozen=True)
+class Playback:
+    """How the agent plays the recording.
+
+    Attributes:
+        resize: Factor on the image size.
+        stride: One image of so many is sent.
+        rate_hz: Images a second that are sent.
+        speed: Of the playback against the recording.
+    """
+
+    resize: float
+    stride: int
+    rate_hz: float
+    speed: float
 
 
-def real_time_stride(times_ns: NDArray[np.int64]) -> int:
-    """Return the step between images that are sent, so that there are no more a second than can be served."""
-    usual_s = float(np.median(np.diff(times_ns))) * 1e-9 if len(times_ns) > 1 else 0.0
-    return start_stride(1.0 / usual_s) if usual_s > 0.0 else 1
-
-
-def role_commands(
-    settings: DemoSettings, sequence: Path, resize: float, stride: int, endpoint: str
-) -> dict[str, list[str]]:
-    """Return the command line of each role, in the order they are started."""
-    program = [sys.executable, "-m", "semcast"]
-    meet = ["--agent-id", AGENT_ID, "--connect", endpoint]
-    server = [*program, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
+def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict[str, list[str]]:
+    """Return the command lines of server and channel, in the order they are started."""
+    server = [*_PROGRAM, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
     server += ["--reference", str(sequence), *_camera_flags(settings.camera)]
     server += ["--confidence", settings.confidence, "--view", settings.view]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
     server += ["--save-images", settings.save_images]
     if settings.record is not None:
         server += ["--record", str(settings.record)]
-    channel = [*program, "channel", *meet, "--channel", settings.channel, "--snr-db", f"{settings.snr_db:g}"]
+    channel = [*_PROGRAM, "channel", "--agent-id", AGENT_ID, "--connect", endpoint]
+    channel += ["--channel", settings.channel, "--snr-db", f"{settings.snr_db:g}"]
     channel += ["--seed", str(settings.seed)]
-    agent = [*program, "agent", *meet, "--source", str(sequence), "--codec", settings.codec]
-    agent += ["--rate", settings.rate]
-    agent += ["--modulation", settings.modulation, "--resize", f"{resize:g}", "--stride", str(stride)]
-    agent += _camera_flags(settings.camera)
-    return {"server": server, "channel": channel, "agent": agent}
+    return {"server": server, "channel": channel}
+
+
+def agent_command(settings: DemoSettings, sequence: Path, endpoint: str, playback: Playback) -> list[str]:
+    """Return the command line of the agent, which is started last."""
+    agent = [*_PROGRAM, "agent", "--agent-id", AGENT_ID, "--connect", endpoint]
+    agent += ["--source", str(sequence), *_camera_flags(settings.camera)]
+    agent += ["--codec", settings.codec, "--modulation", settings.modulation, "--rate", settings.rate]
+    agent += ["--resize", f"{playback.resize:g}", "--stride", str(playback.stride)]
+    if playback.speed != 1.0:
+        agent += ["--pace", "rate", "--rate-hz", f"{playback.rate_hz:.3g}"]
+    return agent
 
 
 def _camera_flags(camera: CameraSettings) -> list[str]:
@@ -264,11 +273,7 @@ def run_demo(
     logs.mkdir(exist_ok=True)
     endpoint = free_endpoint()
     recorded = open_sequence(sequence, settings.camera)
-    resize = settings.resize or real_time_resize(recorded.intrinsics.shape_hw)
-    stride = settings.stride or real_time_stride(recorded.times_ns)
-    if stride > 1:
-        tell(f"one image in {stride} is sent; --stride 1 sends all")
-    commands = role_commands(settings, sequence, resize, stride, endpoint)
+    commands = role_commands(settings, sequence, endpoint)
     children = {name: Role(name, command, logs / f"{name}.log") for name, command in commands.items()}
     alive = Alive(set(), threading.Condition())
     try:
@@ -279,8 +284,14 @@ def run_demo(
             return None, None
         with session:
             session.watch_alive(AGENT_ID, alive.on_change)
+            children["channel"].start()
+            playback = choose_playback(settings, recorded)
+            for text in _reductions(settings, playback):
+                tell(text)
+            command = agent_command(settings, sequence, endpoint, playback)
+            children["agent"] = Role("agent", command, logs / "agent.log")
             for name, child in children.items():
-                if name != "server":
+                if name == "agent":
                     child.start()
                 alive.wait_for(name, child, stop)
                 tell(f"{name} is up: {shlex.join(child.command)}")
@@ -290,10 +301,44 @@ def run_demo(
             raise SemcastError(f"server did not start: {children['server'].last_words()}") from err
         raise
     finally:
-        for name in ("agent", "channel", "server"):
-            children[name].stop()
+        for child in reversed(children.values()):
+            child.stop()
     summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
     return summary, error
+
+
+def choose_playback(settings: DemoSettings, recorded: Sequence) -> Playback:
+    """Return how the recording is played: as asked for, and the rest as this machine can serve it.
+
+    Raises:
+        ConfigError: The codec is unknown.
+        CheckpointError: Its weights are missing or damaged.
+    """
+    recorded_hz = _usual_rate_hz(recorded)
+    stride = settings.stride or start_stride(recorded_hz)
+    rate_hz = settings.rate_hz or recorded_hz / stride
+    if settings.resize is not None and settings.rate_hz is not None:
+        return Playback(settings.resize, stride, rate_hz, rate_hz * stride / recorded_hz)
+    image = recorded.image(0)
+    plan = plan_for(settings.codec, settings.modulation, image, rate_hz, settings.rate, settings.resize)
+    rate_hz = settings.rate_hz or plan.rate_hz
+    return Playback(plan.resize, stride, rate_hz, rate_hz * stride / recorded_hz)
+
+
+def _reductions(settings: DemoSettings, playback: Playback) -> Iterator[str]:
+    """Yield in words what was done, unasked, for this machine to keep up."""
+    if settings.stride is None and playback.stride > 1:
+        yield f"one image in {playback.stride} is sent; --stride 1 sends all"
+    if settings.resize is None and playback.resize < 1.0:
+        yield f"images are sent at {playback.resize:g} of their size; --resize 1 sends them as they are"
+    if settings.rate_hz is None and playback.speed < 1.0:
+        yield f"played at {playback.speed:.2g} of the recorded pace, as this machine can serve; see --rate-hz"
+
+
+def _usual_rate_hz(recorded: Sequence) -> float:
+    """Return the images a second of a recording; those of a usual camera where it has but one image."""
+    usual_s = float(np.median(np.diff(recorded.times_ns))) * 1e-9 if len(recorded) > 1 else 0.1
+    return 1.0 / usual_s
 
 
 def _watch(

@@ -1,0 +1,175 @@
+"""How large images may be, and how many a second, for all processes to keep up on this machine."""
+
+import math
+import multiprocessing
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.codec import Modulation, ReceivedImage
+from semcast.common.codecs import load_codec
+from semcast.common.rate import NATIVE_RATE, RateChoice, to_coded
+
+#: Larger images gain little.
+MAX_PIXELS = 250_000
+#: Images get smaller first, down to this share of the pixels, then fewer a second.
+_MIN_SHARE = 0.6
+#: Share of the cores' time that may be planned: beyond it frames have to wait for each other.
+_USABLE = 0.5
+#: Everything but coding (tracker, bundle adjustment, viewer, transport) in units of following 500 points, and
+#: the share of it that does not depend on the image size.
+_OTHER_WORK, _FIXED_SHARE = 4.5, 0.6
+#: So many cores at most are of use to one stream.
+_MAX_CORES = 4
+#: A recording is played slower only if it is worth it: the measurement is no better.
+_FULL_PACE = 0.9
+_MEASURE_S = 1.0
+_MAX_CALLS = 7
+_SNR_DB = 10.0
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What one core of this machine, as it is loaded now, needs for one image.
+
+    Attributes:
+        coding_ms: Encoding and decoding.
+        following_ms: Following 500 points to the next image and back.
+    """
+
+    coding_ms: float
+    following_ms: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a demo sends.
+
+    Attributes:
+        resize: Factor on the image size.
+        rate_hz: Images a second.
+    """
+
+    resize: float
+    rate_hz: float
+
+
+def make_plan(
+    speed: Speed, shape_hw: tuple[int, int], rate_hz: float, cores: int, resize: float | None = None
+) -> Plan:
+    """Choose the size of images, and how many a second, that a machine can serve.
+
+    Args:
+        speed: For an image of ``shape_hw`` brought down to ``MAX_PIXELS`` if it is larger.
+        shape_hw: Height and width of the recorded images.
+        rate_hz: Images a second of the recording; never exceeded.
+        cores: Of the machine.
+        resize: Factor on the image size that is asked for, or None to choose it.
+    """
+    height, width = shape_hw
+    largest = _resize_to(MAX_PIXELS, shape_hw)
+    fixed_ms = _OTHER_WORK * speed.following_ms * _FIXED_SHARE
+    growing_ms = _OTHER_WORK * speed.following_ms * (1.0 - _FIXED_SHARE) + speed.coding_ms
+    usable_ms = 1e3 * min(cores, _MAX_CORES) * _USABLE
+    if resize is None:
+        share = min(1.0, max(_MIN_SHARE, (usable_ms / rate_hz - fixed_ms) / growing_ms))
+        resize = min(largest, _resize_to(share * largest**2 * height * width, shape_hw))
+    served_hz = usable_ms / (fixed_ms + (resize / largest) ** 2 * growing_ms)
+    return Plan(resize, served_hz if served_hz < _FULL_PACE * rate_hz else rate_hz)
+
+
+def _resize_to(pixels: float, shape_hw: tuple[int, int]) -> float:
+    """Return the factor, at most 1, that brings an image down to so many pixels."""
+    height, width = shape_hw
+    return min(1.0, round(math.sqrt(pixels / (height * width)), 2))
+
+
+def measure_speed(
+    codec: str, modulation: Modulation, image: NDArray[np.uint8], rate: RateChoice = NATIVE_RATE
+) -> Speed:
+    """Time the work on one image on one core, for a second or two.
+
+    Args:
+        codec: Codec by name.
+        modulation: How symbols travel.
+        image: ``(H, W, 3)`` uint8 RGB, at the size at which it is sent.
+        rate: Channel uses per pixel value; ``auto`` is taken for the native one.
+
+    Raises:
+        ConfigError: The codec is unknown.
+        CheckpointError: Its weights are missing or damaged.
+    """
+    coder = load_codec(codec, modulation=modulation, num_threads=1)
+    coded = to_coded(image, NATIVE_RATE if rate == "auto" else rate)
+    rng = np.random.default_rng(0)
+    noise_var = 10.0 ** (-_SNR_DB / 10.0)
+    shrink = 1.0 / (1.0 + noise_var)
+    times_s: list[float] = []
+    until_s = math.inf
+    while len(times_s) <= _MAX_CALLS and time.perf_counter() < until_s:
+        since_s = time.perf_counter()
+        encoded = coder.encode(coded, _SNR_DB)
+        encoded_s = time.perf_counter() - since_s
+        noise = rng.standard_normal((2, *encoded.symbols.shape)) * math.sqrt(noise_var / 2.0)
+        symbols = (shrink * (encoded.symbols + noise[0] + 1j * noise[1])).astype(np.complex64)
+        snr_db = np.full(symbols.shape[0], _SNR_DB, np.float32)
+        since_s = time.perf_counter()
+        coder.decode(ReceivedImage(encoded.shape_hw, symbols, snr_db, encoded.modulation))
+        times_s.append(encoded_s + time.perf_counter() - since_s)
+        if until_s == math.inf:
+            until_s = time.perf_counter() + _MEASURE_S  # the first call, which warms up, counts for nothing
+    return Speed(1e3 * float(np.median(times_s[1:] or times_s)), _following_ms(image))
+
+
+def _following_ms(image: NDArray[np.uint8]) -> float:
+    cv2.setNumThreads(1)
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    moved = np.roll(grey, (2, 3), axis=(0, 1))
+    times_s = []
+    for _ in range(_MAX_CALLS):
+        since_s = time.perf_counter()
+        points = cv2.goodFeaturesToTrack(grey, 500, 0.01, 8)
+        if points is not None:
+            there = cv2.calcOpticalFlowPyrLK(grey, moved, points, None)[0]  # type: ignore[call-overload]
+            cv2.calcOpticalFlowPyrLK(moved, grey, there, None)  # type: ignore[call-overload]
+        times_s.append(time.perf_counter() - since_s)
+    return 1e3 * float(np.median(times_s))
+
+
+def plan_for(
+    codec: str,
+    modulation: Modulation,
+    image: NDArray[np.uint8],
+    rate_hz: float,
+    rate: RateChoice = NATIVE_RATE,
+    resize: float | None = None,
+) -> Plan:
+    """Measure this machine and choose what it can serve.
+
+    It is measured in a process of its own, so that the codec's libraries don't stay in this one.
+
+    Args:
+        codec: Codec by name.
+        modulation: How symbols travel.
+        image: ``(H, W, 3)`` uint8 RGB, one of those to be sent.
+        rate_hz: Images a second of the recording.
+        rate: Channel uses per pixel value.
+        resize: Factor on the image size that is asked for, or None to choose it.
+
+    Raises:
+        ConfigError: The codec is unknown.
+        CheckpointError: Its weights are missing or damaged.
+    """
+    height, width = image.shape[:2]
+    largest = _resize_to(MAX_PIXELS, (height, width))
+    size_wh = (max(1, round(width * largest)), max(1, round(height * largest)))
+    smaller = np.asarray(cv2.resize(image, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        speed = pool.submit(measure_speed, codec, modulation, smaller, rate).result()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return make_plan(speed, (height, width), rate_hz, cores, resize)
