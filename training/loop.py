@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 _VALID_IMAGES = 16
 #: Raised when the same weights mean another network.
-CHECKPOINT_FORMAT = 2
+CHECKPOINT_FORMAT = 3
 #: Batches the means of hidden units are taken from, and a step no run gets to.
 _FOLD_BATCHES, _FOLD_STEP = 24, 2**40
 

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from semcast.common.nets.modulation import CLIP
 from semcast.common.nets.transceiver import Transceiver
 from semcast.training.channel import LinkDraw, through_link
 from semcast.training.descriptors import descriptor_loss
@@ -26,8 +25,6 @@ class LossSettings:
             logarithms, and without the knee a few hard crops would own the gradient. 0 is the plain mean.
         confidence_sharpness: alpha of the label ``1 - tanh(alpha * |x_hat - x|)``.
         confidence_loss: ``bce``, or ``l1`` as in the paper.
-        power: Weight of the penalty on 16-QAM frames whose mean power is not 1 or whose latent leaves the
-            levels.
     """
 
     mse: float = field(default=1.0, metadata={"help": "weight of the reconstruction error"})
@@ -44,10 +41,9 @@ class LossSettings:
     confidence_loss: Literal["bce", "l1"] = field(
         default="bce", metadata={"help": "bce, or l1 as in the paper"}
     )
-    power: float = field(default=0.002, metadata={"help": "weight of the penalty on a power that is not 1"})
 
     def __post_init__(self) -> None:
-        for name in ("mse", "descriptor", "confidence", "mse_knee", "power"):
+        for name in ("mse", "descriptor", "confidence", "mse_knee"):
             if getattr(self, name) < 0.0:
                 raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
         if self.confidence_sharpness <= 0.0:
@@ -109,10 +105,6 @@ def transceiver_loss(
     reconstruction, mse = reconstruction_loss(x_hat, x, settings.mse_knee)
     loss = settings.mse * reconstruction
     power = 2.0 * symbols.square().mean(dim=(1, 2, 3))
-    # Beyond the clipping range a value has no gradient from the image and would drift.
-    drift = (latent.abs() - CLIP).clamp_min(0.0).mean(dim=(1, 2, 3))
-    # Straight-through gradients shrink the latent, which wastes power; this holds it at what is allowed.
-    loss = loss + settings.power * ((drift + (power - 1.0).abs()) * draw.is_qam).mean()
     logs = {
         "mse": mse.mean(),
         "power": (power * draw.is_qam).sum().detach() / draw.is_qam.sum().clamp_min(1.0),

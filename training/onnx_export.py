@@ -24,9 +24,9 @@ class _ImageToLatent(nn.Module):
         super().__init__()
         self.encoder = encoder
 
-    def forward(self, image: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+    def forward(self, image: Tensor, snr_db: Tensor) -> Tensor:
         x = image.permute(0, 3, 1, 2).to(torch.float32) * (1.0 / 255.0)
-        latent: Tensor = self.encoder(x, snr_db, is_qam)
+        latent: Tensor = self.encoder(x, snr_db)
         return latent
 
 
@@ -34,14 +34,14 @@ def export_encoder(name_or_path: str | Path, out: Path) -> Path:
     """Export the encoder of shipped weights or of a weights file.
 
     Weights stay in half precision in the file and are widened when it is loaded. The graph takes ``image``
-    ``(1, H, W, 3)`` uint8 with sides that are multiples of 16, ``snr_db (1,)`` and ``is_qam (1,)``, and gives
-    ``latent (1, 94, H/16, W/16)``.
+    ``(1, H, W, 3)`` uint8 with sides that are multiples of 16, and the ``snr_db`` ``(1,)`` at which values
+    arrive; it gives ``latent (1, 94, H/16, W/16)``.
 
     Raises:
         CheckpointError: There are no such weights, or the file can't be written.
     """
     model, manifest = load_transceiver(weights_path(name_or_path))
-    example = (torch.zeros(1, 64, 96, 3, dtype=torch.uint8), torch.full((1,), 10.0), torch.ones(1))
+    example = (torch.zeros(1, 64, 96, 3, dtype=torch.uint8), torch.full((1,), 10.0))
     sides = {1: "height", 2: "width"}
     try:
         out.parent.mkdir(parents=True, exist_ok=True)

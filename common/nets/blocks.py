@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
-#: Values a network is told besides features: normalised SNR and the modulation flag.
-NUM_CONDITIONS = 2
+#: Values a network is told besides features: the normalised SNR.
+NUM_CONDITIONS = 1
 #: Slope of the hidden activation of residual units below zero.
 HIDDEN_SLOPE = 0.1
 
@@ -19,17 +19,9 @@ def normalise_snr_db(snr_db: Tensor) -> Tensor:
     return (snr_db.clamp(-20.0, 30.0) - 6.0) / 10.0
 
 
-def condition_vector(snr_db: Tensor, is_qam: Tensor) -> Tensor:
-    """Stack what the network is told about the link.
-
-    Args:
-        snr_db: ``(B,)`` SNR in dB.
-        is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
-
-    Returns:
-        ``(B, 2)``.
-    """
-    return torch.stack((normalise_snr_db(snr_db), 2.0 * is_qam - 1.0), dim=1)
+def condition_vector(snr_db: Tensor) -> Tensor:
+    """Return what the network is told about the link, ``(B, 1)``, of the SNR ``(B,)`` in dB."""
+    return normalise_snr_db(snr_db)[:, None]
 
 
 class ChannelAttention(nn.Module):
@@ -78,7 +70,7 @@ class Stage(nn.Module):
         self.units = nn.ModuleList(ResidualUnit(channels) for _ in range(num_units))
 
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
-        """Refine ``(B, C, H, W)`` under a ``(B, 2)`` link state."""
+        """Refine ``(B, C, H, W)`` under a ``(B, 1)`` link state."""
         x = self.attention(x, condition)
         for unit in self.units:
             x = unit(x)

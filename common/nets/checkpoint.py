@@ -15,8 +15,9 @@ from semcast.common.nets.registry import build, sizes_to_dict
 from semcast.common.nets.transceiver import Transceiver
 
 MAX_BYTES = 16 * 1024 * 1024
-#: Raised when keys of the manifest change, or when the same weights mean another network (2: leaky units).
-FORMAT = 2
+#: Raised when keys of the manifest change, or when the same weights mean another network (2: leaky units;
+#: 3: told how well values arrive, not how they travel).
+FORMAT = 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

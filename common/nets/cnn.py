@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from semcast.common.nets.blocks import condition_vector, normalise_snr_db
+from semcast.common.nets.blocks import NUM_CONDITIONS, condition_vector, normalise_snr_db
 from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import RECEIVED_CHANNELS, DecoderFeatures
 from semcast.common.nets.transceiver import Transceiver
@@ -30,7 +30,7 @@ class CnnEncoder(nn.Module):
 
     def __init__(self, widths: tuple[int, int, int, int]) -> None:
         super().__init__()
-        inputs = (3 + 2, *widths[:-1])
+        inputs = (3 + NUM_CONDITIONS, *widths[:-1])
         self.layers = nn.ModuleList(
             nn.Conv2d(before, after, 5, stride=2, padding=2)
             for before, after in zip(inputs, widths, strict=True)
@@ -38,9 +38,9 @@ class CnnEncoder(nn.Module):
         self.activations = nn.ModuleList(nn.PReLU(width) for width in widths)
         self.head = nn.Conv2d(widths[-1], LATENT_CHANNELS, 5, padding=2)
 
-    def forward(self, x: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+    def forward(self, x: Tensor, snr_db: Tensor) -> Tensor:
         """Map ``(B, 3, H, W)`` in [0, 1] to the latent ``(B, 94, H/16, W/16)`` before modulation."""
-        condition = condition_vector(snr_db, is_qam)[:, :, None, None].expand(-1, -1, *x.shape[2:])
+        condition = condition_vector(snr_db)[:, :, None, None].expand(-1, -1, *x.shape[2:])
         f = torch.cat((x - 0.5, condition), dim=1)
         for layer, activation in zip(self.layers, self.activations, strict=True):
             f = activation(layer(f))
@@ -62,11 +62,10 @@ class CnnDecoder(nn.Module):
         self.activations = nn.ModuleList(nn.PReLU(width) for width in (sixteenth, eighth, quarter, half))
 
     def forward(
-        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor, is_qam: Tensor
+        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor
     ) -> tuple[Tensor, DecoderFeatures]:
         """Map the received latent to ``(B, 3, 16 h, 16 w)`` and the features at 1/16, 1/8 and 1/4."""
-        flag = (2.0 * is_qam - 1.0).view(-1, 1, 1, 1).expand_as(snr_db)
-        received = torch.cat((y, normalise_snr_db(snr_db), shrink, flag), dim=1)
+        received = torch.cat((y, normalise_snr_db(snr_db), shrink), dim=1)
         f = self.activations[0](self.stem(received))
         stages = [f]
         for layer, activation in zip(self.layers[:3], self.activations[1:], strict=True):

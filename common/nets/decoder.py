@@ -27,8 +27,8 @@ class DecoderFeatures:
     at4: Tensor
 
 
-#: Received latent, normalised SNR, shrink factor, modulation flag.
-RECEIVED_CHANNELS = LATENT_CHANNELS + 3
+#: Received latent, normalised SNR, shrink factor.
+RECEIVED_CHANNELS = LATENT_CHANNELS + 2
 
 
 class Decoder(nn.Module):
@@ -59,22 +59,20 @@ class Decoder(nn.Module):
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
 
     def forward(
-        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor, is_qam: Tensor
+        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor
     ) -> tuple[Tensor, DecoderFeatures]:
         """Map the received latent to ``(B, 3, 16 h, 16 w)``, not clipped, and the features of each stage.
 
         Args:
             y: ``(B, 94, h, w)`` latent, each slot shrunk by ``shrink``.
-            snr_db: ``(B, 1, h, w)`` effective SNR of each slot in dB.
+            snr_db: ``(B, 1, h, w)`` SNR in dB at which the values of each slot arrived.
             shrink: ``(B, 1, h, w)``, ``snr / (1 + snr)``.
-            scale: ``(B, 1, 1, 1)`` factor an analog frame was scaled back with.
-            is_qam: ``(B,)``.
+            scale: ``(B, 1, 1, 1)`` factor the frame was scaled back with.
         """
-        condition = condition_vector(snr_db.mean(dim=(1, 2, 3)), is_qam)
-        flag = (2.0 * is_qam - 1.0).view(-1, 1, 1, 1).expand_as(snr_db)
-        received = torch.cat((y, normalise_snr_db(snr_db), shrink, flag), dim=1)
+        condition = condition_vector(snr_db.mean(dim=(1, 2, 3)))
+        received = torch.cat((y, normalise_snr_db(snr_db), shrink), dim=1)
         at16 = self.stage16(self.stem(received).relu(), condition)
-        estimate = self.linear(y, shrink, scale, is_qam, self.adapt_head(at16.relu()))
+        estimate = self.linear(y, shrink, scale, self.adapt_head(at16.relu()))
         at8 = self.stage8(self.up8(at16.relu()).relu(), condition)
         folded = self.fold(estimate)
         at4 = self.stage4((self.up4(at8.relu()) + self.estimate(folded)).relu(), condition)

@@ -34,15 +34,14 @@ class Encoder(nn.Module):
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
-    def forward(self, x: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+    def forward(self, x: Tensor, snr_db: Tensor) -> Tensor:
         """Map ``(B, 3, H, W)`` in [0, 1] to the latent ``(B, 94, H/16, W/16)`` before modulation.
 
         Args:
             x: Image, sides multiples of 16.
-            snr_db: ``(B,)`` SNR in dB the transmitter expects.
-            is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
+            snr_db: ``(B,)`` SNR in dB at which the transmitter expects its values to arrive.
         """
-        condition = condition_vector(snr_db, is_qam)
+        condition = condition_vector(snr_db)
         x = x - 0.5
         f = self.stem(self.fold(x)).relu()  # (B, C4, H/4, W/4)
         f = self.down8(self.stage4(f, condition)).relu()

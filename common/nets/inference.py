@@ -24,7 +24,7 @@ from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import Decoder
 from semcast.common.nets.encoder import Encoder
 from semcast.common.nets.linear import BlockSynthesis
-from semcast.common.nets.modulation import demodulate
+from semcast.common.nets.modulation import demodulate, effective_snr_db, shrink_of
 from semcast.common.nets.transceiver import Transceiver
 
 _MAX_LOG_GAIN = 3.0
@@ -216,9 +216,9 @@ class _ArrangedEncoder:
         self._transform = _Conv(encoder.linear.transform, dtype, inputs=_block_order(), scale=scale)
         self._mix = _Conv(encoder.linear.mix, dtype)
 
-    def __call__(self, pixels: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+    def __call__(self, pixels: Tensor, snr_db: Tensor) -> Tensor:
         """Encode ``(H, W, 3)`` uint8 to the float latent ``(1, 94, H/16, W/16)``."""
-        condition = condition_vector(snr_db, is_qam)
+        condition = condition_vector(snr_db)
         folded = _gather(pixels, _FOLD).to(self._dtype).sub_(127.5)  # (H/4, W/4, 48)
         f = self._stages[0](self._stem(_image(folded)).relu_(), condition)
         f = self._stages[1](self._down8(f).relu_(), condition)
@@ -251,26 +251,22 @@ class _ArrangedDecoder:
         self._up8c, self._up4c = _Upsample(branch.up8.conv, dtype), _Upsample(branch.up4.conv, dtype)
         self._maps = _Conv(branch.head, dtype)
 
-    def _linear_estimate(
-        self, y: Tensor, shrink: Tensor, scale: Tensor, is_qam: Tensor, adapt: Tensor
-    ) -> Tensor:
+    def _linear_estimate(self, y: Tensor, shrink: Tensor, scale: Tensor, adapt: Tensor) -> Tensor:
         """Estimate as ``BlockSynthesis`` does, folded: ``(1, 48, 4 h, 4 w)``."""
-        gain = self._linear.gain(shrink, scale, is_qam, adapt)
+        gain = self._linear.gain(shrink, scale, adapt)
         coefficients = self._unmix(y.to(self._dtype)).float() * gain
         return _image(_spread(_rows(self._transform(coefficients.to(self._dtype))), _GROUPS))
 
     def __call__(self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See ``InferenceNet.decode``."""
-        linear = 10.0 ** (snr_db / 10.0)
-        shrink = linear / (1.0 + linear)
-        y, scale = demodulate(y_rx, shrink, is_qam)
-        condition = condition_vector(snr_db.mean(dim=(1, 2, 3)), is_qam)
-        flag = (2.0 * is_qam - 1.0).view(-1, 1, 1, 1).expand_as(snr_db)
-        planes = (y, normalise_snr_db(snr_db), shrink, flag)
+        y, snr_db, scale = demodulate(y_rx, snr_db, is_qam)
+        shrink = shrink_of(snr_db)
+        condition = condition_vector(snr_db.mean(dim=(1, 2, 3)))
+        planes = (y, normalise_snr_db(snr_db), shrink)
         received = torch.cat(planes, dim=1).to(self._dtype).contiguous(memory_format=torch.channels_last)
         at16 = self._stages[0](self._stem(received).relu_(), condition)
         opened = at16.relu()
-        folded = self._linear_estimate(y, shrink, scale, is_qam, self._adapt(opened))
+        folded = self._linear_estimate(y, shrink, scale, self._adapt(opened))
         at8 = self._stages[1](self._up8(opened).relu_(), condition)
         at4 = self._up4(at8.relu()).add_(self._estimate(folded)).relu_()
         at4 = self._stages[2](at4, condition)
@@ -311,7 +307,7 @@ class ArrangedNet:
 
     def latent(self, pixels: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
         """See ``InferenceNet``."""
-        return self._encoder(pixels, snr_db, is_qam)
+        return self._encoder(pixels, effective_snr_db(snr_db, is_qam))
 
     def decode(self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See ``InferenceNet``."""

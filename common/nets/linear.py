@@ -49,36 +49,33 @@ class BlockSynthesis(nn.Module):
         super().__init__()
         self.unmix = nn.Conv2d(LATENT_CHANNELS, LATENT_CHANNELS, 1)
         self.log_power = nn.Parameter(torch.zeros(LATENT_CHANNELS))
-        #: Log variance of what the receiver can't undo, under analog and under 16-QAM (it rounds).
-        self.log_distortion = nn.Parameter(torch.tensor([math.log(0.01), math.log(0.13)]))
+        #: Log variance of what the receiver can't undo.
+        self.log_distortion = nn.Parameter(torch.tensor(math.log(0.01)))
         self.transform = nn.Conv2d(LATENT_CHANNELS, _BLOCK_VALUES, 1)
         self.unfold = nn.PixelShuffle(BLOCK_PX)
 
-    def forward(self, y: Tensor, shrink: Tensor, scale: Tensor, is_qam: Tensor, adapt: Tensor) -> Tensor:
+    def forward(self, y: Tensor, shrink: Tensor, scale: Tensor, adapt: Tensor) -> Tensor:
         """Estimate the image linearly.
 
         Args:
             y: ``(B, 94, h, w)`` latent, each slot still shrunk by ``shrink``.
             shrink: ``(B, 1, h, w)``, ``snr / (1 + snr)``.
-            scale: ``(B, 1, 1, 1)`` factor by which an analog frame was scaled back; it scales the noise too.
-            is_qam: ``(B,)``.
+            scale: ``(B, 1, 1, 1)`` factor by which the frame was scaled back; it scales the noise too.
             adapt: ``(B, 188, h, w)`` from the network: what to add to the log prior power of each
                 coefficient, and the log gain that undoes the transmitter's local one.
 
         Returns:
             ``(B, 3, 16 h, 16 w)``.
         """
-        coefficients = self.unmix(y).float() * self.gain(shrink, scale, is_qam, adapt)
+        coefficients = self.unmix(y).float() * self.gain(shrink, scale, adapt)
         x: Tensor = self.unfold(self.transform(coefficients))
         return x
 
-    def gain(self, shrink: Tensor, scale: Tensor, is_qam: Tensor, adapt: Tensor) -> Tensor:
+    def gain(self, shrink: Tensor, scale: Tensor, adapt: Tensor) -> Tensor:
         """Wiener gain of each coefficient, ``(B, 94, h, w)``, which also undoes ``shrink``."""
         shrink = shrink.clamp_min(1e-2)
         noise = (1.0 - shrink) / shrink * scale.square()  # noise variance for unit power
-        flag = is_qam.view(-1, 1, 1, 1)
-        log_distortion = self.log_distortion[0] * (1.0 - flag) + self.log_distortion[1] * flag
         more_power, log_gain = adapt.float().chunk(2, dim=1)
-        log_noise = torch.log(noise + torch.exp(log_distortion))
+        log_noise = torch.log(noise + torch.exp(self.log_distortion))
         wiener = torch.sigmoid(self.log_power.view(1, -1, 1, 1) + more_power - log_noise)
         return wiener * torch.exp(log_gain.clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN)) / shrink

@@ -71,9 +71,9 @@ class MaeEncoder(nn.Module):
         tokens: Tensor = self.gather(blocks)
         return tokens
 
-    def forward(self, x: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+    def forward(self, x: Tensor, snr_db: Tensor) -> Tensor:
         """Map ``(B, 3, H, W)`` in [0, 1] to the latent ``(B, 94, H/16, W/16)`` before modulation."""
-        f = self.trunk(self.embed(x), condition_vector(snr_db, is_qam))
+        f = self.trunk(self.embed(x), condition_vector(snr_db))
         latent: Tensor = self.head(f).float()
         return latent[:, :, : x.shape[2] // BLOCK_PX, : x.shape[3] // BLOCK_PX]
 
@@ -100,14 +100,13 @@ class MaeDecoder(nn.Module):
         return self.unfold(self.head(blocks)).float(), blocks
 
     def forward(
-        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor, is_qam: Tensor
+        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor
     ) -> tuple[Tensor, DecoderFeatures]:
         """Map the received latent to ``(B, 3, 16 h, 16 w)``; finer features are the pixels themselves."""
         rows, columns = y.shape[2:]
-        flag = (2.0 * is_qam - 1.0).view(-1, 1, 1, 1).expand_as(snr_db)
-        received = torch.cat((y, normalise_snr_db(snr_db), shrink, flag), dim=1)
+        received = torch.cat((y, normalise_snr_db(snr_db), shrink), dim=1)
         tokens = self.stem(pad_to_patches(received, self.patch_blocks))
-        pixels, blocks = self.pixels(self.trunk(tokens, condition_vector(snr_db.mean(dim=(1, 2, 3)), is_qam)))
+        pixels, blocks = self.pixels(self.trunk(tokens, condition_vector(snr_db.mean(dim=(1, 2, 3)))))
         pixels = pixels[:, :, : rows * BLOCK_PX, : columns * BLOCK_PX]
         features = DecoderFeatures(
             received, blocks[:, :, :rows, :columns], self.fold8(pixels), self.fold4(pixels)

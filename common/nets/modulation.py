@@ -1,9 +1,14 @@
-"""Latent values as channel symbols: hard 4-PAM reals for 16-QAM, or analog values with a scale carrier.
+"""Latent values as channel symbols: analog ones, or rounded to the levels of 16-QAM; and back.
 
-Under 16-QAM every real latent is rounded to the nearest of four fixed levels, so the scale of the latent
-survives. An analog frame is divided by its own rms, which the receiver does not know. A weak known pattern
-(one sign per channel, alternating over the blocks like a chessboard) is therefore added before the division;
-the receiver correlates with it and learns the divisor from the air, never from the transmitter.
+Both ways begin with analog symbols: the latent of an image divided by its own rms, which the receiver does
+not know. A weak known pattern (one sign per channel, alternating over the blocks like a chessboard) is
+therefore added before the division; the receiver correlates with it and learns the divisor from the air,
+never from the transmitter.
+
+With 16-QAM the values of a slot are then spread evenly over its symbols by a fixed orthonormal mixing and
+rounded. Loud and quiet blocks may differ as they may in analog symbols, every symbol is about Gaussian, and
+what rounding takes is noise like that of the link: a network need not know how its symbols travel, only how
+well.
 """
 
 from typing import Any
@@ -11,12 +16,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-#: Amplitudes of one 4-PAM real of unit-power 16-QAM, ``{-3, -1, 1, 3} / sqrt(10)``.
-LEVEL_STEP = 2.0 / 10.0**0.5
-CLIP = 2.0 * LEVEL_STEP
+from semcast.common.nets.rounding import (
+    CLIP,
+    LEVEL_STEP,
+    LOADING,
+    MEAN_INNER,
+    MEAN_OUTER,
+    OUTER_SHARE,
+    mixing,
+    rounded_snr_db,
+)
+
 #: Amplitude of the carrier against a latent whose rms is about 0.7.
 CARRIER_AMPLITUDE = 0.12
 _MAX_SCALE = 6.0
+#: From an analog value, of power 1/2, to one that is rounded.
+_TO_ROUNDED = 2.0**0.5 * LOADING
 
 
 class _NearestLevel(torch.autograd.Function):
@@ -65,6 +80,54 @@ def analog_symbols(y: Tensor) -> Tensor:
     return y * torch.rsqrt(2.0 * power + 1e-12)
 
 
+def spread(symbols: Tensor) -> Tensor:
+    """Mix the values of every slot, so that each symbol has a part of all.
+
+    Args:
+        symbols: ``(B, C, h, w)``; a slot is a row of blocks.
+    """
+    order, signs, columns, channels = _mixing_of(symbols)
+    with torch.autocast(symbols.device.type, enabled=False):
+        slots = symbols.float().permute(0, 2, 1, 3)  # (B, h, C, w)
+        shuffled = slots.flatten(2)[..., order].view(slots.shape) * signs
+        return (channels @ (shuffled @ columns.mT)).permute(0, 2, 1, 3)
+
+
+def unspread(symbols: Tensor) -> Tensor:
+    """Invert ``spread``."""
+    order, signs, columns, channels = _mixing_of(symbols)
+    with torch.autocast(symbols.device.type, enabled=False):
+        slots = symbols.float().permute(0, 2, 1, 3)
+        shuffled = (channels.mT @ slots @ columns * signs).flatten(2)
+        back = shuffled[..., torch.argsort(order)].view(slots.shape)
+        return back.permute(0, 2, 1, 3)
+
+
+def _mixing_of(symbols: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    of = mixing(symbols.shape[1], symbols.shape[3])
+    parts = (torch.from_numpy(m).to(symbols.device) for m in (of.order, of.signs, of.columns, of.channels))
+    order, signs, columns, channels = parts
+    return order, signs, columns, channels
+
+
+def effective_snr_db(snr_db: Tensor, is_qam: Tensor) -> Tensor:
+    """Return the SNR in dB at which values arrive behind the link and, with 16-QAM, the rounding.
+
+    Args:
+        snr_db: ``(B, ...)`` of the link.
+        is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
+    """
+    rounded = torch.from_numpy(rounded_snr_db(snr_db.detach().cpu().double().numpy()))
+    flag = is_qam.view(-1, *(1,) * (snr_db.ndim - 1))
+    return torch.where(flag > 0, rounded.to(snr_db), snr_db)
+
+
+def shrink_of(snr_db: Tensor) -> Tensor:
+    """Return ``snr / (1 + snr)``: the share of a value that its mean given what arrived has."""
+    linear = 10.0 ** (snr_db / 10.0)
+    return linear / (1.0 + linear)
+
+
 def modulate(latent: Tensor, is_qam: Tensor) -> Tensor:
     """Modulate: real and imaginary parts of unit-power symbols, so power 1/2 for each real value.
 
@@ -72,40 +135,40 @@ def modulate(latent: Tensor, is_qam: Tensor) -> Tensor:
         latent: ``(B, C, h, w)``.
         is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
     """
-    if bool((is_qam == 1).all()):
-        return nearest_level(latent)
+    analog = analog_symbols(latent)
     if bool((is_qam == 0).all()):
-        return analog_symbols(latent)
-    return torch.where(is_qam.view(-1, 1, 1, 1) > 0, nearest_level(latent), analog_symbols(latent))
+        return analog
+    rounded = nearest_level(_TO_ROUNDED * spread(analog))
+    return torch.where(is_qam.view(-1, 1, 1, 1) > 0, rounded, analog)
 
 
-def demodulate(y_rx: Tensor, shrink: Tensor, is_qam: Tensor) -> tuple[Tensor, Tensor]:
-    """Undo the scale of analog images; replace 16-QAM values by the mean of what was sent, given them.
+def demodulate(y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the latent as well as it is known, with what is known about it.
 
     Args:
         y_rx: ``(B, C, h, w)`` MMSE-equalised values.
-        shrink: ``(B, 1, h, w)`` in [0, 1], ``snr / (1 + snr)`` of each slot.
+        snr_db: ``(B, 1, h, w)`` effective SNR of each slot on the link.
         is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
 
     Returns:
-        The latent, shrunk by ``shrink`` or as far as it is uncertain, and the ``(B, 1, 1, 1)`` factor that
-        was applied.
+        The latent, shrunk as far as it is uncertain; the SNR ``(B, 1, h, w)`` in dB at which its values
+        arrived, rounding included; and the ``(B, 1, 1, 1)`` factor that undid the transmitter's division.
     """
-    if bool((is_qam == 1).all()):
-        return soft_levels(y_rx, shrink), torch.ones_like(y_rx[:, :1, :1, :1])
-    descaled, scale = undo_analog(y_rx, shrink)
-    if bool((is_qam == 0).all()):
-        return descaled, scale
-    flag = is_qam.view(-1, 1, 1, 1)
-    soft = soft_levels(y_rx, shrink)
-    return torch.where(flag > 0, soft, descaled), torch.where(flag > 0, torch.ones_like(scale), scale)
+    analog = y_rx
+    if bool((is_qam > 0).any()):
+        means = unspread(mean_before_rounding(y_rx, shrink_of(snr_db))) / _TO_ROUNDED
+        analog = torch.where(is_qam.view(-1, 1, 1, 1) > 0, means.to(y_rx.dtype), y_rx)
+    snr_db = effective_snr_db(snr_db, is_qam)
+    latent, scale = undo_analog(analog, shrink_of(snr_db))
+    return latent, snr_db, scale
 
 
-def soft_levels(y_rx: Tensor, shrink: Tensor) -> Tensor:
-    """Mean of the 4-PAM level that was sent given what was received, all levels alike before.
+def mean_before_rounding(y_rx: Tensor, shrink: Tensor) -> Tensor:
+    """Mean of a Gaussian value that was rounded and sent, given what was received.
 
-    The MMSE equaliser treats a symbol as Gaussian; that it can only be one of four levels leaves a quarter
-    less squared error at 10 dB and two thirds less at 14 dB. Where nothing arrived the mean is 0.
+    The MMSE equaliser treats a symbol as Gaussian; that it can only be one of four levels, the outer ones as
+    often as the Gaussian has them, leaves a quarter less squared error at 10 dB. Where nothing arrived the
+    mean is 0.
 
     Args:
         y_rx: ``(B, C, h, w)`` MMSE-equalised values.
@@ -117,13 +180,14 @@ def soft_levels(y_rx: Tensor, shrink: Tensor) -> Tensor:
     # the inner pair against the outer one.
     inner = 0.5 * LEVEL_STEP
     outer = 3.0 * inner
+    odds = (1.0 - OUTER_SHARE) / OUTER_SHARE
     y, shrink = y_rx.float(), shrink.float().clamp_max(1.0 - 1e-4)
     certainty = 1.0 / (1.0 - shrink)
     exponent = y.abs() * (-4.0 * inner * certainty)
     e = torch.exp(exponent)
-    g = torch.exp((exponent + (outer**2 - inner**2) * shrink * certainty).clamp_max_(60.0))
+    g = odds * torch.exp((exponent + (outer**2 - inner**2) * shrink * certainty).clamp_max_(60.0))
     e3 = e * e * e
-    mean = (outer * (1.0 - e3) + inner * g * (1.0 - e)) / (g * (1.0 + e) + 1.0 + e3)
+    mean = (MEAN_OUTER * (1.0 - e3) + MEAN_INNER * g * (1.0 - e)) / (g * (1.0 + e) + 1.0 + e3)
     return torch.copysign(mean, y).to(y_rx.dtype)
 
 

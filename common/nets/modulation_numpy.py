@@ -7,15 +7,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import Modulation
+from semcast.common.nets.rounding import LEVEL_STEP, LOADING, mixing
 
-LEVEL_STEP = 2.0 / 10.0**0.5
 CARRIER_AMPLITUDE = 0.12
 
 
-def nearest_level(latent: NDArray[np.float32]) -> NDArray[np.float32]:
+def nearest_level(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Round every value to the nearest 4-PAM level of unit-power 16-QAM."""
     step = np.float32(LEVEL_STEP)
-    return np.asarray((np.floor(latent / step).clip(-2.0, 1.0) + np.float32(0.5)) * step, dtype=np.float32)
+    return np.asarray((np.floor(values / step).clip(-2.0, 1.0) + np.float32(0.5)) * step, dtype=np.float32)
+
+
+def spread(symbols: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mix the values ``(C, h, w)`` of every slot, so that each symbol has a part of all."""
+    num_channels, rows, num_columns = symbols.shape
+    of = mixing(num_channels, num_columns)
+    slots = symbols.transpose(1, 0, 2)  # (h, C, w)
+    shuffled = slots.reshape(rows, -1)[:, of.order].reshape(slots.shape) * of.signs
+    return np.asarray((of.channels @ (shuffled @ of.columns.T)).transpose(1, 0, 2), dtype=np.float32)
 
 
 def carrier_pattern(channels: int, rows: int, columns: int) -> NDArray[np.float32]:
@@ -37,4 +46,7 @@ def analog_symbols(latent: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def transmit(latent: NDArray[np.float32], modulation: Modulation) -> NDArray[np.float32]:
     """Modulate the latent ``(94, h, w)`` of one frame: real parts of power 1/2 of unit-power symbols."""
-    return nearest_level(latent) if modulation == "16qam" else analog_symbols(latent)
+    symbols = analog_symbols(latent)
+    if modulation == "analog":
+        return symbols
+    return nearest_level(np.float32(2.0**0.5 * LOADING) * spread(symbols))

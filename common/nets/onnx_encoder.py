@@ -1,6 +1,6 @@
 """The sending end of a learned codec on onnxruntime, for small computers without torch.
 
-The exported graph maps an image to the latent; padding, rounding to levels and pairing are a little numpy.
+The exported graph maps an image to the latent; padding, modulation and pairing are a little numpy.
 """
 
 from pathlib import Path
@@ -13,13 +13,14 @@ from semcast.common.codec import MODULATIONS, DecodedImage, EncodedImage, Modula
 from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.latent import symbols_from_latent
 from semcast.common.nets.modulation_numpy import transmit
+from semcast.common.nets.rounding import rounded_snr_db
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.common.shapes import check_shape
 
 SUFFIX = ".onnx"
 #: Version of what the graph takes and gives, and of its metadata.
-FORMAT = "1"
-INPUTS = ("image", "snr_db", "is_qam")
+FORMAT = "2"
+INPUTS = ("image", "snr_db")
 OUTPUT = "latent"
 
 
@@ -81,7 +82,6 @@ class OnnxEncoder:
         self._name, self._digest = str(facts["architecture"]), str(facts["digest"])
         self._snr_range_db = float(facts["snr_min_db"]), float(facts["snr_max_db"])
         self._modulation: Modulation = modulation
-        self._is_qam = np.array([float(modulation == "16qam")], dtype=np.float32)
 
     @property
     def name(self) -> str:
@@ -111,10 +111,10 @@ class OnnxEncoder:
         bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX
         if bottom or right:
             image = np.pad(image, ((0, bottom), (0, right), (0, 0)), mode="edge")
+        arriving_db = rounded_snr_db(expected) if self._modulation == "16qam" else expected
         given = {
             "image": np.ascontiguousarray(image)[None],
-            "snr_db": np.array([expected], dtype=np.float32),
-            "is_qam": self._is_qam,
+            "snr_db": np.array([arriving_db], dtype=np.float32),
         }
         latent = self._session.run([OUTPUT], given)[0][0]
         return EncodedImage(

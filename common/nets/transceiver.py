@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import Decoder, DecoderFeatures
 from semcast.common.nets.encoder import Encoder
-from semcast.common.nets.modulation import demodulate, modulate
+from semcast.common.nets.modulation import demodulate, effective_snr_db, modulate, shrink_of
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Sizes:
 class Transceiver(nn.Module):
     """Encoder and decoder with the modulation between them.
 
-    Any encoder ``(x, snr_db, is_qam) -> latent`` and decoder
-    ``(y, snr_db, shrink, scale, is_qam) -> (x_hat, DecoderFeatures)`` fit; the rivals use the same shell.
+    Any encoder ``(x, snr_db) -> latent`` and decoder ``(y, snr_db, shrink, scale) -> (x_hat,
+    DecoderFeatures)`` fit; the rivals use the same shell.
     """
 
     def __init__(self, encoder: nn.Module, decoder: nn.Module, confidence: nn.Module) -> None:
@@ -41,8 +41,14 @@ class Transceiver(nn.Module):
         self.confidence = confidence
 
     def latent(self, x: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
-        """Encode ``(B, 3, H, W)`` in [0, 1] to the latent ``(B, 94, H/16, W/16)`` before modulation."""
-        latent: Tensor = self.encoder(x, snr_db, is_qam)
+        """Encode ``(B, 3, H, W)`` in [0, 1] to the latent ``(B, 94, H/16, W/16)`` before modulation.
+
+        Args:
+            x: Image.
+            snr_db: ``(B,)`` SNR in dB that is expected of the link.
+            is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
+        """
+        latent: Tensor = self.encoder(x, effective_snr_db(snr_db, is_qam))
         return latent
 
     def transmit(self, latent: Tensor, is_qam: Tensor) -> Tensor:
@@ -57,10 +63,8 @@ class Transceiver(nn.Module):
             snr_db: ``(B, 1, h, w)`` effective SNR of each slot in dB.
             is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
         """
-        linear = 10.0 ** (snr_db / 10.0)
-        shrink = linear / (1.0 + linear)
-        y, scale = demodulate(y_rx, shrink, is_qam)
-        decoded: tuple[Tensor, DecoderFeatures] = self.decoder(y, snr_db, shrink, scale, is_qam)
+        y, snr_db, scale = demodulate(y_rx, snr_db, is_qam)
+        decoded: tuple[Tensor, DecoderFeatures] = self.decoder(y, snr_db, shrink_of(snr_db), scale)
         return decoded
 
     def judge(self, features: DecoderFeatures, x_hat: Tensor) -> tuple[Tensor, Tensor]:

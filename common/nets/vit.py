@@ -82,7 +82,7 @@ class Trunk(nn.Module):
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, f: Tensor, condition: Tensor) -> Tensor:
-        """Refine ``(B, dim, h, w)`` under a ``(B, 2)`` link state."""
+        """Refine ``(B, dim, h, w)`` under a ``(B, 1)`` link state."""
         batch, dim, rows, columns = f.shape
         tokens = self.refine(self.place(f) + self.condition(condition)[:, None].to(f.dtype))
         grid: Tensor = tokens.transpose(1, 2).reshape(batch, dim, rows, columns)
@@ -112,9 +112,9 @@ class VitEncoder(nn.Module):
         self.trunk = Trunk(sizes.dim, sizes.heads, sizes.encoder_depth)
         self.head = nn.Conv2d(sizes.dim, LATENT_CHANNELS, 1)
 
-    def forward(self, x: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+    def forward(self, x: Tensor, snr_db: Tensor) -> Tensor:
         """Map ``(B, 3, H, W)`` in [0, 1] to the latent ``(B, 94, H/16, W/16)`` before modulation."""
-        f = self.trunk(self.stem(self.fold(x - 0.5)), condition_vector(snr_db, is_qam))
+        f = self.trunk(self.stem(self.fold(x - 0.5)), condition_vector(snr_db))
         latent: Tensor = self.head(f).float()
         return latent
 
@@ -131,12 +131,11 @@ class VitDecoder(nn.Module):
         self.fold8, self.fold4 = nn.PixelUnshuffle(8), nn.PixelUnshuffle(4)
 
     def forward(
-        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor, is_qam: Tensor
+        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor
     ) -> tuple[Tensor, DecoderFeatures]:
         """Map the received latent to ``(B, 3, 16 h, 16 w)``; finer features are the patches themselves."""
-        flag = (2.0 * is_qam - 1.0).view(-1, 1, 1, 1).expand_as(snr_db)
-        received = torch.cat((y, normalise_snr_db(snr_db), shrink, flag), dim=1)
-        f = self.trunk(self.stem(received), condition_vector(snr_db.mean(dim=(1, 2, 3)), is_qam))
+        received = torch.cat((y, normalise_snr_db(snr_db), shrink), dim=1)
+        f = self.trunk(self.stem(received), condition_vector(snr_db.mean(dim=(1, 2, 3))))
         pixels = self.unfold(self.head(f)).float()
         return pixels + 0.5, DecoderFeatures(received, f, self.fold8(pixels), self.fold4(pixels))
 

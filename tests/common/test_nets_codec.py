@@ -157,8 +157,8 @@ def test_a_changed_weights_file_is_refused(weights):
     [
         ({"architecture": "4dcsc"}, "must be one of .*did you mean '3dcsc'"),
         ({"sizes": {"widths": [8, 8, 8]}}, "sizes of 3dcsc must be"),
-        ({"format": 99}, "format 2, got 99"),
-        ({"format": 1}, "format 2, got 1"),
+        ({"format": 99}, "format 3, got 99"),
+        ({"format": 1}, "format 3, got 1"),
         ({"more": 1}, "must have the keys"),
         (
             {

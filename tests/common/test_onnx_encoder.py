@@ -79,11 +79,13 @@ def test_any_size_is_padded_to_whole_blocks(exported):
     assert encoded.symbols.shape == (3, 47 * 3)
 
 
-@pytest.mark.parametrize(("way", "numpy_way"), [("nearest_level", "16qam"), ("analog_symbols", "analog")])
-def test_modulation_without_torch_is_the_same(way, numpy_way):
-    latent = np.random.default_rng(0).normal(0, 0.9, (94, 4, 6)).astype(np.float32)
-    expected = getattr(modulation, way)(torch.from_numpy(latent)[None])[0].numpy()
-    np.testing.assert_allclose(modulation_numpy.transmit(latent, numpy_way), expected, atol=2e-6)
+@pytest.mark.parametrize("way", ["16qam", "analog"])
+def test_modulation_without_torch_is_the_same(way):
+    latent = np.random.default_rng(0).normal(0, 0.9, (94, 4, 7)).astype(np.float32)
+    is_qam = torch.tensor([float(way == "16qam")])
+    expected = modulation.modulate(torch.from_numpy(latent)[None], is_qam)[0].numpy()
+    different = np.abs(modulation_numpy.transmit(latent, way) - expected) > 2e-6
+    assert different.mean() < 0.001  # a value on the edge of a level may fall to either side
 
 
 def test_it_can_not_decode_and_says_who_can(exported):
@@ -111,7 +113,7 @@ def test_bad_files_are_one_clear_error(exported, tmp_path):
     other = onnx.load(str(exported))
     onnx.helper.set_model_props(other, {"semcast_format": "99"})
     onnx.save(other, str(tmp_path / "other.onnx"))
-    with pytest.raises(CheckpointError, match="must have format 1, got 99"):
+    with pytest.raises(CheckpointError, match="must have format 2, got 99"):
         OnnxEncoder(tmp_path / "other.onnx")
     with pytest.raises(ValueError, match="num_threads must be >= 1, got 0"):
         OnnxEncoder(exported, num_threads=0)

@@ -21,7 +21,7 @@ def images(count=64, seed=1):
     return torch.randn(count, 6, 12, 12, generator=torch.Generator().manual_seed(seed)).relu()
 
 
-CONDITION = torch.zeros(64, 2)
+CONDITION = torch.zeros(64, 1)
 
 
 def hidden_of(model, x):
