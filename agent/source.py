@@ -164,11 +164,7 @@ class RecordedSource:
     @property
     def rate_hz(self) -> float:
         """Usual frames per second at this pace."""
-        if self._settings.pace == "receiver":
-            return 0.0
-        if self._settings.pace == "rate" and self._settings.rate_hz is not None:
-            return self._settings.rate_hz
-        return 1e9 / self._period_ns()
+        return self._settings.paced_hz(1e9 / self._period_ns())
 
     def _period_ns(self) -> float:
         times_ns = self._sequence.times_ns

@@ -60,3 +60,9 @@ class SourceSettings:
             raise ValueError(f"rate_hz must be in [0.01, 1000], got {self.rate_hz:g}")
         if self.pace == "rate" and self.rate_hz is None:
             raise ValueError("rate_hz must be given for pace 'rate', got None")
+
+    def paced_hz(self, own_hz: float) -> float:
+        """Return frames per second of a source that gives ``own_hz``; 0 where the receiver sets the pace."""
+        if self.pace == "receiver":
+            return 0.0
+        return self.rate_hz if self.pace == "rate" and self.rate_hz is not None else own_hz

@@ -152,11 +152,7 @@ class VideoSource(_Captured):
     @property
     def rate_hz(self) -> float:
         """Frames per second at this pace."""
-        if self._settings.pace == "receiver":
-            return 0.0
-        if self._settings.pace == "rate" and self._settings.rate_hz is not None:
-            return self._settings.rate_hz
-        return self._fps / self._settings.stride
+        return self._settings.paced_hz(self._fps / self._settings.stride)
 
     def _one_pass(self) -> Iterator[NDArray[np.uint8]]:
         """Yield what is left in the file."""

@@ -135,21 +135,13 @@ def _process(
     received = as_received(frame)
     result = reconstruction.process(received)
     stage_ms = {**frame.stage_ms, **split_bundle(result.stage_ms, bundle.pop_elapsed_ms())}
-    row = FrameRow(
-        frame_id=frame.frame_id,
-        t_source_ns=frame.t_source_ns,
-        state=result.state.value,
-        posed=result.T_world_cam is not None,
-        num_tracked=result.num_tracked,
-        num_inliers=result.num_inliers,
-        reprojection_error_px=result.reprojection_error_px,
-        is_keyframe=result.is_keyframe,
-        map_epoch=result.map_epoch,
+    row = FrameRow.of(
+        received,
+        result,
         snr_set_db=None,
         snr_estimated_db=frame.snr_db_estimate,
         # A clean original equals itself: that says nothing about a codec.
         psnr_db=None if frame.effective_snr_db is None else psnr_db(frame.original, decoded.image),
-        confidence_mean=float(decoded.confidence.mean()),
         age_ms=sum(ms for stage, ms in stage_ms.items() if stage not in _NOT_BEFORE_POSE),
         stage_ms=stage_ms,
     )

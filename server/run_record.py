@@ -16,6 +16,7 @@ from semcast.common.errors import SemcastError
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
 from semcast.server.export.outputs import percentiles, plain
+from semcast.server.mapping.state import DecodedFrame, FrameResult
 
 logger = logging.getLogger(__name__)
 
@@ -60,6 +61,24 @@ class FrameRow:
     confidence_mean: float | None
     age_ms: float
     stage_ms: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, frame: DecodedFrame, result: FrameResult, **rest: Any) -> "FrameRow":
+        """Return the row of a tracked frame; ``rest`` is what the tracker does not know."""
+        confidence = frame.confidence
+        return cls(
+            frame_id=frame.frame_id,
+            t_source_ns=frame.t_source_ns,
+            state=result.state.value,
+            posed=result.T_world_cam is not None,
+            num_tracked=result.num_tracked,
+            num_inliers=result.num_inliers,
+            reprojection_error_px=result.reprojection_error_px,
+            is_keyframe=result.is_keyframe,
+            map_epoch=result.map_epoch,
+            confidence_mean=None if confidence is None else float(confidence.mean()),
+            **rest,
+        )
 
 
 class RunRecord:

@@ -215,20 +215,12 @@ class Session:
         for frame_id, t_source_ns, _ in result.backfilled:
             self._t_source_ns.setdefault(frame_id, t_source_ns)
         psnr = self._await(quality)
-        row = FrameRow(
-            frame_id=frame.frame_id,
-            t_source_ns=frame.t_source_ns,
-            state=result.state.value,
-            posed=result.T_world_cam is not None,
-            num_tracked=result.num_tracked,
-            num_inliers=result.num_inliers,
-            reprojection_error_px=result.reprojection_error_px,
-            is_keyframe=result.is_keyframe,
-            map_epoch=result.map_epoch,
+        row = FrameRow.of(
+            frame,
+            result,
             snr_set_db=arrival.snr_set_db,
             snr_estimated_db=arrival.snr_estimated_db,
             psnr_db=psnr,
-            confidence_mean=float(frame.confidence.mean()) if frame.confidence is not None else None,
             age_ms=(tracked_ns - arrival.t_arrival_ns) * 1e-6,
             stage_ms={
                 **arrival.stage_ms,
