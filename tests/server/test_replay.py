@@ -105,9 +105,11 @@ def test_recorded_originals_give_the_same_psnr_as_the_sequence(recording, tmp_pa
         replay(ReplaySettings(file=recording, out=tmp_path / name, reference=reference))
         rows = (tmp_path / name / "frames.jsonl").read_text().splitlines()
         found[name] = [json.loads(row)["psnr_db"] for row in rows]
-    assert len(found["recorded"]) >= FRAMES // 2
-    assert all(15.0 < psnr < 45.0 for psnr in found["recorded"])
-    assert found["recorded"] == found["sequence"]
+    assert len(found["recorded"]) == len(found["sequence"])
+    # A busy live agent drops originals before frames.
+    pairs = [pair for pair in zip(found["recorded"], found["sequence"], strict=True) if pair[0] is not None]
+    assert len(pairs) >= FRAMES // 2
+    assert all(recorded == sequence and 15.0 < recorded < 45.0 for recorded, sequence in pairs)
 
 
 def test_a_paced_and_shown_replay_gives_the_same_poses(recording, tmp_path):
