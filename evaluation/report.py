@@ -4,7 +4,6 @@ import dataclasses
 import importlib.metadata
 import json
 import math
-import os
 import platform
 import shlex
 import subprocess
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 import semcast
+from semcast.common.cores import usable_cores
 from semcast.common.errors import SemcastError
 
 #: Libraries whose version can change a result.
@@ -73,7 +73,7 @@ def write_json(path: Path, result: Mapping[str, Any]) -> None:
 
 def machine_kind() -> str:
     """Return the kind of this machine, such as ``2-core x86-64, AVX2/AVX512/AMX``; never its name."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     architecture = {"x86_64": "x86-64", "AMD64": "x86-64"}.get(platform.machine(), platform.machine())
     try:
         flags = set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())

@@ -4,13 +4,31 @@ from pathlib import Path
 
 import pytest
 
+from semcast import demo
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recording_reader import RecordingReader
-from semcast.demo import DemoSettings, Playback, agent_command, role_commands, run_demo
+from semcast.common.sequence import open_sequence
+from semcast.demo import DemoSettings, Playback, agent_command, choose_playback, role_commands, run_demo
+from semcast.real_time import Plan
 from semcast.server.replay import ReplaySettings, replay
 
 SEQUENCE = Path(__file__).resolve().parents[1] / "deploy" / "demo" / "kitti_06"
+
+
+@pytest.mark.parametrize("stride", [1, 3, 7])
+def test_a_machine_that_keeps_up_plays_at_the_recorded_times(tmp_path, monkeypatch, stride):
+    monkeypatch.setattr(demo, "plan_for", lambda codec, way, image, rate_hz, rate, resize: Plan(0.5, rate_hz))
+    recorded = open_sequence(SEQUENCE)
+    recorded.times_ns = recorded.times_ns * 1.0371
+    settings = DemoSettings(stride=stride, out=tmp_path)
+    playback = choose_playback(settings, recorded)
+    assert (playback.resize, playback.stride, playback.speed) == (0.5, stride, 1.0)
+    assert "--pace" not in agent_command(settings, SEQUENCE, "tcp/127.0.0.1:1", playback)
+    slower = choose_playback(
+        DemoSettings(stride=stride, rate_hz=playback.rate_hz / 2, out=tmp_path), recorded
+    )
+    assert slower.speed == pytest.approx(0.5)
 
 
 def commands_of(settings):

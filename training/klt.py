@@ -9,7 +9,7 @@ from semcast.common.nets.linear import BlockAnalysis, BlockSynthesis
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
 
-#: Rms of the latent: the best loading of the four levels over a noisy link, the symbols' power close to 1.
+#: Rms of the latent, against which the carrier (see ``modulation``) has its amplitude.
 _LATENT_RMS = 0.9
 
 

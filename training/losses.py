@@ -1,4 +1,4 @@
-"""The loss terms: reconstruction, descriptor consistency, confidence, and a cap on the symbols' power."""
+"""The loss terms: reconstruction, descriptor consistency, confidence."""
 
 from dataclasses import dataclass, field
 from typing import Literal

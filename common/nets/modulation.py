@@ -86,7 +86,7 @@ def spread(symbols: Tensor) -> Tensor:
     Args:
         symbols: ``(B, C, h, w)``; a slot is a row of blocks.
     """
-    order, signs, columns, channels = _mixing_of(symbols)
+    order, _, signs, columns, channels = _mixing_of(symbols)
     with torch.autocast(symbols.device.type, enabled=False):
         slots = symbols.float().permute(0, 2, 1, 3)  # (B, h, C, w)
         shuffled = slots.flatten(2)[..., order].view(slots.shape) * signs
@@ -95,19 +95,18 @@ def spread(symbols: Tensor) -> Tensor:
 
 def unspread(symbols: Tensor) -> Tensor:
     """Invert ``spread``."""
-    order, signs, columns, channels = _mixing_of(symbols)
+    _, inverse, signs, columns, channels = _mixing_of(symbols)
     with torch.autocast(symbols.device.type, enabled=False):
         slots = symbols.float().permute(0, 2, 1, 3)
         shuffled = (channels.mT @ slots @ columns * signs).flatten(2)
-        back = shuffled[..., torch.argsort(order)].view(slots.shape)
+        back = shuffled[..., inverse].view(slots.shape)
         return back.permute(0, 2, 1, 3)
 
 
-def _mixing_of(symbols: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _mixing_of(symbols: Tensor) -> list[Tensor]:
     of = mixing(symbols.shape[1], symbols.shape[3])
-    parts = (torch.from_numpy(m).to(symbols.device) for m in (of.order, of.signs, of.columns, of.channels))
-    order, signs, columns, channels = parts
-    return order, signs, columns, channels
+    arrays = (of.order, of.inverse, of.signs, of.columns, of.channels)
+    return [torch.from_numpy(array).to(symbols.device) for array in arrays]
 
 
 def effective_snr_db(snr_db: Tensor, is_qam: Tensor) -> Tensor:

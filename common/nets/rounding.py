@@ -53,7 +53,7 @@ def rounded_snr_db(snr_db: NDArray[np.float64] | float) -> NDArray[np.float64]:
     """Return the SNR in dB at which an analog value would arrive as well as a rounded one does.
 
     Where a value's mean given what arrives has the share ``r`` of its variance, that is ``r / (1 - r)``. It
-    ends near 8.6 dB on a perfect link: that is what rounding costs.
+    ends at 8.0 dB on a perfect link: that is what rounding costs.
 
     Args:
         snr_db: Of the link, for each complex symbol.
@@ -86,12 +86,14 @@ class Mixing:
 
     Attributes:
         order: ``(C w,)`` int64: which value comes to which place.
+        inverse: ``(C w,)`` int64: the place of each value.
         signs: ``(C, w)`` of +-1.
         columns: ``(w, w)`` orthonormal.
         channels: ``(C, C)`` orthonormal.
     """
 
     order: NDArray[np.int64]
+    inverse: NDArray[np.int64]
     signs: NDArray[np.float32]
     columns: NDArray[np.float32]
     channels: NDArray[np.float32]
@@ -103,8 +105,10 @@ def mixing(channels: int, columns: int) -> Mixing:
     places = np.arange(1, channels * columns + 1, dtype=np.uint64)
     first = _hash(places)
     signs = np.where(_hash(first + places) & np.uint64(1), -1.0, 1.0).astype(np.float32)
+    order = np.argsort(first, kind="stable")
     return Mixing(
-        np.argsort(first, kind="stable"),
+        order,
+        np.argsort(order),
         signs.reshape(channels, columns),
         _cosines(columns),
         _cosines(channels),

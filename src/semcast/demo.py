@@ -316,13 +316,14 @@ def choose_playback(settings: DemoSettings, recorded: Sequence) -> Playback:
     """
     recorded_hz = _usual_rate_hz(recorded)
     stride = settings.stride or start_stride(recorded_hz)
-    rate_hz = settings.rate_hz or recorded_hz / stride
+    full_hz = recorded_hz / stride
+    rate_hz = settings.rate_hz or full_hz
     if settings.resize is not None and settings.rate_hz is not None:
-        return Playback(settings.resize, stride, rate_hz, rate_hz * stride / recorded_hz)
+        return Playback(settings.resize, stride, rate_hz, rate_hz / full_hz)
     image = recorded.image(0)
     plan = plan_for(settings.codec, settings.modulation, image, rate_hz, settings.rate, settings.resize)
     rate_hz = settings.rate_hz or plan.rate_hz
-    return Playback(plan.resize, stride, rate_hz, rate_hz * stride / recorded_hz)
+    return Playback(plan.resize, stride, rate_hz, rate_hz / full_hz)
 
 
 def _reductions(settings: DemoSettings, playback: Playback) -> Iterator[str]:

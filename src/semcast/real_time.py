@@ -2,7 +2,6 @@
 
 import math
 import multiprocessing
-import os
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import Modulation, ReceivedImage
 from semcast.common.codecs import load_codec
+from semcast.common.cores import usable_cores
 from semcast.common.rate import NATIVE_RATE, RateChoice, to_coded
 
 #: Larger images gain little.
@@ -171,5 +171,4 @@ def plan_for(
     smaller = np.asarray(cv2.resize(image, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         speed = pool.submit(measure_speed, codec, modulation, smaller, rate).result()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return make_plan(speed, (height, width), rate_hz, cores, resize)
+    return make_plan(speed, (height, width), rate_hz, usable_cores(), resize)

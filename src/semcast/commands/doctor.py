@@ -16,6 +16,8 @@ from typing import Literal
 from rich.console import Console
 from rich.table import Table
 
+from semcast.common.cores import usable_cores
+
 Verdict = Literal["good", "note", "bad"]
 _STYLE = {"good": "green", "note": "yellow", "bad": "red"}
 
@@ -69,7 +71,7 @@ def check_packages() -> Iterator[Finding]:
 
 def check_processor() -> Iterator[Finding]:
     """Check cores and the instructions that make bfloat16 fast."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = usable_cores()
     yield Finding(
         "cores",
         "good" if cores >= 2 else "note",
