@@ -28,7 +28,7 @@ class EncodedImage:
         shape_hw: Height and width of the image in pixels, before padding to whole blocks.
         symbols: ``(num_slots, data_per_slot)`` complex64, mean ``|s|^2`` over the frame near 1: a learned
             encoder need not use all points alike, and the link scales what it is given. Under ``"16qam"``
-            every symbol is a point of the Gray-mapped constellation in ``phy/qam.py``.
+            every symbol is a point of the Gray-mapped constellation in ``phy/qam.py``, plain or shaped.
         modulation: How the symbols travel.
     """
 

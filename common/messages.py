@@ -34,10 +34,10 @@ PROTOCOL_VERSION = 1
 MAX_PAYLOAD_BYTES = 16 * 1024**2
 MAX_SIDE_PX = 8192
 ROLES = ("agent", "channel", "server")
-PAYLOAD_FORMATS = ("qam16", "iq16", "lost")
+PAYLOAD_FORMATS = ("qam16", "qam16_shaped", "iq16", "lost")
 TRACKING_STATES = ("initializing", "tracking", "lost")
 
-PayloadFormat = Literal["qam16", "iq16", "lost"]
+PayloadFormat = Literal["qam16", "qam16_shaped", "iq16", "lost"]
 AGENT_ID_PATTERN = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 
 _VERSION = rule(WholeNumber(PROTOCOL_VERSION, PROTOCOL_VERSION))
@@ -121,8 +121,9 @@ class SymbolFrame:
         num_slots: Of the grid.
         uses_per_slot: Of the grid, pilots included.
         direction: ``tx`` carries data symbols only, ``rx`` pilots and data as received.
-        payload_format: ``qam16``: 4-bit indices of the data symbols, two to a byte; ``iq16``: float16 I and
-            Q; ``lost``: nothing arrived (lossless service only, so that the receiver can go on).
+        payload_format: ``qam16``: 4-bit indices of the data symbols, two to a byte; ``qam16_shaped``: the
+            same, of points ``phy.qam.SHAPED_SPACING`` times further apart; ``iq16``: float16 I and Q;
+            ``lost``: nothing arrived (lossless service only, so that the receiver can go on).
         payload: See ``symbol_payload``.
         slot_lost: One bit per slot, first slot highest, 1 where nothing arrived; empty on ``tx``.
         lossless: See ``CameraInfo``.
@@ -170,7 +171,8 @@ class SymbolFrame:
             )
         if self.direction == "tx":
             symbols = layout.num_slots * layout.data_per_slot
-            sizes = {"qam16": (symbols + 1) // 2, "iq16": 4 * symbols}
+            packed = (symbols + 1) // 2
+            sizes = {"qam16": packed, "qam16_shaped": packed, "iq16": 4 * symbols}
         else:
             sizes = {"iq16": 4 * layout.num_uses, "lost": 0}
         if self.payload_format not in sizes:

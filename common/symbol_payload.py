@@ -1,11 +1,14 @@
 """Channel symbols as the bytes of a ``SymbolFrame``, and back."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import EncodedImage
 from semcast.common.messages import PayloadFormat, SymbolFrame
 from semcast.common.phy.qam import (
+    SHAPED_SPACING,
     indices_to_symbols,
     pack_indices,
     symbols_to_indices,
@@ -17,6 +20,8 @@ from semcast.common.shapes import check_shape
 #: Largest finite value a sample may have: float16 ends at 65504.
 _LARGEST = 65000.0
 _ON_THE_GRID = 1e-3
+#: Payloads of 4-bit indices, and the factor on the points of the plain constellation.
+_SPACING: Mapping[PayloadFormat, float] = {"qam16": 1.0, "qam16_shaped": SHAPED_SPACING}
 
 
 def pack_iq(samples: NDArray[np.complex64]) -> bytes:
@@ -40,8 +45,8 @@ def unpack_iq(payload: bytes, shape: tuple[int, int]) -> NDArray[np.complex64]:
 def pack_data_symbols(encoded: EncodedImage) -> tuple[PayloadFormat, bytes]:
     """Return format and bytes of a frame's data symbols.
 
-    16-QAM points become 4-bit indices; anything else (analog symbols, or the other constellations of
-    adaptive codecs) float16 I and Q.
+    16-QAM points, plain or shaped, become 4-bit indices; anything else (analog symbols, or the other
+    constellations of adaptive codecs) float16 I and Q.
 
     Raises:
         ValueError: The symbols don't have the shape of the image's slot grid, or are not finite.
@@ -51,10 +56,12 @@ def pack_data_symbols(encoded: EncodedImage) -> tuple[PayloadFormat, bytes]:
     if not np.isfinite(encoded.symbols.view(np.float32)).all():
         raise ValueError("symbols must be finite")
     if encoded.modulation == "16qam":
-        indices = symbols_to_indices(encoded.symbols)
-        offset = np.abs((encoded.symbols - indices_to_symbols(indices)).view(np.float32)).max()
-        if offset < _ON_THE_GRID:
-            return "qam16", pack_indices(indices)
+        for payload_format, spacing in _SPACING.items():
+            plain = encoded.symbols / np.float32(spacing)
+            indices = symbols_to_indices(plain)
+            offset = np.abs((plain - indices_to_symbols(indices)).view(np.float32)).max()
+            if offset < _ON_THE_GRID:
+                return payload_format, pack_indices(indices)
     return "iq16", pack_iq(encoded.symbols)
 
 
@@ -68,8 +75,9 @@ def data_symbols(frame: SymbolFrame) -> NDArray[np.complex64]:
         raise ValueError(f"frame must be tx to hold data symbols, got {frame.direction}")
     layout = frame.layout
     shape = (layout.num_slots, layout.data_per_slot)
-    if frame.payload_format == "qam16":
-        return indices_to_symbols(unpack_indices(frame.payload, shape[0] * shape[1])).reshape(shape)
+    if frame.payload_format in _SPACING:
+        points = indices_to_symbols(unpack_indices(frame.payload, shape[0] * shape[1])).reshape(shape)
+        return points * np.float32(_SPACING[frame.payload_format])
     symbols = unpack_iq(frame.payload, shape)
     if not np.isfinite(symbols.view(np.float32)).all():
         raise ValueError("symbols must be finite")

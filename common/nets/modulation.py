@@ -22,10 +22,10 @@ from semcast.common.nets.rounding import (
     LOADING,
     MEAN_INNER,
     MEAN_OUTER,
-    OUTER_SHARE,
     mixing,
     rounded_snr_db,
 )
+from semcast.common.phy.qam import SHAPED_OUTER_SHARE
 
 #: Amplitude of the carrier against a latent whose rms is about 0.7.
 CARRIER_AMPLITUDE = 0.12
@@ -179,7 +179,7 @@ def mean_before_rounding(y_rx: Tensor, shrink: Tensor) -> Tensor:
     # the inner pair against the outer one.
     inner = 0.5 * LEVEL_STEP
     outer = 3.0 * inner
-    odds = (1.0 - OUTER_SHARE) / OUTER_SHARE
+    odds = (1.0 - SHAPED_OUTER_SHARE) / SHAPED_OUTER_SHARE
     y, shrink = y_rx.float(), shrink.float().clamp_max(1.0 - 1e-4)
     certainty = 1.0 / (1.0 - shrink)
     exponent = y.abs() * (-4.0 * inner * certainty)

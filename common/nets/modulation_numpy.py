@@ -13,7 +13,7 @@ CARRIER_AMPLITUDE = 0.12
 
 
 def nearest_level(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Round every value to the nearest 4-PAM level of unit-power 16-QAM."""
+    """Round every value to the nearest level of shaped 16-QAM."""
     step = np.float32(LEVEL_STEP)
     return np.asarray((np.floor(values / step).clip(-2.0, 1.0) + np.float32(0.5)) * step, dtype=np.float32)
 

@@ -3,9 +3,14 @@
 A symbol of ``b`` bits is two independent Gray-mapped PAM reals of ``b / 2`` bits, the first half of the bits
 in the real part. The default, 16-QAM, has the levels -3, -1, 1, 3 over sqrt(10) with the bits 00, 01, 11, 10,
 so that neighbouring levels differ in one bit and the mean symbol power is 1.
+
+A learned transmitter sends the outer levels less often than the inner ones, as its values are about Gaussian.
+Its points therefore lie ``SHAPED_SPACING`` times further apart at the same mean power (probabilistic shaping,
+Böcherer et al. 2015).
 """
 
-from typing import Literal
+import math
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +18,10 @@ from numpy.typing import NDArray
 BITS_PER_SYMBOL_16QAM = 4
 #: Supported bits per symbol: QPSK, 16-QAM, 64-QAM.
 BITS_PER_SYMBOL = (2, 4, 6)
+#: Share of the outer levels where a Gaussian is rounded to levels one standard deviation apart.
+SHAPED_OUTER_SHARE: Final = math.erfc(0.5**0.5)
+#: Distance of shaped levels against that of equally frequent ones of the same power: 1.19.
+SHAPED_SPACING: Final = (5.0 / (1.0 + 8.0 * SHAPED_OUTER_SHARE)) ** 0.5
 
 
 def _check_bits(bits_per_symbol: int) -> int:

@@ -6,7 +6,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import EncodedImage
 from semcast.common.messages import CameraInfo, SymbolFrame
-from semcast.common.phy.qam import constellation
+from semcast.common.phy.qam import SHAPED_SPACING, constellation
 from semcast.common.phy.slots import layout_for
 from semcast.common.symbol_payload import (
     data_symbols,
@@ -65,6 +65,14 @@ def test_qam_symbols_travel_in_four_bits_and_come_back_exactly(rng):
     assert (payload_format, len(payload)) == ("qam16", 3 * 47 * 4 // 2)
     back = data_symbols(frame(payload_format=payload_format, payload=payload))
     np.testing.assert_array_equal(back, symbols)
+
+
+def test_shaped_symbols_travel_in_four_bits_as_well(rng):
+    symbols = np.complex64(SHAPED_SPACING) * constellation()[rng.integers(0, 16, (3, 47 * 4))]
+    payload_format, payload = pack_data_symbols(encoded(symbols))
+    assert (payload_format, len(payload)) == ("qam16_shaped", 3 * 47 * 4 // 2)
+    back = data_symbols(frame(payload_format=payload_format, payload=payload))
+    np.testing.assert_allclose(back, symbols, rtol=1e-6)
 
 
 def test_symbols_off_the_16qam_grid_travel_as_iq(rng):

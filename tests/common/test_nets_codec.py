@@ -17,7 +17,7 @@ from semcast.common.nets.checkpoint import (
 from semcast.common.nets.codec import NeuralCodec, has_fast_bfloat16
 from semcast.common.nets.registry import architecture, architectures, build
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
-from semcast.common.phy.qam import pam_levels
+from semcast.common.phy.qam import SHAPED_SPACING, pam_levels
 
 TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
 
@@ -72,7 +72,7 @@ def test_any_image_size_comes_back_at_that_size(weights, shape_hw, modulation):
 
 def test_16qam_symbols_are_points_of_the_constellation(weights):
     symbols = NeuralCodec.load(weights).encode(some_image((32, 32)), 6.0).symbols
-    levels = pam_levels()
+    levels = SHAPED_SPACING * pam_levels()
     for part in (symbols.real, symbols.imag):
         assert np.abs(part[..., None] - levels).min(axis=-1).max() < 1e-6
 

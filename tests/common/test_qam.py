@@ -12,6 +12,14 @@ def test_levels_of_16qam_are_odd_multiples_over_sqrt_10():
     np.testing.assert_allclose(qam.pam_levels(4), np.array([-3, -1, 1, 3]) / math.sqrt(10), rtol=1e-6)
 
 
+def test_shaped_points_have_unit_power_at_the_frequencies_of_a_rounded_gaussian(rng):
+    values = rng.standard_normal(400_000)
+    levels = (np.floor(values).clip(-2, 1) + 0.5) * 2 / math.sqrt(10) * qam.SHAPED_SPACING
+    assert 2 * np.mean(levels**2) == pytest.approx(1.0, abs=0.01)
+    assert np.mean(np.abs(values) > 1) == pytest.approx(qam.SHAPED_OUTER_SHARE, abs=0.003)
+    assert (5 / (1 + 8 * 0.317311)) ** 0.5 == pytest.approx(qam.SHAPED_SPACING, abs=1e-5)
+
+
 @pytest.mark.parametrize("bits", qam.BITS_PER_SYMBOL)
 def test_constellation_has_unit_mean_power_and_distinct_points(bits):
     points = qam.constellation(bits)
