@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -17,8 +17,15 @@ from numpy.typing import NDArray
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.channel.trace import SNR_RANGE_DB
-from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
-from semcast.common.codecs import load_codec
+from semcast.common.codec import (
+    DEFAULT_CODEC,
+    Codec,
+    DecodedImage,
+    EncodedImage,
+    Modulation,
+    ReceivedImage,
+)
+from semcast.common.codecs import LEARNED_CODECS, load_codec
 from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
 from semcast.common.phy.slots import layout_for
@@ -62,6 +69,9 @@ class CodecSettings:
         default=(2.0, 4.0, 6.0, 8.0, 10.0, 12.0), metadata={"help": "SNRs in dB, one or more"}
     )
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    runtime: Literal["torch", "onnx"] = field(
+        default="torch", metadata={"help": "what computes learned encoders: torch, or onnx as exported"}
+    )
     rate: Rate = field(default=NATIVE_RATE, metadata={"help": "channel uses per pixel value"})
     link: ChannelSettings = field(default=ChannelSettings(), metadata={"help": "the channel"})
     perfect_csi: bool = field(
@@ -148,10 +158,7 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
     """
     images = read_images(settings.images, settings.max_images)
     if codecs is None:
-        codecs = [
-            load_codec(name, modulation=settings.modulation, num_threads=settings.threads)
-            for name in settings.codec
-        ]
+        codecs = [_load(name, settings) for name in settings.codec]
     _warm_up(codecs, next(iter(images.values())))
     strip_snr_db = min(settings.snr_db, key=lambda snr_db: abs(snr_db - _STRIP_SNR_DB))
     strip: list[dict[str, NDArray[np.uint8]]] = []
@@ -174,6 +181,38 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         _draw(settings.out, settings.snr_db, results)
         write_picture_strip(settings.out / f"pictures_{strip_snr_db:g}db.png", strip)
     return dict(report)
+
+
+@dataclass(frozen=True)
+class _Exported:
+    """A learned codec whose images the exported encoder encodes."""
+
+    encoder: Codec
+    decoder: Codec
+
+    @property
+    def name(self) -> str:
+        return self.decoder.name
+
+    @property
+    def digest(self) -> str:
+        return self.decoder.digest
+
+    def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
+        return self.encoder.encode(image, snr_db)
+
+    def decode(self, received: ReceivedImage) -> DecodedImage:
+        return self.decoder.decode(received)
+
+
+def _load(name: str, settings: CodecSettings) -> Codec:
+    codec = load_codec(name, modulation=settings.modulation, num_threads=settings.threads)
+    if settings.runtime == "torch" or codec.name not in LEARNED_CODECS:
+        return codec
+    encoder = load_codec(
+        name, modulation=settings.modulation, num_threads=settings.threads, runtime=settings.runtime
+    )
+    return _Exported(encoder, codec)
 
 
 def _warm_up(codecs: Sequence[Codec], image: NDArray[np.uint8]) -> None:

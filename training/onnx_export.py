@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from semcast.common.errors import CheckpointError
 from semcast.common.nets.checkpoint import load_transceiver, weights_path
 from semcast.common.nets.onnx_encoder import FORMAT, INPUTS, OUTPUT
+from semcast.common.nets.rounding import rounded_snr_db
+from semcast.training.onnx_int8 import calibration_images, quantise
 
 OPSET = 17
 _HALVE_FROM_VALUES = 256
@@ -30,16 +32,23 @@ class _ImageToLatent(nn.Module):
         return latent
 
 
-def export_encoder(name_or_path: str | Path, out: Path) -> Path:
+def export_encoder(name_or_path: str | Path, out: Path, int8_images: Path | None = None) -> Path:
     """Export the encoder of shipped weights or of a weights file.
 
     Weights stay in half precision in the file and are widened when it is loaded. The graph takes ``image``
     ``(1, H, W, 3)`` uint8 with sides that are multiples of 16, and the ``snr_db`` ``(1,)`` at which values
     arrive; it gives ``latent (1, 94, H/16, W/16)``.
 
+    Args:
+        name_or_path: Shipped name or weights file.
+        out: File to write.
+        int8_images: Folder of photos; with one, convolutions become eight-bit (see ``onnx_int8``).
+
     Raises:
         CheckpointError: There are no such weights, or the file can't be written.
+        SourceError: The folder holds no images.
     """
+    images = [] if int8_images is None else calibration_images(int8_images)
     model, manifest = load_transceiver(weights_path(name_or_path))
     example = (torch.zeros(1, 64, 96, 3, dtype=torch.uint8), torch.full((1,), 10.0))
     sides = {1: "height", 2: "width"}
@@ -57,12 +66,16 @@ def export_encoder(name_or_path: str | Path, out: Path) -> Path:
                 dynamic_axes={"image": sides, OUTPUT: {2: "rows", 3: "columns"}},
                 dynamo=False,
             )
+        if images:
+            low_db, high_db = manifest.snr_range_db
+            quantise(out, images, (float(rounded_snr_db(low_db)), high_db))
         graph = onnx.load(str(out))
         halve_weights(graph)
         facts = {
             "semcast_format": FORMAT,
             "architecture": manifest.architecture,
             "digest": manifest.sha256[:16],
+            "precision": "int8" if images else "float",
             "snr_min_db": str(manifest.snr_range_db[0]),
             "snr_max_db": str(manifest.snr_range_db[1]),
         }

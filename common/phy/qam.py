@@ -19,9 +19,9 @@ BITS_PER_SYMBOL_16QAM = 4
 #: Supported bits per symbol: QPSK, 16-QAM, 64-QAM.
 BITS_PER_SYMBOL = (2, 4, 6)
 #: Share of the outer levels where a Gaussian is rounded to levels one standard deviation apart.
-SHAPED_OUTER_SHARE: Final = math.erfc(0.5**0.5)
+SHAPED_OUTER_SHARE: Final = math.erfc(math.sqrt(0.5))
 #: Distance of shaped levels against that of equally frequent ones of the same power: 1.19.
-SHAPED_SPACING: Final = (5.0 / (1.0 + 8.0 * SHAPED_OUTER_SHARE)) ** 0.5
+SHAPED_SPACING: Final = math.sqrt(5.0 / (1.0 + 8.0 * SHAPED_OUTER_SHARE))
 
 
 def _check_bits(bits_per_symbol: int) -> int:

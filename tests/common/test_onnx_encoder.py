@@ -3,13 +3,14 @@
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import onnx
 import pytest
 import torch
 
 from semcast.common.codecs import load_codec
-from semcast.common.errors import CheckpointError, ConfigError
+from semcast.common.errors import CheckpointError, ConfigError, SourceError
 from semcast.common.nets import modulation, modulation_numpy
 from semcast.common.nets.checkpoint import load_transceiver, read_manifest, save_transceiver, weights_path
 from semcast.common.nets.latent import symbols_from_latent
@@ -77,6 +78,37 @@ def test_any_size_is_padded_to_whole_blocks(exported):
     encoded = OnnxEncoder(exported).encode(some_image((33, 47)), 10.0)
     assert encoded.shape_hw == (33, 47)
     assert encoded.symbols.shape == (3, 47 * 3)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    for k in range(4):
+        image = cv2.GaussianBlur(np.random.default_rng(k).integers(0, 256, (96, 128, 3), np.uint8), None, 3.0)
+        cv2.imwrite(str(folder / f"{k}.png"), cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX))
+    return folder
+
+
+def test_eight_bit_convolutions_hardly_change_the_latent(photos, tmp_path):
+    # The shipped network: one at random may amplify anything.
+    image = cv2.imread(str(photos / "0.png"))
+    plain = export_encoder("3dcsc-lite", tmp_path / "plain.onnx")
+    small = export_encoder("3dcsc-lite", tmp_path / "small.onnx", photos)
+    assert small.stat().st_size < 0.7 * plain.stat().st_size
+    encoders = [OnnxEncoder(path, "analog", 1) for path in (plain, small)]
+    assert encoders[0].digest == encoders[1].digest
+    exact, rounded = (encoder.encode(image, 10.0).symbols for encoder in encoders)
+    error = np.mean(np.abs(rounded - exact) ** 2)
+    assert 0.0 < error < 0.003  # the noise of a link of 10 dB is 0.1
+
+
+def test_eight_bits_need_photos(weights, tmp_path):
+    with pytest.raises(SourceError, match="nothing holds no readable image"):
+        export_encoder(weights, tmp_path / "out.onnx", tmp_path / "nothing")
+    cv2.imwrite(str(tmp_path / "tiny.png"), np.zeros((8, 8, 3), np.uint8))
+    with pytest.raises(SourceError, match="no image of at least 16x16 pixels"):
+        export_encoder(weights, tmp_path / "out.onnx", tmp_path)
+    assert not (tmp_path / "out.onnx").exists()
 
 
 @pytest.mark.parametrize("way", ["16qam", "analog"])

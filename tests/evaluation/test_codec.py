@@ -37,6 +37,17 @@ def report(folder, tmp_path_factory):
     return settings, evaluate_codec(settings)
 
 
+def test_an_exported_encoder_serves_the_same_decoder(folder):
+    both = {
+        runtime: evaluate_codec(
+            CodecSettings(images=folder, codec=("3dcsc-lite",), snr_db=(10.0,), max_images=1, runtime=runtime)
+        )["results"][0]
+        for runtime in ("torch", "onnx")
+    }
+    assert both["onnx"]["psnr_db"] != both["torch"]["psnr_db"], "other arithmetic"
+    assert both["onnx"]["psnr_db"] == pytest.approx(both["torch"]["psnr_db"], abs=0.3)
+
+
 def rows(report):
     return {(row["codec"], row["snr_db"]): row for row in report["results"]}
 
