@@ -22,7 +22,7 @@ HOMES = {
     "gtsam": {"server/mapping/bundle.py"},
     "rerun": {"server/view/rerun_viewer.py"},
     "mcap": {"common/recording.py"},
-    "onnxruntime": {"common/nets/onnx_encoder.py"},
+    "onnxruntime": {"common/nets/onnx_encoder.py", "training/onnx_int8.py"},
     "onnx": {"training/onnx_export.py"},
 }
 

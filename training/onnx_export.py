@@ -68,7 +68,8 @@ def export_encoder(name_or_path: str | Path, out: Path, int8_images: Path | None
             )
         if images:
             low_db, high_db = manifest.snr_range_db
-            quantise(out, images, (float(rounded_snr_db(low_db)), high_db))
+            names = [node.name for node in onnx.load(str(out)).graph.node if node.op_type == "Conv"]
+            quantise(out, names, images, (float(rounded_snr_db(low_db)), high_db))
         graph = onnx.load(str(out))
         halve_weights(graph)
         facts = {

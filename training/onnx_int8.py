@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import onnx
 from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
@@ -60,7 +59,12 @@ def calibration_images(folder: Path) -> list[NDArray[np.uint8]]:
     return images
 
 
-def quantise(path: Path, images: list[NDArray[np.uint8]], snr_range_db: tuple[float, float]) -> None:
+def quantise(
+    path: Path,
+    convolutions: list[str],
+    images: list[NDArray[np.uint8]],
+    snr_range_db: tuple[float, float],
+) -> None:
     """Replace an exported encoder in single precision by one with eight-bit convolutions.
 
     Weights have seven bits, one scale for each output channel: on processors without VNNI two products of
@@ -68,11 +72,10 @@ def quantise(path: Path, images: list[NDArray[np.uint8]], snr_range_db: tuple[fl
 
     Args:
         path: The encoder.
+        convolutions: Names of its convolutions.
         images: Photos; 48 of them, evenly chosen, are used.
         snr_range_db: SNRs at which values arrive.
     """
-    graph = onnx.load(str(path)).graph
-    names = [node.name for node in graph.node if node.op_type == "Conv"]
     # It would warn that it was not given a graph prepared for it; this one has nothing to prepare.
     logging.disable(logging.WARNING)
     try:
@@ -82,7 +85,7 @@ def quantise(path: Path, images: list[NDArray[np.uint8]], snr_range_db: tuple[fl
             _Ranges(images, snr_range_db),
             quant_format=QuantFormat.QDQ,
             op_types_to_quantize=["Conv"],
-            nodes_to_quantize=[name for name in names if not any(part in name for part in _EXACT)],
+            nodes_to_quantize=[name for name in convolutions if not any(part in name for part in _EXACT)],
             per_channel=True,
             reduce_range=True,
             activation_type=QuantType.QUInt8,
