@@ -16,6 +16,9 @@ MODULATIONS: tuple[Modulation, ...] = ("16qam", "analog")
 #: Codec of every command that is not told another.
 DEFAULT_CODEC = "3dcsc-lite"
 
+#: Side of the window in which keypoints are tracked, and whose displacement the keypoint confidence predicts.
+KLT_WINDOW_PX = 21
+
 #: Effective SNR given to the decoder for a slot of which nothing arrived.
 LOST_SLOT_SNR_DB = -20.0
 

@@ -5,12 +5,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
+from semcast.common.codec import KLT_WINDOW_PX
 from semcast.common.geometry import skew
 
 Array = NDArray[np.float64]
 
-#: Window and pyramid of the tracks that serve as truth: those of a usual KLT tracker.
-_LK_WINDOW_PX = 21
+#: Pyramid of the tracks that serve as truth.
 _LK_LEVELS = 3
 
 
@@ -62,7 +62,7 @@ def track_points(
         grey1,
         start,
         start.copy(),
-        winSize=(_LK_WINDOW_PX, _LK_WINDOW_PX),
+        winSize=(KLT_WINDOW_PX, KLT_WINDOW_PX),
         maxLevel=_LK_LEVELS,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )

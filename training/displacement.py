@@ -4,7 +4,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv2d
 
+from semcast.common.codec import KLT_WINDOW_PX
+
 MAX_DISPLACEMENT_PX = 8.0
+#: Side of the window in which a pixel is judged as a corner.
+_CORNER_PX = 9
 _LUMA = (0.299, 0.587, 0.114)
 
 
@@ -25,28 +29,32 @@ def gradients(image: Tensor) -> tuple[Tensor, Tensor]:
     return both[:, :1], both[:, 1:]
 
 
-def lucas_kanade_step(original: Tensor, decoded: Tensor, window_px: int = 9) -> tuple[Tensor, Tensor]:
+def lucas_kanade_step(
+    original: Tensor, decoded: Tensor, window_px: int = KLT_WINDOW_PX
+) -> tuple[Tensor, Tensor]:
     """Take one Lucas-Kanade step at every pixel.
 
     Args:
         original: ``(B, 1, H, W)`` grey image in [0, 1].
         decoded: Its decoded version.
-        window_px: Side of the square window, odd.
+        window_px: Side of the square window, odd; that of the tracker, which averages as much.
 
     Returns:
         The length of the step in px, clipped to ``MAX_DISPLACEMENT_PX``, and the corner strength: the smaller
-        eigenvalue of the mean structure tensor, both ``(B, 1, H, W)``.
+        eigenvalue of the structure tensor, mean over a small window, both ``(B, 1, H, W)``.
     """
 
-    def window(values: Tensor) -> Tensor:
-        return avg_pool2d(values, window_px, stride=1, padding=window_px // 2, count_include_pad=False)
+    def mean(values: Tensor, side_px: int) -> Tensor:
+        return avg_pool2d(values, side_px, stride=1, padding=side_px // 2, count_include_pad=False)
 
     ix, iy = gradients(original)
     it = decoded - original
-    moments = window(torch.cat((ix * ix, ix * iy, iy * iy, ix * it, iy * it), dim=1))
-    a, b, c, ex, ey = moments.split(1, dim=1)
+    tensor = torch.cat((ix * ix, ix * iy, iy * iy), dim=1)
+    a, b, c = mean(tensor, _CORNER_PX).split(1, dim=1)
     half_trace, spread = (a + c) / 2, (((a - c) / 2).square() + b.square()).sqrt()
     strength = (half_trace - spread).clamp_min(0.0)
+    a, b, c = mean(tensor, window_px).split(1, dim=1)
+    ex, ey = mean(torch.cat((ix * it, iy * it), dim=1), window_px).split(1, dim=1)
     damping = 1e-5
     determinant = (a + damping) * (c + damping) - b * b
     dx = (b * ey - (c + damping) * ex) / determinant

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.common.codec import KLT_WINDOW_PX
+
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
-#: Side of the KLT window.
-KLT_WINDOW_PX = 21
 #: Points nearer to the border have no whole window.
 BORDER_PX = 8
 #: OpenCV's KLT gives the smaller eigenvalue of the mean structure tensor in units of 32^2 / 2^20 grey^2.

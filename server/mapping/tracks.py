@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.common.codec import KLT_WINDOW_PX
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.geometry.features import (
-    KLT_WINDOW_PX,
     Grey,
     TrackedPoints,
     corner_strength,
