@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from semcast.cli import main
-from semcast.common.errors import SemcastError
+from semcast.common.errors import SemcastError, SourceError
+from semcast.common.nets.onnx_encoder import encoder_path
 from semcast.common.recording import RecordingWriter, recording_metadata
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.describe import describe
@@ -151,6 +152,15 @@ def test_a_transforms_file_is_described_like_its_folder(tmp_path):
     text = text_of(tmp_path / "transforms_test.json")
     assert "images: 2, 64x48 px" in text
     assert text.splitlines()[1:] == text_of(tmp_path).splitlines()[1:]
+
+
+def test_an_exported_encoder_is_described(tmp_path):
+    words = text_of(encoder_path("3dcsc-lite"))
+    assert "codec: 3dcsc-lite" in words
+    assert "convolutions: int8" in words
+    assert "trained for: 0..14 dB" in words
+    with pytest.raises(SourceError, match=r"there is no file .*nowhere\.onnx"):
+        describe(tmp_path / "nowhere.onnx")
 
 
 def test_shipped_weights_are_described():

@@ -81,7 +81,14 @@ class OnnxEncoder:
             )
         self._name, self._digest = str(facts["architecture"]), str(facts["digest"])
         self._snr_range_db = float(facts["snr_min_db"]), float(facts["snr_max_db"])
+        #: ``int8`` where convolutions are, else ``float``.
+        self.precision = str(facts.get("precision", "float"))
         self._modulation: Modulation = modulation
+
+    @property
+    def snr_range_db(self) -> tuple[float, float]:
+        """SNRs in dB the encoder was trained for; others are clipped to them."""
+        return self._snr_range_db
 
     @property
     def name(self) -> str:

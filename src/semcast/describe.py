@@ -3,6 +3,7 @@
 import datetime
 import json
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,8 @@ def describe(path: Path) -> list[Section]:
 
     Args:
         path: A recording (``.mcap``), a run folder, a sequence folder, a transforms ``.json`` file, or
-            weights (``.safetensors`` or a shipped name such as ``3dcsc-lite``).
+            weights (``.safetensors``, an exported encoder ``.onnx`` or a shipped name such as
+            ``3dcsc-lite``).
 
     Raises:
         SemcastError: It is none of these, or damaged.
@@ -40,6 +42,8 @@ def describe(path: Path) -> list[Section]:
         return describe_sequence(path)
     if path.suffix == ".mcap":
         return describe_recording(path)
+    if path.suffix == ".onnx":
+        return describe_encoder(path)
     if path.suffix == ".safetensors" or _is_bare_name(path):
         return describe_weights(path)
     if path.is_file():
@@ -51,7 +55,7 @@ def describe(path: Path) -> list[Section]:
     got = f"{path} is another kind of file" if path.exists() else f"there is no file or folder {path}"
     raise SourceError(
         f"{got}: it must be a recording (.mcap), a folder that --out wrote, a sequence folder or transforms "
-        ".json, or weights (.safetensors or a shipped name)"
+        ".json, or weights (.safetensors, .onnx or a shipped name)"
     )
 
 
@@ -203,6 +207,26 @@ def describe_weights(path: Path) -> list[Section]:
     for name, value in manifest.measured.items():
         measured += [(f"{name} {key}" if key else name, text) for key, text in _curves(value)]
     return [(f"weights {file.name}", facts), ("made by", made), ("measured", measured)]
+
+
+def describe_encoder(path: Path) -> list[Section]:
+    """Say what an exported encoder is."""
+    if not path.is_file():
+        raise SourceError(f"there is no file {path}")
+    if find_spec("onnxruntime") is None:
+        raise SourceError(f"onnxruntime is needed to read {path} (extra 'edge')")
+    from semcast.common.nets.onnx_encoder import OnnxEncoder
+
+    encoder = OnnxEncoder(path, num_threads=1)
+    low_db, high_db = encoder.snr_range_db
+    facts = [
+        ("codec", encoder.name),
+        ("size", _bytes(path.stat().st_size)),
+        ("digest", f"{encoder.digest}, first digits of the sha256 of its weights"),
+        ("convolutions", encoder.precision),
+        ("trained for", f"{low_db:g}..{high_db:g} dB"),
+    ]
+    return [(f"encoder {path.name}", facts)]
 
 
 def _curves(value: Any) -> list[tuple[str, str]]:
