@@ -2,7 +2,6 @@
 
 import contextlib
 import datetime
-import os
 import platform
 import time
 from collections.abc import Mapping
@@ -23,6 +22,7 @@ from semcast.common.recording_reader import (
     RecordingScan,
     scan_info,
 )
+from semcast.common.whole_file import whole_file
 
 CHUNK_BYTES = 1024**2
 FLUSH_INTERVAL_S = 0.5
@@ -149,17 +149,8 @@ def recover_file(path: Path, out: Path) -> RecordingInfo:
     Raises:
         SourceError: See ``recover_stream``; or a file can't be read or written.
     """
-    partial = out.with_name(out.name + ".part")
     try:
-        with path.open("rb") as source, partial.open("w+b") as target:
-            info = recover_stream(source, target, str(path))
-        os.replace(partial, out)
+        with path.open("rb") as source, whole_file(out) as target:
+            return recover_stream(source, target, str(path))
     except OSError as err:
-        with contextlib.suppress(OSError):
-            partial.unlink()
         raise SourceError(f"{path} can't be recovered into {out}: {err}") from err
-    except SourceError:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        raise
-    return info

@@ -19,7 +19,6 @@ as (landmark id, keyframe id, x, y). It calls ``write_run`` once at the end and 
 import contextlib
 import json
 import logging
-import os
 import queue
 import threading
 import zipfile
@@ -36,6 +35,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.shapes import check_shape
+from semcast.common.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -152,15 +152,11 @@ def write_run(folder: Path, data: RunData) -> None:
     content: dict[str, Any] = {name: getattr(data, name) for name in _ARRAYS}
     content[_HEADER] = np.frombuffer(header, dtype=np.uint8)
     path = folder / RECONSTRUCTION_NAME
-    partial = path.with_name(path.name + ".part")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as file:
+        with whole_file(path) as file:
             np.savez_compressed(file, allow_pickle=False, **content)
-        os.replace(partial, path)
     except OSError as err:
-        with contextlib.suppress(OSError):
-            partial.unlink()
         raise SourceError(f"{path} can't be written: {err}") from err
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import semcast
 from semcast.common.cores import usable_cores
 from semcast.common.errors import SemcastError
+from semcast.common.whole_file import whole_file
 
 #: Libraries whose version can change a result.
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "gtsam", "poselib")
@@ -64,9 +65,8 @@ def write_json(path: Path, result: Mapping[str, Any]) -> None:
     text = json.dumps(json_ready(result), indent=1, allow_nan=False) + "\n"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".part")
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        with whole_file(path) as file:
+            file.write(text.encode())
     except OSError as err:
         raise SemcastError(f"{path} can't be written: {err}") from err
 

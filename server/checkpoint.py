@@ -3,10 +3,8 @@
 One uncompressed ``.npz`` (a zip of plain arrays with a CRC each, read without pickle), replaced atomically.
 """
 
-import contextlib
 import json
 import logging
-import os
 import threading
 import zipfile
 from collections.abc import Mapping
@@ -19,6 +17,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import CheckpointError
+from semcast.common.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -74,17 +73,11 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     header["camera"] = checkpoint.header.camera.to_dict()
     content = {_MAP + name: array for name, array in checkpoint.arrays.items()}
     content[_HEADER] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-    temporary = path.with_name(path.name + ".tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
+        with whole_file(path, durable=True) as file:
             np.savez(file, allow_pickle=False, **content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
     except OSError as err:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
         raise CheckpointError(f"{path} can't be written: {err}") from err
 
 

@@ -3,7 +3,6 @@
 import contextlib
 import json
 import logging
-import os
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -15,6 +14,7 @@ import numpy as np
 from semcast.common.errors import SemcastError
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
+from semcast.common.whole_file import whole_file
 from semcast.server.export.outputs import percentiles, plain
 from semcast.server.mapping.state import DecodedFrame, FrameResult
 
@@ -100,9 +100,8 @@ class RunRecord:
             return
         try:
             kept = read_rows(self._path) if resume else []
-            temporary = self._path.with_name(FILE_NAME + ".tmp")
-            temporary.write_text("".join(_line(row) for row in kept), encoding="utf-8")
-            os.replace(temporary, self._path)
+            with whole_file(self._path) as file:
+                file.writelines(_line(row).encode() for row in kept)
             self._file = self._path.open("a", encoding="utf-8")
         except OSError as err:
             raise SemcastError(f"{self._path} can't be written: {err}") from err

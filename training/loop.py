@@ -21,6 +21,7 @@ from semcast.common.nets.encoder import Encoder
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS, channel_bandwidth_ratio
+from semcast.common.whole_file import whole_file
 from semcast.training.centring import centre_hidden, folded, unfolded
 from semcast.training.channel import LinkDraw, draw_links, through_link
 from semcast.training.data import Batches, read_images
@@ -171,9 +172,8 @@ class Run:
             "step": self.step,
             "elapsed_s": self.elapsed_s,
         }
-        partial = self.checkpoint_path.with_suffix(".partial")
-        torch.save(state, partial)
-        partial.replace(self.checkpoint_path)
+        with whole_file(self.checkpoint_path) as file:
+            torch.save(state, file)
 
     def shippable(self) -> Transceiver:
         """Return the averaged weights as they run without the aids of training."""

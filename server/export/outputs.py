@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import platform
 from collections.abc import Iterable, Mapping
 from importlib import metadata
@@ -15,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from semcast import __version__
 from semcast.common.errors import SourceError
 from semcast.common.trajectory import Trajectory
+from semcast.common.whole_file import whole_file
 
 PACKAGES = ("numpy", "torch", "opencv-python-headless", "eclipse-zenoh", "rerun-sdk", "gtsam", "poselib")
 
@@ -128,9 +128,9 @@ def plain(value: Any) -> Any:
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Write JSON without NaN, whole or not at all."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(plain(value), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    text = json.dumps(plain(value), indent=1, allow_nan=False) + "\n"
+    with whole_file(path) as file:
+        file.write(text.encode())
 
 
 def percentiles(values_ms: Iterable[float]) -> dict[str, float] | None:

@@ -415,7 +415,7 @@ def test_a_new_start_that_cannot_be_written_is_kept_in_memory(tmp_path, hub, seq
     first = Radio(endpoint, sequence, codec, 100)
     first.stream(range(6))
     first.close()
-    (tmp_path / "frames.jsonl.tmp").mkdir()
+    (tmp_path / "frames.jsonl.part").mkdir()
     second = Radio(endpoint, sequence, codec, 200)
     second.stream(range(4))
     second.close()

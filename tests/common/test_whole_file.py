@@ -1,0 +1,34 @@
+import pytest
+
+from semcast.common.whole_file import whole_file
+
+
+@pytest.mark.parametrize("durable", [False, True])
+def test_the_new_content_is_there_when_the_block_ends(tmp_path, durable):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with whole_file(path, durable=durable) as file:
+        file.write(b"new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_failure_leaves_the_old_content_and_nothing_else(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+
+    def interrupted():
+        with whole_file(path) as file:
+            file.write(b"half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
+
+
+def test_a_file_without_a_folder_is_an_os_error(tmp_path):
+    with pytest.raises(FileNotFoundError), whole_file(tmp_path / "no" / "a"):
+        pass
