@@ -7,6 +7,7 @@ common peer would not see each other, and a peer by default listens on all inter
 
 import re
 from dataclasses import dataclass, field
+from pathlib import Path
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _ENDPOINT = re.compile(r"(tcp|udp|quic|tls|ws|unixsock-stream)/\S+")
@@ -34,6 +35,10 @@ class NetworkSettings:
     )
     connect: tuple[str, ...] = field(
         default=(DEFAULT_ENDPOINT,), metadata={"help": "endpoints of the hub to connect to"}
+    )
+    zenoh_config: Path | None = field(
+        default=None,
+        metadata={"help": "file of Zenoh's own configuration (JSON5), for certificates and users"},
     )
 
     def __post_init__(self) -> None:

@@ -13,12 +13,13 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
 import zenoh
 
-from semcast.common.errors import TransportError
+from semcast.common.errors import ConfigError, TransportError
 from semcast.common.keys import agent_of, alive_agents, alive_key, alive_keys, role_of
 from semcast.common.messages import ROLES
 from semcast.common.network_settings import NetworkSettings, is_loopback
@@ -39,9 +40,13 @@ _JOIN_S = 2.0
 def zenoh_config(network: NetworkSettings) -> zenoh.Config:
     """Return the configuration of a session: a router where it listens, else a client.
 
-    Nothing is discovered or opened beyond the endpoints that are named.
+    Nothing is discovered or opened beyond the endpoints that are named. What a configuration file of Zenoh
+    says about anything else, such as certificates, holds as well.
+
+    Raises:
+        ConfigError: That file can't be read or is not one.
     """
-    config = zenoh.Config()
+    config = zenoh.Config() if network.zenoh_config is None else _read_config(network.zenoh_config)
     hub = bool(network.listen)
     values: dict[str, Any] = {
         "mode": "router" if hub else "client",
@@ -64,6 +69,15 @@ def zenoh_config(network: NetworkSettings) -> zenoh.Config:
     for key, value in values.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _read_config(path: Path) -> zenoh.Config:
+    try:
+        return zenoh.Config.from_json5(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as err:
+        raise ConfigError(f"zenoh_config {path} can't be read: {err}") from err
+    except zenoh.ZError as err:
+        raise ConfigError(f"zenoh_config {path} is no Zenoh configuration: {_first_line(err)}") from err
 
 
 class Publisher:
@@ -334,9 +348,10 @@ def open_session(
 
     Raises:
         TransportError: The port is taken, or no hub was found in time.
+        ConfigError: Zenoh's configuration file is not usable.
     """
     for endpoint in network.listen:
-        if not is_loopback(endpoint):
+        if not is_loopback(endpoint) and network.zenoh_config is None:
             logger.warning("listening on %s: whoever reaches it can send and receive", endpoint)
     config = zenoh_config(network)
     if network.listen:

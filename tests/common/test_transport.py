@@ -1,3 +1,4 @@
+import json
 import subprocess
 import sys
 import threading
@@ -5,7 +6,7 @@ import time
 
 import pytest
 
-from semcast.common.errors import TransportError
+from semcast.common.errors import ConfigError, TransportError
 from semcast.common.network_settings import HubSettings, NetworkSettings, is_loopback
 from semcast.common.transport import (
     alive_roles,
@@ -273,3 +274,43 @@ def test_listening_beyond_loopback_is_warned_about(caplog):
 
 def test_a_round_trip_over_loopback_takes_milliseconds():
     assert 0.0 < loopback_round_trip_ms() < 500.0
+
+
+def test_a_hub_with_users_lets_only_them_in(tmp_path):
+    (tmp_path / "users.txt").write_text("alice:secret\n")
+
+    def file(name, **usrpwd):
+        path = tmp_path / name
+        path.write_text(json.dumps({"transport": {"auth": {"usrpwd": usrpwd}}}))
+        return path
+
+    endpoint = free_endpoint()
+    hub = file("hub.json5", dictionary_file=str(tmp_path / "users.txt"))
+    alice, mallory = file("a.json5", user="alice", password="secret"), file("m.json5", user="m", password="x")
+    with open_session(NetworkSettings(listen=(endpoint,), connect=(), zenoh_config=hub)):
+        with open_client(NetworkSettings(connect=(endpoint,), zenoh_config=alice), 5):
+            pass
+        for stranger in (mallory, None):
+            with pytest.raises(TransportError, match="nothing answers"):
+                open_client(NetworkSettings(connect=(endpoint,), zenoh_config=stranger), 0.6)
+
+
+def test_endpoints_stay_as_they_were_asked_for(tmp_path):
+    path = tmp_path / "all.json5"
+    path.write_text('{mode: "peer", listen: {endpoints: ["tcp/0.0.0.0:7000"]}} // JSON5')
+    config = zenoh_config(NetworkSettings(connect=("tcp/127.0.0.1:7447",), zenoh_config=path))
+    assert config.get_json("mode") == '"client"'
+    assert config.get_json("listen/endpoints") == "[]"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(None, "can't be read"), ("{", "no Zenoh configuration"), ("{tarnsport: 1}", "no Zenoh configuration")],
+)
+def test_a_bad_configuration_of_zenoh_is_one_clear_line(tmp_path, content, message):
+    path = tmp_path / "z.json5"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ConfigError, match=rf"zenoh_config .*z\.json5.* {message}") as raised:
+        zenoh_config(NetworkSettings(zenoh_config=path))
+    assert "\n" not in str(raised.value)
