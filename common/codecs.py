@@ -1,5 +1,6 @@
 """All codecs by name, learned and conventional: the one way to get a codec."""
 
+from functools import cache
 from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
@@ -9,6 +10,7 @@ from semcast.common.codec import MODULATIONS, Codec, Modulation
 from semcast.common.config import near_match
 from semcast.common.conventional_source import ImageFormat
 from semcast.common.errors import ConfigError
+from semcast.common.phy.equaliser import Equalised
 
 Runtime = Literal["auto", "torch", "onnx"]
 
@@ -24,6 +26,7 @@ def _shipped_weights() -> list[str]:
     return sorted(names, key=lambda n: (LEARNED_CODECS.index(n) if n in LEARNED_CODECS else 99, n))
 
 
+@cache
 def _conventional_names() -> dict[str, tuple[ImageFormat, bool]]:
     """Return name to (format, adaptive) of what this OpenCV can do."""
     from semcast.common.conventional_source import supported
@@ -37,6 +40,15 @@ def _conventional_names() -> dict[str, tuple[ImageFormat, bool]]:
 def available_codecs() -> list[str]:
     """Return the codecs that can be used as installed, learned ones with weights first; loads no network."""
     return [*_shipped_weights(), *_conventional_names()]
+
+
+def reported_snr_db(codec: str, equalised: Equalised) -> float:
+    """Return the SNR in dB that a receiver reports to the transmitter of a codec.
+
+    Learned codecs are told the link's average. A conventional one has to choose what still gets through, and
+    is told the SNR of a steady link that carries as much.
+    """
+    return equalised.steady_snr_db if codec in _conventional_names() else equalised.snr_db
 
 
 def _choose_runtime(runtime: Runtime, weights: Path | None) -> Literal["torch", "onnx"]:

@@ -25,7 +25,7 @@ from semcast.common.codec import (
     Modulation,
     ReceivedImage,
 )
-from semcast.common.codecs import LEARNED_CODECS, load_codec
+from semcast.common.codecs import LEARNED_CODECS, load_codec, reported_snr_db
 from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
 from semcast.common.phy.slots import layout_for
@@ -106,6 +106,7 @@ class _Sample:
     confidence: dict[str, float | None]
     times_ms: dict[str, float]
     decoded: DecodedImage
+    report_db: float
 
 
 def read_images(folder: Path, max_images: int | None = None) -> dict[str, NDArray[np.uint8]]:
@@ -136,8 +137,8 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
     """Send every image through every codec at every SNR and measure what arrives.
 
     A lost frame or an outage counts with the grey picture the receiver shows then, and in ``outage``. The
-    transmitter is told the SNR that is set, as a perfect report of the mean; in ``eval trajectory`` and live
-    it is told what the receiver estimates.
+    transmitter is told what the receiver reported on the image before, and before the first the SNR that is
+    set.
 
     Args:
         settings: What to measure.
@@ -167,10 +168,13 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         samples: dict[str, list[_Sample]] = {codec.name: [] for codec in codecs}
         # One link per codec for all images, so that traces and fading go on from image to image; all see the
         # same noise, which belongs to the image's number.
+        told_db = {codec.name: snr_db for codec in codecs}
         links = {c.name: Link(replace(settings.link, snr_db=snr_db), settings.seed) for c in codecs}
         for k, (name, image) in enumerate(images.items()):
             for codec in codecs:
-                samples[codec.name].append(_run(codec, image, links[codec.name], k, settings))
+                sample = _run(codec, image, links[codec.name], k, told_db[codec.name], settings)
+                samples[codec.name].append(sample)
+                told_db[codec.name] = sample.report_db
             if snr_db == strip_snr_db and len(strip) < _STRIP_IMAGES:
                 strip.append(_strip_row(name, image, {n: s[-1] for n, s in samples.items()}))
         results += [_row(name, snr_db, list(images), rows) for name, rows in samples.items()]
@@ -223,9 +227,11 @@ def _warm_up(codecs: Sequence[Codec], image: NDArray[np.uint8]) -> None:
             codec.decode(received)
 
 
-def _run(codec: Codec, image: NDArray[np.uint8], link: Link, k: int, settings: CodecSettings) -> _Sample:
+def _run(
+    codec: Codec, image: NDArray[np.uint8], link: Link, k: int, told_db: float, settings: CodecSettings
+) -> _Sample:
     start_ns = time.perf_counter_ns()
-    encoded = codec.encode(to_coded(image, settings.rate), link.settings.snr_db)
+    encoded = codec.encode(to_coded(image, settings.rate), told_db)
     encode_ms = (time.perf_counter_ns() - start_ns) * 1e-6
     equalised = link.receive(encoded, k * _FRAME_INTERVAL_S, k, perfect_csi=settings.perfect_csi)
     times_ms = {"encode": encode_ms}
@@ -248,7 +254,8 @@ def _run(codec: Codec, image: NDArray[np.uint8], link: Link, k: int, settings: C
         "outage": float(decoded.outage),
         "snr_db_estimate": None if equalised is None else equalised.snr_db,
     }
-    return _Sample(figures, _grade_confidence(decoded, image), times_ms, decoded)
+    report_db = told_db if equalised is None else reported_snr_db(codec.name, equalised)
+    return _Sample(figures, _grade_confidence(decoded, image), times_ms, decoded, report_db)
 
 
 def _grade_confidence(decoded: DecodedImage, image: NDArray[np.uint8]) -> dict[str, float | None]:

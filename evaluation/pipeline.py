@@ -17,7 +17,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
-from semcast.common.codecs import load_codec
+from semcast.common.codecs import load_codec, reported_snr_db
 from semcast.common.errors import ConfigError
 from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
@@ -142,7 +142,7 @@ def run_frames(
 ) -> Iterator[LinkedFrame]:
     """Send frames of a recording through a codec and a link, one after the other.
 
-    The encoder is told what the agent would be told: the receiver's SNR estimate of the last frame that
+    The encoder is told what the agent would be told: the receiver's report on the last frame that
     arrived; before the first one, the SNR the link is set to.
 
     Args:
@@ -178,7 +178,7 @@ def run_frames(
         since = time.perf_counter_ns()
         equalised = equalise(sent.slots_rx, encoded.shape_hw, encoded.modulation, slot_lost=sent.slot_lost)
         stage_ms["equalise"] = _elapsed_ms(since)
-        feedback_db = equalised.snr_db
+        feedback_db = reported_snr_db(codec.name, equalised)
         since = time.perf_counter_ns()
         decoded = codec.decode(equalised.received)
         stage_ms["decode"] = _elapsed_ms(since)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import ReceivedImage
+from semcast.common.codecs import reported_snr_db
 from semcast.common.errors import TransportError
 from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.mailbox import Mailbox
@@ -309,7 +310,7 @@ class Receiver:
             equalise_ms = (time.perf_counter_ns() - started_ns) * 1e-6
             received, snr_db = equalised.received, float(equalised.snr_db)
             self._metrics.observe("equalise", equalise_ms)
-            self._report(message, snr_db)
+            self._report(message, reported_snr_db(message.codec, equalised))
         self._took(message)
         self._metrics.count("delivered")
         with self._lock:
