@@ -21,6 +21,8 @@ Ids = NDArray[np.int64]
 MAX_OBSERVATIONS = 3500
 #: Landmarks further than this many median depths are as good as at infinity.
 _MAX_DEPTH_RATIO = 60.0
+#: Noise is judged by residuals that keep at least this share of its variance.
+_MIN_LEFT = 0.1
 #: Observations in a row that disagree before a landmark is given up.
 _MAX_MISSED = 4
 
@@ -295,19 +297,30 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
         if not fixed:
             world.move_keyframe(frame_id, T_world_cam)
     world.move_landmarks(problem.landmark_ids, result.xyz)
-    known = np.isfinite(result.residual_px).all(axis=1)
+    known = np.asarray(np.isfinite(result.residual_px).all(axis=1))
     size = np.linalg.norm(np.nan_to_num(result.residual_px), axis=1)
-    shrink = _shrinkage(problem, int(known.sum()))
-    mild = known & (size < 12.0 * problem.sigma_px)
-    noise.add(np.repeat(problem.confidence[mild], 2), np.abs(result.residual_px[mild]).ravel() / shrink)
+    left = _share_left(problem, known)
+    telling = known & (size < 12.0 * problem.sigma_px) & (left > _MIN_LEFT)
+    as_noise = np.abs(result.residual_px[telling]) / np.sqrt(left[telling, None])
+    noise.add(np.repeat(problem.confidence[telling], 2), as_noise.ravel())
     bad = ~known | (size > 1.3 * noise.model.threshold_px(problem.confidence))
     _drop(world, problem, bad)
 
 
-def _shrinkage(problem: BundleProblem, num_used: int) -> float:
-    """How much smaller residuals are than the noise, because unknowns were fitted to them."""
-    free = 6 * int((~problem.fixed).sum()) + 3 * len(problem.xyz)
-    return float(np.sqrt(max(0.1, 1.0 - free / max(1, 2 * num_used))))
+def _share_left(problem: BundleProblem, known: NDArray[np.bool_]) -> Array:
+    """Share of each observation's noise variance that is left in its residual, ``(M,)``, perhaps below 0.
+
+    Unknowns were fitted to the observations, which takes their leverage off the variance. The three unknowns
+    of a landmark and the six of a view are shared out among their observations by weight: what has more
+    weight is fitted more closely. Without that, weights would make the very residuals that then ask for
+    stronger weights.
+    """
+    weight = np.where(known, problem.sigma_px**-2.0, 0.0)
+    of_point = np.bincount(problem.point, weight, minlength=len(problem.xyz))[problem.point]
+    of_view = np.bincount(problem.view, weight, minlength=len(problem.fixed))[problem.view]
+    leverage = 1.5 * weight / np.maximum(of_point, 1e-12)
+    leverage += np.where(problem.fixed[problem.view], 0.0, 3.0 * weight / np.maximum(of_view, 1e-12))
+    return np.asarray(1.0 - leverage)
 
 
 def _drop(world: WorldMap, problem: BundleProblem, bad: NDArray[np.bool_]) -> None:

@@ -121,6 +121,26 @@ def test_an_adjustment_mends_shaken_poses():
     assert noise.model.sigma0_px < 0.5
 
 
+def test_the_fit_finds_the_noise_that_is_there_and_not_what_its_own_weights_make():
+    true = NoiseModel(0.4, 3.0)
+    noise = OnlineNoise("robust", 0.7, 0.0, True)
+    for seed in range(14):
+        rng = np.random.default_rng(100 + seed)
+        world, _, _ = make_world(6, 160, noise_px=0.0, seed=seed)
+        for keyframe in world.keyframes:
+            keyframe.confidence[:] = rng.uniform(0.3, 1.0, len(keyframe.confidence))
+            sigma = true.sigma_px(keyframe.confidence)[:, None]
+            keyframe.xy += sigma * rng.normal(size=keyframe.xy.shape)
+        add_landmarks(world, CAMERA, NoiseModel(6.0, 0.0), IMAGE, 0.3)
+        for keyframe in world.keyframes:  # short tracks: what is fitted to them hides half of their noise
+            keyframe.drop_observations(rng.random(len(keyframe.ids)) < 0.4)
+        problem = build_problem(world, CAMERA, noise.model, 10)
+        assert problem is not None
+        apply_result(world, optimise(problem), noise)
+    assert 1.8 < noise.model.beta < 3.8  # 4.7 with uniform shrinkage
+    assert noise.model.sigma0_px == pytest.approx(true.sigma0_px, rel=0.15)
+
+
 def test_what_came_after_the_question_moves_with_the_answer():
     world, _, _ = make_world(5, 100, shake=0.01)
     add_landmarks(world, CAMERA, NoiseModel(6.0, 0.0), IMAGE, 0.5)
