@@ -1,19 +1,31 @@
 """Starting weights: the best linear transceiver of the training images."""
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from semcast.common.errors import ConfigError
+from semcast.common.nets.decoder import Decoder
+from semcast.common.nets.encoder import Encoder
 from semcast.common.nets.linear import BlockAnalysis, BlockSynthesis
+from semcast.common.nets.mae import MaeDecoder, MaeEncoder
 from semcast.common.nets.transceiver import Transceiver
+from semcast.common.nets.vit import VitDecoder, VitEncoder
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
 
 #: Rms of the latent, against which the carrier (see ``modulation``) has its amplitude.
 _LATENT_RMS = 0.9
+#: Where a network has no Wiener filter of its own, the one it starts with suits this SNR.
+_START_SNR_DB = 5.0
+
+Array = NDArray[np.float64]
 
 
-def block_statistics(images: list[NDArray[np.uint8]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def block_statistics(images: list[NDArray[np.uint8]]) -> tuple[Array, Array]:
     """Return mean ``(768,)`` and covariance ``(768, 768)`` of all 16x16 RGB blocks of half-size images.
 
     Values are in [-0.5, 0.5]; a block is ordered like ``torch.nn.PixelUnshuffle(16)``: channel, row, column.
@@ -40,40 +52,140 @@ def block_statistics(images: list[NDArray[np.uint8]]) -> tuple[NDArray[np.float6
     return mean, products / count - np.outer(mean, mean)
 
 
+@dataclass(frozen=True)
+class LinearLink:
+    """The best linear transceiver of 16x16 blocks for analog symbols, in float64.
+
+    Attributes:
+        mean: ``(768,)`` of all blocks.
+        analysis: ``(K, 768)``: a block around the mean to coefficients, of variance ``power``.
+        power: ``(K,)``, 1 on average.
+        mix: ``(94, K)``, orthogonal columns: coefficients to a latent of the rms ``_LATENT_RMS``.
+        unmix: ``(K, 94)``: back.
+        synthesis: ``(768, K)``: coefficients to a block around the mean.
+    """
+
+    mean: Array
+    analysis: Array
+    power: Array
+    mix: Array
+    unmix: Array
+    synthesis: Array
+
+    def wiener(self, snr_db: float) -> Array:
+        """Return the ``(K,)`` gains that suit one SNR; they also undo the equaliser's shrinking."""
+        snr = 10.0 ** (snr_db / 10.0)
+        noise = self.power.size / LATENT_CHANNELS / snr
+        return np.asarray(self.power / (self.power + noise) * (1.0 + snr) / snr)
+
+
+def linear_link(
+    images: list[NDArray[np.uint8]], num_coefficients: int, generator: torch.Generator
+) -> LinearLink:
+    """Return the linear transceiver of these images that sends so many coefficients of each block.
+
+    Args:
+        images: ``(H, W, 3)`` uint8.
+        num_coefficients: At most 94.
+        generator: Draws the orthogonal mixing.
+    """
+    mean, covariance = block_statistics(images)
+    variances, vectors = np.linalg.eigh(covariance)
+    variances = np.maximum(variances[::-1][:num_coefficients], 1e-9)
+    basis = vectors[:, ::-1][:, :num_coefficients].T
+    power = np.sqrt(variances) / np.sqrt(variances).mean()
+    gain = np.sqrt(power / variances)
+    rotation = torch.linalg.qr(torch.randn(LATENT_CHANNELS, LATENT_CHANNELS, generator=generator))[0].numpy()
+    mixing = rotation[:, :num_coefficients]
+    scale = _LATENT_RMS * math.sqrt(LATENT_CHANNELS / num_coefficients)
+    return LinearLink(
+        mean, gain[:, None] * basis, power, scale * mixing, mixing.T / scale, (basis / gain[:, None]).T
+    )
+
+
 def start_from_klt(model: Transceiver, images: list[NDArray[np.uint8]], generator: torch.Generator) -> None:
     """Set the linear layers of encoder and decoder to the transform of these images, in place.
 
     Args:
-        model: A transceiver whose encoder and decoder have a linear heart.
+        model: A transceiver with a linear way from pixels to latent and back: 3dcsc, vit or mae.
         images: Training images, ``(H, W, 3)`` uint8.
         generator: Draws the orthogonal mixing.
 
     Raises:
-        ConfigError: The transceiver has no linear heart.
+        ConfigError: The transceiver has no linear way.
     """
-    heart_in, heart_out = getattr(model.encoder, "linear", None), getattr(model.decoder, "linear", None)
-    if not isinstance(heart_in, BlockAnalysis) or not isinstance(heart_out, BlockSynthesis):
-        raise ConfigError("start must be 'random' for an architecture without a linear heart, got 'klt'")
-    mean, covariance = block_statistics(images)
-    variances, vectors = np.linalg.eigh(covariance)
-    variances = np.maximum(variances[::-1][:LATENT_CHANNELS], 1e-9)
-    basis = vectors[:, ::-1][:, :LATENT_CHANNELS].T  # (94, 768)
-    power = np.sqrt(variances) / np.sqrt(variances).mean()
-    gain = np.sqrt(power / variances)
-    mixing = torch.linalg.qr(torch.randn(LATENT_CHANNELS, LATENT_CHANNELS, generator=generator))[0].numpy()
-    analysis = gain[:, None] * basis
-    synthesis = (basis / gain[:, None]).T  # (768, 94)
-    start = {
-        heart_in.transform.weight: analysis[:, :, None, None],
-        heart_in.transform.bias: -analysis @ mean,
-        heart_in.mix.weight: _LATENT_RMS * mixing[:, :, None, None],
-        heart_out.unmix.weight: mixing.T[:, :, None, None] / _LATENT_RMS,
-        heart_out.unmix.bias: np.zeros(LATENT_CHANNELS),
-        heart_out.log_power: np.log(power),
-        heart_out.transform.weight: synthesis[:, :, None, None],
-        heart_out.transform.bias: mean,
-    }
+    encoder, decoder = model.encoder, model.decoder
     with torch.no_grad():
-        for weight, values in start.items():
-            if weight is not None:
-                weight.copy_(torch.from_numpy(values))
+        if isinstance(encoder, Encoder) and isinstance(decoder, Decoder):
+            _start_heart(encoder.linear, decoder.linear, linear_link(images, LATENT_CHANNELS, generator))
+        elif isinstance(encoder, VitEncoder) and isinstance(decoder, VitDecoder):
+            _start_vit(encoder, decoder, linear_link(images, LATENT_CHANNELS, generator))
+        elif isinstance(encoder, MaeEncoder) and isinstance(decoder, MaeDecoder):
+            per_block = encoder.gather.out_channels // encoder.patch_blocks**2
+            _start_mae(encoder, decoder, linear_link(images, min(per_block, LATENT_CHANNELS), generator))
+        else:
+            raise ConfigError(
+                "start must be 'random' for an architecture that is not linear anywhere, got 'klt'"
+            )
+
+
+def _set(weight: torch.Tensor | None, values: Array) -> None:
+    assert weight is not None
+    weight.copy_(torch.from_numpy(values).reshape(weight.shape))
+
+
+def _bias(layer: nn.Conv2d | nn.ConvTranspose2d) -> torch.Tensor:
+    assert layer.bias is not None
+    return layer.bias
+
+
+def _start_heart(heart_in: BlockAnalysis, heart_out: BlockSynthesis, link: LinearLink) -> None:
+    _set(heart_in.transform.weight, link.analysis)
+    _set(heart_in.transform.bias, -link.analysis @ link.mean)
+    _set(heart_in.mix.weight, link.mix)
+    _set(heart_out.unmix.weight, link.unmix)
+    _set(heart_out.unmix.bias, np.zeros(LATENT_CHANNELS))
+    _set(heart_out.log_power, np.log(link.power))
+    _set(heart_out.transform.weight, link.synthesis)
+    _set(heart_out.transform.bias, link.mean)
+
+
+def _start_vit(encoder: VitEncoder, decoder: VitDecoder, link: LinearLink) -> None:
+    """The first values of a token are coefficients; the others start at random and are not read yet."""
+    count = link.power.size
+    _set(encoder.stem.weight[:count], link.analysis)
+    _set(_bias(encoder.stem)[:count], -link.analysis @ link.mean)
+    encoder.head.weight.zero_()
+    _bias(encoder.head).zero_()
+    _set(encoder.head.weight[:, :count], link.mix)
+    decoder.stem.weight[:count].zero_()
+    _bias(decoder.stem)[:count].zero_()
+    _set(decoder.stem.weight[:count, :LATENT_CHANNELS], link.unmix)
+    decoder.head.weight.zero_()
+    _set(decoder.head.weight[:, :count], link.synthesis * link.wiener(_START_SNR_DB))
+    _set(_bias(decoder.head), link.mean)
+
+
+def _start_mae(encoder: MaeEncoder, decoder: MaeDecoder, link: LinearLink) -> None:
+    """As ``_start_vit``; a token holds as many coefficients of each of its blocks as it has room for."""
+    count = link.power.size
+    _set(encoder.stem.weight[:count], link.analysis)
+    _set(_bias(encoder.stem)[:count], -link.analysis @ link.mean)
+    decoder.head.weight.zero_()
+    _set(decoder.head.weight[:, :count], link.synthesis * link.wiener(_START_SNR_DB))
+    _set(_bias(decoder.head), link.mean)
+    used = count * encoder.patch_blocks**2
+    for weight in (encoder.gather.weight, decoder.stem.weight):
+        weight[:used].zero_()
+    for layer in (encoder.gather, decoder.stem):
+        _bias(layer)[:used].zero_()
+    for spread in (encoder.head, decoder.spread):
+        spread.weight.zero_()
+        _bias(spread).zero_()
+    for block in range(encoder.patch_blocks**2):
+        own = slice(block * count, (block + 1) * count)
+        place = divmod(block, encoder.patch_blocks)
+        _set(encoder.gather.weight[own, :count, *place], np.eye(count))
+        _set(encoder.head.weight[own, :, *place], link.mix.T)
+        _set(decoder.stem.weight[own, :LATENT_CHANNELS, *place], link.unmix)
+        _set(decoder.spread.weight[own, :count, *place], np.eye(count))

@@ -34,10 +34,11 @@ def masked_image_loss(
     num_kept = min(count - 1, max(1, round((1.0 - mask_share) * count)))
     order = torch.rand(batch, count, generator=generator).argsort(dim=1).to(x.device)
     kept = order[:, :num_kept, None].expand(-1, -1, dim)
-    visible = encoder.trunk.refine(encoder.trunk.place(f).gather(1, kept))
+    tokens, where = encoder.trunk.place(f)
+    visible = encoder.trunk.refine(tokens.gather(1, kept), where.expand(batch, -1, -1).gather(1, kept))
     full = decoder.mask_token.to(visible.dtype).expand(batch, count, dim).scatter(1, kept, visible)
     grid = full.transpose(1, 2).reshape(batch, dim, rows, columns)
-    tokens = decoder.trunk.refine(decoder.trunk.place(grid))
+    tokens = decoder.trunk.refine(*decoder.trunk.place(grid))
     pixels, _ = decoder.pixels(tokens.transpose(1, 2).reshape(batch, dim, rows, columns))
     is_hidden = torch.ones(batch, count, device=x.device).scatter(1, order[:, :num_kept], 0.0)
     height, width = x.shape[2:]

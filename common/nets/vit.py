@@ -47,7 +47,11 @@ def positions(rows: int, columns: int, dim: int, like: Tensor) -> Tensor:
 
 
 class TransformerBlock(nn.Module):
-    """Pre-norm attention and a two-layer network; the second layers start at zero."""
+    """Pre-norm attention and a two-layer network; the second layers start at zero.
+
+    Attention is told positions anew in every block (as in DETR, Carion et al. 2020), so that tokens carry
+    nothing but the image: a linear transform passes untrained blocks as it is.
+    """
 
     def __init__(self, dim: int, heads: int) -> None:
         super().__init__()
@@ -61,10 +65,10 @@ class TransformerBlock(nn.Module):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Refine tokens ``(B, N, dim)``."""
+    def forward(self, x: Tensor, where: Tensor) -> Tensor:
+        """Refine tokens ``(B, N, dim)`` at positions ``(1 or B, N, dim)``."""
         batch, count, dim = x.shape
-        parts = self.qkv(self.norm1(x)).view(batch, count, 3, self.heads, dim // self.heads)
+        parts = self.qkv(self.norm1(x) + where).view(batch, count, 3, self.heads, dim // self.heads)
         q, k, v = parts.permute(2, 0, 3, 1, 4)
         mixed = scaled_dot_product_attention(q, k, v).transpose(1, 2).reshape(batch, count, dim)
         x = x + self.out(mixed)
@@ -78,28 +82,29 @@ class Trunk(nn.Module):
     def __init__(self, dim: int, heads: int, depth: int) -> None:
         super().__init__()
         self.condition = nn.Linear(NUM_CONDITIONS, dim)
+        nn.init.zeros_(self.condition.weight)
+        nn.init.zeros_(self.condition.bias)
         self.blocks = nn.ModuleList(TransformerBlock(dim, heads) for _ in range(depth))
-        self.norm = nn.LayerNorm(dim)
 
     def forward(self, f: Tensor, condition: Tensor) -> Tensor:
         """Refine ``(B, dim, h, w)`` under a ``(B, 1)`` link state."""
         batch, dim, rows, columns = f.shape
-        tokens = self.refine(self.place(f) + self.condition(condition)[:, None].to(f.dtype))
+        tokens, where = self.place(f)
+        tokens = self.refine(tokens + self.condition(condition)[:, None].to(f.dtype), where)
         grid: Tensor = tokens.transpose(1, 2).reshape(batch, dim, rows, columns)
         return grid
 
-    def place(self, f: Tensor) -> Tensor:
-        """Turn ``(B, dim, h, w)`` into tokens ``(B, h * w, dim)`` that know their position."""
+    def place(self, f: Tensor) -> tuple[Tensor, Tensor]:
+        """Turn ``(B, dim, h, w)`` into tokens ``(B, h * w, dim)`` and positions ``(1, h * w, dim)``."""
         _, dim, rows, columns = f.shape
         tokens = f.flatten(2).transpose(1, 2)
-        return tokens + positions(rows, columns, dim, tokens)
+        return tokens, positions(rows, columns, dim, tokens)
 
-    def refine(self, tokens: Tensor) -> Tensor:
-        """Pass tokens ``(B, N, dim)`` through all blocks."""
+    def refine(self, tokens: Tensor, where: Tensor) -> Tensor:
+        """Pass tokens ``(B, N, dim)`` at positions ``(1 or B, N, dim)`` through all blocks."""
         for block in self.blocks:
-            tokens = block(tokens)
-        refined: Tensor = self.norm(tokens)
-        return refined
+            tokens = block(tokens, where)
+        return tokens
 
 
 class VitEncoder(nn.Module):

@@ -5,7 +5,7 @@ import torch
 from semcast.common.errors import ConfigError
 from semcast.common.nets.registry import build
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
-from semcast.training.klt import block_statistics, start_from_klt
+from semcast.training.klt import LinearLink, block_statistics, linear_link, start_from_klt
 
 TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
 
@@ -37,19 +37,39 @@ def test_images_without_a_block_are_refused():
         block_statistics([np.zeros((16, 16, 3), np.uint8)])
 
 
+@pytest.mark.parametrize(
+    ("model", "psnr_db"),
+    [(build_3dcsc(TINY), 20.0), (build("vit"), 20.0), (build("mae"), 18.0)],
+    ids=["3dcsc", "vit", "mae"],
+)
 @pytest.mark.parametrize("flag", [0.0, 1.0])
-def test_before_any_training_the_link_already_carries_the_image(flag):
+def test_before_any_training_the_link_already_carries_the_image(model, psnr_db, flag):
     torch.manual_seed(0)
     photos = smooth_photos()
-    model = build_3dcsc(TINY).eval()
-    start_from_klt(model, photos, torch.Generator().manual_seed(0))
+    start_from_klt(model.eval(), photos, torch.Generator().manual_seed(0))
     x = torch.from_numpy(photos[0][::2, ::2].copy()).permute(2, 0, 1)[None] / 255.0
     snr_db, is_qam = torch.full((1,), 20.0), torch.full((1,), flag)
     with torch.inference_mode():
         latent = model.latent(x, snr_db, is_qam)
         symbols = model.transmit(latent, is_qam) * (100 / 101)
         x_hat, _ = model.receive(symbols, torch.full((1, 1, 6, 6), 20.0), is_qam)
-    assert -10 * torch.log10((x_hat - x).square().mean()) > 20.0
+    assert -10 * torch.log10((x_hat - x).square().mean()) > psnr_db
+
+
+def test_the_linear_link_returns_what_its_coefficients_hold():
+    link = linear_link(smooth_photos(), 40, torch.Generator().manual_seed(0))
+    np.testing.assert_allclose(link.unmix @ link.mix, np.eye(40), atol=1e-6)
+    np.testing.assert_allclose(link.analysis @ link.synthesis, np.eye(40), atol=1e-6)
+    assert link.power.mean() == pytest.approx(1.0)
+    rms = np.sqrt(np.mean((link.mix**2) @ link.power))
+    assert rms == pytest.approx(0.9, rel=1e-3)
+
+
+def test_wiener_gains_by_hand():
+    # Half the latent for one coefficient each, 0 dB: noise 1/2 a coefficient, shrunk by 1/2 on the way.
+    eye = np.eye(47)
+    link = LinearLink(eye, eye, np.ones(47), eye, eye, eye)
+    np.testing.assert_allclose(link.wiener(0.0), 1.0 / 1.5 * 2.0)
 
 
 def test_an_architecture_without_a_linear_heart_is_refused():

@@ -37,7 +37,7 @@ def test_the_encoder_does_not_see_what_is_hidden():
     kept = torch.rand(1, 4, generator=seeded()).argsort(dim=1)[0, 0].item()
     x.requires_grad_(True)
     seen = []
-    model.encoder.trunk.norm.register_forward_hook(lambda layer, given, out: seen.append(out))
+    model.encoder.trunk.blocks[-1].register_forward_hook(lambda layer, given, out: seen.append(out))
     masked_image_loss(model, x, 0.75, seeded())
     (seen[0] * torch.arange(32.0)).sum().backward()
     row, column = 48 * (kept // 2), 48 * (kept % 2)
