@@ -20,8 +20,8 @@ from semcast.common.shapes import check_shape
 #: Largest finite value a sample may have: float16 ends at 65504.
 _LARGEST = 65000.0
 _ON_THE_GRID = 1e-3
-#: Payloads of 4-bit indices, and the factor on the points of the plain constellation.
-_SPACING: Mapping[PayloadFormat, float] = {"qam16": 1.0, "qam16_shaped": SHAPED_SPACING}
+#: Payloads of 4-bit indices, the more frequent first, and the factor on the points of the plain constellation.
+_SPACING: Mapping[PayloadFormat, float] = {"qam16_shaped": SHAPED_SPACING, "qam16": 1.0}
 
 
 def pack_iq(samples: NDArray[np.complex64]) -> bytes:
