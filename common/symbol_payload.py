@@ -20,7 +20,7 @@ from semcast.common.shapes import check_shape
 #: Largest finite value a sample may have: float16 ends at 65504.
 _LARGEST = 65000.0
 _ON_THE_GRID = 1e-3
-#: Payloads of 4-bit indices, the more frequent first, and the factor on the points of the plain constellation.
+#: Payloads of 4-bit indices, the more frequent first, and the factor on the points of plain 16-QAM.
 _SPACING: Mapping[PayloadFormat, float] = {"qam16_shaped": SHAPED_SPACING, "qam16": 1.0}
 
 
