@@ -29,15 +29,12 @@ def gradients(image: Tensor) -> tuple[Tensor, Tensor]:
     return both[:, :1], both[:, 1:]
 
 
-def lucas_kanade_step(
-    original: Tensor, decoded: Tensor, window_px: int = KLT_WINDOW_PX
-) -> tuple[Tensor, Tensor]:
-    """Take one Lucas-Kanade step at every pixel.
+def lucas_kanade_step(original: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
+    """Take one Lucas-Kanade step at every pixel, over the window of the tracker, which averages as much.
 
     Args:
         original: ``(B, 1, H, W)`` grey image in [0, 1].
         decoded: Its decoded version.
-        window_px: Side of the square window, odd; that of the tracker, which averages as much.
 
     Returns:
         The length of the step in px, clipped to ``MAX_DISPLACEMENT_PX``, and the corner strength: the smaller
@@ -53,8 +50,8 @@ def lucas_kanade_step(
     a, b, c = mean(tensor, _CORNER_PX).split(1, dim=1)
     half_trace, spread = (a + c) / 2, (((a - c) / 2).square() + b.square()).sqrt()
     strength = (half_trace - spread).clamp_min(0.0)
-    a, b, c = mean(tensor, window_px).split(1, dim=1)
-    ex, ey = mean(torch.cat((ix * it, iy * it), dim=1), window_px).split(1, dim=1)
+    a, b, c = mean(tensor, KLT_WINDOW_PX).split(1, dim=1)
+    ex, ey = mean(torch.cat((ix * it, iy * it), dim=1), KLT_WINDOW_PX).split(1, dim=1)
     damping = 1e-5
     determinant = (a + damping) * (c + damping) - b * b
     dx = (b * ey - (c + damping) * ex) / determinant

@@ -28,10 +28,9 @@ def _density(x: NDArray[np.float64] | float) -> NDArray[np.float64]:
     return np.exp(-0.5 * np.square(x)) / math.sqrt(2.0 * math.pi)
 
 
-_EDGE = LEVEL_STEP / LOADING
 #: Mean size of Gaussian values that got an inner, an outer level.
-MEAN_INNER: Final = LOADING * 2.0 * float(_density(0.0) - _density(_EDGE)) / (1.0 - SHAPED_OUTER_SHARE)
-MEAN_OUTER: Final = LOADING * 2.0 * float(_density(_EDGE)) / SHAPED_OUTER_SHARE
+MEAN_INNER: Final = LOADING * 2.0 * float(_density(0.0) - _density(1.0)) / (1.0 - SHAPED_OUTER_SHARE)
+MEAN_OUTER: Final = LOADING * 2.0 * float(_density(1.0)) / SHAPED_OUTER_SHARE
 
 
 @cache

@@ -310,10 +310,10 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
 def _share_left(problem: BundleProblem, known: NDArray[np.bool_]) -> Array:
     """Share of each observation's noise variance that is left in its residual, ``(M,)``, perhaps below 0.
 
-    Unknowns were fitted to the observations, which takes their leverage off the variance. The three unknowns
-    of a landmark and the six of a view are shared out among their observations by weight: what has more
-    weight is fitted more closely. Without that, weights would make the very residuals that then ask for
-    stronger weights.
+    Unknowns were fitted to the observations, which takes their leverage (the diagonal of the hat matrix, here
+    landmark by landmark and view by view) off the variance. The three unknowns of a landmark and the six of a
+    view are shared out among their observations by weight: what has more weight is fitted more closely.
+    Without that, weights would make the very residuals that then ask for stronger weights.
     """
     weight = np.where(known, problem.sigma_px**-2.0, 0.0)
     of_point = np.bincount(problem.point, weight, minlength=len(problem.xyz))[problem.point]

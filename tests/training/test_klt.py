@@ -38,15 +38,16 @@ def test_images_without_a_block_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("model", "psnr_db"),
-    [(build_3dcsc(TINY), 20.0), (build("vit"), 20.0), (build("mae"), 18.0)],
+    ("make", "psnr_db"),
+    [(lambda: build_3dcsc(TINY), 20.0), (lambda: build("vit"), 20.0), (lambda: build("mae"), 18.0)],
     ids=["3dcsc", "vit", "mae"],
 )
 @pytest.mark.parametrize("flag", [0.0, 1.0])
-def test_before_any_training_the_link_already_carries_the_image(model, psnr_db, flag):
+def test_before_any_training_the_link_already_carries_the_image(make, psnr_db, flag):
     torch.manual_seed(0)
     photos = smooth_photos()
-    start_from_klt(model.eval(), photos, torch.Generator().manual_seed(0))
+    model = make().eval()
+    start_from_klt(model, photos, torch.Generator().manual_seed(0))
     x = torch.from_numpy(photos[0][::2, ::2].copy()).permute(2, 0, 1)[None] / 255.0
     snr_db, is_qam = torch.full((1,), 20.0), torch.full((1,), flag)
     with torch.inference_mode():
