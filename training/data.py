@@ -21,22 +21,22 @@ class CropSettings:
 
     Attributes:
         size_px: Side of the crop, a multiple of 16.
-        scale_min: Smallest factor a photo is reduced by first: it hides the traces of JPEG.
-        scale_max: Largest.
+        scale_min: Smallest factor a photo is resized by first; reducing hides the traces of JPEG.
+        scale_max: Largest; enlarged photos are as smooth as the frames of many cameras.
         share_grey: Share of crops turned grey, since many cameras are.
     """
 
     size_px: int = field(default=128, metadata={"help": "side of a crop, a multiple of 16"})
-    scale_min: float = field(default=0.5, metadata={"help": "smallest factor a photo is reduced by before"})
+    scale_min: float = field(default=0.5, metadata={"help": "smallest factor a photo is resized by before"})
     scale_max: float = field(default=0.9, metadata={"help": "largest"})
     share_grey: float = field(default=0.18, metadata={"help": "share of crops turned grey"})
 
     def __post_init__(self) -> None:
         if self.size_px < 16 or self.size_px % 16:
             raise ValueError(f"size_px must be a positive multiple of 16, got {self.size_px}")
-        if not 0.0 < self.scale_min <= self.scale_max <= 1.0:
+        if not 0.0 < self.scale_min <= self.scale_max <= 2.0:
             raise ValueError(
-                "scale_min and scale_max must be in (0, 1] and ordered, "
+                "scale_min and scale_max must be in (0, 2] and ordered, "
                 f"got {self.scale_min}, {self.scale_max}"
             )
 
@@ -60,7 +60,7 @@ def read_images(folder: Path) -> list[NDArray[np.uint8]]:
 def random_crop(
     image: NDArray[np.uint8], settings: CropSettings, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Reduce, cut, mirror, turn, and sometimes change contrast or colour; ``(size, size, 3)`` uint8."""
+    """Resize, cut, mirror, turn, and sometimes change contrast or colour; ``(size, size, 3)`` uint8."""
     size = settings.size_px
     smallest = size / min(image.shape[:2])
     scale = max(smallest, rng.uniform(settings.scale_min, settings.scale_max))
@@ -68,7 +68,8 @@ def random_crop(
     row = int(rng.integers(image.shape[0] - source + 1))
     column = int(rng.integers(image.shape[1] - source + 1))
     cut = image[row : row + source, column : column + source]
-    crop = cv2.resize(cut, (size, size), interpolation=cv2.INTER_AREA) if source != size else cut
+    how = cv2.INTER_AREA if source > size else cv2.INTER_CUBIC
+    crop = cv2.resize(cut, (size, size), interpolation=how) if source != size else cut
     crop = np.rot90(crop, int(rng.integers(4)))
     if rng.random() < 0.5:
         crop = crop[:, ::-1]
