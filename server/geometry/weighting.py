@@ -33,6 +33,8 @@ SIGMA0_RANGE_PX = (0.25, 6.0)
 _MIN_GATE_SIGMA_PX = 0.6
 #: The pixel confidence is trained on ``1 - tanh(30 |x_hat - x|)`` (paper Sec. III-B) with images in [0, 1].
 _LABEL_SHARPNESS = 30.0
+#: What tracking errs by without a link, and the expected error from which a position is worth nothing.
+_TRACKING_PX, _MOST_PX = 0.3, 5.0
 #: Median of |x| / sigma under normal noise.
 _MAD_TO_SIGMA = 1.0 / 0.67449
 
@@ -195,6 +197,7 @@ class KeypointCues:
         gradient_grey2: ``(N,)`` smaller eigenvalue of the structure tensor, mean over the window per pixel.
         forward_backward_px: ``(N,)`` distance of tracking there and back.
         photometric_grey: ``(N,)`` mean absolute difference of the tracked windows.
+        drift_px2: ``(N,)`` variance left behind by the images a point was followed through; 0 where it is new.
     """
 
     pixel_confidence: Array | None
@@ -202,10 +205,11 @@ class KeypointCues:
     gradient_grey2: Array
     forward_backward_px: Array
     photometric_grey: Array
+    drift_px2: Array | float = 0.0
 
 
-def geometric_confidence(cues: KeypointCues) -> Array:
-    """Confidence in a keypoint's *position*: ``1 / (1 + d)`` of the displacement ``d`` that is expected.
+def localisation_variance_px2(cues: KeypointCues) -> Array:
+    """Square of the displacement that is expected in this image alone, ``(N,)``, drift left out.
 
     Pixel confidence alone misleads: pixel errors are largest on strong edges, where localisation is best. So
     the image noise it stands for is divided by the structure tensor (the localisation bound), and what the
@@ -222,7 +226,19 @@ def geometric_confidence(cues: KeypointCues) -> Array:
     if cues.keypoint_confidence is not None:
         head_px = displacement_px(np.clip(cues.keypoint_confidence, 0.0, 1.0).astype(np.float32))
         variance_px2 = variance_px2 + np.minimum(head_px.astype(np.float64), 20.0) ** 2
-    return np.asarray(1.0 / (1.0 + np.sqrt(variance_px2)))
+    return np.asarray(variance_px2)
+
+
+def geometric_confidence(cues: KeypointCues) -> Array:
+    """Confidence in a keypoint's *position*, of the variance ``v`` that is expected: a logarithm of it.
+
+    ``c = 1 - log(1 + v / s^2) / log(1 + v_max / s^2)`` turns ``sigma0^2 exp(beta (1 - c))`` into a power of
+    ``1 + v / s^2``: what the link adds to the error ``s`` that tracking makes on clean images too. Small
+    differences of ``v`` below it say nothing, and points are then weighted alike.
+    """
+    variance_px2 = localisation_variance_px2(cues) + cues.drift_px2
+    doubt = np.log1p(variance_px2 / _TRACKING_PX**2) / np.log1p((_MOST_PX / _TRACKING_PX) ** 2)
+    return np.asarray(1.0 - np.minimum(doubt, 1.0))
 
 
 def observation_confidence(mode: ConfidenceMode, cues: KeypointCues, rng: np.random.Generator) -> Array:

@@ -78,9 +78,11 @@ def test_the_first_end_is_a_new_corner_and_the_second_one_was_followed(matches):
         forward_backward_px=np.full(150, 0.3),
     )
     # First: 2 grey levels over 16 * 100 give 0.05 px, with 0.1 px of a new corner. Second: 0.3 px.
-    np.testing.assert_allclose(match_confidence("robust", still, 0), 1 / 1.3, rtol=1e-3)
+    whole = np.log(1 + (5 / 0.3) ** 2)
+    np.testing.assert_allclose(match_confidence("robust", still, 0), 1 - np.log(2) / whole, rtol=1e-3)
     calm = replace(still, forward_backward_px=np.zeros(150))
-    np.testing.assert_allclose(match_confidence("robust", calm, 0), 1 / (1 + np.hypot(0.05, 0.1)))
+    first = 1 - np.log(1 + (0.05**2 + 0.1**2) / 0.3**2) / whole
+    np.testing.assert_allclose(match_confidence("robust", calm, 0), first)
 
 
 def test_shuffling_depends_on_the_seed_alone(matches):

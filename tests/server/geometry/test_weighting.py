@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from semcast.server.geometry.weighting import (
     fit_noise,
     fuse_confidence,
     geometric_confidence,
+    localisation_variance_px2,
     observation_confidence,
     sampling_probability,
 )
@@ -129,12 +132,26 @@ def test_fit_can_be_switched_off():
     assert noise.model == NoiseModel(0.7, 2.0)
 
 
-def test_geometric_confidence_by_hand():
+def test_localisation_variance_by_hand():
     # 2 grey levels of noise, 16 independent values of gradient energy 100: variance 4 / 1600 = 0.05^2.
-    assert np.allclose(geometric_confidence(cues(forward_backward_px=np.full(4, 0.12))), 1 / (1 + 0.13))
-    # The displacement head alone says 3 px: c = 0.25.
+    assert np.allclose(localisation_variance_px2(cues(forward_backward_px=np.full(4, 0.12))), 0.13**2)
+    # The displacement head alone says 3 px.
     sure = cues(keypoint_confidence=np.full(4, 0.25), gradient_grey2=np.full(4, 1e12))
-    assert np.allclose(geometric_confidence(sure), 0.25, atol=1e-6)
+    assert np.allclose(localisation_variance_px2(sure), 9.0, atol=1e-5)
+
+
+def test_geometric_confidence_by_hand():
+    calm = cues(gradient_grey2=np.full(4, 1e12))
+    # 0 at 5 px; with 0.4 px of drift v = 0.16, and c = 1 - log(1 + 0.16 / 0.09) / log(1 + 25 / 0.09).
+    drifted = geometric_confidence(replace(calm, drift_px2=np.array([0.0, 0.16, 25.0, 100.0])))
+    assert np.allclose(drifted, [1.0, 1 - 1.02165 / 5.63040, 0.0, 0.0], atol=1e-5)
+
+
+def test_doubt_adds_to_the_error_of_tracking_where_beta_is_its_own_unit():
+    v = np.array([0.0, 0.01, 0.09, 1.0])
+    c = geometric_confidence(replace(cues(gradient_grey2=np.full(4, 1e12)), drift_px2=v))
+    model = NoiseModel(0.3, float(np.log(1 + 25 / 0.09)))
+    assert np.allclose(model.sigma_px(c) ** 2, 0.09 + v, atol=1e-6)
 
 
 def test_a_strong_edge_is_trusted_more_than_a_weak_one_under_the_same_noise():
@@ -152,6 +169,7 @@ def test_every_cue_lowers_the_confidence():
         {"pixel_confidence": np.full(4, 0.1)},
         {"keypoint_confidence": np.full(4, 0.5)},
         {"gradient_grey2": np.full(4, 1.0)},
+        {"drift_px2": np.full(4, 0.1)},
     ):
         assert np.all(geometric_confidence(cues(**changes)) < calm)
 

@@ -115,6 +115,23 @@ def test_low_confidence_in_the_maps_lowers_that_of_tracks():
     assert low.confidence.mean() < 0.6 * high.confidence.mean()
 
 
+def test_a_track_keeps_a_part_of_the_doubt_of_the_images_it_came_through():
+    doubtful = np.full(SHAPE, 0.5, np.float32)  # the displacement head expects 1 px
+    certain = np.ones(SHAPE, np.float32)
+    through, around = begin(), begin()
+    for tracks, middle in ((through, doubtful), (around, certain)):
+        for k, head in enumerate((certain, middle, certain)):
+            tracks.follow(sight_at(21 + k, frame_id=1 + k, keypoint_confidence=head), tracks.xy - [1, 0])
+    ids, row, other = np.intersect1d(through.ids, around.ids, return_indices=True)
+    assert len(ids) > 50
+    assert np.all(through.confidence[row] < around.confidence[other])
+    assert np.allclose(through.drift_px2[row] - around.drift_px2[other], 0.2, atol=0.02)
+    # A point that begins now has come through nothing.
+    through.keep(through.ids < 40)
+    through.refill(sight_at(23, frame_id=3))
+    assert np.all(through.drift_px2[through.age == 1] == 0.0)
+
+
 def test_nan_maps_give_finite_confidence():
     tracks = begin(
         confidence=np.full(SHAPE, np.nan, np.float32), keypoint_confidence=np.full(SHAPE, np.nan, np.float32)
