@@ -30,7 +30,10 @@ def gradients(image: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def window_mean(values: Tensor, side_px: int) -> Tensor:
-    """Mean over a square window, cut at the edges, of ``(B, C, H, W)``; rows, then columns: a tenth of the time."""
+    """Mean over a square window, cut at the edges, of ``(B, C, H, W)``.
+
+    Rows, then columns: a tenth of the time of the square at once.
+    """
     half = side_px // 2
     rows = avg_pool2d(values, (1, side_px), stride=1, padding=(0, half), count_include_pad=False)
     return avg_pool2d(rows, (side_px, 1), stride=1, padding=(half, 0), count_include_pad=False)
@@ -47,7 +50,6 @@ def lucas_kanade_step(original: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor
         The length of the step in px, clipped to ``MAX_DISPLACEMENT_PX``, and the corner strength: the smaller
         eigenvalue of the structure tensor, mean over a small window, both ``(B, 1, H, W)``.
     """
-
     ix, iy = gradients(original)
     it = decoded - original
     tensor = torch.cat((ix * ix, ix * iy, iy * iy), dim=1)

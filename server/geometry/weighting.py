@@ -197,7 +197,7 @@ class KeypointCues:
         gradient_grey2: ``(N,)`` smaller eigenvalue of the structure tensor, mean over the window per pixel.
         forward_backward_px: ``(N,)`` distance of tracking there and back.
         photometric_grey: ``(N,)`` mean absolute difference of the tracked windows.
-        drift_px2: ``(N,)`` variance left behind by the images a point was followed through; 0 where it is new.
+        drift_px2: ``(N,)`` variance left by the images a point was followed through; 0 where it is new.
     """
 
     pixel_confidence: Array | None
@@ -229,16 +229,20 @@ def localisation_variance_px2(cues: KeypointCues) -> Array:
     return np.asarray(variance_px2)
 
 
-def geometric_confidence(cues: KeypointCues) -> Array:
+def variance_confidence(variance_px2: Array) -> Array:
     """Confidence in a keypoint's *position*, of the variance ``v`` that is expected: a logarithm of it.
 
     ``c = 1 - log(1 + v / s^2) / log(1 + v_max / s^2)`` turns ``sigma0^2 exp(beta (1 - c))`` into a power of
     ``1 + v / s^2``: what the link adds to the error ``s`` that tracking makes on clean images too. Small
     differences of ``v`` below it say nothing, and points are then weighted alike.
     """
-    variance_px2 = localisation_variance_px2(cues) + cues.drift_px2
     doubt = np.log1p(variance_px2 / _TRACKING_PX**2) / np.log1p((_MOST_PX / _TRACKING_PX) ** 2)
     return np.asarray(1.0 - np.minimum(doubt, 1.0))
+
+
+def geometric_confidence(cues: KeypointCues) -> Array:
+    """Confidence in a keypoint's position of everything that is known about it, ``(N,)`` in [0, 1]."""
+    return variance_confidence(localisation_variance_px2(cues) + cues.drift_px2)
 
 
 def observation_confidence(mode: ConfidenceMode, cues: KeypointCues, rng: np.random.Generator) -> Array:

@@ -18,8 +18,9 @@ from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
 
-#: Keyframes whose images are kept.
-NUM_IMAGES = 3
+#: Keyframes whose images are kept, as many as an adjustment takes, and those of them that are looked at here.
+NUM_IMAGES = 10
+_NUM_RECALLED = 3
 #: A point is looked for no nearer to the border than this.
 _BORDER_PX = 8
 
@@ -69,7 +70,7 @@ def recall_landmarks(
     T_cam_world = invert_transform(T_world_cam)
     height, width = sight.grey.shape
     found = [np.zeros(0, np.int64)]
-    for image in reversed(images):
+    for image in list(images)[: -_NUM_RECALLED - 1 : -1]:
         keyframe = next((k for k in reversed(world.keyframes) if k.frame_id == image.frame_id), None)
         if keyframe is None or keyframe.submap != submap:
             continue

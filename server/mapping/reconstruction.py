@@ -12,6 +12,7 @@ from semcast.common.shapes import check_shape
 from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.motion import ConstantVelocity
 from semcast.server.mapping import mapper
+from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.initialiser import Initialiser, Observed, Start, pose_of
 from semcast.server.mapping.map_builder import MapBuilder
@@ -21,6 +22,7 @@ from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.mapping.tracker import MIN_BELIEVED_SHARE, TrackedPose, expected_positions, track_pose
 from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
+from semcast.server.mapping.world_map import Keyframe
 
 __all__ = ["Reconstruction", "ReconstructionSettings"]
 
@@ -258,6 +260,7 @@ class Reconstruction:
         )
         if is_keyframe:
             since = time.perf_counter_ns()
+            pose = self._anchored(sight, pose, reference)
             tracks.refill(sight)
             self._map.make_keyframe(sight, tracks, pose.T_world_cam)
             self._frames_since_keyframe = 0
@@ -265,6 +268,25 @@ class Reconstruction:
             self._try_to_join(sight, pose.T_world_cam)
         T_world_cam = self._map.world.pose_of_frame(frame.frame_id)
         return self._result(frame, T_world_cam, pose, is_keyframe=is_keyframe, backfilled=backfilled)
+
+    def _anchored(self, sight: Sight, pose: TrackedPose, reference: Keyframe) -> TrackedPose:
+        """Take the drift out of the tracks of a keyframe to be, and its pose from them anew."""
+        tracks, world = self._tracks, self._map.world
+        num_aligned = anchor_tracks(
+            self._camera,
+            world,
+            self._map.images,
+            tracks,
+            sight,
+            pose.T_world_cam,
+            submap=self._map.submap,
+        )
+        anew = self._pose(pose.T_world_cam) if num_aligned else None
+        if anew is None:
+            return pose
+        world.add_frame(sight.frame.frame_id, reference.frame_id, anew.T_world_cam)
+        self._moved(1.0)
+        return anew
 
     # -- starting and finding back -----------------------------------------------------------------------
 

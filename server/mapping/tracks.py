@@ -21,6 +21,7 @@ from semcast.server.geometry.weighting import (
     KeypointCues,
     localisation_variance_px2,
     observation_confidence,
+    variance_confidence,
 )
 from semcast.server.geometry.wide_search import search_wide
 from semcast.server.mapping.state import DecodedFrame
@@ -72,10 +73,10 @@ class Sight:
 #: After a jump a point is looked for no further than this from where descriptors put it.
 _MAX_FROM_JUMP_PX = 25.0
 #: What a track has, by attribute of ``TrackTable``.
-_COLUMNS = ("ids", "xy", "velocity", "confidence", "drift_px2", "age", "missed")
-#: Share of an image's localisation variance that stays with a point followed on from it. Most of it goes with the
-#: image: the next step begins where this one ended, and takes its error back. Measured against tracks of the
-#: original images.
+_COLUMNS = ("ids", "xy", "velocity", "confidence", "variance_px2", "drift_px2", "age", "missed")
+#: Share of an image's localisation variance that stays with a point followed on from it. Most of it goes with
+#: the image: the next step begins where this one ended, and takes its error back. Measured against tracks of
+#: the original images.
 _KEPT_VARIANCE = 0.2
 
 
@@ -110,6 +111,7 @@ class TrackTable:
         xy: ``(N, 2)`` newest position, in the image of its last sight.
         velocity: ``(N, 2)`` pixels per frame at the last sight.
         confidence: ``(N,)`` of the newest position.
+        variance_px2: ``(N,)`` of the newest position, as its image alone makes it.
         drift_px2: ``(N,)`` variance that a next position takes over from those before.
         age: ``(N,)`` int64, frames it was seen in.
         missed: ``(N,)`` int64, frames since its last sight; 0 is visible now.
@@ -130,6 +132,7 @@ class TrackTable:
         self.xy: Array = np.zeros((0, 2))
         self.velocity: Array = np.zeros((0, 2))
         self.confidence: Array = np.zeros(0)
+        self.variance_px2: Array = np.zeros(0)
         self.drift_px2: Array = np.zeros(0)
         self.age: Ids = np.zeros(0, np.int64)
         self.missed: Ids = np.zeros(0, np.int64)
@@ -166,6 +169,7 @@ class TrackTable:
         count = len(first)
         self.velocity = np.zeros((count, 2))
         self.confidence = np.full(count, confidence)
+        self.variance_px2 = np.zeros(count)
         self.drift_px2 = np.zeros(count)
         self.age = np.ones(count, np.int64)
         self.missed = np.zeros(count, np.int64)
@@ -277,11 +281,22 @@ class TrackTable:
         )
         self.confidence = self.confidence.copy()
         self.confidence[ok] = observation_confidence(self._mode, cues, self._rng)
-        self.drift_px2 = self.drift_px2.copy()
-        self.drift_px2[ok] += _KEPT_VARIANCE * localisation_variance_px2(cues)
+        self.variance_px2 = self.variance_px2.copy()
+        self.variance_px2[ok] = localisation_variance_px2(cues)
+        self.drift_px2 = self.drift_px2 + _KEPT_VARIANCE * np.where(ok, self.variance_px2, 0.0)
         alive = ok | (coasting & (self.missed <= MAX_COAST))
         alive[ok] &= deduplicate(self.xy[ok])
         self.keep(alive)
+
+    def settle_at(self, rows: NDArray[np.intp], xy: Array) -> None:
+        """Put visible tracks where they were found from an image of long ago: they have no drift then."""
+        self.xy = self.xy.copy()
+        self.xy[rows] = xy
+        self.drift_px2 = self.drift_px2.copy()
+        self.drift_px2[rows] = 0.0
+        if self._mode == "robust":
+            self.confidence = self.confidence.copy()
+            self.confidence[rows] = variance_confidence(self.variance_px2[rows])
 
     def take_up(
         self, sight: Sight, grey0: Grey, ids: Ids, xy0: Array, expected_xy: Array, reach_px: float
@@ -324,6 +339,7 @@ class TrackTable:
             "xy": xy,
             "velocity": np.tile(usual, (len(ids), 1)),
             "confidence": observation_confidence(self._mode, cues, self._rng),
+            "variance_px2": localisation_variance_px2(cues),
             "drift_px2": np.zeros(len(ids)),
             "age": np.ones(len(ids), np.int64),
             "missed": np.zeros(len(ids), np.int64),

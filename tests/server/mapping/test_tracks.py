@@ -1,4 +1,4 @@
-"""Tracks from image to image, and landmarks that get their tracks back."""
+"""Tracks from image to image, their drift taken out, and landmarks that get their tracks back."""
 
 import cv2
 import numpy as np
@@ -7,6 +7,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
 from semcast.server.geometry.features import to_grey
+from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.recall import NUM_IMAGES, SeenFrom, no_images, recall_landmarks
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import MAX_COAST, Sight, TrackTable, usable_rows
@@ -326,4 +327,52 @@ def test_old_images_are_forgotten():
     images = no_images()
     for k in range(NUM_IMAGES + 2):
         images.append(SeenFrom(k, np.zeros((2, 2), np.uint8)))
-    assert [i.frame_id for i in images] == [2, 3, 4]
+    assert [i.frame_id for i in images] == list(range(2, NUM_IMAGES + 2))
+
+
+def anchor(mapped, sight, x, submap=0):
+    world, images, tracks = mapped
+    return anchor_tracks(CAMERA, world, images, tracks, sight, pose_at(x), submap=submap)
+
+
+def test_drift_is_taken_out_at_a_keyframe(mapped, rng):
+    _, _, tracks = mapped
+    true = {i: xy - (10, 0) for i, xy in zip(tracks.ids, tracks.xy, strict=True)}
+    sight = sight_at(30, frame_id=1)
+    tracks.follow(sight, tracks.xy - (10, 0))
+    tracks.xy = tracks.xy + rng.normal(0, 0.7, tracks.xy.shape)
+    tracks.drift_px2[:] = 0.5
+    doubtful = tracks.confidence.copy()
+    visible = int(tracks.visible.sum())
+    assert anchor(mapped, sight, 30) > 0.9 * visible
+    error = np.linalg.norm(tracks.xy - np.array([true[i] for i in tracks.ids]), axis=1)[tracks.visible]
+    assert np.median(error) < 0.05
+    settled = tracks.drift_px2 == 0.0
+    assert settled.sum() > 0.9 * visible
+    assert np.all(tracks.confidence[settled] >= doubtful[settled])
+
+
+def test_without_confidence_drift_is_taken_out_too(mapped):
+    _, _, tracks = mapped
+    tracks._mode = "off"
+    sight = sight_at(24, frame_id=1)
+    tracks.follow(sight, tracks.xy - (4, 0))
+    assert anchor(mapped, sight, 24) > 50
+    assert np.all(tracks.confidence[tracks.visible] <= 1.0)
+
+
+def test_a_track_that_fits_nowhere_stays_where_it_is(mapped):
+    world, images, tracks = mapped
+    sight = sight_at(30, frame_id=1)
+    tracks.follow(sight, tracks.xy - (10, 0))
+    followed = tracks.xy.copy()
+    images.clear()
+    images.append(SeenFrom(0, np.random.default_rng(0).integers(0, 256, SHAPE).astype(np.uint8)))
+    assert anchor(mapped, sight, 30) == 0
+    np.testing.assert_array_equal(tracks.xy, followed)
+    images.clear()
+    images.append(SeenFrom(0, sight_at(START_X).grey))
+    assert anchor(mapped, sight, 30, submap=1) == 0, "a keyframe of another submap has another world"
+    world.landmarks.keep(np.zeros(len(world.landmarks), bool))
+    assert anchor(mapped, sight, 30) == 0, "no depth, no warp"
+    np.testing.assert_array_equal(tracks.xy, followed)

@@ -1,0 +1,89 @@
+"""Takes the drift out of tracks: at keyframes they are aligned with how an earlier keyframe saw them.
+
+Following a point from image to image makes a small error at every step, and a larger one where images are
+noisy: about a pixel in a dozen decoded frames. At a keyframe the pose is known, so that the patch of an older
+keyframe can be warped to how it should look now, and the point put back on it.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.patch_alignment import affine_warps, align_patches
+from semcast.server.mapping.recall import Images
+from semcast.server.mapping.tracks import Sight, TrackTable
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+
+#: Patches that are seen at less than this share of their area, or more than its inverse, have other details.
+_MIN_AREA_RATIO = 0.4
+#: A point that would move further than this has found something else.
+_MAX_MOVE_PX = 3.0
+_MIN_CORRELATION = 0.7
+_MIN_DEPTH_MAP = 1e-3
+
+
+def anchor_tracks(
+    camera: Intrinsics,
+    world: WorldMap,
+    images: Images,
+    tracks: TrackTable,
+    sight: Sight,
+    T_world_cam: Array,
+    *,
+    submap: int,
+) -> int:
+    """Align the tracks of landmarks in sight, each with the oldest kept keyframe that saw it.
+
+    A track that does not fit there stays where it is.
+
+    Args:
+        camera: Pinhole.
+        world: The map.
+        images: Of the newest keyframes.
+        tracks: Followed to the new image; moved.
+        sight: The new image.
+        T_world_cam: Its pose.
+        submap: The current one.
+
+    Returns:
+        How many tracks were aligned.
+    """
+    by_id = {k.frame_id: k for k in world.keyframes if k.submap == submap}
+    T_cam_world = invert_transform(T_world_cam)
+    landmark = world.landmarks.rows(tracks.ids)
+    waiting = tracks.visible & (landmark >= 0)
+    num_aligned = 0
+    for image in images:  # oldest first
+        keyframe = by_id.get(image.frame_id)
+        if keyframe is None:
+            continue
+        rows, xy0 = _shared(tracks, waiting, keyframe)
+        T_anchor_world = invert_transform(keyframe.T_world_cam)
+        depth = world.landmarks.xyz[landmark[rows]] @ T_anchor_world[2, :3] + T_anchor_world[2, 3]
+        before = depth > _MIN_DEPTH_MAP
+        rows, xy0, depth = rows[before], xy0[before], depth[before]
+        warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
+        area = np.linalg.det(warps)
+        alike = (depth_now > _MIN_DEPTH_MAP) & (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
+        rows = rows[alike]
+        if len(rows) == 0:
+            continue
+        found = align_patches(image.grey, sight.grey, xy0[alike], tracks.xy[rows], warps[alike])
+        near = np.linalg.norm(found.xy - tracks.xy[rows], axis=1) < _MAX_MOVE_PX
+        fits = near & (found.correlation > _MIN_CORRELATION)
+        tracks.settle_at(rows[fits], found.xy[fits])
+        num_aligned += int(fits.sum())
+        waiting[rows] = False
+    return num_aligned
+
+
+def _shared(
+    tracks: TrackTable, waiting: NDArray[np.bool_], keyframe: Keyframe
+) -> tuple[NDArray[np.intp], Array]:
+    """Rows of waiting tracks that a keyframe saw too, and where."""
+    rows = np.flatnonzero(waiting)
+    _, mine, theirs = np.intersect1d(tracks.ids[rows], keyframe.ids, assume_unique=True, return_indices=True)
+    return rows[mine], keyframe.xy[theirs]
