@@ -50,6 +50,20 @@ def test_a_photo_smaller_than_the_crop_is_enlarged():
     assert crop.shape == (64, 64, 3)
 
 
+def test_photos_may_be_enlarged_on_purpose():
+    stripes = np.tile(np.repeat(np.array([0, 255], np.uint8), 4), 16)[None, :, None] * np.ones(
+        (128, 1, 3), np.uint8
+    )
+
+    def flips(scale):
+        settings = CropSettings(size_px=64, scale_min=scale, scale_max=scale, share_grey=0.0)
+        crop = random_crop(stripes, settings, np.random.default_rng(0))[..., 0].astype(int) > 127
+        return max(np.diff(crop.astype(int), axis=axis).astype(bool).sum(axis=axis).max() for axis in (0, 1))
+
+    assert flips(1.0) == pytest.approx(16, abs=1)
+    assert flips(2.0) == pytest.approx(8, abs=1)
+
+
 def test_grey_crops_have_equal_channels():
     crop = random_crop(photo(), CropSettings(size_px=32, share_grey=1.0), np.random.default_rng(0))
     np.testing.assert_array_equal(crop[..., 0], crop[..., 2])
@@ -76,3 +90,5 @@ def test_crop_settings_are_checked():
         CropSettings(size_px=100)
     with pytest.raises(ValueError, match="scale_min and scale_max"):
         CropSettings(scale_min=0.9, scale_max=0.5)
+    with pytest.raises(ValueError, match=r"scale_max must be in \(0, 2\] and ordered, got 0.5, 2.5"):
+        CropSettings(scale_max=2.5)

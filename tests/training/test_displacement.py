@@ -3,7 +3,13 @@ import math
 import pytest
 import torch
 
-from semcast.training.displacement import MAX_DISPLACEMENT_PX, gradients, grey, lucas_kanade_step
+from semcast.training.displacement import (
+    MAX_DISPLACEMENT_PX,
+    gradients,
+    grey,
+    lucas_kanade_step,
+    window_mean,
+)
 
 
 def blobs(shift_x=0.0, shift_y=0.0):
@@ -39,6 +45,12 @@ def test_gradients_of_a_ramp_are_its_slope():
     ix, iy = gradients(ramp)
     torch.testing.assert_close(ix[..., 2:-2, 2:-2], torch.full((1, 1, 12, 12), 0.01))
     assert iy.abs().max().item() < 1e-7
+
+
+def test_the_mean_over_a_window_is_that_of_what_lies_inside():
+    values = torch.rand(2, 3, 30, 26, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    at_once = torch.nn.functional.avg_pool2d(values, 21, stride=1, padding=10, count_include_pad=False)
+    torch.testing.assert_close(window_mean(values, 21), at_once)
 
 
 def test_luma_of_grey_is_grey():
