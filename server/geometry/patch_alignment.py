@@ -17,20 +17,73 @@ from semcast.server.geometry.features import Grey
 Array = NDArray[np.float64]
 Values = NDArray[np.float32]
 
+#: Every so many pixels of the window are looked at: noise of decoded images is alike over several.
+_STRIDE_PX = 2
 #: Range of the contrast of one patch against the other.
 _GAIN_RANGE = (0.5, 2.0)
-#: Steps shorter than this end the search.
-_SMALL_STEP_PX = 0.02
+#: Patches that move less in a step are there.
+_SMALL_STEP_PX = 0.03
 #: A structure tensor whose determinant is smaller than this share of its squared trace is an edge.
 _MIN_CORNERNESS = 1e-6
 
 
 @dataclass(frozen=True)
-class AlignedPatches:
-    """Where patches of one image are in another.
+class Templates:
+    """Patches to be looked for, with their mean taken off.
 
     Attributes:
-        xy: ``(N, 2)`` pixels in the second image.
+        values: ``(N, M)`` float32.
+        slope_x: ``(N, M)`` float32 derivatives along x.
+        slope_y: ``(N, M)`` float32 derivatives along y.
+        dx: ``(M,)`` float32 offset of each value from the centre.
+        dy: ``(M,)``.
+    """
+
+    values: Values
+    slope_x: Values
+    slope_y: Values
+    dx: Values
+    dy: Values
+
+    @staticmethod
+    def cut(image: Grey, centres_xy: Array, window_px: int = KLT_WINDOW_PX) -> "Templates":
+        """Cut the windows around ``(N, 2)`` points of an image."""
+        half = window_px // 2
+        offset = np.arange(-half, half + 1, _STRIDE_PX, dtype=np.float32)
+        dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
+        x, y = (centres_xy[:, k : k + 1].astype(np.float32) for k in range(2))
+        grey = image.astype(np.float32)
+        east, west = _sample(grey, x + dx + 1, y + dy), _sample(grey, x + dx - 1, y + dy)
+        south, north = _sample(grey, x + dx, y + dy + 1), _sample(grey, x + dx, y + dy - 1)
+        return Templates(
+            values=_centred(_sample(grey, x + dx, y + dy)),
+            slope_x=_centred(0.5 * (east - west)),
+            slope_y=_centred(0.5 * (south - north)),
+            dx=dx,
+            dy=dy,
+        )
+
+    @staticmethod
+    def join(parts: "list[Templates]") -> "Templates":
+        """Put templates of several images, cut alike, into one set."""
+        return Templates(
+            values=np.concatenate([p.values for p in parts]),
+            slope_x=np.concatenate([p.slope_x for p in parts]),
+            slope_y=np.concatenate([p.slope_y for p in parts]),
+            dx=parts[0].dx,
+            dy=parts[0].dy,
+        )
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+
+@dataclass(frozen=True)
+class AlignedPatches:
+    """Where patches are in an image.
+
+    Attributes:
+        xy: ``(N, 2)`` pixels.
         correlation: ``(N,)`` in [-1, 1], zero-mean normalised cross-correlation there; -1 where the patch has
             too little structure or the search left the numbers.
     """
@@ -67,68 +120,59 @@ def affine_warps(
 
 
 def align_patches(
-    image0: Grey,
-    image1: Grey,
-    xy0: Array,
-    start1_xy: Array,
-    warps: Array,
-    *,
-    window_px: int = KLT_WINDOW_PX,
-    iterations: int = 6,
+    templates: Templates, image: Grey, start_xy: Array, warps: Array, *, iterations: int = 6
 ) -> AlignedPatches:
-    """Find where the patches around points of one image are in another.
+    """Find where templates are in an image.
 
     Brightness and contrast of each patch may differ.
 
     Args:
-        image0: Image of the templates.
-        image1: Image they are looked for in.
-        xy0: ``(N, 2)`` centres in ``image0``.
-        start1_xy: ``(N, 2)`` starts in ``image1``, right to about two pixels.
-        warps: ``(N, 2, 2)`` derivatives of pixels in ``image1`` by those in ``image0``.
-        window_px: Side of the patch in ``image0``, odd.
+        templates: N patches, of any images.
+        image: Image they are looked for in.
+        start_xy: ``(N, 2)`` starts, right to about two pixels.
+        warps: ``(N, 2, 2)`` derivatives of pixels in ``image`` by those of the template.
         iterations: Steps at most.
     """
-    count = len(xy0)
-    if count == 0:
-        return AlignedPatches(np.zeros((0, 2)), np.zeros(0))
-    offset = np.arange(-(window_px // 2) - 1, window_px // 2 + 2)
-    dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
-    wide = _sample(image0, xy0[:, :1] + dx, xy0[:, 1:] + dy).reshape(count, len(offset), len(offset))
-    template = _centred(wide[:, 1:-1, 1:-1].reshape(count, -1))
-    slope_x = _centred((0.5 * (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2])).reshape(count, -1))
-    slope_y = _centred((0.5 * (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1])).reshape(count, -1))
-    a, b, c = (_products(*pair) for pair in ((slope_x, slope_x), (slope_x, slope_y), (slope_y, slope_y)))
+    xy, correlation = start_xy.copy(), np.full(len(templates), -1.0)
+    if len(templates) == 0:
+        return AlignedPatches(xy, correlation)
+    slopes = templates.slope_x, templates.slope_y
+    a, b, c = (_products(slopes[j], slopes[k]) for j, k in ((0, 0), (0, 1), (1, 1)))
     determinant = a * c - b * b
     usable = determinant > _MIN_CORNERNESS * (a + c) ** 2
-    determinant = np.where(usable, determinant, 1.0)
-    dy, dx = (d.ravel() for d in np.meshgrid(offset[1:-1], offset[1:-1], indexing="ij"))
-    across = warps[:, :, :1] * dx + warps[:, :, 1:] * dy  # (N, 2, window^2)
-    xy, correlation = start1_xy.copy(), np.full(count, -1.0)
-    energy0 = _products(template, template)
-    for _ in range(iterations + 1):
-        seen = _centred(_sample(image1, xy[:, :1] + across[:, 0], xy[:, 1:] + across[:, 1]))
-        energy1, both = _products(seen, seen), _products(seen, template)
-        correlation = both / np.sqrt(np.maximum(energy0 * energy1, 1e-9))
-        gain = np.clip(both / np.maximum(energy1, 1e-9), *_GAIN_RANGE)
-        difference = gain[:, None].astype(np.float32) * seen - template
-        u, v = _products(slope_x, difference), _products(slope_y, difference)
-        # How far the content in sight is from the template's centre, in pixels of the first image.
-        away = np.stack([c * u - b * v, a * v - b * u], axis=1) / determinant[:, None]
-        step = np.where(usable[:, None], np.einsum("nij,nj->ni", warps, away), 0.0)
-        if float(np.abs(step).max()) < _SMALL_STEP_PX:
-            break
-        xy = xy - step
-    sound = usable & np.isfinite(xy).all(axis=1)
-    return AlignedPatches(np.where(sound[:, None], xy, start1_xy), np.where(sound, correlation, -1.0))
-
-
-def _sample(image: Grey, x: Array, y: Array) -> Values:
-    """Bilinear values at ``(N, M)`` pixels; the border goes on outside."""
     grey = image.astype(np.float32)
-    at = x.astype(np.float32), y.astype(np.float32)
+    across = warps.astype(np.float32)
+    across_x = across[:, 0, :1] * templates.dx + across[:, 0, 1:] * templates.dy
+    across_y = across[:, 1, :1] * templates.dx + across[:, 1, 1:] * templates.dy
+    energy = _products(templates.values, templates.values)
+    moving = np.flatnonzero(usable)
+    for _ in range(iterations):
+        if len(moving) == 0:
+            break
+        x, y = (xy[moving, k : k + 1].astype(np.float32) for k in range(2))
+        seen = _centred(_sample(grey, x + across_x[moving], y + across_y[moving]))
+        template = templates.values[moving]
+        seen_energy, both = _products(seen, seen), _products(seen, template)
+        correlation[moving] = both / np.sqrt(np.maximum(energy[moving] * seen_energy, 1e-9))
+        gain = np.clip(both / np.maximum(seen_energy, 1e-9), *_GAIN_RANGE)
+        difference = gain[:, None].astype(np.float32) * seen - template
+        u, v = (_products(slope[moving], difference) for slope in slopes)
+        # How far the content in sight is from the template's centre, in pixels of the template.
+        a_, b_, c_, d_ = (terms[moving] for terms in (a, b, c, determinant))
+        away = np.stack([c_ * u - b_ * v, a_ * v - b_ * u], axis=1) / d_[:, None]
+        step = np.einsum("nij,nj->ni", warps[moving], away)
+        xy[moving] -= step
+        moving = moving[np.abs(step).max(axis=1) >= _SMALL_STEP_PX]
+    sound = usable & np.isfinite(xy).all(axis=1)
+    return AlignedPatches(np.where(sound[:, None], xy, start_xy), np.where(sound, correlation, -1.0))
+
+
+def _sample(grey: Values, x: Values, y: Values) -> Values:
+    """Bilinear values at ``(N, M)`` pixels; the border goes on outside."""
+    if x.size == 0:
+        return np.zeros(x.shape, np.float32)
     return np.asarray(
-        cv2.remap(grey, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32
+        cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32
     )
 
 

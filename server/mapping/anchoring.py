@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
-from semcast.server.geometry.patch_alignment import affine_warps, align_patches
+from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches
 from semcast.server.mapping.recall import Images
 from semcast.server.mapping.tracks import Sight, TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -55,7 +55,7 @@ def anchor_tracks(
     T_cam_world = invert_transform(T_world_cam)
     landmark = world.landmarks.rows(tracks.ids)
     waiting = tracks.visible & (landmark >= 0)
-    num_aligned = 0
+    parts: list[tuple[NDArray[np.intp], Array, Templates]] = []
     for image in images:  # oldest first
         keyframe = by_id.get(image.frame_id)
         if keyframe is None:
@@ -68,16 +68,18 @@ def anchor_tracks(
         warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
         area = np.linalg.det(warps)
         alike = (depth_now > _MIN_DEPTH_MAP) & (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
-        rows = rows[alike]
-        if len(rows) == 0:
-            continue
-        found = align_patches(image.grey, sight.grey, xy0[alike], tracks.xy[rows], warps[alike])
-        near = np.linalg.norm(found.xy - tracks.xy[rows], axis=1) < _MAX_MOVE_PX
-        fits = near & (found.correlation > _MIN_CORRELATION)
-        tracks.settle_at(rows[fits], found.xy[fits])
-        num_aligned += int(fits.sum())
-        waiting[rows] = False
-    return num_aligned
+        if alike.any():
+            parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike])))
+            waiting[rows[alike]] = False
+    if not parts:
+        return 0
+    rows, warps = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    templates = Templates.join([part[2] for part in parts])
+    found = align_patches(templates, sight.grey, tracks.xy[rows], warps)
+    near = np.linalg.norm(found.xy - tracks.xy[rows], axis=1) < _MAX_MOVE_PX
+    fits = near & (found.correlation > _MIN_CORRELATION)
+    tracks.settle_at(rows[fits], found.xy[fits])
+    return int(fits.sum())
 
 
 def _shared(

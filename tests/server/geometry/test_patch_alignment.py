@@ -6,7 +6,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform
-from semcast.server.geometry.patch_alignment import affine_warps, align_patches
+from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches
 
 CAMERA = Intrinsics(fx=300, fy=320, cx=160, cy=120, width=320, height=240)
 CENTRES = np.array([[80.0, 60.0], [160.3, 120.7], [230.5, 90.2], [120.0, 180.0]])
@@ -35,7 +35,7 @@ def test_patches_are_found_to_a_tenth_of_a_pixel(texture, A):
     image = np.clip(0.8 * image.astype(np.float32) + 20, 0, 255).astype(np.uint8)  # another exposure
     true = CENTRES @ A.T + t
     start = true + np.array([[1.5, -1.0], [-1.2, 1.3], [0.8, 1.6], [-1.7, -0.4]])
-    found = align_patches(texture, image, CENTRES, start, np.tile(A, (4, 1, 1)))
+    found = align_patches(Templates.cut(texture, CENTRES), image, start, np.tile(A, (4, 1, 1)))
     assert np.abs(found.xy - true).max() < 0.1
     assert found.correlation.min() > 0.98
 
@@ -45,8 +45,8 @@ def test_without_the_warp_a_scaled_patch_is_found_worse(texture):
     t = -0.3 * np.array([160.0, 120.0])
     image = seen_through(texture, A, t)
     true = CENTRES @ A.T + t
-    warped = align_patches(texture, image, CENTRES, true + 1.0, np.tile(A, (4, 1, 1)))
-    plain = align_patches(texture, image, CENTRES, true + 1.0, np.tile(np.eye(2), (4, 1, 1)))
+    warped = align_patches(Templates.cut(texture, CENTRES), image, true + 1.0, np.tile(A, (4, 1, 1)))
+    plain = align_patches(Templates.cut(texture, CENTRES), image, true + 1.0, np.tile(np.eye(2), (4, 1, 1)))
     assert np.abs(warped.xy - true).max() < 0.1
     assert plain.correlation.max() < warped.correlation.min()
 
@@ -54,21 +54,23 @@ def test_without_the_warp_a_scaled_patch_is_found_worse(texture):
 def test_what_is_not_there_or_has_no_structure_does_not_correlate(texture):
     other = np.random.default_rng(2).integers(0, 256, texture.shape).astype(np.uint8)
     warps = np.tile(np.eye(2), (4, 1, 1))
-    assert align_patches(texture, other, CENTRES, CENTRES, warps).correlation.max() < 0.5
+    assert align_patches(Templates.cut(texture, CENTRES), other, CENTRES, warps).correlation.max() < 0.5
     flat = np.full_like(texture, 90)
-    found = align_patches(flat, texture, CENTRES, CENTRES, warps)
+    found = align_patches(Templates.cut(flat, CENTRES), texture, CENTRES, warps)
     np.testing.assert_array_equal(found.xy, CENTRES)
     np.testing.assert_array_equal(found.correlation, -1.0)
-    blind = align_patches(texture, flat, CENTRES, CENTRES, warps)
+    blind = align_patches(Templates.cut(texture, CENTRES), flat, CENTRES, warps)
     assert np.isfinite(blind.xy).all()
     assert blind.correlation.max() < 0.1
 
 
 def test_points_at_the_border_and_no_points_are_no_error(texture):
     edge = np.array([[0.0, 0.0], [319.0, 239.0]])
-    found = align_patches(texture, texture, edge, edge, np.tile(np.eye(2), (2, 1, 1)))
+    found = align_patches(Templates.cut(texture, edge), texture, edge, np.tile(np.eye(2), (2, 1, 1)))
     assert np.isfinite(found.xy).all()
-    assert len(align_patches(texture, texture, edge[:0], edge[:0], np.zeros((0, 2, 2))).xy) == 0
+    assert (
+        len(align_patches(Templates.cut(texture, edge[:0]), texture, edge[:0], np.zeros((0, 2, 2))).xy) == 0
+    )
 
 
 def test_warps_are_the_derivatives_of_the_projection():
