@@ -9,6 +9,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, make_transform
 from semcast.server.geometry.weighting import OnlineNoise
 from semcast.server.mapping import mapper
+from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.recall import SeenFrom, no_images
@@ -110,6 +111,12 @@ class MapBuilder:
         self.collect(wait=True)
         visible = tracks.ids[tracks.visible]
         self.num_inliers_at_keyframe = int((self.world.landmarks.rows(visible) >= 0).sum())
+
+    def anchor(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> int:
+        """Align tracks with how earlier keyframes of this submap saw them; the number aligned."""
+        return anchor_tracks(
+            self._camera, self.world, self.images, tracks, sight, T_world_cam, submap=self.submap
+        )
 
     def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
         """Turn the newest frame into a keyframe, triangulate, and ask for an adjustment."""

@@ -12,7 +12,6 @@ from semcast.common.shapes import check_shape
 from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.motion import ConstantVelocity
 from semcast.server.mapping import mapper
-from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.initialiser import Initialiser, Observed, Start, pose_of
 from semcast.server.mapping.map_builder import MapBuilder
@@ -141,10 +140,9 @@ class Reconstruction:
 
     def _moved(self, scale: float) -> None:
         """The map was moved: so is the last pose."""
-        if self._last_posed_id is not None:
-            T_world_last = self._map.world.pose_of_frame(self._last_posed_id)
-            if T_world_last is not None:
-                self._motion.correct(T_world_last, scale)
+        T_world_last = self._last_pose()
+        if T_world_last is not None:
+            self._motion.correct(T_world_last, scale)
 
     def _follow(self, sight: Sight, T_world_guess: Array | None) -> None:
         tracks = self._tracks
@@ -165,10 +163,8 @@ class Reconstruction:
     def _pose(
         self, T_world_guess: Array | None, *, min_share: float = MIN_BELIEVED_SHARE
     ) -> TrackedPose | None:
-        tracks, visible = self._tracks, self._tracks.visible
-        return self._pose_from(
-            tracks.ids[visible], tracks.xy[visible], tracks.confidence[visible], T_world_guess, min_share
-        )
+        t, seen = self._tracks, self._tracks.visible
+        return self._pose_from(t.ids[seen], t.xy[seen], t.confidence[seen], T_world_guess, min_share)
 
     def _pose_from(
         self,
@@ -271,20 +267,11 @@ class Reconstruction:
 
     def _anchored(self, sight: Sight, pose: TrackedPose, reference: Keyframe) -> TrackedPose:
         """Take the drift out of the tracks of a keyframe to be, and its pose from them anew."""
-        tracks, world = self._tracks, self._map.world
-        num_aligned = anchor_tracks(
-            self._camera,
-            world,
-            self._map.images,
-            tracks,
-            sight,
-            pose.T_world_cam,
-            submap=self._map.submap,
-        )
+        num_aligned = self._map.anchor(self._tracks, sight, pose.T_world_cam)
         anew = self._pose(pose.T_world_cam) if num_aligned else None
         if anew is None:
             return pose
-        world.add_frame(sight.frame.frame_id, reference.frame_id, anew.T_world_cam)
+        self._map.world.add_frame(sight.frame.frame_id, reference.frame_id, anew.T_world_cam)
         self._moved(1.0)
         return anew
 
