@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches
+from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 from semcast.server.mapping.recall import Images
 from semcast.server.mapping.tracks import Sight, TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -22,7 +23,6 @@ _MIN_AREA_RATIO = 0.4
 #: A point that would move further than this has found something else.
 _MAX_MOVE_PX = 3.0
 _MIN_CORRELATION = 0.7
-_MIN_DEPTH_MAP = 1e-3
 
 
 def anchor_tracks(
@@ -63,11 +63,11 @@ def anchor_tracks(
         rows, xy0 = _shared(tracks, waiting, keyframe)
         T_anchor_world = invert_transform(keyframe.T_world_cam)
         depth = world.landmarks.xyz[landmark[rows]] @ T_anchor_world[2, :3] + T_anchor_world[2, 3]
-        before = depth > _MIN_DEPTH_MAP
+        before = depth > MIN_DEPTH_MAP
         rows, xy0, depth = rows[before], xy0[before], depth[before]
         warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
         area = np.linalg.det(warps)
-        alike = (depth_now > _MIN_DEPTH_MAP) & (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
+        alike = (depth_now > MIN_DEPTH_MAP) & (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
         if alike.any():
             parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike])))
             waiting[rows[alike]] = False
