@@ -358,7 +358,7 @@ def test_without_confidence_drift_is_taken_out_too(mapped):
     sight = sight_at(24, frame_id=1)
     tracks.follow(sight, tracks.xy - (4, 0))
     assert anchor(mapped, sight, 24) > 50
-    assert np.all(tracks.confidence[tracks.visible] <= 1.0)
+    assert np.all(tracks.confidence[tracks.visible] == 1.0)
 
 
 def test_a_track_that_fits_nowhere_stays_where_it_is(mapped):
