@@ -25,8 +25,8 @@ FrameHook = Callable[[DecodedFrame, FrameResult, FrameRow, MapUpdate | None], No
 
 #: Stages of the reconstruction that may ask for an adjustment, which then runs within them.
 _BUNDLE_HOLDERS = ("map", "two_view", "relocalise")
-#: Stages that don't count towards a pose's age: before the receiver, or of another process.
-_NOT_BEFORE_POSE = frozenset({"encode", "channel", "bundle"})
+#: Stages that don't count towards a pose's age: before the receiver, of another process, or after the pose.
+_NOT_BEFORE_POSE = frozenset({"encode", "channel", "bundle", "map"})
 
 
 class TimedBundle(InlineBundle):

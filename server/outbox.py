@@ -40,12 +40,9 @@ class Outbox:
         self._thread = threading.Thread(target=self._run, name="semcast-outbox", daemon=True)
         self._thread.start()
 
-    def put(self, arrival: ReceivedFrame, result: FrameResult, update: MapUpdate | None) -> None:
-        """Send one frame's outcome, and the poses it gave to earlier frames before its own."""
+    def put_pose(self, arrival: ReceivedFrame, result: FrameResult) -> None:
+        """Send what became of one frame, after the poses it gave to earlier frames."""
         epoch = arrival.message.agent_epoch
-        before = self._box.dropped
-        if update is not None:
-            self._box.put((self._map, map_message(epoch, update)))
         self._t_capture_ns[(epoch, result.frame_id)] = arrival.message.t_capture_ns
         while len(self._t_capture_ns) > CAPACITY:
             self._t_capture_ns.popitem(last=False)
@@ -65,8 +62,16 @@ class Outbox:
                 map_epoch=result.map_epoch,
                 submap=result.submap,
             )
-            self._box.put((self._pose, message))
-        self._box.put((self._pose, pose_message(arrival, result)))
+            self._put(self._pose, message)
+        self._put(self._pose, pose_message(arrival, result))
+
+    def put_map(self, arrival: ReceivedFrame, update: MapUpdate) -> None:
+        """Send what a frame changed in the map."""
+        self._put(self._map, map_message(arrival.message.agent_epoch, update))
+
+    def _put(self, publisher: Publisher, message: PoseMessage | MapMessage) -> None:
+        before = self._box.dropped
+        self._box.put((publisher, message))
         self._metrics.drop("outbox", self._box.dropped - before)
 
     def _run(self) -> None:

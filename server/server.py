@@ -300,7 +300,11 @@ class Server:
             self._metrics.drop("processed")
             return
         try:
-            outcome = session.process(decoded.frame, self._arrival_of(decoded))
+            outcome = session.process(
+                decoded.frame,
+                self._arrival_of(decoded),
+                lambda found: self._outbox.put_pose(decoded.arrival, found),
+            )
         except Exception as err:
             logger.exception("frame %d could not be tracked and is left out", message.frame_id)
             self._metrics.drop("track")
@@ -334,9 +338,10 @@ class Server:
         )
 
     def _spread(self, decoded: DecodedArrival, outcome: Outcome) -> None:
-        """Publish, show and count what a frame led to."""
+        """Publish what a frame did to the map, show and count what it led to; its pose is on its way."""
         result = outcome.result
-        self._outbox.put(decoded.arrival, result, outcome.update)
+        if outcome.update is not None:
+            self._outbox.put_map(decoded.arrival, outcome.update)
         self._metrics.count("tracked")
         if result.T_world_cam is not None:
             self._metrics.count("posed")

@@ -202,14 +202,31 @@ class Session:
         logger.info("map restored from the checkpoint, up to frame %d", self._last_frame_id)
         return True
 
-    def process(self, frame: DecodedFrame, arrival: Arrival) -> Outcome:
-        """Track a frame, extend the map and write the frame's row."""
+    def process(
+        self, frame: DecodedFrame, arrival: Arrival, on_pose: Callable[[FrameResult], None] | None = None
+    ) -> Outcome:
+        """Track a frame, extend the map and write the frame's row.
+
+        Args:
+            frame: The frame.
+            arrival: What else is known about it.
+            on_pose: Is told what the tracker found, once, as soon as it is known; the map is extended after.
+        """
         quality = (
             self._reference.psnr_db(frame.frame_id, frame.image) if self._reference is not None else None
         )
-        result = self._reconstruction.process(frame)
+        tracked_ns = 0
+
+        def tell(found: FrameResult) -> None:
+            nonlocal tracked_ns
+            tracked_ns = time.perf_counter_ns()
+            if on_pose is not None:
+                on_pose(found)
+
+        result = self._reconstruction.process(frame, tell)
+        if not tracked_ns:
+            tell(result)
         update = self._reconstruction.take_map_update()
-        tracked_ns = time.perf_counter_ns()
         self._last_frame_id = frame.frame_id
         self._t_source_ns[frame.frame_id] = frame.t_source_ns
         for frame_id, t_source_ns, _ in result.backfilled:

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
-from semcast.server.geometry.pnp import refine_pose, search_pose
 from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import TwoViewResult, estimate_two_view
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.ambiguity import Side, decide
 from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.kept_frames import Observed, pose_of
 from semcast.server.mapping.mapper import gather_observations
 from semcast.server.mapping.tracker import interpolate_pose
 from semcast.server.mapping.world_map import Keyframe
@@ -46,17 +46,6 @@ _MIN_SHARED = 0.12
 _MIN_FLOW_SHARE = 0.012
 #: Median angle between the rays of the two views.
 _MIN_MEDIAN_PARALLAX_DEG = 0.7
-
-
-@dataclass(frozen=True)
-class Observed:
-    """The tracks of one frame."""
-
-    frame_id: int
-    t_source_ns: int
-    ids: Ids
-    xy: Array
-    confidence: Array
 
 
 @dataclass(frozen=True)
@@ -296,31 +285,3 @@ def _keyframe(o: Observed, T_world_cam: Array) -> Keyframe:
         descriptor_ids=np.zeros(0, np.int64),
         descriptors=np.zeros((0, 32), np.uint8),
     )
-
-
-def pose_of(
-    camera: Intrinsics,
-    observed: Observed,
-    ids: Ids,
-    xyz: Array,
-    noise: NoiseModel,
-    T_world_guess: Array,
-    seed: int,
-    min_inliers: int = 15,
-) -> Array | None:
-    """``T_world_cam`` of a kept frame from landmarks (``ids`` ascending), None where too few agree."""
-    _, row, row_o = np.intersect1d(ids, observed.ids, assume_unique=True, return_indices=True)
-    if len(row) < min_inliers:
-        return None
-    sigma = noise.sigma_px(observed.confidence[row_o])
-    gate = noise.threshold_px(observed.confidence[row_o])
-    estimate = refine_pose(camera, invert_transform(T_world_guess), xyz[row], observed.xy[row_o], sigma, gate)
-    if estimate.num_inliers < 0.5 * len(row):
-        searched = search_pose(
-            camera, xyz[row], observed.xy[row_o], sigma, gate, seed=seed, min_inliers=min_inliers
-        )
-        if searched is not None and searched.num_inliers > estimate.num_inliers:
-            estimate = searched
-    if estimate.num_inliers < min_inliers:
-        return None
-    return invert_transform(estimate.T_cam_world)

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,8 @@ from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.motion import ConstantVelocity
 from semcast.server.mapping import mapper
 from semcast.server.mapping.bundle_problem import BundleRunner
-from semcast.server.mapping.initialiser import Initialiser, Observed, Start, pose_of
+from semcast.server.mapping.initialiser import Initialiser, Start
+from semcast.server.mapping.kept_frames import Observed, backfill
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place
@@ -80,6 +81,7 @@ class Reconstruction:
         self._frames_since_keyframe = 0
         self._keyframes_since_join = 0
         self._stage_ms: dict[str, float] = {}
+        self._on_pose: Callable[[FrameResult], None] | None = None
 
     def reset(self) -> None:
         """Forget the map; the next one has another epoch."""
@@ -93,17 +95,26 @@ class Reconstruction:
 
     # -- frames ----------------------------------------------------------------------------------------
 
-    def process(self, frame: DecodedFrame) -> FrameResult:
+    def process(
+        self, frame: DecodedFrame, on_pose: Callable[[FrameResult], None] | None = None
+    ) -> FrameResult:
         """Track one frame and extend the map with it.
 
         No image content makes it fail. A frame not newer than the last one is not tracked: its result has the
         pose it got before, if any.
+
+        Args:
+            frame: The frame.
+            on_pose: Is told the result of a frame located in the map before the map is extended with it.
+                What is returned has the pose after that, which differs by what the extension corrected. Not
+                called for other frames.
 
         Raises:
             ValueError: An array has another shape than the camera's image.
         """
         self._check(frame)
         self._stage_ms = {}
+        self._on_pose = on_pose
         if frame.frame_id <= self._last_frame_id:
             return self._result(frame, self._map.world.pose_of_frame(frame.frame_id), None)
         self._last_frame_id = frame.frame_id
@@ -226,9 +237,7 @@ class Reconstruction:
         self._tracks.keep(~np.isin(self._tracks.ids, recalled))
         return pose
 
-    def _accept(
-        self, sight: Sight, pose: TrackedPose, backfilled: tuple[tuple[int, int, Array], ...] = ()
-    ) -> FrameResult:
+    def _accept(self, sight: Sight, pose: TrackedPose) -> FrameResult:
         """Take a pose: note it, weed out tracks that slipped, and make a keyframe where one is due."""
         frame, tracks = sight.frame, self._tracks
         reference = self._map.reference_keyframe()
@@ -254,6 +263,8 @@ class Reconstruction:
                 usable_share=float(sight.usable.mean()),
             )
         )
+        if self._on_pose is not None:
+            self._on_pose(self._result(frame, pose.T_world_cam, pose, is_keyframe=is_keyframe))
         if is_keyframe:
             since = time.perf_counter_ns()
             pose = self._anchored(sight, pose, reference)
@@ -263,7 +274,7 @@ class Reconstruction:
             self._lap("map", since)
             self._try_to_join(sight, pose.T_world_cam)
         T_world_cam = self._map.world.pose_of_frame(frame.frame_id)
-        return self._result(frame, T_world_cam, pose, is_keyframe=is_keyframe, backfilled=backfilled)
+        return self._result(frame, T_world_cam, pose, is_keyframe=is_keyframe)
 
     def _anchored(self, sight: Sight, pose: TrackedPose, reference: Keyframe) -> TrackedPose:
         """Take the drift out of the tracks of a keyframe to be, and its pose from them anew."""
@@ -352,7 +363,16 @@ class Reconstruction:
         guess = self._motion.predict(first.t_source_ns)
         T_world_ref, scale = self._map.bridge(guess, self._motion.speed_map_per_s, start)
         self._map.take_start(start, sight, self._tracks, T_world_ref, scale)
-        backfilled = self._backfill()
+        reference = self._map.reference_keyframe()
+        assert reference is not None
+        backfilled = backfill(
+            self._camera,
+            self._map.world,
+            reference,
+            self._initialiser.history[:-1],
+            self._map.noise.model,
+            self._settings.seed,
+        )
         self._motion.reset()
         for _, t_ns, T_world_cam in backfilled[-2:]:
             self._motion.observe(t_ns, T_world_cam)
@@ -369,33 +389,6 @@ class Reconstruction:
         self._last_posed_id = sight.frame.frame_id
         self._motion.observe(sight.frame.t_source_ns, pose.T_world_cam)
         return self._result(sight.frame, newest, pose, is_keyframe=True, backfilled=backfilled)
-
-    def _backfill(self) -> tuple[tuple[int, int, Array], ...]:
-        """Pose the frames kept since the start was looked for, from the newest backwards."""
-        world = self._map.world
-        reference = self._map.reference_keyframe()
-        assert reference is not None
-        guess = reference.T_world_cam
-        posed = []
-        for observed in reversed(self._initialiser.history[:-1]):
-            if observed.frame_id in world.frames:
-                T_world_cam = world.pose_of_frame(observed.frame_id)
-            else:
-                T_world_cam = pose_of(
-                    self._camera,
-                    observed,
-                    world.landmarks.ids,
-                    world.landmarks.xyz,
-                    self._map.noise.model,
-                    guess,
-                    self._settings.seed,
-                )
-                if T_world_cam is not None:
-                    world.add_frame(observed.frame_id, reference.frame_id, T_world_cam)
-            if T_world_cam is not None:
-                guess = T_world_cam
-                posed.append((observed.frame_id, observed.t_source_ns, T_world_cam))
-        return tuple(reversed(posed))
 
     def _try_to_join(self, sight: Sight, T_world_cam: Array) -> None:
         """Look from time to time whether an older submap is in sight again."""
@@ -447,7 +440,7 @@ class Reconstruction:
             keypoint_inlier=agrees,
             keypoint_confidence=self._tracks.confidence[visible].astype(np.float32),
             backfilled=backfilled,
-            stage_ms=self._stage_ms,
+            stage_ms=dict(self._stage_ms),
         )
 
     def take_map_update(self) -> MapUpdate | None:

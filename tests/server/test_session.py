@@ -10,12 +10,13 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.config import build_settings, read_toml
-from semcast.common.run_folder import read_image_paths, read_run
+from semcast.common.run_folder import FRAMES_NAME, read_image_paths, read_run
 from semcast.common.sequence import open_sequence
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.reference import Reference
 from semcast.server.replay import ReplaySettings
+from semcast.server.run_record import read_rows
 from semcast.server.session import Arrival, Session, StreamIdentity
 from semcast.server.settings import ServerSettings
 
@@ -105,6 +106,31 @@ def run_session(demo, folder, frame_ids, epoch=5, program=None, **settings):
         session.write_outputs(folder, {}, complete=True)
     session.close()
     return session
+
+
+def test_every_frame_tells_once_what_became_of_it(demo, tmp_path):
+    identity = StreamIdentity(
+        agent_id="a", agent_epoch=5, codec="x", digest="", camera=demo.intrinsics, num_frames=None
+    )
+    session = Session(ServerSettings(bundle="inline", out=tmp_path), identity, tmp_path, None)
+    told, outcomes, told_ms = [], [], []
+    for k in range(8):
+        now_ns = time.perf_counter_ns()
+        frame = DecodedFrame(k, int(demo.times_ns[k]), demo.image(k), None)
+
+        def tell(found, since_ns=now_ns):
+            told.append(found)
+            told_ms.append((time.perf_counter_ns() - since_ns) * 1e-6)
+
+        outcomes.append(session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}), tell))
+    session.close()
+    rows = read_rows(tmp_path / FRAMES_NAME)
+    assert [found.frame_id for found in told] == list(range(8))
+    assert [f.backfilled for f in told] == [o.result.backfilled for o in outcomes]
+    assert told[0].T_world_cam is None
+    assert told[-1].T_world_cam is not None
+    for row, ms in zip(rows, told_ms, strict=True):
+        assert 0 < row.stage_ms["decoded_to_pose"] <= ms
 
 
 def test_every_keyframe_has_its_image_also_those_the_map_began_with(demo, tmp_path):

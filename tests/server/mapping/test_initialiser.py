@@ -5,7 +5,8 @@ import numpy as np
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.initialiser import Initialiser, Observed
+from semcast.server.mapping.initialiser import Initialiser
+from semcast.server.mapping.kept_frames import Observed
 
 CAMERA = Intrinsics(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
 NOISE = NoiseModel(1.0, 0.0)

@@ -121,6 +121,30 @@ def reprojection(trajectory, points, frames, xy):
     return np.linalg.norm(CAMERA.project(cam) - xy, axis=1)
 
 
+def test_a_pose_is_told_before_the_map_is_extended_with_its_frame(room):
+    _, images = room
+    reconstruction = make()
+    early, keyframes_known = {}, {}
+
+    def tell(found):
+        early[found.frame_id] = found
+        seen = reconstruction.observations()[1]
+        keyframes_known[found.frame_id] = found.frame_id in seen
+
+    results = [reconstruction.process(frame_of(k, image), tell) for k, image in enumerate(images)]
+    located = [r for r in results if r.state is TrackingState.TRACKING and not r.backfilled]
+    assert sorted(early) == [r.frame_id for r in located]
+    assert not any(keyframes_known.values())
+    assert any(r.is_keyframe for r in located)
+    for after in located:
+        before = early[after.frame_id]
+        assert (before.is_keyframe, before.submap) == (after.is_keyframe, after.submap)
+        assert "map" not in before.stage_ms
+        moved = np.linalg.norm(before.T_world_cam[:3, 3] - after.T_world_cam[:3, 3])
+        assert moved < 0.01
+        assert after.is_keyframe or moved < 1e-12
+
+
 def test_the_same_input_gives_the_same_bits(room):
     _, images = room
     runs = [run(images[:12], make(seed=3))[1] for _ in range(2)]

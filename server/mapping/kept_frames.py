@@ -1,0 +1,94 @@
+"""Frames kept from before there is a map, and their poses once there is one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.pnp import refine_pose, search_pose
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Observed:
+    """The tracks of one frame."""
+
+    frame_id: int
+    t_source_ns: int
+    ids: Ids
+    xy: Array
+    confidence: Array
+
+
+def pose_of(
+    camera: Intrinsics,
+    observed: Observed,
+    ids: Ids,
+    xyz: Array,
+    noise: NoiseModel,
+    T_world_guess: Array,
+    seed: int,
+    min_inliers: int = 15,
+) -> Array | None:
+    """``T_world_cam`` of a kept frame from landmarks (``ids`` ascending), None where too few agree."""
+    _, row, row_o = np.intersect1d(ids, observed.ids, assume_unique=True, return_indices=True)
+    if len(row) < min_inliers:
+        return None
+    sigma = noise.sigma_px(observed.confidence[row_o])
+    gate = noise.threshold_px(observed.confidence[row_o])
+    estimate = refine_pose(camera, invert_transform(T_world_guess), xyz[row], observed.xy[row_o], sigma, gate)
+    if estimate.num_inliers < 0.5 * len(row):
+        searched = search_pose(
+            camera, xyz[row], observed.xy[row_o], sigma, gate, seed=seed, min_inliers=min_inliers
+        )
+        if searched is not None and searched.num_inliers > estimate.num_inliers:
+            estimate = searched
+    if estimate.num_inliers < min_inliers:
+        return None
+    return invert_transform(estimate.T_cam_world)
+
+
+def backfill(
+    camera: Intrinsics,
+    world: WorldMap,
+    reference: Keyframe,
+    kept: Sequence[Observed],
+    noise: NoiseModel,
+    seed: int,
+) -> tuple[tuple[int, int, Array], ...]:
+    """Pose frames of the past in a map, from the newest backwards, and add them to it.
+
+    Args:
+        camera: Pinhole.
+        world: The map; some of the frames may have a pose in it.
+        reference: Keyframe the poses hang on: they move with it.
+        kept: The frames, in order of time.
+        noise: Of the observations.
+        seed: Of the searches.
+
+    Returns:
+        ``(frame_id, t_source_ns, T_world_cam)`` of those that have a pose now, in order of time.
+    """
+    guess = reference.T_world_cam
+    posed = []
+    for observed in reversed(kept):
+        T_world_cam: Array | None
+        if observed.frame_id in world.frames:
+            T_world_cam = world.pose_of_frame(observed.frame_id)
+        else:
+            T_world_cam = pose_of(
+                camera, observed, world.landmarks.ids, world.landmarks.xyz, noise, guess, seed
+            )
+            if T_world_cam is not None:
+                world.add_frame(observed.frame_id, reference.frame_id, T_world_cam)
+        if T_world_cam is not None:
+            guess = T_world_cam
+            posed.append((observed.frame_id, observed.t_source_ns, T_world_cam))
+    return tuple(reversed(posed))
