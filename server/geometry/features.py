@@ -1,6 +1,6 @@
 """Keypoints: corners spread over the image, tracking from frame to frame, descriptors on keyframes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -112,6 +112,14 @@ class TrackedPoints:
     forward_backward_px: Array
     photometric_grey: Array
     gradient_grey2: Array
+
+    def strongest(self, count: int) -> "TrackedPoints":
+        """Return the same points, of which at most ``count`` with the steepest gradients are ``ok``."""
+        rows = np.flatnonzero(self.ok)
+        chosen = rows[np.argsort(-self.gradient_grey2[rows], kind="stable")[:count]]
+        ok = np.zeros(len(self.ok), bool)
+        ok[chosen] = True
+        return replace(self, ok=ok)
 
     @staticmethod
     def none(count: int) -> "TrackedPoints":

@@ -12,12 +12,14 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP
-from semcast.server.mapping.recall import Images
+from semcast.server.mapping.recall import KeyframeImages
 from semcast.server.mapping.tracks import Sight, TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
 
+#: Keyframes that are looked at, the newest ones, as many as an adjustment takes.
+NUM_ANCHORS = 10
 #: Patches that are seen at less than this share of their area, or more than its inverse, have other details.
 _MIN_AREA_RATIO = 0.4
 #: A point that would move further than this has found something else.
@@ -28,7 +30,7 @@ _MIN_CORRELATION = 0.7
 def anchor_tracks(
     camera: Intrinsics,
     world: WorldMap,
-    images: Images,
+    images: KeyframeImages,
     tracks: TrackTable,
     sight: Sight,
     T_world_cam: Array,
@@ -42,7 +44,7 @@ def anchor_tracks(
     Args:
         camera: Pinhole.
         world: The map.
-        images: Of the newest keyframes.
+        images: Of keyframes.
         tracks: Followed to the new image; moved.
         sight: The new image.
         T_world_cam: Its pose.
@@ -56,7 +58,7 @@ def anchor_tracks(
     landmark = world.landmarks.rows(tracks.ids)
     waiting = tracks.visible & (landmark >= 0)
     parts: list[tuple[NDArray[np.intp], Array, Templates]] = []
-    for image in images:  # oldest first
+    for image in images.newest(NUM_ANCHORS):  # oldest first
         keyframe = by_id.get(image.frame_id)
         if keyframe is None:
             continue

@@ -130,6 +130,8 @@ class Initialiser:
         flow_px = float(np.median(np.linalg.norm(xy1 - xy0, axis=1)))
         if flow_px < _MIN_FLOW_SHARE * self._camera.width or not self._is_new_evidence(flow_px):
             return None
+        if self._reference + 1 == len(self.history) - 1 and self._is_too_short():
+            return None
         confidence = fuse_confidence(reference.confidence[row0], observed.confidence[row1])
         threshold_px = float(np.clip(2.0 * noise.sigma0_px, 1.0, 3.0))
         found = estimate_two_view(
@@ -157,6 +159,11 @@ class Initialiser:
             return True
         self._num_since_undecided += 1
         return self._is_overdue() or flow_px >= _RETRY_GROWTH * self._undecided_flow_px
+
+    def _is_too_short(self) -> bool:
+        """Whether to wait for a third view; asked, and counted, each time there are only two."""
+        self._num_too_short += 1
+        return self._num_too_short <= _MAX_TOO_SHORT
 
     def _is_overdue(self) -> bool:
         return self._num_undecided >= _MAX_UNDECIDED or self._num_since_undecided >= _MAX_UNDECIDED_FRAMES
@@ -196,10 +203,8 @@ class Initialiser:
             T_cam = pose_of(self._camera, span[k], ids[good], points.xyz[good], noise, guess, self._seed)
             if T_cam is not None:
                 T_world[k] = T_cam
-        if len(T_world) < _MIN_VIEWS:
-            self._num_too_short += 1
-            if self._num_too_short <= _MAX_TOO_SHORT:
-                return None
+        if len(T_world) < _MIN_VIEWS and self._is_too_short():
+            return None
         chosen = [span[k] for k in sorted(T_world)]
         poses = np.stack([T_world[k] for k in sorted(T_world)])
         side = self._decide(chosen, poses, noise)

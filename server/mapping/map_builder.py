@@ -1,5 +1,6 @@
 """The map as it grows: keyframes, their landmarks, adjustments, and submaps that are joined."""
 
+import logging
 from collections.abc import Callable
 
 import numpy as np
@@ -7,22 +8,31 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, make_transform
-from semcast.server.geometry.weighting import OnlineNoise
+from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
 from semcast.server.mapping import mapper
 from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
-from semcast.server.mapping.recall import SeenFrom, no_images
+from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
+from semcast.server.mapping.revisit import find_revisit, place_anew
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.tracks import Sight, TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
+logger = logging.getLogger(__name__)
+
 Array = NDArray[np.float64]
 
 #: Two keyframes this many steps apart give the scale of a new map its speed.
 _MAX_BRIDGE_S = 5.0
+#: Keyframes whose images are kept: 45 MB of 640x480.
+_MAX_IMAGES = 150
+#: Positions found from an image of long ago are good to about this.
+_OLD_SIGMA_PX = 1.0
+#: Landmarks seen again may take the tracks to so many times the number that is wanted.
+_MAX_TRACKS_SHARE = 1.2
 
 
 class MapBuilder:
@@ -53,7 +63,7 @@ class MapBuilder:
         self.submap = 0
         self._adjusted: tuple[int, Array] | None = None
         self.num_inliers_at_keyframe = 0
-        self.images = no_images()
+        self.images = KeyframeImages(_MAX_IMAGES)
 
     def reference_keyframe(self) -> Keyframe | None:
         """Newest keyframe of the current submap."""
@@ -117,6 +127,53 @@ class MapBuilder:
         return anchor_tracks(
             self._camera, self.world, self.images, tracks, sight, T_world_cam, submap=self.submap
         )
+
+    def reuse(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> int:
+        """Take up landmarks of this submap that were seen long ago and are in sight again.
+
+        Args:
+            tracks: Of a frame that becomes a keyframe; found landmarks get their tracks back.
+            sight: Its image.
+            T_world_cam: Its pose.
+
+        Returns:
+            How many were taken up.
+        """
+        noise = self.noise.model
+        gate_px = GATE_SIGMAS * max(_OLD_SIGMA_PX, noise.sigma0_px)
+        found = find_revisit(
+            self._camera,
+            self.world,
+            self.images,
+            tracks.ids,
+            sight,
+            T_world_cam,
+            submap=self.submap,
+            gate_px=gate_px,
+        )
+        if found is None:
+            return 0
+        tracks.give_way(found.points.xy[found.points.ok])
+        room = int(_MAX_TRACKS_SHARE * self._settings.max_features) - int(tracks.visible.sum())
+        ids = tracks.bring_back(sight, found.ids, found.points.strongest(max(0, room)))
+        rows = np.searchsorted(tracks.ids, ids)
+        good = place_anew(
+            self._camera,
+            self.world,
+            found.keyframe_id,
+            T_world_cam,
+            ids,
+            tracks.xy[rows],
+            tracks.confidence[rows],
+            noise,
+        )
+        tracks.keep(~np.isin(tracks.ids, ids[~good], assume_unique=True))
+        if int(good.sum()) == 0:
+            return 0
+        frame_id = sight.frame.frame_id
+        logger.debug("frame %d: %d landmarks of keyframe %d again", frame_id, good.sum(), found.keyframe_id)
+        self.world.revisits[frame_id] = found.keyframe_id
+        return int(good.sum())
 
     def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
         """Turn the newest frame into a keyframe, triangulate, and ask for an adjustment."""

@@ -21,6 +21,8 @@ Ids = NDArray[np.int64]
 MAX_OBSERVATIONS = 3500
 #: Landmarks further than this many median depths are as good as at infinity.
 _MAX_DEPTH_RATIO = 60.0
+#: Keyframes of long ago in one adjustment at most.
+_MAX_REVISITED = 4
 #: Noise is judged by residuals that keep at least this share of its variance.
 _MIN_LEFT = 0.1
 #: Observations in a row that disagree before a landmark is given up.
@@ -228,10 +230,12 @@ def build_problem(
     """
     submap = world.keyframes[-1].submap
     mine = [k for k in world.keyframes if k.submap == submap]
-    views = mine[-window_size:]
-    if len(views) < (2 if start else 3):
+    recent = mine[-window_size:]
+    if len(recent) < (2 if start else 3):
         return None
-    ids = np.unique(np.concatenate([k.ids for k in views]))
+    anchors = _anchors(world, mine[:-window_size], recent)
+    views = [*anchors, *recent]
+    ids = np.unique(np.concatenate([k.ids for k in recent]))
     ids = ids[world.landmarks.rows(ids) >= 0]
     view, point, xy, confidence = gather_observations(views, ids)
     count = np.bincount(point, minlength=len(ids))
@@ -249,7 +253,7 @@ def build_problem(
     new_row[used_points] = np.arange(len(used_points))
     kept = new_row[point] >= 0
     fixed = np.zeros(len(views), bool)
-    fixed[: 1 if start else 2] = True
+    fixed[: len(anchors) + (1 if start else 2)] = True
     landmark_ids = ids[used_points]
     return BundleProblem(
         intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
@@ -267,6 +271,12 @@ def build_problem(
         iterations=iterations,
         map_version=map_version,
     )
+
+
+def _anchors(world: WorldMap, older: list[Keyframe], recent: list[Keyframe]) -> list[Keyframe]:
+    """Older keyframes whose landmarks the recent ones saw again: they hold the window where it was before."""
+    again = {world.revisits[k.frame_id] for k in recent if k.frame_id in world.revisits}
+    return [k for k in older if k.frame_id in again][-_MAX_REVISITED:]
 
 
 def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> None:

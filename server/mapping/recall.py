@@ -1,10 +1,10 @@
 """Landmarks that are in sight but have lost their track are looked for again, where the pose expects them.
 
 Rows that did not arrive, a blur or a jerk end tracks; their landmarks are still in the map. They are followed
-from the newest keyframes they were seen in, whose images are kept for this.
+from the newest keyframes they were seen in, whose images are kept.
 """
 
-from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +18,7 @@ from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
 
-#: Keyframes whose images are kept, as many as an adjustment takes, and those of them that are looked at here.
-NUM_IMAGES = 10
+#: Keyframes that are looked at here, the newest ones.
 _NUM_RECALLED = 3
 #: A point is looked for no nearer to the border than this.
 _BORDER_PX = 8
@@ -33,18 +32,44 @@ class SeenFrom:
     grey: Grey
 
 
-Images = deque[SeenFrom]
+class KeyframeImages:
+    """Images of keyframes, bounded in number: of too many, every second one of the older half goes.
 
+    Args:
+        capacity: Images kept at most.
+    """
 
-def no_images() -> Images:
-    """Return an empty store; it forgets all but the newest images."""
-    return deque(maxlen=NUM_IMAGES)
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._images: list[SeenFrom] = []
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __iter__(self) -> Iterator[SeenFrom]:
+        """Yield them, oldest first."""
+        return iter(self._images)
+
+    def append(self, image: SeenFrom) -> None:
+        """Keep the image of the newest keyframe."""
+        self._images.append(image)
+        if len(self._images) > self._capacity:
+            half = len(self._images) // 2
+            self._images = self._images[1:half:2] + self._images[half:]
+
+    def newest(self, count: int) -> list[SeenFrom]:
+        """Return the newest ones, oldest first."""
+        return self._images[-count:]
+
+    def older(self, count: int) -> list[SeenFrom]:
+        """Return all but the newest ones, oldest first."""
+        return self._images[:-count]
 
 
 def recall_landmarks(
     camera: Intrinsics,
     world: WorldMap,
-    images: Images,
+    images: KeyframeImages,
     tracks: TrackTable,
     sight: Sight,
     T_world_cam: Array,
@@ -57,7 +82,7 @@ def recall_landmarks(
     Args:
         camera: Pinhole.
         world: The map.
-        images: Of the newest keyframes.
+        images: Of keyframes.
         tracks: After the new image was followed; grows.
         sight: The new image.
         T_world_cam: Its pose, or the expected one.
@@ -70,7 +95,7 @@ def recall_landmarks(
     T_cam_world = invert_transform(T_world_cam)
     height, width = sight.grey.shape
     found = [np.zeros(0, np.int64)]
-    for image in list(images)[: -_NUM_RECALLED - 1 : -1]:
+    for image in reversed(images.newest(_NUM_RECALLED)):
         keyframe = next((k for k in reversed(world.keyframes) if k.frame_id == image.frame_id), None)
         if keyframe is None or keyframe.submap != submap:
             continue

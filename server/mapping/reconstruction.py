@@ -22,7 +22,6 @@ from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.mapping.tracker import MIN_BELIEVED_SHARE, TrackedPose, expected_positions, track_pose
 from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
-from semcast.server.mapping.world_map import Keyframe
 
 __all__ = ["Reconstruction", "ReconstructionSettings"]
 
@@ -267,7 +266,7 @@ class Reconstruction:
             self._on_pose(self._result(frame, pose.T_world_cam, pose, is_keyframe=is_keyframe))
         if is_keyframe:
             since = time.perf_counter_ns()
-            pose = self._anchored(sight, pose, reference)
+            pose = self._improved(sight, pose)
             tracks.refill(sight)
             self._map.make_keyframe(sight, tracks, pose.T_world_cam)
             self._frames_since_keyframe = 0
@@ -276,12 +275,19 @@ class Reconstruction:
         T_world_cam = self._map.world.pose_of_frame(frame.frame_id)
         return self._result(frame, T_world_cam, pose, is_keyframe=is_keyframe)
 
-    def _anchored(self, sight: Sight, pose: TrackedPose, reference: Keyframe) -> TrackedPose:
-        """Take the drift out of the tracks of a keyframe to be, and its pose from them anew."""
-        num_aligned = self._map.anchor(self._tracks, sight, pose.T_world_cam)
-        anew = self._pose(pose.T_world_cam) if num_aligned else None
-        if anew is None:
-            return pose
+    def _improved(self, sight: Sight, pose: TrackedPose) -> TrackedPose:
+        """Take drift out of the tracks of a keyframe to be and take up old landmarks; its pose from those."""
+        for improve in (self._map.anchor, self._map.reuse):
+            if improve(self._tracks, sight, pose.T_world_cam):
+                pose = self._posed_anew(sight, pose.T_world_cam) or pose
+        return pose
+
+    def _posed_anew(self, sight: Sight, T_world_guess: Array) -> TrackedPose | None:
+        """Estimate the pose of a frame again whose tracks or landmarks have moved."""
+        reference = self._map.reference_keyframe()
+        anew = self._pose(T_world_guess)
+        if anew is None or reference is None:
+            return None
         self._map.world.add_frame(sight.frame.frame_id, reference.frame_id, anew.T_world_cam)
         self._moved(1.0)
         return anew

@@ -298,6 +298,11 @@ class TrackTable:
             self.confidence = self.confidence.copy()
             self.confidence[rows] = variance_confidence(self.variance_px2[rows])
 
+    def give_way(self, xy: Array, reach_px: float = 4.0) -> None:
+        """Forget visible tracks next to ``(N, 2)`` points that are known better."""
+        away = np.abs(self.xy[:, None] - xy[None]).max(axis=2)
+        self.keep(~(self.visible & (away < reach_px).any(axis=1)))
+
     def take_up(
         self, sight: Sight, grey0: Grey, ids: Ids, xy0: Array, expected_xy: Array, reach_px: float
     ) -> Ids:
@@ -315,8 +320,24 @@ class TrackTable:
             Ids of those that were found.
         """
         points = track_points(grey0, sight.grey, xy0, expected_xy, max_level=1)
-        ok = points.ok & (np.linalg.norm(points.xy - expected_xy, axis=1) < reach_px)
-        ok &= ~sight.near_lost(points.xy, KLT_WINDOW_PX // 2 - 2)
+        near = np.linalg.norm(points.xy - expected_xy, axis=1) < reach_px
+        return self.bring_back(sight, ids, replace(points, ok=points.ok & near))
+
+    def bring_back(self, sight: Sight, ids: Ids, points: TrackedPoints) -> Ids:
+        """Add tracks that ended earlier where they were found in the newest image.
+
+        Those next to rows that did not arrive are left out, and of several in one place all but the first,
+        tracks that are visible already before others.
+
+        Args:
+            sight: The newest image.
+            ids: ``(N,)`` of the tracks, none of them alive.
+            points: ``(N,)`` where they were found; those that are not ``ok`` are left out.
+
+        Returns:
+            Ids of those that were added.
+        """
+        ok = points.ok & ~sight.near_lost(points.xy, KLT_WINDOW_PX // 2 - 2)
         xy = points.xy[ok]
         taken = np.concatenate([self.xy[self.visible], xy])
         ok[ok] = deduplicate(taken)[len(taken) - len(xy) :]

@@ -132,6 +132,7 @@ class WorldMap:
         poses: Frame id of a keyframe -> ``T_world_cam``, also of keyframes thinned out since.
         submap_of: Frame id of a keyframe -> its submap.
         frames: Frame id -> (keyframe's frame id, ``T_keyframe_cam``).
+        revisits: Frame id of a keyframe -> that of an older one whose landmarks it saw again.
     """
 
     def __init__(self) -> None:
@@ -140,6 +141,7 @@ class WorldMap:
         self.poses: dict[int, Array] = {}
         self.submap_of: dict[int, int] = {}
         self.frames: dict[int, tuple[int, Array]] = {}
+        self.revisits: dict[int, int] = {}
         self._changed: set[int] = set()
         self._moved_keyframes: set[int] = set()
         self._frames_moved = False
@@ -223,6 +225,8 @@ class WorldMap:
         if len(self.keyframes) > max_keyframes:
             old, young = self.keyframes[:-recent], self.keyframes[-recent:]
             self.keyframes = old[1::2] + young
+            kept = {k.frame_id for k in self.keyframes}
+            self.revisits = {new: old for new, old in self.revisits.items() if {new, old} <= kept}
 
     def pose_of_frame(self, frame_id: int) -> Array | None:
         """Best current ``T_world_cam`` of a frame, None where it has none."""

@@ -8,7 +8,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.anchoring import anchor_tracks
-from semcast.server.mapping.recall import NUM_IMAGES, SeenFrom, no_images, recall_landmarks
+from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import MAX_COAST, Sight, TrackTable, usable_rows
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -267,7 +267,7 @@ def mapped():
     )
     xyz = CAMERA.unproject(tracks.xy)
     world.add_landmarks(tracks.ids, xyz, np.zeros((count, 3), np.uint8), np.ones(count), 0, 0)
-    images = no_images()
+    images = KeyframeImages(10)
     images.append(SeenFrom(0, sight_at(START_X).grey))
     return world, images, tracks
 
@@ -323,13 +323,6 @@ def test_landmarks_of_another_submap_stay_where_they_are(mapped):
     assert len(found) == len(tracks) == 0
 
 
-def test_old_images_are_forgotten():
-    images = no_images()
-    for k in range(NUM_IMAGES + 2):
-        images.append(SeenFrom(k, np.zeros((2, 2), np.uint8)))
-    assert [i.frame_id for i in images] == list(range(2, NUM_IMAGES + 2))
-
-
 def anchor(mapped, sight, x, submap=0):
     world, images, tracks = mapped
     return anchor_tracks(CAMERA, world, images, tracks, sight, pose_at(x), submap=submap)
@@ -366,12 +359,10 @@ def test_a_track_that_fits_nowhere_stays_where_it_is(mapped):
     sight = sight_at(30, frame_id=1)
     tracks.follow(sight, tracks.xy - (10, 0))
     followed = tracks.xy.copy()
-    images.clear()
-    images.append(SeenFrom(0, np.random.default_rng(0).integers(0, 256, SHAPE).astype(np.uint8)))
+    images._images[0] = SeenFrom(0, np.random.default_rng(0).integers(0, 256, SHAPE).astype(np.uint8))
     assert anchor(mapped, sight, 30) == 0
     np.testing.assert_array_equal(tracks.xy, followed)
-    images.clear()
-    images.append(SeenFrom(0, sight_at(START_X).grey))
+    images._images[0] = SeenFrom(0, sight_at(START_X).grey)
     assert anchor(mapped, sight, 30, submap=1) == 0, "a keyframe of another submap has another world"
     world.landmarks.keep(np.zeros(len(world.landmarks), bool))
     assert anchor(mapped, sight, 30) == 0, "no depth, no warp"

@@ -1,0 +1,234 @@
+"""A part of the map that was seen long ago and is in sight again: its landmarks are found and used anew.
+
+Without that every return makes new landmarks where there are some already. Where the camera should see a
+keyframe of long ago, that keyframe's landmarks are looked for: first by following them from its image, then
+by aligning its patches, warped by pose and depth. What was found must agree with the relative pose of the two
+images. It need not agree with the landmark's old position: seen under small angles in its time, a landmark
+may be far off in depth, which shows from another place only. So it is triangulated anew.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.epipolar import fundamental_matrix, sampson_px
+from semcast.server.geometry.features import TrackedPoints, track_points
+from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches
+from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.geometry.triangulation import triangulate
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.mapper import gather_observations, median_depth
+from semcast.server.mapping.recall import KeyframeImages, SeenFrom
+from semcast.server.mapping.tracks import Sight
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: The newest keyframes are no revisit: an adjustment has them in its window.
+NUM_RECENT = 12
+#: Keyframes whose landmarks are projected, as long as turn (in half fields of view) and way (in depths of the
+#: scene) together are below this, and how many of those are looked for in the image, one after the other.
+_NUM_NEAREST, _MAX_APART = 10, 2.0
+_NUM_TRIED = 2
+#: Landmarks of a keyframe that should be in sight for it to be looked at.
+_MIN_EXPECTED = 30
+#: Found landmarks that agree with the pose, as a number and as a share of those found.
+_MIN_AGREEING, _MIN_SHARE = 15, 0.6
+#: Patches that are seen at less than this share of their area, or more than its inverse, have other details.
+_MIN_AREA_RATIO = 0.4
+_MIN_CORRELATION = 0.75
+#: Old landmarks are not exactly where they are expected; the patch puts them right by a little once they were
+#: followed there.
+_REACH_PX, _MAX_MOVE_PX = 40.0, 3.0
+_KLT_LEVELS = 2
+_BORDER_PX = 10
+#: Keyframes before and after the old one that help to triangulate.
+_NEIGHBOURS = 6
+#: Rays that are further apart than this tell the depth; all must meet to so many standard deviations.
+_MIN_PARALLAX_DEG, _MAX_ERROR_SIGMA = 1.0, 1.8
+
+
+@dataclass(frozen=True)
+class Revisit:
+    """Landmarks of an old keyframe found in the newest image.
+
+    Attributes:
+        keyframe_id: The old keyframe.
+        ids: ``(N,)`` landmarks, ascending.
+        points: ``(N,)`` where they were found, ``ok`` where that agrees with the pose.
+    """
+
+    keyframe_id: int
+    ids: Ids
+    points: TrackedPoints
+
+
+@dataclass(frozen=True)
+class _Expected:
+    """Landmarks of a keyframe that should be in sight."""
+
+    keyframe: Keyframe
+    image: SeenFrom
+    rows: NDArray[np.intp]
+    xy: Array
+    warps: Array
+
+
+def find_revisit(
+    camera: Intrinsics,
+    world: WorldMap,
+    images: KeyframeImages,
+    tracked_ids: Ids,
+    sight: Sight,
+    T_world_cam: Array,
+    *,
+    submap: int,
+    gate_px: float,
+) -> Revisit | None:
+    """Look for landmarks of an old keyframe that should be in sight.
+
+    Args:
+        camera: Pinhole.
+        world: The map.
+        images: Of keyframes.
+        tracked_ids: Tracks that are alive: they need not be found.
+        sight: The newest image.
+        T_world_cam: Its pose.
+        submap: The current one.
+        gate_px: Distance from the epipolar line up to which a point agrees with the pose.
+
+    Returns:
+        The keyframe of which most should be in sight and enough is, None where there is none.
+    """
+    T_cam_world = invert_transform(T_world_cam)
+    candidates = [
+        _expected(camera, world, keyframe, image, tracked_ids, sight, T_cam_world)
+        for keyframe, image in _nearest(camera, world, images, T_world_cam, submap)
+    ]
+    candidates = [c for c in candidates if len(c.rows) >= _MIN_EXPECTED]
+    candidates.sort(key=lambda c: -len(c.rows))
+    for candidate in candidates[:_NUM_TRIED]:
+        found = _look(camera, candidate, sight, T_world_cam, gate_px)
+        if found is not None:
+            return found
+    return None
+
+
+def _nearest(
+    camera: Intrinsics, world: WorldMap, images: KeyframeImages, T_world_cam: Array, submap: int
+) -> list[tuple[Keyframe, SeenFrom]]:
+    """Old keyframes that looked at about the same from about there."""
+    mine = [k for k in world.keyframes if k.submap == submap]
+    by_id = {k.frame_id: k for k in mine[:-NUM_RECENT]}
+    known = [(by_id[image.frame_id], image) for image in images if image.frame_id in by_id]
+    if not known:
+        return []
+    T_world_old = np.stack([keyframe.T_world_cam for keyframe, _ in known])
+    way = np.linalg.norm(T_world_old[:, :3, 3] - T_world_cam[:3, 3], axis=1) / median_depth(world, mine[-1])
+    turn = np.arccos(np.clip(T_world_old[:, :3, 2] @ T_world_cam[:3, 2], -1.0, 1.0))
+    reach = np.arctan(0.5 * np.hypot(camera.width / camera.fx, camera.height / camera.fy))
+    apart = turn / reach + way
+    nearest = np.argsort(apart, kind="stable")[:_NUM_NEAREST]
+    return [known[k] for k in nearest.tolist() if apart[k] < _MAX_APART]
+
+
+def _expected(
+    camera: Intrinsics,
+    world: WorldMap,
+    keyframe: Keyframe,
+    image: SeenFrom,
+    tracked_ids: Ids,
+    sight: Sight,
+    T_cam_world: Array,
+) -> _Expected:
+    row = world.landmarks.rows(keyframe.ids)
+    rows = np.flatnonzero((row >= 0) & ~np.isin(keyframe.ids, tracked_ids, assume_unique=True))
+    T_old_world = invert_transform(keyframe.T_world_cam)
+    depth = world.landmarks.xyz[row[rows]] @ T_old_world[2, :3] + T_old_world[2, 3]
+    rows, depth = rows[depth > MIN_DEPTH_MAP], depth[depth > MIN_DEPTH_MAP]
+    warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, keyframe.xy[rows], depth)
+    area = np.linalg.det(warps)
+    good = (depth_now > MIN_DEPTH_MAP) & (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
+    points_cam = world.landmarks.xyz[row[rows]] @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    xy = camera.project(np.where(good[:, None], points_cam, (0.0, 0.0, 1.0)))
+    height, width = sight.grey.shape
+    border = np.array([_BORDER_PX, _BORDER_PX])
+    good &= ((xy >= border) & (xy < np.array([width, height]) - border)).all(axis=1)
+    good &= ~sight.near_lost(xy, _BORDER_PX)
+    return _Expected(keyframe, image, rows[good], xy[good], warps[good])
+
+
+def _look(
+    camera: Intrinsics, expected: _Expected, sight: Sight, T_world_cam: Array, gate_px: float
+) -> Revisit | None:
+    """Find a keyframe's landmarks where they agree with the relative pose."""
+    keyframe, rows = expected.keyframe, expected.rows
+    xy0 = keyframe.xy[rows]
+    points = track_points(expected.image.grey, sight.grey, xy0, expected.xy, max_level=_KLT_LEVELS)
+    near = points.ok & (np.linalg.norm(points.xy - expected.xy, axis=1) < _REACH_PX)
+    tried = np.flatnonzero(near)
+    aligned = align_patches(
+        Templates.cut(expected.image.grey, xy0[tried]), sight.grey, points.xy[tried], expected.warps[tried]
+    )
+    moved = np.linalg.norm(aligned.xy - points.xy[tried], axis=1)
+    fits = (aligned.correlation > _MIN_CORRELATION) & (moved < _MAX_MOVE_PX)
+    tried, xy = tried[fits], aligned.xy[fits]
+    if len(tried) < _MIN_AGREEING:
+        return None
+    F = fundamental_matrix(camera, invert_transform(T_world_cam) @ keyframe.T_world_cam)
+    agrees = np.abs(sampson_px(F, xy0[tried], xy)) < gate_px
+    if int(agrees.sum()) < max(_MIN_AGREEING, _MIN_SHARE * len(tried)):
+        return None
+    all_xy, ok = points.xy.copy(), np.zeros(len(rows), bool)
+    all_xy[tried], ok[tried] = xy, agrees
+    return Revisit(keyframe.frame_id, keyframe.ids[rows], replace(points, xy=all_xy, ok=ok))
+
+
+def place_anew(
+    camera: Intrinsics,
+    world: WorldMap,
+    keyframe_id: int,
+    T_world_cam: Array,
+    ids: Ids,
+    xy: Array,
+    confidence: Array,
+    noise: NoiseModel,
+) -> NDArray[np.bool_]:
+    """Triangulate landmarks from the keyframes around an old one and from the newest frame.
+
+    Args:
+        camera: Pinhole.
+        world: The map; landmarks move.
+        keyframe_id: The old keyframe.
+        T_world_cam: Pose of the newest frame.
+        ids: ``(N,)`` landmarks, ascending.
+        xy: ``(N, 2)`` where the newest frame sees them.
+        confidence: ``(N,)`` of that.
+        noise: Of the observations.
+
+    Returns:
+        ``(N,)`` bool: landmarks on which all rays agree.
+    """
+    submap = world.submap_of[keyframe_id]
+    mine = [k for k in world.keyframes if k.submap == submap]
+    at = next(row for row, k in enumerate(mine) if k.frame_id == keyframe_id)
+    views = mine[max(0, at - _NEIGHBOURS) : at + _NEIGHBOURS + 1]
+    view, point, xy_then, confidence_then = gather_observations(views, ids)
+    count = len(ids)
+    placed = triangulate(
+        camera,
+        invert_transform(np.stack([*(k.T_world_cam for k in views), T_world_cam])),
+        np.concatenate([view, np.full(count, len(views), np.intp)]),
+        np.concatenate([point, np.arange(count, dtype=np.intp)]),
+        np.concatenate([xy_then, xy]),
+        noise.sigma_px(np.concatenate([confidence_then, confidence])),
+        count,
+    )
+    good = placed.in_front & (placed.error_sigma < _MAX_ERROR_SIGMA)
+    told = good & (placed.parallax_deg > _MIN_PARALLAX_DEG)
+    world.move_landmarks(ids[told], placed.xyz[told])
+    return np.asarray(good)
