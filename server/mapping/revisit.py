@@ -32,7 +32,7 @@ Ids = NDArray[np.int64]
 NUM_RECENT = 12
 #: Keyframes whose landmarks are projected, as long as turn (in half fields of view) and way (in depths of the
 #: scene) together are below this, and how many of those are looked for in the image, one after the other.
-_NUM_NEAREST, _MAX_APART = 10, 2.0
+_NUM_NEAREST, _MAX_APART = 6, 2.0
 _NUM_TRIED = 2
 #: Landmarks of a keyframe that should be in sight for it to be looked at.
 _MIN_EXPECTED = 30
