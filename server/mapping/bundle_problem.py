@@ -29,6 +29,8 @@ class BundleProblem:
         confidence: ``(M,)`` of each observation, handed through.
         iterations: Levenberg-Marquardt steps at most.
         map_version: Handed through; a result for another map is not applied.
+        num_anchors: So many of the first keyframes are of long ago; they are held, and only what the others
+            see is adjusted.
         with_covariance: Whether the covariance of the last pose is wanted.
     """
 
@@ -46,6 +48,7 @@ class BundleProblem:
     confidence: Array
     iterations: int = 6
     map_version: int = 0
+    num_anchors: int = 0
     with_covariance: bool = True
 
 

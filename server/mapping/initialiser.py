@@ -161,7 +161,10 @@ class Initialiser:
         return self._is_overdue() or flow_px >= _RETRY_GROWTH * self._undecided_flow_px
 
     def _is_too_short(self) -> bool:
-        """Whether to wait for a third view; asked, and counted, each time there are only two."""
+        """Whether to wait for a third view; asked, and counted, each time there are only two.
+
+        The pair need not be good for a start: the search that would tell is what waiting saves.
+        """
         self._num_too_short += 1
         return self._num_too_short <= _MAX_TOO_SHORT
 

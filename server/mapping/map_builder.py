@@ -139,41 +139,33 @@ class MapBuilder:
         Returns:
             How many were taken up.
         """
-        noise = self.noise.model
-        gate_px = GATE_SIGMAS * max(_OLD_SIGMA_PX, noise.sigma0_px)
+        world, noise = self.world, self.noise.model
+        sigma_px = max(_OLD_SIGMA_PX, noise.sigma0_px)
         found = find_revisit(
             self._camera,
-            self.world,
+            world,
             self.images,
             tracks.ids,
             sight,
             T_world_cam,
             submap=self.submap,
-            gate_px=gate_px,
+            gate_px=GATE_SIGMAS * sigma_px,
         )
         if found is None:
             return 0
-        tracks.give_way(found.points.xy[found.points.ok])
+        points = place_anew(self._camera, world, found, T_world_cam, noise, sigma_px)
         room = int(_MAX_TRACKS_SHARE * self._settings.max_features) - int(tracks.visible.sum())
-        ids = tracks.bring_back(sight, found.ids, found.points.strongest(max(0, room)))
-        rows = np.searchsorted(tracks.ids, ids)
-        good = place_anew(
-            self._camera,
-            self.world,
-            found.keyframe_id,
-            T_world_cam,
-            ids,
-            tracks.xy[rows],
-            tracks.confidence[rows],
-            noise,
-        )
-        tracks.keep(~np.isin(tracks.ids, ids[~good], assume_unique=True))
-        if int(good.sum()) == 0:
+        points = points.strongest(max(0, room))
+        # Where an old landmark and a young track are in one place, the young one gives way.
+        tracks.keep(~tracks.beside(points.xy[points.ok]))
+        ids = tracks.bring_back(sight, found.ids, points)
+        if len(ids) == 0:
             return 0
         frame_id = sight.frame.frame_id
-        logger.debug("frame %d: %d landmarks of keyframe %d again", frame_id, good.sum(), found.keyframe_id)
-        self.world.revisits[frame_id] = found.keyframe_id
-        return int(good.sum())
+        logger.debug("frame %d: %d landmarks of keyframe %d again", frame_id, len(ids), found.keyframe_id)
+        mapper.note_sight(world, ids, np.ones(len(ids), bool), frame_id)
+        world.revisits[frame_id] = found.keyframe_id
+        return len(ids)
 
     def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
         """Turn the newest frame into a keyframe, triangulate, and ask for an adjustment."""
@@ -197,7 +189,8 @@ class MapBuilder:
         )
         mapper.add_landmarks(world, self._camera, self.noise.model, frame.image, s.min_parallax_deg)
         self.num_inliers_at_keyframe = int((world.landmarks.rows(ids) >= 0).sum())
-        world.bound(s.max_landmarks, s.max_keyframes, recent=min(40, s.max_keyframes // 2))
+        if world.bound(s.max_landmarks, s.max_keyframes, recent=min(40, s.max_keyframes // 2)):
+            self.images.keep({k.frame_id for k in world.keyframes})
         self._submit()
 
     def _submit(self, *, start: bool = False) -> None:

@@ -21,8 +21,9 @@ Ids = NDArray[np.int64]
 MAX_OBSERVATIONS = 3500
 #: Landmarks further than this many median depths are as good as at infinity.
 _MAX_DEPTH_RATIO = 60.0
-#: Keyframes of long ago in one adjustment at most.
-_MAX_REVISITED = 4
+#: Keyframes of long ago that were recognised in one adjustment at most, and how many of those before and
+#: after each hold their landmarks with it: rays from one place alone would leave them free in depth.
+_MAX_REVISITED, _NEIGHBOURS = 3, 1
 #: Noise is judged by residuals that keep at least this share of its variance.
 _MIN_LEFT = 0.1
 #: Observations in a row that disagree before a landmark is given up.
@@ -240,8 +241,9 @@ def build_problem(
     view, point, xy, confidence = gather_observations(views, ids)
     count = np.bincount(point, minlength=len(ids))
     if count.sum() > MAX_OBSERVATIONS:
-        # Long tracks tie the window together: they are kept first, ids break ties.
-        order = np.lexsort((ids, -count))
+        # What ties the window to long ago is kept first, then long tracks; ids break ties.
+        anchored = np.isin(np.arange(len(ids)), point[view < len(anchors)])
+        order = np.lexsort((ids, -count, ~anchored))
         within = np.cumsum(count[order]) <= MAX_OBSERVATIONS
         chosen = np.zeros(len(ids), bool)
         chosen[order[within]] = True
@@ -270,13 +272,16 @@ def build_problem(
         confidence=confidence[kept],
         iterations=iterations,
         map_version=map_version,
+        num_anchors=len(anchors),
     )
 
 
 def _anchors(world: WorldMap, older: list[Keyframe], recent: list[Keyframe]) -> list[Keyframe]:
     """Older keyframes whose landmarks the recent ones saw again: they hold the window where it was before."""
     again = {world.revisits[k.frame_id] for k in recent if k.frame_id in world.revisits}
-    return [k for k in older if k.frame_id in again][-_MAX_REVISITED:]
+    rows = [row for row, k in enumerate(older) if k.frame_id in again][-_MAX_REVISITED:]
+    near = {r for row in rows for r in range(row - _NEIGHBOURS, row + _NEIGHBOURS + 1)}
+    return [older[r] for r in sorted(near) if 0 <= r < len(older)]
 
 
 def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> None:
@@ -310,7 +315,9 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
     known = np.asarray(np.isfinite(result.residual_px).all(axis=1))
     size = np.linalg.norm(np.nan_to_num(result.residual_px), axis=1)
     left = _share_left(problem, known)
-    telling = known & (size < 12.0 * problem.sigma_px) & (left > _MIN_LEFT)
+    telling = (
+        known & (problem.view >= problem.num_anchors) & (size < 12.0 * problem.sigma_px) & (left > _MIN_LEFT)
+    )
     as_noise = np.abs(result.residual_px[telling]) / np.sqrt(left[telling, None])
     noise.add(np.repeat(problem.confidence[telling], 2), as_noise.ravel())
     bad = ~known | (size > 1.3 * noise.model.threshold_px(problem.confidence))
@@ -342,7 +349,9 @@ def _drop(world: WorldMap, problem: BundleProblem, bad: NDArray[np.bool_]) -> No
             keyframe = by_id[frame_id]
             keyframe.drop_observations(np.isin(keyframe.ids, problem.landmark_ids[problem.point[rows]]))
     left = np.bincount(problem.point[~bad], minlength=len(problem.xyz))
-    row = world.landmarks.rows(problem.landmark_ids[left < 2])
+    # Keyframes outside the problem saw those of long ago too: one new frame does not refute a landmark.
+    of_long_ago = np.isin(np.arange(len(left)), problem.point[problem.view < problem.num_anchors])
+    row = world.landmarks.rows(problem.landmark_ids[(left < 2) & ~of_long_ago])
     mask = np.zeros(len(world.landmarks), bool)
     mask[row[row >= 0]] = True
     world.remove_landmarks(mask)

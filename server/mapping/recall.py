@@ -33,7 +33,7 @@ class SeenFrom:
 
 
 class KeyframeImages:
-    """Images of keyframes, bounded in number: of too many, every second one of the older half goes.
+    """Images of keyframes, bounded in number: of too many, an older one close to others goes.
 
     Args:
         capacity: Images kept at most.
@@ -54,16 +54,16 @@ class KeyframeImages:
         """Keep the image of the newest keyframe."""
         self._images.append(image)
         if len(self._images) > self._capacity:
-            half = len(self._images) // 2
-            self._images = self._images[1:half:2] + self._images[half:]
+            ids = np.array([image.frame_id for image in self._images[: len(self._images) // 2 + 1]])
+            del self._images[1 + int(np.argmin(ids[2:] - ids[:-2]))]
+
+    def keep(self, keyframe_ids: set[int]) -> None:
+        """Forget images of other keyframes."""
+        self._images = [image for image in self._images if image.frame_id in keyframe_ids]
 
     def newest(self, count: int) -> list[SeenFrom]:
         """Return the newest ones, oldest first."""
         return self._images[-count:]
-
-    def older(self, count: int) -> list[SeenFrom]:
-        """Return all but the newest ones, oldest first."""
-        return self._images[:-count]
 
 
 def recall_landmarks(

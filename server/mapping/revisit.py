@@ -17,9 +17,9 @@ from semcast.common.geometry import invert_transform
 from semcast.server.geometry.epipolar import fundamental_matrix, sampson_px
 from semcast.server.geometry.features import TrackedPoints, track_points
 from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches
-from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.geometry.pnp import MIN_DEPTH_MAP, reprojection_residual
 from semcast.server.geometry.triangulation import triangulate
-from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.mapper import gather_observations, median_depth
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.tracks import Sight
@@ -28,7 +28,7 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: The newest keyframes are no revisit: an adjustment has them in its window.
+#: The newest keyframes are no revisit: an adjustment has most of them in its window.
 NUM_RECENT = 12
 #: Keyframes whose landmarks are projected, as long as turn (in half fields of view) and way (in depths of the
 #: scene) together are below this, and how many of those are looked for in the image, one after the other.
@@ -50,6 +50,8 @@ _BORDER_PX = 10
 _NEIGHBOURS = 6
 #: Rays that are further apart than this tell the depth; all must meet to so many standard deviations.
 _MIN_PARALLAX_DEG, _MAX_ERROR_SIGMA = 1.0, 1.8
+#: A depth that changes by more than this factor (as a logarithm) is that of another point along the line.
+_MAX_LOG_DEPTH = 0.7
 
 
 @dataclass(frozen=True)
@@ -191,44 +193,53 @@ def _look(
 def place_anew(
     camera: Intrinsics,
     world: WorldMap,
-    keyframe_id: int,
+    found: Revisit,
     T_world_cam: Array,
-    ids: Ids,
-    xy: Array,
-    confidence: Array,
     noise: NoiseModel,
-) -> NDArray[np.bool_]:
-    """Triangulate landmarks from the keyframes around an old one and from the newest frame.
+    sigma_px: float,
+) -> TrackedPoints:
+    """Triangulate found landmarks from the keyframes around the old one and from the newest frame.
 
     Args:
         camera: Pinhole.
         world: The map; landmarks move.
-        keyframe_id: The old keyframe.
+        found: Landmarks and where the newest frame sees them.
         T_world_cam: Pose of the newest frame.
-        ids: ``(N,)`` landmarks, ascending.
-        xy: ``(N, 2)`` where the newest frame sees them.
-        confidence: ``(N,)`` of that.
-        noise: Of the observations.
+        noise: Of the observations of keyframes.
+        sigma_px: Of those of the newest frame.
 
     Returns:
-        ``(N,)`` bool: landmarks on which all rays agree.
+        The points found, ``ok`` where all rays agree, that of the newest frame for itself too. Where rays are
+        too close to each other to tell the depth, the landmark stays, and has to be seen where it is.
     """
-    submap = world.submap_of[keyframe_id]
+    submap = world.submap_of[found.keyframe_id]
     mine = [k for k in world.keyframes if k.submap == submap]
-    at = next(row for row, k in enumerate(mine) if k.frame_id == keyframe_id)
+    at = next(row for row, k in enumerate(mine) if k.frame_id == found.keyframe_id)
     views = mine[max(0, at - _NEIGHBOURS) : at + _NEIGHBOURS + 1]
-    view, point, xy_then, confidence_then = gather_observations(views, ids)
+    ids, xy = found.ids[found.points.ok], found.points.xy[found.points.ok]
     count = len(ids)
+    view, point, xy_then, confidence = gather_observations(views, ids)
+    T_cam_world = invert_transform(T_world_cam)
     placed = triangulate(
         camera,
-        invert_transform(np.stack([*(k.T_world_cam for k in views), T_world_cam])),
+        np.concatenate([invert_transform(np.stack([k.T_world_cam for k in views])), T_cam_world[None]]),
         np.concatenate([view, np.full(count, len(views), np.intp)]),
         np.concatenate([point, np.arange(count, dtype=np.intp)]),
         np.concatenate([xy_then, xy]),
-        noise.sigma_px(np.concatenate([confidence_then, confidence])),
+        np.concatenate([noise.sigma_px(confidence), np.full(count, sigma_px)]),
         count,
     )
-    good = placed.in_front & (placed.error_sigma < _MAX_ERROR_SIGMA)
-    told = good & (placed.parallax_deg > _MIN_PARALLAX_DEG)
-    world.move_landmarks(ids[told], placed.xyz[told])
-    return np.asarray(good)
+    before = world.landmarks.xyz[world.landmarks.rows(ids)]
+    told = placed.parallax_deg > _MIN_PARALLAX_DEG
+    xyz = np.where(told[:, None], placed.xyz, before)
+    residual, in_front = reprojection_residual(camera, T_cam_world, xyz, xy)
+    good = in_front & (np.linalg.norm(residual, axis=1) < GATE_SIGMAS * sigma_px)
+    at_old = world.poses[found.keyframe_id][:3, 3]
+    depth, depth_before = (np.linalg.norm(x - at_old, axis=1) for x in (xyz, before))
+    change = np.abs(np.log(np.maximum(depth, 1e-9) / np.maximum(depth_before, 1e-9)))
+    sound = placed.in_front & (placed.error_sigma < _MAX_ERROR_SIGMA) & (change < _MAX_LOG_DEPTH)
+    good &= ~told | sound
+    world.move_landmarks(ids[good & told], xyz[good & told])
+    ok = found.points.ok.copy()
+    ok[ok] = good
+    return replace(found.points, ok=ok)

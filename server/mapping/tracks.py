@@ -298,10 +298,14 @@ class TrackTable:
             self.confidence = self.confidence.copy()
             self.confidence[rows] = variance_confidence(self.variance_px2[rows])
 
-    def give_way(self, xy: Array, reach_px: float = 4.0) -> None:
-        """Forget visible tracks next to ``(N, 2)`` points that are known better."""
-        away = np.abs(self.xy[:, None] - xy[None]).max(axis=2)
-        self.keep(~(self.visible & (away < reach_px).any(axis=1)))
+    def beside(self, xy: Array, cell_px: float = 4.0) -> NDArray[np.bool_]:
+        """Visible tracks next to ``(M, 2)`` points, ``(N,)``: in the same or a neighbouring cell."""
+        around = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+        taken = (np.floor(xy / cell_px).astype(np.int64)[:, None] + around).reshape(-1, 2)
+        cell = np.floor(self.xy / cell_px).astype(np.int64)
+        return self.visible & np.isin(
+            cell[:, 0] * 1_000_003 + cell[:, 1], taken[:, 0] * 1_000_003 + taken[:, 1]
+        )
 
     def take_up(
         self, sight: Sight, grey0: Grey, ids: Ids, xy0: Array, expected_xy: Array, reach_px: float

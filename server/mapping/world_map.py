@@ -212,8 +212,12 @@ class WorldMap:
                 T[:3, 3] *= scale
                 self.frames[frame_id] = (keyframe_id, T)
 
-    def bound(self, max_landmarks: int, max_keyframes: int, recent: int) -> None:
-        """Keep the map within its size: longest unseen landmarks and every second old keyframe go."""
+    def bound(self, max_landmarks: int, max_keyframes: int, recent: int) -> bool:
+        """Keep the map within its size: longest unseen landmarks and every second old keyframe go.
+
+        Returns:
+            Whether keyframes went.
+        """
         excess = len(self.landmarks) - max_landmarks
         if excess > 0:
             # A tenth more than needed, so that this does not run on every keyframe.
@@ -222,11 +226,13 @@ class WorldMap:
             bad = np.zeros(len(self.landmarks), bool)
             bad[oldest] = True
             self.remove_landmarks(bad)
-        if len(self.keyframes) > max_keyframes:
-            old, young = self.keyframes[:-recent], self.keyframes[-recent:]
-            self.keyframes = old[1::2] + young
-            kept = {k.frame_id for k in self.keyframes}
-            self.revisits = {new: old for new, old in self.revisits.items() if {new, old} <= kept}
+        if len(self.keyframes) <= max_keyframes:
+            return False
+        old, young = self.keyframes[:-recent], self.keyframes[-recent:]
+        self.keyframes = old[1::2] + young
+        kept = {k.frame_id for k in self.keyframes}
+        self.revisits = {new: old for new, old in self.revisits.items() if {new, old} <= kept}
+        return True
 
     def pose_of_frame(self, frame_id: int) -> Array | None:
         """Best current ``T_world_cam`` of a frame, None where it has none."""

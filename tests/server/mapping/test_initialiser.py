@@ -4,6 +4,7 @@ import numpy as np
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
+from semcast.server.geometry.two_view import estimate_two_view
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.initialiser import Initialiser
 from semcast.server.mapping.kept_frames import Observed
@@ -47,6 +48,19 @@ def test_a_map_begins_from_three_views_with_the_true_motion():
     way = start.keyframes[-1].T_world_cam[:3, 3]
     assert way @ true_way / np.linalg.norm(way) / np.linalg.norm(true_way) > 0.99
     assert np.isclose(np.median(start.xyz[:, 2]), 1.0)
+
+
+def test_no_relative_pose_is_looked_for_before_there_is_a_third_view(monkeypatch):
+    sizes = []
+
+    def counted(camera, xy0, xy1, *args, **options):
+        sizes.append(len(xy0))
+        return estimate_two_view(camera, xy0, xy1, *args, **options)
+
+    monkeypatch.setattr("semcast.server.mapping.initialiser.estimate_two_view", counted)
+    k, _ = begin(ride(6)[0])
+    assert k == 2
+    assert len(sizes) == 1
 
 
 def test_few_points_wait_for_more_but_not_for_ever():

@@ -10,9 +10,12 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.features import TrackedPoints, to_grey
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.mapper import build_problem
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.revisit import NUM_RECENT, find_revisit, place_anew
+from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -59,19 +62,25 @@ def on_wall(T_world_cam, xy):
 def mapped():
     """A map of a camera that went along the wall until it no longer saw where it began."""
     world, images, next_id = WorldMap(), KeyframeImages(50), 0
+    xyz_of = np.zeros((0, 3))
     for k in range(NUM_RECENT + 6):
         T = pose(0.4 * k)
         sight = sight_from(T, k)
+        xy = CAMERA.project(xyz_of @ T[:3, :3] - T[:3, 3] @ T[:3, :3])
+        again = np.flatnonzero(((xy > 12) & (xy < np.array(SHAPE[::-1]) - 12)).all(axis=1))
         tracks = TrackTable("off", 120, 0)
-        tracks.next_id = next_id
         tracks.remember(sight)
+        tracks.adopt(again, xy[again], 1.0)
+        tracks.next_id = next_id
         tracks.refill(sight)
-        next_id = tracks.next_id
         none = np.zeros(0, np.int64), np.zeros((0, 32), np.uint8)
         world.add_keyframe(Keyframe(k, k * 10**8, T, 0, tracks.ids, tracks.xy, tracks.confidence, *none))
-        count = len(tracks)
-        xyz = on_wall(T, tracks.xy)
-        world.add_landmarks(tracks.ids, xyz, np.zeros((count, 3), np.uint8), np.ones(count), 0, k)
+        new = tracks.ids >= next_id
+        next_id = tracks.next_id
+        xyz = on_wall(T, tracks.xy[new])
+        xyz_of = np.concatenate([xyz_of, xyz])
+        count = len(xyz)
+        world.add_landmarks(tracks.ids[new], xyz, np.zeros((count, 3), np.uint8), np.ones(count), 0, k)
         images.append(SeenFrom(k, sight.grey))
     return world, images
 
@@ -97,46 +106,116 @@ def test_landmarks_of_long_ago_are_found_where_they_are(mapped):
     assert away.max() < 3.0
 
 
-def test_a_landmark_whose_depth_was_wrong_is_found_too_and_placed_anew(mapped, rng):
-    world, _ = mapped
+def place(mapped, found, T_world_cam):
+    return place_anew(CAMERA, mapped[0], found, T_world_cam, NOISE, 1.0)
+
+
+def stretched(world, rng):
+    """Move every landmark along the ray of the keyframe that made it; the truth."""
     truth = world.landmarks.xyz.copy()
     camera_at = np.array([world.poses[k][:3, 3] for k in world.landmarks.born.tolist()])
-    stretch = rng.uniform(0.9, 1.15, len(truth))[:, None]
-    world.landmarks.xyz = camera_at + (truth - camera_at) * stretch  # along the ray of the only view
+    world.landmarks.xyz = camera_at + (truth - camera_at) * rng.uniform(0.9, 1.15, len(truth))[:, None]
+    return truth
+
+
+def test_a_landmark_whose_depth_was_wrong_is_found_too_and_placed_anew(mapped, rng):
+    world, _ = mapped
+    truth = stretched(world, rng)
     here = pose(0.2, 0.2)
     found = look(mapped, here)
-    ok = found.points.ok
-    assert ok.sum() > 40
-    ids, xy = found.ids[ok], found.points.xy[ok]
-    row = world.landmarks.rows(ids)
+    row = world.landmarks.rows(found.ids)
     before = np.linalg.norm(world.landmarks.xyz[row] - truth[row], axis=1)
-    good = place_anew(CAMERA, world, found.keyframe_id, here, ids, xy, np.ones(len(ids)), NOISE)
+    ok = place(mapped, found, here).ok
     after = np.linalg.norm(world.landmarks.xyz[row] - truth[row], axis=1)
-    assert good.mean() > 0.9
-    assert np.median(before) > 0.05
-    assert np.median(after[good]) < 0.02
+    assert ok.sum() > 40
+    assert ok.sum() > 0.9 * found.points.ok.sum()
+    assert np.median(before[ok]) > 0.05
+    assert np.median(after[ok]) < 0.02
 
 
-def test_without_a_second_place_depths_stay_as_they_are(mapped):
+def test_where_rays_tell_no_depth_a_landmark_stays_and_has_to_be_seen_there(mapped, rng):
     world, _ = mapped
-    xyz = world.landmarks.xyz.copy()
     here = pose(0.005)
     found = look(mapped, here)
-    ids, xy = found.ids[found.points.ok], found.points.xy[found.points.ok]
-    good = place_anew(CAMERA, world, found.keyframe_id, here, ids, xy, np.ones(len(ids)), NOISE)
-    assert good.mean() > 0.9, "they agree, they only tell no depth"
+    for keyframe in world.keyframes:  # only one keyframe saw them
+        if keyframe.frame_id != found.keyframe_id:
+            keyframe.drop_observations(np.isin(keyframe.ids, found.ids))
+    xyz = world.landmarks.xyz.copy()
+    ok = place(mapped, found, here).ok
+    assert ok.sum() > 0.9 * found.points.ok.sum()
+    np.testing.assert_array_equal(world.landmarks.xyz, xyz)
+    found.points.xy[::2, 0] += 6.0
+    ok = place(mapped, found, here).ok
+    assert not ok[::2].any()
     np.testing.assert_array_equal(world.landmarks.xyz, xyz)
 
 
-def test_a_point_on_which_rays_do_not_meet_is_not_used(mapped):
-    world, _ = mapped
+@pytest.mark.parametrize("off_px", [(0.0, 8.0), (5.0, 0.0), (30.0, 0.0)])
+def test_a_point_that_one_ray_misses_is_not_used(mapped, off_px):
+    """Across the epipolar lines and along them: many old rays must not outvote the new one."""
     here = pose(0.35)
     found = look(mapped, here)
-    ids, xy = found.ids[found.points.ok], found.points.xy[found.points.ok].copy()
-    xy[::2, 1] += 8.0  # across the epipolar lines
-    good = place_anew(CAMERA, world, found.keyframe_id, here, ids, xy, np.ones(len(ids)), NOISE)
-    assert not good[::2].any()
-    assert good[1::2].mean() > 0.9
+    found.points.xy[::2] += off_px
+    often = sum(np.isin(found.ids, k.ids) for k in mapped[0].keyframes) > 2
+    ok = place(mapped, found, here).ok
+    assert often[::2].sum() > 20
+    assert not ok[::2][often[::2]].any()
+    assert ok[1::2].sum() > 0.9 * found.points.ok[1::2].sum()
+
+
+def reused(mapped, T_world_cam, T_believed=None, max_landmarks=20_000, young=40):
+    """A map builder after a frame that came back, its tracks, and the landmarks taken up."""
+    world, images = mapped
+    settings = ReconstructionSettings(confidence="off", max_features=120, max_landmarks=max_landmarks)
+    builder = MapBuilder(CAMERA, settings, InlineBundle())
+    builder.world, builder.images = world, images
+    sight = sight_from(T_world_cam, 100)
+    tracks = TrackTable("off", young, 0)
+    tracks.next_id = int(world.landmarks.ids[-1]) + 1
+    tracks.remember(sight)
+    tracks.refill(sight)
+    count = builder.reuse(tracks, sight, T_world_cam if T_believed is None else T_believed)
+    again = tracks.ids[world.landmarks.rows(tracks.ids) >= 0]
+    assert len(again) == count
+    assert np.all(np.diff(tracks.ids) > 0)
+    return builder, sight, tracks, again
+
+
+def test_old_landmarks_get_tracks_and_young_tracks_in_their_places_give_way(mapped):
+    world, _ = mapped
+    builder, _, tracks, again = reused(mapped, pose(0.1, 0.05))
+    assert len(again) > 40
+    assert len(tracks) > 40, "no fewer than before"
+    assert list(world.revisits) == [100]
+    assert set(again.tolist()) <= set(
+        next(k for k in world.keyframes if k.frame_id == world.revisits[100]).ids
+    )
+    away = np.linalg.norm(tracks.xy[:, None] - tracks.xy[None], axis=2) + 99.0 * np.eye(len(tracks))
+    old = np.isin(tracks.ids, again)
+    assert away[old][:, ~old].min() > 4.0
+    assert np.all(world.landmarks.last_seen[world.landmarks.rows(again)] == 100)
+    builder._bundle.close()
+
+
+def test_what_can_not_be_used_costs_no_young_track(mapped, rng):
+    stretched(mapped[0], rng)
+    _, _, tracks, again = reused(mapped, pose(0.1), pose(0.1, turn_deg=(0.6, 0.0, 0.0)))
+    assert len(tracks) >= 40 - len(again)
+    assert len(tracks) >= 38
+
+
+def test_landmarks_taken_up_are_not_the_first_to_go(mapped):
+    world, _ = mapped
+    builder, sight, tracks, again = reused(mapped, pose(0.1), max_landmarks=len(mapped[0].landmarks) - 5)
+    builder.make_keyframe(sight, tracks, pose(0.1))
+    assert len(world.landmarks) < len(world.keyframes) * 120
+    assert np.all(world.landmarks.rows(again) >= 0)
+
+
+def test_tracks_stay_about_as_many_as_wanted(mapped):
+    _, _, tracks, again = reused(mapped, pose(0.1), young=140)
+    assert len(again) > 0
+    assert len(tracks) <= 1.2 * 120
 
 
 @pytest.mark.parametrize(
@@ -167,20 +246,31 @@ def test_the_newest_keyframes_are_no_revisit(mapped):
     assert found is None or found.keyframe_id <= world.keyframes[-1 - NUM_RECENT].frame_id
 
 
-def test_a_recognised_keyframe_holds_the_window(mapped):
+def test_recognised_keyframes_and_those_around_them_hold_the_window(mapped):
     world, _ = mapped
-    shared = world.keyframes[0].ids
-    last = world.keyframes[-1]
-    last.ids = np.concatenate([shared, last.ids])
-    last.xy = np.concatenate([world.keyframes[0].xy, last.xy])
-    last.confidence = np.ones(len(last.ids))
-    without = build_problem(world, CAMERA, NOISE, 5)
-    world.revisits[last.frame_id] = 0
     problem = build_problem(world, CAMERA, NOISE, 5)
-    assert without is None, "no landmark of the window is seen twice"
-    assert problem.keyframe_ids.tolist() == [0, *(k.frame_id for k in world.keyframes[-5:])]
-    assert problem.fixed.tolist() == [True, True, True, False, False, False]
-    assert problem.landmark_ids.tolist() == shared.tolist()
+    newest = [k.frame_id for k in world.keyframes[-5:]]
+    assert problem.num_anchors == 0
+    assert problem.keyframe_ids.tolist() == newest
+    reused(mapped, pose(0.1))[0].make_keyframe(*reused(mapped, pose(0.1))[1:3], pose(0.1))
+    problem = build_problem(world, CAMERA, NOISE, 5)
+    assert problem.num_anchors >= 2
+    assert world.revisits[100] in problem.keyframe_ids[: problem.num_anchors]
+    assert problem.fixed.tolist() == [True] * (problem.num_anchors + 2) + [False] * 3
+    assert set(problem.landmark_ids.tolist()) <= set(
+        np.concatenate([k.ids for k in world.keyframes[-5:]]).tolist()
+    )
+
+
+def test_an_adjustment_with_them_takes_the_drift_out_of_the_newest_pose(mapped):
+    world, _ = mapped
+    true, believed = pose(0.3, 0.1), pose(0.31, 0.11, 0.01)
+    builder, sight, tracks, again = reused(mapped, true, believed)
+    assert len(again) > 30
+    builder.make_keyframe(sight, tracks, believed)
+    builder.collect(wait=True)
+    away = np.linalg.norm(world.poses[100][:3, 3] - true[:3, 3])
+    assert away < 0.3 * np.linalg.norm(believed[:3, 3] - true[:3, 3])
 
 
 def test_images_are_thinned_out_from_the_old_end():
@@ -191,8 +281,11 @@ def test_images_are_thinned_out_from_the_old_end():
     assert len(images) == len(ids) <= 10
     assert ids == sorted(ids)
     assert ids[-5:] == list(range(25, 30))
-    assert ids[0] < 20
+    assert ids[0] == 0
+    assert max(np.diff(ids)) <= 10
     assert [image.frame_id for image in images.newest(2)] == [28, 29]
+    images.keep({0, 28})
+    assert [image.frame_id for image in images] == [0, 28]
 
 
 def test_of_too_many_points_those_with_the_steepest_gradients_are_used():
