@@ -355,7 +355,7 @@ def test_without_confidence_drift_is_taken_out_too(mapped):
 
 
 def test_a_track_that_fits_nowhere_stays_where_it_is(mapped):
-    world, images, tracks = mapped
+    world, _, tracks = mapped
     sight = sight_at(30, frame_id=1)
     tracks.follow(sight, tracks.xy - (10, 0))
     followed = tracks.xy.copy()
