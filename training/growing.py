@@ -10,6 +10,7 @@ from torch import Tensor
 
 from semcast.common.errors import ConfigError
 from semcast.common.nets.blocks import NUM_CONDITIONS
+from semcast.common.nets.encoder import Encoder
 from semcast.common.nets.transceiver import Transceiver
 
 #: Values of the decoded image as the confidence branch reads it, 4x4 pixels of three colours.
@@ -39,18 +40,36 @@ def _places(old: list[int], new: list[int]) -> Tensor:
     return torch.cat([start + torch.arange(length) for start, length in zip(starts, old, strict=True)])
 
 
+def _shapes(state: dict[str, Tensor]) -> dict[str, torch.Size]:
+    return {name: weight.shape for name, weight in state.items()}
+
+
+def _kind(model: Transceiver) -> str:
+    return f"{type(model.encoder).__name__} of {sum(p.numel() for p in model.parameters())} weights"
+
+
 @torch.no_grad()
 def grow(small: Transceiver, large: Transceiver) -> None:
     """Make a freshly built network compute what a smaller one computes, in place.
 
     Args:
         small: Trained.
-        large: Of the same kind, with at least as many channels and units everywhere.
+        large: Of the same sizes, whatever the architecture; or both are of the 3dcsc kind, and this one has at
+            least as many channels and units everywhere.
 
     Raises:
         ConfigError: A weight of the smaller network has no place in the larger one.
     """
     theirs, ours = small.state_dict(), large.state_dict()
+    if _shapes(theirs) == _shapes(ours):
+        large.load_state_dict(theirs)
+        return
+    if not (isinstance(small.encoder, Encoder) and isinstance(large.encoder, Encoder)):
+        # How inputs are put together is known of the 3dcsc kind only.
+        raise ConfigError(
+            "grow_from must hold a network of just this architecture and size, or a smaller 3dcsc one for a "
+            f"larger one, got {_kind(small)} for {_kind(large)}"
+        )
     was, own = (len(state["confidence.start.bias"]) for state in (theirs, ours))
     for name, old in theirs.items():
         new = ours.get(name)

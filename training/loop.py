@@ -15,9 +15,8 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-from semcast.common.errors import CheckpointError, ConfigError
+from semcast.common.errors import CheckpointError
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
-from semcast.common.nets.encoder import Encoder
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS, channel_bandwidth_ratio
@@ -94,12 +93,7 @@ class Run:
         self._is_asked_to_stop = self.agreed_stop = False
         checkpoint = self._read_checkpoint()
         if checkpoint is None and settings.grow_from is not None:
-            small, manifest = load_transceiver(settings.grow_from)
-            if not (isinstance(small.encoder, Encoder) and isinstance(model.encoder, Encoder)):
-                raise ConfigError(
-                    "grow_from must hold a 3dcsc network and architecture must be one, got "
-                    f"{manifest.architecture} and {settings.architecture}"
-                )
+            small, _ = load_transceiver(settings.grow_from)
             grow(unfolded(small, self._pass_images), model)
         elif checkpoint is None and settings.start == "klt":
             start_from_klt(model, self.images, torch.Generator().manual_seed(settings.seed))

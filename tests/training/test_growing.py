@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from semcast.common.errors import ConfigError
+from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
 from semcast.training.centring import centre_hidden, folded, hidden_layers, unfolded
 from semcast.training.growing import grow
@@ -67,6 +68,17 @@ def test_a_network_of_the_same_size_is_copied():
 def test_a_network_that_does_not_fit_is_refused(change):
     with pytest.raises(ConfigError, match="grow_from must hold a network that fits"):
         grow(trained(SMALL), build_3dcsc(dataclasses.replace(SMALL, **change)))
+
+
+@pytest.mark.parametrize("name", ["cnn", "vit", "mae"])
+def test_a_rival_goes_on_from_its_own_weights_alone(name):
+    entry = architecture(name)
+    first, again = entry.build(entry.sizes), entry.build(entry.sizes)
+    grow(first, again)
+    for key, weight in again.state_dict().items():
+        torch.testing.assert_close(weight, first.state_dict()[key], rtol=0, atol=0)
+    with pytest.raises(ConfigError, match="grow_from must hold a network of just this architecture"):
+        grow(first, build_3dcsc(LARGE))
 
 
 def test_unfolding_undoes_folding():
