@@ -54,8 +54,8 @@ def grow(small: Transceiver, large: Transceiver) -> None:
 
     Args:
         small: Trained.
-        large: Of the same sizes, whatever the architecture; or both are of the 3dcsc kind, and this one has at
-            least as many channels and units everywhere.
+        large: Of the same sizes, whatever the architecture; or both are of the 3dcsc kind, and this one has
+            at least as many channels and units everywhere.
 
     Raises:
         ConfigError: A weight of the smaller network has no place in the larger one.
