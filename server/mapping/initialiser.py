@@ -15,7 +15,7 @@ from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import TwoViewResult, estimate_two_view
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.ambiguity import Side, decide
-from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
 from semcast.server.mapping.kept_frames import Observed, pose_of
 from semcast.server.mapping.mapper import gather_observations
 from semcast.server.mapping.tracker import interpolate_pose
@@ -36,8 +36,8 @@ _MIN_VIEWS, _MAX_TOO_SHORT = 3, 2
 _MAX_UNDECIDED, _MAX_UNDECIDED_FRAMES = 12, 60
 #: What decides grows with the way of the tracks: it is looked at again when that is so many times as long.
 _RETRY_GROWTH = 1.15
-#: Points (the longest tracks) and steps for telling them apart.
-_MAX_DECIDING, _DECIDING_ITERATIONS = 90, 15
+#: So many structures go on to the next attempt, none that is so much more doubtful than the best one.
+_MAX_HYPOTHESES, _HOPELESS = 3, 1.0
 #: A start is better from so many points; fewer do when so many frames have waited for it.
 _PLENTY_OF_POINTS, _PATIENCE_FRAMES = 60, 12
 #: Share of the reference's tracks that must still be there; else the reference moves on.
@@ -90,6 +90,7 @@ class Initialiser:
         self._num_undecided = 0
         self._num_since_undecided = 0
         self._undecided_flow_px = 0.0
+        self._hypotheses: list[Hypothesis] = []
 
     @property
     def oldest_id(self) -> int | None:
@@ -99,6 +100,7 @@ class Initialiser:
     def renew(self, added: int) -> None:
         """Give all tracks of the history new ids, ``added`` more than before."""
         self.history = [replace(o, ids=o.ids + added) for o in self.history]
+        self._hypotheses = [replace(h, ids=h.ids + added) for h in self._hypotheses]
 
     def add(self, observed: Observed, noise: NoiseModel, *, is_damaged: bool = False) -> Start | None:
         """Take a frame and try to start a map with it.
@@ -213,7 +215,7 @@ class Initialiser:
         side = self._decide(chosen, poses, noise)
         if side is None:
             return None
-        T_cam_world = invert_transform(side.T_world_cam)
+        T_cam_world = invert_transform(side.T_world_cam) @ side.T_world_cam[0]
         all_ids = np.unique(np.concatenate([o.ids for o in chosen]))
         points = self._triangulate(chosen, T_cam_world, all_ids, noise)
         good = self._passes(points, noise)
@@ -232,38 +234,23 @@ class Initialiser:
 
     def _decide(self, views: list[Observed], T_world_cam: Array, noise: NoiseModel) -> Side | None:
         """Adjust the start and the structures it may be mistaken for; None while several fit."""
-        all_ids, count = np.unique(np.concatenate([o.ids for o in views]), return_counts=True)
-        longest = np.lexsort((all_ids, -count))[:_MAX_DECIDING]
-        ids = np.sort(all_ids[longest[count[longest] >= 2]])
-        view, point, xy, confidence = gather_observations(views, ids)
-        sigma = noise.sigma_px(confidence)
-        T_cam_world = invert_transform(T_world_cam)
-        points = triangulate(self._camera, T_cam_world, view, point, xy, sigma, len(ids))
-        if not points.in_front.any():
+        problem = problem_of(views, T_world_cam, self._camera, noise)
+        if problem is None:
             return None
-        # A point that fits nowhere begins at a usual depth: the other structure may have a place for it.
-        _, first = np.unique(point, return_index=True)
-        depth = float(np.median(points.xyz[points.in_front, 2]))
-        ray = self._camera.unproject(xy[first]) * depth
-        T = T_world_cam[view[first]]
-        along = np.einsum("pij,pj->pi", T[:, :3, :3], ray) + T[:, :3, 3]
-        problem = BundleProblem(
-            intrinsics=(self._camera.fx, self._camera.fy, self._camera.cx, self._camera.cy),
-            keyframe_ids=np.array([o.frame_id for o in views], dtype=np.int64),
-            T_world_cam=T_world_cam,
-            fixed=np.arange(len(views)) == 0,
-            keep_baseline=True,
-            landmark_ids=ids,
-            xyz=np.where(points.in_front[:, None], points.xyz, along),
-            view=view,
-            point=point,
-            xy=xy,
-            sigma_px=sigma,
-            confidence=confidence,
-            iterations=_DECIDING_ITERATIONS,
-        )
-        side = decide(problem, at_last=self._is_overdue())
-        self._num_undecided += int(side is None)
+        carried = []
+        for hypothesis in self._hypotheses:
+            T = poses_in(hypothesis, views, self._camera, noise, self._seed)
+            again = None if T is None else problem_of(views, T, self._camera, noise)
+            if again is not None:
+                carried.append((again, hypothesis.doubt))
+        side, sides = decide(problem, carried, at_last=self._is_overdue())
+        if side is None:
+            self._num_undecided += 1
+            self._hypotheses = [
+                hypothesis_of(s, views, self._camera, noise)
+                for s in sides[:_MAX_HYPOTHESES]
+                if s.ok and s.doubt < sides[0].doubt + _HOPELESS
+            ]
         return side
 
     def _triangulate(

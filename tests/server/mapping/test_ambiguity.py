@@ -1,5 +1,7 @@
 """A map must begin with the true structure, or wait."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from semcast.server.mapping.reversal import mirrored
 def test_the_true_structure_is_found_from_either_start(seed, arc, direction_error_deg):
     truth = arc(focal_px=600.0, depth=4.0, noise_px=0.7, seed=seed)
     for start in (truth, mirrored(truth)):
-        side = decide(start)
+        side, _ = decide(start)
         assert side is not None
         assert direction_error_deg(side.T_world_cam, truth.T_world_cam) < 5.0
         assert np.corrcoef(side.xyz[:, 2], truth.xyz[:, 2])[0, 1] > 0.9
@@ -20,8 +22,8 @@ def test_the_true_structure_is_found_from_either_start(seed, arc, direction_erro
 
 def test_without_perspective_nothing_is_decided_before_the_last_chance(arc):
     far = arc(focal_px=40_000.0, depth=200.0, noise_px=1.0, turn_deg=3.0)
-    assert decide(far) is None
-    assert decide(far, at_last=True) is not None
+    assert decide(far)[0] is None
+    assert decide(far, at_last=True)[0] is not None
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -30,12 +32,47 @@ def test_a_flat_scene_is_seen_right_from_either_start(seed, wall, direction_erro
     other = twin(truth)
     assert direction_error_deg(other.T_world_cam, truth.T_world_cam) > 25.0
     for start in (truth, other):
-        side = decide(start)
+        side, _ = decide(start)
         assert side is not None
         assert direction_error_deg(side.T_world_cam, truth.T_world_cam) < 5.0
 
 
 def test_a_flat_scene_waits_while_both_structures_fit(wall):
     short = wall(way=(0.06, 0.02, 0.04), turn_deg=(0.3, -0.6, 0.0), noise_px=0.6)
-    assert decide(short) is None
-    assert decide(short, at_last=True) is not None
+    assert decide(short)[0] is None
+    assert decide(short, at_last=True)[0] is not None
+
+
+def begun_as(problem, side):
+    return replace(problem, T_world_cam=side.T_world_cam, xyz=side.xyz), side.doubt
+
+
+def test_a_structure_that_fits_a_little_better_each_time_is_believed_in_the_end(wall, direction_error_deg):
+    """The same views with other noise, whose structures go on from one attempt to the next."""
+    believed, carried, doubts = None, [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        truth = wall(bend=0.08, seed=0)
+        noisy = replace(
+            truth, xy=truth.xy + 0.5 * rng.standard_normal(truth.xy.shape), sigma_px=0 * truth.sigma_px + 0.5
+        )
+        assert decide(noisy)[0] is None, "no attempt is clear by itself"
+        believed, sides = decide(noisy, [begun_as(noisy, side) for side in carried])
+        doubts.append(sides[1].doubt - sides[0].doubt)
+        carried = sides
+        if believed is not None:
+            break
+    assert believed is not None
+    assert len(doubts) >= 3
+    assert doubts[-1] > doubts[0]
+    assert direction_error_deg(believed.T_world_cam, truth.T_world_cam) < 10.0
+
+
+def test_one_lucky_attempt_does_not_outweigh_the_others(wall, direction_error_deg):
+    truth = wall(bend=0.5, noise_px=0.4)
+    other = twin(truth)
+    best, _ = decide(truth, [(truth, 5.0), (other, 0.0)], at_last=True)
+    assert direction_error_deg(best.T_world_cam, truth.T_world_cam) > 15.0
+    believed, sides = decide(truth, [(truth, 0.1), (other, 0.0)])
+    assert direction_error_deg(believed.T_world_cam, truth.T_world_cam) < 5.0
+    assert [side.doubt for side in sides] == sorted(side.doubt for side in sides)

@@ -1,11 +1,14 @@
 """When a map may begin, and from what."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.two_view import estimate_two_view
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.ambiguity import adjusted
 from semcast.server.mapping.initialiser import Initialiser
 from semcast.server.mapping.kept_frames import Observed
 
@@ -97,8 +100,9 @@ def never_decided(monkeypatch):
     """Let no start be decided; the list says for each attempt whether it was to be the last."""
     asked = []
 
-    def never(problem, *, at_last):
+    def never(problem, carried, *, at_last):
         asked.append(at_last)
+        return None, []
 
     monkeypatch.setattr("semcast.server.mapping.initialiser.decide", never)
     return asked
@@ -137,3 +141,24 @@ def test_a_camera_that_stops_too_early_gets_the_better_start_in_the_end(monkeypa
     begin([*moving, *same_view(moving[-1], 62, 6)])
     assert asked[0] is False
     assert asked[-1] is True
+
+
+def test_structures_go_on_to_the_next_attempt_with_their_doubt(monkeypatch):
+    frames, poses = ride(5, step_m=0.05)
+    asked = []
+
+    def undecided(problem, carried, *, at_last):
+        asked.append((problem, carried))
+        side = adjusted(problem)
+        return None, [side, replace(side, doubt=0.4), replace(side, doubt=3.0)]
+
+    monkeypatch.setattr("semcast.server.mapping.initialiser.decide", undecided)
+    assert begin(frames) is None
+    assert asked[0][1] == []
+    problem, carried = asked[-1]
+    assert [doubt for _, doubt in carried] == [0.0, 0.4], "the third is beyond hope"
+    for again, _ in carried:
+        np.testing.assert_array_equal(again.xy, problem.xy)
+        way = (invert_transform(again.T_world_cam[0]) @ again.T_world_cam[-1])[:3, 3]
+        true_way = (invert_transform(poses[0]) @ poses[4])[:3, 3]
+        assert way @ true_way / np.linalg.norm(way) / np.linalg.norm(true_way) > 0.98

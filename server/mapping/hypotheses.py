@@ -1,0 +1,124 @@
+"""What the start of a map may be, kept from one attempt to the next.
+
+While the first views fit several structures, a later attempt that looks for them anew may miss the one that
+was right: its relative pose comes from fewer tracks, and mirroring leads to the others only roughly. So each
+structure goes on: later frames are posed in it, and it competes again with all they have seen.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.triangulation import triangulate
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.ambiguity import Side
+from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.kept_frames import Observed, pose_of
+from semcast.server.mapping.mapper import gather_observations
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Points (the longest tracks) and steps for telling structures apart.
+_MAX_DECIDING, _DECIDING_ITERATIONS = 90, 15
+#: A point of a structure must fit its views to so many standard deviations to pose further views.
+_MAX_ERROR_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One structure the frames so far may show.
+
+    Attributes:
+        poses: Frame id -> ``T_world_cam (4, 4)``, in a frame and unit of its own.
+        ids: ``(P,)`` int64 points, ascending.
+        xyz: ``(P, 3)``.
+        doubt: What attempts so far say against it, see ``Side``.
+    """
+
+    poses: dict[int, Array]
+    ids: Ids
+    xyz: Array
+    doubt: float
+
+
+def hypothesis_of(side: Side, views: Sequence[Observed], camera: Intrinsics, noise: NoiseModel) -> Hypothesis:
+    """Return a structure with all points its views have seen, not only those that it was judged by."""
+    ids = np.unique(np.concatenate([o.ids for o in views]))
+    view, point, xy, confidence = gather_observations(views, ids)
+    sigma = noise.sigma_px(confidence)
+    points = triangulate(camera, invert_transform(side.T_world_cam), view, point, xy, sigma, len(ids))
+    seen = np.bincount(point, minlength=len(ids))
+    good = points.in_front & (seen >= 2) & (points.error_sigma < _MAX_ERROR_SIGMAS)
+    poses = {o.frame_id: T for o, T in zip(views, side.T_world_cam, strict=True)}
+    return Hypothesis(poses, ids[good], points.xyz[good], side.doubt)
+
+
+def poses_in(
+    hypothesis: Hypothesis, views: Sequence[Observed], camera: Intrinsics, noise: NoiseModel, seed: int
+) -> Array | None:
+    """Poses ``T_world_cam (K, 4, 4)`` of other views in a structure, None where one can't be posed."""
+    frames = np.array(sorted(hypothesis.poses))
+    poses = []
+    for o in views:
+        T_world_cam: Array | None = hypothesis.poses.get(o.frame_id)
+        if T_world_cam is None:
+            nearest = hypothesis.poses[int(frames[np.abs(frames - o.frame_id).argmin()])]
+            guess = poses[-1] if poses else nearest
+            T_world_cam = pose_of(camera, o, hypothesis.ids, hypothesis.xyz, noise, guess, seed)
+        if T_world_cam is None:
+            return None
+        poses.append(T_world_cam)
+    return np.stack(poses)
+
+
+def problem_of(
+    views: Sequence[Observed], T_world_cam: Array, camera: Intrinsics, noise: NoiseModel
+) -> BundleProblem | None:
+    """What some views saw of the longest tracks, begun with poses, to tell structures apart by its cost.
+
+    Args:
+        views: In order of time.
+        T_world_cam: ``(K, 4, 4)`` of the views; the first is held.
+        camera: Pinhole.
+        noise: Of the observations.
+
+    Returns:
+        The problem, the same observations whatever the poses; None where these leave no point in front.
+    """
+    all_ids, count = np.unique(np.concatenate([o.ids for o in views]), return_counts=True)
+    longest = np.lexsort((all_ids, -count))[:_MAX_DECIDING]
+    ids = np.sort(all_ids[longest[count[longest] >= 2]])
+    view, point, xy, confidence = gather_observations(views, ids)
+    sigma = noise.sigma_px(confidence)
+    T_cam_world = invert_transform(T_world_cam)
+    points = triangulate(camera, T_cam_world, view, point, xy, sigma, len(ids))
+    if not points.in_front.any():
+        return None
+    # A point that fits nowhere begins at a usual depth: the other structure may have a place for it.
+    _, first = np.unique(point, return_index=True)
+    T_first = T_cam_world[view[first]]
+    z = np.einsum("pi,pi->p", T_first[:, 2, :3], points.xyz) + T_first[:, 2, 3]
+    ray = camera.unproject(xy[first]) * float(np.median(z[points.in_front]))
+    T = T_world_cam[view[first]]
+    along = np.einsum("pij,pj->pi", T[:, :3, :3], ray) + T[:, :3, 3]
+    return BundleProblem(
+        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+        keyframe_ids=np.array([o.frame_id for o in views], dtype=np.int64),
+        T_world_cam=T_world_cam,
+        fixed=np.arange(len(views)) == 0,
+        keep_baseline=True,
+        landmark_ids=ids,
+        xyz=np.where(points.in_front[:, None], points.xyz, along),
+        view=view,
+        point=point,
+        xy=xy,
+        sigma_px=sigma,
+        confidence=confidence,
+        iterations=_DECIDING_ITERATIONS,
+        with_covariance=False,
+    )
