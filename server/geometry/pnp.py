@@ -23,7 +23,8 @@ class PoseEstimate:
     Attributes:
         T_cam_world: ``(4, 4)``.
         inliers: ``(N,)`` bool, in front of the camera and within the gate.
-        residual_px: ``(N,)`` reprojection errors, infinite behind the camera.
+        residual_px: ``(N,)`` reprojection errors, whitened where points are uncertain; infinite behind the
+            camera.
         covariance: ``(6, 6)`` of a twist in the camera frame, rotation before translation; None where the
             inliers do not fix the pose.
     """
@@ -89,8 +90,12 @@ def refine_pose(
     *,
     iterations: int = 10,
     prior_information: Array | None = None,
+    spread_px: Array | None = None,
 ) -> PoseEstimate:
     """Minimise weighted reprojection errors under Huber's loss by Gauss-Newton over the pose alone.
+
+    A point whose depth is uncertain has noise ``sigma^2 I + s s^T``, where ``s`` is what a standard deviation
+    of its depth moves its projection by: residuals are whitened to sigma in all directions.
 
     Args:
         camera: Pinhole.
@@ -101,12 +106,14 @@ def refine_pose(
         gate_px: ``(N,)`` reprojection error up to which an observation is an inlier.
         iterations: Steps at most; the last two without points outside the gate.
         prior_information: ``(6, 6)`` that pulls towards the start, or None.
+        spread_px: ``(N, 2)`` the vectors ``s``, None where all points are certain.
 
     Returns:
         The refined pose; the start with no inlier where nothing could be solved.
     """
     T_start = T_cam_world.copy()
     T = T_start.copy()
+    whitener = None if spread_px is None else _whitener(sigma_px, spread_px)
     weight = sigma_px**-2.0
     hessian = np.zeros((6, 6))
     offset = np.zeros(6)
@@ -117,6 +124,9 @@ def refine_pose(
             return _without_inliers(T_start, len(points_world))
         projected, J = project_with_jacobian(camera, points_cam[used])
         residual = keypoints_xy[used] - projected
+        if whitener is not None:
+            residual = np.einsum("nij,nj->ni", whitener[used], residual)
+            J = whitener[used] @ J
         length = np.linalg.norm(residual, axis=1)
         # Early steps are more tolerant, so that a poor start does not lose the points that would mend it.
         widen = 4.0 if iteration < 2 else 1.0
@@ -143,8 +153,18 @@ def refine_pose(
             break
     T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
     residual, front = reprojection_residual(camera, T, points_world, keypoints_xy)
+    if whitener is not None:
+        residual = np.einsum("nij,nj->ni", whitener, residual)
     length = np.where(front, np.linalg.norm(residual, axis=1), np.inf)
     return PoseEstimate(T, length < gate_px, length, _covariance(hessian))
+
+
+def _whitener(sigma_px: Array, spread_px: Array) -> Array:
+    """``(N, 2, 2)`` that shortens residuals along the spread so that all directions have sigma."""
+    length = np.linalg.norm(spread_px, axis=1)
+    along = spread_px / np.maximum(length, 1e-12)[:, None]
+    shrink = 1.0 - sigma_px / np.hypot(sigma_px, length)
+    return np.asarray(np.eye(2) - (shrink[:, None] * along)[:, :, None] * along[:, None, :])
 
 
 def _without_inliers(T_cam_world: Array, count: int) -> PoseEstimate:

@@ -192,6 +192,7 @@ class Reconstruction:
             xy,
             confidence,
             T_world_guess,
+            submap=self._map.submap,
             seed=self._settings.seed,
             min_share=min_share,
         )

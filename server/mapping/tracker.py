@@ -1,6 +1,6 @@
 """Pose of each frame from the landmarks it sees, with a motion prior."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, log_so3
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.rays import rays_of
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import WorldMap
 
@@ -21,6 +22,11 @@ MIN_INLIERS = 15
 _MIN_INLIER_SHARE = 0.5
 #: Share of the landmarks in sight that must agree with a pose, when the frame before had one.
 MIN_BELIEVED_SHARE = 0.25
+#: So many rays at least must agree with a pose to steady it, that share of them, and that share of its
+#: landmarks still.
+_MIN_RAYS, _MIN_RAY_SHARE, _MIN_KEPT_SHARE = 10, 0.5, 0.8
+#: With fewer landmarks in sight than this they have run out, and so many rays carry on without them.
+_RUN_OUT, _MIN_RAYS_ALONE, _MIN_RAY_SHARE_ALONE = 30, 60, 0.6
 
 
 @dataclass(frozen=True)
@@ -98,6 +104,7 @@ def track_pose(
     confidence: Array,
     T_world_guess: Array | None,
     *,
+    submap: int,
     seed: int,
     min_inliers: int = MIN_INLIERS,
     min_share: float = MIN_BELIEVED_SHARE,
@@ -112,6 +119,7 @@ def track_pose(
         xy: ``(N, 2)`` their positions.
         confidence: ``(N,)`` of the positions.
         T_world_guess: Expected pose, or None to search for it.
+        submap: Part of the map the camera is in.
         seed: Of the search.
         min_inliers: Agreeing landmarks needed.
         min_share: And their share of all that are in sight: fewer are a chance find.
@@ -121,22 +129,68 @@ def track_pose(
     """
     row = world.landmarks.rows(ids)
     known = row >= 0
-    if int(known.sum()) < min_inliers:
-        return None
     points, observed = world.landmarks.xyz[row[known]], xy[known]
     sigma, gate = noise.sigma_px(confidence[known]), noise.threshold_px(confidence[known])
     best: PoseEstimate | None = None
-    if T_world_guess is not None:
+    if T_world_guess is not None and len(points) >= min_inliers:
         best = refine_pose(camera, invert_transform(T_world_guess), points, observed, sigma, gate)
     if best is None or best.num_inliers < max(min_inliers, _MIN_INLIER_SHARE * len(points)):
         searched = search_pose(camera, points, observed, sigma, gate, seed=seed, min_inliers=min_inliers)
         if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
             best = searched
     enough = max(min_inliers, min_share * len(points))
-    if best is None or best.num_inliers < enough or not np.isfinite(best.T_cam_world).all():
+    if best is not None and (best.num_inliers < enough or not np.isfinite(best.T_cam_world).all()):
+        best = None
+    if not known.all():
+        best = _steadied(camera, world, noise, ids, xy, confidence, known, best, T_world_guess, submap)
+    if best is None:
         return None
     T_world_cam = invert_transform(best.T_cam_world)
     return TrackedPose(T_world_cam, best.covariance, ids[known], best.inliers, best.residual_px)
+
+
+def _steadied(
+    camera: Intrinsics,
+    world: WorldMap,
+    noise: NoiseModel,
+    ids: Ids,
+    xy: Array,
+    confidence: Array,
+    known: NDArray[np.bool_],
+    pose: PoseEstimate | None,
+    T_world_guess: Array | None,
+    submap: int,
+) -> PoseEstimate | None:
+    """Refine the pose from landmarks with what the tracks without one say; the same where they disagree.
+
+    Where landmarks have run out, tracks alone carry the expected pose on.
+    """
+    count = int(known.sum())
+    if pose is not None:
+        T_world_cam, min_rays, min_share = invert_transform(pose.T_cam_world), _MIN_RAYS, _MIN_RAY_SHARE
+    elif T_world_guess is not None and count < _RUN_OUT:
+        T_world_cam, min_rays, min_share = T_world_guess, _MIN_RAYS_ALONE, _MIN_RAY_SHARE_ALONE
+    else:
+        return None
+    unknown = np.flatnonzero(~known)
+    rays = rays_of(camera, world, noise, ids[unknown], T_world_cam, submap)
+    if rays is None or len(rays.row) < min_rays:
+        return pose
+    both = np.concatenate([np.flatnonzero(known), unknown[rays.row]])
+    points = np.concatenate([world.landmarks.xyz[world.landmarks.rows(ids[known])], rays.xyz])
+    sigma, gate = noise.sigma_px(confidence[both]), noise.threshold_px(confidence[both])
+    # Both ends of a ray are observed, the keyframe's and this one.
+    wider = np.hypot(sigma[count:], rays.sigma_px) / sigma[count:]
+    sigma[count:] *= wider
+    gate[count:] *= wider
+    spread = np.concatenate([np.zeros((count, 2)), rays.spread_px])
+    start = invert_transform(T_world_cam)
+    steadied = refine_pose(camera, start, points, xy[both], sigma, gate, iterations=6, spread_px=spread)
+    agreeing, rays_agreeing = steadied.inliers[:count], steadied.inliers[count:]
+    kept = pose is None or agreeing.sum() >= _MIN_KEPT_SHARE * pose.num_inliers
+    if not kept or rays_agreeing.sum() < max(min_rays, min_share * len(rays.row)):
+        return pose
+    return replace(steadied, inliers=agreeing, residual_px=steadied.residual_px[:count])
 
 
 def interpolate_pose(T_world_a: Array, T_world_b: Array, share: float) -> Array:

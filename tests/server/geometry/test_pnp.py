@@ -91,6 +91,32 @@ def test_a_prior_holds_what_the_points_do_not_fix():
     assert np.abs(held.T_cam_world - start).max() < 1e-4
 
 
+def test_residuals_are_whitened_along_the_spread_alone():
+    T, points, xy = make_view(6, num=40)
+    spread = np.tile([4.0, 3.0], (40, 1))  # with sigma 1 the standard deviation along (.8, .6) is sqrt(26)
+    off = xy + np.array([0.8, 0.6])  # one pixel along it
+    stiff = np.diag(np.full(6, 1e12))
+    found = refine(T, points, off, spread_px=spread, prior_information=stiff)
+    assert np.allclose(found.residual_px, 1.0 / np.sqrt(26.0), atol=1e-4)
+    across = refine(T, points, xy + np.array([-0.6, 0.8]), spread_px=spread, prior_information=stiff)
+    assert np.allclose(across.residual_px, 1.0, atol=1e-4)
+
+
+def test_uncertain_depths_do_not_pull_at_the_pose():
+    errors = np.zeros((30, 2))
+    for seed in range(30):
+        T, points, exact = make_view(seed, num=80)
+        rng = np.random.default_rng(seed)
+        spread = rng.normal(0, 8.0, (80, 2))
+        noisy = exact + rng.normal(0, 0.5, exact.shape) + rng.normal(0, 1, (80, 1)) * spread
+        for k, known in enumerate((spread, None)):
+            found = refine_pose(
+                CAMERA, T, points, noisy, np.full(80, 0.5), np.full(80, 100.0), spread_px=known
+            )
+            errors[seed, k] = rotation_angle_deg(found.T_cam_world[:3, :3] @ T[:3, :3].T)
+    assert np.median(errors[:, 0]) < 0.4 * np.median(errors[:, 1])
+
+
 def test_points_behind_the_camera_are_no_inliers():
     T, points, xy = make_view(4, num=40)
     flip = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -1,0 +1,97 @@
+"""Tracks without a depth: each is a ray from the keyframe that saw it, and holds the camera's rotation.
+
+While a camera turns, most of what it sees is new, and the few landmarks left lie on one side of the image,
+where turning and moving look alike. The new tracks are many and everywhere. How far their points are is known
+roughly, as far as others: that much uncertainty moves a projection only along one line, and hardly at all
+while the camera is near the keyframe.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.mapper import median_depth
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Standard deviation of an inverse depth, as share of that of the usual depth.
+_INVERSE_DEPTH_SHARE = 0.6
+#: Keyframes whose tracks are looked at.
+_NUM_KEYFRAMES = 12
+#: A point must lie at least this share of its usual depth in front of the camera.
+_MIN_DEPTH_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Points at a usual depth for tracks without one.
+
+    Attributes:
+        row: ``(N,)`` which of the tracks asked for.
+        xyz: ``(N, 3)`` world frame.
+        spread_px: ``(N, 2)`` by how much a standard deviation of the inverse depth moves the projection.
+        sigma_px: ``(N,)`` standard deviation of the observation in the keyframe.
+    """
+
+    row: NDArray[np.intp]
+    xyz: Array
+    spread_px: Array
+    sigma_px: Array
+
+
+def rays_of(
+    camera: Intrinsics, world: WorldMap, noise: NoiseModel, ids: Ids, T_world_cam: Array, submap: int
+) -> Rays | None:
+    """Rays of tracks from the newest keyframe that saw each.
+
+    Args:
+        camera: Pinhole.
+        world: The map.
+        noise: Of the observations in keyframes.
+        ids: ``(M,)`` tracks.
+        T_world_cam: About where the camera is.
+        submap: Part of the map whose keyframes count.
+
+    Returns:
+        Those of the tracks that a keyframe saw; None where none did or no depth is known.
+    """
+    views = [k for k in reversed(world.keyframes[-_NUM_KEYFRAMES:]) if k.submap == submap and len(k.ids)]
+    T_cam_world = invert_transform(T_world_cam)
+    xyz, spread_px, sigma_px = np.zeros((len(ids), 3)), np.zeros((len(ids), 2)), np.zeros(len(ids))
+    found = np.zeros(len(ids), bool)
+    for position, keyframe in enumerate(views):
+        row = np.minimum(np.searchsorted(keyframe.ids, ids), len(keyframe.ids) - 1)
+        new = np.flatnonzero(~found & (keyframe.ids[row] == ids))
+        if len(new) == 0:
+            continue
+        depth = _usual_depth(world, views[position:])
+        if not np.isfinite(depth):
+            break
+        point = camera.unproject(keyframe.xy[row[new]]) * depth
+        T_cam_keyframe = T_cam_world @ keyframe.T_world_cam
+        x, y, z = (point @ T_cam_keyframe[:3, :3].T + T_cam_keyframe[:3, 3]).T
+        front = z > _MIN_DEPTH_SHARE * depth
+        z = np.where(front, z, 1.0)
+        # The derivative of the projection by the inverse depth, times its standard deviation.
+        t = _INVERSE_DEPTH_SHARE * T_cam_keyframe[:3, 3]
+        spread_px[new] = np.column_stack(
+            [camera.fx * (t[0] - x / z * t[2]) / z, camera.fy * (t[1] - y / z * t[2]) / z]
+        )
+        xyz[new] = point @ keyframe.T_world_cam[:3, :3].T + keyframe.T_world_cam[:3, 3]
+        sigma_px[new] = noise.sigma_px(keyframe.confidence[row[new]])
+        found[new[front]] = True
+        if found.all():
+            break
+    rows = np.flatnonzero(found)
+    return Rays(rows, xyz[rows], spread_px[rows], sigma_px[rows]) if len(rows) else None
+
+
+def _usual_depth(world: WorldMap, views: list[Keyframe]) -> float:
+    """Median depth of the landmarks of the first view that has some; infinite where none has."""
+    return next((d for d in (median_depth(world, k) for k in views) if np.isfinite(d)), float("inf"))

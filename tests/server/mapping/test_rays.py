@@ -1,0 +1,133 @@
+"""Tracks without a depth hold the rotation, and carry the pose on where landmarks run out."""
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.rays import rays_of
+from semcast.server.mapping.tracker import track_pose
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+CAMERA = Intrinsics(fx=500, fy=500, cx=319.5, cy=239.5, width=640, height=480)
+NOISE = NoiseModel(0.5, 0.0)
+NUM = 240
+
+
+def project(xyz, T_world_cam):
+    T = invert_transform(T_world_cam)
+    return CAMERA.project(xyz @ T[:3, :3].T + T[:3, 3])
+
+
+def scene(num_landmarks, seed=0, noise_px=0.5):
+    """A keyframe at the origin with tracks all over the image, of which those furthest left are landmarks.
+
+    Returns the map and where the points truly are.
+    """
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(2.5, 6.0, NUM)
+    xy = np.column_stack((np.sort(rng.uniform(20, 620, NUM)), rng.uniform(20, 460, NUM)))
+    xyz = CAMERA.unproject(xy) * depth[:, None]
+    ids = np.arange(NUM)
+    world = WorldMap()
+    world.add_keyframe(
+        Keyframe(
+            frame_id=0,
+            t_source_ns=0,
+            T_world_cam=np.eye(4),
+            submap=0,
+            ids=ids,
+            xy=xy + noise_px * rng.standard_normal(xy.shape),
+            confidence=np.ones(NUM),
+            descriptor_ids=np.zeros(0, np.int64),
+            descriptors=np.zeros((0, 32), np.uint8),
+        )
+    )
+    some = slice(0, num_landmarks)
+    rgb = np.zeros((num_landmarks, 3), np.uint8)
+    world.add_landmarks(ids[some], xyz[some], rgb, np.ones(num_landmarks), 0, 0)
+    return world, xyz
+
+
+MOVED = make_transform(exp_so3(np.array([0.01, -0.04, 0.005])), [0.06, 0.01, 0.03])
+
+
+def rotation_error_deg(T_world_cam):
+    return np.degrees(np.linalg.norm(log_so3(T_world_cam[:3, :3].T @ MOVED[:3, :3])))
+
+
+def track(world, ids, xy, guess):
+    return track_pose(CAMERA, world, NOISE, ids, xy, np.ones(len(ids)), guess, submap=0, seed=0)
+
+
+def test_a_camera_that_only_turns_needs_no_depth():
+    world, xyz = scene(20, noise_px=0.0)
+    turned = make_transform(exp_so3(np.array([0.02, -0.05, 0.01])), np.zeros(3))
+    rays = rays_of(CAMERA, world, NOISE, np.arange(20, NUM), turned, submap=0)
+    assert len(rays.row) == NUM - 20
+    np.testing.assert_allclose(rays.spread_px, 0.0, atol=1e-9)
+    np.testing.assert_allclose(project(rays.xyz, turned), project(xyz[20:], turned), atol=1e-6)
+    np.testing.assert_allclose(rays.sigma_px, 0.5)
+
+
+def test_what_is_not_known_of_the_depth_lies_along_the_spread():
+    world, xyz = scene(20, noise_px=0.0)
+    rays = rays_of(CAMERA, world, NOISE, np.arange(20, NUM), MOVED, submap=0)
+    off = project(xyz[20:], MOVED) - project(rays.xyz, MOVED)
+    length = np.linalg.norm(rays.spread_px, axis=1)
+    assert length.min() > 1.0
+    along = rays.spread_px / length[:, None]
+    across = np.abs(off[:, 0] * along[:, 1] - off[:, 1] * along[:, 0])
+    assert np.linalg.norm(off, axis=1).max() > 3.0
+    assert across.max() < 0.02, "but for rounding the true point lies on the line"
+    # Inverse depths are within two standard deviations of the usual one here.
+    assert (np.linalg.norm(off, axis=1) < 2.0 * length).all()
+
+
+def test_tracks_no_keyframe_of_this_part_saw_are_no_rays():
+    world, _ = scene(20)
+    assert rays_of(CAMERA, world, NOISE, np.arange(1000, 1100), MOVED, submap=0) is None
+    assert rays_of(CAMERA, world, NOISE, np.arange(20, NUM), MOVED, submap=1) is None
+    mixed = rays_of(CAMERA, world, NOISE, np.array([30, 31, 5000]), MOVED, submap=0)
+    assert mixed.row.tolist() == [0, 1]
+
+
+def test_tracks_without_depth_hold_the_rotation():
+    with_rays, without = [], []
+    for seed in range(16):
+        world, xyz = scene(25, seed)
+        rng = np.random.default_rng(100 + seed)
+        xy = project(xyz, MOVED) + 0.5 * rng.standard_normal((NUM, 2))
+        ids = np.arange(NUM)
+        with_rays.append(rotation_error_deg(track(world, ids, xy, np.eye(4)).T_world_cam))
+        without.append(rotation_error_deg(track(world, ids[:25], xy[:25], np.eye(4)).T_world_cam))
+    assert np.median(with_rays) < 0.75 * np.median(without)
+
+
+def test_tracks_alone_carry_the_pose_on_where_landmarks_run_out():
+    world, xyz = scene(20)
+    xy = project(xyz, MOVED)
+    ids = np.arange(NUM)
+    assert track(world, ids[12:20], xy[12:20], np.eye(4)) is None, "eight landmarks are too few"
+    pose = track(world, ids[12:], xy[12:], np.eye(4))
+    assert rotation_error_deg(pose.T_world_cam) < 0.3
+    assert len(pose.ids) == 8, "only landmarks are reported"
+    assert track(world, ids[12:60], xy[12:60], np.eye(4)) is None, "forty tracks are too few"
+    assert track(world, ids[12:], xy[12:], None) is None, "and without a guess there is nothing to go on from"
+
+
+@pytest.mark.parametrize("num_landmarks", [60, 8])
+def test_tracks_that_fit_no_pose_change_nothing(num_landmarks):
+    world, xyz = scene(60)
+    xy = project(xyz, MOVED)
+    rng = np.random.default_rng(1)
+    xy[60:] += rng.uniform(-60, 60, (NUM - 60, 2))
+    ids = np.arange(NUM)
+    used = np.r_[0:num_landmarks, 60:NUM]
+    pose = track(world, ids[used], xy[used], np.eye(4))
+    if num_landmarks == 60:
+        alone = track(world, ids[:60], xy[:60], np.eye(4))
+        np.testing.assert_array_equal(pose.T_world_cam, alone.T_world_cam)
+    else:
+        assert pose is None
