@@ -63,7 +63,7 @@ def poses_in(
 ) -> Array | None:
     """Poses ``T_world_cam (K, 4, 4)`` of other views in a structure, None where one can't be posed."""
     frames = np.array(sorted(hypothesis.poses))
-    poses = []
+    poses: list[Array] = []
     for o in views:
         T_world_cam: Array | None = hypothesis.poses.get(o.frame_id)
         if T_world_cam is None:

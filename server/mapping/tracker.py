@@ -25,8 +25,9 @@ MIN_BELIEVED_SHARE = 0.25
 #: So many rays at least must agree with a pose to steady it, that share of them, and that share of its
 #: landmarks still.
 _MIN_RAYS, _MIN_RAY_SHARE, _MIN_KEPT_SHARE = 10, 0.5, 0.8
-#: With fewer landmarks in sight than this they have run out, and so many rays carry on without them.
-_RUN_OUT, _MIN_RAYS_ALONE, _MIN_RAY_SHARE_ALONE = 30, 60, 0.6
+#: Where fewer landmarks than this are in sight, so many rays, and that share of them, carry the pose on with
+#: the few landmarks that are left: without any, turning and moving are told apart by nothing.
+_RUN_OUT, _MIN_CARRYING, _MIN_CARRYING_SHARE, _MIN_LEFT = 30, 60, 0.6, 4
 
 
 @dataclass(frozen=True)
@@ -163,13 +164,13 @@ def _steadied(
 ) -> PoseEstimate | None:
     """Refine the pose from landmarks with what the tracks without one say; the same where they disagree.
 
-    Where landmarks have run out, tracks alone carry the expected pose on.
+    Where landmarks have all but run out, tracks carry the expected pose on with the few that are left.
     """
     count = int(known.sum())
     if pose is not None:
         T_world_cam, min_rays, min_share = invert_transform(pose.T_cam_world), _MIN_RAYS, _MIN_RAY_SHARE
     elif T_world_guess is not None and count < _RUN_OUT:
-        T_world_cam, min_rays, min_share = T_world_guess, _MIN_RAYS_ALONE, _MIN_RAY_SHARE_ALONE
+        T_world_cam, min_rays, min_share = T_world_guess, _MIN_CARRYING, _MIN_CARRYING_SHARE
     else:
         return None
     unknown = np.flatnonzero(~known)
@@ -187,7 +188,7 @@ def _steadied(
     start = invert_transform(T_world_cam)
     steadied = refine_pose(camera, start, points, xy[both], sigma, gate, iterations=6, spread_px=spread)
     agreeing, rays_agreeing = steadied.inliers[:count], steadied.inliers[count:]
-    kept = pose is None or agreeing.sum() >= _MIN_KEPT_SHARE * pose.num_inliers
+    kept = agreeing.sum() >= (_MIN_LEFT if pose is None else _MIN_KEPT_SHARE * pose.num_inliers)
     if not kept or rays_agreeing.sum() < max(min_rays, min_share * len(rays.row)):
         return pose
     return replace(steadied, inliers=agreeing, residual_px=steadied.residual_px[:count])

@@ -105,7 +105,7 @@ def test_tracks_without_depth_hold_the_rotation():
     assert np.median(with_rays) < 0.75 * np.median(without)
 
 
-def test_tracks_alone_carry_the_pose_on_where_landmarks_run_out():
+def test_tracks_carry_the_pose_on_where_landmarks_all_but_run_out():
     world, xyz = scene(20)
     xy = project(xyz, MOVED)
     ids = np.arange(NUM)
@@ -114,6 +114,7 @@ def test_tracks_alone_carry_the_pose_on_where_landmarks_run_out():
     assert rotation_error_deg(pose.T_world_cam) < 0.3
     assert len(pose.ids) == 8, "only landmarks are reported"
     assert track(world, ids[12:60], xy[12:60], np.eye(4)) is None, "forty tracks are too few"
+    assert track(world, ids[20:], xy[20:], np.eye(4)) is None, "without a landmark nothing holds the scale"
     assert track(world, ids[12:], xy[12:], None) is None, "and without a guess there is nothing to go on from"
 
 

@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import align_umeyama, exp_so3, invert_transform, make_transform
+from semcast.common.geometry import (
+    align_umeyama,
+    exp_so3,
+    invert_transform,
+    make_transform,
+    rotation_angle_deg,
+)
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_process import ProcessBundle
@@ -267,6 +273,18 @@ def turning_away():
         away = np.array([0.15 * (k + 1), 0.03 * np.sin(k), -0.05 * (k + 1)])
         poses.append(make_transform(exp_so3((0.0, yaw, 0.0)), position + away))
     return poses
+
+
+def test_turning_costs_no_rotation_while_landmarks_run_out():
+    truth = turning_away()[:42]
+    reconstruction = make(lost_after_frames=4)
+    results = [reconstruction.process(frame_of(k, render(T))) for k, T in enumerate(truth)]
+    with_pose = [k for k, result in enumerate(results) if result.T_world_cam is not None and k >= 9]
+    assert with_pose == list(range(9, 42))
+    assert results[41].num_inliers < 15, "landmarks did run out on the way"
+    for k in with_pose:
+        turned = results[9].T_world_cam[:3, :3].T @ results[k].T_world_cam[:3, :3]
+        assert rotation_angle_deg(turned.T @ truth[9][:3, :3].T @ truth[k][:3, :3]) < 0.5
 
 
 def test_a_part_begun_after_a_turn_is_not_taken_for_the_old_one(caplog):
