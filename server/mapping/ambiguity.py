@@ -40,7 +40,8 @@ class Side:
         xyz: ``(P, 3)``.
         cost: Sum of squared residuals in standard deviations, each cut off.
         ok: False where the adjustment failed and all is as it was.
-        doubt: Logarithm of how many times the best one's cost it has, summed over the attempts so far.
+        doubt: Logarithm of how many times the cheapest one's cost it has, summed over the attempts so far.
+            One found later begins with the least doubt of the others.
     """
 
     T_world_cam: Array
@@ -97,8 +98,8 @@ def _weighed(found: list[Side], num_carried: int) -> list[Side]:
     """Structures that differ, each as its cheapest copy, with their doubt after this attempt, least first.
 
     Args:
-        found: Adjusted. One found for the first time has no doubt from before.
-        num_carried: So many of the last ones have.
+        found: Adjusted.
+        num_carried: So many of the last ones have a doubt from before.
     """
     by_cost = sorted(range(len(found)), key=lambda k: found[k].cost)
     lowest = max(found[by_cost[0]].cost, 1e-9)
@@ -113,8 +114,10 @@ def _weighed(found: list[Side], num_carried: int) -> list[Side]:
             same = len(sides) - 1
         if k >= len(found) - num_carried:
             doubts[same].append(side.doubt)
+    # What is found for the first time is as good as the best one until now, no better.
+    new = min((doubt for before in doubts for doubt in before), default=0.0)
     weighed = [
-        replace(side, doubt=min(before, default=0.0) + float(np.log(max(side.cost, 1e-9) / lowest)))
+        replace(side, doubt=min(before, default=new) + float(np.log(max(side.cost, 1e-9) / lowest)))
         for side, before in zip(sides, doubts, strict=True)
     ]
     return sorted(weighed, key=lambda side: side.doubt)

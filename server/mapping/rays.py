@@ -35,7 +35,9 @@ class Rays:
     Attributes:
         row: ``(N,)`` which of the tracks asked for.
         xyz: ``(N, 3)`` world frame.
-        spread_px: ``(N, 2)`` by how much a standard deviation of the inverse depth moves the projection.
+        spread_px: ``(N, 2)`` by how much a standard deviation of the inverse depth moves the projection,
+            times the root of N: what is wrong with the usual depth is wrong for all of them, so together they
+            say no more about the camera's way than one.
         sigma_px: ``(N,)`` standard deviation of the observation in the keyframe.
     """
 
@@ -61,7 +63,9 @@ def rays_of(
     Returns:
         Those of the tracks that a keyframe saw; None where none did or no depth is known.
     """
-    views = [k for k in reversed(world.keyframes[-_NUM_KEYFRAMES:]) if k.submap == submap and len(k.ids)]
+    mine = [k for k in world.keyframes if k.submap == submap and len(k.ids)]
+    views = mine[-_NUM_KEYFRAMES:][::-1]
+    depth = float("inf")
     T_cam_world = invert_transform(T_world_cam)
     xyz, spread_px, sigma_px = np.zeros((len(ids), 3)), np.zeros((len(ids), 2)), np.zeros(len(ids))
     found = np.zeros(len(ids), bool)
@@ -70,7 +74,8 @@ def rays_of(
         new = np.flatnonzero(~found & (keyframe.ids[row] == ids))
         if len(new) == 0:
             continue
-        depth = _usual_depth(world, views[position:])
+        own = _usual_depth(world, views[position:])
+        depth = own if np.isfinite(own) else depth
         if not np.isfinite(depth):
             break
         point = camera.unproject(keyframe.xy[row[new]]) * depth
@@ -89,7 +94,9 @@ def rays_of(
         if found.all():
             break
     rows = np.flatnonzero(found)
-    return Rays(rows, xyz[rows], spread_px[rows], sigma_px[rows]) if len(rows) else None
+    if len(rows) == 0:
+        return None
+    return Rays(rows, xyz[rows], np.sqrt(len(rows)) * spread_px[rows], sigma_px[rows])
 
 
 def _usual_depth(world: WorldMap, views: list[Keyframe]) -> float:

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Mapping
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,13 @@ from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
-from semcast.server.mapping.tracker import MIN_BELIEVED_SHARE, TrackedPose, expected_positions, track_pose
+from semcast.server.mapping.tracker import (
+    MIN_INLIERS,
+    Believing,
+    TrackedPose,
+    expected_positions,
+    track_pose,
+)
 from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
 
 __all__ = ["Reconstruction", "ReconstructionSettings"]
@@ -28,6 +35,7 @@ __all__ = ["Reconstruction", "ReconstructionSettings"]
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
 
 #: A frame with fewer rows than this share is kept for its pose, not to start a map from.
 _MIN_USABLE_SHARE = 0.5
@@ -170,36 +178,20 @@ class Reconstruction:
     def _last_pose(self) -> Array | None:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
 
-    def _pose(
-        self, T_world_guess: Array | None, *, min_share: float = MIN_BELIEVED_SHARE
-    ) -> TrackedPose | None:
+    def _pose(self, T_world_guess: Array | None, **how: Unpack[Believing]) -> TrackedPose | None:
         t, seen = self._tracks, self._tracks.visible
-        return self._pose_from(t.ids[seen], t.xy[seen], t.confidence[seen], T_world_guess, min_share)
+        return self._pose_from(t.ids[seen], t.xy[seen], t.confidence[seen], T_world_guess, **how)
 
     def _pose_from(
-        self,
-        ids: NDArray[np.int64],
-        xy: Array,
-        confidence: Array,
-        T_world_guess: Array | None,
-        min_share: float = MIN_BELIEVED_SHARE,
+        self, ids: Ids, xy: Array, confidence: Array, T_world_guess: Array | None, **how: Unpack[Believing]
     ) -> TrackedPose | None:
-        return track_pose(
-            self._camera,
-            self._map.world,
-            self._map.noise.model,
-            ids,
-            xy,
-            confidence,
-            T_world_guess,
-            submap=self._map.submap,
-            seed=self._settings.seed,
-            min_share=min_share,
-        )
+        world, noise = self._map.world, self._map.noise.model
+        known = {"submap": self._map.submap, "seed": self._settings.seed}
+        return track_pose(self._camera, world, noise, ids, xy, confidence, T_world_guess, **known, **how)
 
     def _track(self, sight: Sight, T_world_guess: Array | None) -> FrameResult:
         since = time.perf_counter_ns()
-        pose = self._pose(T_world_guess)
+        pose = self._pose(T_world_guess, may_carry=True)
         if pose is None and self._tracks.follow_jump(sight):
             pose = self._pose(T_world_guess)
         pose = self._with_more(sight, pose, T_world_guess)
@@ -228,7 +220,7 @@ class Reconstruction:
             sight,
             T_world_cam,
             submap=self._map.submap,
-            reach_px=_REACH_PX if pose is not None else _REACH_BLIND_PX,
+            reach_px=_REACH_PX if pose is not None and pose.num_inliers >= MIN_INLIERS else _REACH_BLIND_PX,
         )
         again = self._pose(T_world_cam) if len(recalled) else None
         if again is not None and (pose is None or again.num_inliers > pose.num_inliers):
@@ -387,7 +379,9 @@ class Reconstruction:
         self._frames_since_keyframe = 0
         self._lap("two_view", since)
         newest = self._map.world.pose_of_frame(sight.frame.frame_id)
-        pose = self._pose(newest)
+        t = self._tracks
+        marks = t.visible & (self._map.world.landmarks.rows(t.ids) >= 0)
+        pose = self._pose_from(t.ids[marks], t.xy[marks], t.confidence[marks], newest)
         if pose is None:
             self._state = TrackingState.LOST
             self._last_posed_id = sight.frame.frame_id

@@ -1,6 +1,7 @@
 """Pose of each frame from the landmarks it sees, with a motion prior."""
 
 from dataclasses import dataclass, replace
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +23,20 @@ MIN_INLIERS = 15
 _MIN_INLIER_SHARE = 0.5
 #: Share of the landmarks in sight that must agree with a pose, when the frame before had one.
 MIN_BELIEVED_SHARE = 0.25
-#: So many rays at least must agree with a pose to steady it, that share of them, and that share of its
-#: landmarks still.
-_MIN_RAYS, _MIN_RAY_SHARE, _MIN_KEPT_SHARE = 10, 0.5, 0.8
+#: So many rays, and that share of them, must agree to steady a pose, and that share of its landmarks still.
+_STEADY, _MIN_KEPT_SHARE = (10, 0.5), 0.8
 #: Where fewer landmarks than this are in sight, so many rays, and that share of them, carry the pose on with
 #: the few landmarks that are left: without any, turning and moving are told apart by nothing.
-_RUN_OUT, _MIN_CARRYING, _MIN_CARRYING_SHARE, _MIN_LEFT = 30, 60, 0.6, 4
+_RUN_OUT, _CARRY, _MIN_LEFT = 30, (60, 0.6), 4
+#: The gate of a ray is so many times as wide at most for what the keyframe's observation is in doubt.
+_MOST_WIDER = 3.0
+
+
+class Believing(TypedDict, total=False):
+    """When a pose is believed, arguments of ``track_pose``."""
+
+    min_share: float
+    may_carry: bool
 
 
 @dataclass(frozen=True)
@@ -109,8 +118,9 @@ def track_pose(
     seed: int,
     min_inliers: int = MIN_INLIERS,
     min_share: float = MIN_BELIEVED_SHARE,
+    may_carry: bool = False,
 ) -> TrackedPose | None:
-    """Pose from the landmarks among the tracks of a frame.
+    """Pose from the landmarks among the tracks of a frame, steadied by the other tracks.
 
     Args:
         camera: Pinhole.
@@ -124,6 +134,8 @@ def track_pose(
         seed: Of the search.
         min_inliers: Agreeing landmarks needed.
         min_share: And their share of all that are in sight: fewer are a chance find.
+        may_carry: Where landmarks have all but run out, let many other tracks carry the guess on with fewer
+            than ``min_inliers``.
 
     Returns:
         The pose, or None when too few landmarks agree with any.
@@ -142,8 +154,15 @@ def track_pose(
     enough = max(min_inliers, min_share * len(points))
     if best is not None and (best.num_inliers < enough or not np.isfinite(best.T_cam_world).all()):
         best = None
-    if not known.all():
-        best = _steadied(camera, world, noise, ids, xy, confidence, known, best, T_world_guess, submap)
+    if best is None and may_carry and T_world_guess is not None and len(points) < _RUN_OUT:
+        least = max(_MIN_LEFT, min_share * len(points))
+        best = _steadied(
+            camera, world, noise, ids, xy, confidence, known, T_world_guess, submap, _CARRY, least
+        )
+    elif best is not None and not known.all():
+        T, least = invert_transform(best.T_cam_world), max(enough, _MIN_KEPT_SHARE * best.num_inliers)
+        steadied = _steadied(camera, world, noise, ids, xy, confidence, known, T, submap, _STEADY, least)
+        best = best if steadied is None else steadied
     if best is None:
         return None
     T_world_cam = invert_transform(best.T_cam_world)
@@ -158,40 +177,47 @@ def _steadied(
     xy: Array,
     confidence: Array,
     known: NDArray[np.bool_],
-    pose: PoseEstimate | None,
-    T_world_guess: Array | None,
+    T_world_cam: Array,
     submap: int,
+    needed: tuple[int, float],
+    min_inliers: float,
 ) -> PoseEstimate | None:
-    """Refine the pose from landmarks with what the tracks without one say; the same where they disagree.
+    """Refine a pose with what the tracks without a landmark say too.
 
-    Where landmarks have all but run out, tracks carry the expected pose on with the few that are left.
+    Args:
+        camera: Pinhole.
+        world: The map.
+        noise: Gives each observation its sigma.
+        ids: ``(N,)`` tracks in sight.
+        xy: ``(N, 2)`` their positions.
+        confidence: ``(N,)`` of the positions.
+        known: ``(N,)`` bool, those that have a landmark.
+        T_world_cam: Where to begin.
+        submap: Part of the map the camera is in.
+        needed: Rays that must agree, and their share.
+        min_inliers: Landmarks that must agree.
+
+    Returns:
+        The pose with the landmarks it agrees with; None where too few agree.
     """
-    count = int(known.sum())
-    if pose is not None:
-        T_world_cam, min_rays, min_share = invert_transform(pose.T_cam_world), _MIN_RAYS, _MIN_RAY_SHARE
-    elif T_world_guess is not None and count < _RUN_OUT:
-        T_world_cam, min_rays, min_share = T_world_guess, _MIN_CARRYING, _MIN_CARRYING_SHARE
-    else:
-        return None
-    unknown = np.flatnonzero(~known)
+    count, unknown = int(known.sum()), np.flatnonzero(~known)
     rays = rays_of(camera, world, noise, ids[unknown], T_world_cam, submap)
-    if rays is None or len(rays.row) < min_rays:
-        return pose
+    if rays is None or len(rays.row) < needed[0]:
+        return None
     both = np.concatenate([np.flatnonzero(known), unknown[rays.row]])
     points = np.concatenate([world.landmarks.xyz[world.landmarks.rows(ids[known])], rays.xyz])
     sigma, gate = noise.sigma_px(confidence[both]), noise.threshold_px(confidence[both])
     # Both ends of a ray are observed, the keyframe's and this one.
     wider = np.hypot(sigma[count:], rays.sigma_px) / sigma[count:]
     sigma[count:] *= wider
-    gate[count:] *= wider
+    gate[count:] *= np.minimum(wider, _MOST_WIDER)
     spread = np.concatenate([np.zeros((count, 2)), rays.spread_px])
     start = invert_transform(T_world_cam)
-    steadied = refine_pose(camera, start, points, xy[both], sigma, gate, iterations=6, spread_px=spread)
-    agreeing, rays_agreeing = steadied.inliers[:count], steadied.inliers[count:]
-    kept = agreeing.sum() >= (_MIN_LEFT if pose is None else _MIN_KEPT_SHARE * pose.num_inliers)
-    if not kept or rays_agreeing.sum() < max(min_rays, min_share * len(rays.row)):
-        return pose
-    return replace(steadied, inliers=agreeing, residual_px=steadied.residual_px[:count])
+    pose = refine_pose(camera, start, points, xy[both], sigma, gate, iterations=6, spread_px=spread)
+    agreeing, rays_agreeing = pose.inliers[:count], pose.inliers[count:]
+    if agreeing.sum() < min_inliers or rays_agreeing.sum() < max(needed[0], needed[1] * len(rays.row)):
+        return None
+    return replace(pose, inliers=agreeing, residual_px=pose.residual_px[:count])
 
 
 def interpolate_pose(T_world_a: Array, T_world_b: Array, share: float) -> Array:
