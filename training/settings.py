@@ -41,7 +41,7 @@ class TrainSettings:
     grow_from: Path | None = field(
         default=None,
         metadata={
-            "help": "start as a trained network of the same kind and at most this size, a weights file"
+            "help": "start as a trained network of this very size, or a smaller 3dcsc one; a weights file"
         },
     )
     pretrain_share: float = field(
