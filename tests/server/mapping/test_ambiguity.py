@@ -80,6 +80,6 @@ def test_one_lucky_attempt_does_not_outweigh_the_others(wall, direction_error_de
 
 def test_what_is_found_for_the_first_time_is_not_ahead_of_what_led_in_turn(wall, direction_error_deg):
     """Two structures that were ahead in turn have some doubt both; a third one that costs more has none."""
-    truth = wall(bend=0.3, noise_px=0.4)
+    truth = wall(bend=0.1, noise_px=0.4)
     _, sides = decide(truth, [(truth, 0.65)])
     assert direction_error_deg(sides[0].T_world_cam, truth.T_world_cam) < 10.0
