@@ -3,7 +3,7 @@
 While a camera turns, most of what it sees is new, and the few landmarks left lie on one side of the image,
 where turning and moving look alike. The new tracks are many and everywhere. How far their points are is known
 roughly, as far as others: that much uncertainty moves a projection only along one line, and hardly at all
-while the camera is near the keyframe.
+while the camera is near the keyframe (inverse depth with its doubt: Civera, Davison and Montiel 2008).
 """
 
 from dataclasses import dataclass
