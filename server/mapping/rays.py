@@ -7,6 +7,7 @@ while the camera is near the keyframe (inverse depth with its doubt: Civera, Dav
 """
 
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,8 +64,8 @@ def rays_of(
     Returns:
         Those of the tracks that a keyframe saw; None where none did or no depth is known.
     """
-    mine = [k for k in world.keyframes if k.submap == submap and len(k.ids)]
-    views = mine[-_NUM_KEYFRAMES:][::-1]
+    mine = (k for k in reversed(world.keyframes) if k.submap == submap and len(k.ids))
+    views = list(islice(mine, _NUM_KEYFRAMES))  # newest first; the map may have a thousand
     depth = float("inf")
     T_cam_world = invert_transform(T_world_cam)
     xyz, spread_px, sigma_px = np.zeros((len(ids), 3)), np.zeros((len(ids), 2)), np.zeros(len(ids))
