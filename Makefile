@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test check format docs results-page bench-pairs bench-loss clean help
+.PHONY: demo test check format docs results-page bench-pairs bench-scenes bench-loss clean help
 
 help:            ## what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
@@ -30,6 +30,10 @@ docs: $(VENV)/.ready-dev  ## write docs/commands.md from the command line
 
 bench-pairs: $(VENV)/.ready-run  ## measure relative poses on the recordings of DATA (make bench-pairs DATA=folder)
 	$(BIN)/python -m semcast.evaluation.pair_suite $(DATA) $(ARGS)
+	$(BIN)/python -m semcast.evaluation.results_page
+
+bench-scenes: $(VENV)/.ready-run  ## draw a room, a street and an orbit and measure trajectories on them
+	$(BIN)/python -m semcast.evaluation.scene_suite $(ARGS)
 	$(BIN)/python -m semcast.evaluation.results_page
 
 bench-loss: $(VENV)/.ready-run  ## train short with terms of the loss switched off (make bench-loss DATA=folder)

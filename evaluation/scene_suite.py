@@ -1,0 +1,82 @@
+"""The trajectory benchmark on drawn scenes: needs no recording, and nothing was tuned on it.
+
+Run by ``make bench-scenes``. About 45 minutes of one core with the default three seeds.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from semcast.channel.settings import ChannelSettings
+from semcast.evaluation.scenes.render import RenderSettings, render_scene
+from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory
+
+RESULTS = Path("evaluation/results")
+SCENES_FOLDER = Path("runs/scenes")
+#: Seeds of the scenes; those below were looked at while the renderer was written.
+_FIRST_SCENE_SEED = 100
+_LINK_DB = 6.0
+#: Seconds are chosen so that every recording has 100 to 300 frames.
+_SECONDS = {"room": 10.0, "street": 20.0, "orbit": 10.0}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A recording to draw and what to measure on it."""
+
+    render: RenderSettings
+    settings: TrajectorySettings
+
+
+def suite(folder: Path, results: Path, seeds: int) -> Iterator[Run]:
+    """Yield every scene at normal and fast pace, behind a Rayleigh fading link.
+
+    Args:
+        folder: Where the recordings are written.
+        results: Folder of the result files.
+        seeds: Seeds of channel and estimation.
+    """
+    for number, (scene, seconds) in enumerate(_SECONDS.items()):
+        for pace in ("normal", "fast"):
+            name = f"{scene}_{pace}"
+            render = RenderSettings(
+                scene=scene,  # type: ignore[arg-type]
+                pace=pace,  # type: ignore[arg-type]
+                seed=_FIRST_SCENE_SEED + number,
+                seconds=seconds,
+                out=folder / name,
+            )
+            settings = TrajectorySettings(
+                sequence=folder / name,
+                link=ChannelSettings(channel="rayleigh"),
+                snr_db=(_LINK_DB,),
+                seeds=seeds,
+                threads=1,
+                confidence=("robust", "off"),
+                rows=False,
+                json=results / f"trajectory_rayleigh_{name}.json",
+            )
+            yield Run(render, settings)
+
+
+def main() -> None:
+    """Draw what is not there yet and run the benchmark, or the part whose names hold a word."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--folder", type=Path, default=SCENES_FOLDER, help="folder of the recordings")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the result files")
+    parser.add_argument("--seeds", type=int, default=3, help="seeds of each run")
+    parser.add_argument("--only", default="", help="run only what has this in its name")
+    arguments = parser.parse_args()
+    for run in suite(arguments.folder, arguments.results, arguments.seeds):
+        if arguments.only in run.render.out.name:
+            # The path is written last: with it the recording is whole.
+            if not (run.render.out / "groundtruth.txt").exists():
+                render_scene(run.render)
+            evaluate_trajectory(run.settings)
+            sys.stderr.write(f"{run.render.out.name}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Write a drawn scene as a recorded sequence with its exact path."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import SourceError
+from semcast.common.trajectory import Trajectory, write_tum
+from semcast.evaluation.scenes.motion import Pace
+from semcast.evaluation.scenes.orbit import Orbit
+from semcast.evaluation.scenes.room import Room
+from semcast.evaluation.scenes.street import Street
+from semcast.evaluation.scenes.surfaces import Surface, draw
+
+Array = NDArray[np.float64]
+
+#: Samples of a pixel, in place and over the exposure: they soften edges and blur what moves.
+_SAMPLES = ((-0.25, -0.25), (0.25, 0.25), (-0.25, 0.25), (0.25, -0.25))
+
+
+class Scene(Protocol):
+    """Something to see and a camera that moves in it; metres, z up."""
+
+    camera: Intrinsics
+    rate_hz: float
+    exposure_s: float
+
+    def surfaces(self, t_s: float) -> list[Surface]:
+        """Return what there is to see at a time."""
+
+    def T_world_cam(self, t_s: float) -> Array:
+        """Return the ``(4, 4)`` pose of the camera at a time."""
+
+    def background(self, T_world_cam: Array) -> NDArray[np.float32]:
+        """Return ``(H, W, 3)`` grey levels of what is seen where no surface is."""
+
+
+SCENES: dict[str, type[Room] | type[Orbit] | type[Street]] = {"room": Room, "street": Street, "orbit": Orbit}
+
+
+def frame_of(scene: Scene, t_s: float, noise_sd: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Return the ``(H, W, 3)`` RGB picture of a scene, with blur of motion and noise of the sensor."""
+    total = np.zeros((scene.camera.height, scene.camera.width, 3), np.float32)
+    for index, (dx, dy) in enumerate(_SAMPLES):
+        moment_s = t_s + scene.exposure_s * ((index + 0.5) / len(_SAMPLES) - 0.5)
+        camera = Intrinsics(
+            fx=scene.camera.fx,
+            fy=scene.camera.fy,
+            cx=scene.camera.cx - dx,
+            cy=scene.camera.cy - dy,
+            width=scene.camera.width,
+            height=scene.camera.height,
+        )
+        T_world_cam = scene.T_world_cam(moment_s)
+        total += draw(scene.surfaces(moment_s), camera, T_world_cam, scene.background(T_world_cam))
+    noisy = total / len(_SAMPLES) + rng.normal(0, noise_sd, total.shape[:2])[..., None]
+    return np.asarray(np.clip(np.rint(noisy), 0, 255), np.uint8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderSettings:
+    """Settings of ``render_scene``.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    scene: Literal["room", "street", "orbit"] = field(
+        default="room",
+        metadata={
+            "help": "room: handheld, 30 Hz; street: from a car, 10 Hz; orbit: round a still life, 10 Hz"
+        },
+    )
+    pace: Pace = field(default="normal", metadata={"help": "how fast the camera moves and shakes"})
+    seed: int = field(default=0, metadata={"help": "seed of the scene, the path and the noise"})
+    seconds: float = field(default=10.0, metadata={"help": "length of the recording, at most 40"})
+    noise_sd: float = field(default=1.5, metadata={"help": "noise of the sensor in grey levels of 255"})
+    out: Path = field(metadata={"help": "folder to write; it must not exist or be empty"})
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        if self.seed < 0:
+            raise ValueError(f"seed must be at least 0, got {self.seed}")
+        if not 0 < self.seconds <= 40:
+            raise ValueError(f"seconds must be in (0, 40], got {self.seconds:g}")
+        if not 0 <= self.noise_sd <= 50:
+            raise ValueError(f"noise_sd must be in [0, 50], got {self.noise_sd:g}")
+
+
+def render_scene(settings: RenderSettings) -> int:
+    """Write a scene as a sequence of the native layout: images, times, intrinsics and the exact path.
+
+    The same settings give the same files.
+
+    Returns:
+        Number of frames.
+
+    Raises:
+        SourceError: The folder has files in it or can't be written.
+    """
+    folder = settings.out
+    try:
+        if folder.exists() and any(folder.iterdir()):
+            raise SourceError(f"out must be a new or an empty folder, {folder} has files in it")
+        (folder / "images").mkdir(parents=True, exist_ok=True)
+    except OSError as err:
+        raise SourceError(f"can't write to {folder}: {err.strerror}") from err
+    scene = SCENES[settings.scene](settings.seed, settings.pace)
+    times_s = np.arange(max(1, round(settings.seconds * scene.rate_hz))) / scene.rate_hz
+    T_world_cams = np.stack([scene.T_world_cam(float(t_s)) for t_s in times_s])
+    for index, t_s in enumerate(times_s):
+        rng = np.random.default_rng([settings.seed, index, 4])
+        image = frame_of(scene, float(t_s), settings.noise_sd, rng)
+        path = folder / "images" / f"{index:06d}.png"
+        if not cv2.imwrite(str(path), image[..., ::-1]):
+            raise SourceError(f"can't write {path}")
+    (folder / "times.txt").write_text("".join(f"{t_s:.6f}\n" for t_s in times_s))
+    scene.camera.save(folder / "intrinsics.json")
+    write_tum(folder / "groundtruth.txt", Trajectory(times_s, T_world_cams))
+    return len(times_s)

@@ -1,0 +1,170 @@
+"""Textured rectangles and the picture a pinhole camera has of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.evaluation.scenes.textures import Pyramid
+
+Array = NDArray[np.float64]
+
+#: Nothing nearer than this is drawn, in metres.
+NEAR_M = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A textured rectangle, seen from both sides.
+
+    Attributes:
+        corner_m: ``(3,)`` world position of texture coordinate (0, 0).
+        edge_u_m: ``(3,)`` from there along the texture's rows.
+        edge_v_m: ``(3,)`` from there along its columns, perpendicular to ``edge_u_m``.
+        texture: What is painted on it.
+        repeats: How often the texture fits along each edge.
+        light: Factor on the texture's brightness.
+    """
+
+    corner_m: Array
+    edge_u_m: Array
+    edge_v_m: Array
+    texture: Pyramid
+    repeats: tuple[float, float] = (1.0, 1.0)
+    light: float = 1.0
+
+
+def box(
+    centre_m: Sequence[float],
+    size_m: Sequence[float],
+    yaw_rad: float,
+    textures: Sequence[Pyramid],
+    lights: Sequence[float] = (0.75, 0.9, 1.0, 0.82, 1.1, 0.5),
+) -> list[Surface]:
+    """Return the six sides of a box that stands upright.
+
+    Args:
+        centre_m: Its middle in the world, z up.
+        size_m: Length, width and height.
+        yaw_rad: Turn about the vertical.
+        textures: Used in turn for the four sides, top and bottom.
+        lights: Brightness of the four sides, top and bottom.
+    """
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    along = np.array([cos, sin, 0.0]) * size_m[0] / 2
+    across = np.array([-sin, cos, 0.0]) * size_m[1] / 2
+    up = np.array([0.0, 0.0, size_m[2] / 2])
+    middle = np.asarray(centre_m, np.float64)
+    sides = [
+        (middle - along + across + up, 2 * along, -2 * up),
+        (middle + along + across + up, -2 * across, -2 * up),
+        (middle + along - across + up, -2 * along, -2 * up),
+        (middle - along - across + up, 2 * across, -2 * up),
+        (middle - along - across + up, 2 * along, 2 * across),
+        (middle - along - across - up, 2 * along, 2 * across),
+    ]
+    return [
+        Surface(corner, edge_u, edge_v, textures[i % len(textures)], light=lights[i])
+        for i, (corner, edge_u, edge_v) in enumerate(sides)
+    ]
+
+
+def draw(
+    surfaces: Sequence[Surface], camera: Intrinsics, T_world_cam: Array, background: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return what the camera sees, each pixel one sample at its centre.
+
+    Args:
+        surfaces: What is in the scene; the nearest hides the others.
+        camera: Pinhole, distortion ignored.
+        T_world_cam: ``(4, 4)`` pose, camera axes x right, y down, z forward.
+        background: ``(H, W, 3)`` seen where no surface is.
+
+    Returns:
+        ``(H, W, 3)`` in grey levels 0..255.
+    """
+    image = background.copy()
+    nearest = np.full((camera.height, camera.width), 1e-4, np.float32)
+    R_cam_world, centre = T_world_cam[:3, :3].T, T_world_cam[:3, 3]
+    # Columns span each plane in the camera's frame, so that A (u, v, 1) is a point of it.
+    spans = [np.column_stack([s.edge_u_m, s.edge_v_m, s.corner_m - centre]) for s in surfaces]
+    As = R_cam_world @ np.stack(spans)
+    for index in _in_view(As, camera):
+        window = _window(As[index], camera)
+        if window is not None and abs(np.linalg.det(As[index])) > 1e-9:
+            G = np.linalg.inv(As[index]) @ np.linalg.inv(camera.K)
+            _paint(image, nearest, surfaces[index], G, window)
+    return image
+
+
+def _in_view(As: Array, camera: Intrinsics) -> list[int]:
+    """Return which rectangles may be seen, the nearest first: what they hide need not be painted."""
+    corners = As @ np.array([[0, 1, 1, 0], [0, 0, 1, 1], [1, 1, 1, 1]])  # (N, 3, 4)
+    x, y, z = corners[:, 0], corners[:, 1], corners[:, 2]
+    left, right = (0 - camera.cx) / camera.fx, (camera.width - camera.cx) / camera.fx
+    top, bottom = (0 - camera.cy) / camera.fy, (camera.height - camera.cy) / camera.fy
+    beside = (x < left * z).all(1) | (x > right * z).all(1) | (y < top * z).all(1) | (y > bottom * z).all(1)
+    seen = np.flatnonzero(~beside & (z >= NEAR_M).any(1))
+    order = np.argsort(np.linalg.norm(corners[seen], axis=1).min(1))
+    return [int(i) for i in seen[order]]
+
+
+def _window(A: Array, camera: Intrinsics) -> tuple[slice, slice] | None:
+    """Return rows and columns a rectangle may cover, None when it is out of view."""
+    corners = [A @ np.array([u, v, 1.0]) for u, v in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    kept = []
+    for this, following in zip(corners, corners[1:] + corners[:1], strict=True):
+        if this[2] >= NEAR_M:
+            kept.append(this)
+        if (this[2] >= NEAR_M) != (following[2] >= NEAR_M):
+            share = (NEAR_M - this[2]) / (following[2] - this[2])
+            kept.append(this + share * (following - this))
+    if not kept:
+        return None
+    pixels = np.array([camera.K @ (point / point[2]) for point in kept])[:, :2]
+    low = np.maximum(np.floor(pixels.min(0)), 0).astype(int)
+    high = np.minimum(np.ceil(pixels.max(0)) + 1, (camera.width, camera.height)).astype(int)
+    if (low >= high).any():
+        return None
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def _paint(
+    image: NDArray[np.float32],
+    nearest: NDArray[np.float32],
+    surface: Surface,
+    G: Array,
+    window: tuple[slice, slice],
+) -> None:
+    """Draw one rectangle where it is the nearest; ``G`` maps pixels to ``(u, v, 1)`` over depth."""
+    rows, columns = window
+    ys, xs = np.mgrid[rows, columns].astype(np.float32)
+    G32 = G.astype(np.float32)
+    inverse_depth = G32[2, 0] * xs + G32[2, 1] * ys + G32[2, 2]
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        u = (G32[0, 0] * xs + G32[0, 1] * ys + G32[0, 2]) / inverse_depth
+        v = (G32[1, 0] * xs + G32[1, 1] * ys + G32[1, 2]) / inverse_depth
+        inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+        visible = inside & (inverse_depth > nearest[window]) & (inverse_depth < 1 / NEAR_M)
+    if not visible.any():
+        return
+    tall, wide = surface.texture[0].shape[:2]
+    wide, tall = wide * surface.repeats[0], tall * surface.repeats[1]
+    # Texture pixels under an image pixel decide the level, half a level sharper: pixels have several samples.
+    area = abs(np.linalg.det(G)) * wide * tall / np.where(visible, inverse_depth, 1.0) ** 3
+    level = np.clip(0.5 * np.log2(area) - 0.5, 0, len(surface.texture) - 1)
+    shown = np.zeros((*visible.shape, 3), np.float32)
+    low, high = int(level[visible].min()), int(np.ceil(level[visible].max()))
+    for k in range(low, high + 1):
+        weight = np.maximum(0, 1 - np.abs(level - k))
+        texture = surface.texture[k]
+        wide_k, tall_k = texture.shape[1] * surface.repeats[0], texture.shape[0] * surface.repeats[1]
+        map_x = np.where(visible, u * wide_k - 0.5, 0).astype(np.float32)
+        map_y = np.where(visible, v * tall_k - 0.5, 0).astype(np.float32)
+        layer = cv2.remap(texture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        shown += weight[..., None].astype(np.float32) * layer
+    image[window][visible] = shown[visible] * surface.light
+    nearest[window][visible] = inverse_depth[visible]

@@ -1,0 +1,86 @@
+"""Drawn sequences are read back as recordings, and the reconstruction finds their path."""
+
+import filecmp
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semcast.common.errors import SourceError
+from semcast.common.sequence import open_sequence
+from semcast.evaluation.scenes.render import SCENES, RenderSettings, frame_of, render_scene
+from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory
+
+
+@pytest.fixture(scope="module")
+def orbit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "orbit"
+    render_scene(RenderSettings(scene="orbit", seconds=1.6, out=folder))
+    return folder
+
+
+def test_a_drawn_sequence_is_a_recording_with_an_exact_path(orbit: Path) -> None:
+    sequence = open_sequence(orbit)
+    truth = sequence.groundtruth()
+    assert truth is not None
+    assert len(truth) == 16
+    scene = SCENES["orbit"](0, "normal")
+    np.testing.assert_allclose(truth.T_world_cam[7], scene.T_world_cam(0.7), atol=1e-6)
+    assert sequence.intrinsics == scene.camera
+
+
+def test_the_reconstruction_finds_the_drawn_path(orbit: Path) -> None:
+    report = evaluate_trajectory(TrajectorySettings(sequence=orbit, codec="none"))
+    assert report["completeness"] == 1.0
+    assert report["ate_percent"] < 1.0
+
+
+def test_the_same_settings_give_the_same_files(orbit: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    render_scene(RenderSettings(scene="orbit", seconds=0.2, out=again))
+    for name in ("000000.png", "000001.png"):
+        assert filecmp.cmp(orbit / "images" / name, again / "images" / name, shallow=False)
+
+
+def test_a_folder_with_files_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(SourceError, match="has files in it"):
+        render_scene(RenderSettings(seconds=0.1, out=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("name", sorted(SCENES))
+def test_scenes_fill_the_view_and_cameras_move_smoothly(name: str) -> None:
+    scene = SCENES[name](3, "normal")
+    image = frame_of(scene, 2.0, 0.0, np.random.default_rng(0))
+    assert image.shape == (scene.camera.height, scene.camera.width, 3)
+    assert image.std() > 10
+    times_s = np.arange(0, 20, 1 / scene.rate_hz)
+    positions = np.stack([scene.T_world_cam(t_s)[:3, 3] for t_s in times_s])
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    # No standing still, and no jump: 15 m/s is the fastest any of them goes.
+    assert np.median(steps) > 0
+    assert steps.max() < 15 / scene.rate_hz
+
+
+def test_seeds_and_paces_differ() -> None:
+    one, other = SCENES["room"](1, "normal"), SCENES["room"](2, "normal")
+    assert not np.allclose(one.T_world_cam(1.0), other.T_world_cam(1.0))
+    gentle, fast = (SCENES["room"](1, pace) for pace in ("gentle", "fast"))
+    times_s = np.arange(0, 5, 0.1)
+    paths = [np.stack([scene.T_world_cam(t)[:3, 3] for t in times_s]) for scene in (gentle, fast)]
+    lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths]
+    assert lengths[1] > 2 * lengths[0]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"seconds": 0}, r"seconds must be in \(0, 40\], got 0"),
+        ({"seed": -1}, "seed must be at least 0, got -1"),
+        ({"noise_sd": 60}, r"noise_sd must be in \[0, 50\], got 60"),
+    ],
+)
+def test_settings_out_of_range_are_refused(values: dict[str, float], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        RenderSettings(out=tmp_path / "x", **values)  # type: ignore[arg-type]

@@ -1,0 +1,43 @@
+"""The benchmark on drawn scenes draws what is missing, once, and writes a result for each."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from semcast.evaluation import scene_suite
+
+
+def test_suite_has_every_scene_at_two_paces_and_files_of_their_own(tmp_path: Path) -> None:
+    runs = list(scene_suite.suite(tmp_path / "scenes", tmp_path / "results", seeds=2))
+    names = [run.render.out.name for run in runs]
+    assert names == ["room_normal", "room_fast", "street_normal", "street_fast", "orbit_normal", "orbit_fast"]
+    assert len({run.settings.json for run in runs}) == 6
+    assert all(run.settings.sequence == run.render.out for run in runs)
+
+
+def test_a_recording_is_drawn_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = scene_suite.suite
+
+    def short(folder: Path, results: Path, seeds: int):  # type: ignore[no-untyped-def]
+        for run in whole(folder, results, seeds):
+            yield scene_suite.Run(
+                replace(run.render, seconds=0.8), replace(run.settings, confidence=("robust",), resize=0.5)
+            )
+
+    monkeypatch.setattr(scene_suite, "suite", short)
+    arguments = ["--folder", str(tmp_path / "s"), "--results", str(tmp_path / "r")]
+    arguments += ["--seeds", "1", "--only", "orbit_normal"]
+    (tmp_path / "r").mkdir()
+    monkeypatch.setattr(sys, "argv", ["scene_suite", *arguments])
+    scene_suite.main()
+    drawn = tmp_path / "s" / "orbit_normal" / "images" / "000000.png"
+    at_first = drawn.stat().st_mtime_ns
+    scene_suite.main()
+    assert drawn.stat().st_mtime_ns == at_first
+    report = json.loads((tmp_path / "r" / "trajectory_rayleigh_orbit_normal.json").read_text())
+    assert report["sequence"] == "orbit_normal"
+    assert report["num_frames"] == 8
+    assert [path.name for path in (tmp_path / "r").iterdir()] == ["trajectory_rayleigh_orbit_normal.json"]

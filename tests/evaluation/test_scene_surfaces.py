@@ -1,0 +1,89 @@
+"""Textured rectangles land where the camera model says, and near ones hide far ones."""
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.evaluation.scenes.motion import look
+from semcast.evaluation.scenes.surfaces import Surface, box, draw
+from semcast.evaluation.scenes.textures import Pyramid, pyramid
+
+CAMERA = Intrinsics(fx=100.0, fy=100.0, cx=49.5, cy=39.5, width=100, height=80)
+BLACK = np.zeros((80, 100, 3), np.float32)
+#: Looks along the world's x from its origin: right is -y, down is -z.
+AHEAD = look(np.zeros(3), 0.0, 0.0)
+
+
+def plain(grey: float, side: int = 64) -> Pyramid:
+    return pyramid(np.full((side, side, 3), grey, np.uint8))
+
+
+def wall(distance_m: float, half_m: float, texture: Pyramid) -> Surface:
+    """A square wall across the view, texture upright."""
+    return Surface(
+        np.array([distance_m, half_m, half_m]),
+        np.array([0.0, -2 * half_m, 0.0]),
+        np.array([0.0, 0.0, -2 * half_m]),
+        texture,
+    )
+
+
+def test_wall_covers_the_pixels_its_corners_project_to() -> None:
+    image = draw([wall(2.0, 0.5, plain(200))], CAMERA, AHEAD, BLACK)
+    rows, columns = np.nonzero(image[..., 0])
+    # 100 px focal length, 0.5 m at 2 m: 25 px either side of the centre (49.5, 39.5).
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (15, 64, 25, 74)
+    assert image[40, 50, 0] == pytest.approx(200, abs=0.5)
+
+
+def test_texture_is_upright_and_not_mirrored() -> None:
+    quarters = np.zeros((64, 64, 3), np.uint8)
+    quarters[:32, :32], quarters[:32, 32:], quarters[32:, :32] = 50, 100, 150
+    image = draw([wall(2.0, 0.5, pyramid(quarters))], CAMERA, AHEAD, BLACK)
+    seen = [round(float(image[y, x, 0])) for y, x in ((25, 35), (25, 65), (55, 35), (55, 65))]
+    assert seen == [50, 100, 150, 0]
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_the_nearer_wall_hides_the_farther(order: tuple[int, int]) -> None:
+    walls = [wall(2.0, 0.2, plain(200)), wall(4.0, 2.0, plain(80))]
+    image = draw([walls[i] for i in order], CAMERA, AHEAD, BLACK)
+    assert image[40, 50, 0] == pytest.approx(200, abs=0.5)
+    assert image[10, 10, 0] == pytest.approx(80, abs=0.5)
+
+
+def test_a_floor_that_runs_under_the_camera_is_cut_where_it_passes_it() -> None:
+    floor = Surface(
+        np.array([-5.0, -5.0, -1.0]), np.array([60.0, 0, 0]), np.array([0, 10.0, 0]), plain(120), (6.0, 1.0)
+    )
+    image = draw([floor], CAMERA, AHEAD, BLACK)
+    assert np.all(image[60:, 20:80, 0] > 100)
+    assert not image[:38].any()
+
+
+def test_what_is_behind_the_camera_is_not_seen() -> None:
+    assert not draw([wall(-2.0, 0.5, plain(200))], CAMERA, AHEAD, BLACK).any()
+
+
+def test_texture_far_away_is_averaged_and_not_sampled() -> None:
+    stripes = np.zeros((512, 512, 3), np.uint8)
+    stripes[:, ::2] = 200
+    image = draw([wall(2.0, 0.25, pyramid(stripes))], CAMERA, AHEAD, BLACK)
+    # 512 columns on 25 pixels: every pixel has the mean.
+    assert np.abs(image[30:50, 40:60, 0] - 100).max() < 3
+
+
+def test_box_shows_the_light_of_the_side_that_faces_the_camera() -> None:
+    sides = box((3.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.0, [plain(100)], lights=(0.1, 0.2, 0.3, 0.9, 0.5, 0.6))
+    image = draw(sides, CAMERA, AHEAD, BLACK)
+    assert len(sides) == 6
+    assert image[40, 50, 0] == pytest.approx(90, abs=0.5)
+
+
+def test_look_has_camera_axes() -> None:
+    R_world_cam = look(np.zeros(3), np.pi / 2, 0.0)[:3, :3]
+    np.testing.assert_allclose(R_world_cam, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
+    assert look(np.zeros(3), 0.0, 0.3)[2, 2] == pytest.approx(np.sin(0.3))
+    rolled = look(np.zeros(3), 0.4, 0.3, 0.2)[:3, :3]
+    np.testing.assert_allclose(rolled.T @ rolled, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rolled) == pytest.approx(1)
