@@ -13,6 +13,7 @@ from semcast.server.mapping import mapper
 from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import find_revisit, place_anew
@@ -215,6 +216,7 @@ class MapBuilder:
         if result is None or result.problem.map_version != self._version:
             return None
         mapper.apply_result(self.world, result, self.noise)
+        place_left_out(self.world, self._camera, self.noise.model, result)
         if result.covariance is not None:
             self._adjusted = (int(result.problem.keyframe_ids[-1]), result.covariance)
         return result

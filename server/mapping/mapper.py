@@ -19,6 +19,8 @@ Ids = NDArray[np.int64]
 
 #: Observations one adjustment takes at most; it has to be done before the next keyframe.
 MAX_OBSERVATIONS = 3500
+#: Keyframes that see a landmark, from which on it matters to an adjustment as much as any other.
+_WELL_SEEN = 4
 #: Landmarks further than this many median depths are as good as at infinity.
 _MAX_DEPTH_RATIO = 60.0
 #: Keyframes of long ago that were recognised in one adjustment at most, and how many of those before and
@@ -241,9 +243,10 @@ def build_problem(
     view, point, xy, confidence = gather_observations(views, ids)
     count = np.bincount(point, minlength=len(ids))
     if count.sum() > MAX_OBSERVATIONS:
-        # What ties the window to long ago is kept first, then long tracks; ids break ties.
+        # What ties the window to long ago is kept first, then what several keyframes see. Among those the
+        # choice is even: the longest tracks alone would leave the newest keyframe to half of what it sees.
         anchored = np.isin(np.arange(len(ids)), point[view < len(anchors)])
-        order = np.lexsort((ids, -count, ~anchored))
+        order = np.lexsort((_scattered(ids), -np.minimum(count, _WELL_SEEN), ~anchored))
         within = np.cumsum(count[order]) <= MAX_OBSERVATIONS
         chosen = np.zeros(len(ids), bool)
         chosen[order[within]] = True
@@ -274,6 +277,11 @@ def build_problem(
         map_version=map_version,
         num_anchors=len(anchors),
     )
+
+
+def _scattered(ids: Ids) -> Ids:
+    """Return keys that order ids as good as at random, the same every time (multiplicative hashing)."""
+    return np.asarray((ids * 2_654_435_761) % 4_294_967_296)
 
 
 def _anchors(world: WorldMap, older: list[Keyframe], recent: list[Keyframe]) -> list[Keyframe]:
