@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semcast.channel.settings import ChannelSettings
-from semcast.evaluation.scenes.render import RenderSettings, render_scene
+from semcast.evaluation.scenes.motion import Pace
+from semcast.evaluation.scenes.render import RenderSettings, SceneName, render_scene
 from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory
 
 RESULTS = Path("evaluation/results")
@@ -18,8 +19,9 @@ SCENES_FOLDER = Path("runs/scenes")
 #: Seeds of the scenes; those below were looked at while the renderer was written.
 _FIRST_SCENE_SEED = 100
 _LINK_DB = 6.0
+_PACES: tuple[Pace, ...] = ("normal", "fast")
 #: Seconds are chosen so that every recording has 100 to 300 frames.
-_SECONDS = {"room": 10.0, "street": 20.0, "orbit": 10.0}
+_SECONDS: dict[SceneName, float] = {"room": 10.0, "street": 20.0, "orbit": 10.0}
 
 
 @dataclass(frozen=True)
@@ -39,11 +41,11 @@ def suite(folder: Path, results: Path, seeds: int) -> Iterator[Run]:
         seeds: Seeds of channel and estimation.
     """
     for number, (scene, seconds) in enumerate(_SECONDS.items()):
-        for pace in ("normal", "fast"):
+        for pace in _PACES:
             name = f"{scene}_{pace}"
             render = RenderSettings(
-                scene=scene,  # type: ignore[arg-type]
-                pace=pace,  # type: ignore[arg-type]
+                scene=scene,
+                pace=pace,
                 seed=_FIRST_SCENE_SEED + number,
                 seconds=seconds,
                 out=folder / name,

@@ -55,7 +55,7 @@ class Orbit:
         shake = [wobble.at(t_s) for wobble in self._shake]
         return look(position, angle + np.pi + shake[0], pitch + shake[1], shake[2])
 
-    def background(self, T_world_cam: Array) -> NDArray[np.float32]:
+    def background(self) -> NDArray[np.float32]:
         """Return the plain grey behind the table."""
         return np.full((self.camera.height, self.camera.width, 3), self._grey, np.float32)
 

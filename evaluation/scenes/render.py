@@ -36,11 +36,16 @@ class Scene(Protocol):
     def T_world_cam(self, t_s: float) -> Array:
         """Return the ``(4, 4)`` pose of the camera at a time."""
 
-    def background(self, T_world_cam: Array) -> NDArray[np.float32]:
+    def background(self) -> NDArray[np.float32]:
         """Return ``(H, W, 3)`` grey levels of what is seen where no surface is."""
 
 
-SCENES: dict[str, type[Room] | type[Orbit] | type[Street]] = {"room": Room, "street": Street, "orbit": Orbit}
+SceneName = Literal["room", "street", "orbit"]
+SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street]] = {
+    "room": Room,
+    "street": Street,
+    "orbit": Orbit,
+}
 
 
 def frame_of(scene: Scene, t_s: float, noise_sd: float, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -56,8 +61,7 @@ def frame_of(scene: Scene, t_s: float, noise_sd: float, rng: np.random.Generator
             width=scene.camera.width,
             height=scene.camera.height,
         )
-        T_world_cam = scene.T_world_cam(moment_s)
-        total += draw(scene.surfaces(moment_s), camera, T_world_cam, scene.background(T_world_cam))
+        total += draw(scene.surfaces(moment_s), camera, scene.T_world_cam(moment_s), scene.background())
     noisy = total / len(_SAMPLES) + rng.normal(0, noise_sd, total.shape[:2])[..., None]
     return np.asarray(np.clip(np.rint(noisy), 0, 255), np.uint8)
 
@@ -70,7 +74,7 @@ class RenderSettings:
         ValueError: A value is out of range.
     """
 
-    scene: Literal["room", "street", "orbit"] = field(
+    scene: SceneName = field(
         default="room",
         metadata={
             "help": "room: handheld, 30 Hz; street: from a car, 10 Hz; orbit: round a still life, 10 Hz"

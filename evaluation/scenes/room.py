@@ -52,7 +52,7 @@ class Room:
         yaw = self._start_yaw + self._turn_rad_s * t_s + self._scan.at(t_s) + self._shake[0].at(t_s)
         return look(position, yaw, -0.12 + self._nod.at(t_s) + self._shake[1].at(t_s), self._shake[2].at(t_s))
 
-    def background(self, T_world_cam: Array) -> NDArray[np.float32]:
+    def background(self) -> NDArray[np.float32]:
         """Return darkness: walls hide all of it."""
         return np.zeros((self.camera.height, self.camera.width, 3), np.float32)
 

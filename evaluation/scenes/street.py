@@ -72,7 +72,7 @@ class Street:
         position = np.array([x, y, _EYE_M + self._bounce.at(t_s)])
         return look(position, yaw, self._pitch.at(t_s), self._roll.at(t_s))
 
-    def background(self, T_world_cam: Array) -> NDArray[np.float32]:
+    def background(self) -> NDArray[np.float32]:
         """Return a sky that is brighter towards the horizon."""
         rows = np.linspace(0.9, 1.05, self.camera.height)[:, None, None]
         sky = np.clip(self._sky * rows, 0, 255)

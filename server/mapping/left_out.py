@@ -11,13 +11,11 @@ from semcast.common.geometry import invert_transform
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle_problem import BundleResult
-from semcast.server.mapping.mapper import gather_observations
+from semcast.server.mapping.mapper import MAX_ERROR_SIGMA, gather_observations
 from semcast.server.mapping.world_map import WorldMap
 
 #: Keyframes whose observations place a point: those of a window and as many before it.
 _NUM_KEYFRAMES = 20
-#: A point moves where its rays meet as well as those of a new landmark must, in standard deviations.
-_MAX_ERROR_SIGMA = 1.8
 
 
 def place_left_out(world: WorldMap, camera: Intrinsics, noise: NoiseModel, result: BundleResult) -> int:
@@ -54,6 +52,6 @@ def place_left_out(world: WorldMap, camera: Intrinsics, noise: NoiseModel, resul
     T_cam_world = invert_transform(np.stack([k.T_world_cam for k in views]))
     sigma_px = noise.sigma_px(confidence)
     placed = triangulate(camera, T_cam_world, view, point, xy, sigma_px, len(ids), refinements=1)
-    good = (count >= 2) & placed.in_front & (placed.error_sigma < _MAX_ERROR_SIGMA)
+    good = (count >= 2) & placed.in_front & (placed.error_sigma < MAX_ERROR_SIGMA)
     world.move_landmarks(ids[good], placed.xyz[good])
     return int(good.sum())

@@ -19,6 +19,8 @@ Ids = NDArray[np.int64]
 
 #: Observations one adjustment takes at most; it has to be done before the next keyframe.
 MAX_OBSERVATIONS = 3500
+#: Root mean square error of a triangulated landmark at most, in standard deviations.
+MAX_ERROR_SIGMA = 1.8
 #: Keyframes that see a landmark, from which on it matters to an adjustment as much as any other.
 _WELL_SEEN = 4
 #: Landmarks further than this many median depths are as good as at infinity.
@@ -135,7 +137,7 @@ def add_landmarks(
         (seen >= 2)
         & new.in_front
         & (new.parallax_deg > wanted_deg)
-        & (new.error_sigma < 1.8)
+        & (new.error_sigma < MAX_ERROR_SIGMA)
         & (depth < reach)
     )
     if not good.any():

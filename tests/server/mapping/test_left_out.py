@@ -115,7 +115,7 @@ def test_without_anything_left_out_or_an_adjustment_nothing_moves(monkeypatch, s
 
 
 def test_room_in_an_adjustment_goes_to_new_landmarks_as_to_old_ones():
-    """Half of the landmarks are seen by all ten keyframes, half by the newest four: both get their share."""
+    """Half of the landmarks are seen by all keyframes, half by the newest four: both get their share."""
     world, _ = world_with_shaken_keyframes()
     young = np.arange(0, NUM_POINTS, 2)
     for keyframe in world.keyframes[:4]:
