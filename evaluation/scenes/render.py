@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.trajectory import Trajectory, write_tum
+from semcast.evaluation.scenes.block import Block
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.orbit import Orbit
 from semcast.evaluation.scenes.room import Room
@@ -40,10 +41,11 @@ class Scene(Protocol):
         """Return ``(H, W, 3)`` grey levels of what is seen where no surface is."""
 
 
-SceneName = Literal["room", "street", "orbit"]
+SceneName = Literal["room", "street", "block", "orbit"]
 SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street]] = {
     "room": Room,
     "street": Street,
+    "block": Block,
     "orbit": Orbit,
 }
 
@@ -77,12 +79,13 @@ class RenderSettings:
     scene: SceneName = field(
         default="room",
         metadata={
-            "help": "room: handheld, 30 Hz; street: from a car, 10 Hz; orbit: round a still life, 10 Hz"
+            "help": "room: handheld, 30 Hz; street: from a car, 10 Hz; block: the same round a block of "
+            "houses and on; orbit: round a still life, 10 Hz"
         },
     )
     pace: Pace = field(default="normal", metadata={"help": "how fast the camera moves and shakes"})
     seed: int = field(default=0, metadata={"help": "seed of the scene, the path and the noise"})
-    seconds: float = field(default=10.0, metadata={"help": "length of the recording, at most 40"})
+    seconds: float = field(default=10.0, metadata={"help": "length of the recording, at most 120"})
     noise_sd: float = field(default=1.5, metadata={"help": "noise of the sensor in grey levels of 255"})
     out: Path = field(metadata={"help": "folder to write; it must not exist or be empty"})
 
@@ -90,8 +93,8 @@ class RenderSettings:
         """Check ranges."""
         if self.seed < 0:
             raise ValueError(f"seed must be at least 0, got {self.seed}")
-        if not 0 < self.seconds <= 40:
-            raise ValueError(f"seconds must be in (0, 40], got {self.seconds:g}")
+        if not 0 < self.seconds <= 120:
+            raise ValueError(f"seconds must be in (0, 120], got {self.seconds:g}")
         if not 0 <= self.noise_sd <= 50:
             raise ValueError(f"noise_sd must be in [0, 50], got {self.noise_sd:g}")
 

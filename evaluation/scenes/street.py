@@ -11,7 +11,7 @@ from semcast.evaluation.scenes.textures import Pyramid, asphalt, dead_leaves, fa
 Array = NDArray[np.float64]
 
 #: Steps of the road's centre line, in metres.
-_STEP_M = 0.25
+STEP_M = 0.25
 _LANE_M = 1.75
 _EYE_M = 1.65
 
@@ -32,9 +32,10 @@ class Street:
     def __init__(self, seed: int, pace: Pace) -> None:
         """Build the streets and choose the speed."""
         rng = np.random.default_rng([seed, 3])
-        self._line, self._yaw, self._bend = _centre_line(rng)
-        self._time_s = _timetable(self._bend, 9.0 * PACE_FACTOR[pace] ** 0.6)
-        self._surfaces = _town(rng, self._line, self._yaw)
+        bend, built = self._course(rng)
+        self._line, self._yaw = _centre_line(bend)
+        self._time_s = _timetable(bend, 9.0 * PACE_FACTOR[pace] ** 0.6)
+        self._surfaces = _town(rng, self._line[:built], self._yaw[:built])
         self._cars = [_car_textures(rng) for _ in range(3)]
         self._ahead_m = rng.uniform(12, 25)
         self._oncoming_s = rng.uniform(3, 15, 2)
@@ -43,15 +44,28 @@ class Street:
         self._pitch = Wobble.drawn(rng, np.radians(0.25), 0.5, 3.0)
         self._roll = Wobble.drawn(rng, np.radians(0.2), 0.3, 2.0)
 
+    def _course(self, rng: np.random.Generator) -> tuple[Array, int]:
+        """Return the road's curvature every ``STEP_M``, smoothed, and how many of these steps to build on."""
+        bends = [np.zeros(int(rng.uniform(45, 80) / STEP_M))]
+        turn = rng.choice([-1.0, 1.0])
+        for _ in range(7):
+            radius = rng.uniform(9, 14)
+            bends.append(np.full(int(radius * np.pi / 2 / STEP_M), turn / radius))
+            bends.append(np.zeros(int(rng.uniform(40, 80) / STEP_M)))
+            # Never round a block: the road would meet itself.
+            turn = -turn
+        bend = smoothed(np.concatenate(bends))
+        return bend, len(bend)
+
     def _place(self, way_m: float) -> tuple[Array, float]:
         """Return position ``(x, y)`` and heading after a way along the line."""
-        index = np.clip(way_m / _STEP_M, 0, len(self._line) - 1.001)
+        index = np.clip(way_m / STEP_M, 0, len(self._line) - 1.001)
         low, share = int(index), index - int(index)
         position = (1 - share) * self._line[low] + share * self._line[low + 1]
         return position, float((1 - share) * self._yaw[low] + share * self._yaw[low + 1])
 
     def _way_m(self, t_s: float) -> float:
-        return float(np.interp(t_s, self._time_s, np.arange(len(self._time_s)) * _STEP_M))
+        return float(np.interp(t_s, self._time_s, np.arange(len(self._time_s)) * STEP_M))
 
     def surfaces(self, t_s: float) -> list[Surface]:
         """Return the town, the car ahead and those that come towards the camera."""
@@ -60,7 +74,7 @@ class Street:
             ways.append((self._way_m(meeting_s) - 8.0 * (t_s - meeting_s), _LANE_M))
         moving: list[Surface] = []
         for (way_m, left_m), painted in zip(ways, self._cars, strict=True):
-            if 0 < way_m < (len(self._line) - 2) * _STEP_M:
+            if 0 < way_m < (len(self._line) - 2) * STEP_M:
                 (x, y), yaw = self._place(way_m)
                 moving += _car(x - left_m * np.sin(yaw), y + left_m * np.cos(yaw), yaw, painted)
         return [*self._surfaces, *moving]
@@ -79,22 +93,16 @@ class Street:
         return np.broadcast_to(sky, (self.camera.height, self.camera.width, 3)).astype(np.float32)
 
 
-def _centre_line(rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Return positions ``(N, 2)``, headings and curvatures every ``_STEP_M`` of straights and corners."""
-    bends = [np.zeros(int(rng.uniform(45, 80) / _STEP_M))]
-    turn = rng.choice([-1.0, 1.0])
-    for _ in range(7):
-        radius = rng.uniform(9, 14)
-        bends.append(np.full(int(radius * np.pi / 2 / _STEP_M), turn / radius))
-        bends.append(np.zeros(int(rng.uniform(40, 80) / _STEP_M)))
-        # Never round a block: the road would meet itself.
-        turn = -turn
-    bend = np.concatenate(bends)
+def smoothed(bend: Array) -> Array:
+    """Return curvatures that begin and end over a length, as a steering wheel turns."""
     kernel = np.ones(25) / 25
-    bend = np.convolve(bend, kernel, mode="same")
-    yaw = np.cumsum(bend) * _STEP_M
-    line = np.cumsum(np.column_stack([np.cos(yaw), np.sin(yaw)]), axis=0) * _STEP_M
-    return line, yaw, bend
+    return np.convolve(bend, kernel, mode="same")
+
+
+def _centre_line(bend: Array) -> tuple[Array, Array]:
+    """Return positions ``(N, 2)`` and headings of a line with these curvatures."""
+    yaw = np.cumsum(bend) * STEP_M
+    return np.cumsum(np.column_stack([np.cos(yaw), np.sin(yaw)]), axis=0) * STEP_M, yaw
 
 
 def _timetable(bend: Array, speed_m_s: float) -> Array:
@@ -102,7 +110,7 @@ def _timetable(bend: Array, speed_m_s: float) -> Array:
     speed = np.where(np.abs(bend) > 0.01, 0.55 * speed_m_s, speed_m_s)
     kernel = np.ones(61) / 61
     speed = np.convolve(np.pad(speed, 30, mode="edge"), kernel, mode="valid")
-    return np.concatenate([[0.0], np.cumsum(_STEP_M / speed)[:-1]])
+    return np.concatenate([[0.0], np.cumsum(STEP_M / speed)[:-1]])
 
 
 def _town(rng: np.random.Generator, line: Array, yaw: Array) -> list[Surface]:
@@ -126,12 +134,12 @@ def _town(rng: np.random.Generator, line: Array, yaw: Array) -> list[Surface]:
         kerb = line + side * 8.0 * normal
         index = 0
         while index < len(line) - 80:
-            step = int(rng.uniform(9, 16) / _STEP_M)
+            step = int(rng.uniform(9, 16) / STEP_M)
             near, far = kerb[index], kerb[min(index + step, len(line) - 1)]
-            index += step + (int(rng.uniform(2, 10) / _STEP_M) if rng.uniform() < 0.25 else 0)
+            index += step + (int(rng.uniform(2, 10) / STEP_M) if rng.uniform() < 0.25 else 0)
             if np.linalg.norm(far - near) > 3:
                 found += _house(rng, near, far, fronts, line)
-        for place in range(20, len(line) - 40, int(rng.uniform(9, 14) / _STEP_M)):
+        for place in range(20, len(line) - 40, int(rng.uniform(9, 14) / STEP_M)):
             position = line[place] + side * rng.uniform(5.0, 6.3) * normal[place]
             if _distance_m(position, line) < 4.5:
                 continue
@@ -141,11 +149,11 @@ def _town(rng: np.random.Generator, line: Array, yaw: Array) -> list[Surface]:
                 found += box((*position, 2.6 + crown / 2), (crown,) * 3, rng.uniform(0, 3), leaves)
             else:
                 found += box((*position, 2.5), (0.14, 0.14, 5.0), yaw[place], [white])
-        for place in range(10, len(line) - 30, int(rng.uniform(7, 20) / _STEP_M)):
+        for place in range(10, len(line) - 30, int(rng.uniform(7, 20) / STEP_M)):
             position = line[place] + side * 4.4 * normal[place]
             if rng.uniform() < 0.6 and _distance_m(position, line) > 4.0:
                 found += _car(position[0], position[1], yaw[place], cars[rng.integers(len(cars))])
-    for place in range(0, len(line) - 20, int(6 / _STEP_M)):
+    for place in range(0, len(line) - 20, int(6 / STEP_M)):
         forward = np.array([np.cos(yaw[place]), np.sin(yaw[place]), 0.0])
         across = np.array([normal[place][0], normal[place][1], 0.0])
         corner = np.array([*line[place], 0.01]) - 0.07 * across

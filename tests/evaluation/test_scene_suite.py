@@ -8,13 +8,15 @@ from pathlib import Path
 import pytest
 
 from semcast.evaluation import scene_suite
+from semcast.evaluation.scenes.render import SCENES
 
 
 def test_suite_has_every_scene_at_two_paces_and_files_of_their_own(tmp_path: Path) -> None:
     runs = list(scene_suite.suite(tmp_path / "scenes", tmp_path / "results", seeds=2))
     names = [run.render.out.name for run in runs]
-    assert names == ["room_normal", "room_fast", "street_normal", "street_fast", "orbit_normal", "orbit_fast"]
-    assert len({run.settings.json for run in runs}) == 6
+    assert names == [f"{scene}_{pace}" for scene in scene_suite.SCENE_SECONDS for pace in ("normal", "fast")]
+    assert set(scene_suite.SCENE_SECONDS) == set(SCENES)
+    assert len({run.settings.json for run in runs}) == 2 * len(SCENES)
     assert all(run.settings.sequence == run.render.out for run in runs)
 
 
