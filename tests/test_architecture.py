@@ -19,7 +19,7 @@ MAY_IMPORT = {
 HOMES = {
     "zenoh": {"common/transport.py"},
     "msgpack": {"common/wire.py"},
-    "gtsam": {"server/mapping/bundle.py"},
+    "gtsam": {"server/mapping/bundle.py", "server/mapping/pose_graph.py"},
     "rerun": {"server/view/rerun_viewer.py"},
     "mcap": {"common/recording.py"},
     "onnxruntime": {"common/nets/onnx_encoder.py", "training/onnx_int8.py"},

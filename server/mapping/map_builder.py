@@ -14,9 +14,10 @@ from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.left_out import place_left_out
+from semcast.server.mapping.loop_closure import Loop, LoopFinder, View, share_out
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
-from semcast.server.mapping.revisit import find_revisit, place_anew
+from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, place_anew
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.tracks import Sight, TrackTable
@@ -30,8 +31,6 @@ Array = NDArray[np.float64]
 _MAX_BRIDGE_S = 5.0
 #: Keyframes whose images are kept: 45 MB of 640x480.
 _MAX_IMAGES = 150
-#: Positions found from an image of long ago are good to about this.
-_OLD_SIGMA_PX = 1.0
 #: Landmarks seen again may take the tracks to so many times the number that is wanted.
 _MAX_TRACKS_SHARE = 1.2
 
@@ -61,8 +60,8 @@ class MapBuilder:
         self.world = WorldMap()
         self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
         self.relocaliser = Relocaliser(self._camera, s.seed, s.max_features)
-        self.submap = 0
         self._adjusted: tuple[int, Array] | None = None
+        self.enter(0)
         self.num_inliers_at_keyframe = 0
         self.images = KeyframeImages(_MAX_IMAGES)
 
@@ -81,6 +80,7 @@ class MapBuilder:
     def enter(self, submap: int) -> None:
         """Go on in a submap."""
         self._adjusted = None  # of a keyframe elsewhere, or in another unit
+        self.loops = LoopFinder(self._camera, self.relocaliser, self._settings.seed)
         self.submap = submap
 
     def take_start(
@@ -129,31 +129,65 @@ class MapBuilder:
             self._camera, self.world, self.images, tracks, sight, T_world_cam, submap=self.submap
         )
 
-    def reuse(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> int:
-        """Take up landmarks of this submap that were seen long ago and are in sight again.
+    def revisit(
+        self, tracks: TrackTable, sight: Sight, T_world_cam: Array, on_moved: Callable[[float], None]
+    ) -> bool:
+        """Use what was seen long ago and is in sight again: close a loop, take up landmarks.
 
         Args:
             tracks: Of a frame that becomes a keyframe; found landmarks get their tracks back.
             sight: Its image.
             T_world_cam: Its pose.
+            on_moved: Called with the scale of the newest keyframe after a loop has moved the map.
 
         Returns:
-            How many were taken up.
+            Whether the map or the tracks have changed.
         """
-        world, noise = self.world, self.noise.model
-        sigma_px = max(_OLD_SIGMA_PX, noise.sigma0_px)
-        found = find_revisit(
+        found = self._find_revisit(tracks, sight, T_world_cam)
+        seen = tracks.visible
+        view = View(sight, T_world_cam, tracks.ids[seen], tracks.xy[seen])
+        loop = self.loops.look(view, self.world, self.noise.model, self.submap, found)
+        closed = loop is not None and self._close(loop, on_moved)
+        if closed:
+            T_now = self.world.pose_of_frame(sight.frame.frame_id)
+            T_world_cam = T_world_cam if T_now is None else T_now
+            found = self._find_revisit(tracks, sight, T_world_cam)
+        elif self.loops.pending:
+            return False
+        return (found is not None and self._take_up(found, tracks, sight, T_world_cam) > 0) or closed
+
+    def _find_revisit(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> Revisit | None:
+        return find_revisit(
             self._camera,
-            world,
+            self.world,
             self.images,
             tracks.ids,
             sight,
             T_world_cam,
             submap=self.submap,
-            gate_px=GATE_SIGMAS * sigma_px,
+            gate_px=GATE_SIGMAS * max(OLD_SIGMA_PX, self.noise.model.sigma0_px),
         )
+
+    def _close(self, loop: Loop, on_moved: Callable[[float], None]) -> bool:
+        """Share out what drifted since the camera was at the loop's place; whether that was possible."""
+        found = share_out(self.world, self.submap, loop)
         if found is None:
-            return 0
+            return False
+        keyframe_ids, solved = found
+        if self._bundle.busy:
+            self._bundle.take(wait=True)
+        self._version += 1
+        self.world.bend(keyframe_ids, solved.T_world_cam, solved.scale)
+        self.world.revisits[loop.keyframe_id] = loop.place.keyframe_id
+        self._adjusted = None
+        on_moved(float(solved.scale[-1]))
+        logger.info("keyframe %d: a loop is closed, to keyframe %d", loop.keyframe_id, loop.place.keyframe_id)
+        return True
+
+    def _take_up(self, found: Revisit, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> int:
+        """Give landmarks of long ago their tracks back; how many."""
+        world, noise = self.world, self.noise.model
+        sigma_px = max(OLD_SIGMA_PX, noise.sigma0_px)
         points = place_anew(self._camera, world, found, T_world_cam, noise, sigma_px)
         room = int(_MAX_TRACKS_SHARE * self._settings.max_features) - int(tracks.visible.sum())
         points = points.strongest(max(0, room))
@@ -166,6 +200,7 @@ class MapBuilder:
         logger.debug("frame %d: %d landmarks of keyframe %d again", frame_id, len(ids), found.keyframe_id)
         mapper.note_sight(world, ids, np.ones(len(ids), bool), frame_id)
         world.revisits[frame_id] = found.keyframe_id
+        self.loops.note_tie()
         return len(ids)
 
     def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
@@ -276,6 +311,8 @@ class MapBuilder:
         self._version += 1
         self.world.transform_submap(self.submap, place.submap, scale, T_old_new)
         self.enter(place.submap)
+        if self.world.keyframes[-1].frame_id != place.keyframe_id:
+            self.world.revisits[self.world.keyframes[-1].frame_id] = place.keyframe_id
         on_moved(scale)
         return True
 

@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Unpack
 
 import numpy as np
@@ -269,10 +270,13 @@ class Reconstruction:
         return self._result(frame, T_world_cam, pose, is_keyframe=is_keyframe)
 
     def _improved(self, sight: Sight, pose: TrackedPose) -> TrackedPose:
-        """Take drift out of the tracks of a keyframe to be and take up old landmarks; its pose from those."""
-        for improve in (self._map.anchor, self._map.reuse):
-            if improve(self._tracks, sight, pose.T_world_cam):
-                pose = self._posed_anew(sight, pose.T_world_cam) or pose
+        """Take drift out of a keyframe to be: out of its tracks, and where the camera has been before."""
+        if self._map.anchor(self._tracks, sight, pose.T_world_cam):
+            pose = self._posed_anew(sight, pose.T_world_cam) or pose
+        if self._map.revisit(self._tracks, sight, pose.T_world_cam, self._moved):
+            T_world_guess = self._map.world.pose_of_frame(sight.frame.frame_id)
+            assert T_world_guess is not None
+            pose = self._posed_anew(sight, T_world_guess) or replace(pose, T_world_cam=T_world_guess)
         return pose
 
     def _posed_anew(self, sight: Sight, T_world_guess: Array) -> TrackedPose | None:

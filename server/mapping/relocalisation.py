@@ -1,5 +1,6 @@
 """Where am I? Descriptors of the current image against keyframes, then PnP; and joining two submaps."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +8,14 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
-from semcast.server.geometry.features import Describer, Grey, detect_corners, hamming, match_descriptors
+from semcast.server.geometry.features import (
+    Describer,
+    Grey,
+    count_matches,
+    detect_corners,
+    hamming,
+    match_descriptors,
+)
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.tracks import Sight
@@ -16,8 +24,10 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Keyframes tried per frame; those not tried now get their turn on later frames.
-MAX_CANDIDATES = 4
+#: The newest keyframes are tried on every frame, and of so many others the likeliest; the rest have to wait.
+_NUM_NEWEST, _MAX_CONSIDERED, _NUM_LIKELIEST = 2, 40, 2
+#: Descriptors of the image by which likely keyframes are told, and how many of them must be found there.
+_NUM_COMPARED, _MIN_ALIKE = 200, 4
 #: Agreeing matches that are worth a closer look.
 _MIN_FIRST = 9
 #: Agreeing landmarks that prove a place, as a share of the keypoints followed at most, and its limits: fewer
@@ -86,8 +96,31 @@ class Relocaliser:
             noise: Of observations.
             submaps: Only keyframes of these, None for all.
         """
-        candidates = self._candidates(world, submaps)
-        if not candidates:
+        known = [k for k in world.keyframes if submaps is None or k.submap in submaps]
+        newest, older = known[-_NUM_NEWEST:], known[:-_NUM_NEWEST]
+        count = min(len(older), _MAX_CONSIDERED)
+        turn = [older[-1 - (self._turn + k) % len(older)] for k in range(count)]
+        self._turn = (self._turn + count) % max(1, len(older))
+        return self.recognise(sight, world, noise, turn, tried_anyway=newest[::-1])
+
+    def recognise(
+        self,
+        sight: Sight,
+        world: WorldMap,
+        noise: NoiseModel,
+        candidates: Sequence[Keyframe],
+        tried_anyway: Sequence[Keyframe] = (),
+    ) -> Place | None:
+        """Look for the place of an image among some keyframes.
+
+        Args:
+            sight: The image.
+            world: The map.
+            noise: Of observations.
+            candidates: Keyframes of which the two with the most similar descriptors are tried.
+            tried_anyway: Keyframes that are tried before these.
+        """
+        if not candidates and not tried_anyway:
             return None
         usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
         corners = detect_corners(sight.grey, 800, None, usable, cell_px=40).astype(np.float64)
@@ -95,7 +128,7 @@ class Relocaliser:
         if len(rows) < _MIN_FIRST:
             return None
         sigma_px = max(_MATCH_SIGMA_PX, noise.sigma0_px)
-        for keyframe in candidates:
+        for keyframe in [*tried_anyway, *_likeliest(candidates, descriptors)]:
             ids, known = _pool(world, [keyframe])
             mine, theirs = match_descriptors(descriptors, known)
             found = self._search(world, ids[theirs], corners[rows[mine]], sigma_px)
@@ -166,14 +199,13 @@ class Relocaliser:
             keyframe.submap,
         )
 
-    def _candidates(self, world: WorldMap, submaps: set[int] | None) -> list[Keyframe]:
-        known = [k for k in world.keyframes if submaps is None or k.submap in submaps]
-        known = [k for k in known if len(k.descriptor_ids) >= _MIN_FIRST]
-        newest, older = known[-2:], known[:-2]
-        count = min(len(older), MAX_CANDIDATES - 2)
-        turn = [older[-1 - (self._turn + k) % len(older)] for k in range(count)]
-        self._turn = (self._turn + count) % max(1, len(older))
-        return [*reversed(newest), *turn]
+
+def _likeliest(candidates: Sequence[Keyframe], descriptors: NDArray[np.uint8]) -> list[Keyframe]:
+    """Return the keyframes with the most descriptors like those of an image."""
+    some = descriptors[:: 1 + len(descriptors) // _NUM_COMPARED]
+    alike = np.array([count_matches(some, keyframe.descriptors) for keyframe in candidates], dtype=np.int64)
+    best = np.argsort(-alike, kind="stable")[:_NUM_LIKELIEST]
+    return [candidates[k] for k in best.tolist() if alike[k] >= _MIN_ALIKE]
 
 
 def _pool(world: WorldMap, keyframes: list[Keyframe]) -> tuple[Ids, NDArray[np.uint8]]:

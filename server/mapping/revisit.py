@@ -28,6 +28,8 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
+#: Positions found from an image of long ago are good to about this.
+OLD_SIGMA_PX = 1.0
 #: The newest keyframes are no revisit: an adjustment has most of them in its window.
 NUM_RECENT = 12
 #: Keyframes whose landmarks are projected, as long as turn (in half fields of view) and way (in depths of the

@@ -205,11 +205,44 @@ class WorldMap:
         for keyframe in self.keyframes:
             if keyframe.submap == submap:
                 keyframe.submap = into
+        self._rescale_frames(dict.fromkeys(moved, scale))
+
+    def bend(self, keyframe_ids: Ids, T_world_cam: Array, scale: Array) -> None:
+        """Move keyframes of one submap, and with each what it made: landmarks and frames, in its scale.
+
+        Keyframes that were thinned out move with the one before them.
+
+        Args:
+            keyframe_ids: ``(K,)`` frame ids, ascending.
+            T_world_cam: ``(K, 4, 4)`` their new poses.
+            scale: ``(K,)`` factor on lengths around each.
+        """
+        submap = self.submap_of[int(keyframe_ids[0])]
+        T_before = np.stack([self.poses[k] for k in keyframe_ids.tolist()])
+        mine = self.landmarks.submap == submap
+        at = _at_or_before(keyframe_ids, self.landmarks.born[mine])
+        around = np.einsum("nij,nj->ni", invert_transform(T_before)[at, :3, :3], self.landmarks.xyz[mine])
+        around = scale[at, None] * (around + invert_transform(T_before)[at, :3, 3])
+        moved = np.einsum("nij,nj->ni", T_world_cam[at, :3, :3], around) + T_world_cam[at, :3, 3]
+        self.landmarks.xyz[mine] = moved
+        self._changed.update(self.landmarks.ids[mine].tolist())
+        frame_ids = np.array([k for k, s in self.submap_of.items() if s == submap], dtype=np.int64)
+        at = _at_or_before(keyframe_ids, frame_ids)
+        T = invert_transform(T_before)[at] @ np.stack([self.poses[k] for k in frame_ids.tolist()])
+        T[:, :3, 3] *= scale[at, None]
+        self.poses.update(zip(frame_ids.tolist(), T_world_cam[at] @ T, strict=True))
+        self._moved_keyframes.update(frame_ids.tolist())
+        for keyframe in self.keyframes:
+            keyframe.T_world_cam = self.poses[keyframe.frame_id]
+        self._rescale_frames(dict(zip(frame_ids.tolist(), scale[at].tolist(), strict=True)))
+
+    def _rescale_frames(self, factor: dict[int, float]) -> None:
+        """Scale the poses of frames relative to keyframes."""
         self._frames_moved = True
         for frame_id, (keyframe_id, T_keyframe_cam) in self.frames.items():
-            if keyframe_id in moved:
+            if keyframe_id in factor:
                 T = T_keyframe_cam.copy()
-                T[:3, 3] *= scale
+                T[:3, 3] *= factor[keyframe_id]
                 self.frames[frame_id] = (keyframe_id, T)
 
     def bound(self, max_landmarks: int, max_keyframes: int, recent: int) -> bool:
@@ -337,6 +370,11 @@ class WorldMap:
             )
         self._changed = set(self.landmarks.ids.tolist())
         self._moved_keyframes = set(self.poses)
+
+
+def _at_or_before(keyframe_ids: Ids, frame_ids: Ids) -> NDArray[np.intp]:
+    """Row of the last keyframe not after each frame, the first one for frames before all of them."""
+    return np.maximum(np.searchsorted(keyframe_ids, frame_ids, side="right") - 1, 0)
 
 
 def _joined(parts: Iterable[NDArray], name: str) -> NDArray:

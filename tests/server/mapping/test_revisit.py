@@ -190,9 +190,10 @@ def reused(mapped, T_world_cam, T_believed=None, max_landmarks=20_000, young=40)
     tracks.next_id = int(world.landmarks.ids[-1]) + 1
     tracks.remember(sight)
     tracks.refill(sight)
-    count = builder.reuse(tracks, sight, T_world_cam if T_believed is None else T_believed)
+    T_believed = T_world_cam if T_believed is None else T_believed
+    changed = builder.revisit(tracks, sight, T_believed, lambda scale: None)
     again = tracks.ids[world.landmarks.rows(tracks.ids) >= 0]
-    assert len(again) == count
+    assert changed == (len(again) > 0)
     assert np.all(np.diff(tracks.ids) > 0)
     return builder, sight, tracks, again
 
@@ -289,6 +290,39 @@ def test_an_adjustment_with_them_takes_the_drift_out_of_the_newest_pose(mapped):
     builder.collect(wait=True)
     away = np.linalg.norm(world.poses[100][:3, 3] - true[:3, 3])
     assert away < 0.3 * np.linalg.norm(believed[:3, 3] - true[:3, 3])
+
+
+def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped):
+    world, images = mapped
+    builder = MapBuilder(CAMERA, ReconstructionSettings(confidence="off", max_features=120), InlineBundle())
+    builder.world, builder.images = world, images
+    true, scale = pose(0.1, 0.05), 1.1
+    drift = pose(0.02, 0.03, 0.02, (0.3, 0.4, 0.0))
+    believed = drift @ pose(0.1 * scale, 0.05 * scale)
+    sight = sight_from(true, 100)
+    tracks = TrackTable("off", 80, 0)
+    tracks.next_id = int(world.landmarks.ids[-1]) + 1
+    tracks.remember(sight)
+    tracks.refill(sight)
+    # The young tracks have landmarks already, in the drifted part's place and unit.
+    young = scale * on_wall(true, tracks.xy) @ drift[:3, :3].T + drift[:3, 3]
+    newest, young_ids = 90, tracks.ids
+    none = np.zeros(0, np.int64), np.zeros((0, 32), np.uint8)
+    seen = tracks.ids, tracks.xy, tracks.confidence
+    world.add_keyframe(Keyframe(newest, newest * 10**8, drift @ pose(0.2 * scale), 0, *seen, *none))
+    colour = np.zeros((len(young), 3), np.uint8)
+    world.add_landmarks(young_ids, young, colour, np.ones(len(young)), 0, newest)
+    world.add_frame(100, newest, believed)
+    before = world.landmarks.xyz[world.landmarks.born == 0].copy()
+    moved = []
+    assert builder.revisit(tracks, sight, believed, moved.append)
+    assert moved == [pytest.approx(1 / scale, rel=0.04)]
+    np.testing.assert_allclose(world.pose_of_frame(100)[:3, 3], true[:3, 3], atol=0.03)
+    xyz_young = world.landmarks.xyz[world.landmarks.rows(young_ids)]
+    assert np.median(np.abs(xyz_young[:, 2] - DEPTH)) < 0.05
+    after = world.landmarks.xyz[world.landmarks.born == 0]
+    assert np.median(np.linalg.norm(after - before, axis=1)) < 0.02, "the old part stays"
+    assert world.revisits[newest] in (0, 1)
 
 
 def test_images_are_thinned_out_from_the_old_end():

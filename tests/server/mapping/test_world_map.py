@@ -109,6 +109,52 @@ def test_a_similarity_moves_everything_of_a_submap_alike():
     assert set(world.landmarks.submap.tolist()) == {0}
 
 
+def test_bending_moves_what_each_keyframe_made_with_it_and_in_its_scale():
+    world = WorldMap()
+    for k, submap in enumerate((0, 0, 0, 1)):
+        world.add_keyframe(make_keyframe(10 * k, range(k, k + 6), submap=submap))
+        world.add_frame(10 * k + 3, 10 * k, world.poses[10 * k] @ exp_se3(np.full(6, 0.1)))
+    for ids, submap, born in (([1, 2], 0, 10), ([3, 4, 5], 0, 20), ([7], 1, 30)):
+        add_world(world, ids, submap, born)
+    scale = np.array([1.5, 2.0])
+    T_new = np.stack(
+        [exp_se3([0.2, 0, 0, 0, 0, 1]) @ world.poses[0], exp_se3([0.1, 0.2, -0.1, 3, 1, 2]) @ world.poses[20]]
+    )
+    mine = np.flatnonzero(world.landmarks.submap == 0)
+    made_by = np.where(world.landmarks.born[mine] < 20, 0, 20)
+    assert set(made_by.tolist()) == {0, 20}
+    frames = {k: world.frames[k] for k in (3, 13, 23, 33)}
+    others = world.landmarks.xyz[world.landmarks.submap == 1].copy()
+
+    def around():
+        seen = [
+            transform_points(invert_transform(world.poses[k]), world.landmarks.xyz[[row]])[0]
+            for k, row in zip(made_by.tolist(), mine.tolist(), strict=True)
+        ]
+        return np.array(seen)
+
+    before = around()
+    world.take_changes()
+    # Keyframe 10 was thinned out: it goes with keyframe 0.
+    at_10 = invert_transform(world.poses[0]) @ world.poses[10]
+    world.bend(np.array([0, 20]), T_new, scale)
+    np.testing.assert_allclose(world.poses[20], T_new[1])
+    assert next(k for k in world.keyframes if k.frame_id == 20).T_world_cam is world.poses[20]
+    at_10[:3, 3] *= 1.5
+    np.testing.assert_allclose(invert_transform(world.poses[0]) @ world.poses[10], at_10, atol=1e-12)
+    np.testing.assert_allclose(around(), np.where(made_by == 0, 1.5, 2.0)[:, None] * before, atol=1e-9)
+    np.testing.assert_array_equal(world.landmarks.xyz[world.landmarks.submap == 1], others)
+    for frame_id, factor in ((3, 1.5), (13, 1.5), (23, 2.0), (33, 1.0)):
+        keyframe_id, T = world.frames[frame_id]
+        np.testing.assert_allclose(T[:3, 3], factor * frames[frame_id][1][:3, 3])
+        np.testing.assert_array_equal(T[:3, :3], frames[frame_id][1][:3, :3])
+        assert keyframe_id == frames[frame_id][0]
+    changed, _, keyframes, moved = world.take_changes()
+    assert set(world.landmarks.ids[mine].tolist()) <= set(changed.tolist())
+    assert {0, 10, 20} <= set(keyframes.tolist())
+    assert moved.tolist() == sorted(world.frames)
+
+
 def test_the_map_is_bounded():
     world = WorldMap()
     for k in range(60):

@@ -1,0 +1,268 @@
+"""Closing a loop: the camera is where it has been before, but the map says it is elsewhere.
+
+Where it is off by little, landmarks of long ago are still found one by one (``revisit``), and say where the
+camera is. Where it is off by more, the place is recognised by descriptors, among old keyframes that drift
+leaves in question, and has to be recognised twice. Both say how the newest part of the map has to move, in
+scale too; that is shared out along the way. Only then are the landmarks used anew: placed by the newest
+part as it was, they would hide the difference.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform, rotation_angle_deg
+from semcast.server.geometry.pnp import reprojection_residual, search_pose
+from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
+from semcast.server.mapping.mapper import median_depth
+from semcast.server.mapping.pose_graph import Edge, SolvedGraph, solve_graph
+from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
+from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit
+from semcast.server.mapping.tracks import Sight
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: The newest keyframes are no loop. Where one was closed, or nothing has drifted, none is looked for so long.
+_NUM_RECENT = 20
+#: Keyframes between two looks, and old keyframes considered in each.
+_LOOK_INTERVAL, _MAX_CONSIDERED = 2, 40
+#: The camera may have drifted by this share of the way since; it must have come back to this share of it.
+_MAX_DRIFT, _MAX_APART = 0.1, 0.3
+#: Keyframes after which a place recognised once no longer counts.
+_MAX_PENDING = 10
+#: Two recognitions agree up to this: in median depths, degrees, and as a factor of the scale.
+_SAME_DEPTHS, _SAME_DEG, _SAME_SCALE = 0.1, 2.0, 1.15
+#: Landmarks found one by one that prove a place, as a number and as a share of those found.
+_MIN_FOUND, _MIN_FOUND_SHARE = 20, 0.6
+#: Drift from one keyframe to the next: rotation in radians and as a share of the turn, translation as a share
+#: of the way and of the depth, and the logarithm of the scale.
+_STEP_RAD, _STEP_TURN, _STEP_WAY, _STEP_DEPTH, _STEP_SCALE = 0.002, 0.02, 0.02, 0.002, 0.01
+#: Keyframes that share fewer tracks are on both sides of a gap: next to nothing is known of them.
+_MIN_SHARED, _GAP_RAD, _GAP_SCALE = 8, 0.5, 0.5
+#: How well a recognised place is known: radians, depths, logarithm of the scale.
+_PLACE_RAD, _PLACE_DEPTH, _PLACE_SCALE = 0.004, 0.02, 0.03
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The newest part of the map, seen from an old one.
+
+    Attributes:
+        keyframe_id: The newest keyframe.
+        place: Where a frame soon after it is in the old part.
+        scale: Units of the old part in one of the newest.
+        T_old_new: ``(4, 4)``, brings points ``scale * x`` of the newest part to their places in the old.
+    """
+
+    keyframe_id: int
+    place: Place
+    scale: float
+    T_old_new: Array
+
+    def moved(self, T_world_cam: Array) -> Array:
+        """Return the pose a camera of the newest part has in the old one."""
+        T = T_world_cam.copy()
+        T[:3, 3] *= self.scale
+        return np.asarray(self.T_old_new @ T)
+
+    def agrees(self, other: "Loop", view: "View", depth: float) -> bool:
+        """Whether another recognition says the same of where a view is and how large its unit is."""
+        scale = self.scale / other.scale
+        T = invert_transform(self.moved(view.T_world_cam)) @ other.place.T_world_cam
+        return bool(
+            np.linalg.norm(T[:3, 3]) < _SAME_DEPTHS * depth
+            and rotation_angle_deg(T[:3, :3]) < _SAME_DEG
+            and max(scale, 1.0 / scale) < _SAME_SCALE
+        )
+
+
+@dataclass(frozen=True)
+class View:
+    """A posed frame.
+
+    Attributes:
+        sight: Its image.
+        T_world_cam: ``(4, 4)``.
+        ids: ``(N,)`` tracks in sight.
+        xy: ``(N, 2)`` where they are.
+    """
+
+    sight: Sight
+    T_world_cam: Array
+    ids: Ids
+    xy: Array
+
+
+class LoopFinder:
+    """Recognises old places of a submap at its keyframes.
+
+    Args:
+        camera: Pinhole.
+        relocaliser: Recognises.
+        seed: Of the pose search.
+    """
+
+    def __init__(self, camera: Intrinsics, relocaliser: Relocaliser, seed: int) -> None:
+        self._camera = camera
+        self._seed = seed
+        self._relocaliser = relocaliser
+        self._pending: Loop | None = None
+        self._since_pending = self._since_look = 0
+        self._settled = 0
+
+    @property
+    def pending(self) -> bool:
+        """Whether a place was recognised once."""
+        return self._pending is not None
+
+    def look(
+        self, view: View, world: WorldMap, noise: NoiseModel, submap: int, found: Revisit | None
+    ) -> Loop | None:
+        """Look for a loop.
+
+        Args:
+            view: A frame that becomes a keyframe.
+            world: The map.
+            noise: Of observations.
+            submap: The current one.
+            found: Landmarks of long ago that it sees, where they were found one by one.
+
+        Returns:
+            The loop, once it is sure.
+        """
+        self._since_look += 1
+        self._since_pending += 1
+        self._settled -= 1
+        if self._since_pending > _MAX_PENDING:
+            self._pending = None
+        if self._settled > 0:
+            return None
+        newest = next(k for k in reversed(world.keyframes) if k.submap == submap)
+        place = None if found is None else self._place_of(found, world, noise, submap)
+        if place is not None:
+            return self._judge(view, world, noise, newest, place, is_sure=True)
+        if self._pending is None and self._since_look < _LOOK_INTERVAL:
+            return None
+        candidates = self._candidates(world, submap, view.T_world_cam)
+        if not candidates:
+            return None
+        self._since_look = 0
+        place = self._relocaliser.recognise(view.sight, world, noise, candidates)
+        return None if place is None else self._judge(view, world, noise, newest, place, is_sure=False)
+
+    def _place_of(self, found: Revisit, world: WorldMap, noise: NoiseModel, submap: int) -> Place | None:
+        """Where a frame is that sees landmarks of long ago, going by these alone."""
+        ids, xy = found.ids[found.points.ok], found.points.xy[found.points.ok]
+        sigma = np.full(len(ids), max(OLD_SIGMA_PX, noise.sigma0_px))
+        xyz = world.landmarks.xyz[world.landmarks.rows(ids)]
+        pose = search_pose(self._camera, xyz, xy, sigma, GATE_SIGMAS * sigma, seed=self._seed)
+        if pose is None or pose.num_inliers < max(_MIN_FOUND, _MIN_FOUND_SHARE * len(ids)):
+            return None
+        T_world_cam = invert_transform(pose.T_cam_world)
+        return Place(T_world_cam, found.keyframe_id, ids[pose.inliers], xy[pose.inliers], submap)
+
+    def _judge(
+        self, view: View, world: WorldMap, noise: NoiseModel, newest: Keyframe, place: Place, *, is_sure: bool
+    ) -> Loop | None:
+        """What a recognised place means: that nothing has drifted, or a loop."""
+        xyz = world.landmarks.xyz[world.landmarks.rows(place.ids)]
+        residual, in_front = reprojection_residual(
+            self._camera, invert_transform(view.T_world_cam), xyz, place.xy
+        )
+        away_px = float(np.median(np.where(in_front, np.linalg.norm(residual, axis=1), np.inf)))
+        if away_px < GATE_SIGMAS * max(OLD_SIGMA_PX, noise.sigma0_px):
+            self._pending, self._settled = None, _NUM_RECENT
+            return None
+        fresh = ~np.isin(view.ids, place.ids)  # what is followed anyway knows no other scale
+        similarity = submap_similarity(place, world, view.T_world_cam, view.ids[fresh], view.xy[fresh])
+        if similarity is None:
+            return None
+        loop = Loop(newest.frame_id, place, *similarity)
+        before, self._pending, self._since_pending = self._pending, loop, 0
+        if not is_sure:
+            depth = loop.scale * median_depth(world, newest)
+            if before is None or not before.agrees(loop, view, depth):
+                return None
+        self._pending, self._settled = None, _NUM_RECENT
+        return loop
+
+    def note_tie(self) -> None:
+        """Note that landmarks of long ago were found where they should be: no loop can open meanwhile."""
+        if self._settled > 0:
+            self._settled = _NUM_RECENT
+
+    def _candidates(self, world: WorldMap, submap: int, T_world_cam: Array) -> list[Keyframe]:
+        """Old keyframes the camera may be at if it has drifted."""
+        mine = [k for k in world.keyframes if k.submap == submap]
+        if len(mine) <= _NUM_RECENT:
+            return []
+        newest, older = mine[-1], mine[:-_NUM_RECENT]
+        position = np.stack([k.T_world_cam[:3, 3] for k in mine])
+        steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+        way = (steps.sum() - np.concatenate([[0.0], np.cumsum(steps)]))[: len(older)]
+        apart = np.linalg.norm(position[: len(older)] - T_world_cam[:3, 3], axis=1)
+        axis = np.stack([k.T_world_cam[:3, 2] for k in older])
+        turn = np.arccos(np.clip(axis @ T_world_cam[:3, 2], -1.0, 1.0))
+        reach = 2 * np.arctan(0.5 * np.hypot(self._camera.width, self._camera.height) / self._camera.fx)
+        depth = median_depth(world, newest)
+        near = (apart < _MAX_DRIFT * way + depth) & (apart < _MAX_APART * way) & (turn < 0.5 * reach)
+        rows = np.flatnonzero(near)
+        return [older[row] for row in rows[:: 1 + len(rows) // _MAX_CONSIDERED].tolist()]
+
+
+def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGraph] | None:
+    """Find how the keyframes of a submap have to move for a loop to close.
+
+    Args:
+        world: The map; it is not changed.
+        submap: Of the loop.
+        loop: What was recognised.
+
+    Returns:
+        Frame ids of the submap's keyframes, ascending, and where they go; None where there is no solution.
+    """
+    mine = [k for k in world.keyframes if k.submap == submap]
+    row = {k.frame_id: i for i, k in enumerate(mine)}
+    edges = [_step(world, before, now, row[now.frame_id]) for before, now in pairwise(mine)]
+    for new, old in world.revisits.items():
+        if new in row and old in row:
+            edges.append(_tie(world, mine, row[old], row[new], mine[row[new]].T_world_cam, 1.0))
+    old, new = row[loop.place.keyframe_id], row[loop.keyframe_id]
+    edges.append(_tie(world, mine, old, new, loop.moved(mine[new].T_world_cam), loop.scale))
+    solved = solve_graph(np.stack([k.T_world_cam for k in mine]), edges)
+    if solved is None:
+        return None
+    return np.array([k.frame_id for k in mine], dtype=np.int64), solved
+
+
+def _step(world: WorldMap, before: Keyframe, now: Keyframe, row: int) -> Edge:
+    """What tracking says of a keyframe, in this row, and the one before."""
+    T = invert_transform(before.T_world_cam) @ now.T_world_cam
+    turn_rad = np.radians(rotation_angle_deg(T[:3, :3]))
+    way = float(np.linalg.norm(T[:3, 3]))
+    depth = _depth(world, now, way)
+    sigma = _STEP_RAD + _STEP_TURN * turn_rad, _STEP_WAY * way + _STEP_DEPTH * depth, _STEP_SCALE
+    if len(np.intersect1d(before.ids, now.ids, assume_unique=True)) < _MIN_SHARED:
+        sigma = _GAP_RAD, way + depth, _GAP_SCALE
+    return Edge(row - 1, row, T, 1.0, sigma)
+
+
+def _tie(
+    world: WorldMap, mine: Sequence[Keyframe], old: int, new: int, T_world_new: Array, scale: float
+) -> Edge:
+    """What a place that was recognised says of two keyframes."""
+    T = invert_transform(mine[old].T_world_cam) @ T_world_new
+    depth = _depth(world, mine[old], float(np.linalg.norm(T[:3, 3])))
+    return Edge(old, new, T, scale, (_PLACE_RAD, _PLACE_DEPTH * depth, _PLACE_SCALE))
+
+
+def _depth(world: WorldMap, keyframe: Keyframe, otherwise: float) -> float:
+    """Median depth a keyframe sees, or another length where it sees no landmark any more."""
+    depth = median_depth(world, keyframe)
+    return depth if np.isfinite(depth) else max(otherwise, 1e-6)
