@@ -31,7 +31,7 @@ Ids = NDArray[np.int64]
 #: The newest keyframes are no loop. Where one was closed, or nothing has drifted, none is looked for so long.
 _NUM_RECENT = 20
 #: Keyframes between two looks, and old keyframes considered in each.
-_LOOK_INTERVAL, _MAX_CONSIDERED = 2, 40
+_LOOK_INTERVAL, _MAX_CONSIDERED = 4, 40
 #: The camera may have drifted by this share of the way since; it must have come back to this share of it.
 _MAX_DRIFT, _MAX_APART = 0.1, 0.3
 #: Keyframes after which a place recognised once no longer counts.

@@ -28,6 +28,8 @@ _MAX_DEPTH_RATIO = 60.0
 #: Keyframes of long ago that were recognised in one adjustment at most, and how many of those before and
 #: after each hold their landmarks with it: rays from one place alone would leave them free in depth.
 _MAX_REVISITED, _NEIGHBOURS = 3, 1
+#: Keyframes right before the window that hold it too, among so many: those that saw enough of its landmarks.
+_MAX_BEFORE, _REACH_BACK, _MIN_SHARED = 6, 60, 6
 #: Noise is judged by residuals that keep at least this share of its variance.
 _MIN_LEFT = 0.1
 #: Observations in a row that disagree before a landmark is given up.
@@ -221,6 +223,9 @@ def build_problem(
 ) -> BundleProblem | None:
     """Collect the newest keyframes of the current submap and what they see.
 
+    Older keyframes that see it too are fixed. Two of them know the scale, and then only the first of the
+    newest is fixed with them; otherwise the first two are.
+
     Args:
         world: The map.
         camera: Pinhole.
@@ -238,10 +243,10 @@ def build_problem(
     recent = mine[-window_size:]
     if len(recent) < (2 if start else 3):
         return None
-    anchors = _anchors(world, mine[:-window_size], recent)
-    views = [*anchors, *recent]
     ids = np.unique(np.concatenate([k.ids for k in recent]))
     ids = ids[world.landmarks.rows(ids) >= 0]
+    anchors = _anchors(world, mine[:-window_size], recent, ids)
+    views = [*anchors, *recent]
     view, point, xy, confidence = gather_observations(views, ids)
     count = np.bincount(point, minlength=len(ids))
     if count.sum() > MAX_OBSERVATIONS:
@@ -259,8 +264,9 @@ def build_problem(
     new_row = np.full(len(ids), -1, np.intp)
     new_row[used_points] = np.arange(len(used_points))
     kept = new_row[point] >= 0
+    held = np.bincount(view[kept], minlength=len(views))[: len(anchors)] >= _MIN_SHARED
     fixed = np.zeros(len(views), bool)
-    fixed[: len(anchors) + (1 if start else 2)] = True
+    fixed[: len(anchors) + (1 if start or held.sum() >= 2 else 2)] = True
     landmark_ids = ids[used_points]
     return BundleProblem(
         intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
@@ -286,11 +292,23 @@ def _scattered(ids: Ids) -> Ids:
     return np.asarray((ids * 2_654_435_761) % 4_294_967_296)
 
 
-def _anchors(world: WorldMap, older: list[Keyframe], recent: list[Keyframe]) -> list[Keyframe]:
-    """Older keyframes whose landmarks the recent ones saw again: they hold the window where it was before."""
+def _anchors(world: WorldMap, older: list[Keyframe], recent: list[Keyframe], ids: Ids) -> list[Keyframe]:
+    """Older keyframes that hold the window where it was, and in its scale.
+
+    Those whose landmarks the recent ones saw again after long, and those before the window that saw some of
+    the window's landmarks: where a turn makes keyframes dense, the window alone hardly has an extent to know
+    its scale by.
+    """
     again = {world.revisits[k.frame_id] for k in recent if k.frame_id in world.revisits}
     rows = [row for row, k in enumerate(older) if k.frame_id in again][-_MAX_REVISITED:]
     near = {r for row in rows for r in range(row - _NEIGHBOURS, row + _NEIGHBOURS + 1)}
+    shared = [
+        row
+        for row in range(max(0, len(older) - _REACH_BACK), len(older))
+        if np.isin(older[row].ids, ids, assume_unique=True).sum() >= _MIN_SHARED
+    ]
+    spread = np.linspace(0, len(shared) - 1, min(_MAX_BEFORE, len(shared)))
+    near |= {shared[k] for k in spread.astype(int).tolist()}
     return [older[r] for r in sorted(near) if 0 <= r < len(older)]
 
 

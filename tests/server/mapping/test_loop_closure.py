@@ -9,7 +9,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.features import TrackedPoints
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.loop_closure import Loop, LoopFinder, View, share_out
+from semcast.server.mapping.loop_closure import _LOOK_INTERVAL, Loop, LoopFinder, View, share_out
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.revisit import Revisit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -155,9 +155,9 @@ def place(room, T_true, rng):
 def test_a_place_has_to_be_recognised_twice(room, rng):
     recogniser = Recogniser(place(room, HERE, rng), place(room, HERE, rng))
     finder = LoopFinder(CAMERA, recogniser, 0)
-    loops = [look(finder, room) for _ in range(3)]
-    assert [loop is not None for loop in loops] == [False, False, True]
-    assert loops[2].scale == pytest.approx(1 / DRIFT_SCALE, rel=0.03)
+    loops = [look(finder, room) for _ in range(_LOOK_INTERVAL + 1)]
+    assert [loop is not None for loop in loops] == [False] * _LOOK_INTERVAL + [True]
+    assert loops[-1].scale == pytest.approx(1 / DRIFT_SCALE, rel=0.03)
     assert set(recogniser.asked[0]) <= set(range(NUM - 20))
     assert 0 in recogniser.asked[0]
     assert not finder.pending
@@ -167,13 +167,13 @@ def test_two_recognitions_that_contradict_each_other_are_no_loop(room, rng):
     elsewhere = place(room, HERE, rng)
     elsewhere = Place(HERE @ make_transform(np.eye(3), [1.0, 0, 0]), 0, elsewhere.ids, elsewhere.xy, 0)
     finder = LoopFinder(CAMERA, Recogniser(place(room, HERE, rng), elsewhere), 0)
-    assert all(look(finder, room) is None for _ in range(3))
+    assert all(look(finder, room) is None for _ in range(_LOOK_INTERVAL + 1))
     assert finder.pending
 
 
 def test_a_place_recognised_once_is_forgotten(room, rng):
     finder = LoopFinder(CAMERA, Recogniser(place(room, HERE, rng)), 0)
-    assert all(look(finder, room) is None for _ in range(2))
+    assert all(look(finder, room) is None for _ in range(_LOOK_INTERVAL))
     assert finder.pending
     assert all(look(finder, room) is None for _ in range(11))
     assert not finder.pending

@@ -4,6 +4,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
+from semcast.server.mapping import mapper
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.mapper import (
     KeyframeCues,
@@ -20,13 +21,13 @@ NOISE = NoiseModel(0.5, 0.0)
 IMAGE = np.full((480, 640, 3), (10, 20, 30), np.uint8)
 
 
-def make_world(num_keyframes=5, num_points=80, noise_px=0.2, step=0.3, seed=0, shake=0.0):
+def make_world(num_keyframes=5, num_points=80, noise_px=0.2, step=0.3, seed=0, shake=0.0, way=None):
     rng = np.random.default_rng(seed)
     world = WorldMap()
     points = rng.uniform((-2, -1.5, 5), (3, 1.5, 10), (num_points, 3))
     truth = []
-    for k in range(num_keyframes):
-        centre = (step * k, 0.15 * step * rng.normal(), 0.15 * step * k)
+    for k, x in enumerate(step * np.arange(num_keyframes) if way is None else way):
+        centre = (x, 0.15 * step * rng.normal(), 0.15 * x)
         T = make_transform(exp_so3(rng.normal(0, 0.02, 3)), centre)
         truth.append(T)
         xy = CAMERA.project(transform_points(invert_transform(T), points)) + rng.normal(
@@ -47,6 +48,13 @@ def make_world(num_keyframes=5, num_points=80, noise_px=0.2, step=0.3, seed=0, s
             )
         )
     return world, points, np.stack(truth)
+
+
+def put_landmarks(world, xyz):
+    """Every point is a landmark, made by the first keyframe."""
+    count = len(xyz)
+    colour = np.zeros((count, 3), np.uint8)
+    world.add_landmarks(np.arange(count), xyz, colour, np.ones(count), 0, 0)
 
 
 def cues(**changes):
@@ -207,3 +215,32 @@ def test_there_is_nothing_to_adjust_at_first():
     add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)
     assert build_problem(world, CAMERA, NOISE, 10) is None
     assert build_problem(world, CAMERA, NOISE, 10, start=True) is not None
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_keyframes_before_the_window_keep_its_scale_where_keyframes_are_dense(monkeypatch, seed):
+    """Ten keyframes within 1/70 of the depth hardly know a scale; those before saw the same landmarks."""
+    way = np.concatenate([0.3 * np.arange(6), 1.5 + 0.01 * np.arange(1, 11)])
+    error = {}
+    for num_before in (0, mapper._MAX_BEFORE):
+        monkeypatch.setattr(mapper, "_MAX_BEFORE", num_before)
+        world, points, _ = make_world(noise_px=0.5, step=0.0, seed=seed, way=way)
+        put_landmarks(world, points * np.random.default_rng(seed).uniform(0.95, 1.05, (len(points), 1)))
+        problem = build_problem(world, CAMERA, NOISE, 10)
+        assert problem.num_anchors == num_before
+        assert problem.fixed.sum() == (2 if num_before == 0 else num_before + 1)
+        xyz = optimise(problem).xyz
+        error[num_before > 0] = abs(np.log(np.median(xyz[:, 2] / points[problem.landmark_ids, 2])))
+    assert error[True] < 0.01
+    assert error[False] > 3 * error[True]
+
+
+def test_of_many_keyframes_before_the_window_some_hold_it_evenly():
+    world, points, _ = make_world(num_keyframes=40, step=0.02)
+    put_landmarks(world, points)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    before = problem.keyframe_ids[: problem.num_anchors] // 10
+    assert before.tolist() == [0, 5, 11, 17, 23, 29]
+    for keyframe in world.keyframes[:30]:
+        keyframe.drop_observations(keyframe.ids >= 5)
+    assert build_problem(world, CAMERA, NOISE, 10).num_anchors == 0, "five landmarks in common say little"
