@@ -94,7 +94,7 @@ class Street:
 
 
 def smoothed(bend: Array) -> Array:
-    """Return curvatures that begin and end over a length, as a steering wheel turns."""
+    """Return curvatures that begin and end over a length, as cars drive."""
     kernel = np.ones(25) / 25
     return np.convolve(bend, kernel, mode="same")
 
