@@ -250,8 +250,8 @@ def build_problem(
     view, point, xy, confidence = gather_observations(views, ids)
     count = np.bincount(point, minlength=len(ids))
     if count.sum() > MAX_OBSERVATIONS:
-        # What ties the window to long ago is kept first, then what several keyframes see. Among those the
-        # choice is even: the longest tracks alone would leave the newest keyframe to half of what it sees.
+        # What ties the window to older keyframes is kept first, then what several keyframes see. Among
+        # those the choice is even: the longest tracks alone would leave the newest one to half of its view.
         anchored = np.isin(np.arange(len(ids)), point[view < len(anchors)])
         order = np.lexsort((_scattered(ids), -np.minimum(count, _WELL_SEEN), ~anchored))
         within = np.cumsum(count[order]) <= MAX_OBSERVATIONS
