@@ -9,6 +9,9 @@ from semcast.server.geometry.weighting import HUBER_K
 
 Array = NDArray[np.float64]
 
+#: Derivatives of a rotation at the identity, ``(3, 3, 3)``.
+_GENERATORS = np.stack([skew(axis) for axis in np.eye(3)])
+
 
 def essential_matrix(T_cam1_cam0: Array) -> Array:
     """``E = [t]x R`` with ``p1^T E p0 = 0`` for rays ``p0`` and ``p1`` (Eq. 14)."""
@@ -114,6 +117,37 @@ def _moved(T: Array, step: Array, tangent: Array) -> Array:
     return make_transform(exp_so3(step[:3]) @ T[:3, :3], t / np.linalg.norm(t))
 
 
+def sampson_jacobian(
+    camera: Intrinsics, T_cam1_cam0: Array, tangent: Array, xy0: Array, xy1: Array
+) -> tuple[Array, Array]:
+    """Sampson distances of a pose and how they change with it.
+
+    Args:
+        camera: Of both images.
+        T_cam1_cam0: Pose, translation of length 1.
+        tangent: ``(2, 3)`` unit vectors across the translation.
+        xy0: ``(N, 2)``.
+        xy1: ``(N, 2)``.
+
+    Returns:
+        ``(N,)`` pixels, and ``(N, 5)`` their derivatives by a turn applied from the left (3, radians) and by
+        the way of the translation along ``tangent`` (2).
+    """
+    R, t = T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3]
+    dE = np.stack([*(skew(t) @ _GENERATORS @ R), *(skew(a) @ R for a in tangent)])
+    K_inv = np.linalg.inv(camera.K)
+    F, dF = K_inv.T @ skew(t) @ R @ K_inv, K_inv.T @ dE @ K_inv
+    x0 = np.concatenate([xy0, np.ones((len(xy0), 1))], axis=1)
+    x1 = np.concatenate([xy1, np.ones((len(xy1), 1))], axis=1)
+    line1, dline1 = x0 @ F.T, x0 @ np.swapaxes(dF, 1, 2)
+    line0, dline0 = x1 @ F[:, :2], x1 @ dF[:, :, :2]
+    square = np.maximum((line1[:, :2] ** 2).sum(axis=1) + (line0**2).sum(axis=1), 1e-18)
+    residual = (x1 * line1).sum(axis=1) / np.sqrt(square)
+    dsquare = (line1[:, :2] * dline1[..., :2]).sum(axis=2) + (line0 * dline0).sum(axis=2)
+    J = (x1 * dline1).sum(axis=2) / np.sqrt(square) - residual * dsquare / square
+    return residual, J.T
+
+
 def refine_relative_pose(
     camera: Intrinsics,
     T_cam1_cam0: Array,
@@ -147,14 +181,12 @@ def refine_relative_pose(
         return float(np.where(a < HUBER_K, 0.5 * a * a, HUBER_K * (a - 0.5 * HUBER_K)).sum())
 
     T = T_cam1_cam0.copy()
-    residual = residual_of(T)
-    cost = cost_of(residual)
+    cost = cost_of(residual_of(T))
     damping = 1e-4
-    epsilon = 1e-6
     for _ in range(iterations):
         tangent = _tangent(T[:3, 3])
-        moved = [residual_of(_moved(T, epsilon * np.eye(5)[k], tangent)) for k in range(5)]
-        J = (np.stack(moved, axis=1) - residual[:, None]) / epsilon
+        residual, J = sampson_jacobian(camera, T, tangent, xy0, xy1)
+        residual, J = residual / sigma_px, J / sigma_px[:, None]
         size = np.abs(residual)
         w = np.where(size < cut_sigmas, np.minimum(1.0, HUBER_K / np.maximum(size, 1e-9)), 0.0)
         H = (J * w[:, None]).T @ J
@@ -166,11 +198,10 @@ def refine_relative_pose(
         if not np.isfinite(step).all() or float(np.abs(step).max()) > 1.0:
             break
         candidate = _moved(T, np.asarray(step), tangent)
-        new_residual = residual_of(candidate)
-        new_cost = cost_of(new_residual)
+        new_cost = cost_of(residual_of(candidate))
         if new_cost < cost:
             gain = cost - new_cost
-            T, residual, cost, damping = candidate, new_residual, new_cost, damping * 0.3
+            T, cost, damping = candidate, new_cost, damping * 0.3
             if gain < 1e-6 * cost:
                 break
         else:

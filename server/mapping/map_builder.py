@@ -311,8 +311,7 @@ class MapBuilder:
         self._version += 1
         self.world.transform_submap(self.submap, place.submap, scale, T_old_new)
         self.enter(place.submap)
-        if self.world.keyframes[-1].frame_id != place.keyframe_id:
-            self.world.revisits[self.world.keyframes[-1].frame_id] = place.keyframe_id
+        self.world.revisits[self.world.keyframes[-1].frame_id] = place.keyframe_id
         on_moved(scale)
         return True
 

@@ -30,6 +30,9 @@ _MAX_DEPTH_RATIO = 60.0
 _MAX_REVISITED, _NEIGHBOURS = 3, 1
 #: Keyframes right before the window that hold it too, among so many: those that saw enough of its landmarks.
 _MAX_BEFORE, _REACH_BACK, _MIN_SHARED = 6, 60, 6
+#: Extent of a window, in median depths, from which on it knows its scale, and how many of a submap's first
+#: keyframes do not hold it then: those were placed with the least to go by.
+_MIN_EXTENT, _NUM_UNSURE = 0.2, 20
 #: Noise is judged by residuals that keep at least this share of its variance.
 _MIN_LEFT = 0.1
 #: Observations in a row that disagree before a landmark is given up.
@@ -297,14 +300,17 @@ def _anchors(world: WorldMap, older: list[Keyframe], recent: list[Keyframe], ids
 
     Those whose landmarks the recent ones saw again after long, and those before the window that saw some of
     the window's landmarks: where a turn makes keyframes dense, the window alone hardly has an extent to know
-    its scale by.
+    its scale by. Where it has, the first of a submap would only hold the errors of its start.
     """
     again = {world.revisits[k.frame_id] for k in recent if k.frame_id in world.revisits}
     rows = [row for row, k in enumerate(older) if k.frame_id in again][-_MAX_REVISITED:]
     near = {r for row in rows for r in range(row - _NEIGHBOURS, row + _NEIGHBOURS + 1)}
+    places = np.stack([k.T_world_cam[:3, 3] for k in recent])
+    extent = float(np.linalg.norm(places - places[0], axis=1).max())
+    first = 0 if extent < _MIN_EXTENT * median_depth(world, recent[-1]) else _NUM_UNSURE
     shared = [
         row
-        for row in range(max(0, len(older) - _REACH_BACK), len(older))
+        for row in range(max(first, len(older) - _REACH_BACK), len(older))
         if np.isin(older[row].ids, ids, assume_unique=True).sum() >= _MIN_SHARED
     ]
     spread = np.linspace(0, len(shared) - 1, min(_MAX_BEFORE, len(shared)))

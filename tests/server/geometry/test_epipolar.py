@@ -18,6 +18,7 @@ from semcast.server.geometry.epipolar import (
     rays_angle_deg,
     refine_relative_pose,
     rotation_residual_px,
+    sampson_jacobian,
     sampson_px,
 )
 
@@ -58,6 +59,25 @@ def test_sampson_of_many_matrices_is_that_of_each():
     F = np.stack([fundamental_matrix(CAMERA, T) for T, *_ in pairs])
     _, _, xy0, xy1 = pairs[0]
     assert np.allclose(sampson_px(F, xy0, xy1), [sampson_px(f, xy0, xy1) for f in F])
+
+
+def test_the_derivative_of_sampson_is_that_of_small_steps():
+    rng = np.random.default_rng(4)
+    T, _, xy0, xy1 = make_pair(rng, num=40, noise_px=2.0)
+    t = T[:3, 3]
+    across = np.cross(t, (0.3, -0.5, 0.8))
+    tangent = np.stack([across, np.cross(t, across)]) / np.linalg.norm(across)
+    residual, J = sampson_jacobian(CAMERA, T, tangent, xy0, xy1)
+    assert np.allclose(residual, sampson_px(fundamental_matrix(CAMERA, T), xy0, xy1), atol=1e-12)
+    for k in range(5):
+        step = 1e-6 * np.eye(5)[k]
+
+        def moved(step):
+            turned = t + step[3:] @ tangent
+            pose = make_transform(exp_so3(step[:3]) @ T[:3, :3], turned / np.linalg.norm(turned))
+            return sampson_px(fundamental_matrix(CAMERA, pose), xy0, xy1)
+
+        assert np.allclose(J[:, k], (moved(step) - moved(-step)) / 2e-6, rtol=1e-4, atol=1e-3)
 
 
 def test_msac_by_hand():

@@ -9,6 +9,7 @@ from semcast.common.geometry import (
     rotation_angle_deg,
     transform_points,
 )
+from semcast.server.geometry import two_view
 from semcast.server.geometry.two_view import estimate_two_view
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
@@ -105,6 +106,38 @@ def test_a_plane_gives_a_pose_with_its_points_in_front(seed):
     rotation, direction = errors_deg(found, T)
     assert rotation < 3
     assert direction < 15
+
+
+def make_far_matches(seed, outlier_share, noise_px):
+    """Thirty matches of points 10 to 30 baselines ahead, which a large turn explains nearly as well."""
+    rng = np.random.default_rng(seed)
+    T = make_transform(exp_so3(rng.normal(0, 0.02, 3)), (0.2, 0.05, 1.0))
+    points = rng.uniform((-4, -4, 10), (4, 4, 30), (30, 3))
+    xy0, xy1 = CAMERA.project(points), CAMERA.project(transform_points(T, points))
+    xy1 = xy1 + rng.normal(0, noise_px, xy1.shape)
+    is_outlier = rng.random(30) < outlier_share
+    xy1[is_outlier] += rng.uniform(-60, 60, (int(is_outlier.sum()), 2))
+    return T, xy0, xy1
+
+
+def test_turns_the_camera_never_made_are_rarer_where_turning_costs(monkeypatch):
+    error_deg = {}
+    for cost in (0.0, two_view._TURN_COST):
+        monkeypatch.setattr(two_view, "_TURN_COST", cost)
+        matches = [make_far_matches(seed, 0.5, 0.7) for seed in range(24)]
+        found = [estimate_two_view(CAMERA, xy0, xy1, seed=seed) for seed, (_, xy0, xy1) in enumerate(matches)]
+        error_deg[cost > 0] = np.mean(
+            [errors_deg(f, T)[1] for f, (T, *_) in zip(found, matches, strict=True)]
+        )
+    assert error_deg[True] < 0.85 * error_deg[False]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_motion_near_pure_turning_is_found_without_a_search(seed):
+    T, xy0, xy1 = make_far_matches(seed, 0.0, 0.2)
+    poses = two_view._near_turning(CAMERA, xy0, xy1, 1.0)
+    direction = [angle_between_deg(pose[:3, 3], T[:3, 3]) for pose in poses]
+    assert min(min(angle, 180 - angle) for angle in direction) < 10.0
 
 
 def test_degenerate_matches_give_none_or_a_finite_pose():

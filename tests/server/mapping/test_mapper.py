@@ -235,6 +235,19 @@ def test_keyframes_before_the_window_keep_its_scale_where_keyframes_are_dense(mo
     assert error[False] > 3 * error[True]
 
 
+@pytest.mark.parametrize(("step", "first_held"), [(0.05, 0), (0.3, 20)])
+def test_a_window_of_some_extent_is_not_held_by_the_start_of_the_map(step, first_held):
+    world, points, _ = make_world(num_keyframes=14, step=step)
+    put_landmarks(world, points)
+    assert (build_problem(world, CAMERA, NOISE, 10).num_anchors > 0) == (first_held == 0)
+    world, points, _ = make_world(num_keyframes=34, step=step)
+    put_landmarks(world, points)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    assert problem.num_anchors > 1
+    assert problem.keyframe_ids[0] // 10 == first_held
+    assert problem.fixed.sum() == problem.num_anchors + 1
+
+
 def test_of_many_keyframes_before_the_window_some_hold_it_evenly():
     world, points, _ = make_world(num_keyframes=40, step=0.02)
     put_landmarks(world, points)
