@@ -34,6 +34,9 @@ LEASE_MS = 2000
 RING_CAPACITY = 2
 _FIFO_CAPACITY = 64
 _CONNECT_TRY_MS = 300
+#: How long a sender that drops under congestion waits for room first: half a frame's time at 30 a second.
+#: A process on a busy machine waits for its turn for longer than the 1 ms that Zenoh gives it.
+_WAIT_FOR_ROOM_US = 15_000
 _JOIN_S = 2.0
 
 
@@ -63,6 +66,7 @@ def zenoh_config(network: NetworkSettings) -> zenoh.Config:
         "open/return_conditions/connect_scouted": False,
         "scouting/delay": 0,
         "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": _WAIT_FOR_ROOM_US,
         "transport/link/rx/max_message_size": 2 * MAX_MESSAGE_BYTES,
         "transport/shared_memory/enabled": False,
     }

@@ -144,8 +144,8 @@ class Initialiser:
             mode=self._mode,
             threshold_px=threshold_px,
             seed=self._seed,
-            min_iterations=200,
-            max_iterations=2000,
+            min_iterations=130,
+            max_iterations=1300,
             choose_model=True,
         )
         if found is None or not self._is_good(found, len(shared)):

@@ -251,6 +251,9 @@ def test_sessions_open_nothing_beyond_what_is_named():
         assert config.get_json("scouting/multicast/enabled") == "false"
         assert config.get_json("scouting/gossip/enabled") == "false"
         assert config.get_json("transport/link/tx/lease") == "2000"
+        # A process that waits for a core must not cost a frame; half a frame's time at most, though.
+        wait_us = config.get_json("transport/link/tx/queue/congestion_control/drop/wait_before_drop")
+        assert 10_000 <= int(wait_us) <= 17_000
         assert config.get_json("transport/shared_memory/enabled") == "false"
 
 
