@@ -53,7 +53,7 @@ def anchor_tracks(
     Returns:
         How many tracks were aligned.
     """
-    by_id = {k.frame_id: k for k in world.keyframes if k.submap == submap}
+    by_id = {k.frame_id: k for k in world.keyframes_of(submap)}
     T_cam_world = invert_transform(T_world_cam)
     landmark = world.landmarks.rows(tracks.ids)
     waiting = tracks.visible & (landmark >= 0)

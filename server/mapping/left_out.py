@@ -36,7 +36,7 @@ def place_left_out(world: WorldMap, camera: Intrinsics, noise: NoiseModel, resul
     last_id = int(problem.keyframe_ids[-1])
     submap = world.submap_of.get(last_id)
     moved = set(problem.keyframe_ids[~problem.fixed].tolist())
-    views = [k for k in world.keyframes if k.submap == submap and k.frame_id <= last_id][-_NUM_KEYFRAMES:]
+    views = [k for k in world.keyframes_of(submap) if k.frame_id <= last_id][-_NUM_KEYFRAMES:]
     seen = [k.ids for k in views if k.frame_id in moved]
     if not seen:
         return 0

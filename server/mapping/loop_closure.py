@@ -199,7 +199,7 @@ class LoopFinder:
 
     def _candidates(self, world: WorldMap, submap: int, T_world_cam: Array) -> list[Keyframe]:
         """Old keyframes the camera may be at if it has drifted."""
-        mine = [k for k in world.keyframes if k.submap == submap]
+        mine = world.keyframes_of(submap)
         if len(mine) <= _NUM_RECENT:
             return []
         newest, older = mine[-1], mine[:-_NUM_RECENT]
@@ -227,7 +227,7 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
     Returns:
         Frame ids of the submap's keyframes, ascending, and where they go; None where there is no solution.
     """
-    mine = [k for k in world.keyframes if k.submap == submap]
+    mine = world.keyframes_of(submap)
     row = {k.frame_id: i for i, k in enumerate(mine)}
     edges = [_step(world, before, now, row[now.frame_id]) for before, now in pairwise(mine)]
     for new, old in world.revisits.items():

@@ -232,7 +232,7 @@ class MapBuilder:
     def _submit(self, *, start: bool = False) -> None:
         if self._bundle.busy:
             return
-        mine = sum(k.submap == self.submap for k in self.world.keyframes)
+        mine = len(self.world.keyframes_of(self.submap))
         problem = mapper.build_problem(
             self.world,
             self._camera,

@@ -242,7 +242,7 @@ def build_problem(
         The problem, or None when there is nothing to adjust.
     """
     submap = world.keyframes[-1].submap
-    mine = [k for k in world.keyframes if k.submap == submap]
+    mine = world.keyframes_of(submap)
     recent = mine[-window_size:]
     if len(recent) < (2 if start else 3):
         return None

@@ -163,10 +163,8 @@ class Relocaliser:
         sigma_px: float,
     ) -> Place | None:
         """Look for more landmarks where the pose expects them; a wrong pose finds few."""
-        near = sorted(
-            (k for k in world.keyframes if k.submap == keyframe.submap),
-            key=lambda k: abs(k.frame_id - keyframe.frame_id),
-        )[:_NEIGHBOURS]
+        mine = world.keyframes_of(keyframe.submap)
+        near = sorted(mine, key=lambda k: abs(k.frame_id - keyframe.frame_id))[:_NEIGHBOURS]
         ids, known = _pool(world, near)
         points = world.landmarks.xyz[world.landmarks.rows(ids)]
         T = found.T_cam_world

@@ -126,7 +126,7 @@ def _nearest(
     camera: Intrinsics, world: WorldMap, images: KeyframeImages, T_world_cam: Array, submap: int
 ) -> list[tuple[Keyframe, SeenFrom]]:
     """Old keyframes that looked at about the same from about there."""
-    mine = [k for k in world.keyframes if k.submap == submap]
+    mine = world.keyframes_of(submap)
     by_id = {k.frame_id: k for k in mine[:-NUM_RECENT]}
     known = [(by_id[image.frame_id], image) for image in images if image.frame_id in by_id]
     if not known:
@@ -215,7 +215,7 @@ def place_anew(
         too close to each other to tell the depth, the landmark stays, and has to be seen where it is.
     """
     submap = world.submap_of[found.keyframe_id]
-    mine = [k for k in world.keyframes if k.submap == submap]
+    mine = world.keyframes_of(submap)
     at = next(row for row, k in enumerate(mine) if k.frame_id == found.keyframe_id)
     views = mine[max(0, at - _NEIGHBOURS) : at + _NEIGHBOURS + 1]
     ids, xy = found.ids[found.points.ok], found.points.xy[found.points.ok]

@@ -189,6 +189,10 @@ class WorldMap:
         """Note a frame's pose relative to a keyframe."""
         self.frames[frame_id] = (keyframe_id, invert_transform(self.poses[keyframe_id]) @ T_world_cam)
 
+    def keyframes_of(self, submap: int) -> list[Keyframe]:
+        """Keyframes of a submap, in order of time."""
+        return [k for k in self.keyframes if k.submap == submap]
+
     def transform_submap(self, submap: int, into: int, scale: float, T_new_old: Array) -> None:
         """Move a submap by a similarity ``x' = T (s x)`` and make it part of another."""
         mine = self.landmarks.submap == submap
@@ -202,9 +206,8 @@ class WorldMap:
             T[:3, 3] *= scale
             self.move_keyframe(frame_id, T_new_old @ T)
             self.submap_of[frame_id] = into
-        for keyframe in self.keyframes:
-            if keyframe.submap == submap:
-                keyframe.submap = into
+        for keyframe in self.keyframes_of(submap):
+            keyframe.submap = into
         self._rescale_frames(dict.fromkeys(moved, scale))
 
     def bend(self, keyframe_ids: Ids, T_world_cam: Array, scale: Array) -> None:
