@@ -40,13 +40,15 @@ _THRESHOLD_FACTORS = (1.0, 2.0)
 _SCORE_FACTORS = (0.5, 1.0, 2.0, 4.0)
 #: A match that fewer of its neighbours agree with is in the first search alone, not in the refinement.
 _MIN_AGREEMENT = 0.25
+#: Where more than this share of the matches agree, a search among these alone is the first one over again.
+_NEARLY_ALL = 0.9
 #: Weight in the score against agreement: from the least at the first value to 1 at the second.
 _AGREEMENT_RANGE, _LEAST_WEIGHT = (0.1, 0.4), 0.05
 #: What turning costs a pose in the choice among several, in matches of full weight per root of a degree:
 #: frames follow one another, and where two motions explain the matches alike the smaller turn is likelier.
 _TURN_COST = 0.3
 #: Matches that the motions near pure turning are sought by at most, and steps of each search.
-_MAX_TURNING_MATCHES, _TURNING_STEPS = 200, 10
+_MAX_TURNING_MATCHES, _TURNING_STEPS = 100, 6
 #: Points near the camera have larger errors and most of the information: the fitted beta overstates what
 #: confidence is worth, half of it does best.
 _BETA_SHARE = 0.5
@@ -124,7 +126,7 @@ def estimate_two_view(
     low, high = _AGREEMENT_RANGE
     weight = np.clip((agreement - low) / (high - low), _LEAST_WEIGHT, 1.0)
     searches: list[tuple[NDArray[np.intp], bool]] = [(np.arange(len(xy0)), False)]
-    if len(kept) < len(xy0):
+    if len(kept) < _NEARLY_ALL * len(xy0):
         searches.append((kept, False))
     if confidence is not None:
         searches.append((kept[np.argsort(-confidence[kept], kind="stable")], True))
