@@ -31,8 +31,8 @@ _MAX_REVISITED, _NEIGHBOURS = 3, 1
 #: Keyframes right before the window that hold it too, among so many: those that saw enough of its landmarks.
 _MAX_BEFORE, _REACH_BACK, _MIN_SHARED = 6, 60, 6
 #: Extent of a window, in median depths, from which on it knows its scale, and how many of a submap's first
-#: keyframes do not hold it then: those were placed with the least to go by.
-_MIN_EXTENT, _NUM_UNSURE = 0.2, 20
+#: keyframes do not hold it then: those of the start, which were placed with the least to go by.
+_MIN_EXTENT, _NUM_UNSURE = 0.2, 5
 #: Noise is judged by residuals that keep at least this share of its variance.
 _MIN_LEFT = 0.1
 #: Observations in a row that disagree before a landmark is given up.
