@@ -31,10 +31,10 @@ def place_left_out(world: WorldMap, camera: Intrinsics, noise: NoiseModel, resul
         Number of landmarks that were placed anew.
     """
     problem = result.problem
-    if not result.ok:
-        return 0
     last_id = int(problem.keyframe_ids[-1])
-    submap = world.submap_of.get(last_id)
+    if not result.ok or last_id not in world.submap_of:
+        return 0
+    submap = world.submap_of[last_id]
     moved = set(problem.keyframe_ids[~problem.fixed].tolist())
     views = [k for k in world.keyframes_of(submap) if k.frame_id <= last_id][-_NUM_KEYFRAMES:]
     seen = [k.ids for k in views if k.frame_id in moved]
