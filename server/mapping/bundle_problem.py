@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """A window of keyframes and the points they see.
+    """A window of keyframes and the landmarks they see.
 
     Attributes:
         intrinsics: fx, fy, cx, cy in pixels.
@@ -20,10 +20,10 @@ class BundleProblem:
         fixed: ``(K,)`` bool, poses that hold the gauge; at least one.
         keep_baseline: The distance between the first keyframe and the one furthest from it is held too, for
             a window with a single fixed pose.
-        point_ids: ``(P,)`` int64 tracks of the points: landmarks, and such as are placed for this once.
+        landmark_ids: ``(P,)`` int64.
         xyz: ``(P, 3)`` world frame.
         view: ``(M,)`` keyframe of each observation.
-        point: ``(M,)`` point of each observation.
+        point: ``(M,)`` landmark of each observation.
         xy: ``(M, 2)`` pixels.
         sigma_px: ``(M,)`` standard deviation per coordinate.
         confidence: ``(M,)`` of each observation, handed through.
@@ -39,7 +39,7 @@ class BundleProblem:
     T_world_cam: Array
     fixed: NDArray[np.bool_]
     keep_baseline: bool
-    point_ids: NDArray[np.int64]
+    landmark_ids: NDArray[np.int64]
     xyz: Array
     view: NDArray[np.intp]
     point: NDArray[np.intp]

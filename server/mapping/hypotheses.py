@@ -112,7 +112,7 @@ def problem_of(
         T_world_cam=T_world_cam,
         fixed=np.arange(len(views)) == 0,
         keep_baseline=True,
-        point_ids=ids,
+        landmark_ids=ids,
         xyz=np.where(points.in_front[:, None], points.xyz, along),
         view=view,
         point=point,

@@ -40,7 +40,7 @@ def place_left_out(world: WorldMap, camera: Intrinsics, noise: NoiseModel, resul
     seen = [k.ids for k in views if k.frame_id in moved]
     if not seen:
         return 0
-    ids = np.setdiff1d(np.concatenate(seen), problem.point_ids)
+    ids = np.setdiff1d(np.concatenate(seen), problem.landmark_ids)
     row = world.landmarks.rows(ids)
     # What came after the adjustment was asked for has moved with its last keyframe.
     there = (row >= 0) & (world.landmarks.born[row] <= last_id) & (world.landmarks.submap[row] == submap)

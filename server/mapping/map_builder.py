@@ -21,7 +21,6 @@ from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, 
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.tracks import Sight, TrackTable
-from semcast.server.mapping.window import build_problem
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
@@ -233,11 +232,13 @@ class MapBuilder:
     def _submit(self, *, start: bool = False) -> None:
         if self._bundle.busy:
             return
-        problem = build_problem(
+        mine = len(self.world.keyframes_of(self.submap))
+        problem = mapper.build_problem(
             self.world,
             self._camera,
             self.noise.model,
             self._settings.window_size,
+            start=start or mine <= self._settings.window_size // 2,
             iterations=15 if start else 6,
             map_version=self._version,
         )

@@ -20,7 +20,7 @@ def _problem_of(camera, poses, xyz, *, noise_px=0.0, rng=None):
         T_world_cam=poses,
         fixed=np.arange(len(poses)) == 0,
         keep_baseline=True,
-        point_ids=np.arange(len(xyz)),
+        landmark_ids=np.arange(len(xyz)),
         xyz=xyz,
         view=view,
         point=point,

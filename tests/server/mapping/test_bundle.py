@@ -36,7 +36,7 @@ def make_problem(seed=0, num_views=6, num_points=60, noise_px=0.3, shake=0.02, s
         "T_world_cam": start,
         "fixed": np.arange(num_views) < 2,
         "keep_baseline": False,
-        "point_ids": np.arange(num_points),
+        "landmark_ids": np.arange(num_points),
         "xyz": xyz + rng.normal(0, shake, xyz.shape),
         "view": view,
         "point": point,

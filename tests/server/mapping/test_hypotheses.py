@@ -58,8 +58,8 @@ def test_all_structures_are_judged_by_the_same_observations(arc):
     camera, views = camera_of(truth), views_of(truth)
     right = problem_of(views, truth.T_world_cam, camera, NOISE)
     other = problem_of(views, mirrored(truth).T_world_cam, camera, NOISE)
-    for name in ("point_ids", "view", "point", "xy", "sigma_px", "keyframe_ids"):
+    for name in ("landmark_ids", "view", "point", "xy", "sigma_px", "keyframe_ids"):
         np.testing.assert_array_equal(getattr(right, name), getattr(other, name))
-    assert len(right.point_ids) == 90, "the longest tracks"
-    np.testing.assert_allclose(right.xyz, truth.xyz[right.point_ids], atol=0.2)
+    assert len(right.landmark_ids) == 90, "the longest tracks"
+    np.testing.assert_allclose(right.xyz, truth.xyz[right.landmark_ids], atol=0.2)
     assert np.isfinite(other.xyz).all()

@@ -4,16 +4,16 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
-from semcast.server.mapping import window
+from semcast.server.mapping import mapper
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.mapper import (
     KeyframeCues,
     add_landmarks,
     apply_result,
+    build_problem,
     note_sight,
     wants_keyframe,
 )
-from semcast.server.mapping.window import build_problem
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
@@ -120,8 +120,7 @@ def test_an_adjustment_mends_shaken_poses():
     world.add_frame(73, 70, world.poses[70])
     problem = build_problem(world, CAMERA, NOISE, 10)
     assert problem is not None
-    assert problem.fixed.tolist() == [True] + [False] * 7
-    assert problem.keep_baseline
+    assert problem.fixed.tolist() == [True, True] + [False] * 6
     noise = OnlineNoise("robust", 0.5, 0.0, True)
     apply_result(world, optimise(problem), noise)
     after = np.abs(np.stack([k.T_world_cam for k in world.keyframes]) - truth).max()
@@ -194,7 +193,7 @@ def test_a_large_window_is_cut_to_what_several_keyframes_see():
     problem = build_problem(world, CAMERA, NOISE, 10)
     assert problem is not None
     assert len(problem.xy) <= 3500
-    assert (problem.point_ids % 2 == 0).sum() >= (world.landmarks.ids % 2 == 0).sum() - 1
+    assert (problem.landmark_ids % 2 == 0).sum() >= (world.landmarks.ids % 2 == 0).sum() - 1
 
 
 def test_a_landmark_that_keeps_disagreeing_is_given_up():
@@ -211,22 +210,11 @@ def test_a_landmark_that_keeps_disagreeing_is_given_up():
 
 
 def test_there_is_nothing_to_adjust_at_first():
-    world, _, _ = make_world(1)
-    assert build_problem(world, CAMERA, NOISE, 10) is None
     world, _, _ = make_world(2)
     assert build_problem(world, CAMERA, NOISE, 10) is None
     add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)
-    assert build_problem(world, CAMERA, NOISE, 10) is not None
-
-
-def test_a_window_that_is_not_the_whole_map_is_held_by_two_poses_where_nothing_older_is_seen():
-    world, points, _ = make_world(num_keyframes=11)
-    put_landmarks(world, points)
-    world.keyframes[0].drop_observations(world.keyframes[0].ids >= 5)
-    problem = build_problem(world, CAMERA, NOISE, 10)
-    assert problem.keyframe_ids.tolist() == list(range(10, 110, 10))
-    assert problem.fixed.tolist() == [True, True] + [False] * 8
-    assert not problem.keep_baseline
+    assert build_problem(world, CAMERA, NOISE, 10) is None
+    assert build_problem(world, CAMERA, NOISE, 10, start=True) is not None
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -234,15 +222,15 @@ def test_keyframes_before_the_window_keep_its_scale_where_keyframes_are_dense(mo
     """Ten keyframes within 1/70 of the depth hardly know a scale; those before saw the same landmarks."""
     way = np.concatenate([0.3 * np.arange(6), 1.5 + 0.01 * np.arange(1, 11)])
     error = {}
-    for num_before in (0, window._MAX_BEFORE):
-        monkeypatch.setattr(window, "_MAX_BEFORE", num_before)
+    for num_before in (0, mapper._MAX_BEFORE):
+        monkeypatch.setattr(mapper, "_MAX_BEFORE", num_before)
         world, points, _ = make_world(noise_px=0.5, step=0.0, seed=seed, way=way)
         put_landmarks(world, points * np.random.default_rng(seed).uniform(0.95, 1.05, (len(points), 1)))
         problem = build_problem(world, CAMERA, NOISE, 10)
         assert problem.num_anchors == num_before
         assert problem.fixed.sum() == (2 if num_before == 0 else num_before + 1)
         xyz = optimise(problem).xyz
-        error[num_before > 0] = abs(np.log(np.median(xyz[:, 2] / points[problem.point_ids, 2])))
+        error[num_before > 0] = abs(np.log(np.median(xyz[:, 2] / points[problem.landmark_ids, 2])))
     assert error[True] < 0.01
     assert error[False] > 3 * error[True]
 

@@ -12,12 +12,12 @@ from semcast.server.geometry.features import TrackedPoints, to_grey
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.mapper import build_problem
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.revisit import NUM_RECENT, find_revisit, place_anew
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
-from semcast.server.mapping.window import build_problem
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 SHAPE = (192, 256)
@@ -276,7 +276,7 @@ def test_recognised_keyframes_and_those_around_them_hold_the_window(mapped):
     assert problem.num_anchors >= 2
     assert world.revisits[100] in problem.keyframe_ids[: problem.num_anchors]
     assert problem.fixed.tolist() == [True] * (problem.num_anchors + 1) + [False] * 4
-    assert set(problem.point_ids.tolist()) <= set(
+    assert set(problem.landmark_ids.tolist()) <= set(
         np.concatenate([k.ids for k in world.keyframes[-5:]]).tolist()
     )
 
