@@ -21,6 +21,7 @@ from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, 
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.tracks import Sight, TrackTable
+from semcast.server.mapping.window import build_problem
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
@@ -233,7 +234,7 @@ class MapBuilder:
         if self._bundle.busy:
             return
         mine = len(self.world.keyframes_of(self.submap))
-        problem = mapper.build_problem(
+        problem = build_problem(
             self.world,
             self._camera,
             self.noise.model,

@@ -1,4 +1,4 @@
-"""Keyframes into map: when to take one, new landmarks, culling, and the window for bundle adjustment."""
+"""Keyframes into map: when to take one, new landmarks, what an adjustment brings, and culling."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,22 +17,10 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Observations one adjustment takes at most; it has to be done before the next keyframe.
-MAX_OBSERVATIONS = 3500
 #: Root mean square error of a triangulated landmark at most, in standard deviations.
 MAX_ERROR_SIGMA = 1.8
-#: Keyframes that see a landmark, from which on it matters to an adjustment as much as any other.
-_WELL_SEEN = 4
 #: Landmarks further than this many median depths are as good as at infinity.
 _MAX_DEPTH_RATIO = 60.0
-#: Keyframes of long ago that were recognised in one adjustment at most, and how many of those before and
-#: after each hold their landmarks with it: rays from one place alone would leave them free in depth.
-_MAX_REVISITED, _NEIGHBOURS = 3, 1
-#: Keyframes right before the window that hold it too, among so many: those that saw enough of its landmarks.
-_MAX_BEFORE, _REACH_BACK, _MIN_SHARED = 6, 60, 6
-#: Extent of a window, in median depths, from which on it knows its scale, and how many of a submap's first
-#: keyframes do not hold it then: those of the start, which were placed with the least to go by.
-_MIN_EXTENT, _NUM_UNSURE = 0.2, 5
 #: Noise is judged by residuals that keep at least this share of its variance.
 _MIN_LEFT = 0.1
 #: Observations in a row that disagree before a landmark is given up.
@@ -212,110 +200,6 @@ def median_depth(world: WorldMap, keyframe: Keyframe) -> float:
     T_cam_world = invert_transform(keyframe.T_world_cam)
     depth = world.landmarks.xyz[row] @ T_cam_world[2, :3] + T_cam_world[2, 3]
     return float(np.median(np.maximum(depth, 1e-6)))
-
-
-def build_problem(
-    world: WorldMap,
-    camera: Intrinsics,
-    noise: NoiseModel,
-    window_size: int,
-    *,
-    start: bool = False,
-    iterations: int = 6,
-    map_version: int = 0,
-) -> BundleProblem | None:
-    """Collect the newest keyframes of the current submap and what they see.
-
-    Older keyframes that see it too are fixed. Two of them know the scale, and then only the first of the
-    newest is fixed with them; otherwise the first two are.
-
-    Args:
-        world: The map.
-        camera: Pinhole.
-        noise: Gives each observation its sigma.
-        window_size: Keyframes at most.
-        start: The first adjustment of a new map: one pose and the baseline are held instead of two poses.
-        iterations: Steps at most.
-        map_version: Handed through.
-
-    Returns:
-        The problem, or None when there is nothing to adjust.
-    """
-    submap = world.keyframes[-1].submap
-    mine = world.keyframes_of(submap)
-    recent = mine[-window_size:]
-    if len(recent) < (2 if start else 3):
-        return None
-    ids = np.unique(np.concatenate([k.ids for k in recent]))
-    ids = ids[world.landmarks.rows(ids) >= 0]
-    anchors = _anchors(world, mine[:-window_size], recent, ids)
-    views = [*anchors, *recent]
-    view, point, xy, confidence = gather_observations(views, ids)
-    count = np.bincount(point, minlength=len(ids))
-    if count.sum() > MAX_OBSERVATIONS:
-        # What ties the window to older keyframes is kept first, then what several keyframes see. Among
-        # those the choice is even: the longest tracks alone would leave the newest one to half of its view.
-        anchored = np.isin(np.arange(len(ids)), point[view < len(anchors)])
-        order = np.lexsort((_scattered(ids), -np.minimum(count, _WELL_SEEN), ~anchored))
-        within = np.cumsum(count[order]) <= MAX_OBSERVATIONS
-        chosen = np.zeros(len(ids), bool)
-        chosen[order[within]] = True
-        count = np.where(chosen, count, 0)
-    used_points = np.flatnonzero(count >= 2)
-    if len(used_points) < 8:
-        return None
-    new_row = np.full(len(ids), -1, np.intp)
-    new_row[used_points] = np.arange(len(used_points))
-    kept = new_row[point] >= 0
-    held = np.bincount(view[kept], minlength=len(views))[: len(anchors)] >= _MIN_SHARED
-    fixed = np.zeros(len(views), bool)
-    fixed[: len(anchors) + (1 if start or held.sum() >= 2 else 2)] = True
-    landmark_ids = ids[used_points]
-    return BundleProblem(
-        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
-        keyframe_ids=np.array([k.frame_id for k in views], dtype=np.int64),
-        T_world_cam=np.stack([k.T_world_cam for k in views]),
-        fixed=fixed,
-        keep_baseline=start,
-        landmark_ids=landmark_ids,
-        xyz=world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
-        view=view[kept],
-        point=new_row[point[kept]],
-        xy=xy[kept],
-        sigma_px=noise.sigma_px(confidence[kept]),
-        confidence=confidence[kept],
-        iterations=iterations,
-        map_version=map_version,
-        num_anchors=len(anchors),
-    )
-
-
-def _scattered(ids: Ids) -> Ids:
-    """Return keys that order ids as good as at random, the same every time (multiplicative hashing)."""
-    return np.asarray((ids * 2_654_435_761) % 4_294_967_296)
-
-
-def _anchors(world: WorldMap, older: list[Keyframe], recent: list[Keyframe], ids: Ids) -> list[Keyframe]:
-    """Older keyframes that hold the window where it was, and in its scale.
-
-    Those whose landmarks the recent ones saw again after long, and those before the window that saw some of
-    the window's landmarks: where a turn makes keyframes dense, the window alone hardly has an extent to know
-    its scale by. Where it has, the first of a submap would only hold the errors of its start.
-    """
-    again = {world.revisits[k.frame_id] for k in recent if k.frame_id in world.revisits}
-    rows = [row for row, k in enumerate(older) if k.frame_id in again][-_MAX_REVISITED:]
-    near = {r for row in rows for r in range(row - _NEIGHBOURS, row + _NEIGHBOURS + 1)}
-    places = np.stack([k.T_world_cam[:3, 3] for k in recent])
-    extent = float(np.linalg.norm(places - places[0], axis=1).max())
-    first = 0 if extent < _MIN_EXTENT * median_depth(world, recent[-1]) else _NUM_UNSURE
-    shared = [
-        row
-        for row in range(max(first, len(older) - _REACH_BACK), len(older))
-        if np.isin(older[row].ids, ids, assume_unique=True).sum() >= _MIN_SHARED
-    ]
-    spread = np.linspace(0, len(shared) - 1, min(_MAX_BEFORE, len(shared)))
-    near |= {shared[k] for k in spread.astype(int).tolist()}
-    return [older[r] for r in sorted(near) if 0 <= r < len(older)]
 
 
 def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> None:

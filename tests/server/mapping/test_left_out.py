@@ -6,7 +6,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
-from semcast.server.mapping import mapper
+from semcast.server.mapping import mapper, window
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -47,8 +47,8 @@ def world_with_shaken_keyframes(seed=0):
 
 def adjusted(world, monkeypatch, max_observations):
     """Adjust with room for a part of the landmarks; the result and the ids of those without."""
-    monkeypatch.setattr(mapper, "MAX_OBSERVATIONS", max_observations)
-    problem = mapper.build_problem(world, CAMERA, NOISE, 10, iterations=20)
+    monkeypatch.setattr(window, "MAX_OBSERVATIONS", max_observations)
+    problem = window.build_problem(world, CAMERA, NOISE, 10, iterations=20)
     left_out = np.setdiff1d(world.landmarks.ids, problem.landmark_ids)
     result = optimise(problem)
     mapper.apply_result(world, result, OnlineNoise("off", 0.5, 0.0, True))
@@ -123,8 +123,8 @@ def test_room_in_an_adjustment_goes_to_new_landmarks_as_to_old_ones():
     problem_ids = {}
     for limit in (300, 100_000):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(mapper, "MAX_OBSERVATIONS", limit)
-            problem_ids[limit] = mapper.build_problem(world, CAMERA, NOISE, 10).landmark_ids
+            patch.setattr(window, "MAX_OBSERVATIONS", limit)
+            problem_ids[limit] = window.build_problem(world, CAMERA, NOISE, 10).landmark_ids
     share = np.isin(problem_ids[300], young).mean()
     assert len(problem_ids[300]) < len(problem_ids[100_000])
     assert 0.3 < share < 0.7

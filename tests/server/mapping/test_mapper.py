@@ -4,16 +4,16 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
-from semcast.server.mapping import mapper
+from semcast.server.mapping import window
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.mapper import (
     KeyframeCues,
     add_landmarks,
     apply_result,
-    build_problem,
     note_sight,
     wants_keyframe,
 )
+from semcast.server.mapping.window import build_problem
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
@@ -217,13 +217,22 @@ def test_there_is_nothing_to_adjust_at_first():
     assert build_problem(world, CAMERA, NOISE, 10, start=True) is not None
 
 
+def test_the_first_adjustment_of_a_map_is_held_by_a_pose_and_a_distance():
+    world, points, _ = make_world(num_keyframes=4)
+    put_landmarks(world, points)
+    for start in (True, False):
+        problem = build_problem(world, CAMERA, NOISE, 10, start=start)
+        assert problem.fixed.tolist() == [True, not start, False, False]
+        assert problem.keep_baseline == start
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_keyframes_before_the_window_keep_its_scale_where_keyframes_are_dense(monkeypatch, seed):
     """Ten keyframes within 1/70 of the depth hardly know a scale; those before saw the same landmarks."""
     way = np.concatenate([0.3 * np.arange(6), 1.5 + 0.01 * np.arange(1, 11)])
     error = {}
-    for num_before in (0, mapper._MAX_BEFORE):
-        monkeypatch.setattr(mapper, "_MAX_BEFORE", num_before)
+    for num_before in (0, window._MAX_BEFORE):
+        monkeypatch.setattr(window, "_MAX_BEFORE", num_before)
         world, points, _ = make_world(noise_px=0.5, step=0.0, seed=seed, way=way)
         put_landmarks(world, points * np.random.default_rng(seed).uniform(0.95, 1.05, (len(points), 1)))
         problem = build_problem(world, CAMERA, NOISE, 10)
