@@ -27,7 +27,7 @@ class AgentSettings:
         metadata={"help": "live: newest frame wins; replay: every frame, in order, when the server takes it"},
     )
     source: SourceSettings = field(metadata={"help": "where frames come from"})
-    codec: str = field(default=DEFAULT_CODEC, metadata={"help": "codec by name"})
+    codec: str = field(default=DEFAULT_CODEC, metadata={"help": "codec by name or file of weights"})
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
     weights: Path | None = field(default=None, metadata={"help": "weights instead of the shipped ones"})
     threads: int = field(default=1, metadata={"help": "CPU threads of the encoder"})

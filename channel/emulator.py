@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -170,12 +170,20 @@ class Emulator:
                 changed = build_settings(ChannelSettings, {**current, **request.settings})
                 self._link.update(changed)
                 logger.info("channel set: %s", ", ".join(f"{k}={v}" for k, v in request.settings.items()))
+                _warn_of_idle(changed, request.settings)
             return settings_to_dict(self._link.settings)
 
     def close(self) -> None:
         """End the delay line's thread. Idempotent."""
         self._box.close()
         self._delay.close()
+
+
+def _warn_of_idle(link: ChannelSettings, given: Collection[str]) -> None:
+    """Say which of the given values do nothing as long as the channel is what it is."""
+    idle = [name for name in link.without_effect() if name in given]
+    if idle:
+        logger.warning("%s: no effect on channel %s", ", ".join(idle), link.channel)
 
 
 def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, Any]:
@@ -201,6 +209,7 @@ def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, 
         beat = StatusBeat(session, settings.agent_id, ROLE, metrics, lambda: emulator.agent_epoch)
         session.declare_alive(settings.agent_id, ROLE)
         logger.info("channel %s at %g dB", settings.link.channel, settings.link.snr_db)
+        _warn_of_idle(settings.link, settings.link.without_effect())
         try:
             emulator.work(stop)
         finally:

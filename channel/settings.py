@@ -1,6 +1,6 @@
 """What can be set about a channel, in one flat set of values that may change while it runs."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -8,6 +8,21 @@ from semcast.channel.trace import SNR_RANGE_DB
 
 ChannelName = Literal["awgn", "rayleigh", "rician", "erasure", "burst", "trace"]
 TraceName = Literal["constant", "ramp", "walk", "file"]
+
+
+#: Channels that a value belongs to; the others belong to all.
+_CHANNELS_OF: dict[str, tuple[ChannelName, ...]] = {
+    "slot_loss": ("erasure", "burst"),
+    "burst_slots": ("burst",),
+    "burst_noise_db": ("burst",),
+    "rician_k_db": ("rician",),
+    "doppler_hz": ("rayleigh", "rician"),
+    "trace": ("trace",),
+    "trace_end_db": ("trace",),
+    "trace_s": ("trace",),
+    "trace_step_db": ("trace",),
+    "trace_file": ("trace",),
+}
 
 
 def _check_range(name: str, value: float, low: float, high: float) -> None:
@@ -86,3 +101,12 @@ class ChannelSettings:
             )
         if self.channel == "trace" and self.trace == "file" and self.trace_file is None:
             raise ValueError("trace_file must be given for trace 'file', got None")
+
+    def without_effect(self) -> list[str]:
+        """Return the names of values that were changed and belong to another channel than this."""
+        return [
+            entry.name
+            for entry in fields(self)
+            if self.channel not in _CHANNELS_OF.get(entry.name, (self.channel,))
+            and getattr(self, entry.name) != entry.default
+        ]

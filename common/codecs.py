@@ -14,6 +14,7 @@ from semcast.common.phy.equaliser import Equalised
 
 Runtime = Literal["auto", "torch", "onnx"]
 
+_WEIGHTS_SUFFIXES = (".safetensors", ".onnx")
 #: Learned transceivers in the order they are listed; their networks are in ``semcast.common.nets.registry``.
 LEARNED_CODECS = ("3dcsc", "3dcsc-lite", "cnn", "vit", "mae")
 
@@ -84,6 +85,32 @@ def codec_of_weights(weights: Path, runtime: Runtime = "auto") -> str:
     return read_manifest(weights_path(weights)).architecture
 
 
+def named_weights(codec: str, runtime: Runtime = "torch") -> tuple[str, Path | None]:
+    """Return the name of a codec, and its weights where a weights file stands for it.
+
+    Raises:
+        ConfigError: The runtime is not installed.
+        CheckpointError: The weights are missing or damaged.
+    """
+    if Path(codec).suffix not in _WEIGHTS_SUFFIXES:
+        return codec, None
+    return codec_of_weights(Path(codec), runtime), Path(codec)
+
+
+def check_codec(codec: str) -> None:
+    """Check that there is a codec of this name, or a weights file, without loading it.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    names = available_codecs()
+    if Path(codec).suffix in _WEIGHTS_SUFFIXES:
+        if not Path(codec).is_file():
+            raise ConfigError(f"codec must be a name or a file of weights, got {codec!r}: no such file")
+    elif codec not in names:
+        raise ConfigError(f"codec must be one of {', '.join(names)}, got {codec!r}{near_match(codec, names)}")
+
+
 def _load_learned(
     source: str | Path,
     runtime: Literal["torch", "onnx"],
@@ -112,7 +139,8 @@ def load_codec(
     """Load a codec, ready for use.
 
     Args:
-        name: One of ``available_codecs()``, or a learned architecture together with ``weights``.
+        name: One of ``available_codecs()``, a file of weights, or a learned architecture together with
+            ``weights``.
         modulation: ``"16qam"`` or ``"analog"``.
         num_threads: CPU threads of a learned codec; None leaves the library's choice.
         device: ``"auto"``, ``"cpu"`` or ``"cuda"``, for learned codecs.
@@ -128,6 +156,8 @@ def load_codec(
     if modulation not in MODULATIONS:
         hint = near_match(modulation, list(MODULATIONS))
         raise ConfigError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}{hint}")
+    if weights is None:
+        name, weights = named_weights(name, runtime)
     if name in LEARNED_CODECS or name in _shipped_weights():
         source = name if weights is None else weights
         chosen = _choose_runtime(runtime, weights)
@@ -137,8 +167,7 @@ def load_codec(
         return codec
     conventional = _conventional_names()
     if name not in conventional:
-        names = available_codecs()
-        raise ConfigError(f"codec must be one of {', '.join(names)}, got {name!r}{near_match(name, names)}")
+        check_codec(name)
     if weights is not None:
         raise ConfigError(f"codec {name!r} has no weights, got {weights}")
     from semcast.common.conventional import ConventionalCodec

@@ -5,7 +5,7 @@ under every codec.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -63,7 +63,8 @@ class CodecSettings:
 
     images: Path = field(metadata={"help": "folder of images, used in the order of their names"})
     codec: tuple[str, ...] = field(
-        default=(DEFAULT_CODEC, "jpeg-ldpc"), metadata={"help": "codecs by name, one or more"}
+        default=(DEFAULT_CODEC, "jpeg-ldpc"),
+        metadata={"help": "codecs by name or .safetensors file, one or more"},
     )
     snr_db: tuple[float, ...] = field(
         default=(2.0, 4.0, 6.0, 8.0, 10.0, 12.0), metadata={"help": "SNRs in dB, one or more"}
@@ -159,22 +160,24 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
     """
     images = read_images(settings.images, settings.max_images)
     if codecs is None:
-        codecs = [_load(name, settings) for name in settings.codec]
-    _warm_up(codecs, next(iter(images.values())))
+        under_name = {name: _load(name, settings) for name in settings.codec}
+    else:
+        under_name = {codec.name: codec for codec in codecs}
+    _warm_up(under_name.values(), next(iter(images.values())))
     strip_snr_db = min(settings.snr_db, key=lambda snr_db: abs(snr_db - _STRIP_SNR_DB))
     strip: list[dict[str, NDArray[np.uint8]]] = []
     results = []
     for snr_db in settings.snr_db:
-        samples: dict[str, list[_Sample]] = {codec.name: [] for codec in codecs}
+        samples: dict[str, list[_Sample]] = {label: [] for label in under_name}
         # One link per codec for all images, so that traces and fading go on from image to image; all see the
         # same noise, which belongs to the image's number.
-        told_db = {codec.name: snr_db for codec in codecs}
-        links = {c.name: Link(replace(settings.link, snr_db=snr_db), settings.seed) for c in codecs}
+        told_db = dict.fromkeys(under_name, snr_db)
+        links = {label: Link(replace(settings.link, snr_db=snr_db), settings.seed) for label in under_name}
         for k, (name, image) in enumerate(images.items()):
-            for codec in codecs:
-                sample = _run(codec, image, links[codec.name], k, told_db[codec.name], settings)
-                samples[codec.name].append(sample)
-                told_db[codec.name] = sample.report_db
+            for label, codec in under_name.items():
+                sample = _run(codec, image, links[label], k, told_db[label], settings)
+                samples[label].append(sample)
+                told_db[label] = sample.report_db
             if snr_db == strip_snr_db and len(strip) < _STRIP_IMAGES:
                 strip.append(_strip_row(name, image, {n: s[-1] for n, s in samples.items()}))
         results += [_row(name, snr_db, list(images), rows) for name, rows in samples.items()]
@@ -219,7 +222,7 @@ def _load(name: str, settings: CodecSettings) -> Codec:
     return _Exported(encoder, codec)
 
 
-def _warm_up(codecs: Sequence[Codec], image: NDArray[np.uint8]) -> None:
+def _warm_up(codecs: Iterable[Codec], image: NDArray[np.uint8]) -> None:
     """Let every codec build what it builds at its first image, outside the measured times."""
     for codec in codecs:
         received = Link(ChannelSettings(snr_db=15.0), 0).carry(codec.encode(image, 15.0), 0.0)

@@ -46,6 +46,7 @@ class EnduranceSettings(StreamSettings):
         ValueError: A value is out of range.
     """
 
+    snr_db: tuple[float, ...] = field(default=(10.0,), metadata={"help": "SNR in dB, a single one"})
     frames: int = field(default=20_000, metadata={"help": "frames in all, back and forth"})
     every: int = field(default=1000, metadata={"help": "frames a row of the result is about"})
     reconstruction: ReconstructionSettings = field(

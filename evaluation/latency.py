@@ -42,6 +42,7 @@ class LatencySettings(StreamSettings):
         ValueError: A value is out of range.
     """
 
+    snr_db: tuple[float, ...] = field(default=(10.0,), metadata={"help": "SNR in dB, a single one"})
     reconstruction: ReconstructionSettings = field(
         default=ReconstructionSettings(), metadata={"help": "the server's estimation"}
     )

@@ -49,7 +49,7 @@ class StreamSettings:
     )
     codec: str = field(
         default=DEFAULT_CODEC,
-        metadata={"help": f"codec by name; {CLEAN} takes the original images, confidence 1"},
+        metadata={"help": f"codec by name or .safetensors file; {CLEAN}: original images, confidence 1"},
     )
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
     snr_db: tuple[float, ...] = field(default=(10.0,), metadata={"help": "SNRs in dB, one or more"})

@@ -74,7 +74,7 @@ class FrameDecoder:
         if codec.digest != digest:
             raise CheckpointError(
                 f"codec {name} has digest {codec.digest} here but {digest} at the agent: "
-                "install the same version of semcast at both ends"
+                "install the same version of semcast at both ends, or give both the same weights"
             )
         return codec
 

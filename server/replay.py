@@ -75,6 +75,9 @@ class ReplaySettings:
         default=0.0,
         metadata={"help": "1: as recorded, 2: twice as fast; 0: as fast as this machine goes"},
     )
+    weights: Path | None = field(
+        default=None, metadata={"help": "weights of the recorded agent, where they are not the shipped ones"}
+    )
     threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})
     start_s: float = field(default=0.0, metadata={"help": "leave out frames before this time of the source"})
     end_s: float | None = field(default=None, metadata={"help": "leave out frames after this time"})
@@ -141,7 +144,9 @@ def replay(
     if settings.out is not None and settings.save_images != "none":
         check_not_foreign(settings.out, IMAGES_NAME)
     decoder = FrameDecoder(
-        lambda name, modulation: load_codec(name, modulation=modulation, num_threads=settings.threads)
+        lambda name, modulation: load_codec(
+            name, modulation=modulation, num_threads=settings.threads, weights=settings.weights
+        )
     )
     identity = StreamIdentity(
         agent_id=agent_id,

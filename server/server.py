@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from semcast.common.codec import Codec, Modulation
-from semcast.common.codecs import load_codec
+from semcast.common.codecs import load_codec, named_weights
 from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.keys import camera_key, control_key
@@ -77,6 +77,10 @@ class Server:
         self._settings = settings
         self._agent_id = settings.agent_id
         self._metrics = Metrics("server")
+        self._codec: str | None = None
+        self._weights: Path | None = None
+        if settings.codec is not None:
+            self._codec, self._weights = named_weights(settings.codec)
         self._decoder = FrameDecoder(load if load is not None else self._load_codec)
         self._session: Session | None = None
         self._viewer: ViewerFeed | None = None
@@ -120,6 +124,7 @@ class Server:
             modulation=modulation,
             num_threads=self._settings.threads,
             device=self._settings.device,
+            weights=self._weights if name == self._codec else None,
         )
 
     def _make_ready(self) -> None:
@@ -136,8 +141,8 @@ class Server:
             open_sequence(settings.reference, settings.camera)
         self._spare_bundle = self._new_bundle()
         check_viewer(settings)
-        if settings.codec is not None:
-            codec = self._decoder.load(settings.codec, settings.modulation)
+        if self._codec is not None:
+            codec = self._decoder.load(self._codec, settings.modulation)
             self._decoder.warm_up(codec.name, settings.modulation, codec.digest, WARM_UP_SHAPE_HW)
 
     def _new_bundle(self) -> BundleRunner:

@@ -77,7 +77,8 @@ class ServerSettings:
         mode: ``live`` takes the newest frame and drops the others; ``replay`` loses none and repeats exactly.
         max_age_ms: Live frames older than this are dropped.
         out: Folder for outputs, or None.
-        codec: Codec to load before the server reports itself ready; others are loaded when they arrive.
+        codec: Codec to load before the server reports itself ready; others are loaded when they arrive. A
+            file of weights takes the place of the shipped ones of its codec.
         modulation: Of that codec.
         threads: CPU threads of the decoder.
         device: Where the decoder runs.
@@ -106,7 +107,11 @@ class ServerSettings:
     )
     out: Path | None = field(default=None, metadata={"help": "folder for trajectory, map, summary, run.rrd"})
     codec: str | None = field(
-        default=None, metadata={"help": "codec to have ready at once; any other is loaded when it arrives"}
+        default=None,
+        metadata={
+            "help": "codec to have ready at once, any other is loaded when it arrives; the agent's "
+            ".safetensors file where it has weights of its own"
+        },
     )
     modulation: Modulation = field(default="16qam", metadata={"help": "modulation of that codec"})
     threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})

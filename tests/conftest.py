@@ -7,3 +7,19 @@ import pytest
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20240611)
+
+
+@pytest.fixture(scope="session")
+def tiny_weights(tmp_path_factory):
+    """The weights of a small ``3dcsc`` that was never trained, in a file."""
+    import torch
+
+    from semcast.common.nets.checkpoint import save_transceiver
+    from semcast.common.nets.transceiver import Sizes, build_3dcsc
+
+    torch.manual_seed(0)
+    sizes = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
+    file = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    facts = {"architecture": "3dcsc", "sizes": sizes, "cbr": 1 / 16, "snr_range_db": (0.0, 14.0)}
+    save_transceiver(build_3dcsc(sizes), file, made_by={"steps": 0}, **facts)
+    return file

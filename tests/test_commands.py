@@ -148,6 +148,16 @@ def test_set_is_checked_against_the_running_channel(channel, tmp_path, capsys):
     assert (now["snr_db"], now["slot_loss"], now["burst_slots"]) == (3.0, 0.5, 20.0)
 
 
+def test_what_does_nothing_is_said(channel, capsys, caplog):
+    words = ["channel", "set", "--agent-id", "a", "--connect", channel]
+    assert main([*words, "--channel", "awgn", "--slot-loss", "0.3", "--seed", "7"]) == 0
+    assert "seed: no effect on a channel that runs" in caplog.text
+    assert "slot_loss: no effect on channel awgn" in caplog.text
+    caplog.clear()
+    assert main([*words, "--channel", "erasure"]) == 0
+    assert "no effect" not in caplog.text
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

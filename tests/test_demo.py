@@ -68,7 +68,24 @@ def test_bad_settings_are_refused_before_anything_starts(values, message):
         DemoSettings(**values)
 
 
-def test_a_role_that_can_not_start_ends_the_demo_with_its_own_words(tmp_path):
+@pytest.mark.parametrize("wrong", ["codec", "camera", "channel"])
+def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
+    former = tmp_path / "out"
+    former.mkdir()
+    (former / "summary.json").write_text("{}")
+    values = {"view": "none", "out": former, "codec": "jpeg-ldpc"}
+    if wrong == "camera":
+        values["sequence"] = tmp_path / "plain"
+        shutil.copytree(SEQUENCE / "images", values["sequence"])
+    values |= {"codec": {"codec": "no-such-codec"}, "channel": {"channel": "raleigh"}}.get(wrong, {})
+    message = {"codec": "no-such-codec", "camera": "camera of plain is unknown", "channel": "raleigh"}[wrong]
+    with pytest.raises((SemcastError, ValueError), match=message):
+        run_demo(DemoSettings(**values), threading.Event(), lambda line: None, lambda row: None)
+    assert [p.name for p in former.iterdir()] == ["summary.json"]
+
+
+def test_a_role_that_can_not_start_ends_the_demo_with_its_own_words(tmp_path, monkeypatch):
+    monkeypatch.setattr("semcast.demo.check_codec", lambda name: None)
     settings = DemoSettings(codec="no-such-codec", view="none", resize=0.25, rate_hz=10.0, out=tmp_path)
     with pytest.raises(SemcastError, match="did not start: .*no-such-codec"):
         run_demo(settings, threading.Event(), lambda line: None, lambda row: None)

@@ -1,5 +1,6 @@
 """What the documentation says about the command line is what the command line takes."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -72,3 +73,23 @@ def test_the_figures_in_the_docs_are_those_of_the_result_files(monkeypatch):
     assert readme == with_part(readme, "results", readme_table()), "run make results-page"
     confidence = (ROOT / "docs/confidence.md").read_text(encoding="utf-8")
     assert confidence == with_part(confidence, "pairs", confidence_part()), "run make results-page"
+
+
+@pytest.mark.parametrize(
+    "manifest", sorted((ROOT / "common" / "weights").glob("*.json")), ids=lambda p: p.stem
+)
+def test_the_figures_of_shipped_weights_are_those_of_the_results_they_name(manifest):
+    measured = json.loads(manifest.read_text(encoding="utf-8"))["measured"]["kodak"]
+    files = [ROOT / "evaluation" / "results" / Path(file).name for file in measured["file"].split(", ")]
+    results = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+    rows = {
+        (report["settings"]["modulation"], row["snr_db"]): row
+        for report in results
+        for row in report["results"]
+        if row["codec"] == manifest.stem
+    }
+    for modulation in {"16qam", "analog"} & set(measured):
+        for stated in measured[modulation]:
+            row = rows[modulation, stated["snr_db"]]
+            assert stated["psnr_db"] == pytest.approx(row["psnr_db"], abs=0.002)
+            assert stated["ssim"] == pytest.approx(row["ssim"], abs=0.0002)

@@ -4,6 +4,7 @@ COLMAP stores ``T_cam_world`` with the quaternion ``qw qx qy qz``, and its pixel
 half a pixel more than ours (https://colmap.github.io/format.html).
 """
 
+import logging
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +15,8 @@ from numpy.typing import NDArray
 from semcast.common.geometry import invert_transform, quat_wxyz_from_rotation
 from semcast.common.run_folder import RunData, image_name
 from semcast.server.export.geometry import reprojection_errors_px, unique_observations
+
+logger = logging.getLogger(__name__)
 
 PIXEL_CENTRE = 0.5
 CAMERA_ID = 1
@@ -58,7 +61,15 @@ def write_colmap(folder: Path, data: RunData, images: Mapping[int, Path]) -> lis
     }
     for name, lines in files.items():
         (model / name).write_text("\n".join(lines) + "\n", encoding="ascii")
-    copy_images(images, exported_frame_ids(data, images), folder / "images")
+    frame_ids = exported_frame_ids(data, images)
+    num_copied = copy_images(images, frame_ids, folder / "images")
+    if num_copied < len(frame_ids):
+        logger.warning(
+            "%d of %d images were not kept by the run: only its poses and points are whole; "
+            "run with --save-images keyframes for images too",
+            len(frame_ids) - num_copied,
+            len(frame_ids),
+        )
     return [model / name for name in files]
 
 

@@ -11,13 +11,15 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from semcast.agent.pace_control import start_stride
+from semcast.channel.settings import ChannelName
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
+from semcast.common.codecs import check_codec
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.rate import NATIVE_RATE, RateChoice
@@ -55,9 +57,8 @@ class DemoSettings:
         default=NATIVE_RATE, metadata={"help": "channel uses per pixel value; auto: as the link needs"}
     )
     snr_db: float = field(default=10.0, metadata={"help": "Es/N0 of the link in dB"})
-    channel: str = field(
-        default="awgn",
-        metadata={"help": "awgn, rayleigh, rician, erasure (20 percent of slots lost), burst, trace"},
+    channel: ChannelName = field(
+        default="awgn", metadata={"help": "kind of link; erasure loses 20 percent of the slots"}
     )
     confidence: Literal["robust", "paper", "off"] = field(
         default="robust", metadata={"help": "how the geometry uses confidence"}
@@ -88,7 +89,11 @@ class DemoSettings:
     json: Path | None = field(default=None, metadata={"help": "also write the summary to this file"})
 
     def __post_init__(self) -> None:
-        """Check ranges that the three processes would only notice after their start."""
+        """Check what the three processes would only notice after their start."""
+        if self.channel not in get_args(ChannelName):
+            raise ValueError(
+                f"channel must be one of {', '.join(get_args(ChannelName))}, got {self.channel!r}"
+            )
         if not -5.0 <= self.snr_db <= 30.0:
             raise ValueError(f"snr_db must be in [-5, 30], got {self.snr_db:g}")
         if self.resize is not None and not 0.05 <= self.resize <= 1.0:
@@ -261,9 +266,13 @@ def run_demo(
         The server's summary, or None when it never wrote one, and what ended the run early, or None.
 
     Raises:
-        SemcastError: A process could not be started.
+        SemcastError: The sequence or the codec can't be used, or a process could not be started.
     """
+    # What can be wrong is looked at before anything of a former run goes.
     sequence = settings.sequence or default_sequence()
+    recorded = open_sequence(sequence, settings.camera)
+    _ = recorded.intrinsics
+    check_codec(settings.codec)
     settings.out.mkdir(parents=True, exist_ok=True)
     summary_file = settings.out / "summary.json"
     for name in (SUMMARY_NAME, IMAGES_NAME):
@@ -272,7 +281,6 @@ def run_demo(
     logs = settings.out / "logs"
     logs.mkdir(exist_ok=True)
     endpoint = free_endpoint()
-    recorded = open_sequence(sequence, settings.camera)
     commands = role_commands(settings, sequence, endpoint)
     children = {name: Role(name, command, logs / f"{name}.log") for name, command in commands.items()}
     alive = Alive(set(), threading.Condition())

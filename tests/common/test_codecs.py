@@ -5,23 +5,15 @@ import shutil
 import pytest
 import torch
 
-from semcast.common.codecs import codec_of_weights, load_codec
+from semcast.common.codecs import check_codec, codec_of_weights, load_codec, named_weights
 from semcast.common.errors import CheckpointError, ConfigError
-from semcast.common.nets.checkpoint import save_transceiver
-from semcast.common.nets.transceiver import Sizes, build_3dcsc
 from semcast.training.onnx_export import export_encoder
-
-TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
+def files(tiny_weights):
     """The weights of a small ``3dcsc``, and its encoder as ONNX."""
-    torch.manual_seed(0)
-    weights = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    facts = {"architecture": "3dcsc", "sizes": TINY, "cbr": 1 / 16, "snr_range_db": (0.0, 14.0)}
-    save_transceiver(build_3dcsc(TINY), weights, made_by={"steps": 0}, **facts)
-    return {"torch": weights, "onnx": export_encoder(weights, weights.with_suffix(".onnx"))}
+    return {"torch": tiny_weights, "onnx": export_encoder(tiny_weights, tiny_weights.with_suffix(".onnx"))}
 
 
 @pytest.mark.parametrize("kind", ["torch", "onnx"])
@@ -35,6 +27,22 @@ def test_weights_of_another_codec_than_the_named_one_are_refused(files, kind):
 @pytest.mark.parametrize("kind", ["torch", "onnx"])
 def test_weights_say_which_codec_they_are_of(files, kind):
     assert codec_of_weights(files[kind]) == "3dcsc"
+
+
+def test_a_file_of_weights_stands_for_its_codec(files):
+    by_file = load_codec(str(files["torch"]))
+    assert (by_file.name, by_file.digest) == ("3dcsc", load_codec("3dcsc", weights=files["torch"]).digest)
+    assert named_weights(str(files["torch"])) == ("3dcsc", files["torch"])
+    assert named_weights("jpeg-ldpc") == ("jpeg-ldpc", None)
+
+
+def test_a_codec_is_checked_without_being_loaded(files, tmp_path):
+    check_codec("jpeg-ldpc")
+    check_codec(str(files["torch"]))
+    with pytest.raises(ConfigError, match="got 'jpg-ldpc', did you mean 'jpeg-ldpc'"):
+        check_codec("jpg-ldpc")
+    with pytest.raises(ConfigError, match="gone.safetensors': no such file"):
+        check_codec(str(tmp_path / "gone.safetensors"))
 
 
 @pytest.mark.parametrize("name", ["none.safetensors", "none.onnx"])

@@ -48,6 +48,13 @@ def test_an_exported_encoder_serves_the_same_decoder(folder):
     assert both["onnx"]["psnr_db"] == pytest.approx(both["torch"]["psnr_db"], abs=0.3)
 
 
+def test_weights_of_ones_own_stand_beside_the_shipped_ones(folder, tiny_weights):
+    file = str(tiny_weights)
+    settings = CodecSettings(images=folder, codec=("3dcsc", file), snr_db=(10.0,), max_images=1)
+    found = rows(evaluate_codec(settings))
+    assert found[file, 10.0]["psnr_db"] < found["3dcsc", 10.0]["psnr_db"] - 3, "they were never trained"
+
+
 def rows(report):
     return {(row["codec"], row["snr_db"]): row for row in report["results"]}
 

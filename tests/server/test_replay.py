@@ -15,7 +15,7 @@ from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.common.codecs import load_codec
 from semcast.common.config import build_settings, read_toml
-from semcast.common.errors import SourceError
+from semcast.common.errors import ConfigError, SourceError
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recording import recover_file
 from semcast.common.recording_reader import RecordingReader
@@ -68,6 +68,11 @@ def test_everything_that_was_sent_is_in_the_recording(recording):
     assert counts["semcast/agent0/rx/symbols"] >= FRAMES // 2
     assert counts["semcast/agent0/camera"] >= 1
     assert counts["semcast/agent0/source"] >= FRAMES // 2
+
+
+def test_weights_are_those_of_the_recorded_codec(recording, tiny_weights):
+    with pytest.raises(ConfigError, match="codec 'jpeg-ldpc' has no weights, got .*tiny.safetensors"):
+        replay(ReplaySettings(file=recording, weights=tiny_weights))
 
 
 def test_the_recording_names_the_weights_that_decode_it(recording):

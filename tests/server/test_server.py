@@ -1,5 +1,6 @@
 """The server over real loopback Zenoh: an agent's stream in, poses and files out."""
 
+import contextlib
 import hashlib
 import json
 import threading
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from semcast.common.codec import DecodedImage, EncodedImage
+from semcast.common.codecs import load_codec
 from semcast.common.errors import SemcastError
 from semcast.common.keys import camera_key, control_key, flow_key, pose_key, rx_key
 from semcast.common.messages import (
@@ -494,3 +496,16 @@ def test_a_silent_stream_ends_with_the_idle_limit_and_its_outputs(tmp_path, hub,
     assert running.finish()["frames"]["tracked"] == 3
     assert (tmp_path / "summary.json").exists()
     radio.close()
+
+
+def test_a_server_decodes_with_weights_of_ones_own(tiny_weights):
+    hub, _ = open_hub()
+    own = load_codec(str(tiny_weights))
+    settings = ServerSettings(agent_id=AGENT, bundle="inline", codec=str(tiny_weights))
+    with hub, contextlib.closing(Server(settings, hub)) as server:
+        decoder = server._decoder
+        assert decoder.codec_for("3dcsc", "16qam", own.digest).digest == own.digest
+        with pytest.raises(SemcastError, match="or give both the same weights"):
+            decoder.codec_for("3dcsc", "16qam", load_codec("3dcsc").digest)
+        shipped = load_codec("3dcsc-lite").digest
+        assert decoder.codec_for("3dcsc-lite", "16qam", shipped).digest == shipped

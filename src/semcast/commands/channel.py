@@ -2,12 +2,15 @@
 
 import argparse
 import json
+import logging
 
 from semcast.channel.emulator import run_channel, set_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
 from semcast.common.config import build_settings
 from semcast.common.errors import ConfigError
+
+logger = logging.getLogger(__name__)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,6 +39,8 @@ def _set(arguments: argparse.Namespace) -> int:
     changes = given.pop("link", None)
     if not changes:
         raise ConfigError("set needs a value to change, such as --snr-db 4")
+    if "seed" in given:
+        logger.warning("seed: no effect on a channel that runs")
     settings = build_settings(EmulatorSettings, given)
     print(json.dumps(set_channel(settings.network, settings.agent_id, changes), indent=1))
     return 0

@@ -59,6 +59,16 @@ def test_pycolmap_reads_the_model_and_finds_the_same_reprojection_error(tmp_path
     )
 
 
+def test_images_that_were_not_kept_are_missed_aloud(tmp_path, arc_run, write_arc_run, caplog):
+    data = arc_run()
+    write_colmap(tmp_path / "whole", data, written(tmp_path, data, write_arc_run))
+    assert not caplog.text
+    write_colmap(tmp_path / "bare", data, {})
+    count = len(data.keyframe_ids)
+    assert f"{count} of {count} images were not kept by the run" in caplog.text
+    assert "--save-images keyframes" in caplog.text
+
+
 def test_colmap_poses_are_camera_from_world_and_its_pixels_half_a_pixel_more(
     tmp_path, arc_run, write_arc_run
 ):
