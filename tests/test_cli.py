@@ -61,3 +61,19 @@ def test_an_error_is_one_line_and_exit_code_1(tmp_path, capsys):
     err = capsys.readouterr().err
     assert "none.toml can't be read as settings" in err
     assert "Traceback" not in err
+
+
+def test_help_is_a_verb_too(capsys):
+    for words, first in ((["help"], "usage: semcast VERB"), (["help", "replay"], "usage: semcast replay")):
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        assert ended.value.code == 0
+        assert capsys.readouterr().out.startswith(first)
+    assert main(["help", "rpelay"]) == 2
+    assert "did you mean 'replay'" in capsys.readouterr().err
+
+
+def test_a_missing_file_is_named_once(tmp_path, capsys):
+    file = tmp_path / "nope.mcap"
+    assert main(["replay", str(file)]) == 1
+    assert capsys.readouterr().err == f"semcast replay: {file} can't be read: No such file or directory\n"

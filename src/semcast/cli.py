@@ -73,10 +73,20 @@ def _configure_logging(debug: bool) -> logging.Handler:
     return handler
 
 
+def _plain(err: SemcastError) -> str:
+    """Return an error in words: what the system said of a file without its number and the file again."""
+    cause = err.__cause__
+    if isinstance(cause, OSError) and cause.strerror:
+        return str(err).replace(str(cause), cause.strerror)
+    return str(err)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
     overview = _overview()
+    if words[:1] == ["help"]:
+        words = [*words[1:2], "--help"]
     if not words or words[0].startswith("-"):
         overview.parse_args(words)
         overview.print_help()
@@ -97,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SemcastError as err:
         if debug:
             traceback.print_exc()
-        print(f"semcast {verb}: {err}", file=sys.stderr)
+        print(f"semcast {verb}: {_plain(err)}", file=sys.stderr)
         return EXIT_ERROR
     except ModuleNotFoundError as err:
         if debug or (err.name or "").startswith("semcast"):

@@ -87,7 +87,7 @@ def check_processor() -> Iterator[Finding]:
         yield Finding(
             "bfloat16",
             "note",
-            "not in hardware: fp32, 3-5 times slower; use --codec 3dcsc-lite or --resize 0.5",
+            "not in hardware: fp32, 3-5 times slower; use --resize 0.5 or a conventional codec",
         )
 
 
