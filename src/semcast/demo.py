@@ -51,7 +51,9 @@ class DemoSettings:
     camera: CameraSettings = field(
         default=CameraSettings(), metadata={"help": "camera of a sequence that does not say it"}
     )
-    codec: str = field(default=DEFAULT_CODEC, metadata={"help": "codec by name, such as jpeg-ldpc"})
+    codec: str = field(
+        default=DEFAULT_CODEC, metadata={"help": "codec by name, such as jpeg-ldpc, or file of weights"}
+    )
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
     rate: RateChoice = field(
         default=NATIVE_RATE, metadata={"help": "channel uses per pixel value; auto: as the link needs"}
