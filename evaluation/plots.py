@@ -11,11 +11,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from semcast.common.errors import SemcastError
 
-_MARKERS = "os^Dv<>P*X"
+_MARKERS = "os^Dv<>P*Xh"
+#: Matplotlib's own ten and black: as many as a pair benchmark has estimators.
+_COLOURS = (*(f"C{k}" for k in range(10)), "black")
 #: More curves than these leave no room for their names between them.
 _MAX_IN_AXES = 5
 
@@ -105,7 +108,8 @@ def plot_pair_errors(
     """Draw rotation and translation-direction error against SNR, with and without confidence.
 
     These are Fig. 9 (``fig9_rotation.png``) and Fig. 10 (``fig10_translation_direction.png``) of the paper,
-    with a panel for every gap, kind of features and thinning.
+    with a panel for every gap, kind of features and thinning. The error is on a logarithmic scale: estimators
+    differ by up to a hundredfold.
 
     Args:
         folder: Where the two files go.
@@ -127,7 +131,7 @@ def plot_pair_errors(
     ):
         num_columns = min(len(panels), 4)
         num_rows = -(-len(panels) // num_columns)
-        size = (5.0, 3.6) if len(panels) == 1 else (3.2 * num_columns, 2.9 * num_rows)
+        size = (5.0, 4.4) if len(panels) == 1 else (3.2 * num_columns, 2.9 * num_rows + 0.6)
         figure, grid = new_grid(num_rows, num_columns, *size)
         flat = [axes for row in grid for axes in row]
         for axes in flat[len(panels) :]:
@@ -137,14 +141,29 @@ def plot_pair_errors(
             for k, mode in enumerate(modes):
                 values = [cell["results"][mode][key] for cell in cells]
                 y = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
-                axes.plot(snr_db, y, marker=_MARKERS[k % len(_MARKERS)], markersize=4, label=mode)
+                axes.plot(
+                    snr_db,
+                    np.where(y > 0, y, np.nan),
+                    color=_COLOURS[k % len(_COLOURS)],
+                    marker=_MARKERS[k % len(_MARKERS)],
+                    markersize=4,
+                    linewidth=2.2 if k == 0 else 1.0,
+                    zorder=3 if k == 0 else 2,
+                    label=mode,
+                )
             title = variant if len(panels) > 1 else str(result.get("title", ""))
             axes.set_title(title, fontsize="medium")
-            axes.set(xlabel="SNR (dB)")
-            axes.set_ylim(bottom=0.0)
+            axes.set(xlabel="SNR (dB)", yscale="log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
+            axes.grid(alpha=0.15, which="minor")
         for row in grid:
             row[0].set_ylabel(label, fontsize="small")
-        flat[0].legend(fontsize="x-small")
+        names = flat[0].get_legend_handles_labels()
+        figure.legend(
+            *names, fontsize="small", loc="outside lower center", ncols=min(len(modes), 3 * num_columns)
+        )
         if len(panels) > 1:
             figure.suptitle(str(result.get("title", "")))
         save_figure(figure, folder / f"{prefix}{name}")
