@@ -7,7 +7,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 .PHONY: demo test check format docs results-page bench-pairs bench-scenes bench-loss clean help
 
 help:            ## what can be made
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
 
 demo: $(VENV)/.ready-run  ## stream the demo sequence over a noisy link and reconstruct it live
 	$(BIN)/semcast demo --out runs/demo $(ARGS)
@@ -32,7 +32,7 @@ bench-pairs: $(VENV)/.ready-run  ## measure relative poses on the recordings of 
 	$(BIN)/python -m semcast.evaluation.pair_suite $(DATA) $(ARGS)
 	$(BIN)/python -m semcast.evaluation.results_page
 
-bench-scenes: $(VENV)/.ready-run  ## draw a room, a street and an orbit and measure trajectories on them
+bench-scenes: $(VENV)/.ready-run  ## draw rooms, streets, blocks, orbits and measure trajectories on them (80 minutes of a core)
 	$(BIN)/python -m semcast.evaluation.scene_suite $(ARGS)
 	$(BIN)/python -m semcast.evaluation.results_page
 
