@@ -1,8 +1,8 @@
 """What a bundle adjustment is asked: the newest keyframes, those that hold them, and what they see.
 
-Tried without gain: tracks that are no landmarks yet as further points of an adjustment (paths of drawn streets a
-little better, of a real shelf worse), and a single fixed pose with a distance until the map outgrows the window
-(an orbit better, a drive worse).
+Tried without gain: tracks that are no landmarks yet as further points of an adjustment (drawn streets a
+little better, a real shelf worse), and a single fixed pose with a distance until the map outgrows the
+window (an orbit better, a drive worse).
 """
 
 import numpy as np
