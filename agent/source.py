@@ -241,4 +241,12 @@ def open_source(settings: SourceSettings) -> Source:
         settings.max_frames,
         settings.rate_hz or 10.0,
     )
-    return RecordedSource(sequence, settings)
+    source = RecordedSource(sequence, settings)
+    wanted_hz = settings.rate_hz
+    if wanted_hz is not None and settings.pace == "recorded":
+        recorded_hz = source.rate_hz * settings.stride
+        if abs(recorded_hz - wanted_hz) > 0.01 * wanted_hz:
+            logger.warning(
+                "rate_hz: no effect on %s, whose times are recorded; --pace rate sends at it", source.name
+            )
+    return source

@@ -96,6 +96,17 @@ def test_pacing_follows_the_recording_or_the_rate():
     assert not Pacer(SourceSettings(source="x"), lambda s: True, clock).until_due(0)
 
 
+def test_a_rate_that_recorded_times_overrule_is_said(recording, tmp_path, caplog):
+    for changes in ({}, {"rate_hz": 7.0, "pace": "rate"}):
+        open_source(SourceSettings(source=str(recording), **changes)).close()
+    plain = tmp_path / "plain"
+    shutil.copytree(recording / "images", plain)
+    open_source(SourceSettings(source=str(plain), camera=PINHOLE, rate_hz=7.0, stride=2)).close()
+    assert not caplog.text
+    open_source(SourceSettings(source=str(recording), rate_hz=7.0)).close()
+    assert "rate_hz: no effect on" in caplog.text
+
+
 def test_recorded_pace_takes_the_recorded_time(recording):
     started_s = time.monotonic()
     _, frames = play(SourceSettings(source=str(recording)))
