@@ -28,15 +28,15 @@ format: $(VENV)/.ready-dev  ## rewrite the code in the project's format
 docs: $(VENV)/.ready-dev  ## write docs/commands.md from the command line
 	COLUMNS=100 $(BIN)/python -m semcast.reference
 
-bench-pairs: $(VENV)/.ready-run  ## measure relative poses on the recordings of DATA (make bench-pairs DATA=folder)
+bench-pairs: $(VENV)/.ready-run  ## measure relative poses (DATA=folder with sequences/ and blender/); overwrites results
 	$(BIN)/python -m semcast.evaluation.pair_suite $(DATA) $(ARGS)
 	$(BIN)/python -m semcast.evaluation.results_page
 
-bench-scenes: $(VENV)/.ready-run  ## draw rooms, streets, blocks, orbits and measure trajectories on them (80 minutes of a core)
+bench-scenes: $(VENV)/.ready-run  ## draw rooms, streets, blocks, orbits, measure paths on them (80 minutes of a core); overwrites results
 	$(BIN)/python -m semcast.evaluation.scene_suite $(ARGS)
 	$(BIN)/python -m semcast.evaluation.results_page
 
-bench-loss: $(VENV)/.ready-run  ## train short with terms of the loss switched off (make bench-loss DATA=folder)
+bench-loss: $(VENV)/.ready-run  ## train short with terms of the loss off (DATA=folder with train/ and valid/); overwrites results
 	$(BIN)/python -m semcast.evaluation.loss_ablation $(DATA) $(ARGS)
 	$(BIN)/python -m semcast.evaluation.results_page
 

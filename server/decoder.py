@@ -5,10 +5,12 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from semcast.common.codec import LOST_SLOT_SNR_DB, Codec, Modulation, ReceivedImage
+from semcast.common.codecs import load_codec, named_weights
 from semcast.common.errors import CheckpointError
 from semcast.common.phy.slots import layout_for
 from semcast.common.rate import from_coded
@@ -18,6 +20,30 @@ from semcast.server.receiver import ReceivedFrame
 logger = logging.getLogger(__name__)
 
 CodecLoader = Callable[[str, Modulation], Codec]
+
+
+def codec_loader(
+    codec: str | None, num_threads: int, device: Literal["auto", "cpu", "cuda"]
+) -> tuple[str | None, CodecLoader]:
+    """Return the name of the codec that comes first and what loads it and any other.
+
+    Args:
+        codec: Name or file of weights, which then take the place of the shipped ones; None names none.
+        num_threads: CPU threads of a codec.
+        device: Of a learned one.
+
+    Raises:
+        CheckpointError: The weights are missing or damaged.
+    """
+    first, own = (None, None) if codec is None else named_weights(codec)
+
+    def load(name: str, modulation: Modulation) -> Codec:
+        weights = own if name == first else None
+        return load_codec(
+            name, modulation=modulation, num_threads=num_threads, device=device, weights=weights
+        )
+
+    return first, load
 
 
 @dataclass(frozen=True)

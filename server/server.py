@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from semcast.common.codec import Codec, Modulation
-from semcast.common.codecs import load_codec, named_weights
 from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.keys import camera_key, control_key
@@ -24,7 +23,7 @@ from semcast.common.transport import Session as NetworkSession
 from semcast.common.transport import open_session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.server.decode_ahead import DecodeAhead
-from semcast.server.decoder import DecodedArrival, FrameDecoder
+from semcast.server.decoder import DecodedArrival, FrameDecoder, codec_loader
 from semcast.server.former_run import check_not_foreign, free_folder
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.outbox import Outbox
@@ -77,11 +76,8 @@ class Server:
         self._settings = settings
         self._agent_id = settings.agent_id
         self._metrics = Metrics("server")
-        self._codec: str | None = None
-        self._weights: Path | None = None
-        if settings.codec is not None:
-            self._codec, self._weights = named_weights(settings.codec)
-        self._decoder = FrameDecoder(load if load is not None else self._load_codec)
+        self._codec, installed = codec_loader(settings.codec, settings.threads, settings.device)
+        self._decoder = FrameDecoder(load if load is not None else installed)
         self._session: Session | None = None
         self._viewer: ViewerFeed | None = None
         self._reference: Reference | None = None
@@ -117,15 +113,6 @@ class Server:
             stack.callback(self._ahead.close)
             session.declare_alive(self._agent_id, "server")
             self._resources = stack.pop_all()
-
-    def _load_codec(self, name: str, modulation: Modulation) -> Codec:
-        return load_codec(
-            name,
-            modulation=modulation,
-            num_threads=self._settings.threads,
-            device=self._settings.device,
-            weights=self._weights if name == self._codec else None,
-        )
 
     def _make_ready(self) -> None:
         """Do what takes long, or may fail, before others see that the server is there."""
