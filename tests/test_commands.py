@@ -21,7 +21,7 @@ from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.cli import main, verb_parser
 from semcast.commands.agent import settings_of
-from semcast.commands.doctor import check_packages
+from semcast.commands.doctor import check_packages, check_processor
 from semcast.commands.evaluate import EVALUATIONS
 from semcast.commands.running import read_given, read_settings
 from semcast.common.config import to_toml
@@ -245,3 +245,18 @@ def test_a_recorder_that_met_nobody_says_that_nothing_was_recorded(tmp_path, cap
     assert shown.out == ""
     assert "nothing was recorded" in shown.err
     assert file.read_bytes() == b"an older recording"
+
+
+@pytest.mark.parametrize(
+    ("flags", "verdict", "text"),
+    [
+        ("avx2 avx512_bf16 amx_bf16", "good", "(AMX)"),
+        ("avx2 avx512_bf16", "good", "(AVX512)"),
+        ("avx2", "note", "not in hardware"),
+    ],
+)
+def test_the_doctor_tells_what_makes_bfloat16_fast(monkeypatch, flags, verdict, text):
+    monkeypatch.setattr(Path, "read_text", lambda path, **_: f"flags : {flags}\n")
+    found = {finding.what: finding for finding in check_processor()}["bfloat16"]
+    assert found.verdict == verdict
+    assert text in found.text

@@ -81,8 +81,10 @@ def check_processor() -> Iterator[Finding]:
         flags = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
         return
-    if "amx_bf16" in flags or "avx512_bf16" in flags:
-        yield Finding("bfloat16", "good", "in hardware: the networks run in bf16")
+    if "amx_bf16" in flags:
+        yield Finding("bfloat16", "good", "in hardware (AMX): the networks run in bf16")
+    elif "avx512_bf16" in flags:
+        yield Finding("bfloat16", "good", "in hardware (AVX512): the networks run in bf16")
     else:
         yield Finding(
             "bfloat16",
