@@ -32,7 +32,7 @@ def place_left_out(world: WorldMap, camera: Intrinsics, noise: NoiseModel, resul
     """
     problem = result.problem
     last_id = int(problem.keyframe_ids[-1])
-    if not result.ok or last_id not in world.submap_of:
+    if not result.ok or last_id not in world.submap_of or len(world.landmarks) == 0:
         return 0
     submap = world.submap_of[last_id]
     moved = set(problem.keyframe_ids[~problem.fixed].tolist())

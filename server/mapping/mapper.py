@@ -229,7 +229,9 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
     ):
         if not fixed:
             world.move_keyframe(frame_id, T_world_cam)
-    world.move_landmarks(problem.landmark_ids, result.xyz)
+    # A landmark that was given up and made again while the adjustment ran is one of those that came later.
+    same = ~np.isin(problem.landmark_ids, later)
+    world.move_landmarks(problem.landmark_ids[same], result.xyz[same])
     known = np.asarray(np.isfinite(result.residual_px).all(axis=1))
     size = np.linalg.norm(np.nan_to_num(result.residual_px), axis=1)
     left = _share_left(problem, known)

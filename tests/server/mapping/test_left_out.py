@@ -128,3 +128,10 @@ def test_room_in_an_adjustment_goes_to_new_landmarks_as_to_old_ones():
     share = np.isin(problem_ids[300], young).mean()
     assert len(problem_ids[300]) < len(problem_ids[100_000])
     assert 0.3 < share < 0.7
+
+
+def test_a_map_whose_landmarks_are_all_gone_has_none_to_place(monkeypatch):
+    world, _ = world_with_shaken_keyframes()
+    result, _ = adjusted(world, monkeypatch, 400)
+    world.remove_landmarks(np.ones(len(world.landmarks), bool))
+    assert place_left_out(world, CAMERA, NOISE, result) == 0

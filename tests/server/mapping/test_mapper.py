@@ -173,6 +173,24 @@ def test_what_came_after_the_question_moves_with_the_answer():
     assert np.allclose(transform_points(invert_transform(world.poses[50]), moved), mark)
 
 
+def test_a_landmark_that_was_made_again_since_the_question_keeps_its_new_place():
+    world, _, _ = make_world(5, 100, shake=0.01)
+    add_landmarks(world, CAMERA, NoiseModel(6.0, 0.0), IMAGE, 0.5)
+    result = optimise(build_problem(world, CAMERA, NOISE, 10))
+    again = result.problem.landmark_ids[:1]
+    mask = np.zeros(len(world.landmarks), bool)
+    mask[world.landmarks.rows(again)] = True
+    world.remove_landmarks(mask)
+    last = world.keyframes[-1]
+    world.add_keyframe(Keyframe(**{**vars(last), "frame_id": 50}))
+    xyz = np.array([[1.0, 2, 33]])
+    world.add_landmarks(again, xyz, np.zeros((1, 3), np.uint8), np.ones(1), 0, 50)
+    in_last = transform_points(invert_transform(world.poses[40]), xyz)
+    apply_result(world, result, OnlineNoise("off", 0.5, 0.0, True))
+    moved = world.landmarks.xyz[world.landmarks.rows(again)]
+    np.testing.assert_allclose(transform_points(invert_transform(world.poses[40]), moved), in_last, atol=1e-9)
+
+
 def test_outliers_of_an_adjustment_are_dropped():
     world, _, _ = make_world(6, 100)
     add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)
