@@ -201,6 +201,7 @@ def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, 
         TransportError: Its port is taken, where it is the hub.
     """
     metrics = Metrics(ROLE)
+    Link(settings.link, settings.seed)  # a trace that can't be read is told before any wait
     session = open_session(settings.network, stop)
     if session is None:
         return metrics.summary()

@@ -17,7 +17,7 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.codecs import load_codec
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.keys import agent_of
-from semcast.common.messages import CameraInfo, SymbolFrame
+from semcast.common.messages import SymbolFrame
 from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.rate import belongs_to
@@ -29,6 +29,7 @@ from semcast.server.decoder import DecodedArrival, FrameDecoder
 from semcast.server.former_run import check_not_foreign
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.receiver import ReceivedFrame
+from semcast.server.recorded_streams import RecordedStream, choose_stream
 from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Arrival, Outcome, Session, StreamIdentity
 from semcast.server.settings import ServerSettings, ViewSettings
@@ -57,6 +58,13 @@ class ReplaySettings:
         default=ChannelSettings(), metadata={"help": "the channel for transmitted symbols"}
     )
     seed: int = field(default=0, metadata={"help": "seed of the channel"})
+    stream: int | None = field(
+        default=None,
+        metadata={
+            "help": "which start of an agent, counted from 1; semcast info lists them (default the last one "
+            "that has frames)"
+        },
+    )
     out: Path | None = field(default=None, metadata={"help": "folder for trajectory, map, summary"})
     save_images: Literal["none", "keyframes", "all"] = field(
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
@@ -112,7 +120,7 @@ def replay(
     stop: threading.Event | None = None,
     on_frame: Callable[[int], None] | None = None,
 ) -> dict[str, Any]:
-    """Replay the newest stream of a recording.
+    """Replay one stream of a recording: the one asked for, else the last that has frames.
 
     Args:
         settings: What and how.
@@ -127,7 +135,8 @@ def replay(
         CheckpointError: The recorded stream was encoded with other weights than those installed.
     """
     reader = RecordingReader(settings.file)
-    agent_id, camera = _newest_camera(reader)
+    stream = choose_stream(reader, settings.stream, settings.source)
+    agent_id, camera = stream.agent_id, stream.camera
     server = ServerSettings(
         agent_id=agent_id,
         mode="replay",
@@ -167,7 +176,7 @@ def replay(
     drops: dict[str, int] = {}
     processed = 0
     try:
-        for arrival in _paced(_arrivals(reader, camera, settings), settings.pace, stop):
+        for arrival in _paced(_arrivals(reader, stream, settings), settings.pace, stop):
             if stop.is_set():
                 break
             decoded = decoder.decode(arrival)
@@ -211,28 +220,19 @@ def _process(session: Session, decoded: DecodedArrival, drops: dict[str, int]) -
     )
 
 
-def _newest_camera(reader: RecordingReader) -> tuple[str, CameraInfo]:
-    newest: tuple[str, CameraInfo] | None = None
-    for message in reader.messages(frozenset({"camera"})):
-        camera = unpack(message.data, CameraInfo)
-        if newest is None or camera.agent_epoch >= newest[1].agent_epoch:
-            newest = agent_of(message.topic), camera
-    if newest is None:
-        raise SourceError(f"{reader.path} says nothing about a camera, so its frames can't be placed")
-    return newest
-
-
 def _arrivals(
-    reader: RecordingReader, camera: CameraInfo, settings: ReplaySettings
+    reader: RecordingReader, stream: RecordedStream, settings: ReplaySettings
 ) -> Iterator[ReceivedFrame]:
     """Yield the frames of the stream in order, each once."""
+    camera = stream.camera
     direction = "rx" if settings.source == "received" else "tx"
     link = Link(settings.link, settings.seed) if direction == "tx" else None
     last_id, first_ns = -1, None
     for message in reader.messages(frozenset({"symbols"})):
         frame = unpack(message.data, SymbolFrame)
         if (
-            frame.direction != direction
+            agent_of(message.topic) != stream.agent_id
+            or frame.direction != direction
             or frame.agent_epoch != camera.agent_epoch
             or frame.frame_id <= last_id
         ):

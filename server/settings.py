@@ -1,5 +1,6 @@
 """Settings of the server process."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -9,6 +10,9 @@ from semcast.common.codec import Modulation
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import HubSettings
 from semcast.server.mapping.settings import ReconstructionSettings
+
+#: Sizes the viewer understands.
+_MEMORY = re.compile(r"\d+(\.\d+)? ?(B|[kMGT]B|[KMGT]iB)|(100|\d{1,2}(\.\d+)?)%")
 
 View = Literal["auto", "native", "web", "file", "none"]
 
@@ -61,6 +65,11 @@ class ViewSettings:
         for name in ("port", "web_port"):
             if not 1 <= getattr(self, name) <= 65535:
                 raise ValueError(f"{name} must be in [1, 65535], got {getattr(self, name)}")
+        if not _MEMORY.fullmatch(self.memory_limit):
+            raise ValueError(
+                f"memory_limit must be a number of MB, GB ... or a percentage up to 100%, such as 1GB, "
+                f"got {self.memory_limit!r}"
+            )
         if not 0.1 <= self.image_rate_hz <= 60:
             raise ValueError(f"image_rate_hz must be in [0.1, 60], got {self.image_rate_hz}")
         if not 10 <= self.jpeg_quality <= 100:

@@ -23,7 +23,7 @@ from semcast.cli import main, verb_parser
 from semcast.commands.agent import settings_of
 from semcast.commands.doctor import check_packages, check_processor
 from semcast.commands.evaluate import EVALUATIONS
-from semcast.commands.running import read_given, read_settings
+from semcast.commands.running import read_given, read_settings, run_until_stopped
 from semcast.common.config import to_toml
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.transport import free_endpoint, open_hub
@@ -260,3 +260,33 @@ def test_the_doctor_tells_what_makes_bfloat16_fast(monkeypatch, flags, verdict, 
     found = {finding.what: finding for finding in check_processor()}["bfloat16"]
     assert found.verdict == verdict
     assert text in found.text
+
+
+def raise_and_wait(number):
+    def work(stop):
+        signal.raise_signal(number)
+        assert stop.wait(5)
+
+    return work
+
+
+@pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 0), ("SIGHUP", 0)])
+def test_a_signal_ends_a_run_in_good_order(number, code):
+    before = signal.getsignal(getattr(signal, number))
+    assert run_until_stopped(raise_and_wait(getattr(signal, number))) == code
+    assert signal.getsignal(getattr(signal, number)) is before
+
+
+def test_a_run_under_nohup_outlives_its_terminal():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    stopped = []
+
+    def work(stop):
+        signal.raise_signal(signal.SIGHUP)
+        stopped.append(stop.wait(0.1))
+
+    try:
+        assert run_until_stopped(work) == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert stopped == [False]

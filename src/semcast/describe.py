@@ -20,6 +20,7 @@ from semcast.common.run_folder import (
     read_run,
 )
 from semcast.common.run_summary import read_summary
+from semcast.server.recorded_streams import RecordedStream, recorded_streams
 
 #: Heading and ``(name, value)`` lines; a name of "" goes on with the line before.
 Section = tuple[str, list[tuple[str, str]]]
@@ -83,6 +84,9 @@ def describe_recording(path: Path) -> list[Section]:
         kind, size = info.kinds.get(topic, "?"), _bytes(info.num_bytes[topic])
         topics.append((topic, f"{count:>6} {kind}, {size}{missed}"))
     sections: list[Section] = [(f"recording {path}", facts), ("messages", topics)]
+    streams = [] if info.num_damaged_chunks else recorded_streams(reader)
+    if streams:
+        sections.append(("streams", [(f"--stream {k}", _stream(s)) for k, s in enumerate(streams, start=1)]))
     for name, values in info.metadata.items():
         if name != RECORDING_METADATA:
             sections.append((name, [(key, _short(value)) for key, value in sorted(values.items())]))
@@ -90,6 +94,15 @@ def describe_recording(path: Path) -> list[Section]:
     if settings:
         sections.append(("settings of the recorder", _flat_toml(settings)))
     return sections
+
+
+def _stream(stream: RecordedStream) -> str:
+    camera = stream.camera
+    began = datetime.datetime.fromtimestamp(camera.agent_epoch * 1e-9, datetime.UTC)
+    return (
+        f"{stream.agent_id}, {camera.codec}, begun {began:%H:%M:%S} UTC: "
+        f"{stream.num_transmitted} frames sent, {stream.num_received} received"
+    )
 
 
 def describe_run(path: Path) -> list[Section]:

@@ -273,6 +273,15 @@ def test_a_channel_without_a_hub_can_be_stopped():
     assert summary == [{"counts": {}, "drops": {}, "stage_ms": {}}]
 
 
+def test_a_trace_that_is_not_there_is_told_before_waiting_for_a_hub(tmp_path):
+    settings = EmulatorSettings(
+        link=ChannelSettings(channel="trace", trace="file", trace_file=tmp_path / "none.csv"),
+        network=NetworkSettings(connect=("tcp/127.0.0.1:9",)),
+    )
+    with pytest.raises(ConfigError, match="none.csv"):
+        run_channel(settings, threading.Event())
+
+
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="seed must be at least 0, got -1"):
         EmulatorSettings(seed=-1)

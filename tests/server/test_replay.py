@@ -1,8 +1,10 @@
 """A recording replays to the same poses every time; through another channel it does not."""
 
 import json
+import re
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,11 +18,15 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codecs import load_codec
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import ConfigError, SourceError
+from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import NetworkSettings
-from semcast.common.recording import recover_file
+from semcast.common.recording import RecordingWriter, recording_metadata, recover_file
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.transport import open_hub
+from semcast.common.wire import pack, unpack
+from semcast.describe import describe_recording
 from semcast.server.record import RecordSettings, kind_of_key, run_record
+from semcast.server.recorded_streams import recorded_streams
 from semcast.server.replay import ReplaySettings, replay
 from semcast.server.settings import ViewSettings
 
@@ -149,6 +155,50 @@ def test_a_cut_recording_is_recovered_and_still_replays(recording, tmp_path):
     assert not info.complete
     assert RecordingReader(tmp_path / "whole.mcap").info().complete
     assert replay(ReplaySettings(file=tmp_path / "whole.mcap"))["frames"]
+
+
+@pytest.fixture
+def with_a_later_start(recording, tmp_path):
+    """The recording, then the camera of another start of the agent, which never sent a frame."""
+    path = tmp_path / "two.mcap"
+    messages = list(RecordingReader(recording).messages())
+    camera = unpack(next(m.data for m in messages if m.kind == "camera"), CameraInfo)
+    later = replace(camera, agent_epoch=camera.agent_epoch + 10**9)
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, recording_metadata("", "0"))
+        for m in messages:
+            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, m.data)
+        writer.add("semcast/agent0/camera", "camera", messages[-1].log_time_ns, 99, pack(later))
+        writer.finish()
+    return path
+
+
+def test_a_start_without_frames_does_not_hide_the_one_before(recording, with_a_later_start, tmp_path):
+    with_frames, without = recorded_streams(RecordingReader(with_a_later_start))
+    assert with_frames.num_received >= FRAMES // 2
+    assert with_frames.num_transmitted >= with_frames.num_received
+    assert (without.num_received, without.num_transmitted) == (0, 0)
+    assert without.camera.agent_epoch == with_frames.camera.agent_epoch + 10**9
+    for name, path in (("alone", recording), ("both", with_a_later_start)):
+        replay(ReplaySettings(file=path, out=tmp_path / name, end_s=0.6))
+    first, second = ((tmp_path / name / "trajectory.tum").read_bytes() for name in ("alone", "both"))
+    assert first == second
+
+
+def test_a_stream_is_chosen_by_its_number(with_a_later_start):
+    with pytest.raises(SourceError, match=r"no received frames of stream 2 \(stream 1: \d+, stream 2: 0\)"):
+        replay(ReplaySettings(file=with_a_later_start, stream=2))
+    with pytest.raises(SourceError, match=r"stream must be in \[1, 2\] for .*two.mcap, got 3"):
+        replay(ReplaySettings(file=with_a_later_start, stream=3))
+    assert replay(ReplaySettings(file=with_a_later_start, stream=1, end_s=0.6))["frames"]
+
+
+def test_info_lists_the_streams_of_a_recording(with_a_later_start):
+    sections = dict(describe_recording(with_a_later_start))
+    (first, told), (second, told_of_second) = sections["streams"]
+    assert (first, second) == ("--stream 1", "--stream 2")
+    assert re.search(r"agent0, jpeg-ldpc, begun .* UTC: \d+ frames sent, \d+ received", told)
+    assert told_of_second.endswith("0 frames sent, 0 received")
 
 
 def test_a_time_range_without_frames_is_one_clear_error(recording):

@@ -74,3 +74,14 @@ def test_the_hub_is_on_loopback_unless_told_otherwise():
 def test_the_last_frames_are_known_by_their_ids(num_frames, last_id, frame_id, is_near):
     camera = SimpleNamespace(num_frames=num_frames, last_frame_id=last_id)
     assert _is_nearly_final(frame_id, camera) is is_near
+
+
+@pytest.mark.parametrize("limit", ["1GB", "1.5 GB", "512MiB", "512kB", "50%", "100%"])
+def test_a_viewer_may_use_so_much_memory(limit):
+    assert ViewSettings(memory_limit=limit).memory_limit == limit
+
+
+@pytest.mark.parametrize("limit", ["abc", "100", "1gb", "512KB", "200%", ""])
+def test_a_viewer_that_would_refuse_its_memory_is_not_begun(limit):
+    with pytest.raises(ValueError, match=f"such as 1GB, got '{limit}'"):
+        ViewSettings(memory_limit=limit)

@@ -36,7 +36,7 @@ def read_given(cls: type, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 class Interrupted:
-    """Tells afterwards whether Ctrl-C (not SIGTERM) ended the run."""
+    """Tells afterwards whether Ctrl-C (not another signal) ended the run."""
 
     def __init__(self) -> None:
         self.by_user = False
@@ -44,7 +44,11 @@ class Interrupted:
 
 @contextmanager
 def stop_on_signals(stop: threading.Event) -> Iterator[Interrupted]:
-    """Set ``stop`` on SIGINT and SIGTERM; a second SIGINT raises ``KeyboardInterrupt`` as usual."""
+    """Set ``stop`` on SIGINT, SIGTERM and SIGHUP; a second SIGINT raises ``KeyboardInterrupt`` as usual.
+
+    A hang-up (the terminal or its connection is gone) ends a run like SIGTERM, with all its results; under
+    nohup, which has it ignored, the run goes on.
+    """
     interrupted = Interrupted()
 
     def handle(number: int, frame: object) -> None:
@@ -54,7 +58,11 @@ def stop_on_signals(stop: threading.Event) -> Iterator[Interrupted]:
             interrupted.by_user = True
         stop.set()
 
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    hang_up = getattr(signal, "SIGHUP", None)  # Windows has none
+    if hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN:
+        numbers.append(hang_up)
+    previous = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield interrupted
     finally:
