@@ -5,15 +5,16 @@
 ``map.ply``           landmarks with colour and confidence
 ``summary.json``      figures of the run
 ``settings.toml``     resolved settings
-``frames.jsonl``      one row per frame: state, SNR, PSNR, inliers, stage times
+``frames.jsonl``      one row per frame: state, part, SNR, PSNR, inliers, stage times
 ``run.rrd``           what the viewer showed
 ``reconstruction.npz`` what ``semcast export`` needs, see ``RunData``
 ``images/``           decoded images, ``<frame id, six digits>.jpg``, of keyframes or of all frames
 ===================== =================================================================================
 
 The server fills ``RunData`` from ``Reconstruction``: intrinsics of decoded (undistorted) images, frame ids,
-times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks()``, and ``observations()``
-as (landmark id, keyframe id, x, y). It calls ``write_run`` once at the end and feeds an ``ImageWriter``.
+times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks()``, ``observations()`` as
+(landmark id, keyframe id, x, y), and the parts of the map that frames and landmarks are in. It calls
+``write_run`` once at the end and feeds an ``ImageWriter``.
 """
 
 import contextlib
@@ -65,11 +66,14 @@ class RunData:
         frame_ids: ``(F,)`` int64, strictly increasing, all posed frames.
         t_source_ns: ``(F,)`` int64, recorded time of each.
         T_world_cam: ``(F, 4, 4)`` float64.
+        frame_submap: ``(F,)`` int64, part of the map each is in at the end; poses of two parts don't fit
+            together, as place and scale of a later part are guessed.
         keyframe_ids: ``(K,)`` int64, a subset of ``frame_ids``.
         landmark_ids: ``(N,)`` int64, unique.
         xyz: ``(N, 3)`` float64 in the world frame, map units.
         rgb: ``(N, 3)`` uint8.
         confidence: ``(N,)`` float32 in [0, 1].
+        landmark_submap: ``(N,)`` int64, part of the map each is in at the end.
         observed_landmark_ids: ``(M,)`` int64, each in ``landmark_ids``.
         observed_keyframe_ids: ``(M,)`` int64, each in ``keyframe_ids``.
         observed_xy: ``(M, 2)`` float32, pixels, integer values at pixel centres.
@@ -79,11 +83,13 @@ class RunData:
     frame_ids: NDArray[np.int64]
     t_source_ns: NDArray[np.int64]
     T_world_cam: NDArray[np.float64]
+    frame_submap: NDArray[np.int64]
     keyframe_ids: NDArray[np.int64]
     landmark_ids: NDArray[np.int64]
     xyz: NDArray[np.float64]
     rgb: NDArray[np.uint8]
     confidence: NDArray[np.float32]
+    landmark_submap: NDArray[np.int64]
     observed_landmark_ids: NDArray[np.int64]
     observed_keyframe_ids: NDArray[np.int64]
     observed_xy: NDArray[np.float32]
@@ -99,8 +105,8 @@ class RunData:
             check_shape(array, pattern, name)
             object.__setattr__(self, name, array)
         for first, *others in (
-            ("frame_ids", "t_source_ns", "T_world_cam"),
-            ("landmark_ids", "xyz", "rgb", "confidence"),
+            ("frame_ids", "t_source_ns", "T_world_cam", "frame_submap"),
+            ("landmark_ids", "xyz", "rgb", "confidence", "landmark_submap"),
             ("observed_landmark_ids", "observed_keyframe_ids", "observed_xy"),
         ):
             for other in others:
@@ -130,16 +136,20 @@ _ARRAYS: dict[str, tuple[Any, str]] = {
     "frame_ids": (np.int64, "F"),
     "t_source_ns": (np.int64, "F"),
     "T_world_cam": (np.float64, "F 4 4"),
+    "frame_submap": (np.int64, "F"),
     "keyframe_ids": (np.int64, "K"),
     "landmark_ids": (np.int64, "N"),
     "xyz": (np.float64, "N 3"),
     "rgb": (np.uint8, "N 3"),
     "confidence": (np.float32, "N"),
+    "landmark_submap": (np.int64, "N"),
     "observed_landmark_ids": (np.int64, "M"),
     "observed_keyframe_ids": (np.int64, "M"),
     "observed_xy": (np.float32, "M 2"),
 }
 assert {*_ARRAYS, "intrinsics"} == {f.name for f in fields(RunData)}
+#: Arrays that older runs lack -> those they go with; such a run counts as one part.
+_ADDED = {"frame_submap": "frame_ids", "landmark_submap": "landmark_ids"}
 
 
 def write_run(folder: Path, data: RunData) -> None:
@@ -179,10 +189,13 @@ def read_run(folder: Path) -> RunData:
         if unpacked > MAX_UNPACKED_BYTES:
             raise SourceError(f"{path} must unpack to at most {MAX_UNPACKED_BYTES} bytes, got {unpacked}")
         with np.load(path, allow_pickle=False) as content:
-            arrays = {name: np.array(content[name]) for name in (_HEADER, *_ARRAYS)}
+            there = [name for name in (_HEADER, *_ARRAYS) if name in content or name not in _ADDED]
+            arrays = {name: np.array(content[name]) for name in there}
         header = json.loads(arrays.pop(_HEADER).tobytes())
         if header.get("format") != FORMAT:
             raise SourceError(f"{path} has format {header.get('format')}, this semcast reads {FORMAT}")
+        for name, owner in _ADDED.items():
+            arrays.setdefault(name, np.zeros(len(arrays[owner]), dtype=np.int64))
         return RunData(intrinsics=Intrinsics.from_dict(header["intrinsics"]), **arrays)
     except SourceError:
         raise

@@ -13,6 +13,7 @@ from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import ate, match_times
 from semcast.evaluation.pipeline import LinkedFrame
 from semcast.server.export.outputs import trajectory_of
+from semcast.server.export.parts import frame_parts
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.reconstruction import Reconstruction
@@ -118,12 +119,14 @@ def reconstruct(
             rows.append(_process(reconstruction, bundle, frame, on_frame))
         poses = reconstruction.final_trajectory()
         num_landmarks = len(reconstruction.landmarks()[0])
+        part_of = frame_parts(reconstruction.snapshot())
+        num_keyframes = len(np.unique(reconstruction.observations()[1]))
     finally:
         reconstruction.close()
     trajectory = trajectory_of(poses, frame_times_ns)
     truth = cut_to_frames(truth, frame_times_ns) if truth is not None else None
     drops = {"lost": num_lost} if num_lost else {}
-    summary = summarise(rows, trajectory, set(poses), truth, len(frame_times_ns), drops)
+    summary = summarise(rows, trajectory, part_of, truth, len(frame_times_ns), drops, num_keyframes)
     return ReconstructedRun(summary, _plain_rows(rows, trajectory, truth), trajectory, num_landmarks)
 
 

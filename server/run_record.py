@@ -16,6 +16,7 @@ from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
 from semcast.common.whole_file import whole_file
 from semcast.server.export.outputs import percentiles, plain
+from semcast.server.export.parts import count_parts
 from semcast.server.mapping.state import DecodedFrame, FrameResult
 
 logger = logging.getLogger(__name__)
@@ -36,8 +37,10 @@ class FrameRow:
         num_tracked: Keypoints followed into the frame.
         num_inliers: Of them, those that agree with the pose.
         reprojection_error_px: Median over inliers.
-        is_keyframe: Whether it became a keyframe.
+        is_keyframe: Whether it became a keyframe at once; a start makes keyframes of earlier frames too.
         map_epoch: Map it belongs to.
+        submap: Part of the map the tracker was in after the frame. Parts that meet become one later:
+            ``RunData.frame_submap`` says where posed frames belong at the end. 0 in rows of older runs.
         snr_set_db: What the channel node says it applies.
         snr_estimated_db: What the receiver estimated from the pilots.
         psnr_db: Of the decoded image, where the original is known.
@@ -61,6 +64,7 @@ class FrameRow:
     confidence_mean: float | None
     age_ms: float
     stage_ms: dict[str, float] = field(default_factory=dict)
+    submap: int = 0
 
     @classmethod
     def of(cls, frame: DecodedFrame, result: FrameResult, **rest: Any) -> "FrameRow":
@@ -76,6 +80,7 @@ class FrameRow:
             reprojection_error_px=result.reprojection_error_px,
             is_keyframe=result.is_keyframe,
             map_epoch=result.map_epoch,
+            submap=result.submap,
             confidence_mean=None if confidence is None else float(confidence.mean()),
             **rest,
         )
@@ -182,21 +187,24 @@ def sent_frame_ids(frame_ids: list[int]) -> list[int]:
 def summarise(
     rows: list[FrameRow],
     trajectory: Trajectory,
-    posed_ids: set[int],
+    part_of: Mapping[int, int],
     truth: Trajectory | None,
     num_frames: int | None,
     drops: Mapping[str, int],
+    num_keyframes: int,
 ) -> dict[str, Any]:
     """Return the figures of a run; None where one has no meaning.
 
     Args:
         rows: One per frame that reached the tracker.
         trajectory: All posed frames after the last correction.
-        posed_ids: Their frame ids.
+        part_of: Frame id of each -> the part of the map it is in.
         truth: Reference poses in metres, or None.
         num_frames: Frames the source had; None takes what frame ids up to the newest one imply.
         drops: Frames that never reached the tracker, by reason.
+        num_keyframes: Keyframes the map rests on.
     """
+    posed_ids = set(part_of)
     frame_ids = sent_frame_ids([row.frame_id for row in rows])
     num_frames = max(num_frames if num_frames is not None else len(frame_ids), len(posed_ids))
     psnr_db = np.array([row.psnr_db for row in rows if row.psnr_db is not None and np.isfinite(row.psnr_db)])
@@ -217,8 +225,9 @@ def summarise(
             "source": num_frames,
             "tracked": len(rows),
             "posed": len(posed_ids),
-            "keyframes": sum(row.is_keyframe for row in rows),
+            "keyframes": num_keyframes,
         },
+        "parts": count_parts(part_of.values()),
         "frame_rate_hz": (len(rows) - 1) / span_s if span_s > 0 else None,
         "drops": dict(drops),
         "states": dict(Counter(row.state for row in rows)),

@@ -37,6 +37,7 @@ from semcast.server.checkpoint import (
     mismatch,
 )
 from semcast.server.export.outputs import trajectory_of, versions, write_json, write_ply
+from semcast.server.export.parts import frame_parts, landmark_parts
 from semcast.server.former_run import set_aside
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleRunner
@@ -107,6 +108,23 @@ class Outcome:
     result: FrameResult
     update: MapUpdate | None
     view: FrameView
+
+
+@dataclass(frozen=True)
+class Results:
+    """What there is of a map.
+
+    Attributes:
+        trajectory: All posed frames.
+        part_of: Frame id of each -> the part of the map it is in now.
+        num_landmarks: Of the map.
+        num_keyframes: Keyframes the map rests on.
+    """
+
+    trajectory: Trajectory
+    part_of: Mapping[int, int]
+    num_landmarks: int
+    num_keyframes: int
 
 
 class Session:
@@ -312,17 +330,18 @@ class Session:
             OSError: A file can't be written.
             SemcastError: The rows of the run can't be read back.
         """
-        poses, trajectory, num_landmarks = self.write_results(folder)
+        results = self.write_results(folder)
         truth = self._reference.truth if self._reference is not None else None
         summary = summarise(
             self._record.rows(),
-            trajectory,
-            set(poses),
+            results.trajectory,
+            results.part_of,
             truth,
             self.identity.num_frames if complete else None,
             drops,
+            results.num_keyframes,
         )
-        summary["num_landmarks"] = num_landmarks
+        summary["num_landmarks"] = results.num_landmarks
         summary["stream"] = {
             "agent_id": self.identity.agent_id,
             "codec": self.identity.codec,
@@ -336,22 +355,51 @@ class Session:
             write_json(folder / SUMMARY_NAME, summary)
         return summary
 
-    def write_results(self, folder: Path | None) -> tuple[Mapping[int, Array], Trajectory, int]:
-        """Write trajectory, map and reconstruction; return poses, trajectory and number of landmarks.
+    def write_results(self, folder: Path | None) -> Results:
+        """Write trajectory, map and reconstruction; return what there is.
 
         Raises:
             OSError: A file can't be written.
         """
         poses = self._reconstruction.final_trajectory()
+        snapshot = self._reconstruction.snapshot()
+        part_of = frame_parts(snapshot)
         trajectory = trajectory_of(poses, self._t_source_ns)
         ids, xyz, rgb, confidence = self._reconstruction.landmarks()
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            (folder / SETTINGS_NAME).write_text(to_toml(self._program), encoding="utf-8")
-            write_tum(folder / TRAJECTORY_NAME, trajectory)
-            write_ply(folder / MAP_NAME, xyz, rgb, confidence)
-            self._write_run(folder, poses, ids, xyz, rgb, confidence)
-        return poses, trajectory, len(ids)
+        landmark_ids, keyframe_ids, xy = self._reconstruction.observations()
+        results = Results(trajectory, part_of, len(ids), len(np.unique(keyframe_ids)))
+        if folder is None:
+            return results
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / SETTINGS_NAME).write_text(to_toml(self._program), encoding="utf-8")
+        write_tum(folder / TRAJECTORY_NAME, trajectory)
+        write_ply(folder / MAP_NAME, xyz, rgb, confidence)
+        timed = sorted(frame_id for frame_id in poses if frame_id in self._t_source_ns)
+        used = np.isin(landmark_ids, ids) & np.isin(keyframe_ids, timed)
+        try:
+            # What exports to other tools are made from.
+            write_run(
+                folder,
+                RunData(
+                    intrinsics=self.identity.camera,
+                    frame_ids=np.array(timed, dtype=np.int64),
+                    t_source_ns=np.array([self._t_source_ns[k] for k in timed], dtype=np.int64),
+                    T_world_cam=np.array([poses[k] for k in timed]).reshape(-1, 4, 4),
+                    frame_submap=np.array([part_of[k] for k in timed], dtype=np.int64),
+                    keyframe_ids=np.unique(keyframe_ids[used]),
+                    landmark_ids=ids,
+                    xyz=xyz,
+                    rgb=rgb,
+                    confidence=confidence,
+                    landmark_submap=landmark_parts(snapshot),
+                    observed_landmark_ids=landmark_ids[used],
+                    observed_keyframe_ids=keyframe_ids[used],
+                    observed_xy=xy[used].astype(np.float32),
+                ),
+            )
+        except (SemcastError, ValueError) as err:
+            logger.warning("the reconstruction can't be written for export: %s", err)
+        return results
 
     def move_records(self, folder: Path) -> None:
         """Move what was written on the way to another folder, after ``close``."""
@@ -360,40 +408,6 @@ class Session:
         for name in (FRAMES_NAME, IMAGES_NAME, CHECKPOINT_NAME):
             with contextlib.suppress(FileNotFoundError):
                 (self._folder / name).rename(folder / name)
-
-    def _write_run(
-        self,
-        folder: Path,
-        poses: Mapping[int, Array],
-        ids: NDArray[np.int64],
-        xyz: Array,
-        rgb: NDArray[np.uint8],
-        confidence: NDArray[np.float32],
-    ) -> None:
-        """Write what exports to other tools are made from; failing to is reported, not fatal."""
-        timed = sorted(frame_id for frame_id in poses if frame_id in self._t_source_ns)
-        landmark_ids, keyframe_ids, xy = self._reconstruction.observations()
-        used = np.isin(landmark_ids, ids) & np.isin(keyframe_ids, timed)
-        try:
-            write_run(
-                folder,
-                RunData(
-                    intrinsics=self.identity.camera,
-                    frame_ids=np.array(timed, dtype=np.int64),
-                    t_source_ns=np.array([self._t_source_ns[k] for k in timed], dtype=np.int64),
-                    T_world_cam=np.array([poses[k] for k in timed]).reshape(-1, 4, 4),
-                    keyframe_ids=np.unique(keyframe_ids[used]),
-                    landmark_ids=ids,
-                    xyz=xyz,
-                    rgb=rgb,
-                    confidence=confidence,
-                    observed_landmark_ids=landmark_ids[used],
-                    observed_keyframe_ids=keyframe_ids[used],
-                    observed_xy=xy[used].astype(np.float32),
-                ),
-            )
-        except (SemcastError, ValueError) as err:
-            logger.warning("the reconstruction can't be written for export: %s", err)
 
     def close(self) -> None:
         """End threads and processes. Idempotent; outputs are written by ``write_outputs`` before."""

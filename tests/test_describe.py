@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from semcast.cli import main
+from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.nets.onnx_encoder import encoder_path
 from semcast.common.recording import RecordingWriter, recording_metadata
+from semcast.common.run_folder import RECONSTRUCTION_NAME, RunData, write_run
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.describe import describe
 from semcast.server.run_record import FrameRow, RunRecord
@@ -102,6 +104,35 @@ def test_a_run_is_described(run_folder):
     text = text_of(run_folder)
     assert "image quality (PSNR): 27.12 dB" in text
     assert "frames with a pose: 50.0%" in text
+
+
+def test_a_run_of_one_part_says_nothing_of_parts_and_one_of_two_says_so(run_folder):
+    values = {
+        "intrinsics": Intrinsics(fx=50, fy=50, cx=31.5, cy=23.5, width=64, height=48),
+        "frame_ids": np.arange(1, 6),
+        "t_source_ns": np.arange(1, 6) * 500_000_000,
+        "T_world_cam": straight_path(5).T_world_cam,
+        "keyframe_ids": [],
+        "landmark_ids": [],
+        "xyz": np.zeros((0, 3)),
+        "rgb": np.zeros((0, 3)),
+        "confidence": [],
+        "landmark_submap": [],
+        "observed_landmark_ids": [],
+        "observed_keyframe_ids": [],
+        "observed_xy": np.zeros((0, 2)),
+    }
+    write_run(run_folder, RunData(**values, frame_submap=np.zeros(5)))
+    assert "parts" not in text_of(run_folder)
+    told = (
+        "parts: 2 (part 0: 3 frames, part 1: 2 frames); the place and scale of all but the first are guessed"
+    )
+    write_run(run_folder, RunData(**values, frame_submap=[0, 0, 0, 1, 1]))
+    assert told in text_of(run_folder)
+    (run_folder / RECONSTRUCTION_NAME).unlink()
+    parts = [{"submap": 0, "num_posed": 3}, {"submap": 1, "num_posed": 2}]
+    (run_folder / "summary.json").write_text(json.dumps({"parts": parts}))
+    assert told in text_of(run_folder)
 
 
 def test_a_folder_of_photos_says_what_is_missing(tmp_path):

@@ -1,5 +1,6 @@
 """Exports of a run folder by format name."""
 
+import logging
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -9,7 +10,10 @@ from semcast.common.run_folder import RunData, read_image_paths, read_run
 from semcast.server.export.colmap import write_colmap
 from semcast.server.export.nerfstudio import write_nerfstudio
 from semcast.server.export.outputs import write_ply
+from semcast.server.export.parts import ALL, LARGEST, count_parts, parts_line, select_part
 from semcast.server.export.poses import write_run_kitti, write_run_tum
+
+logger = logging.getLogger(__name__)
 
 #: Format -> what is written where, for the help.
 FORMATS = {
@@ -22,16 +26,19 @@ FORMATS = {
 }
 
 
-def export_run(folder: Path, format_name: str, out: Path) -> list[Path]:
+def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> list[Path]:
     """Write a run in another tool's format; returns the files a person opens.
+
+    Several parts in one model are told as a warning.
 
     Args:
         folder: A run folder.
         format_name: One of ``FORMATS``.
         out: File or folder, as ``FORMATS`` says.
+        part: Part of the map: its number, ``largest`` or ``all``.
 
     Raises:
-        SourceError: The run can't be read, or lacks what the format needs.
+        SourceError: The run can't be read, has no such part, or lacks what the format needs.
         SemcastError: ``out`` can't be written.
     """
     if format_name not in FORMATS:
@@ -39,6 +46,8 @@ def export_run(folder: Path, format_name: str, out: Path) -> list[Path]:
     data = read_run(folder)
     if len(data.frame_ids) == 0:
         raise SourceError(f"{folder} has no posed frame, so there is nothing to export")
+    parts = parts_line(count_parts(data.frame_submap.tolist()))
+    data = select_part(data, part)
     images = read_image_paths(folder)
     if FORMATS[format_name].startswith("FILE") and out.is_dir():
         raise SourceError(f"{out} is a folder; --format {format_name} writes a file")
@@ -50,8 +59,11 @@ def export_run(folder: Path, format_name: str, out: Path) -> list[Path]:
         "ply": lambda: _write_run_ply(out, data),
         "colmap": lambda: write_colmap(out, data, images),
         "nerfstudio": lambda: write_nerfstudio(out, data, images),
-        "rrd": lambda: _write_run_rrd(out, folder, data, images),
+        # The server's own recording shows all parts.
+        "rrd": lambda: _write_run_rrd(out, folder, data, images, copy=parts is None or part == ALL),
     }
+    if parts is not None and part == ALL:
+        logger.warning("parts of the map: %s; --part %s writes one that fits together", parts, LARGEST)
     try:
         return writers[format_name]()
     except (OSError, shutil.Error) as err:
@@ -64,7 +76,9 @@ def _write_run_ply(path: Path, data: RunData) -> list[Path]:
     return [path]
 
 
-def _write_run_rrd(path: Path, folder: Path, data: RunData, images: dict[int, Path]) -> list[Path]:
+def _write_run_rrd(
+    path: Path, folder: Path, data: RunData, images: dict[int, Path], *, copy: bool
+) -> list[Path]:
     from semcast.server.export.rrd import write_rrd  # loads rerun
 
-    return write_rrd(path, folder, data, images)
+    return write_rrd(path, folder, data, images, copy=copy)

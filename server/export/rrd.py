@@ -16,7 +16,9 @@ JPEG_QUALITY = 80
 CLOSE_DEADLINE_S = 30.0
 
 
-def write_rrd(path: Path, folder: Path, data: RunData, images: Mapping[int, Path]) -> list[Path]:
+def write_rrd(
+    path: Path, folder: Path, data: RunData, images: Mapping[int, Path], *, copy: bool = True
+) -> list[Path]:
     """Copy the run's own recording, plots included; without one, show its poses, kept images and points.
 
     Args:
@@ -24,13 +26,14 @@ def write_rrd(path: Path, folder: Path, data: RunData, images: Mapping[int, Path
         folder: The run folder.
         data: Its reconstruction.
         images: Frame id to file of the kept images.
+        copy: False where ``data`` is not all the run's own recording shows.
 
     Raises:
         SourceError: An image can't be read, or the file can't be finished.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     recorded = folder / VIEWER_NAME
-    if recorded.is_file():
+    if copy and recorded.is_file():
         shutil.copyfile(recorded, path)
         return [path]
     stream = RerunStream(

@@ -20,6 +20,7 @@ from semcast.common.run_folder import (
     read_run,
 )
 from semcast.common.run_summary import read_summary
+from semcast.server.export.parts import count_parts, parts_line
 from semcast.server.recorded_streams import RecordedStream, recorded_streams
 
 #: Heading and ``(name, value)`` lines; a name of "" goes on with the line before.
@@ -131,8 +132,10 @@ def describe_run(path: Path) -> list[Section]:
             facts.append(("dropped frames", ", ".join(f"{n} {why}" for why, n in summary["drops"].items())))
     else:
         facts.append(("state", f"no {SUMMARY_NAME}: the run is going on, or was killed"))
+    parts = summary.get("parts") or []
     if (path / RECONSTRUCTION_NAME).is_file():
         data = read_run(path)
+        parts = count_parts(data.frame_submap.tolist())
         facts.append(
             (
                 "map",
@@ -148,6 +151,8 @@ def describe_run(path: Path) -> list[Section]:
                 f"cx {camera.cx:.1f} cy {camera.cy:.1f} px",
             )
         )
+    if line := parts_line(parts):
+        facts.append(("parts", line))
     names = (TRAJECTORY_NAME, MAP_NAME, VIEWER_NAME, RECONSTRUCTION_NAME, FRAMES_NAME, SUMMARY_NAME)
     files = [(name, _bytes((path / name).stat().st_size)) for name in names if (path / name).is_file()]
     images = read_image_paths(path)

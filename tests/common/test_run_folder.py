@@ -24,11 +24,13 @@ def tiny_run(**changes):
         "frame_ids": [0, 2, 5],
         "t_source_ns": [0, 200_000_000, 500_000_000],
         "T_world_cam": np.stack([np.eye(4)] * 3),
+        "frame_submap": [0, 0, 3],
         "keyframe_ids": [0, 5],
         "landmark_ids": [7, 9],
         "xyz": [[0, 0, 4], [1, 0, 5]],
         "rgb": [[255, 0, 1], [2, 3, 4]],
         "confidence": [0.5, 1.0],
+        "landmark_submap": [0, 3],
         "observed_landmark_ids": [7, 7, 9],
         "observed_keyframe_ids": [0, 5, 5],
         "observed_xy": [[31.5, 23.5], [30, 20], [51.5, 23.5]],
@@ -60,6 +62,8 @@ def test_what_was_written_is_read_back_exactly(tmp_path):
         ({"landmark_ids": [7, 7]}, "unique"),
         ({"observed_landmark_ids": [7, 7, 8]}, "must be in landmark_ids"),
         ({"observed_xy": [[0, 0, 0]] * 3}, r"shape \(M 2\)"),
+        ({"frame_submap": [0, 0]}, "frame_submap must have 3 rows"),
+        ({"landmark_submap": [0]}, "landmark_submap must have 2 rows"),
         ({"T_world_cam": np.full((3, 4, 4), np.nan)}, "finite"),
     ],
 )
@@ -73,6 +77,17 @@ def test_a_missing_run_says_what_to_give(tmp_path):
         read_run(tmp_path / "nowhere")
     with pytest.raises(SourceError, match="holds no reconstruction.npz"):
         read_run(tmp_path)
+
+
+def test_a_run_from_before_parts_were_told_is_one_part(tmp_path):
+    write_run(tmp_path, tiny_run())
+    path = tmp_path / RECONSTRUCTION_NAME
+    with np.load(path) as content:
+        arrays = {name: content[name] for name in content.files if not name.endswith("_submap")}
+    np.savez(path, **arrays)
+    data = read_run(tmp_path)
+    assert data.frame_submap.tolist() == [0, 0, 0]
+    assert data.landmark_submap.tolist() == [0, 0]
 
 
 def test_damaged_files_are_source_errors(tmp_path):

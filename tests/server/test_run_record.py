@@ -66,6 +66,18 @@ def test_damage_in_the_middle_is_an_error_with_its_line(tmp_path):
         read_rows(tmp_path / FILE_NAME)
 
 
+def test_rows_tell_the_part_of_the_map_and_older_rows_count_as_the_first(tmp_path):
+    record = RunRecord(tmp_path)
+    record.add(row(0, submap=2))
+    record.close()
+    path = tmp_path / FILE_NAME
+    assert read_rows(path)[0].submap == 2
+    older = json.loads(path.read_text())
+    del older["submap"]
+    path.write_text(json.dumps(older) + "\n")
+    assert read_rows(path)[0].submap == 0
+
+
 def test_without_a_folder_rows_stay_in_memory():
     record = RunRecord(None)
     record.add(row(3))
@@ -96,8 +108,9 @@ def test_the_summary_has_the_promised_keys_and_values(tmp_path):
     rows = [row(k, posed=k != 3, psnr_db=30.0 + k) for k in range(10)]
     rows.append(row(10, psnr_db=float("inf")))
     kept = [k for k in range(11) if k != 3]
+    part_of = {k: 0 if k < 3 else 2 for k in kept}
     summary = summarise(
-        rows, line_trajectory(kept), set(kept), line_trajectory(range(20)), 20, {"superseded": 2}
+        rows, line_trajectory(kept), part_of, line_trajectory(range(20)), 20, {"superseded": 2}, 7
     )
     assert summary["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
     assert summary["completeness"] == 10 / 20
@@ -106,6 +119,8 @@ def test_the_summary_has_the_promised_keys_and_values(tmp_path):
     assert summary["stage_ms"]["decode"]["p95"] == pytest.approx(29.5)
     assert summary["drops"] == {"superseded": 2}
     assert summary["unposed_frames"] == [(3, 3)]
+    assert summary["parts"] == [{"submap": 0, "num_posed": 3}, {"submap": 2, "num_posed": 7}]
+    assert summary["frames"] == {"source": 20, "tracked": 11, "posed": 10, "keyframes": 7}
     assert summary["frame_rate_hz"] == pytest.approx(10.0)
     assert {"ate_percent", "rpe_trans_percent", "rpe_rot_deg"} <= set(summary)
     write_json(tmp_path / "summary.json", summary)
@@ -113,7 +128,8 @@ def test_the_summary_has_the_promised_keys_and_values(tmp_path):
 
 
 def test_a_run_without_frames_has_a_summary_too():
-    summary = summarise([], line_trajectory([]), set(), None, None, {})
+    summary = summarise([], line_trajectory([]), {}, None, None, {}, 0)
+    assert summary["parts"] == []
     assert summary["completeness"] == 0.0
     assert summary["ate_rmse_m"] is None
     assert summary["psnr_db"] is None

@@ -161,6 +161,37 @@ def test_every_keyframe_of_a_later_part_has_its_image_too(demo, tmp_path):
     assert list(read_image_paths(tmp_path)) == keyframes
 
 
+def test_parts_that_never_met_are_told_apart_in_all_that_is_left(demo, tmp_path):
+    reconstruction = ReconstructionSettings(lost_after_frames=4)
+    run_session(demo, tmp_path, range(20), picture=turned, reconstruction=reconstruction)
+    data = read_run(tmp_path)
+    first = data.frame_ids < 8
+    assert data.frame_submap.tolist() == [0 if early else 1 for early in first]
+    for part in (0, 1):
+        seen = np.isin(data.observed_keyframe_ids, data.frame_ids[data.frame_submap == part])
+        marks = np.isin(data.landmark_ids, data.observed_landmark_ids[seen])
+        assert marks.any()
+        assert set(data.landmark_submap[marks].tolist()) == {part}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    num_first, num_later = int(first.sum()), int((~first).sum())
+    assert min(num_first, num_later) > 3
+    assert summary["parts"] == [
+        {"submap": 0, "num_posed": num_first},
+        {"submap": 1, "num_posed": num_later},
+    ]
+    rows = read_rows(tmp_path / FRAMES_NAME)
+    assert (rows[0].submap, rows[-1].submap) == (0, 1)
+    early = [row.frame_id for row in rows if row.submap == 0 and row.frame_id >= 8]
+    assert set(early) & set(data.frame_ids.tolist()), "a start gave frames a pose that had been lost"
+
+
+def test_the_summary_counts_the_keyframes_of_the_map_also_those_it_began_with(demo, tmp_path):
+    run_session(demo, tmp_path, range(12))
+    num_keyframes = len(read_run(tmp_path).keyframe_ids)
+    assert num_keyframes > sum(row.is_keyframe for row in read_rows(tmp_path / FRAMES_NAME))
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"]["keyframes"] == num_keyframes
+
+
 def test_a_resumed_session_goes_on_with_what_is_there_and_a_new_one_sets_it_aside(demo, tmp_path):
     run_session(demo, tmp_path, range(8), save_images="keyframes", killed=True)
     before = list(read_image_paths(tmp_path))

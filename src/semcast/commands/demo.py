@@ -13,6 +13,7 @@ from semcast.commands.running import add_settings, read_settings, run_until_stop
 from semcast.common.sequence import open_sequence
 from semcast.demo import DemoSettings, default_sequence, run_demo
 from semcast.evaluation.report import provenance, write_json
+from semcast.server.export.parts import parts_line
 
 #: Rows of the final table: key of the summary, name, format.
 _FIGURES = (
@@ -39,6 +40,8 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
         if isinstance(value, Mapping):
             value = value.get("p50", value.get("mean"))
         table.add_row(name, "-" if value is None else form.format(value))
+    if line := parts_line(summary.get("parts") or []):
+        table.add_row("parts of the map", line)
     for reason, count in (summary.get("drops") or {}).items():
         table.add_row(f"frames dropped: {reason}", str(count))
     for stage, figures in (summary.get("stage_ms") or {}).items():
