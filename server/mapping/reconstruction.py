@@ -168,9 +168,10 @@ class Reconstruction:
         if len(tracks) == 0:
             tracks.remember(sight)
             return
-        T_world_last = self._last_pose()
-        if self._state is TrackingState.TRACKING and T_world_guess is not None and T_world_last is not None:
-            guess = expected_positions(self._camera, self._map.world, tracks, T_world_guess, T_world_last)
+        if self._state is TrackingState.TRACKING and T_world_guess is not None:
+            world = self._map.world
+            T_world_seen = [world.pose_of_frame(frame_id) for frame_id in tracks.frame_ids]
+            guess = expected_positions(self._camera, world, tracks, T_world_guess, T_world_seen)
             tracks.follow(sight, guess)
         else:
             ahead = tracks.xy + tracks.velocity * (tracks.missed + 1)[:, None]

@@ -1,5 +1,6 @@
 """Pose of each frame from the landmarks it sees, with a motion prior."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypedDict
 
@@ -69,12 +70,24 @@ class TrackedPose:
 
 
 def expected_positions(
-    camera: Intrinsics, world: WorldMap, tracks: TrackTable, T_world_cam: Array, T_world_last: Array
+    camera: Intrinsics,
+    world: WorldMap,
+    tracks: TrackTable,
+    T_world_cam: Array,
+    T_world_seen: Sequence[Array | None],
 ) -> Array:
     """Where tracks are expected in a frame with a given pose, ``(N, 2)``.
 
-    Landmarks are projected. Other tracks are taken to be as far as the landmark next to them in the last
-    image; without any landmark they go on as they moved.
+    Landmarks are projected. Other tracks are taken to be as far as the landmark that is next to them in the
+    image they were last seen in; where that is not known they go on as they moved.
+
+    Args:
+        camera: Pinhole.
+        world: The map.
+        tracks: As the frames before left them.
+        T_world_cam: ``(4, 4)`` expected pose.
+        T_world_seen: Poses of the frames before, newest first, as far back as a track may have been out of
+            sight; None where a frame has none.
     """
     ahead = tracks.xy + tracks.velocity * (tracks.missed + 1)[:, None]
     row = world.landmarks.rows(tracks.ids)
@@ -82,19 +95,22 @@ def expected_positions(
     if int(known.sum()) < 5:
         return ahead
     T_cam_world = invert_transform(T_world_cam)
-    T_last_world = invert_transform(T_world_last)
-    xyz = world.landmarks.xyz[row[known]]
-    depth_last = xyz @ T_last_world[2, :3] + T_last_world[2, 3]
     expected = ahead.copy()
-    expected[known] = _project(camera, T_cam_world, xyz, ahead[known])
-    unknown = np.flatnonzero(~known)
-    usable = np.flatnonzero(known)[depth_last > 1e-3]
-    depth_usable = depth_last[depth_last > 1e-3]
-    if len(unknown) and len(usable):
-        square = ((tracks.xy[unknown][:, None] - tracks.xy[usable][None]) ** 2).sum(axis=2)
-        depth = depth_usable[square.argmin(axis=1)]
+    around = world.landmarks.xyz[row[known]]
+    expected[known] = _project(camera, T_cam_world, around, ahead[known])
+    for missed, T_world_then in enumerate(T_world_seen):
+        unknown = np.flatnonzero(~known & (tracks.missed == missed))
+        if T_world_then is None or len(unknown) == 0:
+            continue
+        T_then_world = invert_transform(T_world_then)
+        seen = around @ T_then_world[:3, :3].T + T_then_world[:3, 3]
+        seen = seen[seen[:, 2] > 1e-3]
+        if len(seen) == 0:
+            continue
+        square = ((tracks.xy[unknown][:, None] - camera.project(seen)[None]) ** 2).sum(axis=2)
+        depth = seen[square.argmin(axis=1), 2]
         rays = camera.unproject(tracks.xy[unknown]) * depth[:, None]
-        points = rays @ T_world_last[:3, :3].T + T_world_last[:3, 3]
+        points = rays @ T_world_then[:3, :3].T + T_world_then[:3, 3]
         expected[unknown] = _project(camera, T_cam_world, points, ahead[unknown])
     return expected
 

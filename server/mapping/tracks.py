@@ -33,6 +33,11 @@ Ids = NDArray[np.int64]
 LOST_SLOT_DB = -15.0
 #: A track may be out of sight for so many frames, as long as the image is what is missing.
 MAX_COAST = 3
+#: A point nearer than this to rows that did not arrive counts as hidden. What the decoder makes of such rows
+#: fits what is around them: a window may reach into them, and does until only its middle row is left.
+_LOST_MARGIN_PX = 1
+#: Found tracks next to one that was missed, by whose error of the guess it is looked for again.
+_NEIGHBOURS, _MIN_NEIGHBOURS = 5, 8
 #: Share of tracks that must be found again; below, the frame counts as damaged and all tracks coast.
 _MIN_FOUND_SHARE = 0.35
 
@@ -123,6 +128,7 @@ class TrackTable:
         self._rng = np.random.default_rng(seed)
         self._next_id = 0
         self._greys: list[Grey] = []
+        self._frame_ids: list[int] = []
         self._before: dict[str, Array] | None = None
         self.clear()
 
@@ -153,6 +159,11 @@ class TrackTable:
     def visible(self) -> NDArray[np.bool_]:
         """Tracks seen in the newest image."""
         return np.asarray(self.missed == 0)
+
+    @property
+    def frame_ids(self) -> list[int]:
+        """Frames of the images tracks are followed from, newest first: ``missed`` is an index into them."""
+        return self._frame_ids[::-1]
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Forget tracks outside the mask."""
@@ -204,11 +215,14 @@ class TrackTable:
         found = _Found.nothing(self.xy)
         for back in range(min(len(self._greys), MAX_COAST + 1)):
             rows = np.flatnonzero(self.missed == back)
-            if len(rows):
-                points = track_points(
-                    self._greys[-1 - back], sight.grey, self.xy[rows], guess_xy[rows], max_level=max_level
-                )
-                found.take(rows, points)
+            if len(rows) == 0:
+                continue
+            grey = self._greys[-1 - back]
+            found.take(
+                rows, track_points(grey, sight.grey, self.xy[rows], guess_xy[rows], max_level=max_level)
+            )
+            if not sight.usable.all():
+                self._look_again(grey, sight, found, guess_xy, rows)
         hidden = self._hidden(sight, found, guess_xy)
         coasting = hidden & ~found.ok
         if found.ok.sum() < _MIN_FOUND_SHARE * max(1, count - int(hidden.sum())):
@@ -217,6 +231,21 @@ class TrackTable:
             coasting = self._hidden(sight, found, guess_xy) & ~found.ok if jumped else ~found.ok
         self._settle(sight, found, coasting)
         self.remember(sight)
+
+    def _look_again(
+        self, grey: Grey, sight: Sight, found: _Found, guess_xy: Array, rows: NDArray[np.intp]
+    ) -> None:
+        """Look for the missed ones of some tracks where those found next to them say they should be.
+
+        Rows that did not arrive spoil the coarse levels of a pyramid, which make up for a poor guess.
+        """
+        missed, seen = rows[~found.ok[rows]], rows[found.ok[rows]]
+        if len(missed) == 0 or len(seen) < _MIN_NEIGHBOURS:
+            return
+        square = ((self.xy[missed][:, None] - self.xy[seen][None]) ** 2).sum(axis=2)
+        near = seen[np.argsort(square, axis=1, kind="stable")[:, :_NEIGHBOURS]]
+        better = guess_xy[missed] + np.median(found.xy[near] - guess_xy[near], axis=1)
+        found.take(missed, track_points(grey, sight.grey, self.xy[missed], better, max_level=2))
 
     def follow_jump(self, sight: Sight) -> bool:
         """Look again for what ``follow`` just looked for, by descriptors.
@@ -246,7 +275,7 @@ class TrackTable:
 
     def _hidden(self, sight: Sight, found: "_Found", guess_xy: Array) -> NDArray[np.bool_]:
         """Which tracks are, or would be, next to rows that did not arrive; none of them counts as found."""
-        hidden = sight.near_lost(np.where(found.ok[:, None], found.xy, guess_xy), KLT_WINDOW_PX // 2 - 2)
+        hidden = sight.near_lost(np.where(found.ok[:, None], found.xy, guess_xy), _LOST_MARGIN_PX)
         found.ok &= ~hidden
         return hidden
 
@@ -341,7 +370,7 @@ class TrackTable:
         Returns:
             Ids of those that were added.
         """
-        ok = points.ok & ~sight.near_lost(points.xy, KLT_WINDOW_PX // 2 - 2)
+        ok = points.ok & ~sight.near_lost(points.xy, _LOST_MARGIN_PX)
         xy = points.xy[ok]
         taken = np.concatenate([self.xy[self.visible], xy])
         ok[ok] = deduplicate(taken)[len(taken) - len(xy) :]
@@ -376,6 +405,7 @@ class TrackTable:
     def remember(self, sight: Sight) -> None:
         """Keep the image for tracks that are looked for in later ones."""
         self._greys = [*self._greys[-MAX_COAST:], sight.grey]
+        self._frame_ids = [*self._frame_ids[-MAX_COAST:], sight.frame.frame_id]
 
     def refill(self, sight: Sight) -> int:
         """Start new tracks where there are none; the number started.

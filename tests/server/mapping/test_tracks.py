@@ -10,6 +10,7 @@ from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
 from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.tracker import expected_positions
 from semcast.server.mapping.tracks import MAX_COAST, Sight, TrackTable, usable_rows
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -83,6 +84,27 @@ def test_tracks_in_a_lost_slot_coast_and_come_back():
     assert np.isin(band_ids, coasting).all()
     tracks.follow(sight_at(26), tracks.xy + tracks.velocity)
     assert np.isin(band_ids, tracks.ids[tracks.visible]).mean() > 0.6
+
+
+def test_a_point_beside_a_lost_slot_is_seen():
+    tracks = begin()
+    beside = (np.abs(tracks.xy[:, 1] - 80) < 30) & ((tracks.xy[:, 1] < 62) | (tracks.xy[:, 1] > 97))
+    ids, xy = tracks.ids[beside], tracks.xy[beside]
+    nearest = np.minimum(np.abs(xy[:, 1] - 63), np.abs(xy[:, 1] - 96))
+    assert (nearest < 7).sum() >= 5
+    tracks.follow(sight_at(23, lost=(4, 5)), tracks.xy)
+    seen = np.isin(ids, tracks.ids[tracks.visible])
+    assert seen[nearest < 7].mean() > 0.5
+
+
+def test_tracks_of_a_damaged_image_are_looked_for_where_their_neighbours_went():
+    tracks = begin()
+    ids, xy = tracks.ids.copy(), tracks.xy.copy()
+    tracks.follow(sight_at(26, lost=(2, 5, 8)), tracks.xy + np.array([22.0, 0.0]))
+    came = tracks.visible
+    error_px = np.linalg.norm(tracks.xy[came] - (xy[np.searchsorted(ids, tracks.ids[came])] - (6, 0)), axis=1)
+    assert (error_px < 1).sum() > 85  # 76 by the guess alone
+    assert (error_px >= 1).sum() <= 2
 
 
 def test_nothing_coasts_for_ever():
@@ -294,6 +316,24 @@ def test_lost_landmarks_get_their_tracks_back(mapped):
     where = xy[np.searchsorted(ids, tracks.ids[back])] - (10, 0)
     assert np.abs(tracks.xy[back] - where).max() < 1.0
     assert recall(mapped, sight, 30) == 0, "those found have a track now"
+
+
+def test_a_track_without_a_landmark_is_expected_from_where_it_was_last_seen(mapped):
+    world, _, tracks = mapped
+    unknown = np.arange(len(tracks)) % 3 == 0
+    world.remove_landmarks(unknown)
+    where = tracks.xy - (24, 0)
+    # The camera stood at 20, 26 and 34 and is at 44 now; some tracks were last seen from 20.
+    seen_at = np.where(np.arange(len(tracks)) % 2, 20, 34)
+    tracks.missed = np.where(seen_at == 20, 2, 0)
+    tracks.xy = tracks.xy - np.stack([seen_at - 20, np.zeros(len(tracks))], axis=1)
+    before = [pose_at(34), pose_at(26), pose_at(20)]
+    expected = expected_positions(CAMERA, world, tracks, pose_at(44), before)
+    assert np.abs(expected - where).max() < 1e-6
+    stays = unknown & (tracks.missed == 2)
+    expected = expected_positions(CAMERA, world, tracks, pose_at(44), [pose_at(34), pose_at(26), None])
+    assert np.abs(expected - where)[~stays].max() < 1e-6
+    np.testing.assert_array_equal(expected[stays], tracks.xy[stays])  # it did not move when last seen
 
 
 def test_a_wrong_pose_finds_next_to_nothing(mapped):
