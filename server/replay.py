@@ -24,7 +24,7 @@ from semcast.common.rate import belongs_to
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.run_folder import IMAGES_NAME
 from semcast.common.symbol_payload import data_symbols, lost_slots_of, slots_of
-from semcast.common.wire import unpack
+from semcast.common.wire import WireError, unpack
 from semcast.server.decoder import DecodedArrival, FrameDecoder
 from semcast.server.former_run import check_not_foreign
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -229,7 +229,11 @@ def _arrivals(
     link = Link(settings.link, settings.seed) if direction == "tx" else None
     last_id, first_ns = -1, None
     for message in reader.messages(frozenset({"symbols"})):
-        frame = unpack(message.data, SymbolFrame)
+        try:
+            frame = unpack(message.data, SymbolFrame)
+        except WireError as err:
+            logger.warning("a message of %s in %s is left out: %s", message.topic, reader.path, err)
+            continue
         if (
             agent_of(message.topic) != stream.agent_id
             or frame.direction != direction

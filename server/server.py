@@ -361,6 +361,10 @@ class Server:
             self._end_former(former)
         self._former_epochs.discard(identity.agent_epoch)
         self._complete = self._nearly_final = False
+        other_camera = former is not None and former.identity.camera != identity.camera
+        if other_camera and self._reference is not None:
+            self._reference.close()
+            self._reference = None
         if self._settings.reference is not None and self._reference is None:
             self._reference = sequence_reference(
                 self._settings.reference, identity.camera, self._settings.camera
@@ -368,7 +372,7 @@ class Server:
         self._session = self._new_session(identity, goes_on=former is not None)
         self._begun_ns = time.perf_counter_ns()
         self._drops_before = self._metrics.drops if former is not None else {}
-        if former is not None and former.identity.camera != identity.camera:
+        if other_camera:
             self._close_viewer()
         if self._viewer is None:
             self._open_viewer(identity, self._session.resumed)

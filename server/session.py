@@ -315,6 +315,7 @@ class Session:
     def restart_map(self) -> None:
         """Forget the map, as the control request ``reset`` asks."""
         self._reconstruction.reset()
+        self._restored = {}
 
     def write_outputs(
         self, folder: Path | None, drops: Mapping[str, int], *, complete: bool

@@ -147,7 +147,7 @@ class OnlineNoise:
     """The noise model in use, fitted again to the residuals of each bundle adjustment.
 
     Args:
-        mode: ``paper`` keeps what is given; ``off`` and ``constant`` fit sigma0 alone.
+        mode: ``paper`` keeps what is given; ``off`` fits sigma0 alone.
         sigma0_px: Start.
         beta: In mode ``paper``; the others start at 0 and fit.
         fit: False keeps the start in every mode.
@@ -182,7 +182,10 @@ class OnlineNoise:
         return np.array([self.model.sigma0_px, self.model.beta])
 
     def restore(self, state: Array) -> None:
-        """Go on from ``state``."""
+        """Go on from ``state``; what is not fitted stays as it was set."""
+        if not self._fit:
+            return
+        state = state * (1.0, 0.0) if self._mode == "off" else state
         self.model = NoiseModel(float(state[0]), float(state[1]))
         self._recent.clear()
 

@@ -228,8 +228,8 @@ class Initialiser:
         for o, T in zip(chosen, invert_transform(T_cam_world), strict=True):
             T[:3, 3] *= scale
             keyframes.append(_keyframe(o, T))
-        total = [o.confidence[np.isin(o.ids, all_ids[good])] for o in chosen]
-        mean = np.full(int(good.sum()), float(np.mean(np.concatenate(total))))
+        _, point, _, confidence = gather_observations(chosen, all_ids[good])
+        mean = np.bincount(point, weights=confidence) / np.bincount(point)
         return Start(keyframes, all_ids[good], scale * points.xyz[good], mean)
 
     def _decide(self, views: list[Observed], T_world_cam: Array, noise: NoiseModel) -> Side | None:

@@ -291,13 +291,15 @@ class MapBuilder:
         tracks: TrackTable,
         on_moved: Callable[[float], None],
     ) -> bool:
-        """Join the current submap to the one a place was recognised in.
+        """Join the current submap and the one a place was recognised in.
+
+        The older of the two stays where it is, for its place in the world was not guessed.
 
         Args:
-            place: The newest frame's place in the older submap.
+            place: The newest frame's place in the other submap.
             T_world_cam: Its pose in the current one.
             tracks: Its tracks.
-            on_moved: Called with the scale of the similarity after the map has moved.
+            on_moved: Called with the scale of the similarity that moved the current submap, 1 if it stayed.
 
         Returns:
             Whether they were joined.
@@ -306,12 +308,18 @@ class MapBuilder:
         found = submap_similarity(place, self.world, T_world_cam, tracks.ids[visible], tracks.xy[visible])
         if found is None:
             return False
-        scale, T_old_new = found
+        scale, T_place_mine = found
         if self._bundle.busy:
             self._bundle.take(wait=True)
         self._version += 1
-        self.world.transform_submap(self.submap, place.submap, scale, T_old_new)
-        self.enter(place.submap)
+        if self.submap > place.submap:
+            self.world.transform_submap(self.submap, place.submap, scale, T_place_mine)
+        else:
+            T_mine_place = invert_transform(T_place_mine)
+            T_mine_place[:3, 3] /= scale
+            self.world.transform_submap(place.submap, self.submap, 1.0 / scale, T_mine_place)
+            scale = 1.0
+        self.enter(min(self.submap, place.submap))
         self.world.revisits[self.world.keyframes[-1].frame_id] = place.keyframe_id
         on_moved(scale)
         return True

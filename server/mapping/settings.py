@@ -35,7 +35,7 @@ class ReconstructionSettings:
         metadata={"help": "sigma^2 = sigma0^2 exp(beta (1 - c)): beta in paper mode; robust mode fits it"},
     )
     fit_noise: bool = field(
-        default=True, metadata={"help": "fit sigma0 (all modes but paper) and beta (robust) to residuals"}
+        default=True, metadata={"help": "fit sigma0 (all modes but paper) and beta (nor off) to residuals"}
     )
     min_parallax_deg: float = field(
         default=1.0, metadata={"help": "angle between rays from which a point is triangulated"}

@@ -19,7 +19,7 @@ class Landmarks:
         ids: ``(N,)`` int64, ascending.
         xyz: ``(N, 3)`` world frame.
         rgb: ``(N, 3)`` uint8.
-        confidence: ``(N,)`` float32 in [0, 1], mean over the observations so far.
+        confidence: ``(N,)`` float32 in [0, 1], mean over the observations it was made from.
         submap: ``(N,)`` int64.
         born: ``(N,)`` int64, frame id of the keyframe that made it.
         last_seen: ``(N,)`` int64, frame id of the last frame it was seen in.

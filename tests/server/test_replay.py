@@ -185,6 +185,24 @@ def test_a_start_without_frames_does_not_hide_the_one_before(recording, with_a_l
     assert first == second
 
 
+def test_an_unreadable_message_costs_its_frame_alone(recording, tmp_path, caplog):
+    path = tmp_path / "damaged.mcap"
+    damaged = 0
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, recording_metadata("", "0"))
+        for m in RecordingReader(recording).messages():
+            is_hit = m.topic.endswith("rx/symbols") and m.sequence == 2
+            damaged += is_hit
+            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, m.data[:-9] if is_hit else m.data)
+        writer.finish()
+    assert damaged == 1
+    frames = [[], []]
+    for seen, file in zip(frames, (recording, path), strict=True):
+        replay(ReplaySettings(file=file), None, seen.append)
+    assert len(set(frames[0]) - set(frames[1])) == 1
+    assert "a message of semcast/agent0/rx/symbols" in caplog.text
+
+
 def test_a_stream_is_chosen_by_its_number(with_a_later_start):
     with pytest.raises(SourceError, match=r"no received frames of stream 2 \(stream 1: \d+, stream 2: 0\)"):
         replay(ReplaySettings(file=with_a_later_start, stream=2))

@@ -1,16 +1,20 @@
 """What a server refuses before it begins, and what it takes for the end of a stream."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from semcast.common.errors import CheckpointError, ConfigError, SourceError
+from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import HubSettings
+from semcast.common.sequence import open_sequence
 from semcast.common.transport import open_hub
 from semcast.server.server import Server, _is_nearly_final
 from semcast.server.settings import ServerSettings, ViewSettings
 
 AGENT = "cam0"
+DEMO = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
 
 
 @pytest.fixture
@@ -74,6 +78,37 @@ def test_the_hub_is_on_loopback_unless_told_otherwise():
 def test_the_last_frames_are_known_by_their_ids(num_frames, last_id, frame_id, is_near):
     camera = SimpleNamespace(num_frames=num_frames, last_frame_id=last_id)
     assert _is_nearly_final(frame_id, camera) is is_near
+
+
+def test_the_reference_follows_the_camera_of_a_restarted_agent(session):
+    sequences = [open_sequence(DEMO, resize=resize) for resize in (0.5, 0.25)]
+    server = Server(
+        ServerSettings(agent_id=AGENT, reference=DEMO, bundle="inline", view=ViewSettings(view="none")),
+        session,
+    )
+    try:
+        for epoch, sequence in enumerate(sequences, start=1):
+            camera = sequence.intrinsics
+            info = CameraInfo(
+                agent_id=AGENT,
+                agent_epoch=epoch,
+                fx=camera.fx,
+                fy=camera.fy,
+                cx=camera.cx,
+                cy=camera.cy,
+                image_wh=sequence.size_wh,
+                nominal_rate_hz=10.0,
+                codec="jpeg-ldpc",
+                digest="",
+                modulation="16qam",
+                source_name="demo",
+                num_frames=24,
+                lossless=False,
+            )
+            server._begin(info)
+            assert server._reference.psnr_db(3, sequence.image(3)).result(20) == 100.0
+    finally:
+        server.close()
 
 
 @pytest.mark.parametrize("limit", ["1GB", "1.5 GB", "512MiB", "512kB", "50%", "100%"])

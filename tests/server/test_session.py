@@ -207,6 +207,26 @@ def test_a_resumed_session_goes_on_with_what_is_there_and_a_new_one_sets_it_asid
     assert (tmp_path / "previous-1" / "trajectory.tum").read_bytes() == trajectory
 
 
+def test_a_reset_after_a_resume_shows_nothing_of_the_map_before(demo, tmp_path):
+    run_session(demo, tmp_path, range(8), killed=True)
+    identity = StreamIdentity(
+        agent_id="a", agent_epoch=5, codec="x", digest="", camera=demo.intrinsics, num_frames=None
+    )
+    shown = []
+    for is_reset in (False, True):
+        session = Session(ServerSettings(bundle="inline", out=tmp_path), identity, tmp_path, None)
+        assert session.resumed
+        if is_reset:
+            session.restart_map()
+        now_ns = time.perf_counter_ns()
+        frame = DecodedFrame(8, int(demo.times_ns[8]), demo.image(8), None)
+        outcome = session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}))
+        shown.append(len(outcome.view.backfilled))
+        session.close()
+    assert shown[0] >= 5
+    assert shown[1] == 0
+
+
 def test_the_records_hold_the_settings_of_the_program(demo, tmp_path):
     program = ReplaySettings(file=Path("run.mcap"), pace=2.0)
     run_session(demo, tmp_path, range(3), program=program)

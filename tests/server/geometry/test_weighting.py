@@ -126,6 +126,17 @@ def test_what_each_mode_fits(mode, moves_sigma, moves_beta):
     assert again.model == noise.model
 
 
+def test_what_is_not_fitted_is_as_set_after_a_restart_too():
+    state = OnlineNoise("robust", 0.3, 7.0, False).state()
+    for mode, fit in (("paper", True), ("robust", False)):
+        noise = OnlineNoise(mode, 2.0, 3.0, fit)
+        noise.restore(state)
+        assert noise.model == NoiseModel(2.0, 3.0)
+    noise = OnlineNoise("off", 2.0, 3.0, True)
+    noise.restore(state)
+    assert noise.model == NoiseModel(0.3, 0.0)
+
+
 def test_fit_can_be_switched_off():
     noise = OnlineNoise("robust", 0.7, 2.0, False)
     noise.add(np.linspace(0, 1, 500), np.linspace(5, 0, 500))

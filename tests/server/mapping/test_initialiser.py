@@ -53,6 +53,16 @@ def test_a_map_begins_from_three_views_with_the_true_motion():
     assert np.isclose(np.median(start.xyz[:, 2]), 1.0)
 
 
+def test_a_landmark_of_a_start_has_the_mean_confidence_of_its_observations():
+    rng = np.random.default_rng(5)
+    frames = [replace(f, confidence=rng.uniform(0.0, 1.0, len(f.ids))) for f in ride(6)[0]]
+    _, start = begin(frames)
+    for number, landmark in enumerate(start.ids[:20]):
+        seen = [k.confidence[k.ids == landmark] for k in start.keyframes]
+        assert np.isclose(start.confidence[number], np.mean(np.concatenate(seen)))
+    assert start.confidence.std() > 0.1
+
+
 def test_no_relative_pose_is_looked_for_before_there_is_a_third_view(monkeypatch):
     sizes = []
 

@@ -262,6 +262,35 @@ def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog):
     assert ate_percent(trajectory, truth) < 1.0
 
 
+def test_a_join_leaves_the_older_part_where_it_is(caplog):
+    # Back from a second part the camera is recognised in the first one, and comes into sight of the second.
+    def at(x, k):
+        turn = exp_so3((0.0, 0.004 * np.sin(k / 5), 0.0))
+        return make_transform(turn, (x, 0.05 * np.sin(k / 4), 0.02 * np.sin(k / 7)))
+
+    path = [at(0.08 * k, k) for k in range(25)] + [None] * 3 + [at(13.0 + 0.1 * k, k) for k in range(40)]
+    path += [None] * 2 + [at(1.0 + 0.12 * k, k) for k in range(130)]
+    blank = np.full((*CAMERA.shape_hw, 3), 90, np.uint8)
+    reconstruction = make(lost_after_frames=3)
+    before, submaps = None, []
+    with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
+        for k, T in enumerate(path):
+            result = reconstruction.process(frame_of(k, blank if T is None else render(T)))
+            if "submaps are joined" in caplog.text:
+                break
+            submaps.append(result.submap)
+            before = reconstruction.final_trajectory()
+    assert "submaps are joined" in caplog.text
+    assert 1 in submaps
+    assert submaps[-1] == 0
+    after = reconstruction.final_trajectory()
+    np.testing.assert_allclose(after[0], before[0], atol=1e-9)
+    np.testing.assert_allclose(after[20], before[20], atol=0.02)
+    assert {reconstruction._map.world.submap_of[k.frame_id] for k in reconstruction._map.world.keyframes} == {
+        0
+    }
+
+
 def turning_away():
     """Sideways, then a turn on the spot until all landmarks are out of view, then sideways again."""
     poses = [make_transform(np.eye(3), (0.12 * k, 0.02 * np.sin(k), 0.0)) for k in range(10)]
