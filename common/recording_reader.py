@@ -198,15 +198,13 @@ class RecordingScan:
                 raise SourceError(
                     f"{self._name} is damaged: a checksum does not match; 'semcast recover' keeps the rest"
                 )
+            # Topics are defined where they first occur. Without them later, sound chunks say nothing.
+            for opcode, record in _records_in(inner):
+                if opcode in (_SCHEMA, _CHANNEL):
+                    yield from self._record(opcode, record)
             return
-        place = 0
-        while place + _FRAME.size <= len(inner):
-            opcode, record_size = _FRAME.unpack_from(inner, place)
-            place += _FRAME.size
-            if place + record_size > len(inner):
-                break
-            yield from self._record(opcode, inner[place : place + record_size])
-            place += record_size
+        for opcode, record in _records_in(inner):
+            yield from self._record(opcode, record)
         if not whole:
             raise _CutError
 
@@ -240,6 +238,18 @@ class RecordingScan:
             if not self._strict:
                 return
             raise SourceError(f"{self._name} is damaged: a record of type {opcode} is too short") from err
+
+
+def _records_in(chunk: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """Yield opcode and content of the whole records of a chunk."""
+    place = 0
+    while place + _FRAME.size <= len(chunk):
+        opcode, size = _FRAME.unpack_from(chunk, place)
+        place += _FRAME.size
+        if place + size > len(chunk):
+            return
+        yield opcode, chunk[place : place + size]
+        place += size
 
 
 class RecordingReader:
