@@ -266,9 +266,23 @@ class WorldMap:
             return False
         old, young = self.keyframes[:-recent], self.keyframes[-recent:]
         self.keyframes = old[1::2] + young
-        kept = {k.frame_id for k in self.keyframes}
-        self.revisits = {new: old for new, old in self.revisits.items() if {new, old} <= kept}
+        self._hang_revisits_on_what_is_left()
         return True
+
+    def _hang_revisits_on_what_is_left(self) -> None:
+        """Let keyframes that were thinned out stand in a revisit for the kept one next in time.
+
+        A revisit ties places by how they are now; without it the next loop would part them again.
+        """
+        kept = np.array([k.frame_id for k in self.keyframes])
+        submap = np.array([k.submap for k in self.keyframes])
+
+        def next_to(frame_id: int) -> int | None:
+            near = kept[submap == self.submap_of[frame_id]]
+            return int(near[np.argmin(np.abs(near - frame_id))]) if len(near) else None
+
+        ends = [(next_to(new), next_to(old)) for new, old in self.revisits.items()]
+        self.revisits = {new: old for new, old in ends if new is not None and old is not None and new != old}
 
     def pose_of_frame(self, frame_id: int) -> Array | None:
         """Best current ``T_world_cam`` of a frame, None where it has none."""
@@ -328,6 +342,7 @@ class WorldMap:
             "frames.frame_id": np.array(frames, dtype=np.int64),
             "frames.keyframe_id": np.array([self.frames[k][0] for k in frames], dtype=np.int64),
             "frames.T_keyframe_cam": np.array([self.frames[k][1] for k in frames]).reshape(-1, 4, 4),
+            "revisits": np.array(list(self.revisits.items()), dtype=np.int64).reshape(-1, 2),
         }
 
     def restore(self, arrays: dict[str, NDArray]) -> None:
@@ -371,6 +386,9 @@ class WorldMap:
                     **parts,
                 )
             )
+        there = {k.frame_id for k in self.keyframes}
+        revisits = arrays.get("revisits", np.zeros((0, 2), np.int64))  # older checkpoints have none
+        self.revisits = {new: old for new, old in revisits.tolist() if {new, old} <= there}
         self._changed = set(self.landmarks.ids.tolist())
         self._moved_keyframes = set(self.poses)
 

@@ -168,6 +168,30 @@ def test_the_map_is_bounded():
     assert len(world.trajectory()) == 60
 
 
+def test_revisits_outlive_the_keyframes_that_are_thinned_out():
+    # Two laps of 11 keyframes each: of a pair 11 apart one end always goes.
+    world = WorldMap()
+    for k in range(22):
+        world.add_keyframe(make_keyframe(k, range(4)))
+    world.revisits = {k + 11: k for k in range(11)}
+    assert world.bound(100, 20, 2)
+    kept = {k.frame_id for k in world.keyframes}
+    assert len(world.revisits) >= 5
+    assert all({new, old} <= kept and 9 <= new - old <= 13 for new, old in world.revisits.items())
+
+
+def test_revisits_are_in_a_checkpoint_where_it_has_them():
+    world = make_world()
+    world.revisits = {30: 20, 20: 0}
+    arrays = world.arrays()
+    again = WorldMap()
+    again.restore(arrays)
+    assert again.revisits == world.revisits
+    del arrays["revisits"]
+    again.restore(arrays)
+    assert again.revisits == {}
+
+
 def test_observations_are_those_of_landmarks():
     ids, frames, xy = make_world().observations()
     assert set(ids.tolist()) <= {1, 2, 3, 5, 6}
