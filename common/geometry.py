@@ -139,15 +139,12 @@ def angle_between_deg(a: ArrayLike, b: ArrayLike) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
-def align_umeyama(
-    points_from: ArrayLike, points_to: ArrayLike, with_scale: bool = True
-) -> tuple[float, Array, Array]:
+def align_umeyama(points_from: ArrayLike, points_to: ArrayLike) -> tuple[float, Array, Array]:
     """Least-squares similarity with ``points_to = scale * R @ points_from + t`` (Umeyama 1991).
 
     Args:
         points_from: ``(N, 3)``.
         points_to: ``(N, 3)``, row i belongs to row i of ``points_from``.
-        with_scale: False fixes the scale to 1 (rigid alignment).
 
     Returns:
         ``(scale, R, t)``. Collinear points leave the rotation about their line free; any one is returned.
@@ -166,5 +163,5 @@ def align_umeyama(
     U, D, Vt = np.linalg.svd((y - mean_y).T @ (x - mean_x) / len(x))
     S = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])
     R = U @ np.diag(S) @ Vt
-    scale = float((D * S).sum() / variance_x) if with_scale else 1.0
+    scale = float((D * S).sum() / variance_x)
     return scale, R, mean_y - scale * R @ mean_x

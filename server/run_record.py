@@ -34,7 +34,7 @@ class FrameRow:
         t_source_ns: Recorded time of the frame.
         state: Tracking state after the frame.
         posed: Whether it had a pose at once; frames posed later count in the trajectory.
-        num_tracked: Keypoints followed into the frame.
+        num_tracked: Keypoints in sight: followed into the frame, or begun in it.
         num_inliers: Of them, those that agree with the pose.
         reprojection_error_px: Median over inliers.
         is_keyframe: Whether it became a keyframe at once; a start makes keyframes of earlier frames too.

@@ -160,7 +160,7 @@ class Server:
         self._metrics.error(f"frame {arrival.message.frame_id} dropped: {reason}")
 
     def _answer(self, payload: bytes) -> bytes:
-        """Answer a control request: ``reset`` begins a new map, ``save`` writes all outputs now."""
+        """Answer a control request: ``reset`` begins a new map, ``save`` writes what there is."""
         try:
             request = unpack(payload, ControlRequest)
         except WireError as err:
@@ -237,7 +237,7 @@ class Server:
         return ""
 
     def _save(self, session: Session) -> str:
-        """Write all outputs now; return what went wrong."""
+        """Write checkpoint and results now, as far as they are; return what went wrong."""
         out = self._settings.out
         session.save_checkpoint()
         try:

@@ -15,7 +15,6 @@ from semcast.common.shapes import check_shape
 #: Scale of the min-sum messages; plain min-sum (1.0) loses about half a dB.
 MIN_SUM_SCALE = 0.7
 _SIGN = np.uint32(0x80000000)
-_MAGNITUDE = np.uint32(0x7FFFFFFF)
 #: LLR of a filler bit, which is known to be zero.
 _KNOWN_ZERO = np.float32(1e4)
 

@@ -89,7 +89,6 @@ def refine_pose(
     gate_px: Array,
     *,
     iterations: int = 10,
-    prior_information: Array | None = None,
     spread_px: Array | None = None,
 ) -> PoseEstimate:
     """Minimise weighted reprojection errors under Huber's loss by Gauss-Newton over the pose alone.
@@ -104,8 +103,7 @@ def refine_pose(
         keypoints_xy: ``(N, 2)`` their observations.
         sigma_px: ``(N,)`` standard deviation of each observation per coordinate.
         gate_px: ``(N,)`` reprojection error up to which an observation is an inlier.
-        iterations: Steps at most; the last two without points outside the gate.
-        prior_information: ``(6, 6)`` that pulls towards the start, or None.
+        iterations: Steps at most; from the third on without points three gates off.
         spread_px: ``(N, 2)`` the vectors ``s``, None where all points are certain.
 
     Returns:
@@ -116,7 +114,6 @@ def refine_pose(
     whitener = None if spread_px is None else _whitener(sigma_px, spread_px)
     weight = sigma_px**-2.0
     hessian = np.zeros((6, 6))
-    offset = np.zeros(6)
     for iteration in range(iterations):
         points_cam = points_world @ T[:3, :3].T + T[:3, 3]
         used = points_cam[:, 2] > MIN_DEPTH_MAP
@@ -138,9 +135,6 @@ def refine_pose(
         weighted = (rows * np.repeat(w, 2)[:, None]).T
         hessian = weighted @ rows
         gradient = weighted @ residual.ravel()
-        if prior_information is not None:
-            hessian = hessian + prior_information
-            gradient = gradient - prior_information @ offset
         try:
             step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) / 6.0 * np.eye(6), gradient)
         except np.linalg.LinAlgError:
@@ -148,7 +142,6 @@ def refine_pose(
         if not np.isfinite(step).all():
             return _without_inliers(T_start, len(points_world))
         T = exp_se3(step) @ T
-        offset = offset + step
         if iteration >= 3 and float(np.abs(step).max()) < 1e-6:
             break
     T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])

@@ -199,7 +199,7 @@ class Initialiser:
         first, last = span[0], span[-1]
         T_world = {0: np.eye(4), len(span) - 1: invert_transform(found.T_cam1_cam0)}
         points = self._triangulate([first, last], np.stack([np.eye(4), found.T_cam1_cam0]), ids, noise)
-        good = self._passes(points, noise)
+        good = self._passes(points)
         if int(good.sum()) < MIN_POINTS:
             return None
         between = np.unique(np.linspace(0, len(span) - 1, START_KEYFRAMES).round().astype(int))
@@ -218,7 +218,7 @@ class Initialiser:
         T_cam_world = invert_transform(side.T_world_cam) @ side.T_world_cam[0]
         all_ids = np.unique(np.concatenate([o.ids for o in chosen]))
         points = self._triangulate(chosen, T_cam_world, all_ids, noise)
-        good = self._passes(points, noise)
+        good = self._passes(points)
         if int(good.sum()) < MIN_POINTS:
             return None
         scale = 1.0 / float(np.median(points.xyz[good, 2]))
@@ -260,7 +260,7 @@ class Initialiser:
         sigma = noise.sigma_px(confidence)
         return triangulate(self._camera, T_cam_world, view, point, xy, sigma, len(ids))
 
-    def _passes(self, points: Triangulation, noise: NoiseModel) -> NDArray[np.bool_]:
+    def _passes(self, points: Triangulation) -> NDArray[np.bool_]:
         return (
             points.in_front
             & (points.parallax_deg > 0.5 * self._min_parallax_deg)

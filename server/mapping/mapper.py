@@ -107,8 +107,8 @@ def add_landmarks(
 ) -> int:
     """Triangulate the tracks of the newest keyframe that are no landmarks yet; the number added.
 
-    A point must have its rays more than ``min_parallax_deg`` apart, be in front of all its cameras and
-    within 3 sigma of its observations.
+    A point must have its rays more than ``min_parallax_deg`` apart, be in front of all its cameras and fit
+    its observations within ``MAX_ERROR_SIGMA``.
     """
     newest = world.keyframes[-1]
     wanted = newest.ids[world.landmarks.rows(newest.ids) < 0]

@@ -53,7 +53,7 @@ class ReconstructionSettings:
             ("seed", 0, 2**31 - 1),
             ("max_features", 50, 5000),
             ("window_size", 3, 30),
-            ("max_landmarks", 500, 1_000_000),
+            ("max_landmarks", 500, 300_000),
             ("max_keyframes", 20, 100_000),
             ("sigma0_px", 0.05, 20.0),
             ("beta", 0.0, 8.0),

@@ -48,7 +48,7 @@ class FrameResult:
         t_source_ns: As received.
         state: After the frame.
         T_world_cam: ``(4, 4)``, or None where the frame has no pose (yet).
-        num_tracked: Keypoints followed into the frame.
+        num_tracked: Keypoints in sight: followed into the frame, or begun in it.
         num_inliers: Landmark observations that agree with the pose.
         reprojection_error_px: Median over inliers, or None without a pose.
         covariance: ``(6, 6)`` of the pose in the camera frame, rotation before translation (gtsam's order),

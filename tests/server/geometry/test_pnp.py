@@ -83,22 +83,13 @@ def test_weights_make_the_estimate_better_than_equal_ones():
     assert errors[:, 0].mean() < 0.75 * errors[:, 1].mean()
 
 
-def test_a_prior_holds_what_the_points_do_not_fix():
-    T, points, xy = make_view(3, num=3)
-    start = exp_se3([0.0, 0, 0, 0, 0, 0.05]) @ T
-    stiff = np.diag(np.full(6, 1e12))
-    held = refine(start, points, xy, prior_information=stiff)
-    assert np.abs(held.T_cam_world - start).max() < 1e-4
-
-
 def test_residuals_are_whitened_along_the_spread_alone():
     T, points, xy = make_view(6, num=40)
     spread = np.tile([4.0, 3.0], (40, 1))  # with sigma 1 the standard deviation along (.8, .6) is sqrt(26)
     off = xy + np.array([0.8, 0.6])  # one pixel along it
-    stiff = np.diag(np.full(6, 1e12))
-    found = refine(T, points, off, spread_px=spread, prior_information=stiff)
+    found = refine(T, points, off, spread_px=spread, iterations=0)
     assert np.allclose(found.residual_px, 1.0 / np.sqrt(26.0), atol=1e-4)
-    across = refine(T, points, xy + np.array([-0.6, 0.8]), spread_px=spread, prior_information=stiff)
+    across = refine(T, points, xy + np.array([-0.6, 0.8]), spread_px=spread, iterations=0)
     assert np.allclose(across.residual_px, 1.0, atol=1e-4)
 
 
