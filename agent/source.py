@@ -153,13 +153,17 @@ class RecordedSource:
 
     @property
     def num_frames(self) -> int | None:
-        """Frames of one pass; None when it is repeated for ever."""
-        return len(self._sequence) if self._settings.repeat == "once" else None
+        """Frames of one pass, or as many as were asked for; None when it is repeated for ever."""
+        return len(self._sequence) if self._settings.repeat == "once" else self._settings.max_frames
 
     @property
     def last_frame_id(self) -> int | None:
-        """Of the last frame of the only pass."""
-        return int(self._sequence.frame_ids[-1]) if self._settings.repeat == "once" else None
+        """Of the last frame; None when there is none."""
+        count, ids = self.num_frames, self._sequence.frame_ids
+        if count is None:
+            return None
+        # From the second pass on ids are counted on.
+        return int(ids[count - 1]) if count <= len(ids) else int(ids[-1]) + count - len(ids)
 
     @property
     def rate_hz(self) -> float:
@@ -183,6 +187,7 @@ class RecordedSource:
         pacer = Pacer(self._settings, stop.wait)
         times_ns = self._sequence.times_ns
         last = len(self._sequence) - 1
+        total = self.num_frames
         period_ns = round(self._period_ns())
         frame_id, t_source_ns, previous, bad = -1, 0, -1, 0
         for count, index in enumerate(playback_order(len(self._sequence), self._settings.repeat)):
@@ -192,7 +197,7 @@ class RecordedSource:
                 step_ns = abs(int(times_ns[index] - times_ns[previous])) if abs(index - previous) == 1 else 0
                 frame_id, t_source_ns = frame_id + 1, t_source_ns + (step_ns or period_ns)
             previous = index
-            final = count == last and self._settings.repeat == "once"
+            final = total is not None and count == total - 1
             try:
                 image = self._sequence.image(index)
             except SourceError as err:
@@ -205,6 +210,8 @@ class RecordedSource:
             if not pacer.until_due(t_source_ns):
                 return
             yield SourceFrame(frame_id, t_source_ns, time.monotonic_ns(), image, final)
+            if final:
+                return
 
     def close(self) -> None:
         """Nothing to free."""
@@ -238,7 +245,7 @@ def open_source(settings: SourceSettings) -> Source:
         settings.layout,
         settings.resize,
         settings.stride,
-        settings.max_frames,
+        settings.max_frames if settings.repeat == "once" else None,
         settings.rate_hz or 10.0,
     )
     source = RecordedSource(sequence, settings)

@@ -22,6 +22,8 @@ logger = logging.getLogger(__name__)
 
 _REOPEN_AFTER_S = 1.0
 _OPEN_TIMEOUT_MS = 5000
+#: Stamps of a constant frame rate are off by the rounding of their container.
+_STAMP_ROUNDING_NS = 500_000
 
 
 def public_name(source: str) -> str:
@@ -154,29 +156,56 @@ class VideoSource(_Captured):
         """Frames per second at this pace."""
         return self._settings.paced_hz(self._fps / self._settings.stride)
 
-    def _one_pass(self) -> Iterator[NDArray[np.uint8]]:
-        """Yield what is left in the file."""
+    def _one_pass(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield what is left in the file, each image with its time in ns since the first one.
+
+        Phones and screen recorders vary their frame rate: the file's own stamps count, where they go on.
+        """
         image, self._first = self._first, None
+        count, t_ns, began_ns = 0, -1, 0
         while self._capture is not None:
             if image is None:
                 image = _read(self._capture)
             if image is None:
+                self._warn_if_cut(count)
                 return
-            yield image
+            stamp_ns = round(float(np.nan_to_num(self._capture.get(cv2.CAP_PROP_POS_MSEC))) * 1e6)
+            began_ns = stamp_ns if count == 0 else began_ns
+            nominal_ns = round(count * 1e9 / self._fps)
+            stamp_ns -= began_ns
+            is_nominal = abs(stamp_ns - nominal_ns) < _STAMP_ROUNDING_NS or stamp_ns <= t_ns
+            t_ns = max(t_ns + 1, nominal_ns if is_nominal else stamp_ns)
+            count += 1
+            yield t_ns, image
             image = None
 
-    def _images(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield the frames that are to be sent, over all passes, with a running index."""
+    def _warn_if_cut(self, count: int) -> None:
+        """Containers count frames roughly; a good deal fewer are a sign of damage."""
+        if self._stored_frames is not None and count < min(
+            0.98 * self._stored_frames, self._stored_frames - 3
+        ):
+            logger.warning(
+                "%s: %d of its %d frames could be read; it may be damaged",
+                self.name,
+                count,
+                self._stored_frames,
+            )
+
+    def _images(self) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
+        """Yield the frames that are to be sent, over all passes, with a running index and time in ns."""
         index, sent, most = 0, 0, self._settings.max_frames
+        begun_ns = t_source_ns = 0
         while True:
             before = index
-            for image in self._one_pass():
+            for t_ns, image in self._one_pass():
+                t_source_ns = begun_ns + t_ns
                 if index % self._settings.stride == 0:
                     if most is not None and sent == most:
                         return
                     sent += 1
-                    yield index, image
+                    yield index, t_source_ns, image
                 index += 1
+            begun_ns = t_source_ns + round(1e9 / self._fps)
             if self._settings.repeat != "loop" or self._capture is None or index == before:
                 return
             self._capture.release()
@@ -188,9 +217,8 @@ class VideoSource(_Captured):
         images = self._images()
         ahead = next(images, None)
         while ahead is not None and not stop.is_set():
-            index, image = ahead
+            index, t_source_ns, image = ahead
             ahead = next(images, None)
-            t_source_ns = round(index * 1e9 / self._fps)
             rectified = self._rectify(image)
             if not pacer.until_due(t_source_ns):
                 return

@@ -18,7 +18,29 @@ Array = NDArray[np.float64]
 
 #: Coefficients of OpenCV's models that are known here: none, radial-tangential, with k3, rational.
 _DISTORTION_COUNTS = (0, 4, 5, 8)
-_DISTORTION_KEYS = ("distortion", "distortion_coeffs", "distortion_coefficients")
+_DISTORTION_KEYS = (
+    "distortion",
+    "distortion_coeffs",
+    "distortion_coefficients",
+    "dist_coeffs",
+    "distCoeffs",
+    "dist",
+    "D",
+)
+#: The same one by one, in OpenCV's order.
+_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+#: Keys that may name a lens model, and parts of words that none of a pinhole camera has.
+_MODEL_KEYS = ("distortion_model", "distortion_type", "camera_model", "model", "type")
+_NO_PINHOLE = (
+    "fisheye",
+    "equidist",
+    "kannala",
+    "omni",
+    "double_sphere",
+    "panoram",
+    "equirect",
+    "spheri",
+)
 
 
 def known_distortion(coefficients: Iterable[Any]) -> tuple[float, ...]:
@@ -29,6 +51,41 @@ def known_distortion(coefficients: Iterable[Any]) -> tuple[float, ...]:
     values = tuple(float(value) for value in coefficients)
     fitting = (n for n in _DISTORTION_COUNTS if n <= len(values) and not any(values[n:]))
     return values[: next(fitting, len(values))]
+
+
+def _check_pinhole(values: dict[str, Any]) -> None:
+    for key in _MODEL_KEYS:
+        word = str(values.get(key, "")).lower()
+        if word in ("mei", "ds", "eucm", "fov") or any(part in word for part in _NO_PINHOLE):
+            raise ValueError(f"{key} must be a pinhole camera's (pinhole, radtan, none), got {values[key]!r}")
+    if values.get("is_fisheye"):
+        raise ValueError(f"is_fisheye must be false for a pinhole camera, got {values['is_fisheye']!r}")
+
+
+def _distortion_of(values: dict[str, Any]) -> list[float]:
+    """Return the coefficients; none only where no key speaks of distortion, never for want of reading it."""
+    named = {key.lower(): value for key, value in values.items() if key.lower() in _COEFFICIENTS}
+    if named:
+        return [_number(name, named.get(name, 0.0)) for name in _COEFFICIENTS]
+    for key, value in values.items():
+        is_known = key in _DISTORTION_KEYS
+        is_spoken_of = is_known or key.lower().startswith(("distor", "dist_coef", "distcoef"))
+        if not is_spoken_of or key in _MODEL_KEYS or value is None or value in ([], 0, ""):
+            continue
+        if is_known and isinstance(value, dict):
+            return _distortion_of(value)
+        if not is_known or not isinstance(value, list | tuple):
+            known = ", ".join(_DISTORTION_KEYS)
+            raise ValueError(f"{key} must be a list of numbers named {known}, got {value!r}")
+        flat = value[0] if len(value) == 1 and isinstance(value[0], list) else value  # OpenCV's are 1 x N
+        return [_number(key, number) for number in flat]
+    return []
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{name} must be of numbers, got {value!r}")
+    return float(value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,14 +184,14 @@ class Intrinsics:
     def from_dict(values: dict[str, Any]) -> "Intrinsics":
         """Build from a mapping with fx, fy, cx, cy, width, height and optionally ``distortion``.
 
-        ``distortion_coeffs`` and ``distortion_coefficients`` are read as other names of ``distortion``; other
-        keys are notes and ignored.
+        Distortion may have another of its usual names, or be given as ``k1``, ``k2``, ``p1`` ... one by one.
+        Other keys are notes and ignored, but for those that name a lens which is none of a pinhole camera.
 
         Raises:
-            SourceError: A key is missing or a value is out of range.
+            SourceError: A key is missing, a value is out of range, or the camera is a fisheye or panorama.
         """
         try:
-            distortion = next((values[key] for key in _DISTORTION_KEYS if values.get(key)), ())
+            _check_pinhole(values)
             return Intrinsics(
                 fx=float(values["fx"]),
                 fy=float(values["fy"]),
@@ -142,7 +199,7 @@ class Intrinsics:
                 cy=float(values["cy"]),
                 width=int(values["width"]),
                 height=int(values["height"]),
-                distortion=known_distortion(distortion),
+                distortion=known_distortion(_distortion_of(values)),
             )
         except KeyError as err:
             raise SourceError(f"intrinsics need fx fy cx cy width height, missing {err}") from err

@@ -1,5 +1,8 @@
 """A recorded image sequence with random access: images as the codec gets them, times, camera, true path."""
 
+import logging
+from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -14,6 +17,8 @@ from semcast.common.sequence_layouts import Layout, SequenceFiles, ns_to_seconds
 from semcast.common.sequence_sizes import size_in_header_wh
 from semcast.common.trajectory import Trajectory
 
+logger = logging.getLogger(__name__)
+
 #: Poses further apart than this many frames are not interpolated between.
 _MAX_GAP_FRAMES = 2.0
 #: The first image that can be read tells the size; so many unreadable ones may come before it.
@@ -22,15 +27,47 @@ _MAX_BAD_AT_START = 9
 _OVERSHOOT = 2.0
 
 
-def read_image(path: Path) -> NDArray[np.uint8]:
+def read_image(path: Path, bit_depth: Callable[[], int] = lambda: 16) -> NDArray[np.uint8]:
     """Read an image file as ``(H, W, 3)`` uint8 RGB.
 
     Grey is repeated, 16-bit is cut to 8, transparency is laid on white. Orientation notes of cameras are
     not applied: a calibration belongs to the pixels as stored.
 
+    Args:
+        path: The file.
+        bit_depth: Tells how many bits of a 16-bit file are in use; asked for such files alone.
+
     Raises:
         SourceError: The file is missing or damaged.
     """
+    raw = _read_raw(path)
+    if raw.dtype == np.uint16:
+        raw = (np.minimum(raw, 2 ** bit_depth() - 1) >> bit_depth() - 8).astype(np.uint8)
+    try:
+        return as_rgb(raw)
+    except SourceError as err:
+        raise SourceError(f"{path}: {err}") from err
+
+
+def bit_depth_of(paths: tuple[Path, ...]) -> int:
+    """Tell how many bits of 16-bit images are in use: 8, 10, 12, 14 or 16.
+
+    Machine vision and thermal cameras store 10 to 14 bits as the lower ones of 16.
+
+    Args:
+        paths: Images of one camera; a few are looked at.
+    """
+    brightest = 0
+    for path in {paths[0], paths[len(paths) // 2], paths[-1]}:
+        try:
+            raw = _read_raw(path)
+        except SourceError:
+            continue
+        brightest = max(brightest, int(raw.max()) if raw.dtype == np.uint16 else 0)
+    return next(bits for bits in (8, 10, 12, 14, 16) if brightest < 2**bits or bits == 16)
+
+
+def _read_raw(path: Path) -> NDArray:
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as err:
@@ -38,10 +75,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if raw is None:
         raise SourceError(f"{path} is not a readable image (damaged, or of an unknown format)")
-    try:
-        return as_rgb(raw)
-    except SourceError as err:
-        raise SourceError(f"{path}: {err}") from err
+    return np.asarray(raw)
 
 
 def as_rgb(raw: NDArray) -> NDArray[np.uint8]:
@@ -145,6 +179,7 @@ class Sequence:
         self.name = files.name
         self.frame_ids: NDArray[np.int64] = np.arange(len(files.image_paths), dtype=np.int64)[kept]
         self.times_ns: NDArray[np.int64] = files.times_ns[kept]
+        self._all_paths = files.image_paths
         self._paths = files.image_paths[kept]
         self._stored_wh = size_wh
         self._distortion = camera.distortion if camera is not None else ()
@@ -159,6 +194,16 @@ class Sequence:
 
     def __len__(self) -> int:
         return len(self._paths)
+
+    @cached_property
+    def _bit_depth(self) -> int:
+        """Bits of 16-bit images in use, the same for all of them."""
+        bits = bit_depth_of(self._all_paths)
+        if bits != 16:
+            logger.info(
+                "%s: its 16-bit images are read as %d-bit, by their brightest values", self.name, bits
+            )
+        return bits
 
     @property
     def size_wh(self) -> tuple[int, int]:
@@ -195,7 +240,7 @@ class Sequence:
         """
         if not 0 <= index < len(self._paths):
             raise IndexError(f"frame must be in [0, {len(self._paths) - 1}], got {index}")
-        raw = read_image(self._paths[index])
+        raw = read_image(self._paths[index], lambda: self._bit_depth)
         self._check_size(self._paths[index], (raw.shape[1], raw.shape[0]))
         image = self._rectify(raw)
         if camera is None or (camera.width, camera.height) == self._size_wh:

@@ -63,16 +63,23 @@ def natural_key(name: str) -> list[tuple[int, int | str]]:
     return [(0, int(part)) if k % 2 else (1, part) for k, part in enumerate(parts) if part]
 
 
+#: The year 2255; nanoseconds beyond 2262 are no 64-bit number.
+_MAX_TIME_NS = 9_000_000_000 * 10**9
+
+
 def seconds_to_ns(text: str) -> int:
     """Convert decimal seconds to nanoseconds without passing through a float.
 
     Raises:
-        ValueError: Not a finite number.
+        ValueError: Not a finite number, or too large for seconds since 1970.
     """
     try:
-        return int((Decimal(text) * 1_000_000_000).to_integral_value())
+        time_ns = int((Decimal(text) * 1_000_000_000).to_integral_value())
     except (InvalidOperation, OverflowError, ValueError) as err:
         raise ValueError(f"time must be a number of seconds, got {text!r}") from err
+    if abs(time_ns) > _MAX_TIME_NS:
+        raise ValueError(f"time must be in seconds, got {text} (milliseconds or nanoseconds?)")
+    return time_ns
 
 
 def ns_to_seconds(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -316,6 +323,8 @@ def _read_euroc(path: Path, rate_hz: float) -> SequenceFiles:
         raise SourceError(f"{path} must have mav0/cam0/data.csv and mav0/cam0/data to be a EuRoC sequence")
     try:
         rows = [(int(t), folder / "data" / name) for t, name, *_ in _fields(folder / "data.csv", 2)]
+        if any(abs(t_ns) > _MAX_TIME_NS for t_ns, _ in rows):
+            raise ValueError(f"got up to {max(t_ns for t_ns, _ in rows)}")
     except ValueError as err:
         raise SourceError(f"{folder / 'data.csv'}: times must be whole nanoseconds: {err}") from err
     sensor = folder / "sensor.yaml"

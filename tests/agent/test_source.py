@@ -2,6 +2,7 @@ import shutil
 import threading
 import time
 
+import cv2
 import numpy as np
 import pytest
 
@@ -64,15 +65,24 @@ def test_stride_size_and_length_can_be_chosen(recording):
 
 
 def test_repeated_playing_counts_ids_and_times_on(recording):
-    source, frames = play(fast(recording, max_frames=3, repeat="loop"), most=7)
-    assert [int(f.image[0, 0, 0]) for f in frames] == [0, 20, 40, 0, 20, 40, 0]
-    assert [f.frame_id for f in frames] == list(range(7))
-    assert np.diff([f.t_source_ns for f in frames]).tolist() == [20_000_000] * 6
-    assert source.num_frames is None
-    _, frames = play(fast(recording, max_frames=3, repeat="swing"), most=8)
-    assert [int(f.image[0, 0, 0]) for f in frames] == [0, 20, 40, 20, 0, 20, 40, 20]
-    assert np.diff([f.t_source_ns for f in frames]).tolist() == [20_000_000] * 7
+    source, frames = play(fast(recording, stride=4, repeat="loop"), most=7)
+    assert [int(f.image[0, 0, 0]) for f in frames] == [0, 80, 160, 0, 80, 160, 0]
+    assert [f.frame_id for f in frames] == [0, 4, 8, 9, 10, 11, 12]
+    assert np.diff([f.t_source_ns for f in frames]).tolist() == [80_000_000] * 6
+    assert (source.num_frames, source.last_frame_id) == (None, None)
+    _, frames = play(fast(recording, stride=4, repeat="swing"), most=8)
+    assert [int(f.image[0, 0, 0]) for f in frames] == [0, 80, 160, 80, 0, 80, 160, 80]
+    assert np.diff([f.t_source_ns for f in frames]).tolist() == [80_000_000] * 7
     assert not any(f.final for f in frames)
+
+
+@pytest.mark.parametrize("most", [2, 12, 15])
+def test_repeated_playing_ends_after_the_frames_asked_for(recording, most):
+    for repeat in ("loop", "swing"):
+        source, frames = play(fast(recording, max_frames=most, repeat=repeat))
+        assert len(frames) == source.num_frames == most
+        assert frames[-1].frame_id == source.last_frame_id == most - 1
+        assert [f.final for f in frames] == [False] * (most - 1) + [True]
 
 
 def test_a_swing_over_one_frame_stays_there():
@@ -163,6 +173,57 @@ def test_a_video_can_be_cut_and_repeated(video):
     assert source.num_frames is None
     with pytest.raises(SourceError, match="can't be played backwards"):
         open_source(fast(video, camera=PINHOLE, repeat="swing"))
+
+
+class Stamped:
+    """A capture whose file says when its images were taken."""
+
+    def __init__(self, capture, stamps_ms):
+        self._capture, self._stamps_ms, self._read = capture, stamps_ms, 0
+
+    def read(self):
+        self._read += 1
+        return self._capture.read()
+
+    def get(self, name):
+        return self._stamps_ms[self._read] if name == cv2.CAP_PROP_POS_MSEC else self._capture.get(name)
+
+    def release(self):
+        self._capture.release()
+
+
+@pytest.mark.parametrize(
+    ("stamps_ms", "times_ms"),
+    [
+        ([7, 107, 117, 127, 327, 337, 347, 357, 367, 377], [0, 100, 110, 120, 320, 330, 340, 350, 360, 370]),
+        ([0.0] * 10, [20 * k for k in range(10)]),
+        ([20.0001 * k for k in range(10)], [20 * k for k in range(10)]),
+    ],
+)
+def test_times_of_a_video_are_its_own_where_it_has_some(video, stamps_ms, times_ms):
+    source = open_source(fast(video, camera=PINHOLE))
+    assert source._fps == 50.0
+    source._capture = Stamped(source._capture, stamps_ms)
+    times_ns = [f.t_source_ns for f in source.frames(threading.Event())]
+    source.close()
+    assert times_ns[0] == 0
+    assert times_ns == [1_000_000 * t for t in times_ms[: len(times_ns)]]
+    assert len(times_ns) >= 9
+
+
+def test_a_damaged_video_says_how_much_of_it_can_be_read(tmp_path, caplog):
+    whole, cut = tmp_path / "whole.avi", tmp_path / "cut.avi"
+    writer = cv2.VideoWriter(str(whole), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
+    for seed in range(60):
+        writer.write(np.random.default_rng(seed).integers(0, 256, (48, 64, 3), dtype=np.uint8))
+    writer.release()
+    data = whole.read_bytes()
+    cut.write_bytes(data[: len(data) * 2 // 3])
+    for path, is_damaged in ((whole, False), (cut, True)):
+        caplog.clear()
+        _, frames = play(fast(path, camera=PINHOLE))
+        assert (len(frames) < 60) == is_damaged
+        assert ("of its 60 frames could be read; it may be damaged" in caplog.text) == is_damaged
 
 
 def test_a_video_needs_a_camera_that_fits(video, tmp_path):

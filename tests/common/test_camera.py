@@ -90,3 +90,49 @@ def test_a_longer_distortion_model_that_is_used_is_refused():
 def test_a_byte_order_mark_does_not_matter(tmp_path):
     (tmp_path / "i.json").write_text(json.dumps(CAMERA.to_dict()), encoding="utf-8-sig")
     assert Intrinsics.load(tmp_path / "i.json") == CAMERA
+
+
+PINHOLE = {"fx": 500, "fy": 500, "cx": 320, "cy": 240, "width": 640, "height": 480}
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"distortion": [-0.3, 0.1, 0.01, 0.02]},
+        {"D": [-0.3, 0.1, 0.01, 0.02, 0.0], "distortion_model": "plumb_bob"},
+        {"dist_coeffs": [[-0.3, 0.1, 0.01, 0.02, 0]]},
+        {"k1": -0.3, "k2": 0.1, "p1": 0.01, "p2": 0.02, "camera_model": "OPENCV"},
+        {"distortion": {"k1": -0.3, "k2": 0.1, "p1": 0.01, "p2": 0.02}},
+    ],
+)
+def test_distortion_is_read_under_its_usual_names(lens):
+    assert Intrinsics.from_dict({**PINHOLE, **lens}).distortion == (-0.3, 0.1, 0.01, 0.02)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"distortion_model": "none given: rectified"},
+        {"distortion": None, "camera_model": "a phone of 2021"},
+        {"distortion": [], "distortion_coeffs": 0},
+    ],
+)
+def test_notes_about_a_lens_without_distortion_are_ignored(lens):
+    assert Intrinsics.from_dict({**PINHOLE, **lens}).distortion == ()
+
+
+@pytest.mark.parametrize(
+    ("lens", "message"),
+    [
+        ({"distortion_model": "equidistant", "D": [0.1, 0, 0, 0]}, "distortion_model .* got 'equidistant'"),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1}, "camera_model .* got 'OPENCV_FISHEYE'"),
+        ({"is_fisheye": True}, "is_fisheye must be false"),
+        ({"distortion": "-0.3 0.1 0 0"}, "distortion must be a list of numbers"),
+        ({"distortion_params": [0.1, 0, 0, 0]}, "distortion_params must be a list of numbers named"),
+        ({"dist": [0.1, "x", 0, 0]}, "dist must be of numbers, got 'x'"),
+        ({"k1": None}, "k1 must be of numbers, got None"),
+    ],
+)
+def test_a_lens_that_is_not_understood_is_refused(lens, message):
+    with pytest.raises(SourceError, match=message):
+        Intrinsics.from_dict({**PINHOLE, **lens})

@@ -90,6 +90,26 @@ def test_grey_sixteen_bit_and_transparent_images_become_rgb():
     np.testing.assert_array_equal(as_rgb(bgra), [[[30, 20, 10], [255, 255, 255], [204, 204, 204]]])
 
 
+@pytest.mark.parametrize(("bits", "brightest"), [(8, 250), (10, 1000), (12, 4000), (14, 9000), (16, 60000)])
+def test_images_of_fewer_bits_in_files_of_sixteen_are_as_bright_as_meant(tmp_path, bits, brightest):
+    (tmp_path / "images").mkdir()
+    for k, top in enumerate((brightest, brightest // 3, brightest)):
+        image = np.linspace(0, top, 24 * 32).reshape(24, 32).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), image)
+    sequence = open_sequence(tmp_path)
+    dark = open_sequence(tmp_path, stride=3, max_frames=1)  # bits are those of the whole recording
+    for image, top in ((sequence.image(1), brightest // 3), (dark.image(0), brightest)):
+        assert image.max() == top >> (bits - 8)
+        assert image.shape == (24, 32, 3)
+
+
+@pytest.mark.parametrize("time", ["1403636579763555584", "1.4e12"])
+def test_times_that_are_no_seconds_are_refused(native, time):
+    (native / "times.txt").write_text("".join(f"{time}\n" for _ in range(6)))
+    with pytest.raises(SourceError, match="time must be in seconds, got 1.*milliseconds or nanoseconds"):
+        open_sequence(native)
+
+
 @pytest.mark.parametrize(
     ("values", "expected"),
     [
