@@ -158,7 +158,7 @@ class RecordedSource:
 
     @property
     def last_frame_id(self) -> int | None:
-        """Of the last frame; None when there is none."""
+        """Of the last frame where none is left out; None when there is no last one."""
         count, ids = self.num_frames, self._sequence.frame_ids
         if count is None:
             return None
@@ -182,12 +182,13 @@ class RecordedSource:
         """Yield frames when they are due; unreadable ones are left out.
 
         Raises:
-            SourceError: ``MAX_BAD_IN_A_ROW`` images in a row, or the last one, can't be read.
+            SourceError: ``MAX_BAD_IN_A_ROW`` images in a row, or the last one of the only pass, can't be
+                read.
         """
         pacer = Pacer(self._settings, stop.wait)
         times_ns = self._sequence.times_ns
         last = len(self._sequence) - 1
-        total = self.num_frames
+        once, sent = self._settings.repeat == "once", 0
         period_ns = round(self._period_ns())
         frame_id, t_source_ns, previous, bad = -1, 0, -1, 0
         for count, index in enumerate(playback_order(len(self._sequence), self._settings.repeat)):
@@ -197,16 +198,18 @@ class RecordedSource:
                 step_ns = abs(int(times_ns[index] - times_ns[previous])) if abs(index - previous) == 1 else 0
                 frame_id, t_source_ns = frame_id + 1, t_source_ns + (step_ns or period_ns)
             previous = index
-            final = total is not None and count == total - 1
+            # Repeated, there is always another frame for one that is left out.
+            final = count == last if once else sent + 1 == self._settings.max_frames
             try:
                 image = self._sequence.image(index)
             except SourceError as err:
                 bad += 1
-                if bad >= MAX_BAD_IN_A_ROW or final:
+                if bad >= MAX_BAD_IN_A_ROW or (final and once):
                     raise
                 logger.warning("frame %d is left out: %s", frame_id, err)
                 continue
             bad = 0
+            sent += 1
             if not pacer.until_due(t_source_ns):
                 return
             yield SourceFrame(frame_id, t_source_ns, time.monotonic_ns(), image, final)

@@ -22,8 +22,9 @@ logger = logging.getLogger(__name__)
 
 _REOPEN_AFTER_S = 1.0
 _OPEN_TIMEOUT_MS = 5000
-#: Stamps of a constant frame rate are off by the rounding of their container.
-_STAMP_ROUNDING_NS = 500_000
+#: Stamps of a constant frame rate are off by the rounding of their container: Matroska's to whole ms,
+#: and that of the first frame comes on top.
+_STAMP_ROUNDING_NS = 1_000_000
 
 
 def public_name(source: str) -> str:
@@ -130,6 +131,7 @@ class VideoSource(_Captured):
         self._fps = fps if np.isfinite(fps) and 0.1 <= fps <= 1000 else settings.rate_hz or 30.0
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self._stored_frames = count if count > 0 else None
+        self._is_cut = False
 
     @property
     def name(self) -> str:
@@ -162,7 +164,7 @@ class VideoSource(_Captured):
         Phones and screen recorders vary their frame rate: the file's own stamps count, where they go on.
         """
         image, self._first = self._first, None
-        count, t_ns, began_ns = 0, -1, 0
+        count, t_ns, began_ns, ahead_ns = 0, -1, 0, 0
         while self._capture is not None:
             if image is None:
                 image = _read(self._capture)
@@ -173,23 +175,28 @@ class VideoSource(_Captured):
             began_ns = stamp_ns if count == 0 else began_ns
             nominal_ns = round(count * 1e9 / self._fps)
             stamp_ns -= began_ns
-            is_nominal = abs(stamp_ns - nominal_ns) < _STAMP_ROUNDING_NS or stamp_ns <= t_ns
-            t_ns = max(t_ns + 1, nominal_ns if is_nominal else stamp_ns)
+            if abs(stamp_ns - nominal_ns) <= _STAMP_ROUNDING_NS:
+                ahead_ns = 0
+            elif stamp_ns > t_ns:
+                ahead_ns = stamp_ns - nominal_ns
+            # A frame without a time of its own is a usual period after the one before.
+            t_ns = max(t_ns + 1, nominal_ns + ahead_ns)
             count += 1
             yield t_ns, image
             image = None
 
     def _warn_if_cut(self, count: int) -> None:
-        """Containers count frames roughly; a good deal fewer are a sign of damage."""
-        if self._stored_frames is not None and count < min(
-            0.98 * self._stored_frames, self._stored_frames - 3
-        ):
-            logger.warning(
-                "%s: %d of its %d frames could be read; it may be damaged",
-                self.name,
-                count,
-                self._stored_frames,
-            )
+        """Containers count frames roughly; a good deal fewer are a sign of damage, said once.
+
+        Phones trim by an edit list that hides frames, which are counted all the same.
+        """
+        stored = self._stored_frames
+        if stored is None or self._is_cut or count >= min(0.98 * stored, stored - 3):
+            return
+        self._is_cut = True
+        logger.warning(
+            "%s: %d of its %d frames could be read; it may be damaged or trimmed", self.name, count, stored
+        )
 
     def _images(self) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:
         """Yield the frames that are to be sent, over all passes, with a running index and time in ns."""

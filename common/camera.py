@@ -4,7 +4,8 @@ Pixel centres have integer coordinates: the image spans ``[-0.5, width - 0.5]``.
 """
 
 import json
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,9 @@ _NO_PINHOLE = (
     "equirect",
     "spheri",
 )
+_NO_PINHOLE_WORDS = ("mei", "ds", "eucm", "fov", "kb4", "kb8")
+#: Parts of the words for models whose coefficients are known here.
+_KNOWN_MODELS = ("none", "rad", "plumb", "rational", "brown", "opencv", "pinhole")
 
 
 def known_distortion(coefficients: Iterable[Any]) -> tuple[float, ...]:
@@ -54,32 +58,55 @@ def known_distortion(coefficients: Iterable[Any]) -> tuple[float, ...]:
 
 
 def _check_pinhole(values: dict[str, Any]) -> None:
-    for key in _MODEL_KEYS:
-        word = str(values.get(key, "")).lower()
-        if word in ("mei", "ds", "eucm", "fov") or any(part in word for part in _NO_PINHOLE):
-            raise ValueError(f"{key} must be a pinhole camera's (pinhole, radtan, none), got {values[key]!r}")
-    if values.get("is_fisheye"):
-        raise ValueError(f"is_fisheye must be false for a pinhole camera, got {values['is_fisheye']!r}")
+    for key, value in values.items():
+        word = str(value).lower()
+        is_fisheye = word in _NO_PINHOLE_WORDS or any(part in word for part in _NO_PINHOLE)
+        if key.lower() in _MODEL_KEYS and is_fisheye and not word.startswith("none"):
+            raise ValueError(f"{key} must be a pinhole camera's (pinhole, radtan, none), got {value!r}")
+        if key.lower() in ("is_fisheye", "fisheye") and value:
+            raise ValueError(f"{key} must be false for a pinhole camera, got {value!r}")
 
 
-def _distortion_of(values: dict[str, Any]) -> list[float]:
+def _distortion_of(values: dict[str, Any]) -> tuple[float, ...]:
     """Return the coefficients; none only where no key speaks of distortion, never for want of reading it."""
+    read = {key: known_distortion(numbers) for key, numbers in _distortions_in(values)}
+    found = {key: coefficients for key, coefficients in read.items() if coefficients}
+    if len(set(found.values())) > 1:
+        raise ValueError(f"{' and '.join(found)} must say the same, got {list(found.values())}")
+    for key in ("distortion_model", "distortion_type") if found else ():
+        word = str(values.get(key) or "none").lower()
+        if not any(part in word for part in _KNOWN_MODELS):
+            raise ValueError(f"{key} must be radtan, plumb_bob, rational or none, got {values[key]!r}")
+    return next(iter(found.values()), ())
+
+
+def _distortions_in(values: dict[str, Any]) -> Iterator[tuple[str, list[float]]]:
+    """Yield each key that gives coefficients, with them."""
     named = {key.lower(): value for key, value in values.items() if key.lower() in _COEFFICIENTS}
     if named:
-        return [_number(name, named.get(name, 0.0)) for name in _COEFFICIENTS]
+        numbers = {name: _number(name, value) for name, value in named.items()}
+        # A fisheye has k1 to k4 alone; the rational model has k4 to k6.
+        if numbers.get("k4") and not {"k5", "k6"} <= numbers.keys():
+            raise ValueError(f"k4 must be 0 or come with k5 and k6, got {named['k4']!r} (a fisheye?)")
+        yield "k1", [numbers.get(name, 0.0) for name in _COEFFICIENTS]
     for key, value in values.items():
         is_known = key in _DISTORTION_KEYS
-        is_spoken_of = is_known or key.lower().startswith(("distor", "dist_coef", "distcoef"))
-        if not is_spoken_of or key in _MODEL_KEYS or value is None or value in ([], 0, ""):
+        is_spoken_of = is_known or re.search("(?<!un)distor|dist_?coef|^dist$", key.lower())
+        if not is_spoken_of or key.lower() in _MODEL_KEYS or not value:
+            continue
+        if isinstance(value, str) and value.lower().startswith("none"):
             continue
         if is_known and isinstance(value, dict):
-            return _distortion_of(value)
+            _check_pinhole(value)
+            inner = dict(_distortions_in({"D" if k == "data" else k: v for k, v in value.items()}))
+            if inner:
+                yield key, next(iter(inner.values()))
+                continue
         if not is_known or not isinstance(value, list | tuple):
             known = ", ".join(_DISTORTION_KEYS)
             raise ValueError(f"{key} must be a list of numbers named {known}, got {value!r}")
         flat = value[0] if len(value) == 1 and isinstance(value[0], list) else value  # OpenCV's are 1 x N
-        return [_number(key, number) for number in flat]
-    return []
+        yield key, [_number(key, number) for number in flat]
 
 
 def _number(name: str, value: Any) -> float:
@@ -199,7 +226,7 @@ class Intrinsics:
                 cy=float(values["cy"]),
                 width=int(values["width"]),
                 height=int(values["height"]),
-                distortion=known_distortion(_distortion_of(values)),
+                distortion=_distortion_of(values),
             )
         except KeyError as err:
             raise SourceError(f"intrinsics need fx fy cx cy width height, missing {err}") from err

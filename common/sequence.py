@@ -25,9 +25,13 @@ _MAX_GAP_FRAMES = 2.0
 _MAX_BAD_AT_START = 9
 #: Resampling and sharpening leave pictures of 0..1 or 0..255 with values above, but hardly by this factor.
 _OVERSHOOT = 2.0
+#: Bits of a 16-bit image that cameras use, always the lower ones.
+_BIT_DEPTHS = (8, 10, 12, 14, 16)
+#: So many images, spread over a recording, tell its bit depth: a dark beginning alone would mislead.
+_MAX_DEPTH_IMAGES = 9
 
 
-def read_image(path: Path, bit_depth: Callable[[], int] = lambda: 16) -> NDArray[np.uint8]:
+def read_image(path: Path, bit_depth: Callable[[], int] | None = None) -> NDArray[np.uint8]:
     """Read an image file as ``(H, W, 3)`` uint8 RGB.
 
     Grey is repeated, 16-bit is cut to 8, transparency is laid on white. Orientation notes of cameras are
@@ -35,14 +39,16 @@ def read_image(path: Path, bit_depth: Callable[[], int] = lambda: 16) -> NDArray
 
     Args:
         path: The file.
-        bit_depth: Tells how many bits of a 16-bit file are in use; asked for such files alone.
+        bit_depth: Tells how many bits of a 16-bit file are in use; asked for such files alone. None goes
+            by the brightest value of this one, so that images read one by one may differ in brightness.
 
     Raises:
         SourceError: The file is missing or damaged.
     """
     raw = _read_raw(path)
     if raw.dtype == np.uint16:
-        raw = (np.minimum(raw, 2 ** bit_depth() - 1) >> bit_depth() - 8).astype(np.uint8)
+        bits = bit_depth() if bit_depth is not None else _bits_for(int(raw.max()))
+        raw = (np.minimum(raw, 2**bits - 1) >> (bits - 8)).astype(np.uint8)
     try:
         return as_rgb(raw)
     except SourceError as err:
@@ -58,13 +64,18 @@ def bit_depth_of(paths: tuple[Path, ...]) -> int:
         paths: Images of one camera; a few are looked at.
     """
     brightest = 0
-    for path in {paths[0], paths[len(paths) // 2], paths[-1]}:
+    spread = np.linspace(0, len(paths) - 1, min(len(paths), _MAX_DEPTH_IMAGES)).astype(int)
+    for path in (paths[k] for k in spread):
         try:
             raw = _read_raw(path)
         except SourceError:
             continue
         brightest = max(brightest, int(raw.max()) if raw.dtype == np.uint16 else 0)
-    return next(bits for bits in (8, 10, 12, 14, 16) if brightest < 2**bits or bits == 16)
+    return _bits_for(brightest)
+
+
+def _bits_for(brightest: int) -> int:
+    return next(bits for bits in _BIT_DEPTHS if brightest < 2**bits)
 
 
 def _read_raw(path: Path) -> NDArray:

@@ -64,7 +64,10 @@ def natural_key(name: str) -> list[tuple[int, int | str]]:
 
 
 #: The year 2255; nanoseconds beyond 2262 are no 64-bit number.
-_MAX_TIME_NS = 9_000_000_000 * 10**9
+_MAX_TIME_S = 9_000_000_000
+_MAX_TIME_NS = _MAX_TIME_S * 10**9
+#: Times since 1970 in milliseconds stay below this for as long.
+_MAX_TIME_MS = _MAX_TIME_S * 10**3
 
 
 def seconds_to_ns(text: str) -> int:
@@ -74,12 +77,20 @@ def seconds_to_ns(text: str) -> int:
         ValueError: Not a finite number, or too large for seconds since 1970.
     """
     try:
-        time_ns = int((Decimal(text) * 1_000_000_000).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError) as err:
+        time_s = Decimal(text)
+    except InvalidOperation as err:
         raise ValueError(f"time must be a number of seconds, got {text!r}") from err
-    if abs(time_ns) > _MAX_TIME_NS:
-        raise ValueError(f"time must be in seconds, got {text} (milliseconds or nanoseconds?)")
-    return time_ns
+    if not time_s.is_finite():
+        raise ValueError(f"time must be a number of seconds, got {text!r}")
+    # Not abs(), which overflows at exponents that Decimal itself takes.
+    if time_s.copy_abs() > _MAX_TIME_S:
+        raise ValueError(_not_seconds(text, float(time_s)))
+    return int((time_s * 1_000_000_000).to_integral_value())
+
+
+def _not_seconds(text: str, time_s: float) -> str:
+    unit = "milliseconds" if abs(time_s) <= _MAX_TIME_MS else "micro- or nanoseconds"
+    return f"times must be in seconds, got {text}: looks like {unit}"
 
 
 def ns_to_seconds(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -207,7 +218,11 @@ def _calibration_beside(folder: Path) -> Callable[[int, int], Intrinsics | None]
 
 def _truth_beside(folder: Path) -> Trajectory | None:
     path = folder / "groundtruth.txt"
-    return read_tum(path) if path.is_file() else None
+    truth = read_tum(path) if path.is_file() else None
+    if truth is not None and len(truth) and np.abs(truth.t_s).max() > _MAX_TIME_S:
+        latest = float(np.abs(truth.t_s).max())
+        raise SourceError(f"{path}: {_not_seconds(f'{latest:.0f}', latest)}")
+    return truth
 
 
 def _times_beside(folder: Path, num_images: int, rate_hz: float) -> NDArray[np.int64]:
@@ -323,8 +338,9 @@ def _read_euroc(path: Path, rate_hz: float) -> SequenceFiles:
         raise SourceError(f"{path} must have mav0/cam0/data.csv and mav0/cam0/data to be a EuRoC sequence")
     try:
         rows = [(int(t), folder / "data" / name) for t, name, *_ in _fields(folder / "data.csv", 2)]
-        if any(abs(t_ns) > _MAX_TIME_NS for t_ns, _ in rows):
-            raise ValueError(f"got up to {max(t_ns for t_ns, _ in rows)}")
+        too_large = [t_ns for t_ns, _ in rows if abs(t_ns) > _MAX_TIME_NS]
+        if too_large:
+            raise ValueError(f"must be within {_MAX_TIME_NS}, got {too_large[0]}")
     except ValueError as err:
         raise SourceError(f"{folder / 'data.csv'}: times must be whole nanoseconds: {err}") from err
     sensor = folder / "sensor.yaml"

@@ -146,6 +146,17 @@ def test_a_damaged_image_is_left_out_and_many_end_the_source(recording, tmp_path
         play(fast(folder))
 
 
+@pytest.mark.parametrize("repeat", ["loop", "swing"])
+def test_a_repeated_recording_makes_up_for_damaged_images(recording, tmp_path, repeat):
+    folder = tmp_path / "damaged"
+    shutil.copytree(recording, folder)
+    (folder / "images" / "000011.png").write_bytes(b"broken")
+    source, frames = play(fast(folder, repeat=repeat, max_frames=12))
+    assert [f.frame_id for f in frames] == [*range(11), 12]
+    assert [f.final for f in frames] == [False] * 11 + [True]
+    assert source.num_frames == 12
+
+
 def test_a_damaged_first_image_is_left_out_like_any_other(recording, tmp_path, caplog):
     folder = tmp_path / "damaged"
     shutil.copytree(recording, folder)
@@ -198,6 +209,9 @@ class Stamped:
         ([7, 107, 117, 127, 327, 337, 347, 357, 367, 377], [0, 100, 110, 120, 320, 330, 340, 350, 360, 370]),
         ([0.0] * 10, [20 * k for k in range(10)]),
         ([20.0001 * k for k in range(10)], [20 * k for k in range(10)]),
+        ([0, 20.9, 40, 59.1, 80, 100, 120, 140, 160, 180], [20 * k for k in range(10)]),
+        ([0, 100, 110, 110, 310, 320, 330, 340, 350, 360], [0, 100, 110, 130, 310, 320, 330, 340, 350, 360]),
+        ([0, 100, 90, 80, 310, np.nan, 340, 350, 360, 370], [0, 100, 120, 140, 310, 330, 340, 350, 360, 370]),
     ],
 )
 def test_times_of_a_video_are_its_own_where_it_has_some(video, stamps_ms, times_ms):
@@ -209,6 +223,36 @@ def test_times_of_a_video_are_its_own_where_it_has_some(video, stamps_ms, times_
     assert times_ns[0] == 0
     assert times_ns == [1_000_000 * t for t in times_ms[: len(times_ns)]]
     assert len(times_ns) >= 9
+
+
+@pytest.fixture(scope="module")
+def uneven_video(tmp_path_factory):
+    """Nine images at 0, 1, 2, 3, 6, 9 ... times 40 ms, or a skip where OpenCV can't write Matroska."""
+    path = tmp_path_factory.mktemp("videos") / "uneven.mkv"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
+    if not writer.isOpened():
+        pytest.skip("this OpenCV can't write Matroska")
+    for k in range(9):
+        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
+    writer.release()
+    data = path.read_bytes()
+    # OpenCV writes even times only; a block has its own as 16 bits between track and flags.
+    for k in range(8, 3, -1):
+        even, uneven = (b"\x81" + (40 * n).to_bytes(2, "big") + b"\x80" for n in (k, 3 * k - 6))
+        assert data.count(even) == 1
+        data = data.replace(even, uneven)
+    path.write_bytes(data)
+    return path
+
+
+def test_a_video_of_varying_rate_keeps_its_times_over_all_passes(video, uneven_video):
+    _, frames = play(fast(uneven_video, camera=PINHOLE, repeat="loop", max_frames=18))
+    times_ms = np.array([f.t_source_ns for f in frames]) / 1e6
+    np.testing.assert_allclose(times_ms[:9], [40 * k for k in (0, 1, 2, 3, 6, 9, 12, 15, 18)], atol=1.0)
+    np.testing.assert_allclose(np.diff(times_ms[9:]), np.diff(times_ms[:9]), atol=1e-3)
+    assert times_ms[9] > times_ms[8]
+    _, frames = play(fast(video, camera=PINHOLE, repeat="loop", max_frames=30))
+    assert [f.t_source_ns for f in frames] == [20_000_000 * k for k in range(30)]
 
 
 def test_a_damaged_video_says_how_much_of_it_can_be_read(tmp_path, caplog):
@@ -224,6 +268,12 @@ def test_a_damaged_video_says_how_much_of_it_can_be_read(tmp_path, caplog):
         _, frames = play(fast(path, camera=PINHOLE))
         assert (len(frames) < 60) == is_damaged
         assert ("of its 60 frames could be read; it may be damaged" in caplog.text) == is_damaged
+    caplog.clear()
+    play(fast(cut, camera=PINHOLE, repeat="loop"))
+    assert caplog.text.count("may be damaged") == 1, "once, not in every pass"
+    caplog.clear()
+    play(fast(cut, camera=PINHOLE, max_frames=5))
+    assert not caplog.text, "an end that was asked for is none"
 
 
 def test_a_video_needs_a_camera_that_fits(video, tmp_path):

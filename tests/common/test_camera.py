@@ -103,6 +103,8 @@ PINHOLE = {"fx": 500, "fy": 500, "cx": 320, "cy": 240, "width": 640, "height": 4
         {"dist_coeffs": [[-0.3, 0.1, 0.01, 0.02, 0]]},
         {"k1": -0.3, "k2": 0.1, "p1": 0.01, "p2": 0.02, "camera_model": "OPENCV"},
         {"distortion": {"k1": -0.3, "k2": 0.1, "p1": 0.01, "p2": 0.02}},
+        {"distortion_coefficients": {"rows": 1, "cols": 5, "data": [-0.3, 0.1, 0.01, 0.02, 0]}},
+        {"D": [-0.3, 0.1, 0.01, 0.02], "distortion_model": "none given", "distortion": []},
     ],
 )
 def test_distortion_is_read_under_its_usual_names(lens):
@@ -115,6 +117,8 @@ def test_distortion_is_read_under_its_usual_names(lens):
         {"distortion_model": "none given: rectified"},
         {"distortion": None, "camera_model": "a phone of 2021"},
         {"distortion": [], "distortion_coeffs": 0},
+        {"distortion": "none", "undistorted": True, "distance_unit": "m"},
+        {"distortion_model": "none (not a fisheye)", "is_fisheye": False},
     ],
 )
 def test_notes_about_a_lens_without_distortion_are_ignored(lens):
@@ -131,6 +135,13 @@ def test_notes_about_a_lens_without_distortion_are_ignored(lens):
         ({"distortion_params": [0.1, 0, 0, 0]}, "distortion_params must be a list of numbers named"),
         ({"dist": [0.1, "x", 0, 0]}, "dist must be of numbers, got 'x'"),
         ({"k1": None}, "k1 must be of numbers, got None"),
+        ({"D": [[0.1], [0], [0], [0]]}, r"D must be of numbers, got \[0.1\]"),
+        ({"k1": 0.1, "k2": 0.1, "k3": 0.1, "k4": 0.1}, "k4 must be 0 or come with k5 and k6, got 0.1"),
+        ({"distortion": {"model": "equidistant", "k1": 0.1}}, "model must be a pinhole camera's"),
+        ({"distortion": {"coeffs": [0.1, 0, 0, 0]}}, "distortion must be a list of numbers named"),
+        ({"lens_distortion": [0.1, 0, 0, 0]}, "lens_distortion must be a list of numbers named"),
+        ({"distortion_model": "division", "D": [0.1, 0, 0, 0]}, "distortion_model must be .* got 'division'"),
+        ({"k1": 0.1, "D": [0.2, 0, 0, 0]}, "k1 and D must say the same"),
     ],
 )
 def test_a_lens_that_is_not_understood_is_refused(lens, message):

@@ -91,7 +91,8 @@ def test_grey_sixteen_bit_and_transparent_images_become_rgb():
 
 
 @pytest.mark.parametrize(("bits", "brightest"), [(8, 250), (10, 1000), (12, 4000), (14, 9000), (16, 60000)])
-def test_images_of_fewer_bits_in_files_of_sixteen_are_as_bright_as_meant(tmp_path, bits, brightest):
+def test_images_of_fewer_bits_in_files_of_sixteen_are_as_bright_as_meant(tmp_path, caplog, bits, brightest):
+    caplog.set_level("INFO")
     (tmp_path / "images").mkdir()
     for k, top in enumerate((brightest, brightest // 3, brightest)):
         image = np.linspace(0, top, 24 * 32).reshape(24, 32).astype(np.uint16)
@@ -101,13 +102,49 @@ def test_images_of_fewer_bits_in_files_of_sixteen_are_as_bright_as_meant(tmp_pat
     for image, top in ((sequence.image(1), brightest // 3), (dark.image(0), brightest)):
         assert image.max() == top >> (bits - 8)
         assert image.shape == (24, 32, 3)
+    assert (f"16-bit images are read as {bits}-bit" in caplog.text) == (bits != 16)
+    alone = read_image(tmp_path / "images" / "0.png")
+    assert alone.max() == brightest >> (bits - 8), "one by one an image goes by itself"
 
 
-@pytest.mark.parametrize("time", ["1403636579763555584", "1.4e12"])
-def test_times_that_are_no_seconds_are_refused(native, time):
-    (native / "times.txt").write_text("".join(f"{time}\n" for _ in range(6)))
-    with pytest.raises(SourceError, match="time must be in seconds, got 1.*milliseconds or nanoseconds"):
+def test_a_dark_beginning_and_end_do_not_tell_the_bits_of_a_recording(tmp_path):
+    (tmp_path / "images").mkdir()
+    for k in range(20):
+        image = np.full((24, 32), 4000 if 12 <= k < 15 else 200, np.uint16)
+        cv2.imwrite(str(tmp_path / "images" / f"{k:02d}.png"), image)
+    sequence = open_sequence(tmp_path)
+    assert [int(sequence.image(k).max()) for k in (0, 12)] == [200 >> 4, 4000 >> 4]
+
+
+@pytest.mark.parametrize(
+    ("time", "message"),
+    [
+        ("1403636579763555584", "times must be in seconds, got 1403636579763555584: .*nanoseconds"),
+        ("1.4e12", "times must be in seconds, got 1.4e12: looks like milliseconds"),
+        ("1e999999999", "times must be in seconds, got 1e999999999: .*nanoseconds"),
+        ("inf", "time must be a number of seconds, got 'inf'"),
+        ("nan", "time must be a number of seconds, got 'nan'"),
+    ],
+)
+@pytest.mark.parametrize("name", ["times.txt", "rgb.txt"])
+def test_times_that_are_no_seconds_are_refused(native, name, time, message):
+    (native / name).write_text("".join(f"{time} images/{k:06d}.png\n" for k in range(6)))
+    with pytest.raises(SourceError, match=f"{name}: {message}"):
         open_sequence(native)
+
+
+def test_true_poses_at_times_that_are_no_seconds_are_refused(native):
+    truth = Trajectory(1.4e18 + 5e7 * np.arange(6), poses(6))
+    write_tum(native / "groundtruth.txt", truth)
+    with pytest.raises(SourceError, match="groundtruth.txt: times must be in seconds, got 14.*nanoseconds"):
+        open_sequence(native)
+
+
+def test_whole_nanoseconds_beyond_64_bits_are_refused(tmp_path):
+    write_images(tmp_path / "mav0/cam0/data", 2)
+    (tmp_path / "mav0/cam0/data.csv").write_text(f"{10**18},000000.png\n{10**20},000001.png\n")
+    with pytest.raises(SourceError, match=f"data.csv: times must be whole nanoseconds: .* got {10**20}"):
+        open_sequence(tmp_path)
 
 
 @pytest.mark.parametrize(
