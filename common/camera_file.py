@@ -14,30 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics, known_distortion
+from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
+from semcast.common.lens import check_pinhole, distortion_in
 
 _LINE = re.compile(r"^(?P<indent> *)(?P<key>[A-Za-z_][\w.\- ]*?) *:(?: +|$)(?P<value>.*)$")
 _ITEM = re.compile(r"^(?P<indent> *)(?:- +)+(?P<value>.*)$")
 _SIZE_KEYS = (("image_width", "image_height"), ("Camera.width", "Camera.height"), ("width", "height"))
 _MATRIX_KEYS = ("camera_matrix", "K", "Camera_Matrix", "cameraMatrix")
-_DISTORTION_KEYS = (
-    "distortion_coefficients",
-    "distortion_coeffs",
-    "Distortion_Coefficients",
-    "dist_coeffs",
-    "distCoeffs",
-    "D",
-)
-_LENS_WORDS = ("radtan", "radial-tangential", "plumb_bob", "rational_polynomial", "none")
-#: What keys that name a camera or lens model may say, in small letters.
-_PINHOLE_WORDS = {
-    "distortion_model": _LENS_WORDS,
-    "distortion_type": _LENS_WORDS,
-    "camera_model": ("pinhole", "opencv", "perspective"),
-    "Camera.type": ("pinhole", "rectified"),
-    "fisheye_model": ("0",),
-}
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -146,28 +130,30 @@ def transform_from_yaml(values: dict[str, Any], key: str) -> NDArray[np.float64]
 
 
 def _intrinsics_from_yaml(values: dict[str, Any]) -> Intrinsics:
-    _check_pinhole(values)
-    width, height = _size(values)
-    if "Camera.fx" in values or "Camera1.fx" in values:
-        prefix = "Camera." if "Camera.fx" in values else "Camera1."
+    prefix = next((p for p in ("Camera.", "Camera1.") if f"{p}fx" in values), "")  # ORB-SLAM's
+    lens = _lens_keys(values, prefix or "Camera.")
+    check_pinhole(lens)
+    if prefix:
         fx, fy, cx, cy = (float(values[prefix + name]) for name in ("fx", "fy", "cx", "cy"))
-        distortion = _orbslam_distortion(values, prefix)
     elif "intrinsics" in values:
         fx, fy, cx, cy = _numbers(values, ("intrinsics",), 4)
-        distortion = _distortion(values)
     else:
         fx, _, cx, _, fy, cy, *_ = _numbers(values, _MATRIX_KEYS, 9)
-        distortion = _distortion(values)
-    return Intrinsics(
-        fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=known_distortion(distortion)
-    )
+    width, height = _size(values)
+    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion_in(lens))
 
 
-def _check_pinhole(values: dict[str, Any]) -> None:
-    for key, allowed in _PINHOLE_WORDS.items():
-        word = str(values.get(key, "")).lower().removesuffix(".0")
-        if word and word not in allowed:
-            raise ValueError(f"{key} must be a pinhole camera's ({', '.join(allowed)}), got {word!r}")
+def _lens_keys(values: dict[str, Any], prefix: str) -> dict[str, Any]:
+    """Return the keys of the top level as a lens has them: with what stands under them, without a prefix."""
+    lens: dict[str, Any] = {}
+    for key, value in values.items():
+        head, _, inner = key.partition("/")
+        if not inner:
+            lens[key.removeprefix(prefix)] = value
+        elif head in lens:
+            under = lens[head] if isinstance(lens[head], dict) else {}
+            lens[head] = {**under, inner: value}
+    return lens
 
 
 def _list(values: dict[str, Any], keys: tuple[str, ...]) -> list[float] | None:
@@ -184,26 +170,6 @@ def _numbers(values: dict[str, Any], keys: tuple[str, ...], count: int) -> list[
         got = found or values.get(f"{there}/data", values[there])
         raise ValueError(f"{there} must be a list of {count} numbers, got {got!r}")
     return found
-
-
-def _orbslam_distortion(values: dict[str, Any], prefix: str) -> list[float]:
-    # Only its fisheye model has a fourth radial coefficient.
-    if values.get(f"{prefix}k4"):
-        raise ValueError(f"{prefix}k4 must be 0 for a pinhole camera, got {values[f'{prefix}k4']}")
-    return [float(values.get(prefix + name, 0.0)) for name in ("k1", "k2", "p1", "p2", "k3")]
-
-
-def _distortion(values: dict[str, Any]) -> list[float]:
-    """Return the coefficients; none only where no key speaks of distortion, never for want of reading it."""
-    found = _list(values, _DISTORTION_KEYS)
-    if found is not None:
-        return found
-    for key, value in values.items():
-        is_spoken_of = key in _DISTORTION_KEYS or re.match("distor|dist_?coef", key.lower())
-        if is_spoken_of and key not in _PINHOLE_WORDS:
-            known = ", ".join(_DISTORTION_KEYS)
-            raise ValueError(f"{key} must be a list of numbers named {known}, got {value!r}")
-    return []
 
 
 def _size(values: dict[str, Any]) -> tuple[int, int]:

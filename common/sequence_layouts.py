@@ -14,10 +14,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics, known_distortion
+from semcast.common.camera import Intrinsics
 from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transform_from_yaml
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
+from semcast.common.lens import check_pinhole, distortion_in
 from semcast.common.trajectory import Trajectory, read_tum
 
 Layout = Literal["auto", "native", "tum", "kitti", "euroc", "transforms", "folder"]
@@ -413,7 +414,10 @@ def _transforms_camera(values: dict[str, Any], width: int, height: int) -> Intri
     Raises:
         ValueError: It is no pinhole, or a value is out of range.
     """
-    _check_pinhole(values)
+    model = values.get("camera_model")
+    if model and str(model).upper() not in _PINHOLE_MODELS:
+        raise ValueError(f"camera_model must be one of {', '.join(_PINHOLE_MODELS)}, got {model!r}")
+    check_pinhole(values)
     width, height = int(values.get("w", width)), int(values.get("h", height))
     if "fl_x" in values:
         fx = float(values["fl_x"])
@@ -421,7 +425,6 @@ def _transforms_camera(values: dict[str, Any], width: int, height: int) -> Intri
         fx = 0.5 * width / float(np.tan(0.5 * float(values["camera_angle_x"])))
     else:
         return None
-    distortion = known_distortion(values.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     return Intrinsics(
         fx=fx,
         fy=float(values.get("fl_y", fx)),
@@ -429,14 +432,5 @@ def _transforms_camera(values: dict[str, Any], width: int, height: int) -> Intri
         cy=float(values.get("cy", height / 2)) - 0.5,
         width=width,
         height=height,
-        distortion=distortion,
+        distortion=distortion_in(values),
     )
-
-
-def _check_pinhole(values: dict[str, Any]) -> None:
-    model = values.get("camera_model")
-    if model and str(model).upper() not in _PINHOLE_MODELS:
-        raise ValueError(f"camera_model must be one of {', '.join(_PINHOLE_MODELS)}, got {model!r}")
-    for key in ("is_fisheye", "k4"):
-        if values.get(key):
-            raise ValueError(f"{key} must be absent or 0 for a pinhole camera, got {values[key]!r}")

@@ -1,4 +1,4 @@
-"""Calibration files as other tools write them; see test_sequence.py for their plainest forms."""
+"""Calibration files as other tools write them; see test_camera_settings.py for their plainest forms."""
 
 import cv2
 import numpy as np
@@ -41,8 +41,17 @@ def read(tmp_path, text, encoding="utf-8"):
         f"  distortion_coeffs: {list(COEFFICIENTS)}\n  distortion_model: radtan\n"
         "  intrinsics: [30, 31, 15.5, 11.5]\n  resolution: [32, 24]\n"
         "cam1:\n  distortion_coeffs: [9, 9, 9, 9]\n  intrinsics: [9, 9, 9, 9]\n",
+        f"{EUROC}distortion:\n  k1: 0.1\n  k2: -0.2\n  p1: 0.001\n  p2: 0.002\n  k3: 0.3\n",
     ],
-    ids=["ros data in a block", "ros all in blocks", "lists of lists", "ros message", "euroc", "kalibr"],
+    ids=[
+        "ros data in a block",
+        "ros all in blocks",
+        "lists of lists",
+        "ros message",
+        "euroc",
+        "kalibr",
+        "named",
+    ],
 )
 def test_lists_are_read_however_they_are_written(tmp_path, text):
     found = read(tmp_path, text)
@@ -75,7 +84,7 @@ def test_orbslam_without_tangential_distortion_is_read(tmp_path):
         "Camera.k1: 0.1\nCamera.k2: -0.2\nCamera.width: 32\nCamera.height: 24\n"
     )
     assert read(tmp_path, text).distortion == (0.1, -0.2, 0.0, 0.0)
-    with pytest.raises(SourceError, match="Camera.k4 must be 0 for a pinhole camera, got 0.4"):
+    with pytest.raises(SourceError, match="k4 must be 0 or come with k5 and k6, got 0.4"):
         read(tmp_path, f"{text}Camera.k4: 0.4\n")
 
 
@@ -91,7 +100,7 @@ def test_orbslam_without_tangential_distortion_is_read(tmp_path):
         (f"{EUROC}distortion_coeffs:\n- k1: 0.1\n", "distortion_coeffs must be .*, got '- k1: 0.1'"),
         (
             f"{EUROC}distortion_parameters:\n  k1: 0.1\n",
-            "distortion_parameters must be .* distCoeffs, D, got",
+            "distortion_parameters must be .* distCoeffs, dist, D, got",
         ),
         (f"{EUROC}D: 0.1\n", "D must be a list of numbers.*, got 0.1"),
         (
@@ -110,10 +119,15 @@ def test_orbslam_without_tangential_distortion_is_read(tmp_path):
         ),
         (f"{EUROC}distortion_type: fisheye\n", "distortion_type must be a pinhole camera's .*'fisheye'"),
         (f"{EUROC}camera_model: omni\n", "camera_model must be a pinhole camera's .*, got 'omni'"),
-        ("Camera.type: KannalaBrandt8\n", "Camera.type must be a pinhole camera's .*, got 'kannalabrandt8'"),
+        ("Camera.type: KannalaBrandt8\n", "type must be a pinhole camera's .*, got 'KannalaBrandt8'"),
         (
             f"{ROS_HEAD}{ROS_MATRIX}fisheye_model: 1\n",
-            "fisheye_model must be a pinhole camera's .0., got '1'",
+            "fisheye_model must be false for a pinhole camera, got 1.0",
+        ),
+        (f"{EUROC}k1: 0.1\nD: [0.2, 0, 0, 0]\n", "k1 and D must say the same"),
+        (
+            f"{EUROC}distortion:\n  model: equidistant\n  k1: 0.1\n",
+            "model must be a pinhole camera's .*, got 'equidistant'",
         ),
     ],
 )

@@ -10,12 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from semcast.agent.agent import camera_info
+from semcast.agent.settings import AgentSettings
+from semcast.agent.source import RecordedSource
+from semcast.agent.source_settings import SourceSettings
 from semcast.common.codec import DecodedImage, EncodedImage
 from semcast.common.codecs import load_codec
 from semcast.common.errors import SemcastError
 from semcast.common.keys import camera_key, control_key, flow_key, pose_key, rx_key
 from semcast.common.messages import (
-    CameraInfo,
     ControlReply,
     ControlRequest,
     FlowMessage,
@@ -71,39 +74,25 @@ class IndexCodec:
 
 @pytest.fixture(scope="module")
 def sequence():
-    return open_sequence(DEMO, resize=RESIZE)
+    return open_sequence(DEMO, resize=RESIZE, max_frames=24)
 
 
 @pytest.fixture(scope="module")
 def pictures(sequence):
-    images = [sequence.image(k) for k in range(24)]
+    images = [sequence.image(k) for k in range(len(sequence))]
     return lambda number: images[number]
 
 
 class Radio:
     """Agent and channel in one: what a server hears."""
 
-    def __init__(self, endpoint, sequence, codec, epoch, *, lossless=False, num_frames=24):
+    def __init__(self, endpoint, sequence, codec, epoch, *, lossless=False):
         self.sequence, self.codec, self.epoch, self.lossless = sequence, codec, epoch, lossless
-        self.num_frames = num_frames
         self.session = open_client(NetworkSettings(connect=(endpoint,)), DEADLINE_S)
-        camera = sequence.intrinsics
-        self.camera = CameraInfo(
-            agent_id=AGENT,
-            agent_epoch=epoch,
-            fx=camera.fx,
-            fy=camera.fy,
-            cx=camera.cx,
-            cy=camera.cy,
-            image_wh=sequence.size_wh,
-            nominal_rate_hz=10.0,
-            codec=codec.name,
-            digest=codec.digest,
-            modulation="16qam",
-            source_name="demo",
-            num_frames=num_frames,
-            lossless=lossless,
+        settings = AgentSettings(
+            agent_id=AGENT, mode="replay" if lossless else "live", source=SourceSettings(source=str(DEMO))
         )
+        self.camera = camera_info(settings, RecordedSource(sequence, settings.source), codec, epoch)
         self.poses, self.changed = [], threading.Condition()
         self.allowed = 0
         self.session.answer(camera_key(AGENT), lambda request: pack(self.camera))
@@ -159,7 +148,7 @@ class Radio:
             "payload": pack_iq(slots + noise),
             "slot_lost": pack_lost(np.zeros(layout.num_slots, bool)),
             "lossless": self.lossless,
-            "final": k == self.num_frames - 1,
+            "final": k == len(self.sequence) - 1,
         }
         self._symbols.put(pack(SymbolFrame(**{**values, **changes})))
 

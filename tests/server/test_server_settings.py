@@ -5,8 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from semcast.agent.agent import camera_info
+from semcast.agent.settings import AgentSettings
+from semcast.agent.source import RecordedSource
+from semcast.agent.source_settings import SourceSettings
 from semcast.common.errors import CheckpointError, ConfigError, SourceError
-from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import HubSettings
 from semcast.common.sequence import open_sequence
 from semcast.common.transport import open_hub
@@ -81,6 +84,8 @@ def test_the_last_frames_are_known_by_their_ids(num_frames, last_id, frame_id, i
 
 
 def test_the_reference_follows_the_camera_of_a_restarted_agent(session):
+    agent = AgentSettings(agent_id=AGENT, source=SourceSettings(source=str(DEMO)))
+    codec = SimpleNamespace(name="jpeg-ldpc", digest="")
     sequences = [open_sequence(DEMO, resize=resize) for resize in (0.5, 0.25)]
     server = Server(
         ServerSettings(agent_id=AGENT, reference=DEMO, bundle="inline", view=ViewSettings(view="none")),
@@ -88,23 +93,7 @@ def test_the_reference_follows_the_camera_of_a_restarted_agent(session):
     )
     try:
         for epoch, sequence in enumerate(sequences, start=1):
-            camera = sequence.intrinsics
-            info = CameraInfo(
-                agent_id=AGENT,
-                agent_epoch=epoch,
-                fx=camera.fx,
-                fy=camera.fy,
-                cx=camera.cx,
-                cy=camera.cy,
-                image_wh=sequence.size_wh,
-                nominal_rate_hz=10.0,
-                codec="jpeg-ldpc",
-                digest="",
-                modulation="16qam",
-                source_name="demo",
-                num_frames=24,
-                lossless=False,
-            )
+            info = camera_info(agent, RecordedSource(sequence, agent.source), codec, epoch)
             server._begin(info)
             assert server._reference.psnr_db(3, sequence.image(3)).result(20) == 100.0
     finally:

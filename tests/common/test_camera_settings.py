@@ -1,0 +1,62 @@
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.camera_settings import CameraSettings
+from semcast.common.errors import SourceError
+
+CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        # OpenCV's cv2.FileStorage
+        "%YAML:1.0\n---\nimage_width: 32\nimage_height: 24\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"
+        "   cols: 3\n   dt: d\n   data: [ 30., 0., 15.5, 0., 31.,\n       11.5, 0., 0., 1. ]\n"
+        "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
+        "   data: [ 0.1, -0.2, 0.001, 0.002, 0.3 ]\n",
+        # ORB-SLAM
+        "%YAML:1.0\nCamera.fx: 30.0\nCamera.fy: 31.0\nCamera.cx: 15.5\nCamera.cy: 11.5\nCamera.k1: 0.1\n"
+        "Camera.k2: -0.2\nCamera.p1: 0.001\nCamera.p2: 0.002\nCamera.k3: 0.3\nCamera.width: 32\n"
+        "Camera.height: 24\n",
+        # ROS camera_info
+        "image_width: 32\nimage_height: 24\ncamera_name: c\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+        "  data: [30, 0, 15.5, 0, 31, 11.5, 0, 0, 1]\ndistortion_model: plumb_bob\n"
+        "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.1, -0.2, 0.001, 0.002, 0.3]\n",
+    ],
+    ids=["opencv", "orbslam", "ros"],
+)
+def test_calibration_yaml_of_other_tools_is_read(tmp_path, text):
+    (tmp_path / "camera.yaml").write_text(text)
+    found = CameraSettings(intrinsics=tmp_path / "camera.yaml").resolve(32, 24)
+    assert found.undistorted() == CAMERA
+    assert found.distortion == (0.1, -0.2, 0.001, 0.002, 0.3)
+
+
+def test_a_fisheye_calibration_is_refused(tmp_path):
+    (tmp_path / "camera.yaml").write_text(
+        "resolution: [32, 24]\nintrinsics: [30, 31, 15.5, 11.5]\ndistortion_model: equidistant\n"
+        "distortion_coefficients: [0.1, 0.2, 0.3, 0.4]\n"
+    )
+    with pytest.raises(
+        SourceError, match="distortion_model must be a pinhole camera's .*, got 'equidistant'"
+    ):
+        CameraSettings(intrinsics=tmp_path / "camera.yaml").resolve(32, 24)
+
+
+def test_camera_settings_must_be_complete_and_unambiguous(tmp_path):
+    with pytest.raises(ValueError, match="fx, fy, cx and cy must be given together, got only fx, cy"):
+        CameraSettings(fx=1.0, cy=2.0)
+    with pytest.raises(ValueError, match="either intrinsics or"):
+        CameraSettings(fx=1.0, fy=1.0, cx=1.0, cy=1.0, intrinsics=tmp_path)
+
+
+def test_a_phone_s_focal_length_gives_a_rough_camera():
+    # 26 mm on the 43.27 mm diagonal of film; 3 4 5 makes the image's diagonal 1000 px.
+    camera = CameraSettings(focal_35mm=26.0).resolve(800, 600)
+    assert camera.fx == camera.fy == pytest.approx(26.0 / 43.27 * 1000.0)
+    assert (camera.cx, camera.cy) == (399.5, 299.5)
+    with pytest.raises(ValueError, match="focal_35mm must be given alone"):
+        CameraSettings(focal_35mm=26.0, fx=1.0, fy=1.0, cx=1.0, cy=1.0)
+    with pytest.raises(ValueError, match=r"focal_35mm must be in \[5, 1000\], got 0.02"):
+        CameraSettings(focal_35mm=0.02)

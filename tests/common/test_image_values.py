@@ -1,0 +1,70 @@
+import cv2
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import SourceError
+from semcast.common.sequence import as_rgb, open_sequence, read_image
+
+CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
+
+
+def test_grey_sixteen_bit_and_transparent_images_become_rgb():
+    grey = np.array([[7, 9]], dtype=np.uint8)
+    np.testing.assert_array_equal(as_rgb(grey), [[[7, 7, 7], [9, 9, 9]]])
+    np.testing.assert_array_equal(as_rgb(np.array([[0x1234]], dtype=np.uint16)), [[[0x12] * 3]])
+    bgra = np.array([[[10, 20, 30, 255], [10, 20, 30, 0], [0, 0, 0, 51]]], dtype=np.uint8)
+    np.testing.assert_array_equal(as_rgb(bgra), [[[30, 20, 10], [255, 255, 255], [204, 204, 204]]])
+
+
+@pytest.mark.parametrize(("bits", "brightest"), [(8, 250), (10, 1000), (12, 4000), (14, 9000), (16, 60000)])
+def test_images_of_fewer_bits_in_files_of_sixteen_are_as_bright_as_meant(tmp_path, caplog, bits, brightest):
+    caplog.set_level("INFO")
+    (tmp_path / "images").mkdir()
+    for k, top in enumerate((brightest, brightest // 3, brightest)):
+        image = np.linspace(0, top, 24 * 32).reshape(24, 32).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), image)
+    sequence = open_sequence(tmp_path)
+    dark = open_sequence(tmp_path, stride=3, max_frames=1)  # bits are those of the whole recording
+    for image, top in ((sequence.image(1), brightest // 3), (dark.image(0), brightest)):
+        assert image.max() == top >> (bits - 8)
+        assert image.shape == (24, 32, 3)
+    assert (f"16-bit images are read as {bits}-bit" in caplog.text) == (bits != 16)
+    alone = read_image(tmp_path / "images" / "0.png")
+    assert alone.max() == brightest >> (bits - 8), "one by one an image goes by itself"
+
+
+def test_a_dark_beginning_and_end_do_not_tell_the_bits_of_a_recording(tmp_path):
+    (tmp_path / "images").mkdir()
+    for k in range(20):
+        image = np.full((24, 32), 4000 if 12 <= k < 15 else 200, np.uint16)
+        cv2.imwrite(str(tmp_path / "images" / f"{k:02d}.png"), image)
+    sequence = open_sequence(tmp_path)
+    assert [int(sequence.image(k).max()) for k in (0, 12)] == [200 >> 4, 4000 >> 4]
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([0.0, 0.5, 1.0], [0, 128, 255]),
+        ([0.0, 100.0, 255.0], [0, 100, 255]),
+        ([-3.0, np.nan, 200.0], [0, 0, 200]),
+        ([-np.inf, np.inf, 1.0], [0, 255, 255]),
+        ([0.2, 1.0, 1.1], [51, 255, 255]),
+        ([99.6, 255.0, 260.0], [100, 255, 255]),
+    ],
+)
+def test_floats_count_to_1_or_to_255_as_their_values_tell(tmp_path, values, expected):
+    cv2.imwrite(str(tmp_path / "a.tif"), np.array([values], dtype=np.float32))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif")[0, :, 0], expected)
+
+
+def test_whole_numbers_of_any_type_count_to_255(tmp_path):
+    np.testing.assert_array_equal(as_rgb(np.array([[0, 1, 2]], dtype=np.int32))[0, :, 0], [0, 1, 2])
+    np.testing.assert_array_equal(as_rgb(np.array([[-5, 90, 255]], dtype=np.int16))[0, :, 0], [0, 90, 255])
+
+
+def test_floats_of_another_range_are_refused_by_the_name_of_their_file(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.tif"), np.array([[0.0, 4000.0]], dtype=np.float32))
+    with pytest.raises(SourceError, match=r"a.tif: values must be in 0..1 or 0..255, got up to 4000"):
+        read_image(tmp_path / "a.tif")

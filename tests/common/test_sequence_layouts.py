@@ -1,0 +1,165 @@
+import json
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import SourceError
+from semcast.common.geometry import exp_so3, invert_transform, make_transform, quat_wxyz_from_rotation
+from semcast.common.sequence import open_sequence, truth_at_frames
+from semcast.common.trajectory import Trajectory, write_tum
+
+CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
+
+
+def test_whole_nanoseconds_beyond_64_bits_are_refused(tmp_path, write_images):
+    write_images(tmp_path / "mav0/cam0/data", 2)
+    (tmp_path / "mav0/cam0/data.csv").write_text(f"{10**18},000000.png\n{10**20},000001.png\n")
+    with pytest.raises(SourceError, match=f"data.csv: times must be whole nanoseconds: .* got {10**20}"):
+        open_sequence(tmp_path)
+
+
+def test_tum_layout_interpolates_truth_between_its_own_times(tmp_path, write_images, poses):
+    folder = tmp_path / "rgbd_dataset_freiburg3_desk"
+    write_images(folder / "rgb", 3, "{:d}.png", size=(480, 640))
+    (folder / "rgb.txt").write_text(
+        "# timestamp filename\n"
+        "1305031102.175304 rgb/0.png\n1305031102.211214 rgb/1.png\n1305031102.243211 rgb/2.png\n"
+    )
+    t_s = np.array([1305031102.165304, 1305031102.185304, 1305031102.201214, 1305031102.221214])
+    truth = Trajectory(t_s, poses(4))
+    write_tum(folder / "groundtruth.txt", truth)
+    sequence = open_sequence(folder)
+    assert sequence.intrinsics.fx == 535.4
+    np.testing.assert_array_equal(
+        sequence.times_ns, [1305031102175304000, 1305031102211214000, 1305031102243211000]
+    )
+    found = sequence.groundtruth()
+    assert len(found) == 2, "the last frame has no pose on both sides"
+    expected = make_transform(exp_so3([0.0, 0.05, 0.0]), (0.25, 0.0, 0.1))
+    np.testing.assert_allclose(found.T_world_cam[0], expected, atol=1e-5)
+
+
+def test_truth_is_not_stretched_over_gaps(poses):
+    truth = Trajectory(np.array([0.0, 0.1, 0.9, 1.0]), poses(4))
+    times_ns = np.array([100_000_000, 140_000_000, 500_000_000, 860_000_000, 950_000_000])
+    found = truth_at_frames(truth, times_ns, 0.1)
+    np.testing.assert_allclose(found.t_s, [0.1, 0.95])
+    assert truth_at_frames(truth, np.array([5_000_000_000]), 0.1) is None
+
+
+def test_kitti_layout_moves_poses_to_the_camera_that_is_used(tmp_path, write_images, poses):
+    folder = tmp_path / "sequences" / "06"
+    write_images(folder / "image_2", 3)
+    (folder / "times.txt").write_text("0.000000e+00\n1.036224e-01\n2.072448e-01\n")
+    baseline = 0.06
+    (folder / "calib.txt").write_text(
+        f"P0: 30 0 15.5 0 0 31 11.5 0 0 0 1 0\nP2: 30 0 15.5 {30 * baseline} 0 31 11.5 0 0 0 1 0\n"
+    )
+    (tmp_path / "poses").mkdir()
+    lines = "\n".join(" ".join(f"{v:.9f}" for v in T[:3].ravel()) for T in poses(3))
+    (tmp_path / "poses" / "06.txt").write_text(lines + "\n")
+    sequence = open_sequence(folder)
+    assert sequence.intrinsics == CAMERA
+    assert sequence.times_ns[1] == 103622400
+    found = sequence.groundtruth().T_world_cam
+    # P2 shifts image points of camera 0 to the right, so camera 2 sits to the left by the baseline.
+    for T_world_cam0, T_world_cam2 in zip(poses(3), found, strict=True):
+        np.testing.assert_allclose(
+            (invert_transform(T_world_cam0) @ T_world_cam2)[:3, 3], [-baseline, 0, 0], atol=1e-7
+        )
+
+
+def test_euroc_layout_gives_poses_of_the_camera_not_of_the_body(tmp_path, write_images, poses):
+    folder = tmp_path / "MH_01"
+    cam = folder / "mav0" / "cam0"
+    write_images(cam / "data", 2, "{:d}.png", channels=1)
+    (cam / "data.csv").write_text(
+        "#timestamp [ns],filename\n1403636579763555584,0.png\n1403636579813555456,1.png\n"
+    )
+    T_body_cam = make_transform(exp_so3([0.1, -0.2, 1.5]), (-0.02, -0.06, 0.01))
+    numbers = ", ".join(f"{v:.12f}" for v in T_body_cam.ravel()[:8])
+    rest = ", ".join(f"{v:.12f}" for v in T_body_cam.ravel()[8:])
+    (cam / "sensor.yaml").write_text(
+        "# General sensor definitions.\nsensor_type: camera\ncomment: VI-Sensor cam0 (MT9M034)\n\n"
+        f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{numbers},\n         {rest}]\n\n"
+        "rate_hz: 20\nresolution: [32, 24]\ncamera_model: pinhole\n"
+        "intrinsics: [30.0, 31.0, 15.5, 11.5] #fu, fv, cu, cv\ndistortion_model: radial-tangential\n"
+        "distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]\n"
+    )
+    truth = folder / "mav0" / "state_groundtruth_estimate0"
+    truth.mkdir()
+    rows = []
+    for t_ns, T in zip((1403636579763555584, 1403636579813555456), poses(2), strict=True):
+        w, x, y, z = quat_wxyz_from_rotation(T[:3, :3])
+        rows.append(",".join([str(t_ns), *(f"{v:.12f}" for v in (*T[:3, 3], w, x, y, z)), "0", "0"]))
+    (truth / "data.csv").write_text("#timestamp, p, q\n" + "\n".join(rows) + "\n")
+    sequence = open_sequence(folder)
+    assert sequence.name == "MH_01"
+    assert sequence.intrinsics == CAMERA, "the pinhole of the undistorted image"
+    assert sequence.times_ns[0] == 1403636579763555584
+    np.testing.assert_allclose(sequence.groundtruth().T_world_cam, poses(2) @ T_body_cam, atol=1e-9)
+
+
+def test_blender_layout_sorts_by_number_and_looks_along_z(tmp_path, write_images):
+    folder = tmp_path / "chair"
+    write_images(folder / "test", 12, "r_{:d}.png")
+    # An OpenGL camera at (0, 0, 4) that looks at the origin: its axes are the world's.
+    T_world_gl = make_transform(np.eye(3), (0.0, 0.0, 4.0))
+    frames = [{"file_path": f"./test/r_{k}", "transform_matrix": T_world_gl.tolist()} for k in range(12)]
+    frames.sort(key=lambda f: f["file_path"])
+    document = {"camera_angle_x": 2 * np.arctan(16 / 30), "frames": frames}
+    (folder / "transforms_test.json").write_text(json.dumps(document))
+    sequence = open_sequence(folder)
+    assert [int(sequence.image(k)[0, 0, 0]) for k in (1, 2, 10)] == [10, 20, 100]
+    assert sequence.intrinsics.fx == pytest.approx(30.0)
+    assert (sequence.intrinsics.cx, sequence.intrinsics.cy) == (15.5, 11.5)
+    T_world_cam = sequence.groundtruth().T_world_cam[0]
+    np.testing.assert_allclose(invert_transform(T_world_cam) @ [0, 0, 0, 1], [0, 0, 4, 1], atol=1e-12)
+    np.testing.assert_allclose(T_world_cam[:3, 1], [0, -1, 0], atol=1e-12)  # y down
+
+
+def test_a_transforms_file_with_pinhole_numbers_counts_from_pixel_corners(tmp_path, write_images):
+    write_images(tmp_path / "images", 2)
+    frames = [{"file_path": f"images/{k:06d}.png", "transform_matrix": np.eye(4).tolist()} for k in range(2)]
+    document = {"fl_x": 30, "fl_y": 31, "cx": 16, "cy": 12, "w": 32, "h": 24, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    assert open_sequence(tmp_path).intrinsics == CAMERA
+    assert open_sequence(tmp_path / "transforms.json").intrinsics == CAMERA
+
+
+@pytest.fixture
+def transforms_folder(tmp_path, write_images):
+    """Return a function that writes a recording of one image with more keys in its transforms.json."""
+
+    def write(**document):
+        write_images(tmp_path / "images", 1)
+        frames = [{"file_path": "images/000000.png", "transform_matrix": np.eye(4).tolist()}]
+        known = {"fl_x": 30, "fl_y": 31, "cx": 16, "cy": 12, "w": 32, "h": 24, "frames": frames}
+        (tmp_path / "transforms.json").write_text(json.dumps({**known, **document}))
+        return tmp_path
+
+    return write
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", None])
+def test_a_transforms_file_of_a_pinhole_model_is_read(transforms_folder, model):
+    folder = transforms_folder(camera_model=model, k1=0.1, k4=0.0, is_fisheye=False)
+    assert open_sequence(folder).distortion == (0.1, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        (
+            {"camera_model": "OPENCV_FISHEYE", "k1": 0.1},
+            "camera_model must be one of OPENCV, .*'OPENCV_FISHEYE'",
+        ),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be one of OPENCV, .*'EQUIRECTANGULAR'"),
+        ({"camera_model": "OPENCV", "k4": 0.01}, "k4 must be 0 or come with k5 and k6, got 0.01"),
+        ({"is_fisheye": True}, "is_fisheye must be false for a pinhole camera, got True"),
+    ],
+)
+def test_a_transforms_file_of_another_model_is_refused(transforms_folder, document, message):
+    with pytest.raises(SourceError, match=f"transforms.json holds no usable intrinsics: {message}"):
+        open_sequence(transforms_folder(**document))
