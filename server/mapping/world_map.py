@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform
+from semcast.server.mapping.posed_frames import PosedFrames
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -131,7 +132,7 @@ class WorldMap:
         keyframes: In order of time, those with observations.
         poses: Frame id of a keyframe -> ``T_world_cam``, also of keyframes thinned out since.
         submap_of: Frame id of a keyframe -> its submap.
-        frames: Frame id -> (keyframe's frame id, ``T_keyframe_cam``).
+        frames: Of each its keyframe and ``T_keyframe_cam``.
         revisits: Frame id of a keyframe -> that of an older one whose landmarks it saw again.
     """
 
@@ -140,7 +141,7 @@ class WorldMap:
         self.keyframes: list[Keyframe] = []
         self.poses: dict[int, Array] = {}
         self.submap_of: dict[int, int] = {}
-        self.frames: dict[int, tuple[int, Array]] = {}
+        self.frames = PosedFrames()
         self.revisits: dict[int, int] = {}
         self._changed: set[int] = set()
         self._moved_keyframes: set[int] = set()
@@ -242,11 +243,7 @@ class WorldMap:
     def _rescale_frames(self, factor: dict[int, float]) -> None:
         """Scale the poses of frames relative to keyframes."""
         self._frames_moved = True
-        for frame_id, (keyframe_id, T_keyframe_cam) in self.frames.items():
-            if keyframe_id in factor:
-                T = T_keyframe_cam.copy()
-                T[:3, 3] *= factor[keyframe_id]
-                self.frames[frame_id] = (keyframe_id, T)
+        self.frames.rescale(factor)
 
     def bound(self, max_landmarks: int, max_keyframes: int, recent: int) -> bool:
         """Keep the map within its size: longest unseen landmarks and every second old keyframe go.
@@ -293,10 +290,12 @@ class WorldMap:
 
     def trajectory(self) -> dict[int, Array]:
         """Best current ``T_world_cam`` of every posed frame, by frame id ascending."""
-        return {
-            frame_id: self.poses[self.frames[frame_id][0]] @ self.frames[frame_id][1]
-            for frame_id in sorted(self.frames)
-        }
+        ids, keyframe_ids, T_keyframe_cam = self.frames.columns()
+        if len(ids) == 0:
+            return {}
+        used, at = np.unique(keyframe_ids, return_inverse=True)
+        T_world_cam = np.stack([self.poses[k] for k in used.tolist()])[at] @ T_keyframe_cam
+        return dict(zip(ids.tolist(), T_world_cam, strict=True))
 
     def observations(self) -> tuple[Ids, Ids, Array]:
         """Landmark id, keyframe's frame id and pixel of every observation of a landmark."""
@@ -326,7 +325,7 @@ class WorldMap:
     def arrays(self) -> dict[str, NDArray]:
         """Everything as plain arrays, for a checkpoint."""
         lengths = [[len(getattr(k, part)) for part in _KEYFRAME_PARTS] for k in self.keyframes]
-        frames = sorted(self.frames)
+        frame_ids, keyframe_ids, T_keyframe_cam = self.frames.columns()
         posed = sorted(self.poses)
         return {
             **self.landmarks.arrays(),
@@ -339,9 +338,9 @@ class WorldMap:
             "poses.frame_id": np.array(posed, dtype=np.int64),
             "poses.T_world_cam": np.array([self.poses[k] for k in posed]).reshape(-1, 4, 4),
             "poses.submap": np.array([self.submap_of[k] for k in posed], dtype=np.int64),
-            "frames.frame_id": np.array(frames, dtype=np.int64),
-            "frames.keyframe_id": np.array([self.frames[k][0] for k in frames], dtype=np.int64),
-            "frames.T_keyframe_cam": np.array([self.frames[k][1] for k in frames]).reshape(-1, 4, 4),
+            "frames.frame_id": frame_ids,
+            "frames.keyframe_id": keyframe_ids,
+            "frames.T_keyframe_cam": T_keyframe_cam,
             "revisits": np.array(list(self.revisits.items()), dtype=np.int64).reshape(-1, 2),
         }
 
@@ -361,15 +360,12 @@ class WorldMap:
             strict=True,
         ):
             self.poses[frame_id], self.submap_of[frame_id] = np.array(T), int(submap)
-        for frame_id, keyframe_id, T in zip(
-            arrays["frames.frame_id"].tolist(),
-            arrays["frames.keyframe_id"].tolist(),
-            arrays["frames.T_keyframe_cam"],
-            strict=True,
-        ):
-            if keyframe_id not in self.poses:
-                raise ValueError(f"frame {frame_id} refers to keyframe {keyframe_id}, which is not there")
-            self.frames[frame_id] = (keyframe_id, np.array(T))
+        unknown = np.setdiff1d(arrays["frames.keyframe_id"], arrays["poses.frame_id"])
+        if len(unknown):
+            raise ValueError(f"frames refer to keyframe {unknown[0]}, which is not there")
+        self.frames.take(
+            arrays["frames.frame_id"], arrays["frames.keyframe_id"], arrays["frames.T_keyframe_cam"]
+        )
         ends = np.cumsum(arrays["keyframes.length"], axis=0)
         starts = ends - arrays["keyframes.length"]
         for k, frame_id in enumerate(arrays["keyframes.frame_id"].tolist()):

@@ -212,7 +212,7 @@ def test_arrays_bring_the_map_back():
 
 def test_contradicting_arrays_are_refused():
     arrays = make_world().arrays()
-    with pytest.raises(ValueError, match="refers to keyframe 999"):
+    with pytest.raises(ValueError, match="refer to keyframe 999"):
         WorldMap().restore({**arrays, "frames.keyframe_id": arrays["frames.keyframe_id"] * 0 + 999})
     missing = {k: v for k, v in arrays.items() if k != "landmarks.xyz"}
     with pytest.raises(KeyError):
