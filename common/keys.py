@@ -73,7 +73,7 @@ def pose_key(agent_id: str) -> str:
 
 
 def map_key(agent_id: str) -> str:
-    """``MapMessage``."""
+    """``MapMessage``: what changed, and a queryable that gives the whole map to whoever comes late."""
     return _key(agent_id, "map")
 
 

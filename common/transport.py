@@ -221,8 +221,8 @@ class Session:
         )
         self._add(_Pump(declared, deliver, f"sub-{key.rsplit('/', 1)[-1]}"))
 
-    def answer(self, key: str, handle: Callable[[bytes], bytes]) -> None:
-        """Answer requests on a key with ``handle(payload)``, on a thread of its own.
+    def answer(self, key: str, handle: Callable[[bytes], bytes | None]) -> None:
+        """Answer requests on a key with ``handle(payload)``, on a thread of its own; None is no answer.
 
         Raises:
             TransportError: The session is closed.
@@ -230,7 +230,9 @@ class Session:
 
         def reply(query: Any) -> None:
             with query:
-                query.reply(key, handle(query.payload.to_bytes() if query.payload is not None else b""))
+                answer = handle(query.payload.to_bytes() if query.payload is not None else b"")
+                if answer is not None:
+                    query.reply(key, answer)
 
         declared = self._declare(
             lambda: self._session.declare_queryable(key, zenoh.handlers.FifoChannel(_FIFO_CAPACITY)),

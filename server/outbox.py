@@ -108,7 +108,7 @@ def pose_message(arrival: ReceivedFrame, result: FrameResult) -> PoseMessage:
 
 
 def map_message(agent_epoch: int, update: MapUpdate) -> MapMessage:
-    """Return the message of a map change."""
+    """Return the message of a map change, or of a whole map."""
     return MapMessage(
         agent_epoch=agent_epoch,
         map_epoch=update.map_epoch,

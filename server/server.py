@@ -1,19 +1,18 @@
 """The server process: receives, decodes, tracks and maps one stream, shows it and keeps the results."""
 
 import contextlib
+import functools
 import logging
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
-from concurrent.futures import TimeoutError as FutureTimeoutError
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from semcast.common.codec import Codec, Modulation
 from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError
-from semcast.common.keys import camera_key, control_key
+from semcast.common.keys import camera_key, control_key, map_key
 from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
 from semcast.common.metrics import Metrics
 from semcast.common.run_folder import IMAGES_NAME
@@ -26,10 +25,11 @@ from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import DecodedArrival, FrameDecoder, codec_loader
 from semcast.server.former_run import check_not_foreign, free_folder
 from semcast.server.mapping.bundle_problem import BundleRunner
-from semcast.server.outbox import Outbox
+from semcast.server.outbox import Outbox, map_message
 from semcast.server.receiver import ReceivedFrame, Receiver
 from semcast.server.record import recording
 from semcast.server.reference import Reference, sequence_reference
+from semcast.server.requests import RequestDesk
 from semcast.server.session import Arrival, Outcome, Session, StreamIdentity, new_bundle
 from semcast.server.settings import ServerSettings
 from semcast.server.view.choice import check_viewer, open_viewer
@@ -83,7 +83,7 @@ class Server:
         self._reference: Reference | None = None
         self._former_epochs: set[int] = set()
         self._begun_ns = 0
-        self._requests: dict[str, Future[str]] = {}
+        self._desk = RequestDesk()
         self._announced: CameraInfo | None = None
         self._inbox_lock = threading.Lock()
         self._drops_before: dict[str, int] = {}
@@ -105,6 +105,7 @@ class Server:
             )
             stack.callback(beat.close)
             session.answer(control_key(self._agent_id, "server"), self._answer)
+            session.answer(map_key(self._agent_id), self._answer_map)
             stack.callback(self._close_spare)
             self._make_ready()
             session.subscribe(camera_key(self._agent_id), "every", self._on_camera)
@@ -167,18 +168,15 @@ class Server:
             return pack(ControlReply(ok=False, error=str(err)))
         if request.op not in ("get", "reset", "save"):
             return pack(ControlReply(ok=False, error=f"op must be get, reset or save, got {request.op}"))
-        error = self._ask(request.op) if request.op != "get" else ""
+        # A busy server answers that it will serve it.
+        error = (self._desk.ask(request.op, SERVE_WAIT_S) or "") if request.op != "get" else ""
         values = {"mode": self._settings.mode, "view": self._settings.view.view}
         return pack(ControlReply(ok=not error, error=error[:1000], settings=values))
 
-    def _ask(self, op: str) -> str:
-        """Hand a request to the thread that serves it; return what went wrong, empty as far as is known."""
-        with self._inbox_lock:
-            served = self._requests.setdefault(op, Future())
-        try:
-            return served.result(SERVE_WAIT_S)
-        except FutureTimeoutError:
-            return ""
+    def _answer_map(self, _payload: bytes) -> bytes | None:
+        """Give the whole map to who comes late."""
+        whole: bytes | None = self._desk.ask("map", SERVE_WAIT_S)
+        return whole
 
     def run(self, stop: threading.Event) -> dict[str, Any]:
         """Serve until the source ends, ``stop`` is set or a time limit passes; outputs are always written.
@@ -224,20 +222,21 @@ class Server:
         return limit_s is not None and idle_s >= limit_s
 
     def _serve_requests(self) -> None:
-        with self._inbox_lock:
-            requests, self._requests = self._requests, {}
-        for op, serve in (("reset", self._reset), ("save", self._save)):
-            if op in requests:
-                requests[op].set_result(serve(self._session) if self._session is not None else "")
+        serve = {"reset": self._reset, "save": self._save, "map": self._whole_map}
+        self._desk.serve({what: functools.partial(handle, self._session) for what, handle in serve.items()})
 
-    def _reset(self, session: Session) -> str:
+    def _reset(self, session: Session | None) -> str:
+        if session is None:
+            return ""
         logger.info("map reset on request")
         session.restart_map()
         self._new_map = True
         return ""
 
-    def _save(self, session: Session) -> str:
+    def _save(self, session: Session | None) -> str:
         """Write checkpoint and results now, as far as they are; return what went wrong."""
+        if session is None:
+            return ""
         out = self._settings.out
         session.save_checkpoint()
         try:
@@ -245,6 +244,11 @@ class Server:
         except (OSError, SemcastError) as err:
             return self._tell_not_written(out, err)
         return ""
+
+    def _whole_map(self, session: Session | None) -> bytes | None:
+        if session is None:
+            return None
+        return pack(map_message(session.identity.agent_epoch, session.whole_map()))
 
     def _tell_not_written(self, folder: Path | None, err: Exception) -> str:
         """Report outputs that the stream goes on without."""

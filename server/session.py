@@ -312,6 +312,10 @@ class Session:
         )
         self._checkpoints.submit(Checkpoint(header, self._reconstruction.snapshot()))
 
+    def whole_map(self) -> MapUpdate:
+        """Return the map as one update, for who has seen none before."""
+        return self._reconstruction.whole_map()
+
     def restart_map(self) -> None:
         """Forget the map, as the control request ``reset`` asks."""
         self._reconstruction.reset()

@@ -27,6 +27,7 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
 
 #: Two keyframes this many steps apart give the scale of a new map its speed.
 _MAX_BRIDGE_S = 5.0
@@ -326,14 +327,23 @@ class MapBuilder:
 
     def take_update(self, map_epoch: int) -> MapUpdate | None:
         """What changed in the map since this was last called, None when nothing did."""
-        world = self.world
-        changed, removed, keyframes, frames = world.take_changes()
+        changed, removed, keyframes, frames = self.world.take_changes()
         if len(changed) + len(removed) + len(keyframes) == 0:
             return None
-        row = world.landmarks.rows(changed)
+        return self._update(map_epoch, changed, removed, keyframes, frames)
+
+    def whole(self, map_epoch: int) -> MapUpdate:
+        """All landmarks and keyframes, whether they changed or not."""
+        keyframes = np.array(sorted(self.world.poses), dtype=np.int64)
+        none = np.zeros(0, np.int64)
+        return self._update(map_epoch, self.world.landmarks.ids.copy(), none, keyframes, none)
+
+    def _update(self, map_epoch: int, ids: Ids, removed: Ids, keyframes: Ids, frames: Ids) -> MapUpdate:
+        world = self.world
+        row = world.landmarks.rows(ids)
         return MapUpdate(
             map_epoch=map_epoch,
-            ids=changed,
+            ids=ids,
             xyz=world.landmarks.xyz[row].copy(),
             rgb=world.landmarks.rgb[row].copy(),
             confidence=world.landmarks.confidence[row].copy(),

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.shapes import check_shape
 from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.motion import ConstantVelocity
 from semcast.server.mapping import mapper
@@ -120,7 +119,7 @@ class Reconstruction:
         Raises:
             ValueError: An array has another shape than the camera's image.
         """
-        self._check(frame)
+        frame.check(self._camera.shape_hw)
         self._stage_ms = {}
         self._on_pose = on_pose
         if frame.frame_id <= self._last_frame_id:
@@ -135,14 +134,6 @@ class Reconstruction:
         if self._state is TrackingState.TRACKING:
             return self._track(sight, T_world_guess)
         return self._find(sight)
-
-    def _check(self, frame: DecodedFrame) -> None:
-        height, width = self._camera.shape_hw
-        check_shape(frame.image, f"{height} {width} 3", "image")
-        for name in ("confidence", "keypoint_confidence"):
-            values = getattr(frame, name)
-            if values is not None:
-                check_shape(values, f"{height} {width}", name)
 
     def _lap(self, stage: str, since_ns: int) -> None:
         self._stage_ms[stage] = self._stage_ms.get(stage, 0.0) + (time.perf_counter_ns() - since_ns) * 1e-6
@@ -452,6 +443,10 @@ class Reconstruction:
     def take_map_update(self) -> MapUpdate | None:
         """What changed in the map since this was last called, None when nothing did."""
         return self._map.take_update(self._map_epoch)
+
+    def whole_map(self) -> MapUpdate:
+        """The map as one update, whatever was taken before."""
+        return self._map.whole(self._map_epoch)
 
     def final_trajectory(self) -> dict[int, Array]:
         """Best current ``T_world_cam`` of all posed frames, by frame id; waits for a running adjustment."""

@@ -7,6 +7,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.common.shapes import check_shape
+
 Array = NDArray[np.float64]
 
 
@@ -37,6 +39,19 @@ class DecodedFrame:
     confidence: NDArray[np.float32] | None = None
     keypoint_confidence: NDArray[np.float32] | None = None
     slot_snr_db: NDArray[np.float32] | None = None
+
+    def check(self, shape_hw: tuple[int, int]) -> None:
+        """Check that image and confidence maps are of a camera's size.
+
+        Raises:
+            ValueError: An array has another shape.
+        """
+        height, width = shape_hw
+        check_shape(self.image, f"{height} {width} 3", "image")
+        for name in ("confidence", "keypoint_confidence"):
+            values = getattr(self, name)
+            if values is not None:
+                check_shape(values, f"{height} {width}", name)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,149 @@
+"""The map of a running server, kept up to date in another process: for planning, or for one's own viewer."""
+
+import logging
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.errors import TransportError
+from semcast.common.keys import map_key
+from semcast.common.messages import MapMessage
+from semcast.common.transport import Session
+from semcast.common.wire import WireError, unpack
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class MirroredMap:
+    """A map at one moment; arrays are never changed.
+
+    Attributes:
+        agent_epoch: Start of the agent it belongs to, 0 while there is none.
+        map_epoch: Counts new maps within it; positions of two epochs have nothing to do with each other.
+        ids: ``(N,)`` int64 landmarks, ascending.
+        xyz: ``(N, 3)`` float32 in the world frame, map units.
+        rgb: ``(N, 3)`` uint8.
+        confidence: ``(N,)`` float32 in [0, 1].
+        keyframe_ids: ``(K,)`` int64 frame ids of keyframes, ascending.
+        keyframe_poses: ``(K, 4, 4)`` float64 ``T_world_cam``.
+    """
+
+    agent_epoch: int
+    map_epoch: int
+    ids: NDArray[np.int64]
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    keyframe_ids: NDArray[np.int64]
+    keyframe_poses: NDArray[np.float64]
+
+    def updated(self, message: MapMessage) -> "MirroredMap":
+        """Return the map with what a message says is new, moved or gone; a new epoch begins anew."""
+        before = self
+        if (message.agent_epoch, message.map_epoch) != (self.agent_epoch, self.map_epoch):
+            before = _EMPTY
+        stays = ~np.isin(before.ids, np.concatenate([message.ids, message.removed]))
+        ids = np.concatenate([before.ids[stays], message.ids])
+        order = np.argsort(ids, kind="stable")
+        kept = ~np.isin(before.keyframe_ids, message.keyframe_ids)
+        keyframe_ids = np.concatenate([before.keyframe_ids[kept], message.keyframe_ids])
+        in_time = np.argsort(keyframe_ids, kind="stable")
+        return MirroredMap(
+            agent_epoch=message.agent_epoch,
+            map_epoch=message.map_epoch,
+            ids=ids[order],
+            xyz=np.concatenate([before.xyz[stays], message.xyz])[order],
+            rgb=np.concatenate([before.rgb[stays], message.rgb])[order],
+            confidence=np.concatenate([before.confidence[stays], message.confidence])[order],
+            keyframe_ids=keyframe_ids[in_time],
+            keyframe_poses=np.concatenate([before.keyframe_poses[kept], message.keyframe_poses])[in_time],
+        )
+
+
+_EMPTY = MirroredMap(
+    agent_epoch=0,
+    map_epoch=0,
+    ids=np.zeros(0, np.int64),
+    xyz=np.zeros((0, 3), np.float32),
+    rgb=np.zeros((0, 3), np.uint8),
+    confidence=np.zeros(0, np.float32),
+    keyframe_ids=np.zeros(0, np.int64),
+    keyframe_poses=np.zeros((0, 4, 4)),
+)
+
+
+class MapMirror:
+    """Follows the map of one agent's server, from whatever moment on and over restarts of the server.
+
+    Args:
+        session: An open session; the mirror ends with it.
+        agent_id: Whose map.
+        timeout_s: How long to wait for the server's answer; without one the map begins empty and is asked for
+            again when a server appears.
+
+    Raises:
+        TransportError: The session is closed.
+    """
+
+    def __init__(self, session: Session, agent_id: str, timeout_s: float = 5.0) -> None:
+        self._session, self._agent_id, self._timeout_s = session, agent_id, timeout_s
+        self._lock = threading.Lock()
+        self._map = _EMPTY
+        self._early: list[MapMessage] | None = None
+        session.subscribe(map_key(agent_id), "every", self._on_change)
+        self._is_behind = not self._catch_up()
+        session.watch_alive(agent_id, self._on_role)
+
+    @property
+    def map(self) -> MirroredMap:
+        """The newest state."""
+        with self._lock:
+            return self._map
+
+    def _catch_up(self) -> bool:
+        """Take the whole map from the server; whether it had one.
+
+        Changes that come meanwhile may be older or newer than the answer. Once more on top of it they give
+        the newest state: the last word on a landmark is either among them or in the answer.
+        """
+        with self._lock:
+            self._early = []
+        try:
+            answer = self._session.request(map_key(self._agent_id), b"", self._timeout_s)
+            whole = unpack(answer, MapMessage) if answer is not None else None
+        except (TransportError, WireError) as err:
+            logger.warning("the map can't be taken from the server: %s", err)
+            whole = None
+        with self._lock:
+            early, self._early = self._early or [], None
+            if whole is not None:
+                self._map = _EMPTY.updated(whole)
+                now = (whole.agent_epoch, whole.map_epoch)
+                early = [message for message in early if (message.agent_epoch, message.map_epoch) >= now]
+            for message in early:
+                self._map = self._map.updated(message)
+        return whole is not None
+
+    def _on_role(self, role: str, alive: bool) -> None:
+        """A server that was away may be another one, with another map."""
+        if role != "server":
+            return
+        if not alive:
+            self._is_behind = True
+        elif self._is_behind:
+            self._is_behind = not self._catch_up()
+
+    def _on_change(self, payload: bytes) -> None:
+        try:
+            message = unpack(payload, MapMessage)
+        except WireError as err:
+            logger.warning("a map message can't be read: %s", err)
+            return
+        with self._lock:
+            if self._early is not None:
+                self._early.append(message)
+            else:
+                self._map = self._map.updated(message)

@@ -1,0 +1,32 @@
+"""Requests of other processes, handed from the network's threads to the one thread that may serve them."""
+
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from typing import Any
+
+
+class RequestDesk:
+    """Takes requests on any thread; those for the same thing are served together, once."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: dict[str, Future[Any]] = {}
+
+    def ask(self, what: str, wait_s: float) -> Any:
+        """Return what serving gave; None when it takes longer than ``wait_s``, or failed."""
+        with self._lock:
+            served = self._waiting.setdefault(what, Future())
+        try:
+            return served.result(wait_s)
+        except FutureTimeoutError:
+            return None
+
+    def serve(self, handlers: Mapping[str, Callable[[], Any]]) -> None:
+        """Serve what was asked for, in the order of the handlers."""
+        with self._lock:
+            waiting, self._waiting = self._waiting, {}
+        for what, handle in handlers.items():
+            if what in waiting:
+                waiting[what].set_result(handle())

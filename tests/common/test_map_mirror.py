@@ -1,0 +1,117 @@
+import time
+
+import numpy as np
+import pytest
+
+from semcast.common.keys import map_key
+from semcast.common.map_mirror import MapMirror
+from semcast.common.messages import MapMessage
+from semcast.common.network_settings import NetworkSettings
+from semcast.common.transport import open_client, open_hub
+from semcast.common.wire import pack
+
+AGENT = "cam0"
+
+
+def message(ids, *, removed=(), keyframes=(), offset=0.0, agent_epoch=7, map_epoch=0):
+    count = len(ids)
+    return MapMessage(
+        agent_epoch=agent_epoch,
+        map_epoch=map_epoch,
+        ids=np.array(ids, np.int64),
+        xyz=(np.array(ids, np.float32)[:, None] + offset) * np.ones((1, 3), np.float32),
+        rgb=np.full((count, 3), 9, np.uint8),
+        confidence=np.full(count, 0.5, np.float32),
+        removed=np.array(removed, np.int64),
+        keyframe_ids=np.array(keyframes, np.int64),
+        keyframe_poses=np.array([np.eye(4) * (k + offset) for k in keyframes]).reshape(-1, 4, 4),
+    )
+
+
+def until(condition):
+    deadline_s = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def hub():
+    session, endpoint = open_hub()
+    with session:
+        yield session, endpoint
+
+
+@pytest.fixture
+def client(hub):
+    with open_client(NetworkSettings(connect=(hub[1],)), 5) as session:
+        yield session
+
+
+class Serving:
+    """A server's side of the map."""
+
+    def __init__(self, session, whole):
+        self.whole = whole
+        session.answer(map_key(AGENT), lambda _: None if self.whole is None else pack(self.whole))
+        self.publisher = session.publisher(map_key(AGENT), "every")
+
+    def put(self, change):
+        self.publisher.put(pack(change))
+
+
+def test_landmarks_and_keyframes_are_added_moved_and_removed(hub, client):
+    serving = Serving(hub[0], message([1, 5, 9], keyframes=[0, 10]))
+    mirror = MapMirror(client, AGENT)
+    before = mirror.map
+    assert before.ids.tolist() == [1, 5, 9]
+    serving.put(message([3, 5], removed=[9, 77], keyframes=[10, 20], offset=0.25))
+    until(lambda: mirror.map is not before)
+    now = mirror.map
+    assert (now.ids.tolist(), now.keyframe_ids.tolist()) == ([1, 3, 5], [0, 10, 20])
+    assert now.xyz[:, 0].tolist() == [1.0, 3.25, 5.25]
+    assert now.keyframe_poses[:, 0, 0].tolist() == [0.0, 10.25, 20.25]
+    assert before.ids.tolist() == [1, 5, 9], "a map once taken stays as it was"
+
+
+def test_changes_that_come_before_the_answer_are_the_last_word(hub, client):
+    """Of landmark 5 the answer knows nothing yet; 9 was removed before the answer was made."""
+    serving = Serving(hub[0], None)
+
+    def late(_):
+        serving.put(message([9]))
+        serving.put(message([5], removed=[9]))
+        # Answers and changes take different ways: these are there before the answer is.
+        time.sleep(0.3)
+        return pack(message([1, 2]))
+
+    hub[0].answer(map_key("late"), late)
+    serving.publisher = hub[0].publisher(map_key("late"), "every")
+    mirror = MapMirror(client, "late")
+    assert mirror.map.ids.tolist() == [1, 2, 5]
+
+
+def test_a_new_map_replaces_the_one_before(hub, client):
+    serving = Serving(hub[0], message([1, 2], keyframes=[0]))
+    mirror = MapMirror(client, AGENT)
+    for change in (message([4], map_epoch=1), message([6], agent_epoch=3)):
+        serving.put(change)
+        until(lambda ids=change.ids: np.array_equal(mirror.map.ids, ids))
+        assert len(mirror.map.keyframe_ids) == 0
+
+
+def test_a_server_that_was_away_is_asked_again(hub, client, caplog):
+    serving = Serving(hub[0], None)
+    mirror = MapMirror(client, AGENT)
+    assert len(mirror.map.ids) == 0
+    serving.whole = message([1, 2])
+    with open_client(NetworkSettings(connect=(hub[1],)), 5) as server:
+        server.declare_alive(AGENT, "server")
+        until(lambda: mirror.map.ids.tolist() == [1, 2])
+    serving.whole = message([1, 8])
+    with open_client(NetworkSettings(connect=(hub[1],)), 5) as server:
+        server.declare_alive(AGENT, "server")
+        until(lambda: mirror.map.ids.tolist() == [1, 8])
+    serving.publisher.put(b"\x93garbage")
+    until(lambda: "a map message can't be read" in caplog.text)
+    assert mirror.map.ids.tolist() == [1, 8]

@@ -1,0 +1,46 @@
+"""What other processes ask of a server."""
+
+import time
+
+import pytest
+
+from semcast.common.errors import SemcastError
+
+DEADLINE_S = 60.0
+
+
+def test_control_requests_reset_and_save(tmp_path, air):
+    running = air.serve(out=tmp_path)
+    radio = air.agent(100)
+    radio.stream(range(10))
+
+    epoch = radio.poses[-1].map_epoch
+    assert radio.ask("get").settings["mode"] == "live"
+    assert not radio.ask("explode").ok
+    assert radio.ask("save").ok
+    deadline = time.monotonic() + DEADLINE_S
+    while not (tmp_path / "map.ply").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert not (tmp_path / "summary.json").exists()
+    assert radio.ask("reset").ok
+    radio.stream(range(10, 14))
+    assert radio.poses[-1].map_epoch == epoch + 1
+    running.finish(stop=True)
+
+
+def test_a_save_that_fails_is_answered_and_the_stream_goes_on(tmp_path, air, caplog, monkeypatch):
+    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
+    (tmp_path / "map.ply").mkdir()
+    running = air.serve(out=tmp_path)
+    radio = air.agent(100)
+    radio.stream([0, 1])
+    reply = radio.ask("save")
+    assert not reply.ok
+    assert reply.error.startswith(f"outputs can't be written to {tmp_path}: ")
+    assert "map.ply" in reply.error
+    assert reply.error in caplog.text
+    assert running.server._metrics.status(100).last_error == reply.error
+    radio.stream([2, 3])
+    with pytest.raises(SemcastError, match="map.ply"):
+        running.finish(stop=True)

@@ -1,0 +1,52 @@
+"""The map over the network, for who comes late."""
+
+import time
+
+import numpy as np
+
+from semcast.common.map_mirror import MapMirror
+from semcast.common.network_settings import NetworkSettings
+from semcast.common.transport import open_client
+from semcast.server.export.outputs import read_ply
+
+AGENT = "cam0"
+DEADLINE_S = 60.0
+
+
+def until(condition, what):
+    deadline_s = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline_s, f"not within {DEADLINE_S} s: {what}"
+        time.sleep(0.01)
+
+
+def test_who_comes_late_has_the_whole_map_and_follows_it(tmp_path, air, monkeypatch):
+    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
+    running = air.serve(out=tmp_path)
+    radio = air.agent(100)
+    with open_client(NetworkSettings(connect=(air.endpoint,)), DEADLINE_S) as client:
+        early = MapMirror(client, AGENT, DEADLINE_S)
+        assert len(early.map.ids) == 0
+        radio.stream(range(12))
+        with open_client(NetworkSettings(connect=(air.endpoint,)), DEADLINE_S) as other:
+            late = MapMirror(other, AGENT, DEADLINE_S)
+            then = late.map
+            assert (then.agent_epoch, then.map_epoch) == (100, 0)
+            assert len(then.ids) > 50
+            assert len(then.keyframe_ids) > 1
+            radio.stream(range(12, 20))
+            assert radio.ask("save").ok
+            marks = len(read_ply(tmp_path / "map.ply"))
+            for mirror in (early, late):
+                until(lambda m=mirror: len(m.map.ids) == marks, "the map as the server saved it")
+            assert late.map.keyframe_ids[-1] > then.keyframe_ids[-1]
+            for name in ("ids", "xyz", "rgb", "confidence", "keyframe_ids", "keyframe_poses"):
+                assert np.array_equal(getattr(early.map, name), getattr(late.map, name)), name
+    running.finish(stop=True)
+
+
+def test_a_server_without_a_map_has_no_answer(air):
+    running = air.serve()
+    with open_client(NetworkSettings(connect=(air.endpoint,)), DEADLINE_S) as client:
+        assert len(MapMirror(client, AGENT, DEADLINE_S).map.ids) == 0
+    running.finish(stop=True)

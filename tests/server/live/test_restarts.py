@@ -1,0 +1,135 @@
+"""Agents and servers that are started again, in the middle of a stream."""
+
+import json
+
+import numpy as np
+
+from semcast.server.export.outputs import write_ply
+
+
+def centre(pose):
+    return np.array(pose.T_world_cam)[[3, 7, 11]]
+
+
+def test_a_restarted_agent_begins_a_new_map_and_the_former_run_is_kept(tmp_path, air):
+    running = air.serve(out=tmp_path)
+    first = air.agent(100)
+    first.stream(range(8))
+    first.close()
+    second = air.agent(200)
+    second.stream(range(4))
+    summary = running.finish(stop=True)
+    assert summary["frames"]["tracked"] == 4
+    former = json.loads((tmp_path / "previous-1" / "summary.json").read_text())
+    assert former["frames"]["tracked"] == 8
+    assert len((tmp_path / "previous-1" / "frames.jsonl").read_text().splitlines()) == 8
+    assert len((tmp_path / "frames.jsonl").read_text().splitlines()) == 4
+
+
+def test_a_restarted_server_goes_on_with_the_map_of_its_checkpoint(tmp_path, open_air):
+    with open_air() as air:
+        running = air.serve(out=tmp_path, checkpoint_interval_s=0.1)
+        radio = air.agent(100)
+        radio.stream(range(16))
+        before = {p.frame_id: p for p in radio.poses if p.T_world_cam is not None}
+        assert len(before) > 10
+        running.finish(stop=True)
+    (tmp_path / "summary.json").unlink()
+
+    with open_air() as air:
+        radio = air.agent(100)
+        running = air.serve(out=tmp_path)
+        for k in range(16, 24):  # the camera turns back and sees what it saw before
+            radio.send(k, picture=30 - k)
+            radio.wait(lambda k=k: k in radio.posed_ids(), f"an answer to frame {k}")
+        summary = running.finish()
+    after = {p.frame_id: p for p in radio.poses if p.T_world_cam is not None}
+    assert summary["resumed"]
+    assert summary["frames"]["tracked"] == 24
+    assert len(after) >= 6
+    # The same world: a place seen again has the place it had before the restart.
+    step = np.linalg.norm(centre(before[14]) - centre(before[13]))
+    for k in after:
+        assert np.linalg.norm(centre(after[k]) - centre(before[30 - k])) < 0.5 * step
+
+
+def test_another_agent_epoch_does_not_inherit_the_checkpoint(tmp_path, open_air):
+    for epoch in (100, 200):
+        with open_air() as air:
+            running = air.serve(out=tmp_path, checkpoint_interval_s=0.1)
+            air.agent(epoch).stream(range(6))
+            summary = running.finish(stop=True)
+        assert not summary["resumed"]
+        assert summary["frames"]["tracked"] == 6
+
+
+def test_a_former_start_that_cannot_be_written_does_not_stop_the_new_one(tmp_path, air, caplog, monkeypatch):
+    def full(path, *rest):
+        if path.parent.name == "previous-1":
+            raise OSError(28, "No space left on device")
+        write_ply(path, *rest)
+
+    monkeypatch.setattr("semcast.server.session.write_ply", full)
+    running = air.serve(out=tmp_path)
+    for epoch, num_frames in ((100, 6), (200, 4)):
+        radio = air.agent(epoch)
+        radio.stream(range(num_frames))
+        radio.close()
+    assert running.finish(stop=True)["frames"]["tracked"] == 4
+    former = tmp_path / "previous-1"
+    assert f"outputs can't be written to {former}: [Errno 28] No space left on device" in caplog.text
+    assert len((former / "frames.jsonl").read_text().splitlines()) == 6, "what was written is kept"
+    assert len((tmp_path / "frames.jsonl").read_text().splitlines()) == 4
+    assert running.server._metrics.counts["errors"] == 1
+
+
+def test_a_new_start_that_cannot_be_written_is_kept_in_memory(tmp_path, air, caplog):
+    running = air.serve(out=tmp_path, bundle="process")
+    first = air.agent(100)
+    first.stream(range(6))
+    first.close()
+    (tmp_path / "frames.jsonl.part").mkdir()
+    second = air.agent(200)
+    second.stream(range(4))
+    second.close()
+    assert running.finish(stop=True)["frames"]["tracked"] == 4
+    assert "frames.jsonl can't be written" in caplog.text
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"]["tracked"] == 4
+    assert not (tmp_path / "frames.jsonl").exists()
+
+
+def test_a_late_frame_of_the_former_start_does_not_end_the_new_one(tmp_path, air):
+    running = air.serve(out=tmp_path)
+    first = air.agent(100)
+    first.stream(range(4))
+    second = air.agent(200)
+    second.wait(lambda: second.allowed > 0, "the server is ready for the new start")
+    first.send(4)
+    running.wait_for_drop("epoch")
+    second.stream(range(4))
+    summary = running.finish(stop=True)
+    assert summary["frames"]["tracked"] == 4
+    assert summary["drops"]["epoch"] == 1
+    assert not (tmp_path / "previous-2").exists()
+
+
+def test_a_former_start_that_goes_on_sending_is_taken_up_again(air, monkeypatch):
+    monkeypatch.setattr("semcast.server.server.STRAGGLER_NS", 0)
+    running = air.serve()
+    first = air.agent(100)
+    first.stream(range(4))
+    second = air.agent(200)
+    second.wait(lambda: second.allowed > 0, "the server is ready for the new start")
+    second.close()
+    first.stream(range(4, 8))
+    assert running.finish(stop=True)["frames"]["tracked"] == 4
+
+
+def test_a_start_with_an_earlier_clock_is_followed_after_a_silence(air, monkeypatch):
+    monkeypatch.setattr("semcast.server.arrival._SILENCE_NS", 0)
+    running = air.serve()
+    for epoch, num_frames in ((200, 4), (100, 6)):
+        radio = air.agent(epoch)
+        radio.stream(range(num_frames))
+        radio.close()
+    assert running.finish(stop=True)["frames"]["tracked"] == 6

@@ -1,0 +1,98 @@
+"""A stream over real loopback Zenoh: an agent's frames in, poses and files out."""
+
+import contextlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semcast.common.codecs import load_codec
+from semcast.common.errors import SemcastError
+from semcast.common.phy.slots import layout_for
+from semcast.common.run_folder import read_run
+from semcast.common.symbol_payload import pack_lost
+from semcast.common.trajectory import read_tum
+from semcast.common.transport import open_hub
+from semcast.server.export.outputs import read_ply
+from semcast.server.mapping.bundle_process import GIVEN_UP
+from semcast.server.server import Server
+from semcast.server.settings import ServerSettings, ViewSettings
+
+DEMO = Path(__file__).resolve().parents[3] / "deploy" / "demo" / "kitti_06"
+AGENT = "cam0"
+
+
+def test_a_lossless_stream_leaves_every_promised_file_and_repeats_bit_for_bit(tmp_path, open_air):
+    trajectories = []
+    for run in ("a", "b"):
+        out = tmp_path / run
+        with open_air() as air:
+            running = air.serve(mode="replay", out=out, reference=DEMO, view=ViewSettings(view="file"))
+            radio = air.agent(100, lossless=True)
+            radio.stream(range(24))
+            summary = running.finish()
+        trajectories.append((out / "trajectory.tum").read_bytes())
+        assert summary["frames"]["tracked"] == 24
+        assert summary["completeness"] >= 0.9
+        assert summary["ate_percent"] < 5.0
+        assert summary["psnr_db"] == 100.0, "the pictures are exact"
+        assert json.loads((out / "summary.json").read_text())["frames"] == summary["frames"]
+        assert len(read_tum(out / "trajectory.tum")) == summary["num_posed"]
+        assert len(read_ply(out / "map.ply")) == summary["num_landmarks"] > 50
+        assert len(read_run(out).frame_ids) == summary["num_posed"]
+        assert (out / "run.rrd").stat().st_size > 10_000
+        assert "[reconstruction]" in (out / "settings.toml").read_text()
+        assert set(radio.posed_ids()) == set(range(24))
+    assert trajectories[0] == trajectories[1]
+
+
+def test_bad_frames_are_counted_and_never_stop_the_stream(air):
+    running = air.serve()
+    radio = air.agent(100)
+    radio.stream([0, 1])
+    radio._symbols.put(b"\x93garbage")
+    radio.send(2, digest="0" * 16)
+    running.wait_for_drop("codec")  # live: a newer frame would replace it unseen
+    layout = layout_for(air.sequence.size_wh[::-1])
+    radio.send(3, slot_lost=pack_lost(np.ones(layout.num_slots, bool)))
+    running.wait_for_drop("outage")
+    radio.stream([4, 5])
+    summary = running.finish(stop=True)
+    assert summary["drops"]["protocol"] == 1
+    assert summary["drops"]["codec"] == 1
+    assert summary["drops"]["outage"] == 1
+    assert summary["frames"]["tracked"] == 4
+
+
+def test_a_bundle_adjustment_that_gave_up_is_in_the_status(air):
+    running = air.serve(bundle="process", duration_s=0.1)
+    running.server._spare_bundle._give_up()
+    assert running.server._metrics.status(0).last_error == GIVEN_UP
+    running.finish()
+
+
+def test_a_server_that_hears_nothing_ends_with_its_time_limit(air):
+    running = air.serve(duration_s=0.2)
+    assert running.finish() == {}
+
+
+def test_a_silent_stream_ends_with_the_idle_limit_and_its_outputs(tmp_path, air):
+    running = air.serve(out=tmp_path, idle_timeout_s=0.3)
+    radio = air.agent(100)
+    radio.stream(range(3))
+    assert running.finish()["frames"]["tracked"] == 3
+    assert (tmp_path / "summary.json").exists()
+
+
+def test_a_server_decodes_with_weights_of_ones_own(tiny_weights):
+    hub, _ = open_hub()
+    own = load_codec(str(tiny_weights))
+    settings = ServerSettings(agent_id=AGENT, bundle="inline", codec=str(tiny_weights))
+    with hub, contextlib.closing(Server(settings, hub)) as server:
+        decoder = server._decoder
+        assert decoder.codec_for("3dcsc", "16qam", own.digest).digest == own.digest
+        with pytest.raises(SemcastError, match="or give both the same weights"):
+            decoder.codec_for("3dcsc", "16qam", load_codec("3dcsc").digest)
+        shipped = load_codec("3dcsc-lite").digest
+        assert decoder.codec_for("3dcsc-lite", "16qam", shipped).digest == shipped
