@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import KLT_WINDOW_PX
 from semcast.server.geometry.features import Grey
+from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 
 Array = NDArray[np.float64]
 Values = NDArray[np.float32]
@@ -25,6 +26,8 @@ _GAIN_RANGE = (0.5, 2.0)
 _SMALL_STEP_PX = 0.03
 #: A structure tensor whose determinant is smaller than this share of its squared trace is an edge.
 _MIN_CORNERNESS = 1e-6
+#: A patch that is seen at less than this share of its area, or more than its inverse, has other details.
+_MIN_AREA_RATIO = 0.4
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,19 @@ def affine_warps(
     in_plane = R[:, :2] / np.array([camera.fx, camera.fy])
     warps = projection @ in_plane * depth0_map[:, None, None]
     return np.where(front[:, None, None], warps, np.eye(2)), depth1
+
+
+def seen_alike(warps: Array, depth1_map: Array) -> NDArray[np.bool_]:
+    """Which patches the second camera sees in front of it, and at so much of their area that details stay.
+
+    Args:
+        warps: ``(N, 2, 2)`` as ``affine_warps`` gives them.
+        depth1_map: ``(N,)`` depths, as well.
+    """
+    area = np.linalg.det(warps)
+    return np.asarray(
+        (depth1_map > MIN_DEPTH_MAP) & (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
+    )
 
 
 def align_patches(

@@ -7,7 +7,7 @@ import poselib
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import exp_se3, make_transform, project_to_so3
+from semcast.common.geometry import exp_se3, make_transform, project_to_so3, transform_points
 from semcast.server.geometry.weighting import HUBER_K
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ def reprojection_residual(
     camera: Intrinsics, T_cam_world: Array, points_world: Array, keypoints_xy: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Observed minus projected, ``(N, 2)`` pixels, and which points are in front; zero where they are not."""
-    points_cam = points_world @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    points_cam = transform_points(T_cam_world, points_world)
     front = points_cam[:, 2] > MIN_DEPTH_MAP
     z = np.where(front, points_cam[:, 2], 1.0)
     projected = np.stack(
@@ -115,7 +115,7 @@ def refine_pose(
     weight = sigma_px**-2.0
     hessian = np.zeros((6, 6))
     for iteration in range(iterations):
-        points_cam = points_world @ T[:3, :3].T + T[:3, 3]
+        points_cam = transform_points(T, points_world)
         used = points_cam[:, 2] > MIN_DEPTH_MAP
         if int(used.sum()) < 3:
             return _without_inliers(T_start, len(points_world))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
-from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches
+from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches, seen_alike
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 from semcast.server.mapping.recall import KeyframeImages
 from semcast.server.mapping.tracks import Sight, TrackTable
@@ -20,8 +20,6 @@ Array = NDArray[np.float64]
 
 #: Keyframes that are looked at, the newest ones, as many as an adjustment takes.
 NUM_ANCHORS = 10
-#: Patches that are seen at less than this share of their area, or more than its inverse, have other details.
-_MIN_AREA_RATIO = 0.4
 #: A point that would move further than this has found something else.
 _MAX_MOVE_PX = 3.0
 _MIN_CORRELATION = 0.7
@@ -68,8 +66,7 @@ def anchor_tracks(
         before = depth > MIN_DEPTH_MAP
         rows, xy0, depth = rows[before], xy0[before], depth[before]
         warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
-        area = np.linalg.det(warps)
-        alike = (depth_now > MIN_DEPTH_MAP) & (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
+        alike = seen_alike(warps, depth_now)
         if alike.any():
             parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike])))
             waiting[rows[alike]] = False

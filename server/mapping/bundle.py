@@ -12,6 +12,7 @@ from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, project_to_so3
+from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 from semcast.server.geometry.weighting import HUBER_K
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
 
@@ -20,7 +21,6 @@ Array = NDArray[np.float64]
 #: Observations share noise models: their sigmas are rounded to so many steps.
 NUM_SIGMAS = 16
 SIGMA_RANGE_PX = (0.1, 12.0)
-_MIN_DEPTH_MAP = 1e-3
 #: Holds a fixed pose: radians and map units.
 _FIXED_SIGMA = 1e-6
 
@@ -36,7 +36,7 @@ def residuals_px(problem: BundleProblem, T_world_cam: Array, xyz: Array) -> tupl
     """Observed minus projected, ``(M, 2)``, and which observations have the landmark in front."""
     T_cam_world = invert_transform(T_world_cam)[problem.view]
     points_cam = np.einsum("mij,mj->mi", T_cam_world[:, :3, :3], xyz[problem.point]) + T_cam_world[:, :3, 3]
-    front = points_cam[:, 2] > _MIN_DEPTH_MAP
+    front = points_cam[:, 2] > MIN_DEPTH_MAP
     z = np.where(front, points_cam[:, 2], 1.0)
     fx, fy, cx, cy = problem.intrinsics
     projected = np.stack([fx * points_cam[:, 0] / z + cx, fy * points_cam[:, 1] / z + cy], axis=1)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform, make_transform
+from semcast.common.geometry import invert_transform, make_transform, transform_points
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
 from semcast.server.mapping import mapper
 from semcast.server.mapping.anchoring import anchor_tracks
@@ -109,7 +109,7 @@ class MapBuilder:
         newest.descriptor_ids, newest.descriptors = self.relocaliser.describe(
             sight.grey, newest.ids, newest.xy
         )
-        xyz = scale * start.xyz @ placed[:3, :3].T + placed[:3, 3]
+        xyz = transform_points(placed, scale * start.xyz)
         xy = np.full((len(start.ids), 2), -1.0)
         seen = np.isin(start.ids, newest.ids, assume_unique=True)
         xy[seen] = newest.xy[np.searchsorted(newest.ids, start.ids[seen])]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform
+from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
@@ -223,7 +223,7 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
     marks = world.landmarks
     later = marks.ids[(marks.born > last_id) & (marks.submap == submap)]
     xyz = marks.xyz[marks.rows(later)]
-    world.move_landmarks(later, xyz @ T_correction[:3, :3].T + T_correction[:3, 3])
+    world.move_landmarks(later, transform_points(T_correction, xyz))
     for frame_id, T_world_cam, fixed in zip(
         problem.keyframe_ids.tolist(), result.T_world_cam, problem.fixed.tolist(), strict=True
     ):

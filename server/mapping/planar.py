@@ -13,7 +13,7 @@ import poselib
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform, make_transform, project_to_so3
+from semcast.common.geometry import invert_transform, make_transform, project_to_so3, transform_points
 from semcast.server.geometry.pnp import refine_pose
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.tracker import interpolate_pose
@@ -108,7 +108,7 @@ def _on_plane(
     return replace(
         problem,
         T_world_cam=T_world_first @ np.stack(poses),
-        xyz=xyz @ T_world_first[:3, :3].T + T_world_first[:3, 3],
+        xyz=transform_points(T_world_first, xyz),
     )
 
 

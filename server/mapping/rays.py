@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform
+from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.mapper import median_depth
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -81,7 +81,7 @@ def rays_of(
             break
         point = camera.unproject(keyframe.xy[row[new]]) * depth
         T_cam_keyframe = T_cam_world @ keyframe.T_world_cam
-        x, y, z = (point @ T_cam_keyframe[:3, :3].T + T_cam_keyframe[:3, 3]).T
+        x, y, z = transform_points(T_cam_keyframe, point).T
         front = z > _MIN_DEPTH_SHARE * depth
         z = np.where(front, z, 1.0)
         # The derivative of the projection by the inverse depth, times its standard deviation.
@@ -89,7 +89,7 @@ def rays_of(
         spread_px[new] = np.column_stack(
             [camera.fx * (t[0] - x / z * t[2]) / z, camera.fy * (t[1] - y / z * t[2]) / z]
         )
-        xyz[new] = point @ keyframe.T_world_cam[:3, :3].T + keyframe.T_world_cam[:3, 3]
+        xyz[new] = transform_points(keyframe.T_world_cam, point)
         sigma_px[new] = noise.sigma_px(keyframe.confidence[row[new]])
         found[new[front]] = True
         if found.all():

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform
+from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.features import Grey
 from semcast.server.mapping.tracks import Sight, TrackTable
 from semcast.server.mapping.world_map import WorldMap
@@ -101,7 +101,7 @@ def recall_landmarks(
             continue
         row = world.landmarks.rows(keyframe.ids)
         lost = np.flatnonzero((row >= 0) & ~np.isin(keyframe.ids, tracks.ids, assume_unique=True))
-        points_cam = world.landmarks.xyz[row[lost]] @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+        points_cam = transform_points(T_cam_world, world.landmarks.xyz[row[lost]])
         expected = camera.project(points_cam)
         border = np.array([_BORDER_PX, _BORDER_PX])
         inside = (expected >= border) & (expected < np.array([width, height]) - border)

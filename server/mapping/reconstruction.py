@@ -28,7 +28,7 @@ from semcast.server.mapping.tracker import (
     expected_positions,
     track_pose,
 )
-from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
+from semcast.server.mapping.tracks import Seen, Sight, TrackTable, usable_rows
 
 __all__ = ["Reconstruction", "ReconstructionSettings"]
 
@@ -172,15 +172,14 @@ class Reconstruction:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
 
     def _pose(self, T_world_guess: Array | None, **how: Unpack[Believing]) -> TrackedPose | None:
-        t, seen = self._tracks, self._tracks.visible
-        return self._pose_from(t.ids[seen], t.xy[seen], t.confidence[seen], T_world_guess, **how)
+        return self._pose_from(self._tracks.seen(), T_world_guess, **how)
 
     def _pose_from(
-        self, ids: Ids, xy: Array, confidence: Array, T_world_guess: Array | None, **how: Unpack[Believing]
+        self, seen: Seen, T_world_guess: Array | None, **how: Unpack[Believing]
     ) -> TrackedPose | None:
         world, noise = self._map.world, self._map.noise.model
         known = {"submap": self._map.submap, "seed": self._settings.seed}
-        return track_pose(self._camera, world, noise, ids, xy, confidence, T_world_guess, **known, **how)
+        return track_pose(self._camera, world, noise, seen, T_world_guess, **known, **how)
 
     def _track(self, sight: Sight, T_world_guess: Array | None) -> FrameResult:
         since = time.perf_counter_ns()
@@ -342,8 +341,8 @@ class Reconstruction:
         if place is None:
             return None
         # Nothing is given up for a place before there is a pose in it.
-        confidence = np.full(len(place.ids), _RECOGNISED_CONFIDENCE)
-        pose = self._pose_from(place.ids, place.xy, confidence, place.T_world_cam)
+        seen = Seen(place.ids, place.xy, np.full(len(place.ids), _RECOGNISED_CONFIDENCE))
+        pose = self._pose_from(seen, place.T_world_cam)
         if pose is not None:
             self._map.enter(place.submap)
             self._tracks.adopt(place.ids, place.xy, _RECOGNISED_CONFIDENCE)
@@ -375,9 +374,8 @@ class Reconstruction:
         self._frames_since_keyframe = 0
         self._lap("two_view", since)
         newest = self._map.world.pose_of_frame(sight.frame.frame_id)
-        t = self._tracks
-        marks = t.visible & (self._map.world.landmarks.rows(t.ids) >= 0)
-        pose = self._pose_from(t.ids[marks], t.xy[marks], t.confidence[marks], newest)
+        seen = self._tracks.seen()
+        pose = self._pose_from(seen[self._map.world.landmarks.rows(seen.ids) >= 0], newest)
         if pose is None:
             self._state = TrackingState.LOST
             self._last_posed_id = sight.frame.frame_id

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform
+from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.features import (
     Describer,
     Grey,
@@ -168,7 +168,7 @@ class Relocaliser:
         ids, known = _pool(world, near)
         points = world.landmarks.xyz[world.landmarks.rows(ids)]
         T = found.T_cam_world
-        expected = self._camera.project(points @ T[:3, :3].T + T[:3, 3])
+        expected = self._camera.project(transform_points(T, points))
         size = (self._camera.width, self._camera.height)
         in_view = ((expected >= 0) & (expected < size)).all(axis=1)
         ids, known, points, expected = ids[in_view], known[in_view], points[in_view], expected[in_view]

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.geometry import invert_transform, make_transform, project_to_so3
+from semcast.common.geometry import invert_transform, make_transform, project_to_so3, transform_points
 from semcast.server.mapping.bundle_problem import BundleProblem
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ def mirrored(problem: BundleProblem) -> BundleProblem:
     """
     T_world_first = problem.T_world_cam[0]
     T_first_world = invert_transform(T_world_first)
-    xyz = problem.xyz @ T_first_world[:3, :3].T + T_first_world[:3, 3]
+    xyz = transform_points(T_first_world, problem.xyz)
     middle = np.median(xyz, axis=0)
     depth = float(np.linalg.norm(middle))
     flip = _across(middle)
@@ -44,7 +44,7 @@ def mirrored(problem: BundleProblem) -> BundleProblem:
     return replace(
         problem,
         T_world_cam=np.stack(poses),
-        xyz=turned @ T_world_first[:3, :3].T + T_world_first[:3, 3],
+        xyz=transform_points(T_world_first, turned),
     )
 
 

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform
+from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.epipolar import fundamental_matrix, sampson_px
 from semcast.server.geometry.features import TrackedPoints, track_points
-from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches
+from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches, seen_alike
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP, reprojection_residual
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
@@ -40,8 +40,6 @@ _NUM_TRIED = 2
 _MIN_EXPECTED = 30
 #: Found landmarks that agree with the pose, as a number and as a share of those found.
 _MIN_AGREEING, _MIN_SHARE = 15, 0.6
-#: Patches that are seen at less than this share of their area, or more than its inverse, have other details.
-_MIN_AREA_RATIO = 0.4
 _MIN_CORRELATION = 0.75
 #: Old landmarks are not exactly where they are expected; the patch puts them right by a little once they were
 #: followed there.
@@ -155,9 +153,8 @@ def _expected(
     depth = world.landmarks.xyz[row[rows]] @ T_old_world[2, :3] + T_old_world[2, 3]
     rows, depth = rows[depth > MIN_DEPTH_MAP], depth[depth > MIN_DEPTH_MAP]
     warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, keyframe.xy[rows], depth)
-    area = np.linalg.det(warps)
-    good = (depth_now > MIN_DEPTH_MAP) & (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
-    points_cam = world.landmarks.xyz[row[rows]] @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    good = seen_alike(warps, depth_now)
+    points_cam = transform_points(T_cam_world, world.landmarks.xyz[row[rows]])
     xy = camera.project(np.where(good[:, None], points_cam, (0.0, 0.0, 1.0)))
     height, width = sight.grey.shape
     border = np.array([_BORDER_PX, _BORDER_PX])

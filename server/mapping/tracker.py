@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import exp_so3, invert_transform, log_so3
+from semcast.common.geometry import exp_so3, invert_transform, log_so3, transform_points
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.rays import rays_of
-from semcast.server.mapping.tracks import TrackTable
+from semcast.server.mapping.tracks import Seen, TrackTable
 from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
@@ -103,20 +103,20 @@ def expected_positions(
         if T_world_then is None or len(unknown) == 0:
             continue
         T_then_world = invert_transform(T_world_then)
-        seen = around @ T_then_world[:3, :3].T + T_then_world[:3, 3]
+        seen = transform_points(T_then_world, around)
         seen = seen[seen[:, 2] > 1e-3]
         if len(seen) == 0:
             continue
         square = ((tracks.xy[unknown][:, None] - camera.project(seen)[None]) ** 2).sum(axis=2)
         depth = seen[square.argmin(axis=1), 2]
         rays = camera.unproject(tracks.xy[unknown]) * depth[:, None]
-        points = rays @ T_world_then[:3, :3].T + T_world_then[:3, 3]
+        points = transform_points(T_world_then, rays)
         expected[unknown] = _project(camera, T_cam_world, points, ahead[unknown])
     return expected
 
 
 def _project(camera: Intrinsics, T_cam_world: Array, xyz: Array, otherwise: Array) -> Array:
-    points_cam = xyz @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
+    points_cam = transform_points(T_cam_world, xyz)
     projected = camera.project(points_cam)
     return np.where(np.isfinite(projected).all(axis=1, keepdims=True), projected, otherwise)
 
@@ -125,9 +125,7 @@ def track_pose(
     camera: Intrinsics,
     world: WorldMap,
     noise: NoiseModel,
-    ids: Ids,
-    xy: Array,
-    confidence: Array,
+    seen: Seen,
     T_world_guess: Array | None,
     *,
     submap: int,
@@ -142,9 +140,7 @@ def track_pose(
         camera: Pinhole.
         world: The map.
         noise: Gives each observation its sigma.
-        ids: ``(N,)`` tracks in sight.
-        xy: ``(N, 2)`` their positions.
-        confidence: ``(N,)`` of the positions.
+        seen: Tracks in sight.
         T_world_guess: Expected pose, or None to search for it.
         submap: Part of the map the camera is in.
         seed: Of the search.
@@ -156,15 +152,15 @@ def track_pose(
     Returns:
         The pose, or None when too few landmarks agree with any.
     """
-    row = world.landmarks.rows(ids)
-    known = row >= 0
-    points, observed = world.landmarks.xyz[row[known]], xy[known]
-    sigma, gate = noise.sigma_px(confidence[known]), noise.threshold_px(confidence[known])
+    known = world.landmarks.rows(seen.ids) >= 0
+    marks, others = seen[known], seen[~known]
+    points = world.landmarks.xyz[world.landmarks.rows(marks.ids)]
+    sigma, gate = noise.sigma_px(marks.confidence), noise.threshold_px(marks.confidence)
     best: PoseEstimate | None = None
     if T_world_guess is not None and len(points) >= min_inliers:
-        best = refine_pose(camera, invert_transform(T_world_guess), points, observed, sigma, gate)
+        best = refine_pose(camera, invert_transform(T_world_guess), points, marks.xy, sigma, gate)
     if best is None or best.num_inliers < max(min_inliers, _MIN_INLIER_SHARE * len(points)):
-        searched = search_pose(camera, points, observed, sigma, gate, seed=seed, min_inliers=min_inliers)
+        searched = search_pose(camera, points, marks.xy, sigma, gate, seed=seed, min_inliers=min_inliers)
         if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
             best = searched
     enough = max(min_inliers, min_share * len(points))
@@ -172,27 +168,23 @@ def track_pose(
         best = None
     if best is None and may_carry and T_world_guess is not None and len(points) < _RUN_OUT:
         least = max(_MIN_LEFT, min_share * len(points))
-        best = _steadied(
-            camera, world, noise, ids, xy, confidence, known, T_world_guess, submap, _CARRY, least
-        )
-    elif best is not None and not known.all():
+        best = _steadied(camera, world, noise, marks, others, T_world_guess, submap, _CARRY, least)
+    elif best is not None and len(others):
         T, least = invert_transform(best.T_cam_world), max(enough, _MIN_KEPT_SHARE * best.num_inliers)
-        steadied = _steadied(camera, world, noise, ids, xy, confidence, known, T, submap, _STEADY, least)
+        steadied = _steadied(camera, world, noise, marks, others, T, submap, _STEADY, least)
         best = best if steadied is None else steadied
     if best is None:
         return None
     T_world_cam = invert_transform(best.T_cam_world)
-    return TrackedPose(T_world_cam, best.covariance, ids[known], best.inliers, best.residual_px)
+    return TrackedPose(T_world_cam, best.covariance, marks.ids, best.inliers, best.residual_px)
 
 
 def _steadied(
     camera: Intrinsics,
     world: WorldMap,
     noise: NoiseModel,
-    ids: Ids,
-    xy: Array,
-    confidence: Array,
-    known: NDArray[np.bool_],
+    marks: Seen,
+    others: Seen,
     T_world_cam: Array,
     submap: int,
     needed: tuple[int, float],
@@ -204,10 +196,8 @@ def _steadied(
         camera: Pinhole.
         world: The map.
         noise: Gives each observation its sigma.
-        ids: ``(N,)`` tracks in sight.
-        xy: ``(N, 2)`` their positions.
-        confidence: ``(N,)`` of the positions.
-        known: ``(N,)`` bool, those that have a landmark.
+        marks: Tracks that have a landmark.
+        others: Those that have none.
         T_world_cam: Where to begin.
         submap: Part of the map the camera is in.
         needed: Rays that must agree, and their share.
@@ -216,20 +206,21 @@ def _steadied(
     Returns:
         The pose with the landmarks it agrees with; None where too few agree.
     """
-    count, unknown = int(known.sum()), np.flatnonzero(~known)
-    rays = rays_of(camera, world, noise, ids[unknown], T_world_cam, submap)
+    rays = rays_of(camera, world, noise, others.ids, T_world_cam, submap)
     if rays is None or len(rays.row) < needed[0]:
         return None
-    both = np.concatenate([np.flatnonzero(known), unknown[rays.row]])
-    points = np.concatenate([world.landmarks.xyz[world.landmarks.rows(ids[known])], rays.xyz])
-    sigma, gate = noise.sigma_px(confidence[both]), noise.threshold_px(confidence[both])
+    count, with_ray = len(marks), others[rays.row]
+    points = np.concatenate([world.landmarks.xyz[world.landmarks.rows(marks.ids)], rays.xyz])
+    observed = np.concatenate([marks.xy, with_ray.xy])
+    confidence = np.concatenate([marks.confidence, with_ray.confidence])
+    sigma, gate = noise.sigma_px(confidence), noise.threshold_px(confidence)
     # Both ends of a ray are observed, the keyframe's and this one.
     wider = np.hypot(sigma[count:], rays.sigma_px) / sigma[count:]
     sigma[count:] *= wider
     gate[count:] *= np.minimum(wider, _MOST_WIDER)
     spread = np.concatenate([np.zeros((count, 2)), rays.spread_px])
     start = invert_transform(T_world_cam)
-    pose = refine_pose(camera, start, points, xy[both], sigma, gate, iterations=6, spread_px=spread)
+    pose = refine_pose(camera, start, points, observed, sigma, gate, iterations=6, spread_px=spread)
     agreeing, rays_agreeing = pose.inliers[:count], pose.inliers[count:]
     if agreeing.sum() < min_inliers or rays_agreeing.sum() < max(needed[0], needed[1] * len(rays.row)):
         return None

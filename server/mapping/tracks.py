@@ -75,6 +75,27 @@ class Sight:
         return np.asarray(reach[y])
 
 
+@dataclass(frozen=True)
+class Seen:
+    """Tracks as one image shows them.
+
+    Attributes:
+        ids: ``(N,)`` int64.
+        xy: ``(N, 2)`` pixels.
+        confidence: ``(N,)`` of the positions.
+    """
+
+    ids: Ids
+    xy: Array
+    confidence: Array
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "Seen":
+        return Seen(self.ids[rows], self.xy[rows], self.confidence[rows])
+
+
 #: After a jump a point is looked for no further than this from where descriptors put it.
 _MAX_FROM_JUMP_PX = 25.0
 #: What a track has, by attribute of ``TrackTable``.
@@ -159,6 +180,10 @@ class TrackTable:
     def visible(self) -> NDArray[np.bool_]:
         """Tracks seen in the newest image."""
         return np.asarray(self.missed == 0)
+
+    def seen(self) -> Seen:
+        """Tracks that are visible now."""
+        return Seen(self.ids, self.xy, self.confidence)[self.visible]
 
     @property
     def frame_ids(self) -> list[int]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.geometry import invert_transform
+from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.mapping.posed_frames import PosedFrames
 
 Array = NDArray[np.float64]
@@ -198,7 +198,7 @@ class WorldMap:
         """Move a submap by a similarity ``x' = T (s x)`` and make it part of another."""
         mine = self.landmarks.submap == submap
         xyz = scale * self.landmarks.xyz[mine]
-        self.landmarks.xyz[mine] = xyz @ T_new_old[:3, :3].T + T_new_old[:3, 3]
+        self.landmarks.xyz[mine] = transform_points(T_new_old, xyz)
         self.landmarks.submap[mine] = into
         self._changed.update(self.landmarks.ids[mine].tolist())
         moved = {k for k, s in self.submap_of.items() if s == submap}

@@ -8,6 +8,7 @@ from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_tra
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.rays import rays_of
 from semcast.server.mapping.tracker import track_pose
+from semcast.server.mapping.tracks import Seen
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=319.5, cy=239.5, width=640, height=480)
@@ -58,7 +59,8 @@ def rotation_error_deg(T_world_cam):
 
 
 def track(world, ids, xy, guess, **options):
-    return track_pose(CAMERA, world, NOISE, ids, xy, np.ones(len(ids)), guess, submap=0, seed=0, **options)
+    seen = Seen(ids, xy, np.ones(len(ids)))
+    return track_pose(CAMERA, world, NOISE, seen, guess, submap=0, seed=0, **options)
 
 
 def test_a_camera_that_only_turns_needs_no_depth():

@@ -6,6 +6,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.tracker import track_pose
+from semcast.server.mapping.tracks import Seen
 from semcast.server.mapping.world_map import WorldMap
 
 CAMERA = Intrinsics(fx=300, fy=300, cx=159.5, cy=119.5, width=320, height=240)
@@ -21,7 +22,14 @@ def test_few_agreeing_landmarks_among_many_are_a_chance_find(min_share, is_belie
     world = WorldMap()
     world.add_landmarks(ids, xyz, np.zeros((60, 3), np.uint8), np.ones(60), 0, 0)
     pose = track_pose(
-        CAMERA, world, NoiseModel(0.7, 0.0), ids, xy, np.ones(60), None, submap=0, seed=0, min_share=min_share
+        CAMERA,
+        world,
+        NoiseModel(0.7, 0.0),
+        Seen(ids, xy, np.ones(60)),
+        None,
+        submap=0,
+        seed=0,
+        min_share=min_share,
     )
     assert (pose is not None) == is_believed
     if pose is not None:
