@@ -31,14 +31,3 @@ def normalise_power(symbols: NDArray[np.complex64]) -> NDArray[np.complex64]:
     if power <= 0.0:
         raise ValueError("symbols must have power above 0, got 0")
     return (symbols * np.float32(1.0 / np.sqrt(power))).astype(np.complex64, copy=False)
-
-
-def check_unit_power(symbols: NDArray[np.complex64], tolerance: float = 0.01) -> None:
-    """Check that the average power of one image is 1.
-
-    Raises:
-        ValueError: It is not within ``tolerance``.
-    """
-    power = mean_power(symbols)
-    if abs(power - 1.0) > tolerance:
-        raise ValueError(f"mean symbol power must be 1 within {tolerance:g}, got {power:.4f}")

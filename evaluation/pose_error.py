@@ -31,11 +31,6 @@ class PoseError:
     tdir_deg: float
     failed: bool = False
 
-    @property
-    def max_deg(self) -> float:
-        """The larger of both, infinite for a failed pair: what the AUC is taken over."""
-        return float("inf") if self.failed else max(self.rot_deg, self.tdir_deg)
-
 
 def relative_pose_error(T_cam1_cam0: Array | None, T_cam1_cam0_true: Array) -> PoseError:
     """Compare a relative pose of unknown scale with the truth.

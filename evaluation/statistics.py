@@ -4,7 +4,7 @@ Everything is numpy; a statistic that is not defined for its input (an empty cla
 ``None``, never NaN, so results can be written as JSON.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,12 +109,6 @@ def percentiles(values: ArrayLike, which: Sequence[int] = (50, 95)) -> dict[str,
     """Return ``{"p50": ..., "p95": ...}`` of ``(N,)`` values; None each when there are none."""
     x = np.asarray(values, dtype=np.float64).ravel()
     return {f"p{p}": float(np.percentile(x, p)) if len(x) else None for p in which}
-
-
-def stage_percentiles(rows: Sequence[Mapping[str, float]]) -> dict[str, dict[str, float | None]]:
-    """Summarise stage times: ``stage -> {"p50", "p95"}`` over the rows in which the stage ran, sorted."""
-    stages = sorted({stage for row in rows for stage in row})
-    return {stage: percentiles([row[stage] for row in rows if stage in row]) for stage in stages}
 
 
 @dataclass(frozen=True)

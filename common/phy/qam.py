@@ -10,7 +10,7 @@ Böcherer et al. 2015).
 """
 
 import math
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,7 +141,6 @@ def soft_demap(
     symbols: NDArray[np.complex64],
     noise_var: NDArray[np.float32] | float,
     bits_per_symbol: int = BITS_PER_SYMBOL_16QAM,
-    method: Literal["exact", "maxlog"] = "exact",
 ) -> NDArray[np.float32]:
     """Return log-likelihood ratios ``ln P(bit = 0) / P(bit = 1)`` of equally likely bits.
 
@@ -149,30 +148,27 @@ def soft_demap(
         symbols: ``(..., n)`` complex, unbiased: ``s + noise``. Undo the MMSE shrinkage first.
         noise_var: Complex noise variance, broadcast against ``symbols``; ``inf`` gives LLR 0.
         bits_per_symbol: 2, 4 or 6.
-        method: Sum over all points, or only the nearest of each side.
 
     Returns:
         ``(..., n * bits_per_symbol)`` float32 in the bit order of ``indices_to_bits``.
 
     Raises:
-        ValueError: A noise variance is not positive or the method is unknown.
+        ValueError: A noise variance is not positive.
     """
     _check_bits(bits_per_symbol)
-    if method not in ("exact", "maxlog"):
-        raise ValueError(f"method must be exact or maxlog, got {method!r}")
     variance = np.asarray(noise_var, dtype=np.float32)
     if not bool(np.all(variance > 0)):
         raise ValueError(f"noise_var must be positive, got {float(np.min(variance))}")
     precision = np.broadcast_to(np.float32(1.0) / variance, symbols.shape)
     halves = [
-        _pam_llr(np.ascontiguousarray(part, dtype=np.float32), precision, bits_per_symbol, method)
+        _pam_llr(np.ascontiguousarray(part, dtype=np.float32), precision, bits_per_symbol)
         for part in (symbols.real, symbols.imag)
     ]
     return np.concatenate(halves, axis=-1).reshape(*symbols.shape[:-1], -1)
 
 
 def _pam_llr(
-    values: NDArray[np.float32], precision: NDArray[np.float32], bits_per_symbol: int, method: str
+    values: NDArray[np.float32], precision: NDArray[np.float32], bits_per_symbol: int
 ) -> NDArray[np.float32]:
     """Return ``(..., bits_per_symbol / 2)`` LLRs of one real dimension."""
     levels = pam_levels(bits_per_symbol)
@@ -181,16 +177,12 @@ def _pam_llr(
     # Distances are taken relative to the nearest level, so that exp() never underflows on every level.
     metric = np.stack([-precision * np.square(values - level) for level in levels])
     metric -= metric.max(axis=0)
-    if method == "exact":
-        np.exp(metric, out=metric)
+    likelihood = np.exp(metric, out=metric)
+    tiny = np.float32(1e-37)
     llr = np.empty((*values.shape, num_bits), dtype=np.float32)
     for bit in range(num_bits):
         is_one = ((labels >> (num_bits - 1 - bit)) & 1).astype(bool)
-        if method == "exact":
-            tiny = np.float32(1e-37)
-            zero = np.log(np.maximum(metric[~is_one].sum(axis=0), tiny))
-            one = np.log(np.maximum(metric[is_one].sum(axis=0), tiny))
-        else:
-            zero, one = metric[~is_one].max(axis=0), metric[is_one].max(axis=0)
+        zero = np.log(np.maximum(likelihood[~is_one].sum(axis=0), tiny))
+        one = np.log(np.maximum(likelihood[is_one].sum(axis=0), tiny))
         llr[..., bit] = zero - one
     return llr

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from semcast.channel.power import check_unit_power, mean_power, normalise_power
+from semcast.channel.power import mean_power, normalise_power
 
 
 def test_mean_power_by_hand():
@@ -16,13 +16,10 @@ def test_normalised_symbols_have_unit_power_and_the_same_direction(scale, seed):
     symbols = (scale * pairs).astype(np.complex64)
     out = normalise_power(symbols)
     assert mean_power(out) == pytest.approx(1.0, rel=1e-4)
-    check_unit_power(out)
     np.testing.assert_allclose(np.angle(out), np.angle(symbols), atol=1e-4)
 
 
 def test_bad_power_is_named():
-    with pytest.raises(ValueError, match="mean symbol power must be 1 within 0.01, got 4.0000"):
-        check_unit_power(np.full(4, 2, np.complex64))
     with pytest.raises(ValueError, match="must have power above 0, got 0"):
         normalise_power(np.zeros(4, np.complex64))
     with pytest.raises(ValueError, match="must be finite"):

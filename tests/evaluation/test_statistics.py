@@ -10,7 +10,6 @@ from semcast.evaluation.statistics import (
     percentiles,
     pose_auc_percent,
     spearman,
-    stage_percentiles,
 )
 
 
@@ -75,12 +74,9 @@ def test_pose_auc_limits():
         pose_auc_percent([1.0], 0)
 
 
-def test_percentiles_and_stages():
+def test_percentiles_by_hand():
     assert percentiles([1, 2, 3]) == {"p50": 2.0, "p95": pytest.approx(2.9)}
     assert percentiles([]) == {"p50": None, "p95": None}
-    stages = stage_percentiles([{"track": 1.0}, {"track": 3.0, "map": 7.0}])
-    assert stages["track"]["p50"] == 2.0
-    assert stages["map"] == {"p50": 7.0, "p95": 7.0}
 
 
 def test_finite_mean_leaves_out_what_is_not_known():
