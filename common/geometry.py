@@ -85,6 +85,14 @@ def project_to_so3(M: ArrayLike) -> Array:
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
+def interpolate_pose(T_w_a: ArrayLike, T_w_b: ArrayLike, share: float) -> Array:
+    """Return the pose between two, rotation along the geodesic; ``share`` 0 is the first, 1 the second."""
+    a, b = np.asarray(T_w_a, dtype=np.float64), np.asarray(T_w_b, dtype=np.float64)
+    R_a = a[:3, :3]
+    R = R_a @ exp_so3(share * log_so3(R_a.T @ b[:3, :3]))
+    return make_transform(R, (1.0 - share) * a[:3, 3] + share * b[:3, 3])
+
+
 def quat_wxyz_from_rotation(R: ArrayLike) -> Array:
     """Unit quaternion ``(w, x, y, z)`` with ``w >= 0`` of a 3x3 rotation (Shepperd's method)."""
     R = np.asarray(R, dtype=np.float64)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import HOW_TO_GIVE, CameraSettings
 from semcast.common.errors import SourceError
-from semcast.common.geometry import exp_so3, log_so3, make_transform
+from semcast.common.geometry import interpolate_pose
 from semcast.common.sequence_layouts import Layout, SequenceFiles, ns_to_seconds, read_layout
 from semcast.common.sequence_sizes import size_in_header_wh
 from semcast.common.trajectory import Trajectory
@@ -346,19 +346,11 @@ def truth_at_frames(truth: Trajectory, times_ns: NDArray[np.int64], period_s: fl
             and distance_s <= 0.5 * period_s
         ):
             share = (t - float(truth.t_s[a])) / gap_s
-            poses.append(_interpolate(truth.T_world_cam[a], truth.T_world_cam[b], share))
+            poses.append(interpolate_pose(truth.T_world_cam[a], truth.T_world_cam[b], share))
         else:
             continue
         kept.append(k)
     return Trajectory(times_s[kept], np.array(poses)) if kept else None
-
-
-def _interpolate(
-    T_world_a: NDArray[np.float64], T_world_b: NDArray[np.float64], share: float
-) -> NDArray[np.float64]:
-    R_a = T_world_a[:3, :3]
-    R = R_a @ exp_so3(share * log_so3(R_a.T @ T_world_b[:3, :3]))
-    return make_transform(R, (1.0 - share) * T_world_a[:3, 3] + share * T_world_b[:3, 3])
 
 
 def open_sequence(

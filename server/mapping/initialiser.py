@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform
+from semcast.common.geometry import interpolate_pose, invert_transform
 from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import TwoViewResult, estimate_two_view
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
@@ -18,7 +18,6 @@ from semcast.server.mapping.ambiguity import Side, decide
 from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
 from semcast.server.mapping.kept_frames import Observed, pose_of
 from semcast.server.mapping.mapper import gather_observations
-from semcast.server.mapping.tracker import interpolate_pose
 from semcast.server.mapping.world_map import Keyframe
 
 Array = NDArray[np.float64]

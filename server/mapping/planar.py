@@ -13,10 +13,15 @@ import poselib
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform, make_transform, project_to_so3, transform_points
+from semcast.common.geometry import (
+    interpolate_pose,
+    invert_transform,
+    make_transform,
+    project_to_so3,
+    transform_points,
+)
 from semcast.server.geometry.pnp import refine_pose
 from semcast.server.mapping.bundle_problem import BundleProblem
-from semcast.server.mapping.tracker import interpolate_pose
 
 Array = NDArray[np.float64]
 

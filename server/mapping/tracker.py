@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import exp_so3, invert_transform, log_so3, transform_points
+from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.rays import rays_of
@@ -225,12 +225,3 @@ def _steadied(
     if agreeing.sum() < min_inliers or rays_agreeing.sum() < max(needed[0], needed[1] * len(rays.row)):
         return None
     return replace(pose, inliers=agreeing, residual_px=pose.residual_px[:count])
-
-
-def interpolate_pose(T_world_a: Array, T_world_b: Array, share: float) -> Array:
-    """Pose between two, rotation along the geodesic; ``share`` 0 is the first."""
-    R_a = T_world_a[:3, :3]
-    T = T_world_a.copy()
-    T[:3, :3] = R_a @ exp_so3(share * log_so3(R_a.T @ T_world_b[:3, :3]))
-    T[:3, 3] = (1.0 - share) * T_world_a[:3, 3] + share * T_world_b[:3, 3]
-    return T
