@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import KLT_WINDOW_PX
+from semcast.server.geometry.brightness import brightness_change, with_brightness
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -21,6 +22,8 @@ _MIN_EIGEN_GREY2 = 2.0
 #: Nor are corners weaker than this share of the strongest worth following.
 _MIN_EIGEN_SHARE = 0.004
 _ORB_SCALE = 1.2
+#: Where so many points were found in spite of another exposure, they tell it, and few levels put them right.
+_MOSTLY_FOUND, _LEVELS_ANEW = 0.6, 1
 
 
 def to_grey(image: NDArray[np.uint8]) -> Grey:
@@ -141,6 +144,9 @@ def track_points(
 ) -> TrackedPoints:
     """Follow points by Lucas-Kanade, there and back.
 
+    Where the points that are found tell that the exposure changed, the first image is brought to that of the
+    second and all are followed anew.
+
     Args:
         grey0: Image the points are known in.
         grey1: Image they are looked for in.
@@ -153,6 +159,36 @@ def track_points(
     count = len(xy0)
     if count == 0 or grey0.shape != grey1.shape:
         return TrackedPoints.none(count)
+    found = _track_alike(grey0, grey1, xy0, guess1_xy, max_forward_backward_px, max_level, window_px)
+    for _ in range(2):
+        # Where hardly any was found, the guesses are near enough for a first idea of the change.
+        is_sure = bool(found.ok.mean() >= _MOSTLY_FOUND)
+        rows = found.ok if is_sure else np.ones(count, bool)
+        xy1 = np.where(found.ok[:, None], found.xy, guess1_xy)
+        change = brightness_change(grey0, grey1, xy0[rows], xy1[rows])
+        if change is None:
+            break
+        levels = min(_LEVELS_ANEW, max_level) if is_sure else max_level
+        like_second = with_brightness(grey0, *change)
+        anew = _track_alike(like_second, grey1, xy0, xy1, max_forward_backward_px, levels, window_px)
+        if anew.ok.sum() < found.ok.sum():
+            break
+        found = anew
+        if is_sure:
+            break
+    return found
+
+
+def _track_alike(
+    grey0: Grey,
+    grey1: Grey,
+    xy0: Array,
+    guess1_xy: Array,
+    max_forward_backward_px: float,
+    max_level: int,
+    window_px: int,
+) -> TrackedPoints:
+    """Follow points between images of the same brightness."""
     height, width = grey1.shape
     start = np.ascontiguousarray(xy0, dtype=np.float32)
     guess = np.clip(np.nan_to_num(guess1_xy), (0, 0), (width - 1, height - 1)).astype(np.float32)

@@ -1,0 +1,73 @@
+"""How much brighter one image is than another, seen at points they share.
+
+Lucas-Kanade takes a difference in brightness for a shift. Cameras change their exposure, and a landmark of
+long ago was seen in another light.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+#: Side of the patch a point's brightness is the mean of: a corner is dark on one side.
+_PATCH_PX = 7
+#: Patches outside these grey levels may be clipped.
+_DARKEST, _BRIGHTEST = 8.0, 247.0
+_MIN_POINTS = 20
+_ITERATIONS = 5
+#: An exposure is a gain: an offset is taken to be no larger than about this, and matters for tone curves.
+_OFFSET_SIGMA_GREY = 10.0
+#: Gains beyond this, or its inverse, are those of points that were not found at all.
+_MAX_GAIN = 4.0
+#: A change that moves the typical point by less does not matter to Lucas-Kanade.
+_MIN_CHANGE_GREY = 1.5
+
+
+def brightness_change(grey0: Grey, grey1: Grey, xy0: Array, xy1: Array) -> tuple[float, float] | None:
+    """Fit ``grey1 = gain * grey0 + offset`` to patches around the same points, robustly.
+
+    Args:
+        grey0: First image.
+        grey1: Second image.
+        xy0: ``(N, 2)`` points in the first image.
+        xy1: ``(N, 2)`` the same in the second image; some may be wrong.
+
+    Returns:
+        Gain and offset in grey levels; None where points are too few, or the change is too small to matter.
+    """
+    before, after = _patch_means(grey0, xy0), _patch_means(grey1, xy1)
+    inside = (np.minimum(before, after) > _DARKEST) & (np.maximum(before, after) < _BRIGHTEST)
+    before, after = before[inside], after[inside]
+    if len(before) < _MIN_POINTS or abs(np.median(after - before)) < 0.5 * _MIN_CHANGE_GREY:
+        return None
+    design = np.stack([before, np.ones_like(before)], axis=1)
+    model = np.array([np.median(after / before), 0.0])
+    for _ in range(_ITERATIONS):
+        residual = np.abs(after - design @ model)
+        scale = 1.4826 * float(np.median(residual)) + 0.1
+        weight = 1.0 / np.maximum(residual, scale) / scale
+        normal = design.T @ (weight[:, None] * design)
+        normal[1, 1] += _OFFSET_SIGMA_GREY**-2
+        model = np.linalg.solve(normal, design.T @ (weight * after))
+    gain, offset = float(model[0]), float(model[1])
+    change = float(np.median(np.abs(design @ model - before)))
+    if not 1.0 / _MAX_GAIN < gain < _MAX_GAIN or change < _MIN_CHANGE_GREY:
+        return None
+    return gain, offset
+
+
+def with_brightness(grey: Grey, gain: float, offset: float) -> Grey:
+    """Return the image as it would be with another exposure, clipped as a camera clips."""
+    levels = np.clip(np.rint(gain * np.arange(256) + offset), 0, 255).astype(np.uint8)
+    return np.asarray(cv2.LUT(grey, levels), dtype=np.uint8)
+
+
+def _patch_means(grey: Grey, xy: Array) -> Array:
+    height, width = grey.shape
+    mean = cv2.blur(grey, (_PATCH_PX, _PATCH_PX))
+    nearest = np.rint(np.nan_to_num(xy))
+    x = np.clip(nearest[:, 0], 0, width - 1).astype(np.intp)
+    y = np.clip(nearest[:, 1], 0, height - 1).astype(np.intp)
+    return mean[y, x].astype(np.float64)

@@ -1,0 +1,63 @@
+import cv2
+import numpy as np
+import pytest
+
+from semcast.server.geometry.brightness import brightness_change, with_brightness
+from semcast.server.geometry.features import detect_corners, track_points
+
+
+@pytest.fixture
+def grey(rng):
+    smooth = cv2.GaussianBlur(rng.normal(0, 1, (240, 320)).astype(np.float32), (0, 0), 2.5)
+    light = np.linspace(0.6, 1.0, 320, dtype=np.float32)
+    spread = (smooth - smooth.min()) / (smooth.max() - smooth.min())
+    return np.rint((40 + 120 * spread) * light).astype(np.uint8)
+
+
+def shifted(grey, dx, dy):
+    move = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
+    return cv2.warpAffine(grey, move, grey.shape[::-1], borderMode=cv2.BORDER_REFLECT)
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(0.5, 0.0), (0.9, 0.0), (1.3, 0.0), (1.1, -6.0)])
+def test_a_change_of_exposure_is_found_though_points_are_wrong(grey, rng, gain, offset):
+    xy = rng.uniform((10, 10), (309, 229), (300, 2))
+    moved = with_brightness(shifted(grey, 4, -3), gain, offset)
+    xy1 = xy + np.array([4, -3])
+    xy1[:60] = rng.uniform((10, 10), (309, 229), (60, 2))
+    found_gain, found_offset = brightness_change(grey, moved, xy, xy1)
+    assert found_gain * 100 + found_offset == pytest.approx(gain * 100 + offset, abs=1.0)
+
+
+def test_a_change_that_does_not_matter_is_none(grey, rng):
+    xy = rng.uniform((10, 10), (309, 229), (300, 2))
+    assert brightness_change(grey, grey, xy, xy) is None
+    noisy = np.clip(grey + rng.normal(0, 8, grey.shape), 0, 255).astype(np.uint8)
+    assert brightness_change(grey, noisy, xy, xy) is None
+    assert brightness_change(grey, with_brightness(grey, 0.5, 0.0), xy[:19], xy[:19]) is None
+    black = np.zeros_like(grey)
+    assert brightness_change(black, grey, xy, xy) is None
+
+
+def test_an_image_clips_as_a_camera_does():
+    grey = np.array([[0, 100, 200]], np.uint8)
+    assert with_brightness(grey, 1.5, -10.0).tolist() == [[0, 140, 255]]
+
+
+@pytest.mark.parametrize("gain", [0.6, 0.9, 1.4])
+def test_points_are_followed_to_where_they_are_through_a_change_of_exposure(grey, monkeypatch, gain):
+    corners = detect_corners(grey, 200).astype(np.float64)
+    corners = corners[((corners > 25) & (corners < (294, 214))).all(axis=1)]
+    moved = with_brightness(shifted(grey, 3, 2), gain, 0.0)
+
+    def errors():
+        found = track_points(grey, moved, corners, corners)
+        return np.linalg.norm(found.xy[found.ok] - corners[found.ok] - (3, 2), axis=1), found
+
+    error, found = errors()
+    assert found.ok.mean() > 0.95
+    assert np.median(error) < 0.05
+    assert np.median(found.photometric_grey[found.ok]) < 2.0
+    monkeypatch.setattr("semcast.server.geometry.features.brightness_change", lambda *_: None)
+    error_before, found_before = errors()
+    assert found_before.ok.mean() < found.ok.mean() or np.median(error_before) > 2 * np.median(error)
