@@ -24,6 +24,8 @@ _MIN_EIGEN_SHARE = 0.004
 _ORB_SCALE = 1.2
 #: Where so many points were found in spite of another exposure, they tell it, and few levels put them right.
 _MOSTLY_FOUND, _LEVELS_ANEW = 0.6, 1
+#: A first idea of the change is right if it finds so many times as many.
+_CLEARLY_MORE = 1.2
 
 
 def to_grey(image: NDArray[np.uint8]) -> Grey:
@@ -171,7 +173,7 @@ def track_points(
         levels = min(_LEVELS_ANEW, max_level) if is_sure else max_level
         like_second = with_brightness(grey0, *change)
         anew = _track_alike(like_second, grey1, xy0, xy1, max_forward_backward_px, levels, window_px)
-        if anew.ok.sum() < found.ok.sum():
+        if anew.ok.sum() < (1.0 if is_sure else _CLEARLY_MORE) * found.ok.sum():
             break
         found = anew
         if is_sure:
