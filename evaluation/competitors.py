@@ -71,7 +71,7 @@ def _opencv(
 def opencv_ransac(
     keypoints0_xy: Array, keypoints1_xy: Array, camera: Intrinsics, settings: CompetitorSettings
 ) -> Array | None:
-    """Plain RANSAC over the five-point solver: the estimator the paper compares with.
+    """Plain RANSAC over the five-point solver: what people use, and compare with.
 
     Args:
         keypoints0_xy: ``(N, 2)`` pixels in the first image.
@@ -126,16 +126,11 @@ def plain_ransac(
 ) -> Array | None:
     """The paper's own RANSAC without confidence: uniform sampling, one threshold, most inliers.
 
-    What separates it from mode ``paper`` is confidence alone. Arguments and result as ``opencv_ransac``.
+    What separates it from mode ``paper`` is confidence alone: it has the algebraic residual of Eq. 18 and
+    that mode's threshold, whatever the settings say. Arguments and result as ``opencv_ransac``.
     """
-    found = confidence_ransac(
-        camera,
-        keypoints0_xy,
-        keypoints1_xy,
-        np.ones(len(keypoints0_xy)),
-        delta0=settings.threshold_px / camera.fx,
-        seed=settings.seed,
-    )
+    ones = np.ones(len(keypoints0_xy))
+    found = confidence_ransac(camera, keypoints0_xy, keypoints1_xy, ones, seed=settings.seed)
     return None if found is None else found.T_cam1_cam0
 
 

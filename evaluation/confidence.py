@@ -70,7 +70,9 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
         write_json(settings.json, report)
     if settings.out is not None:
         tables = {f"{r['snr_db']:g} dB": r["pixel"]["reliability"] for r in report["results"]}
-        plot_reliability(settings.out / "reliability.png", tables, f"{settings.codec}, {sequence.name}")
+        label = f"1 - tanh({settings.pixel_alpha:g} |error|)"
+        title = f"{settings.codec}, {sequence.name}"
+        plot_reliability(settings.out / "reliability.png", tables, label, title)
     return report
 
 

@@ -25,7 +25,7 @@ from semcast.evaluation.pipeline import (
     open_stream,
     selected_frame_ids,
 )
-from semcast.evaluation.reconstruct import as_received
+from semcast.evaluation.reconstruct import as_received, cut_to_frames
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.server.export.outputs import trajectory_of
 from semcast.server.mapping.bundle_process import ProcessBundle
@@ -90,8 +90,9 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
         Provenance; ``results``, a row for every ``settings.every`` frames: ``frames`` so far,
         ``posed_share``, ``frame_ms_p50`` and ``frame_ms_p95`` (decoded frame to pose), ``landmarks``,
         ``keyframes`` with observations, ``memory_mb`` and
-        ``bundle_memory_mb`` of the adjustments' process, and ``ate_percent`` of the row's frames where the
-        recording has a truth; ``growth``: last row over the first of the second half.
+        ``bundle_memory_mb`` of the adjustments' process, and ``ate_rmse_m`` of the row's frames and that in
+        percent of one pass, ``ate_percent``, where the recording has a truth; ``growth``: last row over the
+        first of the second half.
 
     Raises:
         SourceError: The recording can't be read.
@@ -106,6 +107,8 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
         )
         if frame.decoded is not None
     ]
+    if not frames:
+        raise ConfigError(f"no frame was received at snr_db {settings.snr_db[0]:g}: there is nothing to run")
     if len(frames) < 3:
         raise ConfigError(f"max_frames must leave at least 3 frames that arrive, got {len(frames)}")
     interval_ns = int(np.median(np.diff([f.t_source_ns for f in frames])))
@@ -114,7 +117,8 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
     times_ms: list[float] = []
     seen: list[tuple[int, int]] = []
     bundle = ProcessBundle(lossless=False)
-    reconstruction = Reconstruction(sequence.intrinsics, settings.reconstruction, bundle)
+    how = replace(settings.reconstruction, seed=settings.seed)
+    reconstruction = Reconstruction(sequence.intrinsics, how, bundle)
     try:
         for k, index in enumerate(back_and_forth(len(frames), settings.frames)):
             since = time.perf_counter_ns()
@@ -168,7 +172,11 @@ def _row(
         at_ns = {k: k * interval_ns for k, _ in seen}
         places = {k: truth.T_world_cam[_nearest(truth, frames[index].t_source_ns)] for k, index in seen}
         summary = trajectory_summary(trajectory_of(posed, at_ns), trajectory_of(places, at_ns), len(seen))
-        row["ate_percent"] = summary["ate_percent"]
+        row["ate_rmse_m"] = summary["ate_rmse_m"]
+        # Of one pass, as for a run that ends there: ridden back and forth, the path grows and errors do not.
+        one_pass_m = cut_to_frames(truth, {f.frame_id: f.t_source_ns for f in frames}).path_length
+        if summary["ate_rmse_m"] is not None and one_pass_m > 0:
+            row["ate_percent"] = 100.0 * summary["ate_rmse_m"] / one_pass_m
     return row
 
 

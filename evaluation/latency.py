@@ -157,6 +157,8 @@ def evaluate_latency(settings: LatencySettings, codec: Codec | None = None) -> d
         finally:
             view.close()
     rows = run.rows[settings.warmup :]
+    if not run.rows:
+        raise ConfigError(f"no frame was received at snr_db {settings.snr_db[0]:g}: there is nothing to time")
     if not rows:
         raise ConfigError(f"warmup must leave frames to time, got {settings.warmup} of {len(run.rows)}")
     report = json_ready(

@@ -210,6 +210,8 @@ def true_motions(
     T_world_cam = {frame_of_time[t]: T for t, T in zip(truth.t_s.tolist(), truth.T_world_cam, strict=True)}
     extent_m = float(np.linalg.norm(np.ptp(truth.positions, axis=0)))
     least_m = max(settings.min_baseline_m, settings.min_baseline_share * extent_m)
+    if len(frame_ids) <= gap:
+        raise ConfigError(f"pairs at gap {gap} need at least {gap + 1} frames, got {len(frame_ids)}")
     motions = {}
     for id0, id1 in zip(frame_ids, frame_ids[gap:], strict=False):
         if id0 not in T_world_cam or id1 not in T_world_cam:

@@ -65,7 +65,6 @@ def plot_against_snr(
     y_label: str,
     *,
     title: str = "",
-    intervals: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     from_zero: bool = True,
 ) -> None:
     """Draw one curve per name over the SNR and save it.
@@ -76,7 +75,6 @@ def plot_against_snr(
         curves: Name to N values; None leaves a gap.
         y_label: Quantity and unit.
         title: Above the axes.
-        intervals: Name to N ``(low, high)`` bounds, drawn as a band.
         from_zero: Start the ordinate at 0, right for errors and wrong for decibels.
 
     Raises:
@@ -88,10 +86,7 @@ def plot_against_snr(
         if len(values) != len(snr_db):
             raise ValueError(f"curve {name!r} must have {len(snr_db)} values, got {len(values)}")
         y = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
-        (line,) = axes.plot(snr_db, y, marker=_MARKERS[k % len(_MARKERS)], markersize=4, label=name)
-        if intervals is not None and name in intervals:
-            low, high = np.asarray(intervals[name], dtype=np.float64).T
-            axes.fill_between(snr_db, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+        axes.plot(snr_db, y, marker=_MARKERS[k % len(_MARKERS)], markersize=4, label=name)
     axes.set(xlabel="SNR (dB)", ylabel=y_label, title=title)
     if from_zero:
         axes.set_ylim(bottom=0.0)
@@ -102,20 +97,17 @@ def plot_against_snr(
     save_figure(figure, path)
 
 
-def plot_pair_errors(
-    folder: Path, result: Mapping[str, Any], modes: Sequence[str] | None = None, prefix: str = ""
-) -> list[Path]:
+def plot_pair_errors(folder: Path, result: Mapping[str, Any]) -> list[Path]:
     """Draw rotation and translation-direction error against SNR, with and without confidence.
 
     These are Fig. 9 (``fig9_rotation.png``) and Fig. 10 (``fig10_translation_direction.png``) of the paper,
     with a panel for every gap, kind of features and thinning. The error is on a logarithmic scale: estimators
-    differ by up to a hundredfold.
+    differ by up to a hundredfold. Bars stand where a mode was compared with others pair by pair: the 95 %
+    interval of its difference from the first of these, set upon that one's error.
 
     Args:
         folder: Where the two files go.
         result: What ``evaluate_pairs`` returned.
-        modes: Curves to show; all modes of the result by default.
-        prefix: Of the file names.
 
     Returns:
         The files written.
@@ -123,7 +115,7 @@ def plot_pair_errors(
     panels: dict[str, list[Mapping[str, Any]]] = {}
     for cell in sorted(result["cells"], key=lambda cell: float(cell["snr_db"])):
         panels.setdefault(variant_name(cell), []).append(cell)
-    modes = list(modes or result["cells"][0]["results"])
+    modes = list(result["cells"][0]["results"])
     paths = []
     for name, key, label in (
         ("fig9_rotation.png", "rot_deg_mean", "mean rotation error (deg)"),
@@ -151,6 +143,7 @@ def plot_pair_errors(
                     zorder=3 if k == 0 else 2,
                     label=mode,
                 )
+                _draw_intervals(axes, cells, mode, key, _COLOURS[k % len(_COLOURS)])
             title = variant if len(panels) > 1 else str(result.get("title", ""))
             axes.set_title(title, fontsize="medium")
             axes.set(xlabel="SNR (dB)", yscale="log")
@@ -166,9 +159,22 @@ def plot_pair_errors(
         )
         if len(panels) > 1:
             figure.suptitle(str(result.get("title", "")))
-        save_figure(figure, folder / f"{prefix}{name}")
-        paths.append(folder / f"{prefix}{name}")
+        save_figure(figure, folder / name)
+        paths.append(folder / name)
     return paths
+
+
+def _draw_intervals(
+    axes: Axes, cells: Sequence[Mapping[str, Any]], mode: str, figure: str, colour: str
+) -> None:
+    for cell in cells:
+        mine = (c for c in cell["comparisons"] if (c["mode"], c["figure"]) == (mode, figure))
+        compared = next((c for c in mine if c["paired"] and c["paired"]["low"] is not None), None)
+        if compared is not None:
+            rival = cell["results"][compared["against"]][figure]
+            bounds = rival + np.array([compared["paired"]["low"], compared["paired"]["high"]])
+            if (bounds > 0).all():  # the scale has no zero
+                axes.plot([cell["snr_db"]] * 2, bounds, color=colour, linewidth=1.0, marker="_", markersize=5)
 
 
 def variant_name(cell: Mapping[str, Any]) -> str:
@@ -181,7 +187,7 @@ def variant_name(cell: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def plot_top_view(
+def plot_path(
     path: Path,
     trajectories: Mapping[str, NDArray[np.float64]],
     *,
@@ -189,7 +195,7 @@ def plot_top_view(
     title: str = "",
     unit: str = "m",
 ) -> None:
-    """Draw camera positions from above and save them.
+    """Draw camera positions along one world axis and save them.
 
     Args:
         path: Image file.
@@ -210,13 +216,14 @@ def plot_top_view(
 
 
 def plot_reliability(
-    path: Path, tables: Mapping[str, Mapping[str, Sequence[float]]], title: str = ""
+    path: Path, tables: Mapping[str, Mapping[str, Sequence[float]]], observed: str, title: str = ""
 ) -> None:
     """Draw reliability diagrams: observed against predicted, one curve per name.
 
     Args:
         path: Image file.
         tables: Name to a mapping with ``predicted`` and ``observed``.
+        observed: What was predicted, for people.
         title: Above the axes.
     """
     figure, axes = _new_figure(4.2, 4.2)
@@ -229,6 +236,6 @@ def plot_reliability(
             markersize=4,
             label=name,
         )
-    axes.set(xlabel="confidence", ylabel="1 - |error|", title=title, xlim=(0, 1), ylim=(0, 1))
+    axes.set(xlabel="confidence", ylabel=observed, title=title, xlim=(0, 1), ylim=(0, 1))
     axes.legend(fontsize="small")
     save_figure(figure, path)

@@ -11,8 +11,9 @@ from semcast.evaluation.statistics import pose_auc_percent
 
 Array = NDArray[np.float64]
 
-#: A pair without an estimate: no direction at all is as far from the truth as a random one.
-FAILED_TDIR_DEG = 90.0
+#: Both errors of a pair without an estimate: a direction at random is as far off in the mean, and no rotation
+#: must not pass for a small one.
+FAILED_DEG = 90.0
 AUC_THRESHOLDS_DEG = (5, 10, 20)
 
 
@@ -36,12 +37,12 @@ def relative_pose_error(T_cam1_cam0: Array | None, T_cam1_cam0_true: Array) -> P
     """Compare a relative pose of unknown scale with the truth.
 
     Args:
-        T_cam1_cam0: Estimate, 4x4, or None when the estimator gave none: then the camera counts as not
-            turned and its translation direction as 90 degrees off.
+        T_cam1_cam0: Estimate, 4x4, or None when the estimator gave none: then both errors count as 90
+            degrees.
         T_cam1_cam0_true: Truth, 4x4, with a translation.
     """
     if T_cam1_cam0 is None:
-        return PoseError(rotation_angle_deg(T_cam1_cam0_true[:3, :3]), FAILED_TDIR_DEG, failed=True)
+        return PoseError(FAILED_DEG, FAILED_DEG, failed=True)
     R_error = T_cam1_cam0[:3, :3] @ T_cam1_cam0_true[:3, :3].T
     return PoseError(
         rotation_angle_deg(R_error), angle_between_deg(T_cam1_cam0[:3, 3], T_cam1_cam0_true[:3, 3])

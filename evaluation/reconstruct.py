@@ -59,12 +59,14 @@ class ReconstructedRun:
         rows: One mapping per frame that reached the tracker, with ``error_m`` after alignment where known.
         trajectory: All posed frames in the map's frame and unit.
         num_landmarks: Landmarks at the end.
+        truth: Reference poses of the frames that were sent, or None.
     """
 
     summary: dict[str, Any]
     rows: list[dict[str, Any]]
     trajectory: Trajectory
     num_landmarks: int
+    truth: Trajectory | None
 
 
 def as_received(frame: LinkedFrame) -> DecodedFrame:
@@ -127,7 +129,7 @@ def reconstruct(
     truth = cut_to_frames(truth, frame_times_ns) if truth is not None else None
     drops = {"lost": num_lost} if num_lost else {}
     summary = summarise(rows, trajectory, part_of, truth, len(frame_times_ns), drops, num_keyframes)
-    return ReconstructedRun(summary, _plain_rows(rows, trajectory, truth), trajectory, num_landmarks)
+    return ReconstructedRun(summary, _plain_rows(rows, trajectory, truth), trajectory, num_landmarks, truth)
 
 
 def _process(

@@ -34,6 +34,11 @@ What the figures mean and what limits them is in [reading the results](reading-r
 
 def _codec(report: Report) -> Iterator[str]:
     rows = report["results"]
+    ratios = sorted({row["cbr"] for row in rows})
+    yield (
+        f"{report['num_images']} images. Channel uses per source value, pilots included: "
+        f"{', '.join(f'{cbr:.4f} (1/{1 / cbr:.1f})' for cbr in ratios)}.\n"
+    )
     snrs = sorted({row["snr_db"] for row in rows})
     for key, name, digits in (("psnr_db", "PSNR dB", 2), ("ssim", "SSIM", 3), ("ms_ssim", "MS-SSIM", 3)):
         body = []
@@ -103,6 +108,16 @@ def _confidence(report: Report) -> Iterator[str]:
         ]
         yield from table(["grade", "value"], rows)
         yield ""
+        for target in ("pixel", "keypoint"):
+            maps = result[target]["maps"]
+            names = sorted({name for grades in maps.values() for name in grades})
+            body = [[map_, *(number(grades.get(name), 3) for name in names)] for map_, grades in maps.items()]
+            yield from table([f"map, against the {_TRUTH[target]}", *names], body)
+            yield ""
+
+
+#: What each target's maps are graded against.
+_TRUTH = {"pixel": "error of pixels", "keypoint": "displacement of keypoints"}
 
 
 def _latency(report: Report) -> Iterator[str]:
@@ -214,7 +229,7 @@ def _recording(report: Report) -> Iterator[str]:
 
 SECTIONS: dict[str, tuple[str, Tables]] = {
     "demo": ("The live demo", _demo),
-    "codec": ("Image quality per channel use (CBR 1/16, pilots included)", _codec),
+    "codec": ("Image quality per channel use", _codec),
     "trajectory": ("Trajectories", _trajectory),
     "pairs": ("Relative pose of frame pairs", _pairs),
     "confidence": ("What the confidence maps are worth", _confidence),

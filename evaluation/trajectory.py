@@ -1,6 +1,7 @@
 """``semcast eval trajectory``: reconstruct a recording over a link, compare the path with the truth."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,8 @@ import numpy as np
 
 from semcast.common.codec import Codec
 from semcast.common.errors import SemcastError
-from semcast.common.trajectory import Trajectory, write_tum
-from semcast.common.trajectory_error import ate
+from semcast.common.trajectory import write_tum
+from semcast.common.trajectory_error import MIN_MATCHES, ate
 from semcast.evaluation.pipeline import (
     CLEAN,
     UNUSED_LINK_FIELDS,
@@ -19,12 +20,14 @@ from semcast.evaluation.pipeline import (
     open_stream,
     selected_frame_ids,
 )
-from semcast.evaluation.plots import plot_top_view
+from semcast.evaluation.plots import plot_path
 from semcast.evaluation.reconstruct import ReconstructedRun, reconstruct
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.statistics import paired_bootstrap
 from semcast.server.geometry.weighting import ConfidenceMode
 from semcast.server.mapping.settings import ReconstructionSettings
+
+logger = logging.getLogger(__name__)
 
 VERB = "eval trajectory"
 #: Flags that this verb sets itself: the mode is a list here, the seed is that of the run.
@@ -68,7 +71,7 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
 
     Returns:
         Provenance and ``cells``: one entry per SNR and mode with the median over seeds of each figure in
-        ``FIGURES``, ``num_failed`` (runs without a trajectory error), and ``runs``, the full summary of each
+        ``FIGURES``, ``num_failed`` (runs without a path), and ``runs``, the full summary of each
         seed. ``comparisons`` holds, per SNR, the paired difference in ATE of each mode to the mode ``off``
         where that was run. With one cell its figures and ``stage_ms`` also stand at the top level.
 
@@ -79,6 +82,8 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     """
     sequence, codec = open_stream(settings, codec)
     truth = sequence.groundtruth()
+    if truth is None:
+        logger.warning("%s has no true path: how far its poses are off is unknown", sequence.name)
     frame_ids = selected_frame_ids(sequence, settings)
     # Without a link neither SNR nor channel seed changes an image: one SNR stands for all.
     snrs_db = settings.snr_db if codec is not None else settings.snr_db[:1]
@@ -93,8 +98,9 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
                 runs[mode].append(_run_entry(run, seed, settings.rows))
                 if settings.out is not None and seed == settings.seed:
                     label = CLEAN if codec is None else f"{snr_db:g}db"
-                    _write_files(settings.out, f"{label}_{mode}", run, truth)
-        cells += [_cell(None if codec is None else snr_db, mode, runs[mode]) for mode in settings.confidence]
+                    _write_files(settings.out, f"{label}_{mode}", run)
+        level = None if codec is None else snr_db
+        cells += [_cell(level, mode, runs[mode], has_truth=truth is not None) for mode in settings.confidence]
     report = {
         **provenance(VERB, settings),
         "sequence": sequence.name,
@@ -122,13 +128,18 @@ def median_or_none(values: Sequence[float | None]) -> float | None:
     return median if np.isfinite(median) else None
 
 
-def _cell(snr_db: float | None, mode: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
+def _has_failed(run: Mapping[str, Any], *, has_truth: bool) -> bool:
+    """Whether a run has no path to speak of; without a truth all that is known is how many poses it has."""
+    return run["ate_rmse_m"] is None if has_truth else run["num_posed"] < MIN_MATCHES
+
+
+def _cell(snr_db: float | None, mode: str, runs: list[dict[str, Any]], *, has_truth: bool) -> dict[str, Any]:
     return {
         "snr_db": snr_db,
         "confidence": mode,
         "seeds": [run["seed"] for run in runs],
         **{name: median_or_none([run[name] for run in runs]) for name in FIGURES},
-        "num_failed": sum(run["ate_rmse_m"] is None for run in runs),
+        "num_failed": sum(_has_failed(run, has_truth=has_truth) for run in runs),
         "runs": runs,
     }
 
@@ -159,19 +170,20 @@ def _comparisons(cells: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]
     return found
 
 
-def _write_files(folder: Path, label: str, run: ReconstructedRun, truth: Trajectory | None) -> None:
+def _write_files(folder: Path, label: str, run: ReconstructedRun) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_tum(folder / f"trajectory_{label}.tum", run.trajectory)
     except OSError as err:
         raise SemcastError(f"{folder} can't be written: {err}") from err
+    truth = run.truth
     absolute = ate(run.trajectory, truth) if truth is not None else None
     if absolute is None or truth is None:
         return
     aligned = absolute.scale * run.trajectory.positions @ absolute.R_truth_map.T + absolute.t_truth_map
     widest = np.sort(np.argsort(np.ptp(truth.positions, axis=0))[1:])
-    plot_top_view(
-        folder / f"top_view_{label}.png",
+    plot_path(
+        folder / f"path_{label}.png",
         {"ground truth": truth.positions, "semcast": aligned},
         axes_names=("xyz"[widest[0]], "xyz"[widest[1]]),
         title=f"ATE {absolute.rmse_m:.3g} m ({absolute.percent:.2g} %)",

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.evaluation.markdown import number, table
+from semcast.evaluation.statistics import small_sample_factor
 
 Array = NDArray[np.float64]
 
@@ -76,9 +77,11 @@ def ratio_interval(pairings: Sequence[Pairing]) -> tuple[float, float, float]:
     logs = [np.log(p.ours_percent / p.theirs_percent) for p in pairings]
     drawn = np.zeros(_NUM_RESAMPLES)
     for log in logs:
-        drawn += log[rng.integers(len(log), size=(_NUM_RESAMPLES, len(log)))].mean(axis=1) / len(logs)
-    low, high = np.exp(np.percentile(drawn, [2.5, 97.5]))
-    return float(np.exp(np.mean([log.mean() for log in logs]))), float(low), float(high)
+        off = log[rng.integers(len(log), size=(_NUM_RESAMPLES, len(log)))].mean(axis=1) - log.mean()
+        drawn += small_sample_factor(len(log)) * off / len(logs)
+    mean = np.mean([log.mean() for log in logs])
+    low, high = np.exp(mean + np.percentile(drawn, [2.5, 97.5]))
+    return float(np.exp(mean)), float(low), float(high)
 
 
 def trajectory_summary(reports: Iterable[Mapping[str, Any]]) -> str:

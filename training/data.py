@@ -13,6 +13,8 @@ from torch import Tensor
 from semcast.common.errors import SourceError
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+#: A whole 16x16 block at half size, from which linear layers start.
+MIN_SIDE_PX = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,12 +47,17 @@ def read_images(folder: Path) -> list[NDArray[np.uint8]]:
     """Read all images of a folder as ``(H, W, 3)`` uint8 RGB, by name.
 
     Raises:
-        SourceError: The folder holds no readable image.
+        SourceError: The folder holds no readable image, or one is too small.
     """
     images: list[NDArray[np.uint8]] = []
     for path in sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES):
         bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if bgr is not None:
+            height, width = bgr.shape[:2]
+            if min(height, width) < MIN_SIDE_PX:
+                raise SourceError(
+                    f"images must have sides of at least {MIN_SIDE_PX} pixels, {path} is {width}x{height}"
+                )
             images.append(np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8))
     if not images:
         raise SourceError(f"{folder} holds no readable image ({', '.join(SUFFIXES)})")

@@ -371,7 +371,9 @@ def _train(
             if run.agreed_stop:
                 break
             start_s = time.perf_counter()
-            rows.append(run.one_step())
+            row = run.one_step()
+            if run.rank == 0:  # the others log nothing
+                rows.append(row)
             run.elapsed_s += time.perf_counter() - start_s
             if run.step % settings.log_every == 0 and run.rank == 0:
                 report = Progress(run.step, run.elapsed_s, run.share_done(), _mean_logs(rows))

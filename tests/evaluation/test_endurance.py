@@ -2,9 +2,13 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
+from semcast.channel.settings import ChannelSettings
 from semcast.common.errors import ConfigError
+from semcast.common.sequence import open_sequence
+from semcast.common.trajectory import Trajectory
 from semcast.evaluation.endurance import EnduranceSettings, back_and_forth, evaluate_endurance
 
 
@@ -36,6 +40,10 @@ def test_a_long_run_reports_cost_and_map(room, tmp_path):
     assert all(row["posed_share"] >= 0.9 for row in report["results"])
     assert all(0.0 < row["frame_ms_p50"] <= row["frame_ms_p95"] for row in report["results"])
     assert all(0.0 <= row["ate_percent"] < 3.0 for row in report["results"])
+    # In percent of one pass of 14 frames, however often it was ridden.
+    one_pass_m = Trajectory(np.arange(14.0), open_sequence(room).groundtruth().T_world_cam[:14]).path_length
+    for row in report["results"]:
+        assert row["ate_percent"] == pytest.approx(100.0 * row["ate_rmse_m"] / one_pass_m)
     last = report["results"][-1]
     assert 40 < last["landmarks"] <= 20_000
     assert report["growth"]["memory_mb"] == pytest.approx(
@@ -43,8 +51,13 @@ def test_a_long_run_reports_cost_and_map(room, tmp_path):
     )
 
 
-def test_settings_that_give_no_run_are_refused(room):
+def test_settings_that_give_no_run_are_refused(room, phase_codec):
     with pytest.raises(ValueError, match=r"every must be in \[1, 10\], got 11"):
         EnduranceSettings(sequence=room, frames=10, every=11)
+    lost = ChannelSettings(frame_loss=1.0)
+    with pytest.raises(ConfigError, match="no frame was received at snr_db 10: there is nothing to run"):
+        evaluate_endurance(
+            EnduranceSettings(sequence=room, codec="phase", link=lost, frames=5, every=5), phase_codec
+        )
     with pytest.raises(ConfigError, match="at least 3 frames"):
         evaluate_endurance(EnduranceSettings(sequence=room, codec="none", max_frames=2, frames=5, every=5))

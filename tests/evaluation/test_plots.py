@@ -3,40 +3,43 @@ import numpy as np
 import pytest
 
 from semcast.common.errors import SemcastError
-from semcast.evaluation.plots import plot_against_snr, plot_pair_errors, plot_reliability, plot_top_view
+from semcast.evaluation.plots import plot_against_snr, plot_pair_errors, plot_path, plot_reliability
 
 
-def test_pair_plots_are_drawn_for_the_chosen_modes(tmp_path):
-    def cell(snr_db, off):
+def test_pair_plots_are_drawn_with_the_intervals_there_are(tmp_path):
+    def cell(snr_db, off, interval=None):
         values = {"rot_deg_mean": off, "tdir_deg_mean": 2 * off}
-        return {"snr_db": snr_db, "results": {"off": values, "robust": values}}
+        paired = None if interval is None else {"low": interval[0], "high": interval[1]}
+        which = {"mode": "robust", "against": "off", "figure": "rot_deg_mean", "paired": paired}
+        return {"snr_db": snr_db, "results": {"off": values, "robust": values}, "comparisons": [which]}
 
     both = plot_pair_errors(tmp_path, {"cells": [cell(10, 1.0), cell(2, 4.0)]})
     assert [p.name for p in both] == ["fig9_rotation.png", "fig10_translation_direction.png"]
     images = [cv2.imread(str(p)) for p in both]
     assert all(image is not None and image.std() > 5 for image in images)
-    before = both[0].read_bytes()
-    plot_pair_errors(tmp_path, {"cells": [cell(10, 1.0), cell(2, 4.0)]}, modes=["off"])
-    assert both[0].read_bytes() != before
+    rotation, direction = (p.read_bytes() for p in both)
+    plot_pair_errors(tmp_path, {"cells": [cell(10, 1.0, (-0.5, 0.5)), cell(2, 4.0, (-5.0, 1.0))]})
+    assert both[0].read_bytes() != rotation
+    assert both[1].read_bytes() == direction
 
 
-def test_curves_with_gaps_and_bands_draw_and_wrong_lengths_raise(tmp_path):
+def test_curves_with_gaps_draw_and_wrong_lengths_raise(tmp_path):
     path = tmp_path / "a.png"
-    plot_against_snr(path, [2, 4], {"x": [1.0, None]}, "y", intervals={"x": [(0.5, 1.5), (0.5, 1.5)]})
+    plot_against_snr(path, [2, 4], {"x": [1.0, None]}, "y")
     assert cv2.imread(str(path)) is not None
     with pytest.raises(ValueError, match="2 values"):
         plot_against_snr(path, [2, 4], {"x": [1.0]}, "y")
 
 
-def test_top_view_and_reliability_are_drawn(tmp_path):
+def test_path_and_reliability_are_drawn(tmp_path):
     path = tmp_path / "top.svg"
     line = np.stack([np.arange(5.0), np.zeros(5), np.arange(5.0)], axis=1)
-    plot_top_view(path, {"ground truth": line, "semcast": line + 0.1}, title="t")
+    plot_path(path, {"ground truth": line, "semcast": line + 0.1}, title="t")
     assert "<svg" in path.read_text()
-    plot_reliability(tmp_path / "r.png", {"c": {"predicted": [0.2, 0.8], "observed": [0.3, 0.7]}})
+    plot_reliability(tmp_path / "r.png", {"c": {"predicted": [0.2, 0.8], "observed": [0.3, 0.7]}}, "what was")
     assert cv2.imread(str(tmp_path / "r.png")) is not None
 
 
 def test_an_unknown_file_type_is_one_clear_error(tmp_path):
     with pytest.raises(SemcastError, match="plot"):
-        plot_top_view(tmp_path / "a.nonsense", {"a": np.zeros((2, 3))})
+        plot_path(tmp_path / "a.nonsense", {"a": np.zeros((2, 3))})

@@ -9,6 +9,7 @@ from semcast.evaluation.statistics import (
     paired_bootstrap,
     percentiles,
     pose_auc_percent,
+    small_sample_factor,
     spearman,
 )
 
@@ -130,3 +131,19 @@ def test_bootstrap_ratio_and_bad_input(rng):
         paired_bootstrap([np.inf], [1.0], rng)
     with pytest.raises(ValueError, match="level"):
         paired_bootstrap([1.0], [1.0], rng, level=1.0)
+
+
+@pytest.mark.parametrize(("count", "student"), [(5, 2.776), (8, 2.365), (20, 2.093), (1000, 1.962)])
+def test_few_samples_widen_an_interval_by_student_s_quantile(count, student):
+    expected = student / 1.95996 * np.sqrt(count / (count - 1))
+    assert small_sample_factor(count) == pytest.approx(expected, rel=0.003)
+
+
+def test_intervals_of_few_samples_cover_what_they_say(rng):
+    covered = 0
+    for _ in range(400):
+        found = paired_bootstrap(rng.normal(0.3, 1.0, 8), np.zeros(8), rng, num_resamples=400)
+        covered += found.low < 0.3 < found.high
+    assert 0.925 < covered / 400 < 0.98
+    with pytest.raises(ValueError, match="count must be at least 5, got 4"):
+        small_sample_factor(4)

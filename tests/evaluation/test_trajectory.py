@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import cv2
 import pytest
@@ -52,7 +53,7 @@ def test_one_run_has_the_promised_keys_and_files(room, phase_codec, tmp_path):
     assert len(cell["runs"][0]["rows"]) == 16
     posed = read_tum(tmp_path / "trajectory_20db_robust.tum")
     assert len(posed) == cell["runs"][0]["num_posed"]
-    assert cv2.imread(str(tmp_path / "top_view_20db_robust.png")) is not None
+    assert cv2.imread(str(tmp_path / "path_20db_robust.png")) is not None
 
 
 def test_the_same_settings_give_the_same_trajectory_bit_for_bit(room, phase_codec, tmp_path):
@@ -107,6 +108,17 @@ def test_a_dead_link_gives_no_error_figure_and_says_so(room, phase_codec):
     assert report["ate_rmse_m"] is None
     assert report["num_failed"] == 1
     assert report["completeness"] == 0.0
+
+
+def test_without_a_truth_a_run_is_judged_by_its_poses(room, tmp_path, caplog):
+    shutil.copytree(room, tmp_path / "blind")
+    (tmp_path / "blind" / "groundtruth.txt").unlink()
+    report = evaluate_trajectory(
+        TrajectorySettings(sequence=tmp_path / "blind", codec="none", max_frames=10, out=tmp_path / "out")
+    )
+    assert (report["ate_rmse_m"], report["num_failed"]) == (None, 0)
+    assert report["completeness"] >= 0.9
+    assert "blind has no true path: how far its poses are off is unknown" in caplog.text
 
 
 def test_a_failed_run_counts_as_worse_than_any_number():

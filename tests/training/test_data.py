@@ -70,14 +70,20 @@ def test_grey_crops_have_equal_channels():
 
 
 def test_images_are_read_by_name_as_rgb(tmp_path):
-    red = np.zeros((8, 8, 3), np.uint8)
+    red = np.zeros((32, 40, 3), np.uint8)
     red[..., 2] = 255  # BGR for cv2
     cv2.imwrite(str(tmp_path / "b.png"), red)
-    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((8, 8, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((32, 40, 3), np.uint8))
     (tmp_path / "notes.txt").write_text("no image")
     images = read_images(tmp_path)
     assert len(images) == 2
     assert images[1][0, 0].tolist() == [255, 0, 0]
+
+
+def test_images_too_small_to_start_from_are_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((31, 40, 3), np.uint8))
+    with pytest.raises(SourceError, match="sides of at least 32 pixels, .*a.png is 40x31"):
+        read_images(tmp_path)
 
 
 def test_a_folder_without_images_is_an_error(tmp_path):
