@@ -13,7 +13,8 @@ from semcast.common.errors import CheckpointError
 from semcast.common.nets.checkpoint import load_transceiver, weights_path
 from semcast.common.nets.onnx_encoder import FORMAT, INPUTS, OUTPUT
 from semcast.common.nets.rounding import rounded_snr_db
-from semcast.training.onnx_int8 import calibration_images, quantise
+from semcast.training.data import read_images
+from semcast.training.onnx_int8 import quantise
 
 OPSET = 17
 _HALVE_FROM_VALUES = 256
@@ -48,7 +49,7 @@ def export_encoder(name_or_path: str | Path, out: Path, int8_images: Path | None
         CheckpointError: There are no such weights, or the file can't be written.
         SourceError: The folder holds no images.
     """
-    images = [] if int8_images is None else calibration_images(int8_images)
+    images = [] if int8_images is None else read_images(int8_images)
     model, manifest = load_transceiver(weights_path(name_or_path))
     example = (torch.zeros(1, 64, 96, 3, dtype=torch.uint8), torch.full((1,), 10.0))
     sides = {1: "height", 2: "width"}

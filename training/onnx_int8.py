@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
-from semcast.common.errors import SourceError
 from semcast.common.nets.onnx_encoder import INPUTS
 from semcast.common.phy.slots import BLOCK_PX
-from semcast.training.data import read_images
 
 #: Images the ranges are taken from, at most, and their longer side in pixels.
 _NUM_IMAGES, _SIDE_PX = 48, 512
@@ -45,18 +43,6 @@ class _Ranges(CalibrationDataReader):  # type: ignore[misc]
     def get_next(self) -> dict[str, NDArray[np.generic]] | None:
         """Return the next input, None behind the last."""
         return next(self._inputs, None)
-
-
-def calibration_images(folder: Path) -> list[NDArray[np.uint8]]:
-    """Read the photos that show which values activations take.
-
-    Raises:
-        SourceError: There are none of at least one block.
-    """
-    images = [image for image in read_images(folder) if min(image.shape[:2]) >= BLOCK_PX]
-    if not images:
-        raise SourceError(f"{folder} holds no image of at least {BLOCK_PX}x{BLOCK_PX} pixels")
-    return images
 
 
 def quantise(
