@@ -52,8 +52,9 @@ def camera_info(settings: AgentSettings, source: Source, codec: Codec, agent_epo
         nominal_rate_hz=source.rate_hz,
         codec=codec.name,
         digest=codec.digest,
-        modulation=settings.modulation,
-        source_name=source.name[:200],
+        modulation=codec.modulation,
+        # The name of a folder may hold bytes that are no text.
+        source_name=source.name[:200].encode("utf-8", "replace").decode(),
         num_frames=source.num_frames,
         last_frame_id=source.last_frame_id,
         lossless=settings.mode == "replay",
@@ -142,8 +143,13 @@ def _send_live(sending: _Sending, capture: Capture, stop: threading.Event) -> No
     while not stop.is_set() and not capture.ended:
         frame = capture.get(_POLL_S)
         if frame is not None:
-            last = sending.encode(frame)
-            sending.send(last)
+            try:
+                last = sending.encode(frame)
+                sending.send(last)
+            except (ValueError, WireError) as err:
+                sending.metrics.drop("encode")
+                sending.metrics.error(f"frame {frame.frame_id} left out: {err}")
+                logger.warning("frame %d is left out: %s", frame.frame_id, err)
     if last is None or not last.final:
         return
     until_s = time.monotonic() + _FAREWELL_S

@@ -63,7 +63,8 @@ class AgentSettings:
     follow_server: bool = field(
         default=True,
         metadata={
-            "help": "live: send only one frame in 2, 3, ... while the server can't keep up with every one"
+            "help": "live: send only one frame in 2, 3, ... while the server can't keep up with every one; "
+            "begins at about 12 a second"
         },
     )
     wait: bool = field(

@@ -21,6 +21,8 @@ from semcast.common.trajectory import Trajectory
 logger = logging.getLogger(__name__)
 
 _REOPEN_AFTER_S = 1.0
+#: Longest time to throw old images away before a camera's first is sent.
+_SKIP_S = 2.0
 _OPEN_TIMEOUT_MS = 5000
 #: Stamps of a constant frame rate are off by the rounding of their container: Matroska's to whole ms,
 #: and that of the first frame comes on top.
@@ -277,6 +279,7 @@ class LiveSource(_Captured):
         if self._settings.pace == "rate" and self._settings.rate_hz is not None:
             interval_ns = round(1e9 / self._settings.rate_hz)
         most = self._settings.max_frames
+        self._skip_what_waited()
         while not stop.is_set() and (most is None or sent < most):
             image = _read(self._capture) if self._capture is not None else None
             now_ns = time.monotonic_ns()
@@ -286,9 +289,23 @@ class LiveSource(_Captured):
             grabbed += 1
             if grabbed % self._settings.stride or now_ns < due_ns:
                 continue
-            due_ns = max(due_ns + interval_ns, now_ns - interval_ns)
+            # On the beat, or where that was missed from now on: nothing is made up for in a burst.
+            due_ns = due_ns + interval_ns if now_ns - due_ns < interval_ns else now_ns + interval_ns
             sent += 1
             yield SourceFrame(grabbed, now_ns, now_ns, self._rectify(image), sent == most)
+
+    def _skip_what_waited(self) -> None:
+        """Throw away images that waited in the driver while nobody took them: their time is not known.
+
+        They come at once; the first that has to be waited for is new.
+        """
+        wait_s = 0.5 / self._fps
+        begun_s = since_s = time.monotonic()
+        while self._capture is not None and since_s - begun_s < _SKIP_S and self._capture.grab():
+            now_s = time.monotonic()
+            if now_s - since_s > wait_s:
+                return
+            since_s = now_s
 
     def _reopen(self, stop: threading.Event) -> None:
         if self._capture is not None:

@@ -145,8 +145,7 @@ class Emulator:
         if frame.agent_epoch != self._epoch:
             self._epoch = frame.agent_epoch
             with self._link_lock:
-                # Time starts anew with the stream, and with it fading and SNR traces.
-                self._link = Link(self._link.settings, self._settings.seed)
+                self._link.restart()
 
     def _send(self, packet: bytes, lossless: bool) -> None:
         try:
@@ -170,7 +169,7 @@ class Emulator:
                 changed = build_settings(ChannelSettings, {**current, **request.settings})
                 self._link.update(changed)
                 logger.info("channel set: %s", ", ".join(f"{k}={v}" for k, v in request.settings.items()))
-                _warn_of_idle(changed, request.settings)
+                warn_of_idle(changed, request.settings)
             return settings_to_dict(self._link.settings)
 
     def close(self) -> None:
@@ -179,11 +178,11 @@ class Emulator:
         self._delay.close()
 
 
-def _warn_of_idle(link: ChannelSettings, given: Collection[str]) -> None:
+def warn_of_idle(link: ChannelSettings, given: Collection[str]) -> None:
     """Say which of the given values do nothing as long as the channel is what it is."""
     idle = [name for name in link.without_effect() if name in given]
     if idle:
-        logger.warning("%s: no effect on channel %s", ", ".join(idle), link.channel)
+        logger.warning("%s: no effect on channel %s as it is set", ", ".join(idle), link.channel)
 
 
 def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, Any]:
@@ -210,7 +209,7 @@ def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, 
         beat = StatusBeat(session, settings.agent_id, ROLE, metrics, lambda: emulator.agent_epoch)
         session.declare_alive(settings.agent_id, ROLE)
         logger.info("channel %s at %g dB", settings.link.channel, settings.link.snr_db)
-        _warn_of_idle(settings.link, settings.link.without_effect())
+        warn_of_idle(settings.link, settings.link.without_effect())
         try:
             emulator.work(stop)
         finally:

@@ -75,6 +75,11 @@ class Link:
             self._model = build_channel(settings, self._seed)
         self._settings = settings
 
+    def restart(self) -> None:
+        """Let time begin anew with the next frame, and with it fading and SNR traces."""
+        self._start_s = None
+        self._next_frame = 0
+
     def transmit(self, slots: NDArray[np.complex64], t_s: float, frame_id: int | None = None) -> Transmission:
         """Send one frame through the channel.
 

@@ -12,6 +12,7 @@ TraceName = Literal["constant", "ramp", "walk", "file"]
 
 #: Channels that a value belongs to; the others belong to all.
 _CHANNELS_OF: dict[str, tuple[ChannelName, ...]] = {
+    "slot_ms": ("rayleigh", "rician"),
     "slot_loss": ("erasure", "burst"),
     "burst_slots": ("burst",),
     "burst_noise_db": ("burst",),
@@ -22,6 +23,16 @@ _CHANNELS_OF: dict[str, tuple[ChannelName, ...]] = {
     "trace_s": ("trace",),
     "trace_step_db": ("trace",),
     "trace_file": ("trace",),
+}
+
+
+#: Kinds of traces that a value belongs to.
+_TRACES_OF: dict[str, tuple[TraceName, ...]] = {
+    "snr_db": ("constant", "ramp", "walk"),
+    "trace_end_db": ("ramp",),
+    "trace_s": ("ramp",),
+    "trace_step_db": ("walk",),
+    "trace_file": ("file",),
 }
 
 
@@ -50,7 +61,10 @@ class ChannelSettings:
         default=0.2, metadata={"help": "share of slots lost (erasure) or hit by a burst (burst)"}
     )
     frame_loss: float = field(default=0.0, metadata={"help": "share of whole frames lost, on any channel"})
-    burst_slots: float = field(default=4.0, metadata={"help": "mean length of a burst in slots"})
+    burst_slots: float = field(
+        default=4.0,
+        metadata={"help": "mean length of a burst in slots, but for those that the end of a frame cuts"},
+    )
     burst_noise_db: float = field(default=20.0, metadata={"help": "how far a burst raises the noise, in dB"})
     rician_k_db: float = field(
         default=6.0, metadata={"help": "line of sight over scattered power in dB (rician)"}
@@ -70,7 +84,13 @@ class ChannelSettings:
         default=None, metadata={"help": "CSV file with the columns t_s,snr_db (trace file)"}
     )
     delay_ms: float = field(default=0.0, metadata={"help": "delay of every frame in ms"})
-    jitter_ms: float = field(default=0.0, metadata={"help": "mean of the random extra delay in ms"})
+    jitter_ms: float = field(
+        default=0.0,
+        metadata={
+            "help": "mean of a random extra delay of each frame in ms; none overtakes another, so that those "
+            "behind it wait too"
+        },
+    )
 
     def __post_init__(self) -> None:
         for name, value, allowed in (
@@ -103,10 +123,16 @@ class ChannelSettings:
             raise ValueError("trace_file must be given for trace 'file', got None")
 
     def without_effect(self) -> list[str]:
-        """Return the names of values that were changed and belong to another channel than this."""
+        """Return the names of values that were changed and change nothing on this channel."""
         return [
             entry.name
             for entry in fields(self)
-            if self.channel not in _CHANNELS_OF.get(entry.name, (self.channel,))
-            and getattr(self, entry.name) != entry.default
+            if getattr(self, entry.name) != entry.default and not self._matters(entry.name)
         ]
+
+    def _matters(self, name: str) -> bool:
+        if self.channel not in _CHANNELS_OF.get(name, (self.channel,)):
+            return False
+        if name == "slot_ms":
+            return self.doppler_hz > 0.0
+        return self.channel != "trace" or self.trace in _TRACES_OF.get(name, (self.trace,))

@@ -98,6 +98,10 @@ class Codec(Protocol):
     def digest(self) -> str:
         """First 16 hex digits of the sha256 of the weights, or of the settings where there are none."""
 
+    @property
+    def modulation(self) -> Modulation:
+        """How what it encodes travels."""
+
     def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
         """Encode one ``(H, W, 3)`` uint8 RGB image for a link whose expected SNR is ``snr_db``."""
 

@@ -49,7 +49,11 @@ def reported_snr_db(codec: str, equalised: Equalised) -> float:
     Learned codecs are told the link's average. A conventional one has to choose what still gets through, and
     is told the SNR of a steady link that carries as much.
     """
-    return equalised.steady_snr_db if codec in _conventional_names() else equalised.snr_db
+    if codec not in _conventional_names():
+        return equalised.snr_db
+    from semcast.common.conventional import reachable_snr_db
+
+    return reachable_snr_db(equalised)
 
 
 def _choose_runtime(runtime: Runtime, weights: Path | None) -> Literal["torch", "onnx"]:

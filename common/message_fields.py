@@ -90,7 +90,14 @@ class Text:
             raise FieldError("range", f"must match {self.pattern}, got {value!r}")
         return value
 
-    dump = load
+    def dump(self, value: Any) -> str:
+        """Check before sending; names of files may hold what is no text."""
+        text = self.load(value)
+        try:
+            text.encode()
+        except UnicodeEncodeError as err:
+            raise FieldError("range", f"must be text that UTF-8 can hold, got {value!r}") from err
+        return text
 
 
 @dataclass(frozen=True)

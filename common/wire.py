@@ -12,6 +12,8 @@ from semcast.common.messages import PROTOCOL_VERSION, Message
 #: A payload of 16 MiB is the largest single field; a map of 300 000 landmarks has 9 MB.
 MAX_MESSAGE_BYTES = 32 * 1024**2
 _MAX_ITEMS = 4096
+#: Lists and maps in one message, nested ones too; ours have a few, and one for each dictionary of a status.
+_MAX_CONTAINERS = 1000
 
 M = TypeVar("M")
 
@@ -71,7 +73,8 @@ def unpack(data: bytes, expected: type[M]) -> M:
         expected: The message class that belongs on the key.
 
     Raises:
-        WireError: The bytes are not such a message. Nothing larger than the bytes themselves was allocated.
+        WireError: The bytes are not such a message. No more memory than their own size was allocated, or a
+            few hundred kilobytes.
     """
     if len(data) > MAX_MESSAGE_BYTES:
         raise WireError("size", f"message must have at most {MAX_MESSAGE_BYTES} bytes, got {len(data)}")
@@ -107,9 +110,21 @@ def unpack(data: bytes, expected: type[M]) -> M:
 
 
 def _parse(data: bytes) -> dict[str, Any]:
+    num_containers = 0
+
+    def count(container: Any) -> Any:
+        """Stop at once where lists and maps, which cost more than their bytes, are too many."""
+        nonlocal num_containers
+        num_containers += 1
+        if num_containers > _MAX_CONTAINERS:
+            raise ValueError(f"more than {_MAX_CONTAINERS} lists and maps")
+        return container
+
     try:
         values = msgpack.unpackb(
             data,
+            list_hook=count,
+            object_hook=count,
             raw=False,
             strict_map_key=True,
             max_str_len=_MAX_ITEMS,

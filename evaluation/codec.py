@@ -205,6 +205,10 @@ class _Exported:
     def digest(self) -> str:
         return self.decoder.digest
 
+    @property
+    def modulation(self) -> Modulation:
+        return self.encoder.modulation
+
     def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
         return self.encoder.encode(image, snr_db)
 

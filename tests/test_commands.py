@@ -16,7 +16,7 @@ import pytest
 
 from semcast.agent.settings import AgentSettings
 from semcast.agent.source_settings import SourceSettings
-from semcast.channel.emulator import run_channel
+from semcast.channel.emulator import run_channel, set_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.cli import main, verb_parser
@@ -152,10 +152,29 @@ def test_what_does_nothing_is_said(channel, capsys, caplog):
     words = ["channel", "set", "--agent-id", "a", "--connect", channel]
     assert main([*words, "--channel", "awgn", "--slot-loss", "0.3", "--seed", "7"]) == 0
     assert "seed: no effect on a channel that runs" in caplog.text
-    assert "slot_loss: no effect on channel awgn" in caplog.text
+    told = [r.name for r in caplog.records if "slot_loss: no effect on channel awgn" in r.getMessage()]
+    assert len(told) == 2  # by the channel, and where the command was typed
     caplog.clear()
     assert main([*words, "--channel", "erasure"]) == 0
     assert "no effect" not in caplog.text
+
+
+def test_a_trace_of_this_folder_is_found_by_a_channel_in_another(channel, tmp_path, monkeypatch, capsys):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "snr.csv").write_text("t_s,snr_db\n0,4\n1,8\n")
+    asked = []
+
+    def from_elsewhere(network, agent_id, changes):
+        monkeypatch.chdir(tmp_path)
+        asked.append(changes)
+        return set_channel(network, agent_id, changes)
+
+    monkeypatch.setattr("semcast.commands.channel.set_channel", from_elsewhere)
+    monkeypatch.chdir(tmp_path / "here")
+    words = ["--channel", "trace", "--trace", "file", "--trace-file", "snr.csv"]
+    assert main(["channel", "set", "--agent-id", "a", "--connect", channel, *words]) == 0
+    assert json.loads(capsys.readouterr().out)["trace_file"] == str(tmp_path / "here" / "snr.csv")
+    assert len(asked) == 1
 
 
 @pytest.mark.parametrize(

@@ -100,6 +100,11 @@ class OnnxEncoder:
         """Digest of the weights the encoder was exported from: the server decodes with the same."""
         return self._digest
 
+    @property
+    def modulation(self) -> Modulation:
+        """How symbols travel."""
+        return self._modulation
+
     def warm_up(self, shape_hw: tuple[int, int]) -> None:
         """Encode one empty frame, so that the first real one is not slow."""
         self.encode(np.zeros((*shape_hw, 3), dtype=np.uint8), 10.0)

@@ -94,17 +94,21 @@ class Equalised:
     snr_db: float
     channel: ChannelEstimate
 
-    @property
-    def steady_snr_db(self) -> float:
-        """SNR in dB of a link without fading and losses that a rate may be chosen by.
+    def steady_snr_db(self, enough_db: float = np.inf) -> float:
+        """Return the SNR in dB of a link without fading and losses that a rate may be chosen by.
 
         Such a link carries ``log(1 + snr)``. A code that spans all slots has the mean of that over the slots,
         lost ones with 0; one frame of twenty has ``_ONE_IN_TWENTY`` standard errors less than another, not
-        counting what the estimate of each gain varies by itself.
+        counting what the estimate of each gain varies by itself. Slots are taken to differ independently:
+        where bursts or slow fading hit many together, more than one frame of twenty has less.
+
+        Args:
+            enough_db: Above this SNR a slot carries no more: what is lost elsewhere can't be made up for by
+                symbols that hold so many bits and no others.
         """
         snr = 10.0 ** (self.received.effective_snr_db.astype(np.float64) / 10.0)
         snr[self.received.effective_snr_db <= LOST_SLOT_SNR_DB] = 0.0
-        carried = np.log1p(snr)
+        carried = np.log1p(np.minimum(snr, 10.0 ** (enough_db / 10.0)))
         variance = float(np.var(carried))
         if self.channel.num_pilots:
             variance -= float(np.mean(2.0 * snr / (self.channel.num_pilots * np.square(1.0 + snr))))

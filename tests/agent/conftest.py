@@ -17,7 +17,7 @@ class TinyCodec:
     """Sends the mean brightness of each block as analog symbols, repeated; decodes to flat blocks."""
 
     name = "tiny"
-    digest = "0123"
+    digest, modulation = "0123", "analog"
 
     def __init__(self):
         self.snrs_db = []

@@ -1,5 +1,6 @@
 import http.server
 import threading
+import time
 
 import cv2
 import numpy as np
@@ -14,9 +15,12 @@ PINHOLE = CameraSettings(fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 
 
 class Camera:
-    """A network camera: motion JPEG over HTTP on loopback, which hangs up after some frames."""
+    """A network camera: motion JPEG over HTTP on loopback, which hangs up after some frames.
 
-    def __init__(self, frames_per_connection):
+    Of those the first ``at_once`` come without delay, the others ``interval_s`` apart.
+    """
+
+    def __init__(self, frames_per_connection, at_once=1, interval_s=0.0):
         jpegs = [
             cv2.imencode(".jpg", np.full((48, 64, 3), 20 * k % 255, np.uint8))[1].tobytes() for k in range(12)
         ]
@@ -31,6 +35,7 @@ class Camera:
                 self.end_headers()
                 try:
                     for k in range(frames_per_connection):
+                        time.sleep(interval_s if k >= at_once else 0.0)
                         jpeg = jpegs[k % len(jpegs)]
                         self.wfile.write(
                             b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
@@ -55,10 +60,21 @@ class Camera:
 
 
 @pytest.fixture
-def camera():
-    opened = Camera(frames_per_connection=60)
-    yield opened
-    opened.close()
+def make_camera():
+    opened = []
+
+    def make(*args):
+        opened.append(Camera(*args))
+        return opened[-1]
+
+    yield make
+    for one in opened:
+        one.close()
+
+
+@pytest.fixture
+def camera(make_camera):
+    return make_camera(60, 60)
 
 
 def test_a_network_camera_is_read_and_found_again_when_it_hangs_up(camera, caplog):
@@ -77,7 +93,33 @@ def test_a_network_camera_is_read_and_found_again_when_it_hangs_up(camera, caplo
     assert source.groundtruth() is None
 
 
-def test_a_camera_that_is_not_there_is_said(camera):
+def test_images_that_waited_before_the_start_are_thrown_away(make_camera):
+    camera = make_camera(40, 8, 0.1)
+    source = open_source(SourceSettings(source=camera.address, camera=PINHOLE, max_frames=1))
+    (frame,) = source.frames(threading.Event())
+    source.close()
+    assert round(frame.image.mean() / 20) in (8, 9, 10)  # the eight before came at once
+
+
+def test_a_camera_is_slowed_down_and_nothing_is_made_up_for(make_camera):
+    settings = SourceSettings(
+        source=make_camera(400, 4, 0.005).address, camera=PINHOLE, max_frames=8, pace="rate", rate_hz=20.0
+    )
+    source = open_source(settings)
+    times_s = []
+    for frame in source.frames(threading.Event()):
+        times_s.append(frame.t_capture_ns * 1e-9)
+        time.sleep(0.3 if len(times_s) == 4 else 0.0)
+    source.close()
+    assert source.rate_hz == 20.0
+    gaps_s = np.diff(times_s)
+    assert gaps_s[3] > 0.3
+    assert gaps_s.min() > 0.03
+    assert np.median(np.delete(gaps_s, 3)) == pytest.approx(0.05, abs=0.02)
+
+
+def test_a_camera_that_is_not_there_is_said(make_camera):
+    camera = make_camera(1)
     address = camera.address.replace("http://", "http://user:secret@").replace("/stream.mjpg", "/x")
     camera.close()
     with pytest.raises(SourceError) as caught:

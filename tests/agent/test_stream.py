@@ -11,19 +11,20 @@ import time
 import numpy as np
 import pytest
 
-from semcast.agent.agent import run_agent
+from semcast.agent.agent import camera_info, run_agent
 from semcast.agent.settings import AgentSettings
+from semcast.agent.source import open_source
 from semcast.agent.source_settings import SourceSettings
 from semcast.channel.emulator import run_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.common.errors import SourceError
 from semcast.common.keys import status_key
-from semcast.common.messages import StatusMessage
+from semcast.common.messages import CameraInfo, StatusMessage
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.transport import free_endpoint, open_hub, open_session
-from semcast.common.wire import unpack
+from semcast.common.wire import pack, unpack
 from semcast.server.receiver import Receiver
 
 PROGRAM = """
@@ -300,11 +301,47 @@ def test_a_source_that_fails_ends_the_agent_with_its_error(bench, tmp_path):
     assert "there is no such folder" in str(failing.error)
 
 
+class Picky:
+    """Refuses one frame of twelve."""
+
+    def __init__(self, codec):
+        self.name, self.digest, self.modulation = codec.name, codec.digest, codec.modulation
+        self._codec = codec
+
+    def encode(self, image, snr_db):
+        if image[0, 0, 0] == 60:
+            raise ValueError("this codec can't")
+        return self._codec.encode(image, snr_db)
+
+
+def test_a_frame_that_can_not_be_sent_live_is_left_out_and_counted(bench, caplog):
+    bench.codec = Picky(bench.codec)
+    bench.channel()
+    receiver = bench.receiver()
+    agent = bench.agent(follow_server=False, source={"pace": "rate", "rate_hz": 10.0})
+    frames = take(receiver, count=5)
+    agent.join(40)
+    assert agent.error is None
+    ids = {f.message.frame_id for f in frames}
+    assert 3 not in ids
+    assert max(ids) > 3
+    assert agent.result["drops"]["encode"] == 1
+    assert "frame 3 is left out: this codec can't" in caplog.text
+
+
+def test_a_folder_whose_name_is_no_text_can_be_sent(recording, codec, tmp_path):
+    folder = os.fsdecode(os.fsencode(tmp_path) + b"/room\xff")
+    shutil.copytree(recording, folder)
+    settings = AgentSettings(source=SourceSettings(source=folder))
+    info = camera_info(settings, open_source(settings.source), codec, 1)
+    assert unpack(pack(info), CameraInfo).source_name == "room?"
+
+
 class AfterTheSource:
     """Encodes nothing before the source has ended."""
 
     def __init__(self, codec, until):
-        self.name, self.digest = codec.name, codec.digest
+        self.name, self.digest, self.modulation = codec.name, codec.digest, codec.modulation
         self._codec, self._until = codec, until
 
     def encode(self, image, snr_db):

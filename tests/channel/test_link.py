@@ -69,6 +69,17 @@ def test_fading_with_doppler_is_the_same_after_lost_frames_and_starts_with_the_l
     np.testing.assert_allclose(np.abs(late.transmit(slots, 0.1 * 3, 3).truth.h), np.abs(gains[0]), rtol=1e-5)
 
 
+@pytest.mark.parametrize("channel", ["rayleigh", "trace"])
+def test_time_begins_anew_with_a_restart(channel, slots):
+    settings = ChannelSettings(channel=channel, doppler_hz=20.0, trace="ramp", trace_s=1.0)
+    link = Link(settings, 5)
+    first, later = (link.transmit(slots, t_s) for t_s in (0.0, 0.4))
+    link.restart()
+    again = link.transmit(slots, 77.0)
+    np.testing.assert_array_equal(again.slots_rx, first.slots_rx)
+    assert not np.array_equal(later.slots_rx, first.slots_rx)
+
+
 def test_rayleigh_gains_are_what_the_receiver_estimates(slots, encoded):
     link = Link(ChannelSettings(channel="rayleigh", snr_db=25.0), 2)
     truth = link.transmit(slots, 0.0, 0).truth

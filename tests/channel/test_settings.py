@@ -1,4 +1,5 @@
 import math
+from pathlib import Path
 
 import pytest
 
@@ -54,3 +55,12 @@ def test_values_of_other_channels_are_named():
     assert ChannelSettings(slot_loss=0.3, rician_k_db=3.0).without_effect() == ["slot_loss", "rician_k_db"]
     assert ChannelSettings(channel="erasure", slot_loss=0.3, snr_db=4.0, delay_ms=5.0).without_effect() == []
     assert ChannelSettings(channel="rician", doppler_hz=20.0, trace_s=3.0).without_effect() == ["trace_s"]
+
+
+def test_values_of_other_traces_and_of_motion_are_named():
+    assert ChannelSettings(channel="trace", trace="walk", trace_s=3.0).without_effect() == ["trace_s"]
+    assert ChannelSettings(channel="trace", trace="ramp", trace_s=3.0).without_effect() == []
+    by_file = ChannelSettings(channel="trace", trace="file", trace_file=Path("x.csv"), snr_db=3.0)
+    assert by_file.without_effect() == ["snr_db"]
+    assert ChannelSettings(channel="rayleigh", slot_ms=2.0).without_effect() == ["slot_ms"]
+    assert ChannelSettings(channel="rayleigh", slot_ms=2.0, doppler_hz=9.0).without_effect() == []

@@ -5,7 +5,7 @@ import pytest
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import ReceivedImage
-from semcast.common.codecs import available_codecs, load_codec
+from semcast.common.codecs import available_codecs, load_codec, reported_snr_db
 from semcast.common.conventional import ADAPTIVE_MODES, ConventionalCodec
 from semcast.common.conventional_source import compress, compress_to_fit, decompress, supported
 from semcast.common.conventional_transport import Transport
@@ -72,6 +72,19 @@ def test_the_adaptive_codec_works_where_the_fixed_one_fails_and_is_better_above(
     assert not through(adaptive, picture, 2.5).outage
     better = psnr_db(through(adaptive, picture, 13.0).image, picture)
     assert better > psnr_db(through(fixed, picture, 13.0).image, picture) + 0.5
+
+
+@pytest.mark.parametrize("snr_db", [10.0, 20.0])
+def test_lost_slots_leave_the_adaptive_codec_few_outages(snr_db, picture):
+    """What a strong link has in excess in some slots can't make up for those that are lost."""
+    codec, image = load_codec("jpeg-amc"), np.vstack([picture] * 3)
+    link = Link(ChannelSettings(channel="erasure", slot_loss=0.2, snr_db=snr_db), 4)
+    reported_db, outages = snr_db, 0
+    for k in range(30):
+        equalised = link.receive(codec.encode(image, reported_db), 0.1 * k)
+        outages += codec.decode(equalised.received).outage
+        reported_db = reported_snr_db(codec.name, equalised)
+    assert outages <= 4
 
 
 @pytest.mark.parametrize("mode", ADAPTIVE_MODES)

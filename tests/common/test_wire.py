@@ -1,5 +1,7 @@
+import dataclasses
 import math
 import time
+import tracemalloc
 
 import msgpack
 import numpy as np
@@ -191,6 +193,16 @@ def test_hostile_bytes_are_refused_at_once(data):
     assert time.perf_counter() - started_s < 0.1
 
 
+def test_many_lists_cost_no_memory():
+    data = b"\x81\xa1a\xdc\x0f\xff" + (b"\xdc\x04\x00" + b"\x90" * 1024) * 4095
+    tracemalloc.start()
+    try:
+        assert refused(data, SymbolFrame).reason == "syntax"
+        assert tracemalloc.get_traced_memory()[1] < 2 * len(data)
+    finally:
+        tracemalloc.stop()
+
+
 def test_what_may_not_be_received_can_not_be_sent():
     flow = FlowMessage(agent_epoch=-1, next_seq=0, arrived_seq=0, window=1)
     with pytest.raises(WireError, match=r"flow.agent_epoch must be in \[0, \d+\], got -1"):
@@ -199,6 +211,9 @@ def test_what_may_not_be_received_can_not_be_sent():
     with pytest.raises(WireError) as caught:
         pack(PoseMessage(**{**vars(pose), "T_world_cam": (float("nan"),) * 16}))
     assert caught.value.reason == "range"
+    camera = next(m for m in examples() if isinstance(m, CameraInfo))
+    with pytest.raises(WireError, match="source_name must be text that UTF-8 can hold"):
+        pack(dataclasses.replace(camera, source_name="room\udcff"))
 
 
 REASONS = ("good", "syntax", "version", "kind", "unknown", "missing", "type", "range", "shape")

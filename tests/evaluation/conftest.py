@@ -76,7 +76,7 @@ def room(tmp_path_factory):
 class PhaseCodec:
     """Grey values of a 7x6 grid per block as phases of unit symbols: no power scale to transmit."""
 
-    name = "phase"
+    name, modulation = "phase", "16qam"
     digest = hashlib.sha256(b"phase").hexdigest()[:16]
     rows, columns = 7, 6
 

@@ -85,7 +85,7 @@ def test_the_last_frames_are_known_by_their_ids(num_frames, last_id, frame_id, i
 
 def test_the_reference_follows_the_camera_of_a_restarted_agent(session):
     agent = AgentSettings(agent_id=AGENT, source=SourceSettings(source=str(DEMO)))
-    codec = SimpleNamespace(name="jpeg-ldpc", digest="")
+    codec = SimpleNamespace(name="jpeg-ldpc", digest="", modulation="16qam")
     sequences = [open_sequence(DEMO, resize=resize) for resize in (0.5, 0.25)]
     server = Server(
         ServerSettings(agent_id=AGENT, reference=DEMO, bundle="inline", view=ViewSettings(view="none")),

@@ -41,7 +41,7 @@ DEADLINE_S = 60.0
 class IndexCodec:
     """Sends a picture's number in the signs of its symbols; the receiver has the pictures."""
 
-    name = "index"
+    name, modulation = "index", "16qam"
     digest = hashlib.sha256(b"index").hexdigest()[:16]
 
     def __init__(self, pictures):
