@@ -147,6 +147,12 @@ def angle_between_deg(a: ArrayLike, b: ArrayLike) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
+def angles_between_deg(a: Array, b: Array) -> Array:
+    """Angles between vectors ``(N, 3)`` row by row, ``(N,)`` degrees; 0 when one of them has no length."""
+    sine = np.linalg.norm(np.cross(a, b), axis=1)
+    return np.asarray(np.degrees(np.arctan2(sine, (a * b).sum(axis=1))))
+
+
 def align_umeyama(points_from: ArrayLike, points_to: ArrayLike) -> tuple[float, Array, Array]:
     """Least-squares similarity with ``points_to = scale * R @ points_from + t`` (Umeyama 1991).
 

@@ -2,10 +2,33 @@
 
 import contextlib
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
+
+from semcast.common.errors import ConfigError
+
+
+def check_writable(path: Path, name: str) -> None:
+    """Refuse a file that could not be written, before the work whose result it is to hold.
+
+    Args:
+        path: The file; folders that lack are made.
+        name: Of the setting.
+
+    Raises:
+        ConfigError: It is a folder, or nothing can be written there.
+    """
+    if path.is_dir():
+        raise ConfigError(f"{name} must be a file, {path} is a folder")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as err:
+        raise ConfigError(f"{name} can't be written to {path}: {err.strerror}") from err
 
 
 @contextmanager

@@ -54,6 +54,22 @@ def check_not_foreign(folder: Path, name: str) -> None:
         raise ConfigError(f"out must not hold {name} that no run wrote, {folder} does: give another folder")
 
 
+def make_output_folder(folder: Path) -> None:
+    """Make the folder a run is to write into, or refuse it.
+
+    Images are looked at also where the run keeps none: a later one in the same folder would take those of
+    somebody else for its own.
+
+    Raises:
+        ConfigError: It can't be made, or holds images that no run wrote.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as err:
+        raise ConfigError(f"{folder} can't be made a folder for outputs: {err}") from err
+    check_not_foreign(folder, IMAGES_NAME)
+
+
 def free_folder(folder: Path) -> Path:
     """Return ``previous-<n>`` in a folder, the first that is not there."""
     n = 1

@@ -22,11 +22,10 @@ from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.rate import belongs_to
 from semcast.common.recording_reader import RecordingReader
-from semcast.common.run_folder import IMAGES_NAME
 from semcast.common.symbol_payload import data_symbols, lost_slots_of, slots_of
 from semcast.common.wire import WireError, unpack
 from semcast.server.decoder import DecodedArrival, FrameDecoder
-from semcast.server.former_run import check_not_foreign
+from semcast.server.former_run import make_output_folder
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_streams import RecordedStream, choose_stream
@@ -150,8 +149,8 @@ def replay(
         view=settings.view,
     )
     check_viewer(server)
-    if settings.out is not None and settings.save_images != "none":
-        check_not_foreign(settings.out, IMAGES_NAME)
+    if settings.out is not None:
+        make_output_folder(settings.out)
     decoder = FrameDecoder(
         lambda name, modulation: load_codec(
             name, modulation=modulation, num_threads=settings.threads, weights=settings.weights

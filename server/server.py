@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from semcast.common.codec import Codec, Modulation
 from semcast.common.config import to_toml
-from semcast.common.errors import ConfigError, SemcastError
+from semcast.common.errors import SemcastError
 from semcast.common.keys import camera_key, control_key, map_key
 from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
 from semcast.common.metrics import Metrics
-from semcast.common.run_folder import IMAGES_NAME
 from semcast.common.sequence import open_sequence
 from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
@@ -23,7 +22,7 @@ from semcast.common.transport import open_session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import DecodedArrival, FrameDecoder, codec_loader
-from semcast.server.former_run import check_not_foreign, free_folder
+from semcast.server.former_run import free_folder, make_output_folder
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.outbox import Outbox, map_message
 from semcast.server.receiver import ReceivedFrame, Receiver
@@ -119,12 +118,7 @@ class Server:
         """Do what takes long, or may fail, before others see that the server is there."""
         settings = self._settings
         if settings.out is not None:
-            try:
-                settings.out.mkdir(parents=True, exist_ok=True)
-            except OSError as err:
-                raise ConfigError(f"{settings.out} can't be made a folder for outputs: {err}") from err
-            if settings.save_images != "none":
-                check_not_foreign(settings.out, IMAGES_NAME)
+            make_output_folder(settings.out)
         if settings.reference is not None:
             open_sequence(settings.reference, settings.camera)
         self._spare_bundle = self._new_bundle()

@@ -1,5 +1,7 @@
 import shutil
+import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -68,7 +70,7 @@ def test_bad_settings_are_refused_before_anything_starts(values, message):
         DemoSettings(**values)
 
 
-@pytest.mark.parametrize("wrong", ["codec", "camera", "channel"])
+@pytest.mark.parametrize("wrong", ["codec", "camera", "channel", "record", "out"])
 def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
     former = tmp_path / "out"
     former.mkdir()
@@ -77,8 +79,19 @@ def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
     if wrong == "camera":
         values["sequence"] = tmp_path / "plain"
         shutil.copytree(SEQUENCE / "images", values["sequence"])
-    values |= {"codec": {"codec": "no-such-codec"}, "channel": {"channel": "raleigh"}}.get(wrong, {})
-    message = {"codec": "no-such-codec", "camera": "camera of plain is unknown", "channel": "raleigh"}[wrong]
+    values |= {
+        "codec": {"codec": "no-such-codec"},
+        "channel": {"channel": "raleigh"},
+        "record": {"record": former / "summary.json" / "run.mcap"},
+        "out": {"out": former / "summary.json"},
+    }.get(wrong, {})
+    message = {
+        "codec": "no-such-codec",
+        "camera": "camera of plain is unknown",
+        "channel": "raleigh",
+        "record": r"record can't be written to .*run\.mcap",
+        "out": "summary.json can't be made a folder for outputs",
+    }[wrong]
     with pytest.raises((SemcastError, ValueError), match=message):
         run_demo(DemoSettings(**values), threading.Event(), lambda line: None, lambda row: None)
     assert [p.name for p in former.iterdir()] == ["summary.json"]
@@ -89,6 +102,17 @@ def test_a_role_that_can_not_start_ends_the_demo_with_its_own_words(tmp_path, mo
     settings = DemoSettings(codec="no-such-codec", view="none", resize=0.25, rate_hz=10.0, out=tmp_path)
     with pytest.raises(SemcastError, match="did not start: .*no-such-codec"):
         run_demo(settings, threading.Event(), lambda line: None, lambda row: None)
+
+
+def test_a_server_that_ends_before_it_listens_is_not_waited_for(tmp_path, monkeypatch):
+    program = (sys.executable, "-c", "import sys; sys.exit('semcast server: the disk is on fire')")
+    monkeypatch.setattr("semcast.demo._PROGRAM", program)
+    started_s = time.monotonic()
+    with pytest.raises(SemcastError, match="server did not start: .*the disk is on fire"):
+        run_demo(
+            DemoSettings(view="none", out=tmp_path), threading.Event(), lambda line: None, lambda row: None
+        )
+    assert time.monotonic() - started_s < 20.0
 
 
 def test_a_folder_with_images_no_run_wrote_is_no_place_for_outputs(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import exp_so3, make_transform, project_to_so3, skew
+from semcast.common.geometry import angles_between_deg, exp_so3, make_transform, project_to_so3, skew
 from semcast.server.geometry.weighting import HUBER_K
 
 Array = NDArray[np.float64]
@@ -72,10 +72,7 @@ def depths(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> tu
 
 def rays_angle_deg(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
     """Angle between the two rays of each match, ``(N,)`` degrees: the parallax."""
-    ray0 = camera.unproject(xy0) @ T_cam1_cam0[:3, :3].T
-    ray1 = camera.unproject(xy1)
-    sine = np.linalg.norm(np.cross(ray0, ray1), axis=1)
-    return np.asarray(np.degrees(np.arctan2(sine, (ray0 * ray1).sum(axis=1))))
+    return angles_between_deg(camera.unproject(xy0) @ T_cam1_cam0[:3, :3].T, camera.unproject(xy1))
 
 
 def rotation_residual_px(camera: Intrinsics, R_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:

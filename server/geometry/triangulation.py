@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
+from semcast.common.geometry import angles_between_deg
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 
 Array = NDArray[np.float64]
@@ -130,8 +131,7 @@ def parallax_deg(centre: Array, xyz: Array, point: NDArray[np.intp], num_points:
     first = np.full(num_points, -1)
     first[point[::-1]] = np.arange(len(point))[::-1]
     reference = to_camera[first[point]]
-    sine = np.linalg.norm(np.cross(reference, to_camera), axis=1)
-    angle = np.degrees(np.arctan2(sine, (reference * to_camera).sum(axis=1)))
+    angle = angles_between_deg(reference, to_camera)
     largest = np.zeros(num_points)
     np.maximum.at(largest, point, angle)
     return largest

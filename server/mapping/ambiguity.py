@@ -14,7 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.geometry import invert_transform
+from semcast.common.geometry import (
+    angle_between_deg,
+    angles_between_deg,
+    invert_transform,
+    rotation_angle_deg,
+)
 from semcast.server.mapping.bundle import optimise, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.planar import twin
@@ -25,10 +30,14 @@ Array = NDArray[np.float64]
 #: An observation further off than this counts as this: it belongs to neither structure.
 _CUT_SIGMAS = 3.0
 #: The worse structure must cost so many times the better one, in one attempt or as the product over several.
-#: Chosen on starts in synthetic rooms and over poor links.
-_CLEAR_RATIO = 1.4
-#: Directions of the last camera nearer to each other than this are one structure.
-_SAME_WAY_DEG = 20.0
+#: Less where the cameras of both go the same way: a relief that is too deep, with some of its points on the
+#: wrong side, shares most of them with the true one. Chosen on starts in synthetic rooms and over poor links.
+_CLEAR_RATIO, _CLEAR_RATIO_SAME_WAY = 1.4, 1.2
+#: One structure: directions of the last camera nearer to each other than this, and its rotations nearer than
+#: this share of the parallax. A relief that is three times too deep needs a third of the turn.
+_SAME_WAY_DEG, _SAME_TURN_SHARE = 20.0, 0.4
+#: A structure that costs so many times the cheapest one needs no search for others next to it.
+_HOPELESS_RATIO = np.e
 
 
 @dataclass(frozen=True)
@@ -82,6 +91,7 @@ def decide(
     if flat is not None:
         others.append(flat)
     found = [start, *(adjusted(p) for p in others)]
+    found += _mirrored_again(problem, found)
     for begun, doubt in carried:
         found.append(replace(adjusted(begun), doubt=doubt))
     sides = _weighed(found, len(carried))
@@ -90,8 +100,31 @@ def decide(
         return best, sides
     # An adjustment that failed says nothing against the structure it began with.
     is_sure = start.ok and best.ok and all(side.ok for side in rest[:1])
-    is_clear = not rest or rest[0].doubt - best.doubt >= np.log(_CLEAR_RATIO)
+    is_clear = all(side.doubt - best.doubt >= _clear_doubt(best, side) for side in rest)
     return (best if is_sure and is_clear else None), sides
+
+
+def _clear_doubt(best: Side, other: Side) -> float:
+    """How much more doubt a structure must have than the best one."""
+    same_way = _way_between_deg(best, other) < _SAME_WAY_DEG
+    return float(np.log(_CLEAR_RATIO_SAME_WAY if same_way else _CLEAR_RATIO))
+
+
+def _mirrored_again(problem: BundleProblem, found: list[Side]) -> list[Side]:
+    """Mirror images of the structures that were found beside the start.
+
+    A start may be a mixture, some of its points on the wrong side: its mirror image then leads to one of the
+    two whole structures, and only the image of that to the other.
+    """
+    lowest = min(side.cost for side in found)
+    told_apart, again = found[:1], []
+    for side in found[1:]:
+        if any(_is_same(side, other) for other in told_apart):
+            continue
+        told_apart.append(side)
+        if side.cost < _HOPELESS_RATIO * lowest:
+            again.append(adjusted(mirrored(replace(problem, T_world_cam=side.T_world_cam, xyz=side.xyz))))
+    return again
 
 
 def _weighed(found: list[Side], num_carried: int) -> list[Side]:
@@ -124,7 +157,22 @@ def _weighed(found: list[Side], num_carried: int) -> list[Side]:
 
 
 def _is_same(a: Side, b: Side) -> bool:
-    """Whether both adjustments ended in the same structure: the last cameras went the same way."""
-    ways = [(invert_transform(s.T_world_cam[0]) @ s.T_world_cam[-1])[:3, 3] for s in (a, b)]
-    unit = [way / max(float(np.linalg.norm(way)), 1e-12) for way in ways]
-    return bool(unit[0] @ unit[1] > np.cos(np.radians(_SAME_WAY_DEG)))
+    """Whether both adjustments ended in the same structure: the last cameras went and turned the same way."""
+    turn_deg = rotation_angle_deg(_last(a)[:3, :3].T @ _last(b)[:3, :3])
+    same_turn = turn_deg < _SAME_TURN_SHARE * max(_parallax_deg(a), _parallax_deg(b))
+    return same_turn and _way_between_deg(a, b) < _SAME_WAY_DEG
+
+
+def _way_between_deg(a: Side, b: Side) -> float:
+    return angle_between_deg(_last(a)[:3, 3], _last(b)[:3, 3])
+
+
+def _last(side: Side) -> Array:
+    """The last camera in the frame of the first."""
+    return invert_transform(side.T_world_cam[0]) @ side.T_world_cam[-1]
+
+
+def _parallax_deg(side: Side) -> float:
+    """Median angle between the rays from the first and the last camera to the points."""
+    first, last = (side.xyz - side.T_world_cam[k][:3, 3] for k in (0, -1))
+    return float(np.median(angles_between_deg(first, last)))

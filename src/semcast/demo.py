@@ -23,11 +23,12 @@ from semcast.common.codecs import check_codec
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.rate import NATIVE_RATE, RateChoice
-from semcast.common.run_folder import IMAGES_NAME, SUMMARY_NAME
+from semcast.common.run_folder import SUMMARY_NAME
 from semcast.common.sequence import Sequence, open_sequence
-from semcast.common.transport import free_endpoint, open_session
+from semcast.common.transport import Session, free_endpoint, open_session
+from semcast.common.whole_file import check_writable
 from semcast.real_time import plan_for
-from semcast.server.former_run import check_not_foreign, discard
+from semcast.server.former_run import check_not_foreign, discard, make_output_folder
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
 START_DEADLINE_S = 60.0
@@ -275,21 +276,25 @@ def run_demo(
     recorded = open_sequence(sequence, settings.camera)
     _ = recorded.intrinsics
     check_codec(settings.codec)
-    settings.out.mkdir(parents=True, exist_ok=True)
-    summary_file = settings.out / "summary.json"
-    for name in (SUMMARY_NAME, IMAGES_NAME):
-        check_not_foreign(settings.out, name)
-    discard(settings.out)
+    for name, file in (("record", settings.record), ("json", settings.json)):
+        if file is not None:
+            check_writable(file, name)
+    make_output_folder(settings.out)
+    summary_file = settings.out / SUMMARY_NAME
+    check_not_foreign(settings.out, SUMMARY_NAME)
     logs = settings.out / "logs"
-    logs.mkdir(exist_ok=True)
+    try:
+        logs.mkdir(exist_ok=True)
+    except OSError as err:
+        raise ConfigError(f"{logs} can't be made a folder for logs: {err}") from err
+    discard(settings.out)
     endpoint = free_endpoint()
     commands = role_commands(settings, sequence, endpoint)
     children = {name: Role(name, command, logs / f"{name}.log") for name, command in commands.items()}
     alive = Alive(set(), threading.Condition())
     try:
         children["server"].start()
-        network = NetworkSettings(connect=(endpoint,))
-        session = open_session(network, stop, START_DEADLINE_S)
+        session = _join(endpoint, children["server"], stop)
         if session is None:
             return None, None
         with session:
@@ -306,15 +311,28 @@ def run_demo(
                 alive.wait_for(name, child, stop)
                 tell(f"{name} is up: {shlex.join(child.command)}")
             error = _watch(settings.out, children, alive, summary_file, stop, tell, progress)
-    except TransportError as err:
-        if children["server"].returncode is not None:
-            raise SemcastError(f"server did not start: {children['server'].last_words()}") from err
-        raise
     finally:
         for child in reversed(children.values()):
             child.stop()
     summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
     return summary, error
+
+
+def _join(endpoint: str, server: Role, stop: threading.Event) -> Session | None:
+    """Connect to the server, which is the hub; None when ``stop`` was set before.
+
+    Raises:
+        SemcastError: Its process ended, or the deadline passed.
+    """
+    deadline_s = time.monotonic() + START_DEADLINE_S
+    while True:
+        try:
+            return open_session(NetworkSettings(connect=(endpoint,)), stop, deadline_s=1.0)
+        except TransportError as err:
+            if server.returncode is not None:
+                raise SemcastError(f"server did not start: {server.last_words()}") from err
+            if time.monotonic() > deadline_s:
+                raise
 
 
 def choose_playback(settings: DemoSettings, recorded: Sequence) -> Playback:

@@ -3,7 +3,7 @@
 import pytest
 
 from semcast.common.errors import ConfigError
-from semcast.server.former_run import check_not_foreign, discard, is_run, set_aside
+from semcast.server.former_run import check_not_foreign, discard, is_run, make_output_folder, set_aside
 
 OURS = ("trajectory.tum", "map.ply", "summary.json", "settings.toml", "frames.jsonl", "run.rrd")
 THEIRS = ("groundtruth.txt", "intrinsics.json", "run.mcap")
@@ -60,6 +60,17 @@ def test_names_of_ours_that_no_run_wrote_are_refused(tmp_path):
         check_not_foreign(tmp_path, "images")
     fill(tmp_path, OURS)
     check_not_foreign(tmp_path, "images")
+
+
+def test_a_folder_for_outputs_has_no_images_of_others_and_is_one(tmp_path):
+    make_output_folder(tmp_path / "new" / "run")
+    assert (tmp_path / "new" / "run").is_dir()
+    fill(tmp_path / "new" / "run", ["images/000000.jpg"])
+    with pytest.raises(ConfigError, match=r"out must not hold images that no run wrote"):
+        make_output_folder(tmp_path / "new" / "run")
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"file can't be made a folder for outputs"):
+        make_output_folder(tmp_path / "file")
 
 
 def test_a_name_that_is_taken_is_passed_over(tmp_path):

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcast.common.geometry import rotation_angle_deg
+from semcast.server.mapping import ambiguity
 from semcast.server.mapping.ambiguity import decide
 from semcast.server.mapping.planar import twin
 from semcast.server.mapping.reversal import mirrored
@@ -24,6 +26,34 @@ def test_without_perspective_nothing_is_decided_before_the_last_chance(arc):
     far = arc(focal_px=40_000.0, depth=200.0, noise_px=1.0, turn_deg=3.0)
     assert decide(far)[0] is None
     assert decide(far, at_last=True)[0] is not None
+
+
+def test_structures_that_turned_differently_are_two(arc, relative):
+    """A relief that is too deep, some of its points on the wrong side: the cameras go the same way."""
+    truth = arc(focal_px=600.0, depth=4.0, noise_px=0.7, seed=7)
+    image = mirrored(truth)
+    wrong = np.random.default_rng(7).random(len(truth.xyz)) < 0.7
+    xyz = np.where(wrong[:, None], image.xyz, truth.xyz)
+    _, sides = decide(replace(truth, T_world_cam=image.T_world_cam, xyz=xyz))
+    true_turn = relative(truth.T_world_cam)[:3, :3]
+    errors_deg = [rotation_angle_deg(true_turn.T @ relative(s.T_world_cam)[:3, :3]) for s in sides[:3]]
+    assert errors_deg[0] < 0.5
+    assert 2.0 < errors_deg[1] < 6.0
+    assert errors_deg[2] > 8.0
+    mixture = sides[1]
+    both = decide(truth, [(replace(truth, T_world_cam=mixture.T_world_cam, xyz=mixture.xyz), 0.0)])[1]
+    assert any(np.allclose(side.T_world_cam, mixture.T_world_cam, atol=0.02) for side in both[1:])
+
+
+@pytest.mark.parametrize(("noise_px", "looks"), [(2.0, True), (0.1, False)])
+def test_others_are_looked_for_beside_a_structure_that_may_be_meant(arc, monkeypatch, noise_px, looks):
+    """The image of an image is another where the start was a mixture; not of one that fits nothing."""
+    problem = arc(focal_px=600.0, depth=6.0, noise_px=noise_px)
+    adjusted, begun = ambiguity.adjusted, []
+    monkeypatch.setattr(ambiguity, "adjusted", lambda p: begun.append(p) or adjusted(p))
+    monkeypatch.setattr(ambiguity, "twin", lambda p: None)
+    decide(problem)
+    assert (len(begun) > 3) == looks
 
 
 @pytest.mark.parametrize("seed", range(3))
