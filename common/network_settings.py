@@ -51,6 +51,13 @@ class NetworkSettings:
         if not self.listen and not self.connect:
             raise ValueError("listen or connect must name an endpoint, got neither")
 
+    @property
+    def where(self) -> str:
+        """Say in words where the process is to be met."""
+        if self.listen:
+            return f"listening on {', '.join(self.listen)}"
+        return f"connected to {', '.join(self.connect)}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class HubSettings(NetworkSettings):

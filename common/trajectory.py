@@ -48,6 +48,12 @@ class Trajectory:
         """Sum of the distances between consecutive camera centres, in the trajectory's own unit."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
 
+    def between(self, start_s: float, end_s: float) -> "Trajectory":
+        """Return the poses of a span of time, with the ones that enclose it."""
+        first = max(0, int(np.searchsorted(self.t_s, start_s, side="right")) - 1)
+        last = int(np.searchsorted(self.t_s, end_s, side="left"))
+        return Trajectory(self.t_s[first : last + 1], self.T_world_cam[first : last + 1])
+
 
 def read_tum(path: Path) -> Trajectory:
     """Read ``t tx ty tz qx qy qz qw`` lines (camera to world); ``#`` starts a comment.

@@ -26,6 +26,7 @@ from semcast.common.symbol_payload import data_symbols, lost_slots_of, slots_of
 from semcast.common.wire import WireError, unpack
 from semcast.server.decoder import DecodedArrival, FrameDecoder
 from semcast.server.former_run import make_output_folder
+from semcast.server.frame_views import missing_view
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_streams import RecordedStream, choose_stream
@@ -182,6 +183,8 @@ def replay(
             if decoded.frame is None:
                 reason = "lost_on_air" if arrival.received is None else "outage"
                 drops[reason] = drops.get(reason, 0) + 1
+                if viewer is not None:
+                    viewer.submit(missing_view(decoded, drops))
                 continue
             outcome = _process(session, decoded, drops)
             if viewer is not None:
@@ -192,7 +195,8 @@ def replay(
         if not processed:
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
         try:
-            return session.write_outputs(settings.out, drops, complete=True)
+            whole = settings.start_s == 0.0 and settings.end_s is None and not stop.is_set()
+            return session.write_outputs(settings.out, drops, complete=whole)
         except OSError as err:
             raise SemcastError(f"outputs can't be written to {settings.out}: {err}") from err
     finally:

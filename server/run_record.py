@@ -235,6 +235,14 @@ def summarise(
     }
 
 
+def run_line(summary: Mapping[str, Any]) -> str:
+    """Return in a line what became of the frames of a run."""
+    frames, drops = summary["frames"], summary["drops"]
+    dropped = ", ".join(f"{count} {reason}" for reason, count in drops.items())
+    text = f"{frames['tracked']} frames tracked, {frames['posed']} with a pose"
+    return f"{text}; dropped: {dropped}" if dropped else text
+
+
 def _mean(values: Iterable[float | None]) -> float | None:
     known = [v for v in values if v is not None]
     return float(np.mean(known)) if known else None

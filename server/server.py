@@ -23,6 +23,7 @@ from semcast.common.wire import WireError, pack, unpack
 from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import DecodedArrival, FrameDecoder, codec_loader
 from semcast.server.former_run import free_folder, make_output_folder
+from semcast.server.frame_views import missing_view
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.outbox import Outbox, map_message
 from semcast.server.receiver import ReceivedFrame, Receiver
@@ -285,6 +286,8 @@ class Server:
         self._nearly_final = _is_nearly_final(message.frame_id, decoded.arrival.camera)
         if decoded.frame is None:
             self._metrics.drop("lost_on_air" if decoded.arrival.received is None else "outage")
+            if self._viewer is not None:
+                self._viewer.submit(missing_view(decoded, self._metrics.drops))
             return
         if message.frame_id <= session.last_frame_id:
             self._metrics.drop("processed")
@@ -491,4 +494,5 @@ def run_server(settings: ServerSettings, stop_event: threading.Event) -> dict[st
     if network is None:
         return {}
     with network, contextlib.closing(Server(settings, network)) as server:
+        logger.info("%s, waiting for agent '%s'", settings.network.where, settings.agent_id)
         return server.run(stop_event)

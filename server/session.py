@@ -39,13 +39,14 @@ from semcast.server.checkpoint import (
 from semcast.server.export.outputs import trajectory_of, versions, write_json, write_ply
 from semcast.server.export.parts import frame_parts, landmark_parts
 from semcast.server.former_run import set_aside
+from semcast.server.frame_views import frame_view
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.reference import Reference
-from semcast.server.run_record import FrameRow, RunRecord, summarise
+from semcast.server.run_record import FrameRow, RunRecord, run_line, summarise
 from semcast.server.settings import ServerSettings
 from semcast.server.view.scene import FrameView
 
@@ -55,8 +56,6 @@ Array = NDArray[np.float64]
 
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
-#: Stages in the viewer's plot; all of them are in ``frames.jsonl`` and the summary.
-PLOTTED_STAGES = ("decode", "track", "map", "bundle")
 
 
 @dataclass(frozen=True)
@@ -162,6 +161,7 @@ class Session:
         self._t_source_ns: dict[int, int] = {}
         self._map_epoch = 0
         self._last_frame_id = -1
+        self._state = TrackingState.INITIALIZING
         self._last_checkpoint_s = time.monotonic()
         self._checkpoints: CheckpointWriter | None = None
         self._images: ImageWriter | None = None
@@ -217,6 +217,7 @@ class Session:
             return False
         self._last_frame_id = checkpoint.header.frame_id
         self._map_epoch = checkpoint.header.map_epoch
+        self._state = TrackingState.LOST
         logger.info("map restored from the checkpoint, up to frame %d", self._last_frame_id)
         return True
 
@@ -244,6 +245,7 @@ class Session:
         result = self._reconstruction.process(frame, tell)
         if not tracked_ns:
             tell(result)
+        self._log_state(result)
         update = self._reconstruction.take_map_update()
         self._last_frame_id = frame.frame_id
         self._t_source_ns[frame.frame_id] = frame.t_source_ns
@@ -274,6 +276,19 @@ class Session:
             view = replace(view, backfilled=(*restored, *view.backfilled))
             self._restored = {}
         return Outcome(result, update, view)
+
+    def _log_state(self, result: FrameResult) -> None:
+        """Say where a map begins and where the camera is lost."""
+        before, self._state = self._state, result.state
+        if result.state is before:
+            return
+        if result.state is TrackingState.TRACKING:
+            what = "a map has begun" if before is TrackingState.INITIALIZING else "the camera is found again"
+        else:
+            what = (
+                "the camera is lost" if result.state is TrackingState.LOST else "waiting for a map to begin"
+            )
+        logger.info("frame %d: %s", result.frame_id, what)
 
     def _keep_image(self, frame: DecodedFrame, result: FrameResult, update: MapUpdate | None) -> None:
         """Keep the decoded image where the settings want it. A start makes keyframes of earlier frames."""
@@ -336,9 +351,13 @@ class Session:
             SemcastError: The rows of the run can't be read back.
         """
         results = self.write_results(folder)
+        rows = self._record.rows()
         truth = self._reference.truth if self._reference is not None else None
+        if truth is not None and rows:
+            # Errors are a share of the way that was gone, and not of all that the source has.
+            truth = truth.between(rows[0].t_source_ns * 1e-9, rows[-1].t_source_ns * 1e-9)
         summary = summarise(
-            self._record.rows(),
+            rows,
             results.trajectory,
             results.part_of,
             truth,
@@ -358,6 +377,8 @@ class Session:
         summary["settings"] = settings_to_dict(self._program)
         if folder is not None:
             write_json(folder / SUMMARY_NAME, summary)
+        posed = summary["frames"]["posed"]
+        logger.log(logging.INFO if posed else logging.WARNING, "%s", run_line(summary))
         return summary
 
     def write_results(self, folder: Path | None) -> Results:
@@ -434,33 +455,3 @@ def new_bundle(settings: ServerSettings, on_give_up: Callable[[str], None] | Non
     if settings.bundle == "inline":
         return InlineBundle()
     return ProcessBundle(lossless=settings.mode == "replay", on_give_up=on_give_up)
-
-
-def frame_view(
-    frame: DecodedFrame, result: FrameResult, row: FrameRow, drops: Mapping[str, int]
-) -> FrameView:
-    """Return what the viewer shows of a frame; unknown values have no point in the plots."""
-    scalars: dict[str, float | None] = {
-        "link/snr_set_db": row.snr_set_db,
-        "link/snr_estimated_db": row.snr_estimated_db,
-        "link/psnr_db": row.psnr_db,
-        "tracking/tracked": float(row.num_tracked),
-        "tracking/inliers": float(row.num_inliers),
-        "error/reprojection_error_px": row.reprojection_error_px,
-        "latency/arrival_to_pose_ms": row.age_ms,
-        **{f"latency/{stage}_ms": row.stage_ms.get(stage) for stage in PLOTTED_STAGES},
-        "drops/all": float(sum(drops.values())),
-        **{f"drops/{reason}": float(count) for reason, count in drops.items()},
-    }
-    return FrameView(
-        frame_id=frame.frame_id,
-        t_source_ns=frame.t_source_ns,
-        T_world_cam=result.T_world_cam,
-        state=result.state.value,
-        scalars={path: value for path, value in scalars.items() if value is not None and np.isfinite(value)},
-        image=frame.image,
-        confidence=frame.confidence,
-        keypoints_xy=result.keypoints_xy,
-        keypoint_inlier=result.keypoint_inlier,
-        backfilled=result.backfilled,
-    )

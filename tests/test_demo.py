@@ -93,7 +93,7 @@ def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
         "out": "summary.json can't be made a folder for outputs",
     }[wrong]
     with pytest.raises((SemcastError, ValueError), match=message):
-        run_demo(DemoSettings(**values), threading.Event(), lambda line: None, lambda row: None)
+        run_demo(DemoSettings(**values), threading.Event(), lambda line: None, lambda done, text: None)
     assert [p.name for p in former.iterdir()] == ["summary.json"]
 
 
@@ -101,7 +101,7 @@ def test_a_role_that_can_not_start_ends_the_demo_with_its_own_words(tmp_path, mo
     monkeypatch.setattr("semcast.demo.check_codec", lambda name: None)
     settings = DemoSettings(codec="no-such-codec", view="none", resize=0.25, rate_hz=10.0, out=tmp_path)
     with pytest.raises(SemcastError, match="did not start: .*no-such-codec"):
-        run_demo(settings, threading.Event(), lambda line: None, lambda row: None)
+        run_demo(settings, threading.Event(), lambda line: None, lambda done, text: None)
 
 
 def test_a_server_that_ends_before_it_listens_is_not_waited_for(tmp_path, monkeypatch):
@@ -110,7 +110,10 @@ def test_a_server_that_ends_before_it_listens_is_not_waited_for(tmp_path, monkey
     started_s = time.monotonic()
     with pytest.raises(SemcastError, match="server did not start: .*the disk is on fire"):
         run_demo(
-            DemoSettings(view="none", out=tmp_path), threading.Event(), lambda line: None, lambda row: None
+            DemoSettings(view="none", out=tmp_path),
+            threading.Event(),
+            lambda line: None,
+            lambda done, text: None,
         )
     assert time.monotonic() - started_s < 20.0
 
@@ -121,7 +124,7 @@ def test_a_folder_with_images_no_run_wrote_is_no_place_for_outputs(tmp_path):
     before = sorted(p.name for p in sequence.rglob("*"))
     settings = DemoSettings(sequence=sequence, codec="jpeg-ldpc", view="none", out=sequence)
     with pytest.raises(ConfigError, match="out must not hold images that no run wrote"):
-        run_demo(settings, threading.Event(), lambda line: None, lambda row: None)
+        run_demo(settings, threading.Event(), lambda line: None, lambda done, text: None)
     assert sorted(p.name for p in sequence.rglob("*")) == before
 
 
@@ -130,11 +133,12 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
     told, rows = [], []
     recording = tmp_path / "run.mcap"
     settings = DemoSettings(codec="jpeg-ldpc", view="none", resize=0.4, out=tmp_path, record=recording)
-    summary, error = run_demo(settings, threading.Event(), told.append, rows.append)
+    summary, error = run_demo(settings, threading.Event(), told.append, lambda *row: rows.append(row))
     assert error is None
     assert summary is not None
     assert {line.split()[0] for line in told} >= {"server", "channel", "agent"}
-    assert rows[-1]["frame_id"] == 50
+    assert rows[-1][0] == 51
+    assert rows[-1][1].startswith("tracking ")
     for name in ("trajectory.tum", "map.ply", "summary.json", "settings.toml"):
         assert (tmp_path / name).stat().st_size > 0
     assert summary["completeness"] > 0.3  # live, so a loaded machine drops frames
@@ -152,6 +156,21 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_link_that_nothing_can_be_decoded_on_is_said(tmp_path):
+    told = []
+    settings = DemoSettings(codec="jpeg-ldpc", snr_db=0.0, view="file", resize=0.3, out=tmp_path)
+    summary, error = run_demo(
+        settings, threading.Event(), lambda line: None, lambda done, text: told.append((done, text))
+    )
+    assert error is None
+    assert summary["frames"]["tracked"] == 0
+    assert "no image could be decoded" in told[-1][1]
+    assert told[-1][0] > 5
+    assert "0 frames tracked, 0 with a pose; dropped: " in (tmp_path / "logs" / "server.log").read_text()
+    assert (tmp_path / "run.rrd").stat().st_size > 20_000  # grey images
+
+
+@pytest.mark.slow
 def test_an_agent_that_gives_up_ends_the_demo_with_what_came_out_so_far(tmp_path):
     sequence = tmp_path / "sequence"
     shutil.copytree(SEQUENCE, sequence)
@@ -161,7 +180,7 @@ def test_an_agent_that_gives_up_ends_the_demo_with_what_came_out_so_far(tmp_path
     settings = DemoSettings(
         sequence=sequence, codec="jpeg-ldpc", view="none", resize=0.4, out=tmp_path / "out"
     )
-    summary, error = run_demo(settings, threading.Event(), lambda line: None, lambda row: None)
+    summary, error = run_demo(settings, threading.Event(), lambda line: None, lambda done, text: None)
     assert error is not None
     assert "images" in error
     assert summary is not None

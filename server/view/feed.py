@@ -131,7 +131,8 @@ class ViewerFeed:
         """
         with self._queue_lock:
             self._pending.append((view.without_image(), update, new_map))
-            self._newest = view
+            if view.image is not None:
+                self._newest = view
         self._work.set()
 
     def _open_stream(self, file: Path | None) -> RerunStream:

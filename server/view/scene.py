@@ -30,6 +30,10 @@ FRUSTUM_SHARE = 0.15
 CONFIDENCE_COLOURS = ((165, 30, 75), (235, 95, 60), (250, 205, 90), (90, 220, 160), (40, 200, 220))
 
 
+#: State of a frame of which no image came: it says nothing of the tracker.
+MISSING = "missing"
+
+
 @dataclass(frozen=True)
 class FrameView:
     """What one processed frame contributes.
@@ -38,9 +42,10 @@ class FrameView:
         frame_id: Index of the frame in its source.
         t_source_ns: Recorded time of the frame.
         T_world_cam: 4x4, or None where the frame has no pose.
-        state: Tracking state in words.
+        state: Tracking state in words, or ``MISSING``.
         scalars: Plot path, such as ``link/snr_set_db``, to value.
-        image: ``(H, W, 3)`` uint8 RGB as decoded; None once the image was replaced by a newer one.
+        image: ``(H, W, 3)`` uint8 RGB as decoded; None once it was replaced by a newer one, or where the one
+            before stays.
         confidence: ``(H, W)`` float32 in [0, 1], or None.
         keypoints_xy: ``(N, 2)`` pixels.
         keypoint_inlier: ``(N,)`` bool.
@@ -199,7 +204,8 @@ class Scene:
         for frame_id, t_source_ns, T_world_cam in view.backfilled:
             self._insert_pose(frame_id, t_source_ns, np.asarray(T_world_cam, dtype=np.float64))
         if view.T_world_cam is None:
-            self._lost_since_pose = bool(self._frame_ids)
+            if view.state != MISSING:
+                self._lost_since_pose = bool(self._frame_ids)
             return
         self._insert_pose(view.frame_id, view.t_source_ns, np.asarray(view.T_world_cam, dtype=np.float64))
         self._lost_since_pose = False

@@ -1,5 +1,6 @@
 """The demo: server, channel and agent as three real processes on loopback, until the sequence ends."""
 
+import contextlib
 import json
 import re
 import shlex
@@ -21,12 +22,15 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.codecs import check_codec
 from semcast.common.errors import ConfigError, SemcastError, TransportError
+from semcast.common.keys import status_key
+from semcast.common.messages import StatusMessage
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.rate import NATIVE_RATE, RateChoice
 from semcast.common.run_folder import SUMMARY_NAME
 from semcast.common.sequence import Sequence, open_sequence
 from semcast.common.transport import Session, free_endpoint, open_session
 from semcast.common.whole_file import check_writable
+from semcast.common.wire import WireError, unpack
 from semcast.real_time import plan_for
 from semcast.server.former_run import check_not_foreign, discard, make_output_folder
 
@@ -225,12 +229,18 @@ class Alive:
 
     roles: set[str]
     changed: threading.Condition
+    num_outages: int = 0
 
     def on_change(self, role: str, alive: bool) -> None:
         """Take one change."""
         with self.changed:
             (self.roles.add if alive else self.roles.discard)(role)
             self.changed.notify_all()
+
+    def on_status(self, payload: bytes) -> None:
+        """Take what the server says of itself."""
+        with contextlib.suppress(WireError):
+            self.num_outages = unpack(payload, StatusMessage).drops.get("outage", 0)
 
     def wait_for(self, role: str, child: Role, stop: threading.Event) -> None:
         """Wait until a role is there.
@@ -252,7 +262,7 @@ def run_demo(
     settings: DemoSettings,
     stop: threading.Event,
     tell: Callable[[str], None],
-    progress: Callable[[Mapping[str, Any]], None],
+    progress: Callable[[int, str], None],
 ) -> tuple[dict[str, Any] | None, str | None]:
     """Run the three processes until the server has written its summary, or until ``stop``.
 
@@ -263,7 +273,7 @@ def run_demo(
         settings: What to run.
         stop: Ends the run early; outputs are still written.
         tell: Takes one line of text for the user.
-        progress: Takes the newest row of ``frames.jsonl``.
+        progress: Takes the number of images that are done with, and how it stands in words.
 
     Returns:
         The server's summary, or None when it never wrote one, and what ended the run early, or None.
@@ -299,6 +309,7 @@ def run_demo(
             return None, None
         with session:
             session.watch_alive(AGENT_ID, alive.on_change)
+            session.subscribe(status_key(AGENT_ID, "server"), "newest", alive.on_status)
             children["channel"].start()
             playback = choose_playback(settings, recorded)
             for text in _reductions(settings, playback):
@@ -370,6 +381,12 @@ def _usual_rate_hz(recorded: Sequence) -> float:
     return 1.0 / usual_s
 
 
+def _standing(row: Mapping[str, Any]) -> str:
+    psnr = row["psnr_db"]
+    quality = "" if psnr is None else f"  {psnr:.1f} dB"
+    return f"{row['state']:<12} {row['num_inliers']:>4} inliers{quality}"
+
+
 def _watch(
     out: Path,
     children: Mapping[str, Role],
@@ -377,11 +394,12 @@ def _watch(
     summary_file: Path,
     stop: threading.Event,
     tell: Callable[[str], None],
-    progress: Callable[[Mapping[str, Any]], None],
+    progress: Callable[[int, str], None],
 ) -> str | None:
     """Follow the rows the server writes until its summary is there; tell what made the agent give up."""
     rows = out / "frames.jsonl"
     read_bytes = 0
+    num_outages = 0
     page: str | None = None
     while not stop.is_set() and not summary_file.exists():
         if page is None and (page := children["server"].viewer_address()) is not None:
@@ -407,7 +425,11 @@ def _watch(
                 complete = file.read(size - read_bytes).rpartition(b"\n")[0]
             read_bytes += len(complete) + bool(complete)
             for line in complete.splitlines():
-                progress(json.loads(line))
+                row = json.loads(line)
+                progress(row["frame_id"] + 1, _standing(row))
+        if not read_bytes and alive.num_outages > num_outages:
+            num_outages = alive.num_outages
+            progress(num_outages, f"no image could be decoded, {num_outages} outages")
         with alive.changed:
             alive.changed.wait(0.1)
     return None

@@ -63,11 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
         with Progress(*columns, console=talk) as bar:
             task = bar.add_task("starting server, channel and agent", total=frames)
 
-            def show(row: Mapping[str, Any]) -> None:
-                psnr = row.get("psnr_db")
-                quality = "" if psnr is None else f"  {psnr:.1f} dB"
-                text = f"{row['state']:<12} {row['num_inliers']:>4} inliers{quality}"
-                bar.update(task, completed=row["frame_id"] + 1, description=text)
+            def show(num_done: int, text: str) -> None:
+                bar.update(task, completed=num_done, description=text)
 
             summary, error = run_demo(
                 settings, stop, lambda line: talk.print(line, highlight=False, soft_wrap=True), show
