@@ -169,7 +169,7 @@ def _way_between_deg(a: Side, b: Side) -> float:
 
 def _last(side: Side) -> Array:
     """The last camera in the frame of the first."""
-    return invert_transform(side.T_world_cam[0]) @ side.T_world_cam[-1]
+    return np.asarray(invert_transform(side.T_world_cam[0]) @ side.T_world_cam[-1])
 
 
 def _parallax_deg(side: Side) -> float:
