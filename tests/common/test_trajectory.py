@@ -22,6 +22,21 @@ def test_path_length_adds_the_steps():
     assert Trajectory(np.arange(3.0), poses).path_length == pytest.approx(7.0)
 
 
+@pytest.mark.parametrize(
+    ("start_s", "end_s", "times_s"),
+    [
+        (1.0, 3.0, [1, 2, 3]),
+        (1.4, 2.6, [1, 2, 3]),
+        (-9.0, 99.0, [0, 1, 2, 3, 4]),
+        (4.2, 5.0, [4]),
+        (2.0, 2.0, [2]),
+    ],
+)
+def test_a_span_of_time_has_the_poses_that_enclose_it(start_s, end_s, times_s):
+    whole = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)))
+    assert whole.between(start_s, end_s).t_s.tolist() == times_s
+
+
 @pytest.mark.parametrize("line", ["1 2 3", "0 0 0 0 0 0 0 0", "0 a 0 0 0 0 0 1"])
 def test_a_bad_line_is_named(tmp_path, line):
     (tmp_path / "t.tum").write_text(f"# head\n{line}\n")

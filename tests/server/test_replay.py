@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from semcast.agent.agent import run_agent
@@ -22,6 +23,7 @@ from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recording import RecordingWriter, recording_metadata, recover_file
 from semcast.common.recording_reader import RecordingReader
+from semcast.common.sequence import open_sequence
 from semcast.common.transport import open_hub
 from semcast.common.wire import pack, unpack
 from semcast.describe import describe_recording
@@ -108,6 +110,15 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
     replay(lossy)
     assert (tmp_path / "c" / "trajectory.tum").read_bytes() != first
     assert build_settings(ReplaySettings, read_toml(tmp_path / "c" / "settings.toml")) == lossy
+
+
+def test_a_part_is_measured_by_the_way_that_was_gone(recording):
+    truth = open_sequence(SEQUENCE).groundtruth()
+    part = replay(ReplaySettings(file=recording, reference=SEQUENCE, start_s=0.2, end_s=0.95))
+    assert part["frames"]["source"] == part["frames"]["tracked"] == 8
+    assert part["completeness"] == 1.0
+    steps_m = np.linalg.norm(np.diff(truth.positions, axis=0), axis=1)
+    assert part["path_length_m"] == pytest.approx(steps_m[2:9].sum(), rel=0.15)
 
 
 def test_recorded_originals_give_the_same_psnr_as_the_sequence(recording, tmp_path):

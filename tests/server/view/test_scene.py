@@ -1,5 +1,7 @@
 """The scene hands out exactly what a viewer has not seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from semcast.common.geometry import exp_se3, exp_so3, make_transform
 from semcast.common.trajectory import Trajectory
 from semcast.server.view.landmark_table import CHUNK_LANDMARKS, LandmarkTable
 from semcast.server.view.scene import (
+    MISSING,
     SEGMENT_POSES,
     Cursor,
     FrameView,
@@ -121,6 +124,16 @@ def test_the_line_is_cut_where_tracking_was_lost():
         scene.add_frame(view(k, at(k)))
     strips = scene.changes_since(Cursor()).segments[0]
     assert [strip[:, 0].tolist() for strip in strips] == [[0.0, 1.0], [3.0, 4.0]]
+
+
+def test_a_frame_that_never_came_cuts_no_line_and_shows_its_counts():
+    scene = Scene()
+    scene.add_frame(view(0, at(0)))
+    scene.add_frame(replace(view(1), state=MISSING, scalars={"drops/all": 1.0}))
+    scene.add_frame(view(2, at(2)))
+    changes = scene.changes_since(Cursor())
+    assert [strip[:, 0].tolist() for strip in changes.segments[0]] == [[0.0, 2.0]]
+    assert [row.scalars for row in changes.rows] == [{}, {"drops/all": 1.0}, {}]
 
 
 def test_a_new_map_clears_the_old_one_and_keeps_the_plots():
