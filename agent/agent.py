@@ -80,6 +80,7 @@ class _Sending:
         follows = settings.follow_server and not self.lossless
         self._pace = PaceControl(self.agent_epoch, source.rate_hz) if follows else None
         self._settings = settings
+        self._last_seq = -1
         self._rate = RateControl(settings.rate, source.intrinsics.shape_hw)
         self._encoder = FrameEncoder(codec, self.agent_epoch, self.lossless)
         agent_id = settings.agent_id
@@ -125,9 +126,13 @@ class _Sending:
             return self._encoder.encode(frame, snr_db, self._rate.choose(snr_db))
 
     def send(self, message: SymbolFrame) -> None:
-        """Publish a frame."""
+        """Publish a frame, which is counted and timed once however often it is sent."""
         with self.metrics.stage("send"):
             self._symbols.put(pack(message))
+        if message.seq <= self._last_seq:
+            self.metrics.count("sent_again")
+            return
+        self._last_seq = message.seq
         self.metrics.count("sent")
         self.metrics.observe("capture_to_sent", (time.monotonic_ns() - message.t_capture_ns) * 1e-6)
 

@@ -51,6 +51,7 @@ class Emulator:
         self._link_lock = threading.Lock()
         self._box: Mailbox[SymbolFrame] = Mailbox(1, "newest")
         self._epoch = 0
+        self._carried_seq = -1
         self._arrived_epoch = 0
         self._arrived_seq = 0
         agent_id = settings.agent_id
@@ -124,8 +125,11 @@ class Emulator:
                 )
             )
         )
+        # What is sent again meets the same fate, which is counted once.
+        again = frame.seq <= self._carried_seq
+        self._carried_seq = max(self._carried_seq, frame.seq)
         if sent.frame_lost:
-            self._metrics.drop("lost")
+            self._metrics.drop("lost", 0 if again else 1)
             if not frame.lossless:
                 return
         received = replace(
@@ -136,7 +140,7 @@ class Emulator:
             slot_lost=pack_lost(sent.slot_lost),
         )
         if self._delay.put(pack(received), frame.lossless, settings.delay_ms, settings.jitter_ms):
-            self._metrics.count("carried")
+            self._metrics.count("carried_again" if again else "carried")
         else:
             self._metrics.drop("overflow")
 
@@ -144,6 +148,7 @@ class Emulator:
         """Start anew for a restarted agent."""
         if frame.agent_epoch != self._epoch:
             self._epoch = frame.agent_epoch
+            self._carried_seq = -1
             with self._link_lock:
                 self._link.restart()
 

@@ -301,6 +301,16 @@ def test_a_source_that_fails_ends_the_agent_with_its_error(bench, tmp_path):
     assert "there is no such folder" in str(failing.error)
 
 
+def test_a_last_frame_that_is_sent_again_is_counted_once(bench):
+    bench.channel(frame_loss=1.0)
+    bench.receiver()
+    agent = bench.agent(follow_server=False)
+    agent.join(40)
+    counts = agent.result["counts"]
+    assert counts["sent"] + sum(agent.result["drops"].values()) == 12
+    assert counts["sent_again"] >= 2
+
+
 class Picky:
     """Refuses one frame of twelve."""
 

@@ -200,6 +200,16 @@ def test_frames_that_are_sent_again_are_not_taken_for_gaps(ends, make):
         e.pass_one(make(seq, epoch=2, lossless=True))
     e.close()
     assert e.summary["drops"] == {"missing": 3}, "6 and 7 of the first start, 5 of the second"
+    counts = e.summary["counts"]
+    assert (counts["received"], counts["carried"], counts["carried_again"]) == (12, 10, 2)
+
+
+def test_a_frame_that_is_lost_over_and_over_is_lost_once(ends, make):
+    e = ends(frame_loss=1.0)
+    for seq in (0, 1, 1, 1):
+        e.pass_one(make(seq))
+    e.close()
+    assert e.summary["drops"] == {"lost": 2}
 
 
 def test_delay_is_added(ends, make):
