@@ -23,6 +23,7 @@ from semcast.common.geometry import (
 from semcast.server.mapping.bundle import optimise, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.planar import twin
+from semcast.server.mapping.relief import nearer
 from semcast.server.mapping.reversal import mirrored
 
 Array = NDArray[np.float64]
@@ -36,6 +37,8 @@ _CLEAR_RATIO, _CLEAR_RATIO_SAME_WAY = 1.4, 1.2
 #: One structure: directions of the last camera nearer to each other than this, and its rotations nearer than
 #: this share of the parallax. A relief that is three times too deep needs a third of the turn.
 _SAME_WAY_DEG, _SAME_TURN_SHARE = 20.0, 0.4
+#: How many times nearer the scene may be than it is found.
+_NEARER = (3.0, 1.0 / 3.0)
 #: A structure that costs so many times the cheapest one needs no search for others next to it.
 _HOPELESS_RATIO = np.e
 
@@ -91,6 +94,9 @@ def decide(
     if flat is not None:
         others.append(flat)
     found = [start, *(adjusted(p) for p in others)]
+    # What fits worse than the start is on the way to it, and no structure of its own.
+    along = [adjusted(nearer(after, factor)) for factor in _NEARER]
+    found += [side for side in along if side.cost < start.cost]
     found += _mirrored_again(problem, found)
     for begun, doubt in carried:
         found.append(replace(adjusted(begun), doubt=doubt))

@@ -53,7 +53,7 @@ def test_others_are_looked_for_beside_a_structure_that_may_be_meant(arc, monkeyp
     monkeypatch.setattr(ambiguity, "adjusted", lambda p: begun.append(p) or adjusted(p))
     monkeypatch.setattr(ambiguity, "twin", lambda p: None)
     decide(problem)
-    assert (len(begun) > 3) == looks
+    assert (len(begun) > 5) == looks
 
 
 @pytest.mark.parametrize("seed", range(3))
