@@ -20,7 +20,7 @@ from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
 from semcast.evaluation.calibration import reliability
-from semcast.evaluation.report import json_ready, machine_kind, source_commit, write_json
+from semcast.evaluation.report import check_outputs, json_ready, machine_kind, source_commit, write_json
 from semcast.evaluation.statistics import spearman
 from semcast.training.channel import ChannelSettings, draw_links, through_link
 from semcast.training.data import read_images
@@ -121,6 +121,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000, help="steps of each training")
     parser.add_argument("--json", type=Path, default=RESULT, help="file for the result")
     arguments = parser.parse_args()
+    check_outputs(arguments.json, None)
     settings = TrainSettings(
         data=arguments.data / "train", steps=arguments.steps, batch=8, warmup_steps=60, decay_share=0.7,
         weight_decay=0.3, threads=1, head_every=2,

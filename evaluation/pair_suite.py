@@ -13,6 +13,7 @@ from typing import Any
 from semcast.channel.settings import ChannelName, ChannelSettings
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.pairs import PairSettings, evaluate_pairs
+from semcast.evaluation.report import check_outputs
 from semcast.server.geometry.weighting import ConfidenceMode
 
 RESULTS = Path("evaluation/results")
@@ -120,6 +121,7 @@ def main() -> None:
     arguments = parser.parse_args()
     for run in suite(arguments.data, arguments.results, arguments.seeds):
         if arguments.only in run.name:
+            check_outputs(run.settings.json, run.settings.out)
             evaluate_pairs(run.settings)
             sys.stderr.write(f"{run.name}\n")
 

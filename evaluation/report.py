@@ -17,9 +17,11 @@ import numpy as np
 
 import semcast
 from semcast.common.cores import usable_cores
-from semcast.common.errors import SemcastError
-from semcast.common.whole_file import whole_file
+from semcast.common.errors import ConfigError, SemcastError
+from semcast.common.whole_file import check_writable, whole_file
 
+#: File of a result in the folder its pictures go to.
+RESULT_NAME = "result.json"
 #: Libraries whose version can change a result.
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "gtsam", "poselib")
 #: Instruction sets that decide how fast a codec runs, widest last.
@@ -54,6 +56,27 @@ def json_ready(value: Any) -> Any:
     if isinstance(value, Sequence):
         return [json_ready(v) for v in value]
     raise TypeError(f"a result can't hold {type(value).__name__}")
+
+
+def check_outputs(json: Path | None, out: Path | None) -> None:
+    """Refuse places that a result could not be written to, before the measurement.
+
+    Args:
+        json: File for the result; folders that lack are made.
+        out: Folder for its pictures, made as well.
+
+    Raises:
+        ConfigError: Nothing can be written there.
+    """
+    try:
+        if json is not None:
+            check_writable(json, "json")
+        if out is not None:
+            if out.is_file():
+                raise ConfigError(f"out must be a folder, {out} is a file")
+            check_writable(out / RESULT_NAME, "out")
+    except OSError as err:  # is_file and is_dir raise below a folder that may not be looked into
+        raise ConfigError(f"{err.filename} can't be written: {err.strerror}") from err
 
 
 def write_json(path: Path, result: Mapping[str, Any]) -> None:

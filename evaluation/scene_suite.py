@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semcast.channel.settings import ChannelSettings
+from semcast.evaluation.report import check_outputs
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.render import RenderSettings, SceneName, render_scene
 from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory
@@ -78,6 +79,7 @@ def main() -> None:
     arguments = parser.parse_args()
     for run in suite(arguments.folder, arguments.results, arguments.seeds):
         if arguments.only in run.render.out.name:
+            check_outputs(run.settings.json, run.settings.out)
             # The path is written last: with it the recording is whole.
             if not (run.render.out / "groundtruth.txt").exists():
                 render_scene(run.render)

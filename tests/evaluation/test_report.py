@@ -1,4 +1,5 @@
 import json
+import os
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -6,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semcast.common.errors import SemcastError
+from semcast.common.errors import ConfigError, SemcastError
 from semcast.evaluation.report import (
+    check_outputs,
     command_line,
     json_ready,
     library_versions,
@@ -95,3 +97,27 @@ def test_provenance_names_kind_of_machine_commit_and_versions():
     commit = source_commit()
     assert commit.startswith("semcast ") or len(commit.removesuffix("+changes")) == 40
     json.dumps(note, allow_nan=False)
+
+
+def test_places_for_results_are_made_or_refused(tmp_path):
+    check_outputs(None, None)
+    check_outputs(tmp_path / "a" / "result.json", tmp_path / "b" / "c")
+    assert list((tmp_path / "a").iterdir()) == list((tmp_path / "b" / "c").iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"json must be a file, .* is a folder"):
+        check_outputs(tmp_path / "a", None)
+    with pytest.raises(ConfigError, match=r"json can't be written to .*file/result\.json: "):
+        check_outputs(tmp_path / "file" / "result.json", None)
+    with pytest.raises(ConfigError, match=r"out must be a folder, .*file is a file"):
+        check_outputs(None, tmp_path / "file")
+    with pytest.raises(ConfigError, match=r"out can't be written to .*file/below/result\.json: "):
+        check_outputs(None, tmp_path / "file" / "below")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may look into every folder")
+def test_places_below_a_closed_folder_are_refused(tmp_path):
+    closed = tmp_path / "closed"
+    closed.mkdir(mode=0)
+    for places in ((closed / "result.json", None), (None, closed / "below")):
+        with pytest.raises(ConfigError, match="can't be written: Permission denied"):
+            check_outputs(*places)

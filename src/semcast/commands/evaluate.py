@@ -10,6 +10,7 @@ from rich.table import Table
 
 from semcast.commands.running import add_settings, read_settings
 from semcast.evaluation import codec, confidence, endurance, latency, pairs, recording, runtime, trajectory
+from semcast.evaluation.report import check_outputs
 
 _Evaluation = tuple[type, Callable[[Any], dict[str, Any]], frozenset[str], str]
 #: what -> settings, function, settings the evaluation sets itself, one line of help
@@ -101,6 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run one evaluation; a table on stdout, or the whole JSON where no ``--json`` file takes it."""
     cls, evaluate, _, text = EVALUATIONS[arguments.what]
     settings: Any = read_settings(cls, arguments)
+    check_outputs(settings.json, getattr(settings, "out", None))
     talk = Console(stderr=True)
     with talk.status(f"{text} ..."):
         report = evaluate(settings)
