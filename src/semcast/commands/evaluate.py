@@ -5,12 +5,15 @@ import json
 from collections.abc import Callable
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from semcast.commands.running import add_settings, read_settings
 from semcast.evaluation import codec, confidence, endurance, latency, pairs, recording, runtime, trajectory
 from semcast.evaluation.report import check_outputs
+from semcast.evaluation.result_table import ResultTable, result_table
 
 _Evaluation = tuple[type, Callable[[Any], dict[str, Any]], frozenset[str], str]
 #: what -> settings, function, settings the evaluation sets itself, one line of help
@@ -75,27 +78,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_settings(child, settings, skip)
 
 
-def _table(what: str, rows: list[dict[str, Any]]) -> Table:
-    """Show the scalar figures that all rows share; per-image and per-frame rows stay in the JSON."""
-    columns = [key for key in rows[0] if all(not isinstance(row.get(key), (list, dict)) for row in rows)]
-    table = Table(title=f"semcast eval {what}")
-    for column in columns:
-        table.add_column(column.replace("_", " "), justify="right")
-    for row in rows:
-        values = (row.get(column) for column in columns)
-        table.add_row(*("-" if v is None else f"{v:.3f}" if isinstance(v, float) else str(v) for v in values))
-    return table
-
-
-def _rows(report: dict[str, Any]) -> list[dict[str, Any]]:
-    """Find the rows of a report: cells, results (a list or one entry per mode) or stages."""
-    for key in ("results", "cells", "stages"):
-        value = report.get(key)
-        if isinstance(value, list) and value and isinstance(value[0], dict):
-            return value
-        if isinstance(value, dict) and value and all(isinstance(v, dict) for v in value.values()):
-            return [{"name": name, **entry} for name, entry in value.items()]
-    return []
+def printed_table(what: str, table: ResultTable) -> Table:
+    """Return a table that shows every name of a column whole; names in its cells may take several lines."""
+    printed = Table(
+        title=f"semcast eval {what}",
+        box=box.SIMPLE_HEAD,
+        show_edge=False,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    for name in table.head:
+        printed.add_column(Text(name), justify="right", min_width=len(name), overflow="fold")
+    for row in table.rows:
+        printed.add_row(*(Text(cell) for cell in row))
+    return printed
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -106,11 +102,12 @@ def run(arguments: argparse.Namespace) -> int:
     talk = Console(stderr=True)
     with talk.status(f"{text} ..."):
         report = evaluate(settings)
-    rows = _rows(report)
     if settings.json is None:
         print(json.dumps(report, indent=1))
     else:
-        if rows:
-            Console().print(_table(arguments.what, rows))
+        table = result_table(arguments.what, report)
+        Console().print(
+            printed_table(arguments.what, table), *table.notes, sep="\n", markup=False, highlight=False
+        )
         talk.print(f"written to {settings.json}")
     return 0

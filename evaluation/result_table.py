@@ -1,0 +1,187 @@
+"""What ``semcast eval`` prints of a result: the figures that say most, in 80 columns."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+Report = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """A table as text.
+
+    Attributes:
+        head: Names of the columns.
+        rows: As many cells each; a dash where there is no figure.
+        notes: Lines to print below.
+    """
+
+    head: list[str]
+    rows: list[list[str]]
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How the table of an evaluation is made.
+
+    Attributes:
+        rows: Finds the rows in the result.
+        columns: Name of a column -> where in a row its figure is, dots between keys, and its format.
+        notes: Returns the lines below the table.
+    """
+
+    rows: Callable[[Report], list[dict[str, Any]]]
+    columns: dict[str, tuple[str, str]]
+    notes: Callable[[Report], list[str]] = lambda report: []
+
+
+def result_table(what: str, report: Report) -> ResultTable:
+    """Return the table of what an evaluation returned.
+
+    Args:
+        what: Name of the evaluation, such as ``trajectory``.
+        report: What it returned.
+    """
+    layout = LAYOUTS[what]
+    rows = [[_cell(row, *column) for column in layout.columns.values()] for row in layout.rows(report)]
+    return ResultTable(list(layout.columns), rows, layout.notes(report))
+
+
+def _cell(row: Mapping[str, Any], where: str, form: str) -> str:
+    value: Any = row
+    for key in where.split("."):
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return "-" if value is None else format(value, form)
+
+
+def _named(entries: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    return [{"name": name, **entry} for name, entry in entries.items()]
+
+
+def _pair_notes(report: Report) -> list[str]:
+    num_pairs = max(entry["num_pairs"] for entry in report["results"].values())
+    return [
+        f"Errors of rotation and direction of the translation in degrees, mean and median, over {num_pairs} "
+        "pairs: all SNRs, seeds and kinds of matches together. AUC: of the larger error, up to 5, 10 and 20 "
+        "degrees, in percent."
+    ]
+
+
+LAYOUTS: dict[str, _Layout] = {
+    "trajectory": _Layout(
+        lambda report: report["cells"],
+        {
+            "SNR dB": ("snr_db", "g"),
+            "confidence": ("confidence", ""),
+            "ATE m": ("ate_rmse_m", ".3f"),
+            "ATE %": ("ate_percent", ".2f"),
+            "posed": ("completeness", ".1%"),
+            "RPE %": ("rpe_trans_percent", ".2f"),
+            "RPE deg": ("rpe_rot_deg", ".3f"),
+            "PSNR dB": ("psnr_db", ".2f"),
+            "failed": ("num_failed", "d"),
+        },
+    ),
+    "pairs": _Layout(
+        lambda report: _named(report["results"]),
+        {
+            "method": ("name", ""),
+            "rot": ("rot_deg_mean", ".3f"),
+            "rot p50": ("rot_deg_median", ".3f"),
+            "dir": ("tdir_deg_mean", ".2f"),
+            "dir p50": ("tdir_deg_median", ".2f"),
+            "AUC5": ("auc5", ".1f"),
+            "AUC10": ("auc10", ".1f"),
+            "AUC20": ("auc20", ".1f"),
+            "failed": ("num_failed", "d"),
+        },
+        _pair_notes,
+    ),
+    "codec": _Layout(
+        lambda report: report["results"],
+        {
+            "codec": ("codec", ""),
+            "SNR dB": ("snr_db", "g"),
+            "PSNR dB": ("psnr_db", ".2f"),
+            "SSIM": ("ssim", ".3f"),
+            "MS-SSIM": ("ms_ssim", ".3f"),
+            "outage": ("outage", ".0%"),
+            "CBR": ("cbr", ".4f"),
+            "enc ms": ("encode_ms.p50", ".0f"),
+            "dec ms": ("decode_ms.p50", ".0f"),
+        },
+    ),
+    "confidence": _Layout(
+        lambda report: report["results"],
+        {
+            "SNR dB": ("snr_db", "g"),
+            "frames": ("num_frames", "d"),
+            "lost": ("num_frames_lost", "d"),
+            "PSNR dB": ("psnr_db", ".2f"),
+            "pixel ECE": ("pixel.ece", ".3f"),
+            "pixel rank": ("pixel.maps.confidence.spearman_pixel", ".2f"),
+            "corner rank": ("keypoint.maps.keypoint_confidence.spearman", ".2f"),
+            "moved px": ("keypoint.displacement_px_median", ".2f"),
+        },
+        lambda report: [
+            "Rank: Spearman correlation of the codec's doubt with the error of pixels, and with how far "
+            "corners moved; 1 is best."
+        ],
+    ),
+    "latency": _Layout(
+        lambda report: _named(report["stages"]),
+        {
+            "stage": ("name", ""),
+            "p50 ms": ("p50", ".1f"),
+            "p95 ms": ("p95", ".1f"),
+            "max ms": ("max", ".1f"),
+            "runs on": ("ran_share", ".0%"),
+            "share of time": ("time_share", ".0%"),
+        },
+        lambda report: [f"Bottleneck: {report['bottleneck']}"],
+    ),
+    "endurance": _Layout(
+        lambda report: report["results"],
+        {
+            "frames": ("frames", "d"),
+            "posed": ("posed_share", ".1%"),
+            "p50 ms": ("frame_ms_p50", ".1f"),
+            "p95 ms": ("frame_ms_p95", ".1f"),
+            "landmarks": ("landmarks", "d"),
+            "keyframes": ("keyframes", "d"),
+            "MB": ("memory_mb", ".0f"),
+            "bundle MB": ("bundle_memory_mb", ".0f"),
+            "ATE %": ("ate_percent", ".2f"),
+        },
+    ),
+    "runtime": _Layout(
+        lambda report: report["results"],
+        {
+            "codec": ("codec", ""),
+            "work": ("work", ""),
+            "runtime": ("runtime", ""),
+            "ISA": ("isa", ""),
+            "threads": ("threads", "d"),
+            "p50 ms": ("p50_ms", ".1f"),
+            "p95 ms": ("p95_ms", ".1f"),
+            "per s": ("fps", ".1f"),
+        },
+        lambda report: [
+            f"{row['codec']}, {row['work']}, {row['runtime']}: {row['error']}"
+            for row in report["results"]
+            if "error" in row
+        ],
+    ),
+    "recording": _Layout(
+        lambda report: [dict(report)],
+        {
+            "share of a core": ("core_share", ".1%"),
+            "put p50 us": ("put_us.p50", ".0f"),
+            "put p99 us": ("put_us.p99", ".0f"),
+            "bytes/s": ("bytes_per_s", ".0f"),
+            "dropped": ("dropped", "d"),
+        },
+    ),
+}

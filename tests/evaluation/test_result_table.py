@@ -1,0 +1,73 @@
+import io
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from semcast.commands.evaluate import EVALUATIONS, printed_table
+from semcast.evaluation.result_table import LAYOUTS, result_table
+
+RESULTS = Path(__file__).resolve().parents[2] / "evaluation" / "results"
+#: One result of each evaluation.
+SHIPPED = {
+    "trajectory": "trajectory_awgn_phone_150",
+    "pairs": "pairs_kitti_06_awgn",
+    "codec": "codec_awgn_kodak",
+    "confidence": "confidence_awgn_kitti_06",
+    "latency": "latency_kitti_06",
+    "endurance": "endurance_parking_synth_60",
+    "runtime": "runtime_3dcsc",
+    "recording": "recording_cost",
+}
+
+
+def shipped(what):
+    return json.loads((RESULTS / f"{SHIPPED[what]}.json").read_text(encoding="utf-8"))
+
+
+def lines_at_80_columns(what, table):
+    console = Console(file=io.StringIO(), width=80)
+    console.print(printed_table(what, table))
+    return console.file.getvalue().splitlines()
+
+
+def test_every_evaluation_has_a_table():
+    assert set(LAYOUTS) == set(EVALUATIONS) == set(SHIPPED)
+
+
+@pytest.mark.parametrize("what", SHIPPED)
+def test_no_name_of_a_column_is_cut_and_every_row_takes_one_line(what):
+    table = result_table(what, shipped(what))
+    _, head, _, *body = lines_at_80_columns(what, table)
+    assert [name.strip() for name in head.split("  ") if name.strip()] == table.head
+    assert [line.split() for line in body] == [row for row in table.rows if row]
+    assert all(cell != "-" for row in table.rows for cell in row), "every figure is found in the result"
+
+
+def test_a_long_name_takes_several_lines_and_cuts_no_other_column():
+    report = shipped("codec")
+    name = "checkpoints/mine/a-rather-long-name-of-weights.safetensors"
+    report["results"] = [{**report["results"][0], "codec": name}]
+    table = result_table("codec", report)
+    _, head, _, *body = lines_at_80_columns("codec", table)
+    assert head.split() == " ".join(table.head).split()
+    assert "".join(line.split()[0] for line in body) == name
+    assert body[0].split()[1:] == table.rows[0][1:]
+
+
+def test_figures_that_are_not_there_are_dashes():
+    report = shipped("confidence")
+    del report["results"][0]["keypoint"]["maps"]["keypoint_confidence"]
+    report["results"][0]["pixel"]["ece"] = None
+    table = result_table("confidence", report)
+    assert [table.rows[0][table.head.index(name)] for name in ("corner rank", "pixel ECE")] == ["-", "-"]
+    assert table.rows[0][0] == "2"
+
+
+def test_a_variant_that_did_not_run_says_why_below_the_table():
+    report = shipped("runtime")
+    report["results"][-1] |= {"p50_ms": None, "p95_ms": None, "fps": None, "error": "no exported encoder"}
+    table = result_table("runtime", report)
+    assert table.rows[-1][-3:] == ["-", "-", "-"]
+    assert table.notes == ["3dcsc-lite, encode, onnx: no exported encoder"]
