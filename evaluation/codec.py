@@ -81,9 +81,10 @@ class CodecSettings:
     seed: int = field(default=0, metadata={"help": "seed of the channel"})
     max_images: int | None = field(default=None, metadata={"help": "images used at most"})
     threads: int = field(default=2, metadata={"help": "threads of a learned codec"})
-    json: Path | None = field(default=None, metadata={"help": "file for the result"})
+    json: Path | None = field(default=None, metadata={"help": "file for the result, - for stdout"})
     out: Path | None = field(
-        default=None, metadata={"help": "folder for PSNR and SSIM curves and a strip of pictures"}
+        default=None,
+        metadata={"help": "folder for PSNR and SSIM curves, pictures and, without --json, result.json"},
     )
 
     def __post_init__(self) -> None:

@@ -37,7 +37,9 @@ class ConfidenceSettings(StreamSettings):
     pixel_alpha: float = field(
         default=30.0, metadata={"help": "alpha of the label 1 - tanh(alpha |error|) the codec was trained on"}
     )
-    out: Path | None = field(default=None, metadata={"help": "folder for reliability diagrams"})
+    out: Path | None = field(
+        default=None, metadata={"help": "folder for reliability diagrams and, without --json, result.json"}
+    )
 
     def __post_init__(self) -> None:
         """Check ranges."""

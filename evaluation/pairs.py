@@ -87,7 +87,10 @@ class PairSettings(StreamSettings):
     min_baseline_share: float = field(
         default=0.0, metadata={"help": "skip pairs with a baseline below this share of the path's extent"}
     )
-    out: Path | None = field(default=None, metadata={"help": "folder for plots of error against SNR"})
+    out: Path | None = field(
+        default=None,
+        metadata={"help": "folder for plots of error against SNR and, without --json, result.json"},
+    )
 
     def __post_init__(self) -> None:
         """Check ranges."""

@@ -61,7 +61,7 @@ class StreamSettings:
     stride: int = field(default=1, metadata={"help": "use every n-th frame"})
     resize: float = field(default=1.0, metadata={"help": "factor on the image size, at most 1"})
     threads: int = field(default=2, metadata={"help": "threads of the codec"})
-    json: Path | None = field(default=None, metadata={"help": "file for the result"})
+    json: Path | None = field(default=None, metadata={"help": "file for the result, - for stdout"})
 
     def __post_init__(self) -> None:
         """Check ranges."""

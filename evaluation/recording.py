@@ -34,7 +34,7 @@ class RecordingSettings:
     rate_hz: float = field(default=15.0, metadata={"help": "frames a second"})
     round_s: float = field(default=10.0, metadata={"help": "length of a round in seconds"})
     rounds: int = field(default=3, metadata={"help": "rounds with and as many without the recorder"})
-    json: Path | None = field(default=None, metadata={"help": "write the result to this file"})
+    json: Path | None = field(default=None, metadata={"help": "file for the result, - for stdout"})
 
     def __post_init__(self) -> None:
         """Check ranges."""

@@ -69,12 +69,12 @@ def check_outputs(json: Path | None, out: Path | None) -> None:
         ConfigError: Nothing can be written there.
     """
     try:
-        if json is not None:
-            check_writable(json, "json")
         if out is not None:
             if out.is_file():
                 raise ConfigError(f"out must be a folder, {out} is a file")
             check_writable(out / RESULT_NAME, "out")
+        if json is not None:
+            check_writable(json, "json")
     except OSError as err:  # is_file and is_dir raise below a folder that may not be looked into
         raise ConfigError(f"{err.filename} can't be written: {err.strerror}") from err
 

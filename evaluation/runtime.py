@@ -36,7 +36,7 @@ class RuntimeSettings:
     threads: tuple[int, ...] = field(default=(1, 2), metadata={"help": "numbers of CPU threads"})
     rounds: int = field(default=8, metadata={"help": "rounds; in each every variant has its turn"})
     calls: int = field(default=8, metadata={"help": "calls of a variant in a round"})
-    json: Path | None = field(default=None, metadata={"help": "write the result to this file"})
+    json: Path | None = field(default=None, metadata={"help": "file for the result, - for stdout"})
 
     def __post_init__(self) -> None:
         """Check ranges."""

@@ -52,7 +52,11 @@ class TrajectorySettings(StreamSettings):
     )
     rows: bool = field(default=True, metadata={"help": "keep one row per frame in the result"})
     out: Path | None = field(
-        default=None, metadata={"help": "folder for trajectories (TUM) and top views of the first seed"}
+        default=None,
+        metadata={
+            "help": "folder for trajectories (TUM) and top views of the first seed and, without --json, "
+            "result.json"
+        },
     )
 
     def __post_init__(self) -> None:

@@ -1,5 +1,9 @@
-"""What ``semcast eval`` does around a measurement: results that can't be kept are refused before it."""
+"""What ``semcast eval`` does around a measurement: places are checked, files written are named."""
 
+import json
+
+import cv2
+import numpy as np
 import pytest
 
 from semcast.cli import main
@@ -22,3 +26,61 @@ def test_a_result_that_can_not_be_kept_is_said_before_the_measurement(what, tmp_
         assert said.startswith(f"semcast eval: {flag.removeprefix('--')} "), said
         assert str(place) in said
         assert said.count("\n") == 1
+
+
+@pytest.fixture
+def codec_words(tmp_path):
+    """A measurement of the codec that takes a moment."""
+    (tmp_path / "images").mkdir()
+    grey = np.tile(np.linspace(0, 255, 96, dtype=np.uint8), (64, 1))
+    cv2.imwrite(str(tmp_path / "images" / "grey.png"), grey)
+    return ["eval", "codec", "--images", str(tmp_path / "images"), "--codec", "jpeg-ldpc", "--snr-db", "12"]
+
+
+def test_a_folder_gets_the_result_and_all_files_written_are_named(codec_words, tmp_path, capsys):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "notes.txt").write_text("of somebody else")
+    assert main([*codec_words, "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    names = ["fig7_psnr.png", "fig8_ssim.png", "pictures_12db.png", "result.json"]
+    assert [line for line in said.err.splitlines() if line.startswith("written")] == [
+        f"written: {out / name}" for name in names
+    ]
+    assert json.loads((out / "result.json").read_text())["results"][0]["codec"] == "jpeg-ldpc"
+    assert "semcast eval codec" in said.out
+    assert "jpeg-ldpc" in said.out
+    assert "{" not in said.out
+
+
+def test_the_result_goes_where_json_says_and_files_written_anew_are_named_again(
+    codec_words, tmp_path, capsys
+):
+    out, file = tmp_path / "out", tmp_path / "elsewhere" / "mine.json"
+    for _ in range(2):
+        assert main([*codec_words, "--out", str(out), "--json", str(file)]) == 0
+        said = capsys.readouterr()
+        assert f"written: {file}\n" in said.err
+        assert f"written: {out / 'fig7_psnr.png'}\n" in said.err
+        assert "jpeg-ldpc" in said.out
+    assert file.exists()
+    assert not (out / "result.json").exists()
+
+
+def test_stdout_is_all_json_where_a_script_asks_for_it(codec_words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main([*codec_words, "--json", "-"]) == 0
+    said = capsys.readouterr()
+    report = json.loads(said.out)
+    assert report["results"][0]["images"][0]["image"] == "grey.png"
+    assert "semcast eval codec" in said.err
+    assert [path.name for path in tmp_path.iterdir()] == ["images"]
+
+
+def test_without_a_file_the_table_is_printed_and_it_is_said_that_nothing_else_is_left(codec_words, capsys):
+    assert main(codec_words) == 0
+    said = capsys.readouterr()
+    assert said.err.startswith("only the table will be left of this run: --json FILE keeps all figures\n")
+    assert "written" not in said.err
+    assert "PSNR dB" in said.out
+    assert "{" not in said.out

@@ -2,7 +2,10 @@
 
 import argparse
 import json
+import sys
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -12,8 +15,11 @@ from rich.text import Text
 
 from semcast.commands.running import add_settings, read_settings
 from semcast.evaluation import codec, confidence, endurance, latency, pairs, recording, runtime, trajectory
-from semcast.evaluation.report import check_outputs
+from semcast.evaluation.report import RESULT_NAME, check_outputs
 from semcast.evaluation.result_table import ResultTable, result_table
+
+#: What ``--json`` is to have the result on stdout.
+STDOUT = Path("-")
 
 _Evaluation = tuple[type, Callable[[Any], dict[str, Any]], frozenset[str], str]
 #: what -> settings, function, settings the evaluation sets itself, one line of help
@@ -94,20 +100,48 @@ def printed_table(what: str, table: ResultTable) -> Table:
     return printed
 
 
+def _write_times_ns(folder: Path | None) -> dict[Path, int]:
+    """Return when each file of a folder was written last, in the order of their names."""
+    if folder is None:
+        return {}
+    return {path: path.stat().st_mtime_ns for path in sorted(folder.iterdir()) if path.is_file()}
+
+
 def run(arguments: argparse.Namespace) -> int:
-    """Run one evaluation; a table on stdout, or the whole JSON where no ``--json`` file takes it."""
+    """Run one evaluation: a table on stdout, the names of the files it wrote on stderr.
+
+    The JSON goes to the file of ``--json``, else to ``result.json`` in the folder of ``--out``. With
+    ``--json -`` it has stdout for itself and the table goes to stderr.
+    """
     cls, evaluate, _, text = EVALUATIONS[arguments.what]
     settings: Any = read_settings(cls, arguments)
-    check_outputs(settings.json, getattr(settings, "out", None))
+    out: Path | None = getattr(settings, "out", None)
     talk = Console(stderr=True)
+    json_to_stdout = settings.json == STDOUT
+    if json_to_stdout:
+        settings = replace(settings, json=None)
+    elif settings.json is None and out is not None:
+        settings = replace(settings, json=out / RESULT_NAME)
+    elif settings.json is None:
+        _tell("only the table will be left of this run: --json FILE keeps all figures")
+    check_outputs(settings.json, out)
+    before_ns = _write_times_ns(out)
     with talk.status(f"{text} ..."):
         report = evaluate(settings)
-    if settings.json is None:
+    table = result_table(arguments.what, report)
+    (talk if json_to_stdout else Console()).print(
+        printed_table(arguments.what, table), *table.notes, sep="\n", markup=False, highlight=False
+    )
+    if json_to_stdout:
         print(json.dumps(report, indent=1))
-    else:
-        table = result_table(arguments.what, report)
-        Console().print(
-            printed_table(arguments.what, table), *table.notes, sep="\n", markup=False, highlight=False
-        )
-        talk.print(f"written to {settings.json}")
+    written = [path for path, time_ns in _write_times_ns(out).items() if before_ns.get(path) != time_ns]
+    if settings.json is not None and settings.json not in written:
+        written.append(settings.json)
+    for path in written:
+        _tell(f"written: {path}")
     return 0
+
+
+def _tell(line: str) -> None:
+    """Say a line that is not part of the result; a console of rich would break long paths."""
+    print(line, file=sys.stderr)
