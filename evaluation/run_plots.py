@@ -1,7 +1,7 @@
 """Pictures of one finished run: its path, and what happened over time."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +10,18 @@ from numpy.typing import NDArray
 
 from semcast.common.errors import SourceError
 from semcast.common.run_folder import FRAMES_NAME, TRAJECTORY_NAME
+from semcast.common.run_summary import read_summary
 from semcast.common.trajectory import Trajectory, read_tum
 from semcast.common.trajectory_error import AteResult, ate
 from semcast.evaluation.plots import new_grid, save_figure
-from semcast.server.run_record import FrameRow, read_rows
+from semcast.server.run_record import FrameRow, read_rows, sent_frame_ids
 
 Array = NDArray[np.float64]
 
 _STATE_COLOURS = {"initializing": "#f0c040", "lost": "#d05050"}
+#: Stages outside the time to the pose: the map is extended when a frame has its pose, its adjustment
+#: runs beside the frames, and the last is a sum of others.
+_NOT_TO_POSE = frozenset({"map", "bundle", "decoded_to_pose"})
 
 
 @dataclass(frozen=True)
@@ -29,12 +33,16 @@ class RunToPlot:
         trajectory: All posed frames.
         rows: One per frame that reached the tracker, in order.
         truth: Reference path, None where unknown.
+        num_source: Frames the source had, None where the run did not say.
+        drops: Frames that never reached the tracker, by reason, as far as the run said.
     """
 
     name: str
     trajectory: Trajectory
     rows: Sequence[FrameRow]
     truth: Trajectory | None
+    num_source: int | None = None
+    drops: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
     def read(folder: Path, truth: Trajectory | None) -> "RunToPlot":
@@ -51,7 +59,15 @@ class RunToPlot:
                 f"{folder} holds neither {TRAJECTORY_NAME} nor {FRAMES_NAME}: there is nothing to plot"
             )
         empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-        return RunToPlot(folder.name, read_tum(path) if path.is_file() else empty, rows, truth)
+        summary = read_summary(folder)
+        return RunToPlot(
+            name=folder.name,
+            trajectory=read_tum(path) if path.is_file() else empty,
+            rows=rows,
+            truth=truth,
+            num_source=summary.get("frames", {}).get("source"),
+            drops=summary.get("drops", {}),
+        )
 
 
 def plot_run(run: RunToPlot, out: Path, image_format: str = "png") -> list[Path]:
@@ -127,7 +143,10 @@ def _plot_timeline(run: RunToPlot, path: Path) -> Path:
     t_s = np.array([row.t_source_ns for row in rows], dtype=np.float64) * 1e-9
     t_s -= t_s[0]
     panels: list[tuple[str, dict[str, Array]]] = [
-        ("SNR (dB)", {"set": _column(rows, "snr_set_db"), "estimated": _column(rows, "snr_estimated_db")}),
+        (
+            "SNR (dB)",
+            {"set": held(_column(rows, "snr_set_db")), "estimated": _column(rows, "snr_estimated_db")},
+        ),
         ("PSNR (dB)", {"decoded image": _column(rows, "psnr_db")}),
         ("mean confidence", {"decoded image": _column(rows, "confidence_mean")}),
         ("keypoints", {"tracked": _column(rows, "num_tracked"), "inliers": _column(rows, "num_inliers")}),
@@ -153,15 +172,51 @@ def _plot_timeline(run: RunToPlot, path: Path) -> Path:
         _shade_states(axes, t_s, rows)
         if len(curves) > 1:
             axes.legend(fontsize="x-small", loc="upper left", bbox_to_anchor=(1.005, 1.02))
-    grid[-1][0].set_xlabel("recorded time (s); yellow: no map yet, red: lost, |: keyframe")
+    top = grid[0][0]
+    meaning = "recorded time (s); yellow: no map yet, red: lost, |: keyframe"
     keyframes = t_s[[row.is_keyframe for row in rows]]
-    grid[0][0].plot(
-        keyframes, np.ones(len(keyframes)), "|", color="k", transform=grid[0][0].get_xaxis_transform()
-    )
-    posed = sum(row.posed for row in rows)
-    figure.suptitle(f"{run.name}: {len(rows)} frames, {posed} with a pose at once")
+    top.plot(keyframes, np.ones(len(keyframes)), "|", color="k", transform=top.get_xaxis_transform())
+    missing = missing_times(np.array([row.frame_id for row in rows]), t_s)
+    if len(missing):
+        at_bottom = np.zeros(len(missing))
+        top.plot(missing, at_bottom, "x", color="r", transform=top.get_xaxis_transform(), clip_on=False)
+        meaning += ", x: missing"
+    grid[-1][0].set_xlabel(meaning)
+    figure.suptitle(timeline_title(run))
     save_figure(figure, path)
     return path
+
+
+def timeline_title(run: RunToPlot) -> str:
+    """Return how many frames there are, of how many where that is known, and what became of the others."""
+    count = str(len(run.rows))
+    if run.num_source is not None and run.num_source > len(run.rows):
+        count += f" of {run.num_source}"
+    dropped = ", ".join(f"{number} {reason}" for reason, number in sorted(run.drops.items()) if number)
+    posed = sum(row.posed for row in run.rows)
+    return f"{run.name}: {count} frames{f' ({dropped})' if dropped else ''}, {posed} with a pose at once"
+
+
+def missing_times(frame_ids: NDArray[np.int64], t_s: Array) -> Array:
+    """Return when the frames were recorded that are missing between others, evenly spread in each gap.
+
+    Args:
+        frame_ids: ``(N,)`` of the frames that are there.
+        t_s: ``(N,)`` their times in seconds.
+    """
+    known, index = np.unique(frame_ids, return_index=True)
+    missing = np.setdiff1d(sent_frame_ids(known.tolist()), known)
+    return np.interp(missing, known, t_s[index])
+
+
+def held(values: Array) -> Array:
+    """Return values with every gap filled by the last value before it; a gap at the begin stays.
+
+    The channel says what it applies in a message of its own, which may come when the frame's row is written.
+    """
+    known = np.isfinite(values)
+    last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
+    return np.where(last >= 0, values[last], np.nan)
 
 
 def _column(rows: Sequence[FrameRow], name: str) -> Array:
@@ -169,9 +224,8 @@ def _column(rows: Sequence[FrameRow], name: str) -> Array:
 
 
 def _stages(rows: Sequence[FrameRow], most: int = 3) -> dict[str, Array]:
-    """Return the stages that take longest in all, each with a value per row."""
-    # Bundle adjustment runs beside the frames; the other is the sum of stages.
-    names = {name for row in rows for name in row.stage_ms} - {"bundle", "decoded_to_pose"}
+    """Return the stages to the pose that take longest in all, each with a value per row."""
+    names = {name for row in rows for name in row.stage_ms} - _NOT_TO_POSE
     total = {name: sum(row.stage_ms.get(name, 0.0) for row in rows) for name in names}
     longest = sorted(total, key=lambda name: (-total[name], name))[:most]
     return {name: np.array([row.stage_ms.get(name, np.nan) for row in rows]) for name in longest}

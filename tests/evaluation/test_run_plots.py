@@ -1,0 +1,115 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast.common.run_folder import FRAMES_NAME, SUMMARY_NAME
+from semcast.common.trajectory import Trajectory
+from semcast.evaluation.run_plots import RunToPlot, held, missing_times, plot_run, timeline_title
+from semcast.server.run_record import FrameRow, RunRecord
+
+NAN = float("nan")
+
+
+def row(frame_id, **changes):
+    values = {
+        "frame_id": frame_id,
+        "t_source_ns": frame_id * 100_000_000,
+        "state": "tracking",
+        "posed": True,
+        "num_tracked": 120,
+        "num_inliers": 100,
+        "reprojection_error_px": 0.5,
+        "is_keyframe": frame_id % 5 == 0,
+        "map_epoch": 0,
+        "snr_set_db": 10.0,
+        "snr_estimated_db": 9.5 + 0.1 * frame_id,
+        "psnr_db": 30.0,
+        "confidence_mean": 0.9,
+        "age_ms": 50.0,
+        "stage_ms": {"decode": 20.0, "track": 10.0},
+    }
+    return FrameRow(**{**values, **changes})
+
+
+def line(frame_ids):
+    poses = np.tile(np.eye(4), (len(frame_ids), 1, 1))
+    poses[:, 2, 3] = frame_ids
+    return Trajectory(np.array(frame_ids) * 0.1, poses)
+
+
+def write_run(folder, rows, summary=None):
+    folder.mkdir()
+    with_rows = RunRecord(folder)
+    for each in rows:
+        with_rows.add(each)
+    with_rows.close()
+    assert (folder / FRAMES_NAME).exists()
+    if summary is not None:
+        (folder / SUMMARY_NAME).write_text(json.dumps(summary))
+    return folder
+
+
+def timeline(rows, tmp_path, name):
+    run = RunToPlot(name="run", trajectory=line([]), rows=rows, truth=None)
+    (path,) = plot_run(run, tmp_path / name)
+    return cv2.imread(str(path))
+
+
+def test_what_was_set_is_held_until_something_else_is_known():
+    np.testing.assert_array_equal(held(np.array([NAN, 10.0, NAN, NAN, 4.0])), [NAN, 10.0, 10.0, 10.0, 4.0])
+    np.testing.assert_array_equal(held(np.array([NAN, NAN])), [NAN, NAN])
+    assert len(held(np.zeros(0))) == 0
+
+
+def test_the_line_of_the_snr_that_is_set_has_no_gap_where_a_report_came_late(tmp_path):
+    whole = [row(k) for k in range(10)]
+    late = [row(k, snr_set_db=None if k in (3, 6) else 10.0) for k in range(10)]
+    unlike = [row(k, snr_set_db=8.0 if k in (3, 6) else 10.0) for k in range(10)]
+    assert (timeline(late, tmp_path, "late") == timeline(whole, tmp_path, "whole")).all()
+    assert (timeline(unlike, tmp_path, "unlike") != timeline(whole, tmp_path, "whole")).any()
+
+
+def test_missing_frames_lie_between_those_that_are_there():
+    ids = np.array([0, 2, 4, 10, 12])
+    t_s = np.array([0.0, 0.2, 0.4, 1.3, 1.5])
+    # Every second frame was sent: 6 and 8 are missing, in thirds of the way from 4 to 10.
+    np.testing.assert_allclose(missing_times(ids, t_s), [0.7, 1.0])
+    assert len(missing_times(ids[:3], t_s[:3])) == 0
+    assert len(missing_times(ids[:1], t_s[:1])) == 0
+
+
+def test_missing_frames_are_marked(tmp_path):
+    there = [row(k, snr_estimated_db=None) for k in (0, 1, 2, 3, 5, 6, 7, 8)]
+    renumbered = [row(k, snr_estimated_db=None, t_source_ns=r.t_source_ns) for k, r in enumerate(there)]
+    marked, unmarked = timeline(there, tmp_path, "marked"), timeline(renumbered, tmp_path, "unmarked")
+
+    def red(image):
+        blue, green, red = (image[..., k].astype(int) for k in range(3))
+        return int(((red > 200) & (green < 60) & (blue < 60)).sum())
+
+    assert red(unmarked) == 0 < red(marked)
+
+
+def test_the_title_says_how_many_frames_were_sent_and_where_the_others_went(tmp_path):
+    rows = [row(k, posed=k > 0) for k in range(3)]
+    summary = {"frames": {"source": 7}, "drops": {"superseded": 3, "lost": 1, "damaged": 0}}
+    known = RunToPlot.read(write_run(tmp_path / "known", rows, summary), None)
+    assert timeline_title(known) == "known: 3 of 7 frames (1 lost, 3 superseded), 2 with a pose at once"
+    cut_off = RunToPlot.read(write_run(tmp_path / "cut_off", rows), None)
+    assert timeline_title(cut_off) == "cut_off: 3 frames, 2 with a pose at once"
+    whole = {"frames": {"source": 3}, "drops": {}}
+    assert "whole: 3 frames, " in timeline_title(
+        RunToPlot.read(write_run(tmp_path / "whole", rows, whole), None)
+    )
+
+
+@pytest.mark.parametrize("stage", ["map", "bundle", "decoded_to_pose"])
+def test_a_stage_outside_the_time_to_the_pose_is_no_part_of_it(stage, tmp_path):
+    plain = [row(k) for k in range(6)]
+    more = [row(k, stage_ms={"decode": 20.0, "track": 10.0, stage: 200.0}) for k in range(6)]
+    part = [row(k, stage_ms={"decode": 20.0, "track": 10.0, "pose": 15.0}) for k in range(6)]
+    expected = timeline(plain, tmp_path, "plain")
+    assert (timeline(more, tmp_path, "more") == expected).all()
+    assert (timeline(part, tmp_path, "part") != expected).any()
