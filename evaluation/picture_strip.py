@@ -1,4 +1,4 @@
-"""A strip of decoded images side by side, each under its name (Fig. 6 of the paper)."""
+"""Decoded images side by side, each under its name (Fig. 6 of the paper)."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,6 +12,8 @@ from semcast.common.errors import SemcastError
 _CELL_WIDTH_PX = 384
 _LABEL_HEIGHT_PX = 26
 _GAP_PX = 4
+#: More cells side by side are too small to be judged on a page.
+_MAX_COLUMNS = 4
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -25,7 +27,7 @@ def _cell(image: NDArray[np.uint8], label: str) -> NDArray[np.uint8]:
 
 
 def picture_strip(rows: Sequence[Mapping[str, NDArray[np.uint8]]]) -> NDArray[np.uint8]:
-    """Lay out images in rows of equal cells.
+    """Lay out images in rows of equal cells, four at most side by side; a longer row goes on below.
 
     Args:
         rows: Per row, label to ``(H, W, 3)`` uint8 RGB image; all images of a row have one shape.
@@ -39,7 +41,10 @@ def picture_strip(rows: Sequence[Mapping[str, NDArray[np.uint8]]]) -> NDArray[np
     if not rows or not all(rows):
         raise ValueError("a picture strip needs at least one image in each row")
     gap = _GAP_PX
-    lines = [[_cell(image, label) for label, image in row.items()] for row in rows]
+    lines = []
+    for row in rows:
+        cells = [_cell(image, label) for label, image in row.items()]
+        lines += [cells[k : k + _MAX_COLUMNS] for k in range(0, len(cells), _MAX_COLUMNS)]
     columns = max(len(line) for line in lines)
     height = sum(line[0].shape[0] + gap for line in lines) - gap
     strip = np.full((height, columns * (_CELL_WIDTH_PX + gap) - gap, 3), 255, dtype=np.uint8)

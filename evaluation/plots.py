@@ -19,8 +19,6 @@ from semcast.common.errors import SemcastError
 _MARKERS = "os^Dv<>P*Xh"
 #: Matplotlib's own ten and black: as many as a pair benchmark has estimators.
 _COLOURS = (*(f"C{k}" for k in range(10)), "black")
-#: More curves than these leave no room for their names between them.
-_MAX_IN_AXES = 5
 
 
 def _new_figure(width_in: float = 5.0, height_in: float = 3.6) -> tuple[Figure, Axes]:
@@ -81,7 +79,7 @@ def plot_against_snr(
         ValueError: A curve has another length than ``snr_db``.
         SemcastError: The file can't be written.
     """
-    figure, axes = _new_figure(6.4 if len(curves) > _MAX_IN_AXES else 5.0)
+    figure, axes = _new_figure(6.4)
     for k, (name, values) in enumerate(curves.items()):
         if len(values) != len(snr_db):
             raise ValueError(f"curve {name!r} must have {len(snr_db)} values, got {len(values)}")
@@ -90,10 +88,8 @@ def plot_against_snr(
     axes.set(xlabel="SNR (dB)", ylabel=y_label, title=title)
     if from_zero:
         axes.set_ylim(bottom=0.0)
-    if len(curves) > _MAX_IN_AXES:
-        figure.legend(fontsize="small", loc="outside right upper")
-    else:
-        axes.legend(fontsize="small")
+    # Inside the axes the names would hide points of the curves.
+    figure.legend(fontsize="small", loc="outside right upper")
     save_figure(figure, path)
 
 
@@ -211,7 +207,7 @@ def plot_path(
         axes.plot(positions[:, columns[0]], positions[:, columns[1]], style, linewidth=1.3, label=name)
     axes.set(xlabel=f"{axes_names[0]} ({unit})", ylabel=f"{axes_names[1]} ({unit})", title=title)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.legend(fontsize="small")
+    figure.legend(fontsize="small", loc="outside lower center", ncols=len(trajectories))
     save_figure(figure, path)
 
 
@@ -237,5 +233,5 @@ def plot_reliability(
             label=name,
         )
     axes.set(xlabel="confidence", ylabel=observed, title=title, xlim=(0, 1), ylim=(0, 1))
-    axes.legend(fontsize="small")
+    figure.legend(fontsize="small", loc="outside lower center", ncols=4)
     save_figure(figure, path)

@@ -176,6 +176,12 @@ def test_a_strip_holds_every_image_once(tmp_path):
     assert strip[100, 100].tolist() == [200, 0, 0]
     assert strip[100, 500].tolist() == strip[350, 100].tolist() == [0, 0, 200]
     assert strip[350, 500].tolist() == [255, 255, 255]
+    # The fifth image goes on below the first, the next row below that.
+    long = picture_strip([{**dict.fromkeys("abcd", blue), "e": red}, {"a": blue}])
+    assert long.shape == (3 * (192 + 26) + 2 * 4, 4 * 384 + 3 * 4, 3)
+    assert long[350, 100].tolist() == [200, 0, 0]
+    assert long[350, 500].tolist() == [255, 255, 255]
+    assert long[550, 100].tolist() == [0, 0, 200]
     write_picture_strip(tmp_path / "new" / "strip.png", [{"a": red}])
     assert (tmp_path / "new" / "strip.png").stat().st_size > 0
     with pytest.raises(ValueError, match="at least one image in each row"):

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from semcast.common.errors import SemcastError
+from semcast.evaluation import plots
 from semcast.evaluation.plots import plot_against_snr, plot_pair_errors, plot_path, plot_reliability
 
 
@@ -43,3 +44,21 @@ def test_path_and_reliability_are_drawn(tmp_path):
 def test_an_unknown_file_type_is_one_clear_error(tmp_path):
     with pytest.raises(SemcastError, match="plot"):
         plot_path(tmp_path / "a.nonsense", {"a": np.zeros((2, 3))})
+
+
+def test_names_of_curves_stand_beside_the_axes_and_hide_no_point(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(plots, "save_figure", lambda figure, path: drawn.append(figure))
+    plot_against_snr(
+        tmp_path / "a.png", [2, 4, 6], {name: [30.0, 30.0, 31.0] for name in "abcde"}, "PSNR (dB)"
+    )
+    corner = {"predicted": [0.1, 0.9], "observed": [0.9, 0.1]}
+    plot_reliability(tmp_path / "b.png", dict.fromkeys("abcde", corner), "what was")
+    plot_path(tmp_path / "c.png", {"ground truth": np.eye(3), "semcast": -np.eye(3)})
+    assert len(drawn) == 3
+    for figure in drawn:
+        figure.draw_without_rendering()
+        (axes,), (names,) = figure.axes, figure.legends
+        assert axes.get_legend() is None
+        assert not names.get_window_extent().overlaps(axes.get_window_extent())
+        assert figure.bbox.containsx(names.get_window_extent().x1)
