@@ -1,5 +1,6 @@
 """Pictures of one finished run: its path, and what happened over time."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,9 +13,11 @@ from semcast.common.errors import SourceError
 from semcast.common.run_folder import FRAMES_NAME, TRAJECTORY_NAME
 from semcast.common.run_summary import read_summary
 from semcast.common.trajectory import Trajectory, read_tum
-from semcast.common.trajectory_error import AteResult, ate
+from semcast.common.trajectory_error import AteResult, ate, match_times
 from semcast.evaluation.plots import new_grid, save_figure
 from semcast.server.run_record import FrameRow, read_rows, sent_frame_ids
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -22,6 +25,11 @@ _STATE_COLOURS = {"initializing": "#f0c040", "lost": "#d05050"}
 #: Stages outside the time to the pose: the map is extended when a frame has its pose, its adjustment
 #: runs beside the frames, and the last is a sum of others.
 _NOT_TO_POSE = frozenset({"map", "bundle", "decoded_to_pose"})
+
+#: A part of a recording without pose is common; beyond this factor the truth may be of another recording.
+_MAX_SPAN_RATIO = 1.5
+#: More numbers with decimals below a narrow panel run into each other.
+_MAX_TICKS = 5
 
 
 @dataclass(frozen=True)
@@ -49,20 +57,24 @@ class RunToPlot:
         """Read a run folder.
 
         Raises:
-            SourceError: The folder is no run, or holds no pose and no row.
+            SourceError: The folder is no run, or one without a decoded frame.
         """
         if not folder.is_dir():
             raise SourceError(f"{folder} is not a folder; give the folder that --out wrote")
         path, rows = folder / TRAJECTORY_NAME, read_rows(folder / FRAMES_NAME)
-        if not path.is_file() and not rows:
+        if not path.is_file() and not (folder / FRAMES_NAME).is_file():
             raise SourceError(
                 f"{folder} holds neither {TRAJECTORY_NAME} nor {FRAMES_NAME}: there is nothing to plot"
             )
-        empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+        trajectory = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+        if path.is_file():
+            trajectory = read_tum(path)
+        if not rows and not len(trajectory):
+            raise SourceError(f"{folder}: no frame was decoded: nothing to plot")
         summary = read_summary(folder)
         return RunToPlot(
             name=folder.name,
-            trajectory=read_tum(path) if path.is_file() else empty,
+            trajectory=trajectory,
             rows=rows,
             truth=truth,
             num_source=summary.get("frames", {}).get("source"),
@@ -99,6 +111,9 @@ def _plot_path(run: RunToPlot, path: Path) -> Path:
     if result is not None:
         estimate = result.scale * estimate @ result.R_truth_map.T + result.t_truth_map
         unit = "m"
+    doubt = time_span_doubt(run.trajectory, run.truth) if run.truth is not None else None
+    if doubt is not None:
+        logger.warning("%s: %s", run.name, doubt)
     figure, grid = new_grid(1 if result is None else 2, 2, 9.0, 4.2 if result is None else 6.4)
     truth = run.truth.positions if result is not None and run.truth is not None else None
     for axes, (first, second), view in zip(
@@ -113,29 +128,57 @@ def _plot_path(run: RunToPlot, path: Path) -> Path:
         axes.set_aspect("equal", adjustable="datalim")
         if second == "y":
             axes.invert_yaxis()  # y points down
-    grid[0][0].legend(fontsize="small")
+    names = grid[0][0].get_legend_handles_labels()
+    figure.legend(*names, fontsize="small", loc="outside lower center", ncols=3)
     if result is not None:
         _plot_error(grid[1], result)
-        figure.suptitle(
-            f"{run.name}: ATE {result.rmse_m:.3g} m RMSE, {result.percent:.2f} % "
-            f"of {result.path_length_m:.3g} m"
-        )
-    else:
-        figure.suptitle(f"{run.name}: {len(estimate)} poses, no ground truth")
+    figure.suptitle(path_title(run, result))
     save_figure(figure, path)
     return path
+
+
+def path_title(run: RunToPlot, result: AteResult | None) -> str:
+    """Return how far the path is from the truth, and how many of its poses that is about."""
+    num_poses = len(run.trajectory)
+    if run.truth is None:
+        return f"{run.name}: {num_poses} poses, no ground truth"
+    if result is None:
+        num_matched = len(match_times(run.trajectory.t_s, run.truth.t_s)[0])
+        return f"{run.name}: {num_matched} of {num_poses} poses matched, not enough for an ATE"
+    num_matched = len(result.t_s)
+    matched = "" if num_matched == num_poses else f"\n{num_matched} of {num_poses} poses matched"
+    error = f"ATE {result.rmse_m:.3g} m RMSE, {result.percent:.2f} % of {result.path_length_m:.3g} m"
+    return f"{run.name}: {error}{matched}"
+
+
+def time_span_doubt(trajectory: Trajectory, truth: Trajectory) -> str | None:
+    """Return what to say where a path and the truth hardly share a time and may not belong together.
+
+    Args:
+        trajectory: At least one pose.
+        truth: At least one pose.
+    """
+    spans_s = [(float(path.t_s.min()), float(path.t_s.max())) for path in (trajectory, truth)]
+    (first_s, last_s), (true_first_s, true_last_s) = spans_s
+    shared_s = min(last_s, true_last_s) - max(first_s, true_first_s)
+    if max(last_s - first_s, true_last_s - true_first_s) <= _MAX_SPAN_RATIO * shared_s:
+        return None
+    return (
+        f"poses are from {first_s:.1f} to {last_s:.1f} s, the true path from {true_first_s:.1f} to "
+        f"{true_last_s:.1f} s: is it of the same recording? ATE in percent is of the whole true path"
+    )
 
 
 def _plot_error(row: Sequence[Any], result: AteResult) -> None:
     over_time, histogram = row
     t_s = result.t_s - result.t_s[0]
     over_time.plot(t_s, result.error_m, color="#d05050", linewidth=1.2)
-    over_time.axhline(result.rmse_m, color="k", linestyle=":", linewidth=1.0, label="RMSE")
-    over_time.set(xlabel="time (s)", ylabel="position error (m)", title="error over time")
+    over_time.axhline(result.rmse_m, color="k", linestyle=":", linewidth=1.0)
+    over_time.set(xlabel="time (s)", ylabel="position error (m)", title="error over time, dotted: RMSE")
     over_time.set_ylim(bottom=0.0)
-    over_time.legend(fontsize="small")
     histogram.hist(result.error_m, bins=min(30, max(5, len(result.error_m) // 4)), color="#d05050")
     histogram.set(xlabel="position error (m)", ylabel="frames", title="how the error is spread")
+    histogram.locator_params(axis="x", nbins=_MAX_TICKS - 1)
 
 
 def _plot_timeline(run: RunToPlot, path: Path) -> Path:

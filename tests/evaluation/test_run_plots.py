@@ -4,9 +4,20 @@ import cv2
 import numpy as np
 import pytest
 
-from semcast.common.run_folder import FRAMES_NAME, SUMMARY_NAME
+from semcast.common.errors import SourceError
+from semcast.common.run_folder import FRAMES_NAME, SUMMARY_NAME, TRAJECTORY_NAME
 from semcast.common.trajectory import Trajectory
-from semcast.evaluation.run_plots import RunToPlot, held, missing_times, plot_run, timeline_title
+from semcast.common.trajectory_error import ate
+from semcast.evaluation import run_plots
+from semcast.evaluation.run_plots import (
+    RunToPlot,
+    held,
+    missing_times,
+    path_title,
+    plot_run,
+    time_span_doubt,
+    timeline_title,
+)
 from semcast.server.run_record import FrameRow, RunRecord
 
 NAN = float("nan")
@@ -113,3 +124,63 @@ def test_a_stage_outside_the_time_to_the_pose_is_no_part_of_it(stage, tmp_path):
     expected = timeline(plain, tmp_path, "plain")
     assert (timeline(more, tmp_path, "more") == expected).all()
     assert (timeline(part, tmp_path, "part") != expected).any()
+
+
+def to_plot(frame_ids, truth_ids):
+    trajectory, truth = line(frame_ids), line(truth_ids)
+    return RunToPlot(name="run", trajectory=trajectory, rows=[], truth=truth), ate(trajectory, truth)
+
+
+def test_the_title_says_how_many_poses_its_error_is_about():
+    assert path_title(*to_plot(range(10), range(10))) == "run: ATE 0 m RMSE, 0.00 % of 9 m"
+    assert path_title(*to_plot(range(44), range(12, 60))).endswith(" of 47 m\n32 of 44 poses matched")
+    # Two poses are fitted without an error.
+    assert path_title(*to_plot(range(10), range(8, 20))) == (
+        "run: 2 of 10 poses matched, not enough for an ATE"
+    )
+    without = RunToPlot(name="run", trajectory=line(range(10)), rows=[], truth=None)
+    assert path_title(without, None) == "run: 10 poses, no ground truth"
+
+
+def test_a_truth_of_other_times_is_doubted():
+    assert time_span_doubt(line(range(50)), line(range(50))) is None
+    assert time_span_doubt(line(range(10, 50)), line(range(50))) is None, "it takes time until there is a map"
+    for truth in (line(range(20)), line(range(200)), line(range(1000, 1050))):
+        assert "is it of the same recording?" in time_span_doubt(line(range(50)), truth)
+    assert time_span_doubt(line(range(50)), line(range(20))).startswith(
+        "poses are from 0.0 to 4.9 s, the true path from 0.0 to 1.9 s: "
+    )
+
+
+def test_a_doubtful_truth_is_drawn_and_warned_of(tmp_path, caplog):
+    run, _ = to_plot(range(50), range(20))
+    with caplog.at_level("WARNING"):
+        (path,) = plot_run(run, tmp_path)
+    assert "run: poses are from" in caplog.text
+    assert cv2.imread(str(path)) is not None
+
+
+def test_the_spread_of_small_errors_has_few_numbers_below_it(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(run_plots, "save_figure", lambda figure, path: drawn.append(figure))
+    rng = np.random.default_rng(0)
+    for scale_m in (1e-4, 0.0173, 0.2, 35.0):
+        trajectory = line(range(60))
+        trajectory.T_world_cam[:, 0, 3] = scale_m * rng.normal(size=60)
+        plot_run(RunToPlot(name="run", trajectory=trajectory, rows=[], truth=line(range(60))), tmp_path)
+        histogram = drawn[-1].axes[3]
+        low, high = histogram.get_xlim()
+        assert 2 <= sum(low <= tick <= high for tick in histogram.get_xticks()) <= 5
+
+
+def test_a_run_without_a_decoded_frame_has_nothing_to_plot(tmp_path):
+    folder = write_run(tmp_path / "run", [])
+    for _ in range(2):
+        with pytest.raises(SourceError, match="run: no frame was decoded: nothing to plot"):
+            RunToPlot.read(folder, None)
+        (folder / TRAJECTORY_NAME).write_text("")
+    (tmp_path / "other").mkdir()
+    with pytest.raises(SourceError, match="holds neither"):
+        RunToPlot.read(tmp_path / "other", None)
+    with pytest.raises(SourceError, match="is not a folder"):
+        RunToPlot.read(tmp_path / "missing", None)
