@@ -64,10 +64,23 @@ def write_picture_strip(path: Path, rows: Sequence[Mapping[str, NDArray[np.uint8
         ValueError: See ``picture_strip``.
         SemcastError: The file can't be written.
     """
-    strip = cv2.cvtColor(picture_strip(rows), cv2.COLOR_RGB2BGR)
+    write_picture(path, picture_strip(rows))
+
+
+def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Save a picture as PNG or JPEG, as its name says, making the folder.
+
+    Args:
+        path: ``.png`` or ``.jpg``.
+        picture: ``(H, W, 3)`` uint8 RGB.
+
+    Raises:
+        SemcastError: The file can't be written.
+    """
+    picture_bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        done, data = cv2.imencode(path.suffix, strip)
+        done, data = cv2.imencode(path.suffix, picture_bgr)
         if not done:
             raise SemcastError(f"{path} can't be written as a picture")
         path.write_bytes(data.tobytes())
