@@ -21,7 +21,7 @@ def check_writable(path: Path, name: str) -> None:
     Raises:
         ConfigError: It is a folder, or nothing can be written there.
     """
-    if path.is_dir():
+    if os.path.isdir(path):  # Path.is_dir raises where it may not look
         raise ConfigError(f"{name} must be a file, {path} is a folder")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
