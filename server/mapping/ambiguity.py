@@ -119,8 +119,8 @@ def _clear_doubt(best: Side, other: Side) -> float:
 def _mirrored_again(problem: BundleProblem, found: list[Side]) -> list[Side]:
     """Mirror images of the structures that were found beside the start.
 
-    A start may be a mixture, too far away and with some of its points on the wrong side: its mirror image then
-    leads to that of the true structure, and only the image of that to the true one.
+    A start may be a mixture, too far away and with some of its points on the wrong side: its mirror image
+    then leads to that of the true structure, and only the image of that to the true one.
     """
     lowest = min(side.cost for side in found)
     told_apart, again = found[:1], []
