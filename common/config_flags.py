@@ -6,10 +6,11 @@ them without the table, by their flag: ``snr_db = 4`` is ``[link]`` with ``snr_d
 
 import argparse
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+from semcast.common.argument_order import SeveralValues
 from semcast.common.config import (
     MissingSettingError,
     build_settings,
@@ -28,13 +29,14 @@ from semcast.common.errors import ConfigError
 S = TypeVar("S")
 
 
-def _flag_options(annotation: Any) -> dict[str, Any]:
+def _flag_options(annotation: Any, takes: Callable[[str], Any] | None = None) -> dict[str, Any]:
     plain, _ = plain_type(annotation)
     origin = get_origin(plain)
     if origin is Literal:
         return {"choices": get_args(plain), "type": type(get_args(plain)[0])}
     if origin is tuple:
-        return {"nargs": "+", **_flag_options(get_args(plain)[0])}
+        options = _flag_options(get_args(plain)[0])
+        return {"action": SeveralValues, "takes": takes or options["type"], **options}
     if plain is bool:
         return {"action": argparse.BooleanOptionalAction}
     return {"type": plain, "metavar": {int: "N", float: "X", Path: "PATH", str: "NAME"}.get(plain, "VALUE")}
@@ -93,7 +95,9 @@ def _flags_of(
 def add_flags(parser: argparse.ArgumentParser, cls: type, skip: frozenset[str] = frozenset()) -> None:
     """Add one flag per field, nested settings flattened; absent flags leave no value behind.
 
-    A field with ``positional`` in its metadata is an argument without a flag; absent, it leaves None.
+    A field with ``positional`` in its metadata is an argument without a flag; absent, it leaves None. One of
+    several values may have ``takes``, which raises ``ValueError`` for a word that can't be one of them: so
+    ``arguments_last`` tells values of a type that takes any word from the argument behind them.
 
     Args:
         parser: Where the flags go.
@@ -102,7 +106,7 @@ def add_flags(parser: argparse.ArgumentParser, cls: type, skip: frozenset[str] =
     """
     for flag in _flags_of(cls, skip):
         text = (str(flag.field.metadata.get("help", "")) + _default_text(flag.default)).replace("%", "%%")
-        options = _flag_options(flag.annotation)
+        options = _flag_options(flag.annotation, flag.field.metadata.get("takes"))
         if flag.is_positional:
             # Optional for argparse, since a settings file may give it; a missing one is missed later. Python
             # 3.11 would turn SUPPRESS, a string, into a value of the argument's type.

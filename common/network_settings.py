@@ -19,6 +19,16 @@ def is_loopback(endpoint: str) -> bool:
     return _LOOPBACK.fullmatch(endpoint) is not None
 
 
+def check_endpoint(text: str) -> None:
+    """Check that a text names an endpoint.
+
+    Raises:
+        ValueError: It does not.
+    """
+    if _ENDPOINT.fullmatch(text) is None:
+        raise ValueError(f"must be an endpoint such as {DEFAULT_ENDPOINT}, got {text!r}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class NetworkSettings:
     """How a process that connects to the hub finds it.
@@ -30,11 +40,13 @@ class NetworkSettings:
     listen: tuple[str, ...] = field(
         default=(),
         metadata={
-            "help": f"be the hub the others connect to, on these endpoints, such as {DEFAULT_ENDPOINT}"
+            "help": f"be the hub the others connect to, on these endpoints, such as {DEFAULT_ENDPOINT}",
+            "takes": check_endpoint,
         },
     )
     connect: tuple[str, ...] = field(
-        default=(DEFAULT_ENDPOINT,), metadata={"help": "endpoints of the hub to connect to"}
+        default=(DEFAULT_ENDPOINT,),
+        metadata={"help": "endpoints of the hub to connect to", "takes": check_endpoint},
     )
     zenoh_config: Path | None = field(
         default=None,
@@ -44,10 +56,10 @@ class NetworkSettings:
     def __post_init__(self) -> None:
         for name in ("listen", "connect"):
             for endpoint in getattr(self, name):
-                if _ENDPOINT.fullmatch(endpoint) is None:
-                    raise ValueError(
-                        f"{name} must be an endpoint such as {DEFAULT_ENDPOINT}, got {endpoint!r}"
-                    )
+                try:
+                    check_endpoint(endpoint)
+                except ValueError as err:
+                    raise ValueError(f"{name} {err}") from err
         if not self.listen and not self.connect:
             raise ValueError("listen or connect must name an endpoint, got neither")
 
@@ -64,8 +76,10 @@ class HubSettings(NetworkSettings):
     """The same for the process that is the hub unless told otherwise: the server."""
 
     listen: tuple[str, ...] = field(
-        default=(DEFAULT_ENDPOINT,), metadata={"help": "endpoints agent and channel connect to"}
+        default=(DEFAULT_ENDPOINT,),
+        metadata={"help": "endpoints agent and channel connect to", "takes": check_endpoint},
     )
     connect: tuple[str, ...] = field(
-        default=(), metadata={"help": "endpoints of another Zenoh router to join"}
+        default=(),
+        metadata={"help": "endpoints of another Zenoh router to join", "takes": check_endpoint},
     )

@@ -24,6 +24,7 @@ from semcast.commands.agent import settings_of
 from semcast.commands.doctor import check_packages, check_processor
 from semcast.commands.evaluate import EVALUATIONS
 from semcast.commands.running import read_given, read_settings, run_until_stopped
+from semcast.common.argument_order import arguments_last
 from semcast.common.config import to_toml
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.transport import free_endpoint, open_hub
@@ -51,6 +52,22 @@ def parser_of(verb, *words):
         if isinstance(action, argparse._SubParsersAction):
             return action.choices[words[0]]
     return parser
+
+
+@pytest.mark.parametrize(
+    ("text", "cls", "expected"),
+    [
+        ("record --connect tcp/a:1 mine.mcap", RecordSettings, {"file": Path("mine.mcap")}),
+        ("replay --distortion 0 -0.1 0 0 mine.mcap", ReplaySettings, {"file": Path("mine.mcap")}),
+        ("channel --connect tcp/a:1 set --snr-db 3", EmulatorSettings, {"link": {"snr_db": 3.0}}),
+    ],
+)
+def test_file_and_action_may_stand_behind_flags_with_several_values(text, cls, expected):
+    verb, *words = text.split()
+    parser = verb_parser(verb)
+    arguments = parser.parse_args(arguments_last(parser, words))
+    assert expected.items() <= read_given(cls, arguments).items()
+    assert getattr(arguments, "action", "set") == "set"
 
 
 def sample(action):

@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Sequence
 
 from semcast import SemcastError, __version__
+from semcast.common.argument_order import arguments_last
 from semcast.common.config import MissingSettingError, near_match
 
 #: verb -> (module in semcast.commands, one line of help)
@@ -99,7 +100,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in words
     handler = _configure_logging(debug)
     try:
-        arguments = verb_parser(verb).parse_args(words[1:])
+        parser = verb_parser(verb)
+        arguments = parser.parse_args(arguments_last(parser, words[1:]))
         return int(arguments.command(arguments))
     except MissingSettingError as err:
         print(f"semcast {verb}: {err}", file=sys.stderr)
