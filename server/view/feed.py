@@ -5,8 +5,6 @@ be missing, frozen, killed or late: the second thread waits for it and then send
 """
 
 import logging
-import os
-import sys
 import threading
 import time
 from collections import deque
@@ -18,7 +16,7 @@ from semcast.common.errors import ConfigError
 from semcast.common.trajectory import Trajectory
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.settings import ViewSettings
-from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
+from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary, window_display
 from semcast.server.view.rerun_viewer import Delivery, RerunStream
 from semcast.server.view.scene import Cursor, FrameView, Scene, compress_picture
 
@@ -37,23 +35,23 @@ def resolve_view(view: str, *, has_folder: bool) -> str:
     """Turn ``auto`` into ``native`` where a window can open, else ``file`` or ``none``; others stay."""
     if view != "auto":
         return view
-    windowed = sys.platform in ("darwin", "win32") or bool(
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    )
-    return "native" if windowed else "file" if has_folder else "none"
+    return "native" if window_display() else "file" if has_folder else "none"
 
 
 def check_view(settings: ViewSettings, *, has_folder: bool) -> None:
     """Check early that what is asked for can be shown.
 
     Raises:
-        ConfigError: ``file`` without an output folder, or no viewer is installed.
+        ConfigError: ``file`` without an output folder, ``native`` without a display, or no viewer at all.
     """
     view = resolve_view(settings.view, has_folder=has_folder)
     if view == "file" and not has_folder:
         raise ConfigError("view file needs an output folder: give --out DIR")
     if view in ("native", "web"):
         rerun_binary()
+    # A viewer that listens already may have its window on another machine, behind a tunnel.
+    if view == "native" and window_display() is None and not is_listening(settings.port):
+        raise ConfigError("no display: use --view web or --view file")
 
 
 class ViewerFeed:
@@ -100,7 +98,8 @@ class ViewerFeed:
         self._last_picture_s = -1e9
         self._last_align_s = -1e9
         self.num_connections = 0
-        check_view(settings, has_folder=file is not None)
+        if process is None:
+            check_view(settings, has_folder=file is not None)
         view = resolve_view(settings.view, has_folder=file is not None)
         self._file = self._open_stream(file) if file is not None else None
         self._process = process

@@ -10,6 +10,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -36,6 +37,13 @@ def rerun_binary() -> Path:
         if spec is not None and (folder / name).exists():
             return folder / name
     raise ConfigError("no Rerun viewer is installed: pip install 'semcast[server]', or use --view none")
+
+
+def window_display() -> str | None:
+    """Return where a window can open: the display's name, or None on a machine without one."""
+    if sys.platform in ("darwin", "win32"):
+        return sys.platform
+    return os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY") or None
 
 
 def is_listening(port: int, timeout_s: float = 0.2) -> bool:

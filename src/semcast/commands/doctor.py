@@ -3,7 +3,6 @@
 import argparse
 import importlib.metadata
 import importlib.util
-import os
 import platform
 import shutil
 import socket
@@ -17,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from semcast.common.cores import usable_cores
+from semcast.server.view.process import window_display
 
 Verdict = Literal["good", "note", "bad"]
 _STYLE = {"good": "green", "note": "yellow", "bad": "red"}
@@ -115,11 +115,11 @@ def check_viewer() -> Iterator[Finding]:
         "good" if program else "note",
         program or "not on PATH: --view native and web can't start",
     )
-    display = os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY")
-    if sys.platform.startswith("linux") and not display:
+    display = window_display()
+    if display is None:
         yield Finding("display", "note", "none: use --view web, or --view file and open run.rrd elsewhere")
     else:
-        yield Finding("display", "good", display or sys.platform)
+        yield Finding("display", "good", display)
 
 
 def check_port(port: int) -> Iterator[Finding]:

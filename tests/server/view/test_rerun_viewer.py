@@ -18,7 +18,7 @@ from semcast.server.view.scene import FrameView
 
 pytest.importorskip("rerun")
 
-from semcast.server.view.feed import ViewerFeed, resolve_view
+from semcast.server.view.feed import ViewerFeed, check_view, resolve_view
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
 
 CAMERA = Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -119,15 +119,31 @@ def test_file_mode_without_a_folder_is_a_clear_error():
         ViewerFeed(ViewSettings(view="file"), CAMERA, "x")
 
 
-def test_auto_opens_a_window_only_where_there_is_a_display(monkeypatch):
+@pytest.fixture
+def no_display(monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.delenv("DISPLAY", raising=False)
+
+
+def test_auto_opens_a_window_only_where_there_is_a_display(monkeypatch, no_display):
     assert resolve_view("auto", has_folder=True) == "file"
     assert resolve_view("auto", has_folder=False) == "none"
     monkeypatch.setenv("DISPLAY", ":7")
     assert resolve_view("auto", has_folder=False) == "native"
     assert resolve_view("web", has_folder=False) == "web"
+
+
+def test_a_window_without_a_display_is_refused_unless_a_viewer_is_open_elsewhere(monkeypatch, no_display):
+    with socket.socket() as tunnel:
+        tunnel.bind(("127.0.0.1", 0))
+        settings = ViewSettings(view="native", port=tunnel.getsockname()[1])
+        with pytest.raises(ConfigError, match="^no display: use --view web or --view file$"):
+            check_view(settings, has_folder=True)
+        tunnel.listen()
+        check_view(settings, has_folder=True)
+    monkeypatch.setenv("DISPLAY", ":7")
+    check_view(settings, has_folder=True)
 
 
 def test_a_killed_viewer_is_back_soon_and_gets_the_stream_again(feed_and_proxy):
