@@ -85,6 +85,7 @@ class _Captured:
                 raise SourceError(
                     f"intrinsics are for {camera.width}x{camera.height} images, {name} gives {width}x{height}"
                 )
+            camera.check_possible(name)
             self._size_wh = resized_wh(width, height, settings.resize)
         except SourceError:
             self.close()

@@ -16,6 +16,9 @@ from semcast.common.lens import DISTORTION_COUNTS, check_pinhole, distortion_in
 
 Array = NDArray[np.float64]
 
+#: Side of an image in focal lengths at most: a view of 2 atan(6), 161 degrees.
+_MAX_SIZE_PER_FOCAL = 12.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics:
@@ -57,6 +60,27 @@ class Intrinsics:
                 raise ValueError(f"{name} must be at least 1 pixel, got {getattr(self, name)}")
         if len(self.distortion) not in DISTORTION_COUNTS or not np.all(np.isfinite(self.distortion)):
             raise ValueError(f"distortion must be 0, 4, 5 or 8 finite values, got {self.distortion}")
+
+    def check_possible(self, name: str) -> None:
+        """Check that a camera can be like that, for those who read what a user gave.
+
+        Args:
+            name: What the intrinsics belong to, for the message.
+
+        Raises:
+            SourceError: The principal point is outside the image, or the view wider than that of a pinhole.
+        """
+        wrong = f"intrinsics of {name} are not valid"
+        for axis, centre, size in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
+            if not -0.5 <= centre <= size - 0.5:
+                raise SourceError(f"{wrong}: {axis} must be in [-0.5, {size - 0.5}], got {centre:g}")
+        for axis, focal_px, size in (("fx", self.fx, self.width), ("fy", self.fy, self.height)):
+            least_px = size / _MAX_SIZE_PER_FOCAL
+            if focal_px < least_px:
+                raise SourceError(
+                    f"{wrong}: {axis} must be at least {least_px:.1f} for images of {self.width}x"
+                    f"{self.height} (a view of 160 degrees), got {focal_px:g}; focal lengths are in pixels"
+                )
 
     @property
     def K(self) -> Array:

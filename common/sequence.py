@@ -394,6 +394,8 @@ def open_sequence(
             f"intrinsics of {files.name} are for {camera.width}x{camera.height} images, "
             f"its images are {width}x{height}"
         )
+    if camera is not None:
+        camera.check_possible(files.name)
     stop = None if max_frames is None else max_frames * stride
     return Sequence(files, camera, (width, height), resize, slice(None, stop, stride))
 

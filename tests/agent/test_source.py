@@ -290,6 +290,8 @@ def test_a_video_needs_a_camera_that_fits(video, tmp_path):
     )
     with pytest.raises(SourceError, match="intrinsics are for 640x480 images, .* gives 64x48"):
         open_source(fast(beside))
+    with pytest.raises(SourceError, match=r"of .*steps.avi are not valid: cx must be in \[-0.5, 63.5\]"):
+        open_source(fast(video, camera=CameraSettings(fx=50.0, fy=50.0, cx=5000.0, cy=23.5)))
     (tmp_path / "steps.json").write_text('{"title": "a film"}')
     with pytest.raises(SourceError, match="steps.json: intrinsics need .*, missing 'fx'"):
         open_source(fast(beside))

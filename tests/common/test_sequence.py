@@ -1,3 +1,5 @@
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -134,6 +136,31 @@ def test_a_folder_of_images_needs_a_camera_only_when_it_is_asked_for_one(tmp_pat
         _ = sequence.intrinsics
     given = CameraSettings(fx=30.0, fy=31.0, cx=15.5, cy=11.5)
     assert open_sequence(tmp_path, given).intrinsics == CAMERA
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cx": 5000.0}, r"cx must be in \[-0.5, 31.5\], got 5000"),
+        ({"cy": -1.0}, r"cy must be in \[-0.5, 23.5\], got -1"),
+        ({"fx": 1.0, "fy": 1.0}, "fx must be at least 2.7 for images of 32x24 .*, got 1; .* in pixels"),
+        ({"fy": 1.9}, "fy must be at least 2.0 for images of 32x24 .*, got 1.9; .* in pixels"),
+    ],
+)
+def test_a_camera_that_can_not_be_is_refused(native, change, message):
+    camera = {**CAMERA.to_dict(), **change}
+    (native / "intrinsics.json").write_text(json.dumps(camera))
+    with pytest.raises(SourceError, match=f"intrinsics of .* are not valid: {message}"):
+        open_sequence(native)
+    given = CameraSettings(**{name: camera[name] for name in ("fx", "fy", "cx", "cy")})
+    with pytest.raises(SourceError, match=message):
+        open_sequence(native, given, resize=0.5)
+
+
+def test_a_wide_camera_with_its_principal_point_in_a_corner_is_taken(native):
+    given = CameraSettings(fx=2.7, fy=2.0, cx=-0.5, cy=23.5)
+    sequence = open_sequence(native, given, resize=0.5)
+    assert (sequence.intrinsics.cx, sequence.intrinsics.cy) == (-0.5, 11.5)
 
 
 def damage_missing(folder):
