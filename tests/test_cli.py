@@ -1,10 +1,14 @@
 import subprocess
 import sys
 import time
+import tomllib
+from pathlib import Path
 
 import pytest
 
 from semcast.cli import VERBS, main, verb_parser
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_help_lists_every_verb_and_answers_at_once():
@@ -77,3 +81,23 @@ def test_a_missing_file_is_named_once(tmp_path, capsys):
     file = tmp_path / "nope.mcap"
     assert main(["replay", str(file)]) == 1
     assert capsys.readouterr().err == f"semcast replay: {file} can't be read: No such file or directory\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "package", "extra"),
+    [
+        (["onnx", "3dcsc-lite"], "onnx", "train"),
+        (["train"], "torch", "train"),
+        (["replay", "some.mcap"], "gtsam", "server"),
+    ],
+)
+def test_a_missing_package_is_named_with_the_extra_that_has_it(words, package, extra, monkeypatch, capsys):
+    def import_module(name):
+        raise ModuleNotFoundError(f"No module named {package!r}", name=package)
+
+    monkeypatch.setattr("importlib.import_module", import_module)
+    assert main(words) == 1
+    assert f"the package '{package}' is not installed; " in (err := capsys.readouterr().err)
+    assert f"'semcast[{extra}]'" in err
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert any(requirement.startswith(package + ">") for requirement in extras[extra])

@@ -35,6 +35,9 @@ VERBS: dict[str, tuple[str, str]] = {
     "doctor": ("doctor", "check this machine and a running system, and say what to mend"),
 }
 
+#: verb -> extra of the package with all it needs; of verbs that are not named it is ``server``.
+_EXTRAS = {"agent": "agent", "train": "train", "onnx": "train"}
+
 EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
@@ -116,7 +119,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         print(
             f"semcast {verb}: the package {err.name!r} is not installed; "
-            f"install semcast with the extra this verb needs, such as 'semcast[server]'",
+            f"install semcast with the extra this verb needs: 'semcast[{_EXTRAS.get(verb, 'server')}]'",
             file=sys.stderr,
         )
         return EXIT_ERROR
