@@ -103,7 +103,7 @@ def find_layout(path: Path) -> Layout:
     """Tell the layout of a folder or transforms file.
 
     Raises:
-        SourceError: There is no such folder, or it holds nothing known.
+        SourceError: There is no such file or folder, or it holds nothing known.
     """
     _check_there(path)
     if path.is_file():
@@ -168,7 +168,7 @@ def _check_there(path: Path) -> None:
                 f"videos go through 'semcast agent --source {path}'"
             )
     elif not path.is_dir():
-        raise SourceError(f"no sequence at {path}: there is no such folder")
+        raise SourceError(f"no sequence at {path}: there is no such file or folder")
 
 
 def images_in(folder: Path) -> tuple[Path, ...]:

@@ -301,7 +301,7 @@ def test_what_can_not_be_opened_is_said(tmp_path):
     (tmp_path / "notes.txt").write_text("no video")
     with pytest.raises(SourceError, match=r"video .*notes.txt can't be opened"):
         open_source(fast(tmp_path / "notes.txt", camera=PINHOLE))
-    with pytest.raises(SourceError, match="there is no such folder"):
+    with pytest.raises(SourceError, match="there is no such file or folder"):
         open_source(fast(tmp_path / "nowhere"))
 
 
@@ -316,7 +316,7 @@ def test_a_number_is_a_camera_unless_something_has_that_name(recording, tmp_path
 @pytest.mark.parametrize("text", ["2²", "²", "٣", "20240101123000"])
 def test_what_only_looks_like_a_camera_number_is_a_folder(text):
     assert not is_camera_number(text)
-    with pytest.raises(SourceError, match=f"no sequence at {text}: there is no such folder"):
+    with pytest.raises(SourceError, match=f"no sequence at {text}: there is no such file or folder"):
         open_source(fast(text))
 
 

@@ -298,7 +298,7 @@ def test_a_source_that_fails_ends_the_agent_with_its_error(bench, tmp_path):
     settings = AgentSettings(source=SourceSettings(source=str(tmp_path / "nowhere")), network=bench.network)
     failing = bench._thread(lambda stop: run_agent(settings, stop, bench.codec))
     failing.join(40)
-    assert "there is no such folder" in str(failing.error)
+    assert "there is no such file or folder" in str(failing.error)
 
 
 def test_a_last_frame_that_is_sent_again_is_counted_once(bench):

@@ -201,7 +201,7 @@ def damage_number(folder):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (damage_missing, "there is no such folder"),
+        (damage_missing, "there is no such file or folder"),
         (damage_empty, "expected images/ .native."),
         (damage_size, "intrinsics of walk are for 64x48 images, its images are 32x24"),
         (damage_all_images, "000000.png is not a readable image"),
