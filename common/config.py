@@ -32,7 +32,8 @@ class MissingSettingError(ConfigError):
 
 def near_match(word: str, allowed: list[str]) -> str:
     """Return ``", did you mean 'x'?"`` for a close name in ``allowed``, or an empty string."""
-    close = difflib.get_close_matches(word, allowed, n=1, cutoff=0.5)
+    # "snr" is close to "snr_db" (0.67), and "resize" to "trace_file" (0.5) is not.
+    close = difflib.get_close_matches(word, allowed, n=1, cutoff=0.65)
     return f", did you mean {close[0]!r}?" if close else ""
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import pytest
 
-from semcast.common.config import MissingSettingError, build_settings, to_toml
+from semcast.common.config import MissingSettingError, build_settings, near_match, to_toml
 from semcast.common.config_flags import add_flags, given_values, settings_from
 from semcast.common.errors import ConfigError
 
@@ -110,6 +110,12 @@ def test_an_unknown_key_is_an_error_with_a_hint(tmp_path):
 def test_a_bad_value_is_named_with_what_was_allowed(values, message):
     with pytest.raises(ConfigError, match=message):
         build_settings(Node, values)
+
+
+def test_only_a_close_name_is_proposed():
+    names = ["trace_file", "snr_db", "seed"]
+    assert near_match("snr", names) == ", did you mean 'snr_db'?"
+    assert near_match("resize", names) == ""
 
 
 def test_a_broken_file_is_one_clear_error(tmp_path):
