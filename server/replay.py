@@ -192,6 +192,8 @@ def replay(
             processed += 1
             if on_frame is not None:
                 on_frame(arrival.message.frame_id)
+        if not processed and not drops and not stop.is_set():
+            raise SourceError(_none_in_part(reader, stream, settings))
         if not processed:
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
         try:
@@ -223,13 +225,21 @@ def _process(session: Session, decoded: DecodedArrival, drops: dict[str, int]) -
     )
 
 
-def _arrivals(
+def _none_in_part(reader: RecordingReader, stream: RecordedStream, settings: ReplaySettings) -> str:
+    """Say that no frame lies between ``start_s`` and ``end_s``, and how long the stream is."""
+    last_s = max((t_s for t_s, _ in _frames(reader, stream, settings)), default=None)
+    if last_s is None:
+        return f"{settings.file} holds no {settings.source} frames that can be read"
+    end = "" if settings.end_s is None else f" and before {settings.end_s:g} s"
+    return f"no frame of {settings.file} lies after {settings.start_s:g} s{end}: it is {last_s:.1f} s long"
+
+
+def _frames(
     reader: RecordingReader, stream: RecordedStream, settings: ReplaySettings
-) -> Iterator[ReceivedFrame]:
-    """Yield the frames of the stream in order, each once."""
+) -> Iterator[tuple[float, SymbolFrame]]:
+    """Yield the frames of the stream in order, each once, with its time in seconds since the first one."""
     camera = stream.camera
     direction = "rx" if settings.source == "received" else "tx"
-    link = Link(settings.link, settings.seed) if direction == "tx" else None
     last_id, first_ns = -1, None
     for message in reader.messages(frozenset({"symbols"})):
         try:
@@ -254,13 +264,21 @@ def _arrivals(
             continue
         last_id = frame.frame_id
         first_ns = frame.t_source_ns if first_ns is None else first_ns
-        t_s = (frame.t_source_ns - first_ns) * 1e-9
+        yield (frame.t_source_ns - first_ns) * 1e-9, frame
+
+
+def _arrivals(
+    reader: RecordingReader, stream: RecordedStream, settings: ReplaySettings
+) -> Iterator[ReceivedFrame]:
+    """Yield the frames that are replayed, as they arrive."""
+    link = Link(settings.link, settings.seed) if settings.source == "transmitted" else None
+    for t_s, frame in _frames(reader, stream, settings):
         if t_s < settings.start_s or (settings.end_s is not None and t_s > settings.end_s):
             continue
         slots, lost, snr_db_set = _on_the_air(frame, link, t_s)
         arrival = ReceivedFrame(
             message=frame,
-            camera=camera,
+            camera=stream.camera,
             received=None,
             snr_db=None,
             snr_db_set=snr_db_set,
