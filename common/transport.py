@@ -7,6 +7,7 @@ order, the sender waits. All payloads are bytes; what they mean is ``wire``'s bu
 
 import atexit
 import contextlib
+import errno
 import json
 import logging
 import socket
@@ -365,9 +366,8 @@ def open_session(
             return Session(zenoh.open(config))
         except zenoh.ZError as err:
             where = ", ".join(network.listen)
-            raise TransportError(
-                f"can't listen on {where}, perhaps something already does: {_first_line(err)}"
-            ) from err
+            hint = ", perhaps something already does" if _says_in_use(err) else ""
+            raise TransportError(f"can't listen on {where}{hint}: {_first_line(err)}") from err
     started_s = time.monotonic()
     told = False
     while stop is None or not stop.is_set():
@@ -391,6 +391,11 @@ def _pause(stop: threading.Event | None) -> None:
         time.sleep(0.1)
     else:
         stop.wait(0.1)
+
+
+def _says_in_use(err: zenoh.ZError) -> bool:
+    """Tell whether an address is taken: a port, or the lock of a socket file."""
+    return f"os error {errno.EADDRINUSE}" in str(err) or "acquire lock: EAGAIN" in str(err)
 
 
 def _first_line(err: Exception) -> str:

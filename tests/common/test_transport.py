@@ -213,6 +213,17 @@ def test_nobody_there_and_a_port_in_use_are_said(hub):
         open_session(NetworkSettings(listen=(hub[1],), connect=()))
 
 
+def test_only_an_address_in_use_is_said_to_be_in_use(tmp_path):
+    with pytest.raises(TransportError, match="^can't listen on tcp/127.0.0.1:80000: invalid port value$"):
+        open_session(NetworkSettings(listen=("tcp/127.0.0.1:80000",), connect=()))
+    socket_file = NetworkSettings(listen=(f"unixsock-stream/{tmp_path / 'hub'}",), connect=())
+    with (
+        open_session(socket_file),
+        pytest.raises(TransportError, match="can't listen on unixsock-.*perhaps something already does"),
+    ):
+        open_session(socket_file)
+
+
 def test_a_program_that_forgets_to_close_still_ends_cleanly():
     program = (
         "from semcast.common.transport import open_hub\n"
