@@ -139,7 +139,7 @@ def test_a_folder_of_photos_says_what_is_missing(tmp_path):
     write_images(tmp_path, 3)
     text = text_of(tmp_path)
     assert "images: 3, 64x48 px" in text
-    assert "camera: unknown" in text
+    assert "camera: unknown: put intrinsics.json" in text
     assert "intrinsics.json" in text
 
 

@@ -7,7 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from semcast.common.errors import CheckpointError, SemcastError, SourceError
+from semcast.common.camera_settings import HOW_TO_GIVE
+from semcast.common.errors import CheckpointError, SourceError
 from semcast.common.recording_reader import RECORDING_METADATA, RecordingReader
 from semcast.common.run_folder import (
     FRAMES_NAME,
@@ -183,8 +184,8 @@ def describe_sequence(path: Path) -> list[Section]:
                 f"fx {camera.fx:.1f} fy {camera.fy:.1f} cx {camera.cx:.1f} cy {camera.cy:.1f} px{distortion}",
             )
         )
-    except SemcastError as err:
-        facts.append(("camera", f"unknown: {err}"))
+    except SourceError:
+        facts.append(("camera", f"unknown: {HOW_TO_GIVE}"))
     truth = sequence.groundtruth()
     facts.append(("true path", "none" if truth is None else f"{len(truth)} poses, {truth.path_length:.2f} m"))
     return [(f"sequence {path}", facts)]
