@@ -1,9 +1,12 @@
+import os
 import subprocess
 import sys
 import time
 import tomllib
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from semcast.cli import VERBS, main, verb_parser
@@ -101,3 +104,20 @@ def test_a_missing_package_is_named_with_the_extra_that_has_it(words, package, e
     assert f"'semcast[{extra}]'" in err
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert any(requirement.startswith(package + ">") for requirement in extras[extra])
+
+
+def test_a_damaged_image_is_told_by_us_and_by_opencv_only_on_request(tmp_path):
+    (tmp_path / "images").mkdir()
+    whole = cv2.imencode(".png", np.arange(48 * 64 * 3, dtype=np.uint8).reshape(48, 64, 3))[1].tobytes()
+    for name, content in (("0.png", whole), ("1.png", whole[: len(whole) // 2])):
+        (tmp_path / "images" / name).write_bytes(content)
+    words = [sys.executable, "-m", "semcast", "info", str(tmp_path)]
+    own = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV_")}
+    for env, debug, is_told in (
+        (own, [], False),
+        (own, ["--debug"], True),
+        ({**own, "OPENCV_LOG_LEVEL": "INFO"}, [], True),
+    ):
+        shown = subprocess.run([*words, *debug], capture_output=True, text=True, check=True, env=env)
+        assert "1 of these images" in shown.stdout
+        assert ("[ WARN:" in shown.stderr) == is_told

@@ -7,6 +7,7 @@ Only the chosen verb is imported, so ``semcast --help`` answers without torch, g
 import argparse
 import importlib
 import logging
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -77,6 +78,15 @@ def _configure_logging(debug: bool) -> logging.Handler:
     return handler
 
 
+def _quieten_opencv() -> None:
+    """Keep OpenCV's and FFmpeg's own lines, which our messages say in words, off the terminal.
+
+    OpenCV reads this when a verb imports it. What the user has set holds.
+    """
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
+
+
 def _plain(err: SemcastError) -> str:
     """Return an error in words: what the system said of a file without its number and the file again."""
     cause = err.__cause__
@@ -102,6 +112,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_USAGE
     debug = "--debug" in words
     handler = _configure_logging(debug)
+    if not debug:
+        _quieten_opencv()
     try:
         parser = verb_parser(verb)
         arguments = parser.parse_args(arguments_last(parser, words[1:]))
