@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from semcast import demo
+from semcast.commands.demo import summary_table
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recording_reader import RecordingReader
@@ -185,3 +186,13 @@ def test_an_agent_that_gives_up_ends_the_demo_with_what_came_out_so_far(tmp_path
     assert "images" in error
     assert summary is not None
     assert summary["frames"]["tracked"] > 0
+
+
+@pytest.mark.parametrize(
+    ("value", "told"), [(0.003312, "0.00331 m"), (12.345, "12.3 m"), (1234.5, "1230 m"), (0.0, "0 m")]
+)
+def test_errors_are_shown_with_three_digits(value, told):
+    table = summary_table({"completeness": 0.98765, "ate_rmse_m": value, "ate_percent": None})
+    names, values = ([str(cell) for cell in column.cells] for column in table.columns)
+    assert values == ["98.8%", told]
+    assert len(names) == 2

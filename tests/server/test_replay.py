@@ -16,6 +16,7 @@ from semcast.agent.source_settings import SourceSettings
 from semcast.channel.emulator import run_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
+from semcast.cli import main
 from semcast.common.codecs import load_codec
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import ConfigError, SourceError
@@ -110,6 +111,15 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
     replay(lossy)
     assert (tmp_path / "c" / "trajectory.tum").read_bytes() != first
     assert build_settings(ReplaySettings, read_toml(tmp_path / "c" / "settings.toml")) == lossy
+
+
+def test_the_command_shows_what_is_known_and_names_its_files(recording, tmp_path, capsys):
+    assert main(["replay", str(recording), "--out", str(tmp_path / "out"), "--end-s", "0.6"]) == 0
+    shown = capsys.readouterr().out
+    assert "frames with a pose" in shown
+    assert "error" not in shown, "there is no truth"
+    names = "trajectory.tum, map.ply, reconstruction.npz, summary.json, settings.toml"
+    assert shown.endswith(f"in {tmp_path / 'out'}: {names}\n")
 
 
 def test_a_part_is_measured_by_the_way_that_was_gone(recording):

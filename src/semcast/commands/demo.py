@@ -2,7 +2,7 @@
 
 import argparse
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rich.console import Console
@@ -15,15 +15,21 @@ from semcast.demo import DemoSettings, default_sequence, run_demo
 from semcast.evaluation.report import provenance, write_json
 from semcast.server.export.parts import parts_line
 
-#: Rows of the final table: key of the summary, name, format.
-_FIGURES = (
-    ("completeness", "frames with a pose", "{:.1%}"),
-    ("ate_rmse_m", "position error (ATE RMSE after Sim(3))", "{:.2f} m"),
-    ("ate_percent", "  in percent of the path", "{:.2f} %"),
-    ("rpe_trans_percent", "step error, translation", "{:.2f} %"),
-    ("rpe_rot_deg", "step error, rotation", "{:.3f} deg"),
-    ("psnr_db", "image quality (PSNR)", "{:.2f} dB"),
-    ("num_landmarks", "landmarks", "{:d}"),
+
+def _measure(unit: str) -> Callable[[float], str]:
+    """Return what writes a value with three digits that count, and its unit."""
+    return lambda value: f"{float(f'{value:.3g}'):g} {unit}"
+
+
+#: Rows of the final table: key of the summary, name, what writes the value.
+_FIGURES: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
+    ("completeness", "frames with a pose", "{:.1%}".format),
+    ("ate_rmse_m", "position error (ATE RMSE after Sim(3))", _measure("m")),
+    ("ate_percent", "  in percent of the path", _measure("%")),
+    ("rpe_trans_percent", "step error, translation", _measure("%")),
+    ("rpe_rot_deg", "step error, rotation", _measure("deg")),
+    ("psnr_db", "image quality (PSNR)", "{:.2f} dB".format),
+    ("num_landmarks", "landmarks", str),
 )
 
 
@@ -33,13 +39,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def summary_table(summary: Mapping[str, Any]) -> Table:
-    """Return the figures of a run as a table."""
+    """Return the figures of a run as a table; what is not known, as errors without a truth, has no row."""
     table = Table(title="what came out", show_header=False, title_justify="left")
-    for key, name, form in _FIGURES:
+    for key, name, written in _FIGURES:
         value = summary.get(key)
         if isinstance(value, Mapping):
             value = value.get("p50", value.get("mean"))
-        table.add_row(name, "-" if value is None else form.format(value))
+        if value is not None:
+            table.add_row(name, written(value))
     if line := parts_line(summary.get("parts") or []):
         table.add_row("parts of the map", line)
     for reason, count in (summary.get("drops") or {}).items():
