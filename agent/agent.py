@@ -219,7 +219,7 @@ def _wait_for_peers(session: Session, agent_id: str, stop: threading.Event) -> N
 
     session.watch_alive(agent_id, on_change)
     if not both.wait(0.5):
-        logger.info("waiting for %s", " and ".join(sorted(missing)))
+        logger.info("waiting for %s of %r (another --agent-id?)", " and ".join(sorted(missing)), agent_id)
     while not stop.is_set() and not both.wait(_POLL_S):
         pass
 

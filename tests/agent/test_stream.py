@@ -261,9 +261,11 @@ def test_a_restarted_agent_is_followed_at_once(bench, until):
     assert second.result["agent_epoch"] == after[0].message.agent_epoch
 
 
-def test_an_agent_waits_for_the_others_unless_told_not_to(bench, until):
+def test_an_agent_waits_for_the_others_unless_told_not_to(bench, until, caplog):
+    caplog.set_level("INFO")
     waiting = bench.agent(source={"repeat": "loop"})
-    until(lambda: "agent" in bench.hub.alive_roles("agent0"))
+    until(lambda: "waiting for channel and server of 'agent0' (another --agent-id?)" in caplog.text)
+    assert "agent" in bench.hub.alive_roles("agent0")
     channel = bench.channel()
     until(lambda: "channel" in bench.hub.alive_roles("agent0"))
     assert bench.codec.snrs_db == []
