@@ -36,7 +36,7 @@ from semcast.server.checkpoint import (
     load_checkpoint,
     mismatch,
 )
-from semcast.server.export.outputs import trajectory_of, versions, write_json, write_ply
+from semcast.server.export.outputs import EachFile, trajectory_of, versions, write_json, write_ply
 from semcast.server.export.parts import frame_parts, landmark_parts
 from semcast.server.former_run import set_aside
 from semcast.server.frame_views import frame_view
@@ -347,10 +347,20 @@ class Session:
             complete: The source came to its end, so all its frames count for completeness.
 
         Raises:
-            OSError: A file can't be written.
+            OSError: Files can't be written; the others are.
             SemcastError: The rows of the run can't be read back.
         """
-        results = self.write_results(folder)
+        with EachFile() as each:
+            results = self._write_results(folder, each)
+            summary = self._summary(results, drops, complete)
+            if folder is not None:
+                with each.attempt(folder / SUMMARY_NAME) as path:
+                    write_json(path, summary)
+            posed = summary["frames"]["posed"]
+            logger.log(logging.INFO if posed else logging.WARNING, "%s", run_line(summary))
+        return summary
+
+    def _summary(self, results: Results, drops: Mapping[str, int], complete: bool) -> dict[str, Any]:
         rows = self._record.rows()
         truth = self._reference.truth if self._reference is not None else None
         if truth is not None and rows:
@@ -375,18 +385,18 @@ class Session:
         summary["resumed"] = self.resumed
         summary["versions"] = versions()
         summary["settings"] = settings_to_dict(self._program)
-        if folder is not None:
-            write_json(folder / SUMMARY_NAME, summary)
-        posed = summary["frames"]["posed"]
-        logger.log(logging.INFO if posed else logging.WARNING, "%s", run_line(summary))
         return summary
 
     def write_results(self, folder: Path | None) -> Results:
         """Write trajectory, map and reconstruction; return what there is.
 
         Raises:
-            OSError: A file can't be written.
+            OSError: Files can't be written; the others are.
         """
+        with EachFile() as each:
+            return self._write_results(folder, each)
+
+    def _write_results(self, folder: Path | None, each: EachFile) -> Results:
         poses = self._reconstruction.final_trajectory()
         snapshot = self._reconstruction.snapshot()
         part_of = frame_parts(snapshot)
@@ -397,9 +407,12 @@ class Session:
         if folder is None:
             return results
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / SETTINGS_NAME).write_text(to_toml(self._program), encoding="utf-8")
-        write_tum(folder / TRAJECTORY_NAME, trajectory)
-        write_ply(folder / MAP_NAME, xyz, rgb, confidence)
+        with each.attempt(folder / SETTINGS_NAME) as path:
+            path.write_text(to_toml(self._program), encoding="utf-8")
+        with each.attempt(folder / TRAJECTORY_NAME) as path:
+            write_tum(path, trajectory)
+        with each.attempt(folder / MAP_NAME) as path:
+            write_ply(path, xyz, rgb, confidence)
         timed = sorted(frame_id for frame_id in poses if frame_id in self._t_source_ns)
         used = np.isin(landmark_ids, ids) & np.isin(keyframe_ids, timed)
         try:

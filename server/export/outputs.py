@@ -1,12 +1,14 @@
-"""File formats of what a run leaves behind: PLY map, timed trajectory, JSON without NaN."""
+"""What a run leaves behind: its files, each on its own, as PLY map, timed trajectory, JSON without NaN."""
 
 import json
 import math
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +32,34 @@ PLY_VERTEX = np.dtype(
     ]
 )
 _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
+
+
+class EachFile:
+    """Writes files each on its own: what can't be written costs no other, and is named when the block ends.
+
+    Raises:
+        OSError: At the end of the block, some files could not be written.
+    """
+
+    def __init__(self) -> None:
+        self._failures: list[str] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None and self._failures:
+            raise OSError("; ".join(self._failures))
+
+    @contextmanager
+    def attempt(self, path: Path) -> Iterator[Path]:
+        """Take note of a file that can't be written in the block."""
+        try:
+            yield path
+        except OSError as err:
+            self._failures.append(f"{path.name}: {err.strerror or err}")
 
 
 def write_ply(

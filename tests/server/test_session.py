@@ -12,6 +12,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.config import build_settings, read_toml
 from semcast.common.run_folder import FRAMES_NAME, read_image_paths, read_run
 from semcast.common.sequence import open_sequence
+from semcast.server.export.outputs import read_ply
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.reference import Reference
@@ -100,11 +101,13 @@ def run_session(demo, folder, frame_ids, epoch=5, program=None, **settings):
         now_ns = time.perf_counter_ns()
         frame = DecodedFrame(k, int(demo.times_ns[k]), picture(demo, k), None)
         session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}))
-    if killed:
-        session.save_checkpoint()
-    else:
-        session.write_outputs(folder, {}, complete=True)
-    session.close()
+    try:
+        if killed:
+            session.save_checkpoint()
+        else:
+            session.write_outputs(folder, {}, complete=True)
+    finally:
+        session.close()
     return session
 
 
@@ -225,6 +228,17 @@ def test_a_reset_after_a_resume_shows_nothing_of_the_map_before(demo, tmp_path):
         session.close()
     assert shown[0] >= 5
     assert shown[1] == 0
+
+
+def test_a_file_that_can_not_be_written_costs_no_other(demo, tmp_path):
+    for name in ("trajectory.tum", "summary.json"):
+        (tmp_path / name).mkdir()
+    message = "^trajectory.tum: Is a directory; summary.json: Is a directory$"
+    with pytest.raises(OSError, match=message):
+        run_session(demo, tmp_path, range(8))
+    assert len(read_run(tmp_path).frame_ids) >= 5
+    assert len(read_ply(tmp_path / "map.ply")) > 20
+    assert read_toml(tmp_path / "settings.toml")
 
 
 def test_the_records_hold_the_settings_of_the_program(demo, tmp_path):

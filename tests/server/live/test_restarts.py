@@ -77,7 +77,8 @@ def test_a_former_start_that_cannot_be_written_does_not_stop_the_new_one(tmp_pat
         radio.close()
     assert running.finish(stop=True)["frames"]["tracked"] == 4
     former = tmp_path / "previous-1"
-    assert f"outputs can't be written to {former}: [Errno 28] No space left on device" in caplog.text
+    assert f"outputs can't be written to {former}: map.ply: No space left on device" in caplog.text
+    assert json.loads((former / "summary.json").read_text())["frames"]["tracked"] == 6
     assert len((former / "frames.jsonl").read_text().splitlines()) == 6, "what was written is kept"
     assert len((tmp_path / "frames.jsonl").read_text().splitlines()) == 4
     assert running.server._metrics.counts["errors"] == 1
