@@ -76,7 +76,8 @@ def blueprint(has_truth: bool, has_confidence: bool) -> rrb.Blueprint:
         rrb.TimeSeriesView(
             name=name,
             origin=f"/plots/{origin}",
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
+            # At the right it would hide the newest values, at the bottom most durations.
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=origin != "error"),
             axis_y=rrb.ScalarAxis(zoom_lock=False),
         )
         for name, origin in (

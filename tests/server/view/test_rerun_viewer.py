@@ -20,6 +20,7 @@ pytest.importorskip("rerun")
 
 from semcast.server.view.feed import ViewerFeed, check_view, resolve_view
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
+from semcast.server.view.rerun_viewer import SERIES, blueprint
 
 CAMERA = Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
 DEADLINE_S = 20.0
@@ -112,6 +113,15 @@ def test_the_file_can_be_read_back_and_holds_everything(tmp_path):
         "/plots/drops/stale",
     ):
         assert entity in text, entity
+
+
+def test_a_plot_has_a_legend_where_it_has_several_curves():
+    _, plots = blueprint(has_truth=True, has_confidence=True).root_container.contents
+    assert len(plots.contents) == 5
+    for plot in plots.contents:
+        (is_shown,) = plot.properties["PlotLegend"].visible.as_arrow_array().to_pylist()
+        num_curves = sum(path.startswith(plot.origin.removeprefix("/plots/") + "/") for path in SERIES)
+        assert is_shown == (num_curves > 1 or plot.origin == "/plots/drops"), plot.name
 
 
 def test_file_mode_without_a_folder_is_a_clear_error():
