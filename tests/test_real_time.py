@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from semcast import real_time
 from semcast.common.errors import ConfigError
 from semcast.real_time import MAX_PIXELS, Plan, Speed, make_plan, measure_speed, plan_for
 
@@ -49,6 +50,18 @@ def test_the_work_is_timed_on_the_images_themselves():
     assert 0.0 < small.following_ms < large.following_ms
     flat = measure_speed("jpeg-ldpc", "16qam", np.full((64, 64, 3), 90, np.uint8))
     assert flat.following_ms > 0.0, "nothing to follow is no error"
+
+
+def test_cores_that_are_shared_promise_less(monkeypatch):
+    alone = {"coding": [40.0, 40.0], "following": [10.0, 10.0]}
+    shared = {"coding": [40.0, 120.0], "following": [10.0, 30.0]}
+    speeds = []
+    for ms in (alone, shared):
+        left = {name: list(values) for name, values in ms.items()}
+        monkeypatch.setattr(real_time, "_coding_ms", lambda _coder, _coded, left=left: left["coding"].pop())
+        monkeypatch.setattr(real_time, "_following_ms", lambda _image, left=left: left["following"].pop())
+        speeds.append(measure_speed("jpeg-ldpc", "16qam", noise(48, 48), num_cores=2))
+    assert speeds == [Speed(40.0, 10.0), Speed(60.0, 15.0)], "two cores do 1/40 + 1/120 images a millisecond"
 
 
 def test_the_plan_follows_from_a_measurement_in_a_process_of_its_own():

@@ -3,14 +3,14 @@
 import math
 import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.codec import Modulation, ReceivedImage
+from semcast.common.codec import Codec, Modulation, ReceivedImage
 from semcast.common.codecs import load_codec
 from semcast.common.cores import usable_cores
 from semcast.common.rate import NATIVE_RATE, RateChoice, to_coded
@@ -35,7 +35,7 @@ _SNR_DB = 10.0
 
 @dataclass(frozen=True)
 class Speed:
-    """What one core of this machine, as it is loaded now, needs for one image.
+    """What a core of this machine, as it is loaded now, needs for one image while the others work too.
 
     Attributes:
         coding_ms: Encoding and decoding.
@@ -90,22 +90,43 @@ def _resize_to(pixels: float, shape_hw: tuple[int, int]) -> float:
 
 
 def measure_speed(
-    codec: str, modulation: Modulation, image: NDArray[np.uint8], rate: RateChoice = NATIVE_RATE
+    codec: str,
+    modulation: Modulation,
+    image: NDArray[np.uint8],
+    rate: RateChoice = NATIVE_RATE,
+    num_cores: int = 1,
 ) -> Speed:
-    """Time the work on one image on one core, for a second or two.
+    """Time the work on one image on each of some cores at the same time, for a second or two.
+
+    Cores that work at the same time share caches, memory and what else runs on the machine: one core alone
+    would promise too much.
 
     Args:
         codec: Codec by name.
         modulation: How symbols travel.
         image: ``(H, W, 3)`` uint8 RGB, at the size at which it is sent.
         rate: Channel uses per pixel value; ``auto`` is taken for the native one.
+        num_cores: Cores to measure.
 
     Raises:
         ConfigError: The codec is unknown.
         CheckpointError: Its weights are missing or damaged.
     """
-    coder = load_codec(codec, modulation=modulation, num_threads=1)
     coded = to_coded(image, NATIVE_RATE if rate == "auto" else rate)
+    coders = [load_codec(codec, modulation=modulation, num_threads=1) for _ in range(num_cores)]
+    cv2.setNumThreads(1)
+    with ThreadPoolExecutor(num_cores) as pool:
+        coding_ms = list(pool.map(lambda coder: _coding_ms(coder, coded), coders))
+        following_ms = list(pool.map(_following_ms, [image] * num_cores))
+    return Speed(_mean_ms(coding_ms), _mean_ms(following_ms))
+
+
+def _mean_ms(times_ms: list[float]) -> float:
+    """Return the time in which all cores together do as many images as there are cores."""
+    return len(times_ms) / sum(1.0 / ms for ms in times_ms)
+
+
+def _coding_ms(coder: Codec, coded: NDArray[np.uint8]) -> float:
     rng = np.random.default_rng(0)
     noise_var = 10.0 ** (-_SNR_DB / 10.0)
     shrink = 1.0 / (1.0 + noise_var)
@@ -123,11 +144,10 @@ def measure_speed(
         times_s.append(encoded_s + time.perf_counter() - since_s)
         if until_s == math.inf:
             until_s = time.perf_counter() + _MEASURE_S  # the first call, which warms up, counts for nothing
-    return Speed(1e3 * float(np.median(times_s[1:] or times_s)), _following_ms(image))
+    return 1e3 * float(np.median(times_s[1:] or times_s))
 
 
 def _following_ms(image: NDArray[np.uint8]) -> float:
-    cv2.setNumThreads(1)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     moved = np.roll(grey, (2, 3), axis=(0, 1))
     times_s = []
@@ -166,9 +186,11 @@ def plan_for(
         CheckpointError: Its weights are missing or damaged.
     """
     height, width = image.shape[:2]
+    cores = usable_cores()
     largest = _resize_to(MAX_PIXELS, (height, width))
     size_wh = (max(1, round(width * largest)), max(1, round(height * largest)))
     smaller = np.asarray(cv2.resize(image, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        speed = pool.submit(measure_speed, codec, modulation, smaller, rate).result()
-    return make_plan(speed, (height, width), rate_hz, usable_cores(), resize)
+        measured = pool.submit(measure_speed, codec, modulation, smaller, rate, min(cores, _MAX_CORES))
+        speed = measured.result()
+    return make_plan(speed, (height, width), rate_hz, cores, resize)
