@@ -1,4 +1,4 @@
-"""Label of the keypoint head: how far one Lucas-Kanade step moves a point of the original."""
+"""Label of the keypoint head: how far one Lucas-Kanade step moves a point of the decoded image."""
 
 import torch
 from torch import Tensor
@@ -39,19 +39,23 @@ def window_mean(values: Tensor, side_px: int) -> Tensor:
     return avg_pool2d(rows, (side_px, 1), stride=1, padding=(half, 0), count_include_pad=False)
 
 
-def lucas_kanade_step(original: Tensor, decoded: Tensor) -> tuple[Tensor, Tensor]:
+def lucas_kanade_step(template: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
     """Take one Lucas-Kanade step at every pixel, over the window of the tracker, which averages as much.
 
+    As in the tracker, the gradients are those of the image in which the points are known. The server's points
+    are corners of the decoded image: where only the original has a corner, nobody looks for one.
+
     Args:
-        original: ``(B, 1, H, W)`` grey image in [0, 1].
-        decoded: Its decoded version.
+        template: ``(B, 1, H, W)`` grey image in [0, 1] that holds the points.
+        image: The image they are looked for in.
 
     Returns:
-        The length of the step in px, clipped to ``MAX_DISPLACEMENT_PX``, and the corner strength: the smaller
-        eigenvalue of the structure tensor, mean over a small window, both ``(B, 1, H, W)``.
+        The length of the step in px, clipped to ``MAX_DISPLACEMENT_PX``, and the corner strength of the
+        template: the smaller eigenvalue of the structure tensor, mean over a small window. Both
+        ``(B, 1, H, W)``.
     """
-    ix, iy = gradients(original)
-    it = decoded - original
+    ix, iy = gradients(template)
+    it = image - template
     tensor = torch.cat((ix * ix, ix * iy, iy * iy), dim=1)
     a, b, c = window_mean(tensor, _CORNER_PX).split(1, dim=1)
     half_trace, spread = (a + c) / 2, (((a - c) / 2).square() + b.square()).sqrt()

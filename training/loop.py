@@ -94,11 +94,16 @@ class Run:
         checkpoint = self._read_checkpoint()
         if checkpoint is None and settings.grow_from is not None:
             small, _ = load_transceiver(settings.grow_from)
-            grow(unfolded(small, self._pass_images), model)
+            grow(small if settings.only_heads else unfolded(small, self._pass_images), model)
         elif checkpoint is None and settings.start == "klt":
             start_from_klt(model, self.images, torch.Generator().manual_seed(settings.seed))
         self.model = model.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        centre_hidden(self.model)
+        if settings.only_heads:
+            self.model.eval()
+            self.model.encoder.requires_grad_(False)
+            self.model.decoder.requires_grad_(False)
+        else:
+            centre_hidden(self.model)
         self.average = copy.deepcopy(self.model).eval()
         self.optimisers = build_optimisers(self.model, settings)
         if checkpoint is not None:
@@ -171,6 +176,8 @@ class Run:
 
     def shippable(self) -> Transceiver:
         """Return the averaged weights as they run without the aids of training."""
+        if self.settings.only_heads:
+            return self.average
         plain: Transceiver = folded(self.average, self._pass_images)
         return plain
 
@@ -249,7 +256,7 @@ class Run:
         shape = (settings.batch, LATENT_CHANNELS, blocks, blocks)
         noise = torch.randn(shape, generator=on_device, device=self.device)
         is_ending = share >= 1.0 - settings.decay_share / 4.0
-        with_heads = is_ending or self.step % settings.head_every == 0
+        with_heads = settings.only_heads or is_ending or self.step % settings.head_every == 0
         set_rate(self.optimisers, rate_factor(share, self.step, settings))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=settings.bf16):
             if share < settings.pretrain_share:

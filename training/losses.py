@@ -121,8 +121,8 @@ def transceiver_loss(
         label = confidence_label(x_hat, x, settings.confidence_sharpness)
         pixel = confidence_loss(logit, label, settings.confidence_loss)
         with torch.no_grad():
-            moved, strength = lucas_kanade_step(grey(x), grey(x_hat.detach().clamp(0.0, 1.0)))
+            moved, strength = lucas_kanade_step(grey(x_hat.detach().clamp(0.0, 1.0)), grey(x))
         keypoint = displacement_loss(displacement, moved, strength)
-        loss = loss + settings.confidence * (pixel + 0.25 * keypoint)
+        loss = loss + settings.confidence * (pixel + 0.5 * keypoint)
         logs["pixel"], logs["keypoint"] = pixel.detach(), keypoint.detach()
     return loss, logs

@@ -23,10 +23,13 @@ def rate_factor(progress: float, step: int, settings: TrainSettings) -> float:
 def build_optimisers(model: Transceiver, settings: TrainSettings) -> list[torch.optim.Optimizer]:
     """Give kernels and a transformer's matrices to Muon (or AdamW), the linear heart and the rest to AdamW.
 
-    First and last layers of the image path are AdamW's: their rows are pixels, not features.
+    First and last layers of the image path are AdamW's: their rows are pixels, not features. Weights that
+    need no gradient are left out.
     """
     kernels, linear, rest = [], [], []
     for name, weight in model.named_parameters():
+        if not weight.requires_grad:
+            continue
         is_heart = ".linear." in name
         is_matrix = weight.ndim == 4 or (weight.ndim == 2 and ".blocks." in name)
         is_edge = "head." in name or name.endswith(("encoder.stem.weight", "decoder.estimate.weight"))

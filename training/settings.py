@@ -61,6 +61,13 @@ class TrainSettings:
             "help": "train the confidence heads every N steps, and always in the last quarter of the decay"
         },
     )
+    only_heads: bool = field(
+        default=False,
+        metadata={
+            "help": "train nothing but the confidence heads of the network in grow_from: the images it "
+            "decodes stay the same to the bit"
+        },
+    )
     seed: int = field(default=0, metadata={"help": "seed of weights, data order and links"})
     device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where to train"})
     bf16: bool = field(default=True, metadata={"help": "bfloat16 autocast"})
@@ -95,6 +102,10 @@ class TrainSettings:
         for name in ("lr", "lr_muon", "lr_linear", "clip"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
+        if self.only_heads and self.grow_from is None:
+            raise ValueError("grow_from must name the weights whose heads are trained when only_heads is set")
+        if self.only_heads and self.loss.confidence == 0.0:
+            raise ValueError("loss.confidence must be > 0 when only_heads is set, got 0")
         if not 0.0 < self.mask_share < 1.0:
             raise ValueError(f"mask_share must be in (0, 1), got {self.mask_share}")
         for name in ("decay_share", "ema", "pretrain_share", "analog_share"):

@@ -26,6 +26,14 @@ def test_a_small_shift_is_measured(shift):
     assert moved[inner][corners].median().item() == pytest.approx(math.hypot(*shift), rel=0.1)
 
 
+def test_points_and_gradients_are_those_of_the_template():
+    faint, clear = 0.5 + 0.1 * (blobs() - 0.5), blobs(0.3)
+    moved, strength = lucas_kanade_step(faint, clear)
+    other, stronger = lucas_kanade_step(clear, faint)
+    assert (stronger.mean() / strength.mean()).item() == pytest.approx(100.0, rel=0.1)
+    assert moved.mean() > 3.0 * other.mean(), "what is nine tenths missing in the template moves it far"
+
+
 def test_an_unchanged_image_does_not_move():
     moved, _ = lucas_kanade_step(blobs(), blobs())
     assert moved.abs().max().item() == 0.0

@@ -3,6 +3,7 @@ import os
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ import torch
 import semcast.common.nets.registry as registry
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import CheckpointError
+from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.codec import NeuralCodec
 from semcast.common.nets.mae import MaeSizes, build_mae
 from semcast.common.nets.registry import architectures
@@ -180,13 +182,33 @@ def test_settings_are_checked():
         TrainSettings(lr=0.0)
 
 
+def test_heads_alone_leave_every_image_as_it_is(tiny_network, photos, tmp_path):
+    first = train(settings_for(photos, tmp_path / "whole", head_every=1, loss=LossSettings(confidence=1.0)))
+    whole = load_transceiver(first.weights)[0].state_dict()
+    heads = settings_for(photos, tmp_path / "heads", only_heads=True, grow_from=first.weights, steps=4)
+    after = load_transceiver(train(heads).weights)[0].state_dict()
+    changed = {name for name in whole if not torch.equal(whole[name], after[name])}
+    assert changed == {name for name in whole if name.startswith("confidence.")}
+    again = train(replace(heads, steps=8))
+    assert again.steps == 8, "it goes on from its checkpoint"
+    resumed = load_transceiver(again.weights)[0].state_dict()
+    assert torch.equal(whole["decoder.head.weight"], resumed["decoder.head.weight"])
+
+
+def test_heads_alone_need_a_network_and_a_loss(tmp_path):
+    with pytest.raises(ValueError, match="grow_from must name the weights"):
+        TrainSettings(only_heads=True)
+    with pytest.raises(ValueError, match="confidence must be > 0 when only_heads is set"):
+        TrainSettings(only_heads=True, grow_from=tmp_path, loss=LossSettings(confidence=0.0))
+
+
 def test_every_shipped_settings_file_is_valid():
     folder = Path(registry.__file__).resolve().parents[2] / "training"
     files = sorted(folder.glob("*.toml"))
     assert "3dcsc-lite" in {f.stem for f in files}
     for file in files:
         settings = build_settings(TrainSettings, read_toml(file))
-        assert settings.architecture == file.stem
+        assert settings.only_heads or settings.architecture == file.stem
         assert settings.architecture in architectures()
 
 
