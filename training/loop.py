@@ -176,10 +176,8 @@ class Run:
 
     def shippable(self) -> Transceiver:
         """Return the averaged weights as they run without the aids of training."""
-        if self.settings.only_heads:
-            return self.average
-        plain: Transceiver = folded(self.average, self._pass_images)
-        return plain
+        average: Transceiver = self.average
+        return average if self.settings.only_heads else folded(average, self._pass_images)
 
     def _pass_images(self, model: Transceiver) -> None:
         """Run fresh crops, the same ones in every process, through the whole link."""
