@@ -7,6 +7,7 @@ epipolar geometry gives each track a place to start from.
 
 import cv2
 import numpy as np
+import poselib
 from numpy.typing import NDArray
 
 from semcast.server.geometry.features import Describer, Grey, detect_corners, match_descriptors
@@ -50,13 +51,8 @@ def search_wide(
         return None
     point, corner = rows0[of_known], rows1[of_seen]
     from_xy, to_xy = xy0[point], corners[corner]
-    _, mask = cv2.findFundamentalMat(
-        from_xy, to_xy, cv2.USAC_MAGSAC, ransacReprojThreshold=_EPIPOLAR_PX, confidence=0.999, maxIters=2000
-    )
-    if mask is None or mask.size != len(point):
-        return None
-    agrees = mask.ravel().astype(bool)
-    if int(agrees.sum()) < max(MIN_AGREEING, _MIN_AGREEING_SHARE * len(point)):
+    agrees = epipolar_inliers(from_xy, to_xy)
+    if agrees is None or int(agrees.sum()) < max(MIN_AGREEING, _MIN_AGREEING_SHARE * len(point)):
         return None
     # A wrong match may lie on its epipolar line by chance; it hardly moves like the matches around it.
     agrees &= _moves_like_its_neighbours(from_xy, to_xy - from_xy, agrees)
@@ -68,6 +64,29 @@ def search_wide(
     guess: Array = xy0 + (to_xy - from_xy)[nearest]
     guess[point] = to_xy
     return guess
+
+
+def epipolar_inliers(from_xy: Array, to_xy: Array) -> NDArray[np.bool_] | None:
+    """Matches that agree on one epipolar geometry, ``(N,)``, None where none is found.
+
+    Args:
+        from_xy: ``(N, 2)`` pixels in the first image.
+        to_xy: ``(N, 2)`` pixels in the second image, matched row by row.
+    """
+    try:
+        _, mask = cv2.findFundamentalMat(
+            from_xy,
+            to_xy,
+            cv2.USAC_MAGSAC,
+            ransacReprojThreshold=_EPIPOLAR_PX,
+            confidence=0.999,
+            maxIters=2000,
+        )
+    except cv2.error:
+        # OpenCV 5 refines an empty model, and raises, on some matches of images that moved by a few pixels.
+        _, info = poselib.estimate_fundamental(from_xy, to_xy, {"max_epipolar_error": _EPIPOLAR_PX}, {})
+        mask = np.asarray(info["inliers"], dtype=np.uint8)
+    return mask.ravel().astype(bool) if mask is not None and mask.size == len(from_xy) else None
 
 
 def _moves_like_its_neighbours(xy: Array, flow: Array, trusted: NDArray[np.bool_]) -> NDArray[np.bool_]:
