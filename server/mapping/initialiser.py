@@ -92,14 +92,15 @@ class Initialiser:
         self._hypotheses: list[Hypothesis] = []
 
     @property
-    def oldest_id(self) -> int | None:
-        """Smallest id of a track in the history, None where there is none."""
-        return min((int(o.ids[0]) for o in self.history), default=None)
+    def ids(self) -> Ids:
+        """Ids of all tracks that are remembered, ascending."""
+        remembered = [*(o.ids for o in self.history), *(h.ids for h in self._hypotheses)]
+        return np.unique(np.concatenate([np.zeros(0, np.int64), *remembered]))
 
-    def renew(self, added: int) -> None:
-        """Give all tracks of the history new ids, ``added`` more than before."""
-        self.history = [replace(o, ids=o.ids + added) for o in self.history]
-        self._hypotheses = [replace(h, ids=h.ids + added) for h in self._hypotheses]
+    def renew(self, before: Ids, after: Ids) -> None:
+        """Give all tracks that are remembered the ids ``after`` instead of ``before``, both ascending."""
+        self.history = [replace(o, ids=after[np.searchsorted(before, o.ids)]) for o in self.history]
+        self._hypotheses = [replace(h, ids=after[np.searchsorted(before, h.ids)]) for h in self._hypotheses]
 
     def add(self, observed: Observed, noise: NoiseModel, *, is_damaged: bool = False) -> Start | None:
         """Take a frame and try to start a map with it.

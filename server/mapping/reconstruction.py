@@ -320,7 +320,7 @@ class Reconstruction:
         would be recognised by it, wherever the camera is.
         """
         self._map.begin_submap()
-        self._initialiser.renew(self._tracks.renew(self._initialiser.oldest_id))
+        self._initialiser.renew(*self._tracks.renew(self._initialiser.ids))
 
     def _recover(self, sight: Sight) -> TrackedPose | None:
         """Pose of a frame after tracking was lost: by tracks that are still alive, else by recognition."""

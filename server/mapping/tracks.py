@@ -210,18 +210,24 @@ class TrackTable:
         self.age = np.ones(count, np.int64)
         self.missed = np.zeros(count, np.int64)
 
-    def renew(self, oldest_id: int | None = None) -> int:
-        """Give all tracks new ids, as if they began now; returns what was added to each.
+    def renew(self, others: Ids) -> tuple[Ids, Ids]:
+        """Give all tracks new ids, as if they began now, and ids kept elsewhere with them.
+
+        New ids are consecutive, whatever lies between the old ones: moved by one sum, those of landmarks of
+        long ago would double the range each time.
 
         Args:
-            oldest_id: Ids from this one on become new by the same sum elsewhere too.
+            others: ``(N,)`` ids kept elsewhere, in any order; those of tracks may be among them.
+
+        Returns:
+            The ids that were, ascending, and the new one of each, ascending too.
         """
-        first_id = int(self.ids[0]) if len(self.ids) else self._next_id
-        added = self._next_id - min(first_id, self._next_id if oldest_id is None else oldest_id)
-        self.ids = self.ids + added
-        self._next_id += added
+        before = np.union1d(self.ids, others)
+        after = self._next_id + np.arange(len(before), dtype=np.int64)
+        self.ids = after[np.searchsorted(before, self.ids)]
+        self._next_id += len(before)
         self._before = None
-        return added
+        return before, after
 
     def follow(self, sight: Sight, guess_xy: Array, max_level: int = 3) -> None:
         """Look for every track in a new image.

@@ -172,3 +172,19 @@ def test_structures_go_on_to_the_next_attempt_with_their_doubt(monkeypatch):
         way = (invert_transform(again.T_world_cam[0]) @ again.T_world_cam[-1])[:3, 3]
         true_way = (invert_transform(poses[0]) @ poses[7])[:3, 3]
         assert way @ true_way / np.linalg.norm(way) / np.linalg.norm(true_way) > 0.98
+
+
+def test_a_start_is_the_same_with_ids_that_were_renewed_on_the_way():
+    frames, _ = ride(8)
+    k, start = begin(frames)
+    initialiser = Initialiser(CAMERA, "off", 1.0, 0)
+    for o in frames[:k]:
+        assert initialiser.add(o, NOISE) is None
+    before = initialiser.ids
+    after = 10**6 + np.arange(len(before))
+    initialiser.renew(before, after)
+    assert np.array_equal(initialiser.ids, after)
+    last = replace(frames[k], ids=10**6 + np.searchsorted(before, frames[k].ids))
+    again = initialiser.add(last, NOISE)
+    assert np.array_equal(again.ids - 10**6, np.searchsorted(before, start.ids))
+    assert np.array_equal(again.xyz, start.xyz)

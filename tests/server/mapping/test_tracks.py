@@ -164,22 +164,35 @@ def test_nan_maps_give_finite_confidence():
 
 def test_new_ids_are_higher_than_all_others():
     tracks = begin()
-    before, next_id, xy = tracks.ids, tracks.next_id, tracks.xy
-    added = tracks.renew(oldest_id=int(before[0]))
-    assert np.array_equal(tracks.ids, before + added)
+    old_ids, next_id, xy = tracks.ids, tracks.next_id, tracks.xy
+    before, after = tracks.renew(old_ids[:3])
+    assert np.array_equal(before, old_ids)
+    assert np.array_equal(tracks.ids, after)
     assert np.array_equal(tracks.xy, xy)
     assert tracks.ids.min() >= next_id
     assert tracks.next_id > tracks.ids.max()
 
 
-def test_ids_kept_elsewhere_become_new_by_the_same_sum():
+def test_ids_kept_elsewhere_become_new_with_those_of_tracks():
     tracks = begin()
     tracks.keep(tracks.ids >= 20)
-    next_id, gone = tracks.next_id, 7
-    added = tracks.renew(oldest_id=gone)
-    assert gone + added >= next_id
-    assert gone + added not in tracks.ids
-    assert tracks.next_id > tracks.ids.max()
+    next_id, kept = tracks.next_id, np.array([7, 25])
+    before, after = tracks.renew(kept)
+    assert (np.diff(after) > 0).all()
+    gone, alive = after[np.searchsorted(before, kept)]
+    assert gone >= next_id
+    assert gone not in tracks.ids
+    assert alive in tracks.ids
+    assert tracks.next_id > after.max()
+
+
+def test_ids_stay_small_however_often_landmarks_of_long_ago_are_among_the_tracks():
+    tracks = TrackTable("robust", 150, 0)
+    tracks.next_id = 5000
+    for _ in range(100):
+        tracks.adopt(np.array([3, 4]), np.array([[9.0, 9.0], [50.0, 50.0]]), 0.5)
+        tracks.renew(np.array([3, 4, 80]))
+    assert tracks.next_id == 5000 + 100 * 3
 
 
 def test_adopted_points_replace_all_tracks():
