@@ -378,6 +378,7 @@ class Reconstruction:
         pose = self._pose_from(seen[self._map.world.landmarks.rows(seen.ids) >= 0], newest)
         if pose is None:
             self._state = TrackingState.LOST
+            self._frames_lost = 0
             self._last_posed_id = sight.frame.frame_id
             return self._result(sight.frame, newest, None, is_keyframe=True, backfilled=backfilled)
         self._state = TrackingState.TRACKING

@@ -348,6 +348,22 @@ def test_a_place_without_a_pose_gives_nothing_up(room, monkeypatch):
     assert [r.submap for r in results] == [1] * 4
 
 
+def test_a_part_that_is_lost_as_it_begins_has_its_time_to_be_found_again(room, monkeypatch):
+    _, images = room
+    reconstruction = make(lost_after_frames=4)
+    other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
+    posed = Reconstruction._pose_from
+
+    def no_pose_in_the_second_part(self, *args, **how):
+        return None if self._map.submap == 1 else posed(self, *args, **how)
+
+    monkeypatch.setattr(Reconstruction, "_pose_from", no_pose_in_the_second_part)
+    results = [reconstruction.process(frame_of(k, image)) for k, image in enumerate(images[:8] + other[:14])]
+    begun = next(k for k, r in enumerate(results) if r.is_keyframe and r.submap == 1)
+    assert [r.state for r in results[begun : begun + 4]] == [TrackingState.LOST] * 4
+    assert results[begun + 4].state is TrackingState.INITIALIZING
+
+
 def test_noise_of_every_kind_is_survived(room):
     _, images = room
     rng = np.random.default_rng(0)
