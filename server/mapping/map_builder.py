@@ -120,6 +120,7 @@ class MapBuilder:
         mapper.add_landmarks(
             self.world, self._camera, self.noise.model, sight.frame.image, self._settings.min_parallax_deg
         )
+        self._bound()
         self._submit(start=True)
         self.collect(wait=True)
         visible = tracks.ids[tracks.visible]
@@ -207,7 +208,7 @@ class MapBuilder:
 
     def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
         """Turn the newest frame into a keyframe, triangulate, and ask for an adjustment."""
-        s, frame, world = self._settings, sight.frame, self.world
+        frame, world = sight.frame, self.world
         visible = tracks.visible
         ids, xy = tracks.ids[visible], tracks.xy[visible]
         self.images.append(SeenFrom(frame.frame_id, sight.grey))
@@ -225,11 +226,18 @@ class MapBuilder:
                 descriptors=descriptors,
             )
         )
-        mapper.add_landmarks(world, self._camera, self.noise.model, frame.image, s.min_parallax_deg)
+        mapper.add_landmarks(
+            world, self._camera, self.noise.model, frame.image, self._settings.min_parallax_deg
+        )
         self.num_inliers_at_keyframe = int((world.landmarks.rows(ids) >= 0).sum())
-        if world.bound(s.max_landmarks, s.max_keyframes, recent=min(40, s.max_keyframes // 2)):
-            self.images.keep({k.frame_id for k in world.keyframes})
+        self._bound()
         self._submit()
+
+    def _bound(self) -> None:
+        """Keep the map, and the images of its keyframes, within its size."""
+        s = self._settings
+        if self.world.bound(s.max_landmarks, s.max_keyframes, recent=min(40, s.max_keyframes // 2)):
+            self.images.keep({k.frame_id for k in self.world.keyframes})
 
     def _submit(self, *, start: bool = False) -> None:
         if self._bundle.busy:

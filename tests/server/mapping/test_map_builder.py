@@ -6,6 +6,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.mapping.bundle import optimise
+from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
@@ -133,3 +134,20 @@ def test_covariance_of_another_part_is_not_carried_over(builder):
     assert builder.pose_covariance(own, builder.world.poses[5]).trace() > own.trace()
     builder.begin_submap()
     np.testing.assert_array_equal(builder.pose_covariance(own, np.eye(4)), own)
+
+
+def test_parts_that_begin_and_are_lost_again_keep_the_map_within_its_size():
+    builder = MapBuilder(CAMERA, ReconstructionSettings(max_landmarks=500, max_keyframes=20), Asked())
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform((-0.5, -0.4, 0.8), (0.5, 0.4, 1.4), (150, 3))
+    for part in range(10):
+        builder.begin_submap()
+        ids = 1000 * part + np.arange(150)
+        views = [keyframe(10 * part + k, part, ids, pose(0.05 * k), xyz) for k in range(5)]
+        frame = DecodedFrame(views[-1].frame_id, 0, IMAGE)
+        sight = Sight(frame, IMAGE[..., 0], np.ones(480, bool))
+        start = Start(views, ids, xyz, np.ones(150))
+        builder.take_start(start, sight, NewestFrame(ids, views[-1].xy), np.eye(4), 1.0)
+        assert len(builder.world.landmarks) <= 500
+        assert len(builder.world.keyframes) <= 20
+        assert {k.frame_id for k in views} <= {k.frame_id for k in builder.world.keyframes}
