@@ -349,6 +349,10 @@ class MapBuilder:
     def _update(self, map_epoch: int, ids: Ids, removed: Ids, keyframes: Ids, frames: Ids) -> MapUpdate:
         world = self.world
         row = world.landmarks.rows(ids)
+        frame_poses = np.zeros((0, 4, 4))
+        if len(frames):  # a run of hours has a hundred thousand
+            posed, T_world_cam = world.poses_of_frames()
+            frame_poses = T_world_cam[np.searchsorted(posed, frames)]
         return MapUpdate(
             map_epoch=map_epoch,
             ids=ids,
@@ -359,7 +363,7 @@ class MapBuilder:
             keyframe_ids=keyframes,
             keyframe_poses=np.array([world.poses[k] for k in keyframes.tolist()]).reshape(-1, 4, 4),
             frame_ids=frames,
-            frame_poses=np.array([world.pose_of_frame(k) for k in frames.tolist()]).reshape(-1, 4, 4),
+            frame_poses=frame_poses,
         )
 
     def pose_covariance(self, covariance_in_map: Array | None, T_world_cam: Array) -> Array | None:

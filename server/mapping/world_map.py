@@ -205,10 +205,11 @@ class WorldMap:
         for frame_id in moved:
             T = self.poses[frame_id].copy()
             T[:3, 3] *= scale
-            self.move_keyframe(frame_id, T_new_old @ T)
+            self.poses[frame_id] = T_new_old @ T
             self.submap_of[frame_id] = into
+        self._moved_keyframes.update(moved)
         for keyframe in self.keyframes_of(submap):
-            keyframe.submap = into
+            keyframe.T_world_cam, keyframe.submap = self.poses[keyframe.frame_id], into
         self._rescale_frames(dict.fromkeys(moved, scale))
 
     def bend(self, keyframe_ids: Ids, T_world_cam: Array, scale: Array) -> None:
@@ -288,13 +289,17 @@ class WorldMap:
         keyframe_id, T_keyframe_cam = self.frames[frame_id]
         return np.asarray(self.poses[keyframe_id] @ T_keyframe_cam)
 
-    def trajectory(self) -> dict[int, Array]:
-        """Best current ``T_world_cam`` of every posed frame, by frame id ascending."""
+    def poses_of_frames(self) -> tuple[Ids, Array]:
+        """Return frame ids of all posed frames, ascending, and the best current ``T_world_cam (N, 4, 4)``."""
         ids, keyframe_ids, T_keyframe_cam = self.frames.columns()
         if len(ids) == 0:
-            return {}
+            return ids, T_keyframe_cam
         used, at = np.unique(keyframe_ids, return_inverse=True)
-        T_world_cam = np.stack([self.poses[k] for k in used.tolist()])[at] @ T_keyframe_cam
+        return ids, np.stack([self.poses[k] for k in used.tolist()])[at] @ T_keyframe_cam
+
+    def trajectory(self) -> dict[int, Array]:
+        """Best current ``T_world_cam`` of every posed frame, by frame id ascending."""
+        ids, T_world_cam = self.poses_of_frames()
         return dict(zip(ids.tolist(), T_world_cam, strict=True))
 
     def observations(self) -> tuple[Ids, Ids, Array]:

@@ -151,3 +151,18 @@ def test_parts_that_begin_and_are_lost_again_keep_the_map_within_its_size():
         assert len(builder.world.landmarks) <= 500
         assert len(builder.world.keyframes) <= 20
         assert {k.frame_id for k in views} <= {k.frame_id for k in builder.world.keyframes}
+
+
+def test_an_update_after_a_join_has_the_poses_of_all_frames(builder):
+    add_part(builder, 0, 4, 0)
+    add_part(builder, 1, 4, 40, seed=1)
+    for k in (3, 2, 1, 0, 43, 41):
+        builder.world.add_frame(50 + k, k, pose(0.01 * k, angle=0.3))
+    builder.take_update(0)
+    builder.world.transform_submap(1, 0, 1.5, pose(2.0, angle=0.1))
+    update = builder.take_update(0)
+    assert update.frame_ids.tolist() == [0, 1, 2, 3, 40, 41, 42, 43, 50, 51, 52, 53, 91, 93]
+    for frame_id, T_world_cam in zip(update.frame_ids.tolist(), update.frame_poses, strict=True):
+        np.testing.assert_allclose(T_world_cam, builder.world.pose_of_frame(frame_id), atol=1e-12)
+    for known in builder.world.keyframes:
+        assert known.T_world_cam is builder.world.poses[known.frame_id]
