@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.mapping.map_arrays import check_map_arrays
 from semcast.server.mapping.posed_frames import PosedFrames
 
 Array = NDArray[np.float64]
@@ -356,6 +357,7 @@ class WorldMap:
             KeyError: An array is missing.
             ValueError: Arrays contradict each other.
         """
+        check_map_arrays(arrays, _KEYFRAME_PARTS)
         self.__init__()  # type: ignore[misc]
         self.landmarks.restore(arrays)
         for frame_id, T, submap in zip(
@@ -365,9 +367,6 @@ class WorldMap:
             strict=True,
         ):
             self.poses[frame_id], self.submap_of[frame_id] = np.array(T), int(submap)
-        unknown = np.setdiff1d(arrays["frames.keyframe_id"], arrays["poses.frame_id"])
-        if len(unknown):
-            raise ValueError(f"frames refer to keyframe {unknown[0]}, which is not there")
         self.frames.take(
             arrays["frames.frame_id"], arrays["frames.keyframe_id"], arrays["frames.T_keyframe_cam"]
         )

@@ -219,6 +219,19 @@ def test_contradicting_arrays_are_refused():
         WorldMap().restore(missing)
 
 
+@pytest.mark.parametrize("name", sorted(make_world().arrays().keys() - {"revisits"}))
+def test_an_array_that_does_not_fit_the_others_is_refused_before_anything_changes(name):
+    world = make_world()
+    arrays = world.arrays()
+    wrong = [arrays[name][:-1], np.stack([arrays[name], arrays[name]], axis=-1)]
+    if arrays[name].dtype.kind == "f":
+        wrong.append(np.full_like(arrays[name], np.nan))
+    for array in wrong:
+        with pytest.raises(ValueError, match=r"must|refer"):
+            world.restore({**arrays, name: array})
+    assert np.array_equal(world.arrays()[name], arrays[name])
+
+
 def test_an_empty_map_travels_too():
     world = WorldMap()
     world.restore(WorldMap().arrays())
