@@ -299,7 +299,7 @@ class MapBuilder:
         T_world_cam: Array,
         tracks: TrackTable,
         on_moved: Callable[[float], None],
-    ) -> bool:
+    ) -> float | None:
         """Join the current submap and the one a place was recognised in.
 
         The older of the two stays where it is, for its place in the world was not guessed.
@@ -308,15 +308,15 @@ class MapBuilder:
             place: The newest frame's place in the other submap.
             T_world_cam: Its pose in the current one.
             tracks: Its tracks.
-            on_moved: Called with the scale of the similarity that moved the current submap, 1 if it stayed.
+            on_moved: Called with the scale that is returned, after the map has moved.
 
         Returns:
-            Whether they were joined.
+            The scale of the similarity that moved the current submap, 1 if it stayed; None if none was found.
         """
         visible = tracks.visible
         found = submap_similarity(place, self.world, T_world_cam, tracks.ids[visible], tracks.xy[visible])
         if found is None:
-            return False
+            return None
         scale, T_place_mine = found
         if self._bundle.busy:
             self._bundle.take(wait=True)
@@ -331,7 +331,7 @@ class MapBuilder:
         self.enter(min(self.submap, place.submap))
         self.world.revisits[self.world.keyframes[-1].frame_id] = place.keyframe_id
         on_moved(scale)
-        return True
+        return scale
 
     def take_update(self, map_epoch: int) -> MapUpdate | None:
         """What changed in the map since this was last called, None when nothing did."""

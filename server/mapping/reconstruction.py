@@ -256,7 +256,7 @@ class Reconstruction:
             self._map.make_keyframe(sight, tracks, pose.T_world_cam)
             self._frames_since_keyframe = 0
             self._lap("map", since)
-            self._try_to_join(sight, pose.T_world_cam)
+            pose = pose.with_unit(self._try_to_join(sight, pose.T_world_cam))
         T_world_cam = self._map.world.pose_of_frame(frame.frame_id)
         return self._result(frame, T_world_cam, pose, is_keyframe=is_keyframe)
 
@@ -386,20 +386,22 @@ class Reconstruction:
         self._motion.observe(sight.frame.t_source_ns, pose.T_world_cam)
         return self._result(sight.frame, newest, pose, is_keyframe=True, backfilled=backfilled)
 
-    def _try_to_join(self, sight: Sight, T_world_cam: Array) -> None:
-        """Look from time to time whether an older submap is in sight again."""
+    def _try_to_join(self, sight: Sight, T_world_cam: Array) -> float:
+        """Look from time to time whether an older submap is in sight again; the factor on lengths, else 1."""
         self._keyframes_since_join += 1
         others = self._map.other_submaps()
         if not others or self._keyframes_since_join < _JOIN_INTERVAL:
-            return
+            return 1.0
         since = time.perf_counter_ns()
         self._keyframes_since_join = 0
         place: Place | None = self._map.relocaliser.find(
             sight, self._map.world, self._map.noise.model, others
         )
-        if place is not None and self._map.join(place, T_world_cam, self._tracks, self._moved):
+        scale = None if place is None else self._map.join(place, T_world_cam, self._tracks, self._moved)
+        if scale is not None:
             logger.info("frame %d: submaps are joined", sight.frame.frame_id)
         self._lap("relocalise", since)
+        return 1.0 if scale is None else scale
 
     # -- results ---------------------------------------------------------------------------------------
 

@@ -68,6 +68,12 @@ class TrackedPose:
         """Median reprojection error of those that agree."""
         return float(np.median(self.residual_px[self.inliers])) if self.inliers.any() else float("inf")
 
+    def with_unit(self, scale: float) -> "TrackedPose":
+        """Return the same with its covariance in a map whose lengths are so many times as large."""
+        unit = np.repeat((1.0, scale), 3)
+        covariance = None if self.covariance is None else self.covariance * np.outer(unit, unit)
+        return replace(self, covariance=covariance)
+
 
 def expected_positions(
     camera: Intrinsics,

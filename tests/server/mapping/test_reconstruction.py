@@ -15,6 +15,7 @@ from semcast.common.geometry import (
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_process import ProcessBundle
+from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
 from semcast.server.mapping.relocalisation import Place, Relocaliser
 from semcast.server.mapping.state import DecodedFrame, TrackingState
@@ -247,14 +248,27 @@ def test_another_place_becomes_a_map_of_its_own(room):
     assert len(reconstruction.final_trajectory()) >= len(sequence) - 4
 
 
-def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog):
+def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch):
+    scales, covariances = [], []
+    join, carried_over = MapBuilder.join, MapBuilder.pose_covariance
+    monkeypatch.setattr(MapBuilder, "join", lambda *a: scales.append(join(*a)) or scales[-1])
+    monkeypatch.setattr(
+        MapBuilder, "pose_covariance", lambda *a: covariances.append(a[1]) or carried_over(*a)
+    )
     # The camera jumps out of view of all it knows, begins a new map, and goes back.
     x = [0.12 * k for k in range(8)] + [13.0 - 0.3 * k for k in range(42)]
     truth = [make_transform(np.eye(3), (v, 0.05 * np.sin(v), 0.0)) for v in x]
     reconstruction = make(lost_after_frames=2)
     with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
         for k, T in enumerate(truth):
-            reconstruction.process(frame_of(k, render(T)))
+            reconstruction.process(frame_of(k, render(T)), lambda _: None)
+            if "submaps are joined" in caplog.text and len(scales) == 1:
+                # Told before the join and after it, the latter in the unit of the older part.
+                before, after = covariances[-2:]
+                assert abs(np.log(scales[0])) > 0.5
+                assert np.allclose(np.diag(after)[:3], np.diag(before)[:3], rtol=0.3)
+                assert np.allclose(np.diag(after)[3:], scales[0] ** 2 * np.diag(before)[3:], rtol=0.3)
+                scales.append(None)
     assert "a new map is begun" in caplog.text
     assert "submaps are joined" in caplog.text
     trajectory = reconstruction.final_trajectory()
