@@ -82,8 +82,14 @@ class MapBuilder:
     def enter(self, submap: int) -> None:
         """Go on in a submap."""
         self._adjusted = None  # of a keyframe elsewhere, or in another unit
+        self._recognised: int | None = None
         self.loops = LoopFinder(self._camera, self.relocaliser, self._settings.seed)
         self.submap = submap
+
+    def go_on_from(self, place: Place) -> None:
+        """Go on in the submap of a place that was recognised; the next keyframe is tied to the one there."""
+        self.enter(place.submap)
+        self._recognised = place.keyframe_id
 
     def take_start(
         self, start: Start, sight: Sight, tracks: TrackTable, T_world_ref: Array, scale: float
@@ -213,6 +219,7 @@ class MapBuilder:
         ids, xy = tracks.ids[visible], tracks.xy[visible]
         self.images.append(SeenFrom(frame.frame_id, sight.grey))
         descriptor_ids, descriptors = self.relocaliser.describe(sight.grey, ids, xy)
+        self._tie_to_recognised(frame.frame_id)
         world.add_keyframe(
             Keyframe(
                 frame_id=frame.frame_id,
@@ -232,6 +239,17 @@ class MapBuilder:
         self.num_inliers_at_keyframe = int((world.landmarks.rows(ids) >= 0).sum())
         self._bound()
         self._submit()
+
+    def _tie_to_recognised(self, frame_id: int) -> None:
+        """Tie a keyframe to the one the camera was found back at, where no adjustment would take that one in.
+
+        The newest keyframes may share no landmark with this one: they would leave it, and those that follow,
+        adrift until a loop is closed.
+        """
+        recognised, self._recognised = self._recognised, None
+        window = self.world.keyframes_of(self.submap)[-self._settings.window_size :]
+        if recognised is not None and recognised not in {k.frame_id for k in window}:
+            self.world.revisits.setdefault(frame_id, recognised)
 
     def _bound(self) -> None:
         """Keep the map, and the images of its keyframes, within its size."""

@@ -344,7 +344,7 @@ class Reconstruction:
         seen = Seen(place.ids, place.xy, np.full(len(place.ids), _RECOGNISED_CONFIDENCE))
         pose = self._pose_from(seen, place.T_world_cam)
         if pose is not None:
-            self._map.enter(place.submap)
+            self._map.go_on_from(place)
             self._tracks.adopt(place.ids, place.xy, _RECOGNISED_CONFIDENCE)
             self._initialiser.clear()
             self._motion.reset()

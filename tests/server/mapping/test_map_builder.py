@@ -8,6 +8,7 @@ from semcast.common.geometry import exp_so3, invert_transform, make_transform, t
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import Sight
@@ -166,3 +167,29 @@ def test_an_update_after_a_join_has_the_poses_of_all_frames(builder):
         np.testing.assert_allclose(T_world_cam, builder.world.pose_of_frame(frame_id), atol=1e-12)
     for known in builder.world.keyframes:
         assert known.T_world_cam is builder.world.poses[known.frame_id]
+
+
+def test_a_camera_found_back_far_in_the_past_is_held_by_the_keyframes_there(builder):
+    # 80 keyframes of another place lie between, and no image of the first ones is left to find a revisit in.
+    ids, xyz = add_part(builder, 0, 5, 0)
+    elsewhere = xyz + np.array([50.0, 0.0, 0.0])
+    for k in range(80):
+        builder.world.add_keyframe(keyframe(10 + k, 0, 500 + np.arange(80), pose(50 + 0.1 * k), elsewhere))
+    grey = np.zeros((80, 3), np.uint8)
+    builder.world.add_landmarks(500 + np.arange(80), elsewhere, grey, np.ones(80), 0, 10)
+    builder.go_on_from(Place(pose(0.2), 2, ids, seen(xyz, pose(0.2)), 0))
+    for frame_id, x in ((200, 0.25), (201, 0.35), (202, 0.45)):
+        sight = Sight(DecodedFrame(frame_id, frame_id, IMAGE), IMAGE[..., 0], np.ones(480, bool))
+        off = pose(x) @ make_transform(np.eye(3), (0.0, 0.02, 0.05))
+        builder.make_keyframe(sight, NewestFrame(ids, seen(xyz, pose(x))), off)
+        builder.collect(wait=True)
+        np.testing.assert_allclose(builder.world.poses[frame_id], pose(x), atol=1e-3)
+    assert builder.world.revisits == {200: 2}
+
+
+def test_a_camera_found_back_in_the_newest_keyframes_needs_no_tie(builder):
+    ids, xyz = add_part(builder, 0, 8, 0)
+    builder.go_on_from(Place(pose(0.5), 5, ids, seen(xyz, pose(0.5)), 0))
+    sight = Sight(DecodedFrame(20, 20, IMAGE), IMAGE[..., 0], np.ones(480, bool))
+    builder.make_keyframe(sight, NewestFrame(ids, seen(xyz, pose(0.55))), pose(0.55))
+    assert builder.world.revisits == {}
