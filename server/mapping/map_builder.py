@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform, make_transform, transform_points
+from semcast.common.geometry import invert_transform, make_transform, skew, transform_points
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
 from semcast.server.mapping import mapper
 from semcast.server.mapping.anchoring import anchor_tracks
@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Two keyframes this many steps apart give the scale of a new map its speed.
+#: A speed that is older than this says nothing of a new map's unit.
 _MAX_BRIDGE_S = 5.0
 #: Keyframes whose images are kept: 45 MB of 640x480.
 _MAX_IMAGES = 150
@@ -400,5 +400,5 @@ class MapBuilder:
         R, t = T[:3, :3], T[:3, 3]
         adjoint = np.zeros((6, 6))
         adjoint[:3, :3] = adjoint[3:, 3:] = R
-        adjoint[3:, :3] = (np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])) @ R
+        adjoint[3:, :3] = skew(t) @ R
         return np.asarray(adjoint @ covariance @ adjoint.T + covariance_in_map)
