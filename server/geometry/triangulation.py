@@ -31,7 +31,7 @@ class Triangulation:
 
 def _sum_by(index: NDArray[np.intp], values: Array, count: int) -> Array:
     """Sum rows of ``values`` that share an index."""
-    flat = values.reshape(len(values), -1)
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     columns = [np.bincount(index, weights=flat[:, k], minlength=count) for k in range(flat.shape[1])]
     return np.stack(columns, axis=1).astype(np.float64).reshape(count, *values.shape[1:])
 

@@ -82,3 +82,11 @@ def test_one_view_and_equal_rays_give_no_parallax():
     assert np.all(found.parallax_deg < 1e-3)
     assert not found.in_front[1]
     assert not found.in_front[2]
+
+
+def test_no_observations_give_no_points():
+    none = np.zeros(0, int)
+    for num_points in (0, 2):
+        found = triangulate(CAMERA, np.eye(4)[None], none, none, np.zeros((0, 2)), np.zeros(0), num_points)
+        assert found.xyz.shape == (num_points, 3)
+        assert not found.in_front.any()
