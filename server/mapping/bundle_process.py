@@ -59,6 +59,7 @@ class ProcessBundle:
         self._process: SpawnProcess | None = None
         self._connection: Connection | None = None
         self._pending: BundleProblem | None = None
+        self._since_s = 0.0
         self._closed = False
         self._failures = 0
         self.num_restarts = 0
@@ -116,7 +117,7 @@ class ProcessBundle:
                 if self._process is None or not self._process.is_alive():
                     raise BrokenPipeError
                 self._connection.send(problem)
-                self._pending = problem
+                self._pending, self._since_s = problem, time.monotonic()
                 return True
             except (BrokenPipeError, OSError):
                 self._restart()
@@ -125,20 +126,22 @@ class ProcessBundle:
     def take(self, wait: bool = False) -> BundleResult | None:
         """Return the result, or None when it is not there yet or the child died over it.
 
-        A problem whose child died is sent once more when the result is waited for.
+        A child that has had a problem for longer than ``DEADLINE_S`` is ended. A problem whose child died is
+        sent once more when the result is waited for.
         """
         if self._pending is None or self._closed:
             return None
         wait = wait or self._lossless
-        deadline_s = time.monotonic() + DEADLINE_S
         retries = 1
         while True:
             assert self._connection is not None
             try:
-                timeout_s = max(0.0, deadline_s - time.monotonic()) if wait else 0.0
-                if not self._connection.poll(timeout_s):
-                    if not wait:
+                left_s = self._since_s + DEADLINE_S - time.monotonic()
+                if not self._connection.poll(max(0.0, left_s) if wait else 0.0):
+                    if not wait and left_s > 0.0:
                         return None
+                    if self._process is not None:
+                        self._process.kill()
                     raise TimeoutError
                 result = self._connection.recv()
                 self._pending, self._failures = None, 0

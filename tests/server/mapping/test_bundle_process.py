@@ -6,7 +6,9 @@ import threading
 import time
 
 import numpy as np
+import pytest
 
+from semcast.server.mapping import bundle_process
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.bundle_process import GIVEN_UP, ProcessBundle
 
@@ -55,5 +57,26 @@ def test_a_child_that_keeps_dying_is_given_up_with_one_clear_error(caplog):
         assert told == [GIVEN_UP]
         assert caplog.text.count(GIVEN_UP) == 1
         assert caplog.text.count("is started again") == 4
+    finally:
+        runner.close()
+
+
+@pytest.mark.parametrize("wait", [False, True])
+def test_a_child_that_hangs_is_ended_and_another_goes_on(monkeypatch, wait):
+    runner = ProcessBundle()
+    try:
+        os.kill(runner.pid, signal.SIGSTOP)
+        hung = runner.pid
+        assert runner.submit(PROBLEM)
+        assert runner.take() is None
+        assert runner.busy
+        monkeypatch.setattr(bundle_process, "DEADLINE_S", 0.0 if not wait else 0.2)
+        since_s = time.monotonic()
+        assert runner.take(wait=wait) is None
+        assert time.monotonic() - since_s < 10.0
+        assert not runner.busy
+        assert runner.pid != hung
+        assert runner.num_restarts >= 1
+        assert runner.submit(PROBLEM), "the next one is taken"
     finally:
         runner.close()
