@@ -234,6 +234,17 @@ def open_source(settings: SourceSettings) -> Source:
     Raises:
         SourceError: It can't be opened, or its camera is unknown.
     """
+    source = _opened(settings)
+    wanted_hz, own_hz = settings.rate_hz, source.rate_hz * settings.stride
+    if wanted_hz is not None and settings.pace == "recorded" and abs(own_hz - wanted_hz) > 0.01 * wanted_hz:
+        logger.warning(
+            "rate_hz: no effect on %s, whose images have times of their own; --pace rate sends at it",
+            source.name,
+        )
+    return source
+
+
+def _opened(settings: SourceSettings) -> Source:
     from semcast.agent.video import LiveSource, VideoSource
 
     text = settings.source
@@ -251,12 +262,4 @@ def open_source(settings: SourceSettings) -> Source:
         settings.max_frames if settings.repeat == "once" else None,
         settings.rate_hz or 10.0,
     )
-    source = RecordedSource(sequence, settings)
-    wanted_hz = settings.rate_hz
-    if wanted_hz is not None and settings.pace == "recorded":
-        recorded_hz = source.rate_hz * settings.stride
-        if abs(recorded_hz - wanted_hz) > 0.01 * wanted_hz:
-            logger.warning(
-                "rate_hz: no effect on %s, whose times are recorded; --pace rate sends at it", source.name
-            )
-    return source
+    return RecordedSource(sequence, settings)

@@ -117,6 +117,20 @@ def test_a_rate_that_recorded_times_overrule_is_said(recording, tmp_path, caplog
     assert "rate_hz: no effect on" in caplog.text
 
 
+def test_a_rate_that_the_times_of_a_video_overrule_is_said(tmp_path, caplog):
+    video = tmp_path / "steady.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))
+    for k in range(3):
+        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
+    writer.release()
+    same = {"source": str(video), "camera": PINHOLE}
+    for changes in ({}, {"rate_hz": 7.0, "pace": "rate"}, {"rate_hz": 25.0, "stride": 2}):
+        open_source(SourceSettings(**same, **changes)).close()
+    assert not caplog.text
+    open_source(SourceSettings(**same, rate_hz=7.0)).close()
+    assert "rate_hz: no effect on steady.avi" in caplog.text
+
+
 def test_recorded_pace_takes_the_recorded_time(recording):
     started_s = time.monotonic()
     _, frames = play(SourceSettings(source=str(recording)))
