@@ -76,6 +76,7 @@ def recall_landmarks(
     *,
     submap: int,
     reach_px: float,
+    wanted: int,
 ) -> NDArray[np.int64]:
     """Look for landmarks of the newest keyframes that have no track; each found one gets its track back.
 
@@ -88,6 +89,7 @@ def recall_landmarks(
         T_world_cam: Its pose, or the expected one.
         submap: The current one; landmarks of others are not in the same world.
         reach_px: A point found further than this from where it is expected is another one.
+        wanted: With so many found, older keyframes are not looked at any more.
 
     Returns:
         Ids of the tracks that were found.
@@ -96,6 +98,8 @@ def recall_landmarks(
     height, width = sight.grey.shape
     found = [np.zeros(0, np.int64)]
     for image in reversed(images.newest(_NUM_RECALLED)):
+        if sum(map(len, found)) >= wanted:
+            break
         keyframe = next((k for k in reversed(world.keyframes) if k.frame_id == image.frame_id), None)
         if keyframe is None or keyframe.submap != submap:
             continue

@@ -163,7 +163,7 @@ class Reconstruction:
             world = self._map.world
             T_world_seen = [world.pose_of_frame(frame_id) for frame_id in tracks.frame_ids]
             guess = expected_positions(self._camera, world, tracks, T_world_guess, T_world_seen)
-            tracks.follow(sight, guess)
+            tracks.follow(sight, guess, is_near=True)
         else:
             ahead = tracks.xy + tracks.velocity * (tracks.missed + 1)[:, None]
             tracks.follow(sight, ahead, max_level=_START_LEVELS)
@@ -212,6 +212,7 @@ class Reconstruction:
             sight,
             T_world_cam,
             submap=self._map.submap,
+            wanted=round(few) - (0 if pose is None else pose.num_inliers),
             reach_px=_REACH_PX if pose is not None and pose.num_inliers >= MIN_INLIERS else _REACH_BLIND_PX,
         )
         again = self._pose(T_world_cam) if len(recalled) else None

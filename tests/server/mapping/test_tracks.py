@@ -1,5 +1,7 @@
 """Tracks from image to image, their drift taken out, and landmarks that get their tracks back."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -307,9 +309,10 @@ def mapped():
     return world, images, tracks
 
 
-def recall(mapped, sight, x, reach_px=6.0):
+def recall(mapped, sight, x, reach_px=6.0, wanted=1000, submap=0):
     world, images, tracks = mapped
-    found = recall_landmarks(CAMERA, world, images, tracks, sight, pose_at(x), submap=0, reach_px=reach_px)
+    how = {"submap": submap, "reach_px": reach_px, "wanted": wanted}
+    found = recall_landmarks(CAMERA, world, images, tracks, sight, pose_at(x), **how)
     assert np.isin(found, tracks.ids).all()
     return len(found)
 
@@ -329,6 +332,22 @@ def test_lost_landmarks_get_their_tracks_back(mapped):
     where = xy[np.searchsorted(ids, tracks.ids[back])] - (10, 0)
     assert np.abs(tracks.xy[back] - where).max() < 1.0
     assert recall(mapped, sight, 30) == 0, "those found have a track now"
+
+
+def test_older_keyframes_are_not_looked_at_once_enough_is_found(mapped):
+    world, images, tracks = mapped
+    old = world.keyframes[0]
+    half = np.arange(len(old.ids)) % 2 == 0
+    world.add_keyframe(
+        replace(old, frame_id=1, ids=old.ids[half], xy=old.xy[half], confidence=old.confidence[half])
+    )
+    images.append(SeenFrom(1, images.newest(1)[0].grey))
+    before = world.keyframes[-1].ids
+    sight = sight_at(24, frame_id=2)
+    for wanted, only_newest in ((5, True), (1000, False)):
+        tracks.keep(np.zeros(len(tracks), bool))
+        assert recall(mapped, sight, 24, wanted=wanted) > 5
+        assert np.isin(tracks.ids, before).all() == only_newest
 
 
 def test_a_track_without_a_landmark_is_expected_from_where_it_was_last_seen(mapped):
@@ -369,11 +388,9 @@ def test_nothing_is_found_where_nothing_arrived(mapped):
 
 
 def test_landmarks_of_another_submap_stay_where_they_are(mapped):
-    world, images, tracks = mapped
+    _, _, tracks = mapped
     tracks.keep(np.zeros(len(tracks), bool))
-    sight = sight_at(24, frame_id=1)
-    found = recall_landmarks(CAMERA, world, images, tracks, sight, pose_at(24), submap=1, reach_px=6.0)
-    assert len(found) == len(tracks) == 0
+    assert recall(mapped, sight_at(24, frame_id=1), 24, submap=1) == len(tracks) == 0
 
 
 def anchor(mapped, sight, x, submap=0):
