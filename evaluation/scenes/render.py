@@ -1,6 +1,7 @@
 """Write a drawn scene as a recorded sequence with its exact path."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 
 #: Samples of a pixel, in place and over the exposure: they soften edges and blur what moves.
 _SAMPLES = ((-0.25, -0.25), (0.25, 0.25), (-0.25, 0.25), (0.25, -0.25))
+#: Rows of a rolling shutter that are drawn together: so many bands an image.
+_NUM_BANDS = 24
 
 
 class Scene(Protocol):
@@ -50,20 +53,34 @@ SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street]] = {
 }
 
 
-def frame_of(scene: Scene, t_s: float, noise_sd: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Return the ``(H, W, 3)`` RGB picture of a scene, with blur of motion and noise of the sensor."""
-    total = np.zeros((scene.camera.height, scene.camera.width, 3), np.float32)
-    for index, (dx, dy) in enumerate(_SAMPLES):
-        moment_s = t_s + scene.exposure_s * ((index + 0.5) / len(_SAMPLES) - 0.5)
-        camera = Intrinsics(
-            fx=scene.camera.fx,
-            fy=scene.camera.fy,
-            cx=scene.camera.cx - dx,
-            cy=scene.camera.cy - dy,
-            width=scene.camera.width,
-            height=scene.camera.height,
-        )
-        total += draw(scene.surfaces(moment_s), camera, scene.T_world_cam(moment_s), scene.background())
+def frame_of(
+    scene: Scene, t_s: float, noise_sd: float, rng: np.random.Generator, readout_s: float = 0.0
+) -> NDArray[np.uint8]:
+    """Return the ``(H, W, 3)`` RGB picture of a scene, with blur of motion and noise of the sensor.
+
+    Args:
+        scene: What to see.
+        t_s: Middle of the exposure of the middle row.
+        noise_sd: In grey levels.
+        rng: Of the noise.
+        readout_s: Time a rolling shutter takes from the top to the bottom, 0 for a global one.
+    """
+    height = scene.camera.height
+    edges = np.linspace(0, height, 2 if readout_s == 0 else _NUM_BANDS + 1, dtype=int)
+    total = np.zeros((height, scene.camera.width, 3), np.float32)
+    background = scene.background()
+    for top, bottom in pairwise(edges.tolist()):
+        late_s = readout_s * (0.5 * (top + bottom) / height - 0.5)
+        for index, (dx, dy) in enumerate(_SAMPLES):
+            moment_s = t_s + late_s + scene.exposure_s * ((index + 0.5) / len(_SAMPLES) - 0.5)
+            band = replace(
+                scene.camera,
+                cx=scene.camera.cx - dx,
+                cy=scene.camera.cy - dy - top,
+                height=bottom - top,
+            )
+            T_world_cam = scene.T_world_cam(moment_s)
+            total[top:bottom] += draw(scene.surfaces(moment_s), band, T_world_cam, background[top:bottom])
     noisy = total / len(_SAMPLES) + rng.normal(0, noise_sd, total.shape[:2])[..., None]
     return np.asarray(np.clip(np.rint(noisy), 0, 255), np.uint8)
 
@@ -87,6 +104,10 @@ class RenderSettings:
     seed: int = field(default=0, metadata={"help": "seed of the scene, the path and the noise"})
     seconds: float = field(default=10.0, metadata={"help": "length of the recording, at most 120"})
     noise_sd: float = field(default=1.5, metadata={"help": "noise of the sensor in grey levels of 255"})
+    readout_ms: float = field(
+        default=0.0,
+        metadata={"help": "time a rolling shutter takes from the top row to the bottom, 0 for none"},
+    )
     out: Path = field(metadata={"help": "folder to write; it must not exist or be empty"})
 
     def __post_init__(self) -> None:
@@ -97,6 +118,8 @@ class RenderSettings:
             raise ValueError(f"seconds must be in (0, 120], got {self.seconds:g}")
         if not 0 <= self.noise_sd <= 50:
             raise ValueError(f"noise_sd must be in [0, 50], got {self.noise_sd:g}")
+        if not 0 <= self.readout_ms <= 100:
+            raise ValueError(f"readout_ms must be in [0, 100], got {self.readout_ms:g}")
 
 
 def render_scene(settings: RenderSettings) -> int:
@@ -122,7 +145,7 @@ def render_scene(settings: RenderSettings) -> int:
     T_world_cams = np.stack([scene.T_world_cam(float(t_s)) for t_s in times_s])
     for index, t_s in enumerate(times_s):
         rng = np.random.default_rng([settings.seed, index, 4])
-        image = frame_of(scene, float(t_s), settings.noise_sd, rng)
+        image = frame_of(scene, float(t_s), settings.noise_sd, rng, 1e-3 * settings.readout_ms)
         path = folder / "images" / f"{index:06d}.png"
         if not cv2.imwrite(str(path), image[..., ::-1]):
             raise SourceError(f"can't write {path}")

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.motion import ConstantVelocity
 from semcast.server.mapping import mapper
 from semcast.server.mapping.bundle_problem import BundleRunner
@@ -19,6 +18,7 @@ from semcast.server.mapping.kept_frames import Observed, backfill
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place
+from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.mapping.tracker import (
@@ -28,7 +28,7 @@ from semcast.server.mapping.tracker import (
     expected_positions,
     track_pose,
 )
-from semcast.server.mapping.tracks import Seen, Sight, TrackTable, usable_rows
+from semcast.server.mapping.tracks import Seen, Sight, TrackTable
 
 __all__ = ["Reconstruction", "ReconstructionSettings"]
 
@@ -81,6 +81,7 @@ class Reconstruction:
         self._tracks = TrackTable(s.confidence, s.max_features, s.seed)
         self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
         self._motion = ConstantVelocity()
+        self._shutter = RollingShutter(self._camera, s.readout_ms, s.readout_from)
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
         self._last_posed_id: int | None = None
@@ -127,9 +128,12 @@ class Reconstruction:
         self._last_frame_id = frame.frame_id
         self._collect()
         since = time.perf_counter_ns()
-        sight = Sight(frame, to_grey(frame.image), usable_rows(frame, frame.image.shape[0]))
+        sight = self._shutter.see(frame)
         T_world_guess = self._motion.predict(frame.t_source_ns)
         self._follow(sight, T_world_guess)
+        sight, is_first = self._shutter.settle(frame, sight, self._tracks)
+        if is_first:
+            self._initialiser.clear()
         self._lap("track", since)
         if self._state is TrackingState.TRACKING:
             return self._track(sight, T_world_guess)
@@ -435,7 +439,7 @@ class Reconstruction:
             is_keyframe=is_keyframe,
             map_epoch=self._map_epoch,
             submap=self._map.submap,
-            keypoints_xy=self._tracks.xy[visible].astype(np.float32),
+            keypoints_xy=self._shutter.in_image(self._tracks.xy[visible]).astype(np.float32),
             keypoint_inlier=agrees,
             keypoint_confidence=self._tracks.confidence[visible].astype(np.float32),
             backfilled=backfilled,

@@ -1,9 +1,12 @@
 """Settings of the reconstruction."""
 
 from dataclasses import dataclass, field
-from typing import get_args
+from typing import Literal, get_args
 
 from semcast.server.geometry.weighting import ConfidenceMode
+
+#: Side of the image that a rolling shutter exposes first.
+ReadoutFrom = Literal["top", "bottom", "left", "right"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +43,16 @@ class ReconstructionSettings:
     min_parallax_deg: float = field(
         default=1.0, metadata={"help": "angle between rays from which a point is triangulated"}
     )
+    readout_ms: float = field(
+        default=0.0,
+        metadata={
+            "help": "time a rolling shutter takes from the first row to the last, 0 for a global shutter"
+        },
+    )
+    readout_from: ReadoutFrom = field(
+        default="top",
+        metadata={"help": "side of the image a rolling shutter begins at; left or right for upright phones"},
+    )
     lost_after_frames: int = field(
         default=10, metadata={"help": "frames without a pose after which a new map is begun"}
     )
@@ -49,6 +62,9 @@ class ReconstructionSettings:
         if self.confidence not in get_args(ConfidenceMode):
             allowed = ", ".join(get_args(ConfidenceMode))
             raise ValueError(f"confidence must be one of {allowed}, got {self.confidence!r}")
+        if self.readout_from not in get_args(ReadoutFrom):
+            allowed = ", ".join(get_args(ReadoutFrom))
+            raise ValueError(f"readout_from must be one of {allowed}, got {self.readout_from!r}")
         for name, low, high in (
             ("seed", 0, 2**31 - 1),
             ("max_features", 50, 5000),
@@ -58,6 +74,7 @@ class ReconstructionSettings:
             ("sigma0_px", 0.05, 20.0),
             ("beta", 0.0, 8.0),
             ("min_parallax_deg", 0.1, 10.0),
+            ("readout_ms", 0.0, 100.0),
             ("lost_after_frames", 1, 10_000),
         ):
             value = getattr(self, name)

@@ -434,6 +434,17 @@ class TrackTable:
         for name in _COLUMNS:
             setattr(self, name, np.concatenate([getattr(self, name), new[name]])[order])
 
+    def move(self, rows: NDArray[np.bool_], xy: Array) -> None:
+        """Put visible tracks where they are in an image that was put right."""
+        self.velocity, before = self.velocity.copy(), self.xy
+        self.xy = before.copy()
+        self.xy[rows] = xy
+        self.velocity += self.xy - before
+
+    def replace_newest(self, sight: Sight) -> None:
+        """Take another version of the image that was taken last."""
+        self._greys[-1] = sight.grey
+
     def remember(self, sight: Sight) -> None:
         """Keep the image for tracks that are looked for in later ones."""
         self._greys = [*self._greys[-MAX_COAST:], sight.grey]

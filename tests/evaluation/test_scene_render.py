@@ -96,3 +96,19 @@ def test_seeds_and_paces_differ() -> None:
 def test_settings_out_of_range_are_refused(values: dict[str, float], message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         RenderSettings(out=tmp_path / "x", **values)  # type: ignore[arg-type]
+
+
+def test_rows_of_a_rolling_shutter_are_drawn_at_their_times() -> None:
+    scene = SCENES["room"](0, "fast")
+    rng = np.random.default_rng(0)
+    rolled = frame_of(scene, 1.0, 0.0, rng, readout_s=0.06)
+    height = scene.camera.height
+    for share in (0.0, 0.5, 1.0):
+        top = round(share * (height - height // 24))
+        rows = slice(top, top + height // 24)
+        late_s = 0.06 * ((top + height // 48) / height - 0.5)
+        at_its_time, at_another = (frame_of(scene, 1.0 + s, 0.0, rng)[rows] for s in (late_s, late_s + 0.03))
+        error, other = (
+            np.abs(rolled[rows].astype(int) - image).mean() for image in (at_its_time, at_another)
+        )
+        assert error < 0.1 * other

@@ -1,0 +1,215 @@
+"""Images of a rolling shutter as if all rows had been exposed at once.
+
+Most cameras expose one row after the other. While they turn, each row is seen from another pose, and a pose
+that is right for the middle row is wrong by pixels for the others. How points move from image to image tells
+how far each row has moved by its time. The image is put right by that, and all that follows, from tracks to
+adjustments, has one pose an image.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.server.geometry.features import to_grey
+from semcast.server.mapping.settings import ReadoutFrom
+from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
+
+Array = NDArray[np.float64]
+
+_MIN_TRACKS = 30
+_ITERATIONS = 6
+#: Images further apart than this say little about how the camera moved during an exposure.
+_MAX_STEP_S = 0.5
+#: A hand shakes several times a second: from images further apart no trend of the movement is read.
+_MAX_TREND_STEP_S = 0.06
+#: Nothing is moved by more than this share of the image's height.
+_MAX_SHARE = 0.2
+#: What was expected to this (root mean square over the image) need not be put right again.
+_SMALL_PX = 0.1
+#: How far the image is moved is computed at every so many pixels.
+_GRID_PX = 16
+
+
+@dataclass(frozen=True)
+class ImageFlow:
+    """How an image moves: as that of a plane does, which is exact for turning and about right for a scene.
+
+    Attributes:
+        camera: Pinhole.
+        coefficients: ``(8,)``, in normalised coordinates and seconds.
+    """
+
+    camera: Intrinsics
+    coefficients: Array
+
+    def at(self, xy: Array) -> Array:
+        """Return pixels per second ``(..., 2)`` at pixels ``(..., 2)``."""
+        c, camera = self.coefficients, self.camera
+        x, y = (xy[..., 0] - camera.cx) / camera.fx, (xy[..., 1] - camera.cy) / camera.fy
+        u = c[0] + c[1] * x + c[2] * y + (c[6] * x + c[7] * y) * x
+        v = c[3] + c[4] * x + c[5] * y + (c[6] * x + c[7] * y) * y
+        return np.stack([camera.fx * u, camera.fy * v], axis=-1)
+
+    @staticmethod
+    def fitted(camera: Intrinsics, xy: Array, velocity_px_s: Array) -> "ImageFlow | None":
+        """Fit to points ``(N, 2)`` and their velocities ``(N, 2)``, robustly; None where they are few."""
+        count = len(xy)
+        if count < _MIN_TRACKS:
+            return None
+        x, y = (xy[:, 0] - camera.cx) / camera.fx, (xy[:, 1] - camera.cy) / camera.fy
+        one, none = np.ones(count), np.zeros(count)
+        design = np.concatenate(
+            [
+                np.stack([one, x, y, none, none, none, x * x, x * y], axis=1),
+                np.stack([none, none, none, one, x, y, x * y, y * y], axis=1),
+            ]
+        )
+        target = np.concatenate([velocity_px_s[:, 0] / camera.fx, velocity_px_s[:, 1] / camera.fy])
+        weight = np.ones(count)
+        coefficients = np.zeros(8)
+        for _ in range(_ITERATIONS):
+            weighted = design * np.tile(weight, 2)[:, None]
+            coefficients = np.linalg.solve(weighted.T @ design + 1e-9 * np.eye(8), weighted.T @ target)
+            error = np.linalg.norm((target - design @ coefficients).reshape(2, count), axis=0)
+            weight = 1.0 / np.maximum(error / (1.5 * np.median(error) + 1e-6), 1.0)
+        return ImageFlow(camera, coefficients)
+
+
+class RollingShutter:
+    """Puts images and the tracks in them right, one after the other.
+
+    Args:
+        camera: Pinhole.
+        readout_ms: Time from the first row (or column) to the last; 0 for a global shutter: nothing is done.
+        readout_from: Side of the image that is exposed first.
+    """
+
+    def __init__(self, camera: Intrinsics, readout_ms: float, readout_from: ReadoutFrom = "top") -> None:
+        self._camera = camera
+        self._axis = int(readout_from in ("top", "bottom"))
+        last = max(1, (camera.width, camera.height)[self._axis] - 1)
+        self._middle = 0.5 * last
+        self._s_per_px = 1e-3 * readout_ms / last * (1 if readout_from in ("top", "left") else -1)
+        y, x = np.mgrid[0 : camera.height + _GRID_PX : _GRID_PX, 0 : camera.width + _GRID_PX : _GRID_PX]
+        self._grid = np.stack([x, y], axis=-1).astype(np.float64)
+        #: The movement at the newest image, that the image was put right by, and the mean towards the image.
+        self._flow: ImageFlow | None = None
+        self._applied: ImageFlow | None = None
+        self._mean: ImageFlow | None = None
+        self._t_ns: int | None = None
+        self._step_s = 0.0
+
+    @property
+    def is_global(self) -> bool:
+        """Whether all rows are exposed at once: there is nothing to do."""
+        return self._s_per_px == 0.0
+
+    def see(self, frame: DecodedFrame) -> Sight:
+        """Return an image put right by the movement before it."""
+        if not 0.0 < self._since_s(frame) < _MAX_STEP_S:
+            self._flow = self._mean = None
+        return self._sight(frame)
+
+    def settle(self, frame: DecodedFrame, sight: Sight, tracks: TrackTable) -> tuple[Sight, bool]:
+        """Put an image and its tracks right by the movement towards it.
+
+        Args:
+            frame: As received.
+            sight: What ``see`` made of it.
+            tracks: After they were followed; their positions move.
+
+        Returns:
+            The image, and whether no movement was known before it: images before this one are not right, and
+            their points can't be compared with those of later ones.
+        """
+        if self.is_global:
+            return sight, False
+        step_s, before = self._since_s(frame), self._flow
+        self._t_ns = frame.t_source_ns
+        self._flow = self._measured(tracks, step_s)
+        self._step_s = step_s
+        if self._flow is None:
+            return sight, False
+        change = self._put_right(self.in_image(self._grid)) - self._grid
+        if before is not None and np.sqrt((change**2).sum(axis=-1).mean()) < _SMALL_PX:
+            return sight, False
+        visible = tracks.visible
+        tracks.move(visible, self._put_right(self.in_image(tracks.xy[visible])))
+        sight = self._sight(frame)
+        tracks.replace_newest(sight)
+        return sight, before is None
+
+    def in_image(self, xy: Array) -> Array:
+        """Return where points ``(..., 2)`` of the newest image, as put right, are in it as received."""
+        if self._applied is None:
+            return xy
+        flow = self._applied.at(xy)
+        # A point moves while the shutter runs towards it: the row it was met in is another one.
+        closing = np.maximum(1.0 - self._s_per_px * flow[..., self._axis], 0.2)
+        offset_s = self._s_per_px * (xy[..., self._axis] - self._middle) / closing
+        return xy + self._bounded(flow * offset_s[..., None])
+
+    def _put_right(self, xy: Array) -> Array:
+        """Return where points ``(..., 2)`` of the received image go, by the newest movement."""
+        assert self._flow is not None
+        offset_s = self._s_per_px * (xy[..., self._axis] - self._middle)
+        there = xy
+        for _ in range(2):
+            there = xy - self._bounded(self._flow.at(there) * offset_s[..., None])
+        return there
+
+    def _bounded(self, away: Array) -> Array:
+        reach = _MAX_SHARE * self._camera.height
+        return np.clip(away, -reach, reach)
+
+    def _since_s(self, frame: DecodedFrame) -> float:
+        return 0.0 if self._t_ns is None else (frame.t_source_ns - self._t_ns) * 1e-9
+
+    def _measured(self, tracks: TrackTable, step_s: float) -> ImageFlow | None:
+        """Return the movement at the newest image."""
+        mean_before, self._mean = self._mean, None
+        if not 0.0 < step_s < _MAX_STEP_S:
+            return None
+        rows = tracks.visible & (tracks.age > 1)
+        way = tracks.velocity[rows]
+        self._mean = ImageFlow.fitted(self._camera, tracks.xy[rows] - 0.5 * way, way / step_s)
+        if self._mean is None or mean_before is None or step_s > _MAX_TREND_STEP_S:
+            return self._mean
+        # The mean is that of half a step ago.
+        trend = (self._mean.coefficients - mean_before.coefficients) / (0.5 * (step_s + self._step_s))
+        return ImageFlow(self._camera, self._mean.coefficients + 0.5 * step_s * trend)
+
+    def _sight(self, frame: DecodedFrame) -> Sight:
+        """Return an image put right by the newest movement that is known."""
+        height, width = frame.image.shape[:2]
+        usable = usable_rows(frame, height)
+        self._applied = self._flow
+        if self._applied is None or self.is_global:
+            return Sight(frame, to_grey(frame.image), usable)
+        size = self._grid.shape[1] * _GRID_PX, self._grid.shape[0] * _GRID_PX
+        coarse = (self.in_image(self._grid) - self._grid).astype(np.float32)
+        larger = np.array([[_GRID_PX, 0, 0], [0, _GRID_PX, 0]], np.float32)
+        away = cv2.warpAffine(coarse, larger, size, flags=cv2.INTER_LINEAR)[:height, :width]
+        x = np.arange(width, dtype=np.float32) + away[..., 0]
+        y = np.arange(height, dtype=np.float32)[:, None] + away[..., 1]
+
+        def taken(values: NDArray) -> NDArray:
+            return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+        def put_right(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+            return None if values is None else np.asarray(taken(values), np.float32)
+
+        right = replace(
+            frame,
+            image=np.asarray(taken(frame.image), np.uint8),
+            confidence=put_right(frame.confidence),
+            keypoint_confidence=put_right(frame.keypoint_confidence),
+        )
+        if not usable.all():
+            rows = np.clip(np.rint(y[:, [0, width // 2, width - 1]]), 0, height - 1).astype(np.intp)
+            usable = np.asarray(usable[rows].all(axis=1))
+        return Sight(right, to_grey(right.image), usable)

@@ -1,0 +1,155 @@
+"""Images of a rolling shutter are put right by the movement of their points."""
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.server.geometry.features import to_grey
+from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.tracks import TrackTable
+
+CAMERA = Intrinsics(fx=250.0, fy=250.0, cx=159.5, cy=119.5, width=320, height=240)
+STEP_S = 1 / 30
+READOUT_MS = 20.0
+
+
+def wide_texture():
+    rng = np.random.default_rng(5)
+    layers = [
+        cv2.GaussianBlur(rng.standard_normal((700, 1200)).astype(np.float32), None, s) for s in (2, 5, 12)
+    ]
+    return np.clip(sum(layer / layer.std() for layer in layers) * 30 + 128, 0, 255).astype(np.float32)
+
+
+TEXTURE = wide_texture()
+
+
+def seen(offset_px_s, frame_id, readout_ms=READOUT_MS, readout_from="top", lost=()):
+    """A far wall that moves over the image by so many pixels a second, ``(x, y)``."""
+    y, x = np.mgrid[0.0:240, 0.0:320]
+    along = {"top": y / 239, "bottom": 1 - y / 239, "left": x / 319, "right": 1 - x / 319}[readout_from] - 0.5
+    t_s = frame_id * STEP_S + 1e-3 * readout_ms * along
+    grey = cv2.remap(
+        TEXTURE,
+        (x - offset_px_s[0] * t_s + 400).astype(np.float32),
+        (y - offset_px_s[1] * t_s + 200).astype(np.float32),
+        cv2.INTER_LINEAR,
+    )
+    snr_db = np.full(15, 20.0, np.float32)
+    for slot in lost:
+        grey[16 * slot : 16 * slot + 16] = 128
+        snr_db[slot] = -20.0
+    image = np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
+    t_ns = 10**9 + round(frame_id * STEP_S * 1e9)
+    flat = np.full((240, 320), 0.5, np.float32)
+    return DecodedFrame(frame_id, t_ns, image, flat, flat, snr_db)
+
+
+def run(shutter, offset_px_s, num_frames=4, **how):
+    """Follow points through a few images; tracks, and where they are while the middle row is exposed."""
+    tracks = TrackTable("robust", 200, 0)
+    for frame_id in range(num_frames):
+        frame = seen(offset_px_s, frame_id, **how)
+        sight = shutter.see(frame)
+        tracks.follow(sight, tracks.xy + tracks.velocity) if len(tracks) else tracks.remember(sight)
+        sight, is_first = shutter.settle(frame, sight, tracks)
+        assert is_first == (frame_id == 1 and not shutter.is_global)
+        if frame_id <= 1:
+            tracks.keep(np.zeros(len(tracks), bool)) if frame_id else None
+            tracks.refill(sight)
+            if frame_id == 1:
+                start_xy, start_ids = tracks.xy.copy(), tracks.ids.copy()
+    rows = np.isin(start_ids, tracks.ids)
+    truth = start_xy[rows] + np.array(offset_px_s) * STEP_S * (num_frames - 2)
+    return tracks.xy, truth, sight
+
+
+@pytest.mark.parametrize("readout_from", ["top", "bottom", "left", "right"])
+@pytest.mark.parametrize("offset_px_s", [(300.0, 0.0), (-120.0, 150.0), (0.0, -200.0)])
+def test_an_image_is_put_right_to_that_of_a_global_shutter(offset_px_s, readout_from):
+    _, _, sight = run(
+        RollingShutter(CAMERA, READOUT_MS, readout_from), offset_px_s, readout_from=readout_from
+    )
+    right = to_grey(seen(offset_px_s, 3, readout_ms=0.0).image).astype(float)[20:-20, 20:-20]
+    rolled = to_grey(seen(offset_px_s, 3, readout_from=readout_from).image).astype(float)[20:-20, 20:-20]
+    error, before = (np.abs(a - right).mean() for a in (sight.grey[20:-20, 20:-20].astype(float), rolled))
+    assert error < 0.25 * before
+
+
+def test_points_stay_where_the_scene_is(rng):
+    offset_px_s = (300.0, -60.0)
+    xy, truth, _ = run(RollingShutter(CAMERA, READOUT_MS), offset_px_s)
+    assert len(xy) > 50
+    assert np.abs(xy - truth).max() < 0.8
+    assert np.median(np.linalg.norm(xy - truth, axis=1)) < 0.1
+
+
+def test_a_point_is_shown_where_it_is_in_the_image_as_received():
+    offset_px_s = (300.0, 90.0)
+    shutter = RollingShutter(CAMERA, READOUT_MS)
+    xy, _, _ = run(shutter, offset_px_s)
+    there = shutter.in_image(xy)
+    late_s = 1e-3 * READOUT_MS * (there[:, 1] / 239 - 0.5)
+    np.testing.assert_allclose(there - xy, late_s[:, None] * offset_px_s, atol=0.15)
+    assert np.abs(there - xy).max() > 1.5
+
+
+def test_a_global_shutter_is_left_as_it_is():
+    shutter = RollingShutter(CAMERA, 0.0)
+    frame = seen((300.0, 0.0), 0)
+    sight = shutter.see(frame)
+    assert sight.frame is frame
+    xy, _, sight = run(shutter, (300.0, 0.0), readout_ms=0.0)
+    np.testing.assert_array_equal(sight.grey, to_grey(seen((300.0, 0.0), 3, readout_ms=0.0).image))
+    np.testing.assert_array_equal(shutter.in_image(xy), xy)
+
+
+def test_rows_that_did_not_arrive_go_with_the_image():
+    offset_px_s = (0.0, 400.0)
+    _, _, sight = run(RollingShutter(CAMERA, READOUT_MS), offset_px_s, lost=(12,))
+    # Row 200 is exposed 7 ms late: what is there belongs 2.7 rows further up.
+    lost = np.flatnonzero(~sight.usable)
+    assert lost[0] == pytest.approx(192 - 400 * 0.02 * (192 / 239 - 0.5), abs=1.1)
+    assert lost[-1] == pytest.approx(207 - 400 * 0.02 * (207 / 239 - 0.5), abs=1.1)
+    assert np.ptp(sight.grey[lost[1] : lost[-1]]) == 0
+
+
+def test_without_enough_points_or_after_a_gap_nothing_is_assumed():
+    shutter = RollingShutter(CAMERA, READOUT_MS)
+    run(shutter, (300.0, 0.0))
+    late = seen((300.0, 0.0), 60)
+    assert shutter.see(late).frame is late
+    sight, is_first = shutter.settle(late, shutter.see(late), TrackTable("robust", 200, 0))
+    assert sight.frame is late
+    assert not is_first
+
+
+def test_the_flow_of_a_turning_camera_is_exact_though_points_are_wrong(rng):
+    turn = np.array([0.4, -0.7, 0.3])  # radians a second
+    xy = rng.uniform((0, 0), (319, 239), (200, 2))
+    x, y = ((xy - (CAMERA.cx, CAMERA.cy)) / (CAMERA.fx, CAMERA.fy)).T
+    # Flow of a point at rest for a camera that turns (Longuet-Higgins and Prazdny 1980).
+    u = x * y * turn[0] - (1 + x**2) * turn[1] + y * turn[2]
+    v = (1 + y**2) * turn[0] - x * y * turn[1] - x * turn[2]
+    truth = np.stack([CAMERA.fx * u, CAMERA.fy * v], axis=1)
+    measured = truth.copy()
+    measured[:40] += rng.normal(0, 200, (40, 2))
+    flow = ImageFlow.fitted(CAMERA, xy, measured)
+    np.testing.assert_allclose(flow.at(xy), truth, atol=0.02 * np.abs(truth).max())
+    assert ImageFlow.fitted(CAMERA, xy[:29], truth[:29]) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "allowed"),
+    [
+        ({"readout_ms": -1.0}, r"readout_ms must be in \[0.0, 100.0\]"),
+        ({"readout_ms": float("nan")}, "readout_ms must be in"),
+        ({"readout_from": "up"}, "readout_from must be one of top, bottom, left, right"),
+    ],
+)
+def test_a_shutter_that_can_not_be_is_refused(values, allowed):
+    with pytest.raises(ValueError, match=allowed):
+        ReconstructionSettings(**values)
