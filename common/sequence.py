@@ -31,7 +31,7 @@ _BIT_DEPTHS = (8, 10, 12, 14, 16)
 _MAX_DEPTH_IMAGES = 9
 
 
-def read_image(path: Path, bit_depth: Callable[[], int] | None = None) -> NDArray[np.uint8]:
+def read_image(path: Path, bit_depth: Callable[[], int | None] | None = None) -> NDArray[np.uint8]:
     """Read an image file as ``(H, W, 3)`` uint8 RGB.
 
     Grey is repeated, 16-bit is cut to 8, transparency is laid on white. Orientation notes of cameras are
@@ -39,15 +39,16 @@ def read_image(path: Path, bit_depth: Callable[[], int] | None = None) -> NDArra
 
     Args:
         path: The file.
-        bit_depth: Tells how many bits of a 16-bit file are in use; asked for such files alone. None goes
-            by the brightest value of this one, so that images read one by one may differ in brightness.
+        bit_depth: Tells how many bits of a 16-bit file are in use; asked for such files alone. None, or
+            an answer of None, goes by the brightest value of this one, so that images read one by one may
+            differ in brightness.
 
     Raises:
         SourceError: The file is missing or damaged.
     """
     raw = _read_raw(path)
     if raw.dtype == np.uint16:
-        bits = bit_depth() if bit_depth is not None else _bits_for(int(raw.max()))
+        bits = (bit_depth() if bit_depth is not None else None) or _bits_for(int(raw.max()))
         raw = (np.minimum(raw, 2**bits - 1) >> (bits - 8)).astype(np.uint8)
     try:
         return as_rgb(raw)
@@ -55,23 +56,24 @@ def read_image(path: Path, bit_depth: Callable[[], int] | None = None) -> NDArra
         raise SourceError(f"{path}: {err}") from err
 
 
-def bit_depth_of(paths: tuple[Path, ...]) -> int:
-    """Tell how many bits of 16-bit images are in use: 8, 10, 12, 14 or 16.
+def bit_depth_of(paths: tuple[Path, ...]) -> int | None:
+    """Tell how many bits of 16-bit images are in use: 8, 10, 12, 14 or 16; None where none is seen.
 
     Machine vision and thermal cameras store 10 to 14 bits as the lower ones of 16.
 
     Args:
         paths: Images of one camera; a few are looked at.
     """
-    brightest = 0
+    brightest: int | None = None
     spread = np.linspace(0, len(paths) - 1, min(len(paths), _MAX_DEPTH_IMAGES)).astype(int)
     for path in (paths[k] for k in spread):
         try:
             raw = _read_raw(path)
         except SourceError:
             continue
-        brightest = max(brightest, int(raw.max()) if raw.dtype == np.uint16 else 0)
-    return _bits_for(brightest)
+        if raw.dtype == np.uint16:
+            brightest = max(brightest or 0, int(raw.max()))
+    return None if brightest is None else _bits_for(brightest)
 
 
 def _bits_for(brightest: int) -> int:
@@ -202,15 +204,24 @@ class Sequence:
             if files.groundtruth is not None
             else None
         )
+        if self._truth is None and files.groundtruth is not None and len(files.groundtruth):
+            true_s, own_s = files.groundtruth.t_s, ns_to_seconds(self.times_ns)
+            logger.warning(
+                "%s: none of its %d true poses, from %.3f to %.3f s, is at the time of an image, "
+                "from %.3f to %.3f s: they are not used",
+                self.name,
+                len(true_s),
+                *(true_s[0], true_s[-1], own_s[0], own_s[-1]),
+            )
 
     def __len__(self) -> int:
         return len(self._paths)
 
     @cached_property
-    def _bit_depth(self) -> int:
-        """Bits of 16-bit images in use, the same for all of them."""
+    def _bit_depth(self) -> int | None:
+        """Bits of 16-bit images in use, the same for all of them; None where they are too few to tell."""
         bits = bit_depth_of(self._all_paths)
-        if bits != 16:
+        if bits not in (None, 16):
             logger.info(
                 "%s: its 16-bit images are read as %d-bit, by their brightest values", self.name, bits
             )

@@ -150,14 +150,23 @@ def read_layout(path: Path, layout: Layout, rate_hz: float) -> SequenceFiles:
     files = readers[find_layout(path) if layout == "auto" else layout](path, rate_hz)
     if not files.image_paths:
         raise SourceError(f"no images in {path}")
-    if len(files.image_paths) != len(files.times_ns):
-        raise SourceError(
-            f"{path} must have one time per image, got {len(files.times_ns)} times "
-            f"and {len(files.image_paths)} images"
-        )
-    if np.any(np.diff(files.times_ns) <= 0):
-        raise SourceError(f"times of {path} must strictly increase")
+    _check_times(path, len(files.image_paths), files.times_ns)
     return files
+
+
+def _check_times(path: Path, num_images: int, times_ns: NDArray[np.int64]) -> None:
+    if num_images != len(times_ns):
+        raise SourceError(
+            f"{path} must have one time per image, got {len(times_ns)} times and {num_images} images"
+        )
+    falls = np.flatnonzero(np.diff(times_ns) <= 0)
+    if len(falls):
+        k = int(falls[0])
+        before_s, after_s = ns_to_seconds(times_ns[k : k + 2]).tolist()
+        raise SourceError(
+            f"times of {path} must strictly increase, image {k + 2} has {after_s:.9g} s "
+            f"after {before_s:.9g} s"
+        )
 
 
 def _check_there(path: Path) -> None:
@@ -203,6 +212,18 @@ def _fields(path: Path, at_least: int) -> Iterable[list[str]]:
         if len(fields) < at_least:
             raise SourceError(f"{path}:{number} must have {at_least} fields, got {line!r}")
         yield fields
+
+
+def _finite(numbers: Iterable[str]) -> list[float]:
+    """Return numbers that a pose can have.
+
+    Raises:
+        ValueError: One is none, or is not finite.
+    """
+    values = [float(number) for number in numbers]
+    if not np.isfinite(values).all():
+        raise ValueError(f"poses must be finite, got {values}")
+    return values
 
 
 def _read_times_ns(path: Path) -> NDArray[np.int64]:
@@ -289,6 +310,7 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
     poses_path = next((place for place in places if place.is_file()), None)
     truth = None
     if poses_path is not None:
+        _check_times(path, len(images), times_ns)
         poses = _kitti_poses(poses_path)
         if projection is not None:
             t_cam_cam0 = np.linalg.solve(projection[:, :3], projection[:, 3])
@@ -321,7 +343,7 @@ def _kitti_projection(path: Path, camera_idx: int) -> NDArray[np.float64] | None
 
 def _kitti_poses(path: Path) -> NDArray[np.float64]:
     try:
-        rows = np.array([[float(n) for n in fields] for fields in _fields(path, 12)]).reshape(-1, 3, 4)
+        rows = np.array([_finite(fields) for fields in _fields(path, 12)]).reshape(-1, 3, 4)
     except ValueError as err:
         raise SourceError(f"{path}: every line must have 12 numbers: {err}") from err
     return np.array([make_transform(project_to_so3(row[:, :3]), row[:, 3]) for row in rows]).reshape(-1, 4, 4)
@@ -366,7 +388,7 @@ def _euroc_truth(path: Path, sensor: Path) -> Trajectory | None:
         times_s: list[float] = []
         poses: list[NDArray[np.float64]] = []
         for t_ns, *numbers in _fields(path, 8):
-            px, py, pz, qw, qx, qy, qz = (float(n) for n in numbers[:7])
+            px, py, pz, qw, qx, qy, qz = _finite(numbers[:7])
             T_world_body = make_transform(rotation_from_quat_wxyz((qw, qx, qy, qz)), (px, py, pz))
             times_s.append(int(t_ns) * 1e-9)
             poses.append(T_world_body @ T_body_cam)
@@ -387,6 +409,8 @@ def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
         frames = sorted(document["frames"], key=lambda f: natural_key(str(f["file_path"])))
         images = tuple(_transforms_image(path.parent, str(frame["file_path"])) for frame in frames)
         T_world_gl = np.array([f["transform_matrix"] for f in frames], dtype=np.float64).reshape(-1, 4, 4)
+        if not np.isfinite(T_world_gl).all():
+            raise ValueError("transform_matrix must be finite")
     except (OSError, ValueError, KeyError, TypeError) as err:
         raise SourceError(f"{path} can't be used as transforms.json: {err}") from err
     for T in T_world_gl:
@@ -422,7 +446,10 @@ def _transforms_camera(values: dict[str, Any], width: int, height: int) -> Intri
     if "fl_x" in values:
         fx = float(values["fl_x"])
     elif "camera_angle_x" in values:
-        fx = 0.5 * width / float(np.tan(0.5 * float(values["camera_angle_x"])))
+        angle_rad = float(values["camera_angle_x"])
+        if not 0.0 < angle_rad < np.pi:
+            raise ValueError(f"camera_angle_x must be in (0, pi) radians, got {angle_rad:g}")
+        fx = 0.5 * width / float(np.tan(0.5 * angle_rad))
     else:
         return None
     return Intrinsics(

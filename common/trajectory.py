@@ -59,7 +59,7 @@ def read_tum(path: Path) -> Trajectory:
     """Read ``t tx ty tz qx qy qz qw`` lines (camera to world); ``#`` starts a comment.
 
     Raises:
-        SourceError: The file can't be read, a line has not eight numbers, or times do not increase.
+        SourceError: The file can't be read, a line has not eight finite numbers, or times do not increase.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -72,7 +72,9 @@ def read_tum(path: Path) -> Trajectory:
         if not fields:
             continue
         try:
-            t, tx, ty, tz, qx, qy, qz, qw = (float(f) for f in fields)
+            t, tx, ty, tz, qx, qy, qz, qw = numbers = [float(f) for f in fields]
+            if not np.isfinite(numbers).all():
+                raise ValueError("not finite")
             poses.append(make_transform(rotation_from_quat_wxyz((qw, qx, qy, qz)), (tx, ty, tz)))
         except ValueError as err:
             raise SourceError(f"{path}:{number} must be 't tx ty tz qx qy qz qw', got {line!r}") from err

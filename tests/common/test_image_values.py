@@ -68,3 +68,11 @@ def test_floats_of_another_range_are_refused_by_the_name_of_their_file(tmp_path)
     cv2.imwrite(str(tmp_path / "a.tif"), np.array([[0.0, 4000.0]], dtype=np.float32))
     with pytest.raises(SourceError, match=r"a.tif: values must be in 0..1 or 0..255, got up to 4000"):
         read_image(tmp_path / "a.tif")
+
+
+def test_a_single_sixteen_bit_image_among_others_goes_by_itself(tmp_path):
+    for k in range(30):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((24, 32), 100, np.uint8))
+    ramp = np.linspace(0, 65535, 24 * 32).astype(np.uint16).reshape(24, 32)
+    cv2.imwrite(str(tmp_path / "8.png"), ramp)
+    np.testing.assert_array_equal(open_sequence(tmp_path).image(8)[:, :, 0], ramp >> 8)

@@ -193,6 +193,12 @@ def damage_order(folder):
     return folder
 
 
+def damage_truth(folder):
+    lines = (folder / "groundtruth.txt").read_text().splitlines()
+    (folder / "groundtruth.txt").write_text("\n".join([*lines[:3], "0.25 nan 0 0 0 0 0 1"]))
+    return folder
+
+
 def damage_number(folder):
     (folder / "times.txt").write_text("0\none\n2\n3\n4\n")
     return folder
@@ -206,13 +212,23 @@ def damage_number(folder):
         (damage_size, "intrinsics of walk are for 64x48 images, its images are 32x24"),
         (damage_all_images, "000000.png is not a readable image"),
         (damage_times, "one time per image, got 2 times and 5 images"),
-        (damage_order, "must strictly increase"),
+        (damage_order, "times of .*walk must strictly increase, image 3 has 1 s after 1 s"),
+        (damage_truth, "groundtruth.txt:4 must be 't tx ty tz qx qy qz qw', got '0.25 nan"),
         (damage_number, "time must be a number of seconds, got 'one'"),
     ],
 )
 def test_what_is_wrong_with_a_recording_is_said(native, damage, message):
     with pytest.raises(SourceError, match=message):
         open_sequence(damage(native))
+
+
+def test_true_poses_of_another_time_are_said_not_to_be_used(native, poses, caplog):
+    assert open_sequence(native).groundtruth() is not None
+    assert not caplog.records
+    write_tum(native / "groundtruth.txt", Trajectory(1000.0 + np.arange(3), poses(3)))
+    assert open_sequence(native).groundtruth() is None
+    assert "none of its 3 true poses, from 1000.000 to 1002.000 s, is at the time of an image" in caplog.text
+    assert "from 0.000 to 0.400 s" in caplog.text
 
 
 def test_a_damaged_first_image_is_an_error_of_that_frame_alone(native):

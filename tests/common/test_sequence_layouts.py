@@ -70,6 +70,22 @@ def test_kitti_layout_moves_poses_to_the_camera_that_is_used(tmp_path, write_ima
         )
 
 
+@pytest.mark.parametrize(
+    ("times", "pose", "message"),
+    [
+        ("0\n2\n1\n", "1 0 0 0 0 1 0 0 0 0 1 0", "must strictly increase, image 3 has 1 s after 2 s"),
+        ("0\n1\n2\n3\n", "1 0 0 0 0 1 0 0 0 0 1 0", "one time per image, got 4 times and 3 images"),
+        ("0\n1\n2\n", "nan 0 0 0 0 1 0 0 0 0 1 0", "poses.txt: every line must have 12 numbers: .*finite"),
+    ],
+)
+def test_what_is_wrong_with_a_kitti_recording_is_said(tmp_path, write_images, times, pose, message):
+    write_images(tmp_path / "image_0", 3)
+    (tmp_path / "times.txt").write_text(times)
+    (tmp_path / "poses.txt").write_text(3 * f"{pose}\n")
+    with pytest.raises(SourceError, match=message):
+        open_sequence(tmp_path)
+
+
 def test_euroc_layout_gives_poses_of_the_camera_not_of_the_body(tmp_path, write_images, poses):
     folder = tmp_path / "MH_01"
     cam = folder / "mav0" / "cam0"
@@ -163,3 +179,20 @@ def test_a_transforms_file_of_a_pinhole_model_is_read(transforms_folder, model):
 def test_a_transforms_file_of_another_model_is_refused(transforms_folder, document, message):
     with pytest.raises(SourceError, match=f"transforms.json holds no usable intrinsics: {message}"):
         open_sequence(transforms_folder(**document))
+
+
+@pytest.mark.parametrize(
+    ("angle_rad", "matrix", "message"),
+    [
+        (0.0, np.eye(4), r"camera_angle_x must be in \(0, pi\) radians, got 0"),
+        (45.0, np.eye(4), r"camera_angle_x must be in \(0, pi\) radians, got 45"),
+        (0.8, np.full((4, 4), np.nan), "transform_matrix must be finite"),
+    ],
+)
+def test_nonsense_in_a_transforms_file_is_said(tmp_path, write_images, angle_rad, matrix, message):
+    write_images(tmp_path / "images", 1)
+    frames = [{"file_path": "images/000000.png", "transform_matrix": matrix.tolist()}]
+    document = {"camera_angle_x": angle_rad, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(SourceError, match=message):
+        open_sequence(tmp_path)
