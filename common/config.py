@@ -161,7 +161,14 @@ def _construct(
     try:
         return cls(**resolved)
     except (TypeError, ValueError) as err:
-        raise ConfigError(str(err)) from err
+        raise ConfigError(_named_as_given(cls, str(err))) from err
+
+
+def _named_as_given(cls: type, message: str) -> str:
+    """Call a setting that a message begins with what the command line and settings files call it."""
+    first, space, rest = message.partition(" ")
+    flags = {field.name: str(field.metadata.get("flag", field.name)) for field in fields_of(cls)}
+    return flags.get(first, first) + space + rest
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -150,7 +150,7 @@ def _into_tables(cls: type, given: Mapping[str, Any], skip: frozenset[str]) -> d
     for key, value in named_by_flag.items():
         *tables, name = flags[key].split(".")
         other = _table(values, tables).setdefault(name, value)
-        if other != value:
+        if other is not value and other != value:  # NaN is not even equal to itself
             raise ConfigError(f"{key} and {flags[key]} are one setting, got {value!r} and {other!r}")
     return values
 

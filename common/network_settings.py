@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-_ENDPOINT = re.compile(r"(tcp|udp|quic|tls|ws|unixsock-stream)/\S+")
+_ENDPOINT = re.compile(r"(tcp|udp|quic|tls|ws)/\S+?:(?P<port>\d+)([?#]\S*)?|unixsock-stream/\S+")
+_MAX_PORT = 65535
 _LOOPBACK = re.compile(r"\w+/(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+.*|unixsock-stream/.*")
 
 
@@ -20,12 +21,13 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def check_endpoint(text: str) -> None:
-    """Check that a text names an endpoint.
+    """Check that a text names an endpoint, with its port: Zenoh would try for ever to reach one without.
 
     Raises:
         ValueError: It does not.
     """
-    if _ENDPOINT.fullmatch(text) is None:
+    found = _ENDPOINT.fullmatch(text)
+    if found is None or int(found["port"] or 0) > _MAX_PORT:
         raise ValueError(f"must be an endpoint such as {DEFAULT_ENDPOINT}, got {text!r}")
 
 

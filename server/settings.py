@@ -173,7 +173,7 @@ class ServerSettings:
             )
         for name in ("idle_timeout_s", "duration_s", "max_age_ms"):
             value = getattr(self, name)
-            if value is not None and value <= 0:
+            if value is not None and not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}")
         if self.save_images != "none" and self.out is None:
             raise ValueError(f"save_images needs out, got save_images={self.save_images!r} without a folder")

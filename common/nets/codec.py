@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -50,8 +50,10 @@ def check_device(device: Device) -> None:
     """Make sure that a device which is asked for is there.
 
     Raises:
-        ConfigError: There is no such device.
+        ConfigError: There is no such device, or no device of that name.
     """
+    if device not in get_args(Device):
+        raise ConfigError(f"device must be one of {', '.join(get_args(Device))}, got {device!r}")
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError("device must be auto or cpu on this machine, which has no usable GPU, got 'cuda'")
 

@@ -65,6 +65,11 @@ def test_a_gpu_that_is_not_there_is_one_clear_error(files):
         load_codec("3dcsc", weights=files["torch"], device="cuda")
 
 
+def test_an_unknown_device_is_not_taken_for_the_cpu(files):
+    with pytest.raises(ConfigError, match="device must be one of auto, cpu, cuda, got 'gpu'"):
+        load_codec("3dcsc", weights=files["torch"], device="gpu")
+
+
 def test_the_onnx_runtime_does_not_pretend_to_use_a_gpu(files):
     with pytest.raises(ConfigError, match="device must be auto or cpu with the onnx runtime, got 'cuda'"):
         load_codec("3dcsc", weights=files["onnx"], runtime="auto", device="cuda")

@@ -57,6 +57,10 @@ class Sender:
     antenna: Antenna = Antenna(band="high")
     snr_db: float = field(default=1.0, metadata={"flag": "expect_snr_db"})
 
+    def __post_init__(self):
+        if not -5 <= self.snr_db <= 30:
+            raise ValueError(f"snr_db must be in [-5, 30], got {self.snr_db}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Reader:
@@ -178,6 +182,8 @@ def test_flags_win_over_a_file_that_names_settings_by_their_flag(toml):
     [
         (Node, "snr_db = 4\n[radio]\nsnr_db = 5", "snr_db and radio.snr_db are one setting, got 4 and 5"),
         (Sender, "expect_snr_db = 4\nsnr_db = 5", "expect_snr_db and snr_db are one setting, got 4 and 5"),
+        (Node, "snr_db = nan", "snr_db must be in [-5, 30], got nan"),
+        (Sender, 'camera = "0"\nexpect_snr_db = 99.0', "expect_snr_db must be in [-5, 30], got 99.0"),
         (Sender, 'camera = "0"\nfx = "far"', "camera.lens.fx must be of type float, got 'far'"),
         (Node, "snr_bd = 4", "unknown setting 'snr_bd', did you mean 'snr_db'"),
         (Sender, "exepct_snr = 4", "unknown setting 'exepct_snr', did you mean 'expect_snr_db'"),

@@ -109,3 +109,9 @@ def test_a_viewer_may_use_so_much_memory(limit):
 def test_a_viewer_that_would_refuse_its_memory_is_not_begun(limit):
     with pytest.raises(ValueError, match=f"such as 1GB, got '{limit}'"):
         ViewSettings(memory_limit=limit)
+
+
+@pytest.mark.parametrize("name", ["idle_timeout_s", "duration_s", "max_age_ms"])
+def test_a_limit_that_is_no_number_is_refused(name):
+    with pytest.raises(ValueError, match=f"{name} must be positive, got nan"):
+        ServerSettings(**{name: float("nan")})
