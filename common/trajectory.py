@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from semcast.common.whole_file import write_whole
 
 
 @dataclass(frozen=True)
@@ -86,10 +87,10 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write ``t tx ty tz qx qy qz qw`` lines with nanosecond times and 9-digit poses."""
+    """Write ``t tx ty tz qx qy qz qw`` lines with nanosecond times and 9-digit poses, all or none of them."""
     rows = ["# t_s tx ty tz qx qy qz qw (camera to world; x right, y down, z forward)"]
     for t_s, T_world_cam in zip(trajectory.t_s, trajectory.T_world_cam, strict=True):
         w, x, y, z = quat_wxyz_from_rotation(T_world_cam[:3, :3])
         numbers = " ".join(f"{v:.9f}" for v in (*T_world_cam[:3, 3], x, y, z, w))
         rows.append(f"{t_s:.9f} {numbers}")
-    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    write_whole(path, "\n".join(rows) + "\n")

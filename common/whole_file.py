@@ -15,7 +15,7 @@ def check_writable(path: Path, name: str) -> None:
     """Refuse a file that could not be written, before the work whose result it is to hold.
 
     Args:
-        path: The file; folders that lack are made.
+        path: The file, or a pipe or device; folders that lack are made.
         name: Of the setting.
 
     Raises:
@@ -23,6 +23,8 @@ def check_writable(path: Path, name: str) -> None:
     """
     if os.path.isdir(path):  # Path.is_dir raises where it may not look
         raise ConfigError(f"{name} must be a file, {path} is a folder")
+    if _is_no_file(path) and os.access(path, os.W_OK):
+        return
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
@@ -31,17 +33,36 @@ def check_writable(path: Path, name: str) -> None:
         raise ConfigError(f"{name} can't be written to {path}: {err.strerror}") from err
 
 
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write text, as UTF-8, or bytes to a file: all of it, or the file stays as it was.
+
+    Raises:
+        OSError: The file can't be written.
+    """
+    with whole_file(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def _is_no_file(path: Path) -> bool:
+    """Tell whether something is there that is neither a file nor a folder, such as ``/dev/stdout``."""
+    return os.path.exists(path) and not os.path.isfile(path) and not os.path.isdir(path)
+
+
 @contextmanager
 def whole_file(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     """Open a binary file that takes the place of ``path`` when the block ends, and vanishes when it raises.
 
     Args:
-        path: In a folder that exists.
+        path: In a folder that exists. A pipe or device is written as it is, and keeps its place.
         durable: Have the content on the disk before it takes the place, for files that outlive a power cut.
 
     Raises:
         OSError: The file can't be written.
     """
+    if _is_no_file(path):
+        with path.open("wb") as file:
+            yield file
+        return
     partial = path.with_name(path.name + ".part")
     try:
         with partial.open("w+b") as file:

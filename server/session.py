@@ -29,6 +29,7 @@ from semcast.common.run_folder import (
     write_run,
 )
 from semcast.common.trajectory import Trajectory, write_tum
+from semcast.common.whole_file import write_whole
 from semcast.server.checkpoint import (
     Checkpoint,
     CheckpointHeader,
@@ -408,7 +409,7 @@ class Session:
             return results
         folder.mkdir(parents=True, exist_ok=True)
         with each.attempt(folder / SETTINGS_NAME) as path:
-            path.write_text(to_toml(self._program), encoding="utf-8")
+            write_whole(path, to_toml(self._program))
         with each.attempt(folder / TRAJECTORY_NAME) as path:
             write_tum(path, trajectory)
         with each.attempt(folder / MAP_NAME) as path:

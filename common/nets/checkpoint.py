@@ -8,11 +8,12 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 from semcast.common.errors import CheckpointError
 from semcast.common.nets.registry import build, sizes_to_dict
 from semcast.common.nets.transceiver import Transceiver
+from semcast.common.whole_file import write_whole
 
 MAX_BYTES = 16 * 1024 * 1024
 #: Raised when keys of the manifest change, or when the same weights mean another network (2: leaky units;
@@ -158,7 +159,7 @@ def save_transceiver(
     if num_bytes > MAX_BYTES:
         raise CheckpointError(f"weights must be <= {MAX_BYTES} bytes, got {num_bytes}")
     weights.parent.mkdir(parents=True, exist_ok=True)
-    save_file(tensors, weights)
+    write_whole(weights, save(tensors))
     manifest = Manifest(
         architecture=architecture,
         sizes=sizes_to_dict(sizes),
@@ -176,4 +177,4 @@ def save_transceiver(
 def write_manifest(manifest: Manifest, weights: Path) -> None:
     """Write the manifest beside its weights."""
     text = json.dumps(dataclasses.asdict(manifest), indent=1) + "\n"
-    manifest_path(weights).write_text(text, encoding="utf-8")
+    write_whole(manifest_path(weights), text)

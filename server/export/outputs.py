@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from semcast import __version__
 from semcast.common.errors import SourceError
 from semcast.common.trajectory import Trajectory
-from semcast.common.whole_file import whole_file
+from semcast.common.whole_file import write_whole
 
 PACKAGES = ("numpy", "torch", "opencv-python-headless", "eclipse-zenoh", "rerun-sdk", "gtsam", "poselib")
 
@@ -70,7 +70,7 @@ def write_ply(
     *,
     axes: str = "x right, y down, z forward of the first camera",
 ) -> None:
-    """Write landmarks as binary PLY with colour and a ``confidence`` property in [0, 1].
+    """Write landmarks as binary PLY with colour and a ``confidence`` property in [0, 1], whole or not at all.
 
     Points with a non-finite coordinate are left out.
 
@@ -98,7 +98,7 @@ def write_ply(
         *properties,
         "end_header",
     ]
-    path.write_bytes("\n".join(header).encode("ascii") + b"\n" + vertices.tobytes())
+    write_whole(path, "\n".join(header).encode("ascii") + b"\n" + vertices.tobytes())
 
 
 def read_ply(path: Path) -> NDArray[Any]:
@@ -158,9 +158,7 @@ def plain(value: Any) -> Any:
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Write JSON without NaN, whole or not at all."""
-    text = json.dumps(plain(value), indent=1, allow_nan=False) + "\n"
-    with whole_file(path) as file:
-        file.write(text.encode())
+    write_whole(path, json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
 
 
 def percentiles(values_ms: Iterable[float]) -> dict[str, float] | None:

@@ -53,6 +53,10 @@ def received(encoded, snr_db):
     )
 
 
+def test_weights_are_readable_like_their_manifest(weights):
+    assert weights.stat().st_mode == weights.with_suffix(".json").stat().st_mode
+
+
 @pytest.mark.parametrize("shape_hw", [(32, 48), (33, 47), (5, 7)])
 @pytest.mark.parametrize("modulation", ["16qam", "analog"])
 def test_any_image_size_comes_back_at_that_size(weights, shape_hw, modulation):

@@ -1,6 +1,9 @@
+import os
+import threading
+
 import pytest
 
-from semcast.common.whole_file import whole_file
+from semcast.common.whole_file import check_writable, whole_file, write_whole
 
 
 @pytest.mark.parametrize("durable", [False, True])
@@ -32,3 +35,17 @@ def test_a_failure_leaves_the_old_content_and_nothing_else(tmp_path):
 def test_a_file_without_a_folder_is_an_os_error(tmp_path):
     with pytest.raises(FileNotFoundError), whole_file(tmp_path / "no" / "a"):
         pass
+
+
+def test_a_pipe_is_written_as_it_is_and_keeps_its_place(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    read: list[bytes] = []
+    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()), name="reader")
+    reader.start()
+    check_writable(pipe, "json")
+    write_whole(pipe, "a name: Bürö\n")
+    reader.join(10.0)
+    assert read == ["a name: Bürö\n".encode()]
+    assert pipe.is_fifo()
+    assert [p.name for p in tmp_path.iterdir()] == ["pipe"]

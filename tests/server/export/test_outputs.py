@@ -1,11 +1,14 @@
 """What a run leaves behind can be read by others."""
 
+import contextlib
 import json
+import resource
 
 import numpy as np
 import pytest
 
 from semcast.common.errors import SourceError
+from semcast.common.trajectory import Trajectory, read_tum, write_tum
 from semcast.server.export.outputs import (
     percentiles,
     plain,
@@ -15,6 +18,22 @@ from semcast.server.export.outputs import (
     write_json,
     write_ply,
 )
+
+
+@pytest.fixture
+def full_disk():
+    """Return a context in which no file grows beyond 512 bytes: writes fail as on a full disk."""
+
+    @contextlib.contextmanager
+    def limited():
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (512, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    return limited
 
 
 def test_ply_is_what_the_format_says_byte_for_byte(tmp_path):
@@ -61,6 +80,20 @@ def test_ply_opens_in_colmap(tmp_path):
     points = sorted(model.points3D.values(), key=lambda p: p.xyz[0])
     assert [p.xyz.tolist() for p in points] == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
     assert [p.color.tolist() for p in points] == rgb.tolist()
+
+
+def test_a_full_disk_leaves_the_results_of_before(tmp_path, full_disk):
+    xyz, rgb, confidence = np.ones((100, 3)), np.zeros((100, 3), np.uint8), np.ones(100, np.float32)
+    write_ply(tmp_path / "map.ply", xyz[:1], rgb[:1], confidence[:1])
+    write_tum(tmp_path / "t.tum", Trajectory(np.zeros(1), np.eye(4)[None]))
+    with full_disk():
+        with pytest.raises(OSError, match="File too large"):
+            write_ply(tmp_path / "map.ply", xyz, rgb, confidence)
+        with pytest.raises(OSError, match="File too large"):
+            write_tum(tmp_path / "t.tum", Trajectory(np.arange(100.0), np.tile(np.eye(4), (100, 1, 1))))
+    assert len(read_ply(tmp_path / "map.ply")) == 1
+    assert len(read_tum(tmp_path / "t.tum")) == 1
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_trajectories_are_ordered_by_frame_and_never_go_back_in_time():
