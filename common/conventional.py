@@ -29,6 +29,8 @@ from semcast.common.phy.slots import SlotLayout, layout_for
 from semcast.common.shapes import check_shape
 
 _GREY = 128
+#: No link is better; what is said to be is finite this way.
+_MAX_SNR_DB = 100.0
 _LABEL_SLOPE = 30.0
 #: Standard deviation of grey levels in an 8x8 window that separates the classes of activity.
 _ACTIVITY_EDGES = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 35.0)
@@ -174,7 +176,13 @@ class ConventionalCodec:
         return EncodedImage(shape_hw=shape_hw, symbols=data, modulation=self._modulation)
 
     def decode(self, received: ReceivedImage) -> DecodedImage:
-        """Decode one frame; a frame whose CRC fails comes back mid-grey, as an outage."""
+        """Decode one frame; a frame whose CRC fails comes back mid-grey, as an outage.
+
+        Values that are not finite count as lost.
+
+        Raises:
+            ValueError: Sizes contradict each other.
+        """
         payload = self._receive(received)
         image = None
         if payload is not None and len(payload) > _NUM_CLASSES:
@@ -199,10 +207,17 @@ class ConventionalCodec:
 
     def _receive(self, received: ReceivedImage) -> bytes | None:
         layout = layout_for(received.shape_hw)
-        snr = 10.0 ** (received.effective_snr_db.astype(np.float64) / 10.0)
-        erased = received.effective_snr_db <= LOST_SLOT_SNR_DB
+        check_shape(received.symbols, f"{layout.num_slots} {layout.data_per_slot}", "symbols")
+        check_shape(received.effective_snr_db, f"{layout.num_slots}", "effective_snr_db")
+        arrived = np.isfinite(received.symbols)
+        snr_db = np.where(arrived.all(axis=1), received.effective_snr_db, LOST_SLOT_SNR_DB)
+        snr_db = np.nan_to_num(snr_db.astype(np.float64), nan=LOST_SLOT_SNR_DB)
+        snr_db = snr_db.clip(LOST_SLOT_SNR_DB, _MAX_SNR_DB)
+        snr = 10.0 ** (snr_db / 10.0)
+        erased = snr_db <= LOST_SLOT_SNR_DB
         # The MMSE estimate is shrunk by snr / (1 + snr); undone, the noise variance is 1 / snr.
-        unbiased = received.symbols * ((1.0 + snr) / snr)[:, None].astype(np.float32)
+        symbols = np.where(arrived, received.symbols, 0)
+        unbiased = symbols * ((1.0 + snr) / snr)[:, None].astype(np.float32)
         header = self._header_per_slot(layout)
         mode_idx = 0
         if header:

@@ -145,11 +145,12 @@ class NeuralCodec:
             snr_db: Expected SNR in dB; values outside the trained range are clipped to it.
 
         Raises:
-            ValueError: The image is not of that shape and type.
+            ValueError: The image is not of that shape and type, or has no pixel.
         """
         sizes = check_shape(image, "H W 3", "image")
         if image.dtype != np.uint8:
             raise ValueError(f"image must be uint8, got {image.dtype}")
+        layout_for((sizes["H"], sizes["W"]))  # refuses images without a pixel
         low, high = self.manifest.snr_range_db
         expected = float(np.clip(snr_db, low, high)) if np.isfinite(snr_db) else low
         bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX

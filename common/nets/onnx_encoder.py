@@ -14,7 +14,7 @@ from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.latent import symbols_from_latent
 from semcast.common.nets.modulation_numpy import transmit
 from semcast.common.nets.rounding import rounded_snr_db
-from semcast.common.phy.slots import BLOCK_PX
+from semcast.common.phy.slots import BLOCK_PX, layout_for
 from semcast.common.shapes import check_shape
 
 SUFFIX = ".onnx"
@@ -113,11 +113,12 @@ class OnnxEncoder:
         """Encode one image; see ``NeuralCodec.encode``.
 
         Raises:
-            ValueError: The image is not ``(H, W, 3)`` uint8.
+            ValueError: The image is not ``(H, W, 3)`` uint8, or has no pixel.
         """
         sizes = check_shape(image, "H W 3", "image")
         if image.dtype != np.uint8:
             raise ValueError(f"image must be uint8, got {image.dtype}")
+        layout_for((sizes["H"], sizes["W"]))  # refuses images without a pixel
         low, high = self._snr_range_db
         expected = float(np.clip(snr_db, low, high)) if np.isfinite(snr_db) else low
         bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX

@@ -9,7 +9,7 @@ pair's own residuals. A misleading confidence can therefore cost time, hardly ac
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import poselib
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform, project_to_so3, rotation_angle_deg
+from semcast.common.shapes import check_shape
 from semcast.server.geometry.agreement import neighbour_agreement
 from semcast.server.geometry.epipolar import (
     depths,
@@ -107,10 +108,23 @@ def estimate_two_view(
         choose_model: Also try a plane and a pure rotation, as a start of a map needs it.
 
     Returns:
-        The result, or None with fewer than 8 matches or when nothing was found.
+        The result, or None with fewer than 8 matches, pixels that are not finite, or when nothing was found.
+
+    Raises:
+        ValueError: Shapes disagree, the camera has distortion, or an argument is out of range.
     """
     xy0 = np.ascontiguousarray(keypoints0_xy, dtype=np.float64)
     xy1 = np.ascontiguousarray(keypoints1_xy, dtype=np.float64)
+    check_shape(xy0, "N 2", "keypoints0_xy")
+    check_shape(xy1, f"{len(xy0)} 2", "keypoints1_xy")
+    if confidence is not None:
+        check_shape(confidence, f"{len(xy0)}", "confidence")
+    if mode not in get_args(ConfidenceMode):
+        raise ValueError(f"mode must be one of {', '.join(get_args(ConfidenceMode))}, got {mode!r}")
+    if not threshold_px > 0.0:
+        raise ValueError(f"threshold_px must be positive, got {threshold_px:g}")
+    if any(camera.distortion):
+        raise ValueError(f"camera must be without distortion, got {camera.distortion}")
     if len(xy0) < MIN_MATCHES or not (np.isfinite(xy0).all() and np.isfinite(xy1).all()):
         return None
     if mode == "paper" and confidence is not None:

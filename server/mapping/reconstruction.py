@@ -118,7 +118,7 @@ class Reconstruction:
                 called for other frames.
 
         Raises:
-            ValueError: An array has another shape than the camera's image.
+            ValueError: An array has another shape than the camera's image, or another number type.
         """
         frame.check(self._camera.shape_hw)
         self._stage_ms = {}

@@ -41,17 +41,21 @@ class DecodedFrame:
     slot_snr_db: NDArray[np.float32] | None = None
 
     def check(self, shape_hw: tuple[int, int]) -> None:
-        """Check that image and confidence maps are of a camera's size.
+        """Check that image and confidence maps are of a camera's size, and hold what they should.
 
         Raises:
-            ValueError: An array has another shape.
+            ValueError: An array has another shape or number type.
         """
         height, width = shape_hw
         check_shape(self.image, f"{height} {width} 3", "image")
+        if self.image.dtype != np.uint8:
+            raise ValueError(f"image must be uint8, got {self.image.dtype}")
         for name in ("confidence", "keypoint_confidence"):
             values = getattr(self, name)
             if values is not None:
                 check_shape(values, f"{height} {width}", name)
+                if values.dtype.kind != "f":
+                    raise ValueError(f"{name} must be floating point in [0, 1], got {values.dtype}")
 
 
 @dataclass(frozen=True)

@@ -133,6 +133,31 @@ def test_garbage_is_an_outage_and_nothing_worse(rng):
         assert codec.decode(received).outage
 
 
+@pytest.mark.parametrize("name", ["jpeg-ldpc", "jpeg-amc"])
+@pytest.mark.parametrize("snr_db", [np.nan, np.inf, -np.inf, 1e6])
+def test_values_that_are_no_numbers_count_as_lost(name, snr_db, picture):
+    codec = load_codec(name)
+    encoded = codec.encode(picture, 10.0)
+    slots = np.full(len(encoded.symbols), 20.0, np.float32)
+    damaged, slots[1] = encoded.symbols.copy(), snr_db
+    damaged[0, 3] = np.nan
+    decoded = codec.decode(ReceivedImage(encoded.shape_hw, damaged, slots, encoded.modulation))
+    assert not decoded.outage, "the code repairs two lost slots"
+    nothing = np.full_like(encoded.symbols, np.nan)
+    slots = np.full(len(nothing), snr_db, np.float32)
+    assert codec.decode(ReceivedImage(encoded.shape_hw, nothing, slots, encoded.modulation)).outage
+
+
+def test_sizes_that_contradict_each_other_are_named(picture):
+    codec = load_codec("jpeg-ldpc")
+    encoded = codec.encode(picture, 10.0)
+    slots = np.full(len(encoded.symbols), 20.0, np.float32)
+    with pytest.raises(ValueError, match="symbols must have shape"):
+        codec.decode(ReceivedImage((16, 16), encoded.symbols, slots, "16qam"))
+    with pytest.raises(ValueError, match="effective_snr_db must have shape"):
+        codec.decode(ReceivedImage(encoded.shape_hw, encoded.symbols, slots[1:], "16qam"))
+
+
 def test_one_instance_serves_changing_image_sizes(picture):
     codec = load_codec("jpeg-ldpc")
     for image in (picture, picture[:96], picture):

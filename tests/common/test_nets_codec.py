@@ -120,6 +120,8 @@ def test_contradicting_sizes_are_refused(weights):
         codec.decode(
             ReceivedImage((32, 32), np.zeros((3, 94), np.complex64), np.zeros(2, np.float32), "16qam")
         )
+    with pytest.raises(ValueError, match=r"shape_hw must be positive, got \(0, 16\)"):
+        codec.encode(np.zeros((0, 16, 3), np.uint8), 10.0)
     with pytest.raises(ValueError, match="uint8"):
         codec.encode(np.zeros((16, 16, 3), np.float32), 10.0)
     with pytest.raises(ValueError, match="modulation must be"):

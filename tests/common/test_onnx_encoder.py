@@ -127,7 +127,11 @@ def test_it_can_not_decode_and_says_who_can(exported):
 
 @pytest.mark.parametrize(
     ("image", "message"),
-    [(np.zeros((32, 32), np.uint8), "image"), (np.zeros((32, 32, 3), np.float32), "image must be uint8")],
+    [
+        (np.zeros((32, 32), np.uint8), "image"),
+        (np.zeros((32, 32, 3), np.float32), "image must be uint8"),
+        (np.zeros((0, 32, 3), np.uint8), "shape_hw must be positive"),
+    ],
 )
 def test_bad_images_are_refused(exported, image, message):
     with pytest.raises(ValueError, match=message):

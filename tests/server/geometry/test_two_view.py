@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -160,3 +162,20 @@ def test_the_same_seed_gives_the_same_result():
     _, xy0, xy1, is_outlier = make_matches(3)
     a, b = (estimate_two_view(CAMERA, xy0, xy1, 1.0 - 0.5 * is_outlier, seed=7, **FAST) for _ in range(2))
     assert np.array_equal(a.T_cam1_cam0, b.T_cam1_cam0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"keypoints1_xy": np.zeros((9, 2))}, r"keypoints1_xy must have shape \(10 2\), got \(9, 2\)"),
+        ({"keypoints0_xy": np.zeros((10, 3))}, "keypoints0_xy must have shape"),
+        ({"confidence": np.ones(5)}, r"confidence must have shape \(10\), got \(5,\)"),
+        ({"mode": "robst"}, "mode must be one of robust, .*, got 'robst'"),
+        ({"threshold_px": float("nan")}, "threshold_px must be positive, got nan"),
+        ({"camera": replace(CAMERA, distortion=(0.1, 0.0, 0.0, 0.0))}, "camera must be without distortion"),
+    ],
+)
+def test_arguments_that_make_no_sense_are_named(changes, message):
+    given = {"camera": CAMERA, "keypoints0_xy": np.zeros((10, 2)), "keypoints1_xy": np.zeros((10, 2))}
+    with pytest.raises(ValueError, match=message):
+        estimate_two_view(**{**given, **changes})
