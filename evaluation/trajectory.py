@@ -10,7 +10,7 @@ import numpy as np
 
 from semcast.common.codec import Codec
 from semcast.common.errors import SemcastError
-from semcast.common.trajectory import write_tum
+from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.trajectory_error import MIN_MATCHES, ate
 from semcast.evaluation.pipeline import (
     CLEAN,
@@ -88,6 +88,11 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     truth = sequence.groundtruth()
     if truth is None:
         logger.warning("%s has no true path: how far its poses are off is unknown", sequence.name)
+    elif not _measures(truth):
+        logger.warning(
+            "%s has a true path of %d poses and %.3g m: too short to say how far its poses are off",
+            *(sequence.name, len(truth), truth.path_length),
+        )
     frame_ids = selected_frame_ids(sequence, settings)
     # Without a link neither SNR nor channel seed changes an image: one SNR stands for all.
     snrs_db = settings.snr_db if codec is not None else settings.snr_db[:1]
@@ -104,7 +109,8 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
                     label = CLEAN if codec is None else f"{snr_db:g}db"
                     _write_files(settings.out, f"{label}_{mode}", run)
         level = None if codec is None else snr_db
-        cells += [_cell(level, mode, runs[mode], has_truth=truth is not None) for mode in settings.confidence]
+        has_truth = truth is not None and _measures(truth)
+        cells += [_cell(level, mode, runs[mode], has_truth=has_truth) for mode in settings.confidence]
     report = {
         **provenance(VERB, settings),
         "sequence": sequence.name,
@@ -130,6 +136,11 @@ def median_or_none(values: Sequence[float | None]) -> float | None:
     """Return the median with None counted as worse than any number; None when that is the median."""
     median = float(np.median([np.inf if v is None else v for v in values])) if len(values) else np.inf
     return median if np.isfinite(median) else None
+
+
+def _measures(truth: Trajectory) -> bool:
+    """Whether a path can be held against this one at all; if not, no run is to blame for having no error."""
+    return len(truth) >= MIN_MATCHES and truth.path_length > 0.0
 
 
 def _has_failed(run: Mapping[str, Any], *, has_truth: bool) -> bool:

@@ -81,9 +81,7 @@ class StreamNotes:
 
 
 @contextlib.contextmanager
-def recording(
-    session: Session, agent_id: str, file: Path, settings_toml: str
-) -> Iterator[tuple[Recorder, StreamNotes]]:
+def recording(session: Session, agent_id: str, file: Path, settings_toml: str) -> Iterator[Recorder]:
     """Record all that is sent about one agent while the context lasts.
 
     Args:
@@ -98,7 +96,11 @@ def recording(
     with Recorder(file, recording_metadata(settings_toml, __version__)) as recorder:
         notes = StreamNotes(recorder)
         session.subscribe_keyed(all_keys(agent_id), "every", notes.put)
-        yield recorder, notes
+        # An agent that was there before us announced its camera, without which nothing can be replayed.
+        camera = session.request(camera_key(agent_id), b"", CAMERA_TIMEOUT_S)
+        if camera is not None:
+            notes.put(camera_key(agent_id), camera)
+        yield recorder
 
 
 def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any]:
@@ -116,12 +118,8 @@ def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any
         return {"messages": 0, "bytes": 0, "drops": {}}
     with (
         session,
-        recording(session, settings.agent_id, settings.file, to_toml(settings)) as (recorder, notes),
+        recording(session, settings.agent_id, settings.file, to_toml(settings)) as recorder,
     ):
-        # The camera was announced before we came.
-        camera = session.request(camera_key(settings.agent_id), b"", CAMERA_TIMEOUT_S)
-        if camera is not None:
-            notes.put(camera_key(settings.agent_id), camera)
         stop.wait()
     return {
         "messages": recorder.num_written,

@@ -121,6 +121,19 @@ def test_without_a_truth_a_run_is_judged_by_its_poses(room, tmp_path, caplog):
     assert "blind has no true path: how far its poses are off is unknown" in caplog.text
 
 
+@pytest.mark.parametrize("truth", ["100 0 0 0 0 0 0 1\n100.1 1 0 0 0 0 0 1\n", "still"])
+def test_a_truth_that_measures_nothing_is_not_a_failure_of_the_run(room, tmp_path, caplog, truth):
+    folder = tmp_path / "short"
+    shutil.copytree(room, folder)
+    if truth == "still":
+        lines = (folder / "groundtruth.txt").read_text().splitlines()[1:]
+        truth = "".join(f"{line.split()[0]} 0 0 0 0 0 0 1\n" for line in lines)
+    (folder / "groundtruth.txt").write_text(truth)
+    report = evaluate_trajectory(TrajectorySettings(sequence=folder, codec="none", max_frames=10))
+    assert (report["ate_rmse_m"], report["num_failed"]) == (None, 0)
+    assert "too short to say how far its poses are off" in caplog.text
+
+
 def test_a_failed_run_counts_as_worse_than_any_number():
     assert median_or_none([1.0, None, 2.0]) == 2.0
     assert median_or_none([1.0, None, None]) is None

@@ -4,7 +4,9 @@ import json
 
 import numpy as np
 
+from semcast.common.recording_reader import RecordingReader
 from semcast.server.export.outputs import write_ply
+from semcast.server.recorded_streams import recorded_streams
 
 
 def centre(pose):
@@ -134,3 +136,13 @@ def test_a_start_with_an_earlier_clock_is_followed_after_a_silence(air, monkeypa
         radio.stream(range(num_frames))
         radio.close()
     assert running.finish(stop=True)["frames"]["tracked"] == 6
+
+
+def test_a_server_that_comes_after_the_agent_records_its_camera_too(tmp_path, air):
+    radio = air.agent(100)
+    running = air.serve(record=tmp_path / "run.mcap")
+    radio.stream(range(4))
+    running.finish(stop=True)
+    (stream,) = recorded_streams(RecordingReader(tmp_path / "run.mcap"))
+    assert stream.camera == radio.camera
+    assert "semcast.stream.100" in RecordingReader(tmp_path / "run.mcap").info().metadata
