@@ -2,15 +2,15 @@
 
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from semcast import __version__
+from semcast import TransportError, __version__
 from semcast.common.config import to_toml
-from semcast.common.keys import DEFAULT_AGENT_ID, all_keys, camera_key, check_agent_id
-from semcast.common.messages import CameraInfo
+from semcast.common.keys import DEFAULT_AGENT_ID, agent_of, all_keys, camera_key, check_agent_id
+from semcast.common.messages import CameraInfo, StatusMessage
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
 from semcast.common.recording import recording_metadata
@@ -49,21 +49,39 @@ def kind_of_key(key: str) -> str:
 class StreamNotes:
     """Puts messages into a recording and, for each stream, what decodes it: a metadata record of its own.
 
+    An agent announces its camera once, and maybe not to us: it was there before, or came back to a hub that
+    was started again. Its status, once a second, tells of it too, and then it is asked.
+
     Args:
         recorder: Where to.
+        ask: Returns an agent's camera message, given the key, or None.
     """
 
-    def __init__(self, recorder: Recorder) -> None:
+    def __init__(self, recorder: Recorder, ask: Callable[[str], bytes | None]) -> None:
         self._recorder = recorder
+        self._ask = ask
         self._epochs: set[int] = set()
 
     def put(self, key: str, payload: bytes) -> None:
         """Record a message that arrived under a key."""
         kind = kind_of_key(key)
-        if kind == "camera":
-            with contextlib.suppress(WireError):
+        with contextlib.suppress(WireError):
+            if kind == "camera":
                 self._note(unpack(payload, CameraInfo))
+            elif kind == "status":
+                self._look_for_camera(key, unpack(payload, StatusMessage))
         self._recorder.put(key, kind, payload)
+
+    def _look_for_camera(self, key: str, status: StatusMessage) -> None:
+        if status.role == "agent" and status.agent_epoch not in self._epochs:
+            self.put_camera(agent_of(key))
+
+    def put_camera(self, agent_id: str) -> None:
+        """Ask an agent for its camera and record that; nothing happens where there is no answer."""
+        key = camera_key(agent_id)
+        answer = self._ask(key)
+        if answer is not None:
+            self.put(key, answer)
 
     def _note(self, camera: CameraInfo) -> None:
         if camera.agent_epoch in self._epochs:
@@ -94,12 +112,15 @@ def recording(session: Session, agent_id: str, file: Path, settings_toml: str) -
         SourceError: The file can't be written.
     """
     with Recorder(file, recording_metadata(settings_toml, __version__)) as recorder:
-        notes = StreamNotes(recorder)
+
+        def ask(key: str) -> bytes | None:
+            with contextlib.suppress(TransportError):  # the session ends while we are at it
+                return session.request(key, b"", CAMERA_TIMEOUT_S)
+            return None
+
+        notes = StreamNotes(recorder, ask)
         session.subscribe_keyed(all_keys(agent_id), "every", notes.put)
-        # An agent that was there before us announced its camera, without which nothing can be replayed.
-        camera = session.request(camera_key(agent_id), b"", CAMERA_TIMEOUT_S)
-        if camera is not None:
-            notes.put(camera_key(agent_id), camera)
+        notes.put_camera(agent_id)
         yield recorder
 
 

@@ -22,13 +22,14 @@ from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import NetworkSettings
+from semcast.common.recorder import Recorder
 from semcast.common.recording import RecordingWriter, recording_metadata, recover_file
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
 from semcast.common.transport import open_hub
 from semcast.common.wire import pack, unpack
 from semcast.describe import describe_recording
-from semcast.server.record import RecordSettings, kind_of_key, run_record
+from semcast.server.record import RecordSettings, StreamNotes, kind_of_key, run_record
 from semcast.server.recorded_streams import recorded_streams
 from semcast.server.replay import ReplaySettings, replay
 from semcast.server.settings import ViewSettings
@@ -69,6 +70,25 @@ def recording(tmp_path_factory):
 def test_a_key_tells_the_kind_of_its_messages():
     assert kind_of_key("semcast/a/rx/symbols") == kind_of_key("semcast/a/tx/symbols") == "symbols"
     assert kind_of_key("semcast/a/status/agent") == "status"
+
+
+def test_the_camera_of_an_agent_that_came_back_is_asked_for(tmp_path, recording):
+    messages = list(RecordingReader(recording).messages(frozenset({"camera", "status", "symbols"})))
+    camera = next(m for m in messages if m.kind == "camera")
+    asked = []
+
+    def answer(key):
+        asked.append(key)
+        return camera.data if len(asked) > 1 else None
+
+    with Recorder(tmp_path / "late.mcap", recording_metadata("", "test")) as recorder:
+        notes = StreamNotes(recorder, answer)
+        status = next(m for m in messages if m.topic.endswith("status/agent"))
+        for message in (*(m for m in messages if m.kind == "symbols"), status, status, status):
+            notes.put(message.topic, message.data)
+    assert asked == 2 * ["semcast/agent0/camera"], "again after silence, and not once it is known"
+    (stream,) = recorded_streams(RecordingReader(tmp_path / "late.mcap"))
+    assert stream.num_received >= FRAMES // 2
 
 
 def test_everything_that_was_sent_is_in_the_recording(recording):
