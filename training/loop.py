@@ -17,10 +17,11 @@ import torch.distributed as dist
 
 from semcast.common.errors import CheckpointError
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
+from semcast.common.nets.codec import check_device
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS, channel_bandwidth_ratio
-from semcast.common.whole_file import whole_file
+from semcast.common.whole_file import check_writable, whole_file
 from semcast.training.centring import centre_hidden, folded, unfolded
 from semcast.training.channel import LinkDraw, draw_links, through_link
 from semcast.training.data import Batches, read_images
@@ -80,6 +81,9 @@ class Run:
 
     def __init__(self, settings: TrainSettings, rank: int, world: int) -> None:
         self.settings, self.rank, self.world = settings, rank, world
+        check_device(settings.device)
+        if rank == 0:
+            check_writable(self.checkpoint_path, "out")  # not after the first thousand steps
         use_cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
         local = int(os.environ.get("LOCAL_RANK", "0"))
         self.device = torch.device("cuda", local) if use_cuda else torch.device("cpu")

@@ -13,7 +13,7 @@ import torch
 
 import semcast.common.nets.registry as registry
 from semcast.common.config import build_settings, read_toml
-from semcast.common.errors import CheckpointError
+from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.codec import NeuralCodec
 from semcast.common.nets.mae import MaeSizes, build_mae
@@ -165,6 +165,15 @@ def test_a_damaged_checkpoint_is_refused(tiny_network, photos, tmp_path):
     (tmp_path / "last.pt").write_bytes(b"nothing")
     with pytest.raises(CheckpointError, match="can't be read"):
         train(settings_for(photos, tmp_path))
+
+
+def test_what_a_run_could_not_do_later_is_said_before_it_begins(tiny_network, photos, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="out can't be written to .*last.pt: Not a directory"):
+        train(settings_for(photos, tmp_path / "file" / "out"))
+    if not torch.cuda.is_available():
+        with pytest.raises(ConfigError, match="device must be auto or cpu on this machine"):
+            train(settings_for(photos, tmp_path / "out", device="cuda"))
 
 
 def test_the_rate_warms_up_stays_and_falls_to_zero():
