@@ -46,6 +46,9 @@ def serve(connection: Connection) -> None:
 class ProcessBundle:
     """Adjusts in a child process that is started again when it dies.
 
+    The child imports the program's main module: a script needs ``if __name__ == "__main__":`` around what it
+    does, or takes ``InlineBundle``.
+
     Args:
         lossless: ``take`` always waits for the result, so the same input gives the same map; otherwise it
             returns at once and the result is applied when it is ready.
