@@ -143,12 +143,11 @@ def track_points(
     max_forward_backward_px: float = 1.5,
     max_level: int = 3,
     window_px: int = KLT_WINDOW_PX,
-    is_near: bool = False,
 ) -> TrackedPoints:
     """Follow points by Lucas-Kanade, there and back.
 
     Where the points that are found tell that the exposure changed, the first image is brought to that of the
-    second and all are followed anew. Guesses that are near tell it before, which mostly saves that.
+    second and all are followed anew.
 
     Args:
         grey0: Image the points are known in.
@@ -158,15 +157,10 @@ def track_points(
         max_forward_backward_px: Points that come back further off are not ``ok``.
         max_level: Pyramid levels above the full image.
         window_px: Side of the window.
-        is_near: The guesses are expected to be a few pixels off.
     """
     count = len(xy0)
     if count == 0 or grey0.shape != grey1.shape:
         return TrackedPoints.none(count)
-    if is_near:
-        change = brightness_change(grey0, grey1, xy0, guess1_xy)
-        if change is not None:
-            grey0 = with_brightness(grey0, *change)
     found = _track_alike(grey0, grey1, xy0, guess1_xy, max_forward_backward_px, max_level, window_px)
     for _ in range(2):
         # Where hardly any was found, the guesses are near enough for a first idea of the change.

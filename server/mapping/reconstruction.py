@@ -167,7 +167,7 @@ class Reconstruction:
             world = self._map.world
             T_world_seen = [world.pose_of_frame(frame_id) for frame_id in tracks.frame_ids]
             guess = expected_positions(self._camera, world, tracks, T_world_guess, T_world_seen)
-            tracks.follow(sight, guess, is_near=True)
+            tracks.follow(sight, guess)
         else:
             ahead = tracks.xy + tracks.velocity * (tracks.missed + 1)[:, None]
             tracks.follow(sight, ahead, max_level=_START_LEVELS)

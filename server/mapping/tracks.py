@@ -229,7 +229,7 @@ class TrackTable:
         self._before = None
         return before, after
 
-    def follow(self, sight: Sight, guess_xy: Array, *, max_level: int = 3, is_near: bool = False) -> None:
+    def follow(self, sight: Sight, guess_xy: Array, max_level: int = 3) -> None:
         """Look for every track in a new image.
 
         A track that runs into rows that did not arrive coasts: it is looked for again from the image it was
@@ -240,7 +240,6 @@ class TrackTable:
             sight: The new image.
             guess_xy: ``(N, 2)`` expected positions.
             max_level: KLT pyramid levels.
-            is_near: The guesses are expected to be a few pixels off.
         """
         count = len(self)
         self._before = {name: getattr(self, name).copy() for name in _COLUMNS}
@@ -250,9 +249,9 @@ class TrackTable:
             if len(rows) == 0:
                 continue
             grey = self._greys[-1 - back]
-            xy0, xy1 = self.xy[rows], guess_xy[rows]
-            points = track_points(grey, sight.grey, xy0, xy1, max_level=max_level, is_near=is_near)
-            found.take(rows, points)
+            found.take(
+                rows, track_points(grey, sight.grey, self.xy[rows], guess_xy[rows], max_level=max_level)
+            )
             if not sight.usable.all():
                 self._look_again(grey, sight, found, guess_xy, rows)
         hidden = self._hidden(sight, found, guess_xy)
@@ -277,7 +276,7 @@ class TrackTable:
         square = ((self.xy[missed][:, None] - self.xy[seen][None]) ** 2).sum(axis=2)
         near = seen[np.argsort(square, axis=1, kind="stable")[:, :_NEIGHBOURS]]
         better = guess_xy[missed] + np.median(found.xy[near] - guess_xy[near], axis=1)
-        found.take(missed, track_points(grey, sight.grey, self.xy[missed], better, max_level=2, is_near=True))
+        found.take(missed, track_points(grey, sight.grey, self.xy[missed], better, max_level=2))
 
     def follow_jump(self, sight: Sight) -> bool:
         """Look again for what ``follow`` just looked for, by descriptors.

@@ -61,20 +61,3 @@ def test_points_are_followed_to_where_they_are_through_a_change_of_exposure(grey
     monkeypatch.setattr("semcast.server.geometry.features.brightness_change", lambda *_: None)
     error_before, found_before = errors()
     assert found_before.ok.mean() < found.ok.mean() or np.median(error_before) > 2 * np.median(error)
-
-
-@pytest.mark.parametrize("gain", [0.6, 1.4])
-def test_guesses_that_are_near_save_a_second_look(grey, monkeypatch, gain):
-    corners = detect_corners(grey, 200).astype(np.float64)
-    corners = corners[((corners > 25) & (corners < (294, 214))).all(axis=1)]
-    moved = with_brightness(shifted(grey, 20, 2), gain, 0.0)
-    guess = corners + np.array([18, 3])
-    looks = []
-    look = cv2.calcOpticalFlowPyrLK
-    monkeypatch.setattr(cv2, "calcOpticalFlowPyrLK", lambda *args: looks.append(1) or look(*args))
-    found = track_points(grey, moved, corners, guess, is_near=True)
-    assert len(looks) == 2, "there and back"
-    assert found.ok.mean() > 0.95
-    assert np.median(np.linalg.norm(found.xy - corners - (20, 2), axis=1)[found.ok]) < 0.1
-    track_points(grey, moved, corners, guess)
-    assert len(looks) > 4
