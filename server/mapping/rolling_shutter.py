@@ -28,8 +28,6 @@ _MAX_STEP_S = 0.5
 _MAX_TREND_STEP_S = 0.06
 #: Nothing is moved by more than this share of the image's height.
 _MAX_SHARE = 0.2
-#: What was expected to this (root mean square over the image) need not be put right again.
-_SMALL_PX = 0.1
 #: How far the image is moved is computed at every so many pixels.
 _GRID_PX = 16
 
@@ -94,8 +92,12 @@ class RollingShutter:
         last = max(1, (camera.width, camera.height)[self._axis] - 1)
         self._middle = 0.5 * last
         self._s_per_px = 1e-3 * readout_ms / last * (1 if readout_from in ("top", "left") else -1)
-        y, x = np.mgrid[0 : camera.height + _GRID_PX : _GRID_PX, 0 : camera.width + _GRID_PX : _GRID_PX]
-        self._grid = np.stack([x, y], axis=-1).astype(np.float64)
+        # Middles of cells, one cell more on each side: a resize puts samples there.
+        x, y = (
+            _GRID_PX * (np.arange(-1, -(-side // _GRID_PX) + 1) + 0.5) - 0.5
+            for side in (camera.width, camera.height)
+        )
+        self._grid = np.stack(np.meshgrid(x, y), axis=-1)
         #: The movement at the newest image, that the image was put right by, and the mean towards the image.
         self._flow: ImageFlow | None = None
         self._applied: ImageFlow | None = None
@@ -109,10 +111,10 @@ class RollingShutter:
         return self._s_per_px == 0.0
 
     def see(self, frame: DecodedFrame) -> Sight:
-        """Return an image put right by the movement before it."""
+        """Return an image put right by the movement before it, for tracks to be followed in."""
         if not 0.0 < self._since_s(frame) < _MAX_STEP_S:
             self._flow = self._mean = None
-        return self._sight(frame)
+        return self._sight(frame, with_colours=False)
 
     def settle(self, frame: DecodedFrame, sight: Sight, tracks: TrackTable) -> tuple[Sight, bool]:
         """Put an image and its tracks right by the movement towards it.
@@ -134,12 +136,9 @@ class RollingShutter:
         self._step_s = step_s
         if self._flow is None:
             return sight, False
-        change = self._put_right(self.in_image(self._grid)) - self._grid
-        if before is not None and np.sqrt((change**2).sum(axis=-1).mean()) < _SMALL_PX:
-            return sight, False
         visible = tracks.visible
         tracks.move(visible, self._put_right(self.in_image(tracks.xy[visible])))
-        sight = self._sight(frame)
+        sight = self._sight(frame, with_colours=True)
         tracks.replace_newest(sight)
         return sight, before is None
 
@@ -183,33 +182,34 @@ class RollingShutter:
         trend = (self._mean.coefficients - mean_before.coefficients) / (0.5 * (step_s + self._step_s))
         return ImageFlow(self._camera, self._mean.coefficients + 0.5 * step_s * trend)
 
-    def _sight(self, frame: DecodedFrame) -> Sight:
+    def _sight(self, frame: DecodedFrame, *, with_colours: bool) -> Sight:
         """Return an image put right by the newest movement that is known."""
         height, width = frame.image.shape[:2]
         usable = usable_rows(frame, height)
         self._applied = self._flow
         if self._applied is None or self.is_global:
             return Sight(frame, to_grey(frame.image), usable)
-        size = self._grid.shape[1] * _GRID_PX, self._grid.shape[0] * _GRID_PX
-        coarse = (self.in_image(self._grid) - self._grid).astype(np.float32)
-        larger = np.array([[_GRID_PX, 0, 0], [0, _GRID_PX, 0]], np.float32)
-        away = cv2.warpAffine(coarse, larger, size, flags=cv2.INTER_LINEAR)[:height, :width]
-        x = np.arange(width, dtype=np.float32) + away[..., 0]
-        y = np.arange(height, dtype=np.float32)[:, None] + away[..., 1]
+        away = (self.in_image(self._grid) - self._grid).astype(np.float32)
+        fine = cv2.resize(away, None, fx=_GRID_PX, fy=_GRID_PX, interpolation=cv2.INTER_LINEAR)
+        fine = fine[_GRID_PX : _GRID_PX + height, _GRID_PX : _GRID_PX + width]
+        x = np.arange(width, dtype=np.float32) + fine[..., 0]
+        y = np.arange(height, dtype=np.float32)[:, None] + fine[..., 1]
 
         def taken(values: NDArray) -> NDArray:
             return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
-        def put_right(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+        def map_taken(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
             return None if values is None else np.asarray(taken(values), np.float32)
 
+        image = np.asarray(taken(frame.image), np.uint8) if with_colours else frame.image
+        grey = to_grey(image) if with_colours else np.asarray(taken(to_grey(frame.image)), np.uint8)
         right = replace(
             frame,
-            image=np.asarray(taken(frame.image), np.uint8),
-            confidence=put_right(frame.confidence),
-            keypoint_confidence=put_right(frame.keypoint_confidence),
+            image=image,
+            confidence=map_taken(frame.confidence),
+            keypoint_confidence=map_taken(frame.keypoint_confidence),
         )
         if not usable.all():
             rows = np.clip(np.rint(y[:, [0, width // 2, width - 1]]), 0, height - 1).astype(np.intp)
             usable = np.asarray(usable[rows].all(axis=1))
-        return Sight(right, to_grey(right.image), usable)
+        return Sight(right, grey, usable)
