@@ -231,6 +231,7 @@ SECTIONS: dict[str, tuple[str, Tables]] = {
     "demo": ("The live demo", _demo),
     "codec": ("Image quality per channel use", _codec),
     "trajectory": ("Trajectories", _trajectory),
+    "shutter": ("Rolling shutters, put right and not", _trajectory),
     "pairs": ("Relative pose of frame pairs", _pairs),
     "confidence": ("What the confidence maps are worth", _confidence),
     "latency": ("Where the time goes", _latency),
