@@ -93,3 +93,16 @@ def test_the_figures_of_shipped_weights_are_those_of_the_results_they_name(manif
             row = rows[modulation, stated["snr_db"]]
             assert stated["psnr_db"] == pytest.approx(row["psnr_db"], abs=0.002)
             assert stated["ssim"] == pytest.approx(row["ssim"], abs=0.0002)
+
+
+def test_the_script_of_the_library_page_runs(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    page = (ROOT / "docs/library.md").read_text(encoding="utf-8")
+    script = re.search(r"```python\n(.*?)```", page, re.DOTALL).group(1)
+    exec(compile(script, "library.md", "exec"), {"__name__": "library"})
+    *frames, last = capsys.readouterr().out.splitlines()
+    assert len(frames) == 8
+    assert "tracking" in frames[-1]
+    poses, points = (int(word) for word in re.findall(r"\d+", last))
+    assert poses == 8
+    assert points > 100
