@@ -145,15 +145,9 @@ class Intrinsics:
         """
         try:
             check_pinhole(values)
-            return Intrinsics(
-                fx=float(values["fx"]),
-                fy=float(values["fy"]),
-                cx=float(values["cx"]),
-                cy=float(values["cy"]),
-                width=int(values["width"]),
-                height=int(values["height"]),
-                distortion=distortion_in(values),
-            )
+            pixels = {name: _number(values, name) for name in ("fx", "fy", "cx", "cy")}
+            size = {name: int(_number(values, name)) for name in ("width", "height")}
+            return Intrinsics(**pixels, **size, distortion=distortion_in(values))
         except KeyError as err:
             raise SourceError(f"intrinsics need fx fy cx cy width height, missing {err}") from err
         except (TypeError, ValueError, OverflowError) as err:
@@ -180,3 +174,14 @@ class Intrinsics:
     def save(self, path: Path) -> None:
         """Write ``intrinsics.json``."""
         path.write_text(json.dumps(self.to_dict(), indent=1) + "\n", encoding="utf-8")
+
+
+def _number(values: dict[str, Any], name: str) -> float:
+    """Return a number of a mapping; an error names it."""
+    try:
+        number = float(values[name])
+    except (TypeError, ValueError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise ValueError(f"{name} must be a finite number, got {values[name]!r}")
+    return number

@@ -150,7 +150,11 @@ def recover_file(path: Path, out: Path) -> RecordingInfo:
         SourceError: See ``recover_stream``; or a file can't be read or written.
     """
     try:
-        with path.open("rb") as source, whole_file(out) as target:
+        source = path.open("rb")
+    except OSError as err:
+        raise SourceError(f"{path} can't be read: {err.strerror}") from err
+    try:
+        with source, whole_file(out) as target:
             return recover_stream(source, target, str(path))
     except OSError as err:
         raise SourceError(f"{path} can't be recovered into {out}: {err}") from err

@@ -1,4 +1,5 @@
 import json
+import re
 
 import cv2
 import numpy as np
@@ -66,3 +67,14 @@ def test_a_missing_key_or_file_is_named(tmp_path):
 def test_a_byte_order_mark_does_not_matter(tmp_path):
     (tmp_path / "i.json").write_text(json.dumps(CAMERA.to_dict()), encoding="utf-8-sig")
     assert Intrinsics.load(tmp_path / "i.json") == CAMERA
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("fx", None), ("cy", "middle"), ("width", [640]), ("height", float("nan")), ("fy", "inf")],
+)
+def test_a_value_that_is_no_number_is_named(name, value):
+    values = {"fx": 500, "fy": "500.5", "cx": 320, "cy": 240, "width": 640, "height": 480.0}
+    assert Intrinsics.from_dict(values).fy == 500.5
+    with pytest.raises(SourceError, match=f"{name} must be a finite number, got {re.escape(repr(value))}"):
+        Intrinsics.from_dict({**values, name: value})

@@ -334,3 +334,10 @@ def test_a_path_that_can_not_be_written_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(SourceError, match="can't be written"):
         Recorder(tmp_path / "file" / "a.mcap", HEADER)
+
+
+def test_a_recording_that_is_not_there_is_named_alone(tmp_path):
+    missing = tmp_path / "missing.mcap"
+    with pytest.raises(SourceError, match=r"missing\.mcap can't be read: No such file"):
+        recover_file(missing, missing)
+    assert list(tmp_path.iterdir()) == []
