@@ -145,9 +145,15 @@ class Intrinsics:
         """
         try:
             check_pinhole(values)
-            pixels = {name: _number(values, name) for name in ("fx", "fy", "cx", "cy")}
-            size = {name: int(_number(values, name)) for name in ("width", "height")}
-            return Intrinsics(**pixels, **size, distortion=distortion_in(values))
+            return Intrinsics(
+                fx=_number(values, "fx"),
+                fy=_number(values, "fy"),
+                cx=_number(values, "cx"),
+                cy=_number(values, "cy"),
+                width=int(_number(values, "width")),
+                height=int(_number(values, "height")),
+                distortion=distortion_in(values),
+            )
         except KeyError as err:
             raise SourceError(f"intrinsics need fx fy cx cy width height, missing {err}") from err
         except (TypeError, ValueError, OverflowError) as err:

@@ -104,6 +104,7 @@ class RollingShutter:
         self._mean: ImageFlow | None = None
         self._t_ns: int | None = None
         self._step_s = 0.0
+        self._has_begun = False
 
     @property
     def is_global(self) -> bool:
@@ -125,12 +126,13 @@ class RollingShutter:
             tracks: After they were followed; their positions move.
 
         Returns:
-            The image, and whether no movement was known before it: images before this one are not right, and
-            their points can't be compared with those of later ones.
+            The image, and whether it is the first that was put right: points of images before can't be
+            compared with those of later ones. That is said once: where points are so few that the movement is
+            unknown now and then, a start from what there is comes before none.
         """
         if self.is_global:
             return sight, False
-        step_s, before = self._since_s(frame), self._flow
+        step_s = self._since_s(frame)
         self._t_ns = frame.t_source_ns
         self._flow = self._measured(tracks, step_s)
         self._step_s = step_s
@@ -140,7 +142,8 @@ class RollingShutter:
         tracks.move(visible, self._put_right(self.in_image(tracks.xy[visible])))
         sight = self._sight(frame, with_colours=True)
         tracks.replace_newest(sight)
-        return sight, before is None
+        is_first, self._has_begun = not self._has_begun, True
+        return sight, is_first
 
     def in_image(self, xy: Array) -> Array:
         """Return where points ``(..., 2)`` of the newest image, as put right, are in it as received."""

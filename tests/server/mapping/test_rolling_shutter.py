@@ -117,6 +117,22 @@ def test_rows_that_did_not_arrive_go_with_the_image():
     assert np.ptp(sight.grey[lost[1] : lost[-1]]) == 0
 
 
+def test_that_images_before_were_not_right_is_said_once():
+    shutter = RollingShutter(CAMERA, READOUT_MS)
+    run(shutter, (300.0, 0.0))
+    said = []
+    tracks = TrackTable("robust", 200, 0)
+    for frame_id in range(60, 64):  # after two seconds the movement is unknown again
+        frame = seen((30.0, 0.0), frame_id)
+        sight = shutter.see(frame)
+        tracks.follow(sight, tracks.xy) if len(tracks) else tracks.remember(sight)
+        sight, is_first = shutter.settle(frame, sight, tracks)
+        said.append(is_first)
+        tracks.refill(sight)
+    assert sight.frame is not frame
+    assert not any(said)
+
+
 def test_without_enough_points_or_after_a_gap_nothing_is_assumed():
     shutter = RollingShutter(CAMERA, READOUT_MS)
     run(shutter, (300.0, 0.0))
