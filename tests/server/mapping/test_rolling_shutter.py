@@ -6,6 +6,8 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import to_grey
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
@@ -169,3 +171,17 @@ def test_the_flow_of_a_turning_camera_is_exact_though_points_are_wrong(rng):
 def test_a_shutter_that_can_not_be_is_refused(values, allowed):
     with pytest.raises(ValueError, match=allowed):
         ReconstructionSettings(**values)
+
+
+def test_the_reconstruction_follows_points_in_images_put_right_and_shows_them_as_received():
+    offset_px_s = (300.0, 0.0)
+    found = {}
+    for readout_ms in (0.0, READOUT_MS):
+        reconstruction = Reconstruction(CAMERA, ReconstructionSettings(readout_ms=readout_ms), InlineBundle())
+        results = [reconstruction.process(seen(offset_px_s, frame_id)) for frame_id in range(3)]
+        found[readout_ms] = results[-1].keypoints_xy.astype(float)
+        tracked = reconstruction._tracks.seen().xy
+        late_s = 1e-3 * readout_ms * (found[readout_ms][:, 1] / 239 - 0.5)
+        np.testing.assert_allclose(found[readout_ms][:, 0] - tracked[:, 0], 300.0 * late_s, atol=0.2)
+        reconstruction.close()
+    assert all(len(xy) > 100 for xy in found.values())
