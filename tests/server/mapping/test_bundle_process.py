@@ -62,7 +62,7 @@ def test_a_child_that_keeps_dying_is_given_up_with_one_clear_error(caplog):
 
 
 @pytest.mark.parametrize("wait", [False, True])
-def test_a_child_that_hangs_is_ended_and_another_goes_on(monkeypatch, wait):
+def test_a_child_that_hangs_is_ended_and_another_goes_on(wait):
     runner = ProcessBundle()
     try:
         os.kill(runner.pid, signal.SIGSTOP)
@@ -70,13 +70,12 @@ def test_a_child_that_hangs_is_ended_and_another_goes_on(monkeypatch, wait):
         assert runner.submit(PROBLEM)
         assert runner.take() is None
         assert runner.busy
-        monkeypatch.setattr(bundle_process, "DEADLINE_S", 0.0 if not wait else 0.2)
-        since_s = time.monotonic()
-        assert runner.take(wait=wait) is None
-        assert time.monotonic() - since_s < 10.0
+        runner._since_s -= 2 * bundle_process.DEADLINE_S
+        result = runner.take(wait=wait)
+        assert (result is not None) == wait, "another child answers one who waits"
         assert not runner.busy
         assert runner.pid != hung
-        assert runner.num_restarts >= 1
+        assert runner.num_restarts == 1
         assert runner.submit(PROBLEM), "the next one is taken"
     finally:
         runner.close()
