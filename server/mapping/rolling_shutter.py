@@ -20,8 +20,8 @@ from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
 
 Array = NDArray[np.float64]
 
-_MIN_TRACKS = 30
-_ITERATIONS = 6
+#: Tracks a movement is fitted to at least, and steps of reweighting (Huber).
+_MIN_TRACKS, _ITERATIONS = 30, 6
 #: Images further apart than this say little about how the camera moved during an exposure.
 _MAX_STEP_S = 0.5
 #: A hand shakes several times a second: from images further apart no trend of the movement is read.
@@ -35,6 +35,8 @@ _GRID_PX = 16
 @dataclass(frozen=True)
 class ImageFlow:
     """How an image moves: as that of a plane does, which is exact for turning and about right for a scene.
+
+    The quadratic flow of a plane under a rigid motion (Longuet-Higgins and Prazdny 1980).
 
     Attributes:
         camera: Pinhole.

@@ -482,21 +482,6 @@ def test_wrong_shapes_are_refused(room):
         reconstruction.process(frame_of(0, images[0], confidence=np.ones((5, 5), np.float32)))
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"confidence": "maybe"}, "confidence must be one of"),
-        ({"max_features": 3}, r"max_features must be in \[50, 5000\], got 3"),
-        ({"window_size": 2}, "window_size"),
-        ({"beta": 9.0}, "beta"),
-        ({"seed": -1}, "seed"),
-    ],
-)
-def test_settings_are_checked(values, message):
-    with pytest.raises(ValueError, match=message):
-        ReconstructionSettings(**values)
-
-
 def test_a_camera_with_distortion_is_refused():
     bent = Intrinsics(**{**vars(CAMERA), "distortion": (0.1, 0.0, 0.0, 0.0)})
     with pytest.raises(ValueError, match="without distortion"):
