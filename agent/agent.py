@@ -58,6 +58,8 @@ def camera_info(settings: AgentSettings, source: Source, codec: Codec, agent_epo
         num_frames=source.num_frames,
         last_frame_id=source.last_frame_id,
         lossless=settings.mode == "replay",
+        readout_ms=camera.readout_ms,
+        readout_from=camera.readout_from,
     )
 
 

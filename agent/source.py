@@ -54,6 +54,10 @@ class Source(Protocol):
         """Of the frames, without distortion."""
 
     @property
+    def stored_camera(self) -> Intrinsics:
+        """Of the images before they are undistorted and resized."""
+
+    @property
     def num_frames(self) -> int | None:
         """Of a finite source whose length is known."""
 
@@ -150,6 +154,11 @@ class RecordedSource:
     def intrinsics(self) -> Intrinsics:
         """Of the frames, without distortion."""
         return self._intrinsics
+
+    @property
+    def stored_camera(self) -> Intrinsics:
+        """Of the images as recorded."""
+        return self._sequence.stored_camera
 
     @property
     def num_frames(self) -> int | None:

@@ -91,6 +91,7 @@ class _Captured:
             self.close()
             raise
         self._stored_wh = (width, height)
+        self._stored_camera = camera
         self._intrinsics = camera.undistorted().scaled_to(*self._size_wh)
         self._rectify = ImageRectifier(camera, self._size_wh)
         self._first: NDArray[np.uint8] | None = first
@@ -99,6 +100,11 @@ class _Captured:
     def intrinsics(self) -> Intrinsics:
         """Of the frames, without distortion."""
         return self._intrinsics
+
+    @property
+    def stored_camera(self) -> Intrinsics:
+        """Of the images as they come."""
+        return self._stored_camera
 
     def groundtruth(self) -> Trajectory | None:
         """None: a camera knows no truth."""

@@ -1,20 +1,26 @@
-"""Pinhole intrinsics with lens distortion.
+"""Pinhole intrinsics with lens distortion and the shutter's readout.
 
 Pixel centres have integer coordinates: the image spans ``[-0.5, width - 0.5]``.
 """
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semcast.common.errors import SourceError
 from semcast.common.lens import DISTORTION_COUNTS, check_pinhole, distortion_in
+from semcast.common.whole_file import write_whole
 
 Array = NDArray[np.float64]
+
+#: Side of the image that a rolling shutter exposes first.
+ReadoutFrom = Literal["top", "bottom", "left", "right"]
+#: Time in ms a shutter takes at most; slower ones are no cameras for moving.
+MAX_READOUT_MS = 100.0
 
 #: Side of an image in focal lengths at most: a view of 2 atan(6), 161 degrees.
 _MAX_SIZE_PER_FOCAL = 12.0
@@ -32,6 +38,8 @@ class Intrinsics:
         width: Image width in pixels.
         height: Image height in pixels.
         distortion: OpenCV coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``; empty means none.
+        readout_ms: Time a rolling shutter takes from the first row or column to the last; 0: a global one.
+        readout_from: Side of the image it begins at.
     """
 
     fx: float
@@ -41,12 +49,14 @@ class Intrinsics:
     width: int
     height: int
     distortion: tuple[float, ...] = ()
+    readout_ms: float = 0.0
+    readout_from: ReadoutFrom = "top"
 
     def __post_init__(self) -> None:
         """Check ranges.
 
         Raises:
-            ValueError: A focal length or a side is not positive, or a value is not finite.
+            ValueError: A focal length or a side is not positive, or another value is out of range.
         """
         for name in ("fx", "fy"):
             value = getattr(self, name)
@@ -60,6 +70,7 @@ class Intrinsics:
                 raise ValueError(f"{name} must be at least 1 pixel, got {getattr(self, name)}")
         if len(self.distortion) not in DISTORTION_COUNTS or not np.all(np.isfinite(self.distortion)):
             raise ValueError(f"distortion must be 0, 4, 5 or 8 finite values, got {self.distortion}")
+        check_readout(self.readout_ms, self.readout_from)
 
     def check_possible(self, name: str) -> None:
         """Check that a camera can be like that, for those who read what a user gave.
@@ -99,19 +110,19 @@ class Intrinsics:
         follows that, not ``cx * s``.
         """
         sx, sy = width / self.width, height / self.height
-        return Intrinsics(
+        return replace(
+            self,
             fx=self.fx * sx,
             fy=self.fy * sy,
             cx=(self.cx + 0.5) * sx - 0.5,
             cy=(self.cy + 0.5) * sy - 0.5,
             width=width,
             height=height,
-            distortion=self.distortion,
         )
 
     def undistorted(self) -> "Intrinsics":
         """Return the same pinhole without distortion: the camera of the undistorted image."""
-        return Intrinsics(**{**asdict(self), "distortion": ()})
+        return replace(self, distortion=())
 
     def project(self, points_cam: ArrayLike) -> Array:
         """Project ``(N, 3)`` points in the camera frame to ``(N, 2)`` pixels, without distortion.
@@ -135,9 +146,10 @@ class Intrinsics:
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> "Intrinsics":
-        """Build from a mapping with fx, fy, cx, cy, width, height and optionally ``distortion``.
+        """Build from a mapping with fx, fy, cx, cy, width and height.
 
-        Distortion may have another of its usual names, or be given as ``k1``, ``k2``, ``p1`` ... one by one.
+        ``distortion``, ``readout_ms`` and ``readout_from`` may be there. Distortion may have another of its
+        usual names, or be given as ``k1``, ``k2``, ``p1`` ... one by one.
         Other keys are notes and ignored, but for those that name a lens which is none of a pinhole camera.
 
         Raises:
@@ -153,6 +165,8 @@ class Intrinsics:
                 width=int(_number(values, "width")),
                 height=int(_number(values, "height")),
                 distortion=distortion_in(values),
+                readout_ms=_number(values, "readout_ms") if "readout_ms" in values else 0.0,
+                readout_from=values.get("readout_from", "top"),
             )
         except KeyError as err:
             raise SourceError(f"intrinsics need fx fy cx cy width height, missing {err}") from err
@@ -178,8 +192,26 @@ class Intrinsics:
             raise SourceError(f"{path}: {err}") from err
 
     def save(self, path: Path) -> None:
-        """Write ``intrinsics.json``."""
-        path.write_text(json.dumps(self.to_dict(), indent=1) + "\n", encoding="utf-8")
+        """Write ``intrinsics.json``, whole or not at all.
+
+        Raises:
+            OSError: The file can't be written.
+        """
+        write_whole(path, json.dumps(self.to_dict(), indent=1) + "\n")
+
+
+def check_readout(readout_ms: float, readout_from: str) -> None:
+    """Check what is said of a rolling shutter.
+
+    Raises:
+        ValueError: The time is out of range or the side is none.
+    """
+    if not 0.0 <= readout_ms <= MAX_READOUT_MS:
+        raise ValueError(f"readout_ms must be in [0, {MAX_READOUT_MS:g}], got {readout_ms:g}")
+    if readout_from not in get_args(ReadoutFrom):
+        raise ValueError(
+            f"readout_from must be one of {', '.join(get_args(ReadoutFrom))}, got {readout_from!r}"
+        )
 
 
 def _number(values: dict[str, Any], name: str) -> float:

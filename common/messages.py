@@ -6,12 +6,12 @@ another host without an offset; ``t_source_ns`` is the recorded time, equal to i
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics
+from semcast.common.camera import MAX_READOUT_MS, Intrinsics, ReadoutFrom
 from semcast.common.codec import MODULATIONS, Modulation
 from semcast.common.message_fields import (
     Array,
@@ -76,6 +76,8 @@ class CameraInfo:
         num_frames: Frames of a finite source, or None.
         last_frame_id: Of its last frame, or None where that is not known.
         lossless: Replay service (every frame, in order) instead of live (newest wins).
+        readout_ms: Time a rolling shutter takes from the first row (or column) to the last; 0: a global one.
+        readout_from: Side of the image it begins at.
     """
 
     version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
@@ -95,12 +97,23 @@ class CameraInfo:
     num_frames: int | None = field(metadata=rule(Maybe(WholeNumber())))
     last_frame_id: int | None = field(default=None, metadata=rule(Maybe(WholeNumber())))
     lossless: bool = field(metadata=rule(Flag()))
+    readout_ms: float = field(default=0.0, metadata=rule(Number(0.0, MAX_READOUT_MS)))
+    readout_from: ReadoutFrom = field(default="top", metadata=rule(Choice(get_args(ReadoutFrom))))
 
     @property
     def intrinsics(self) -> Intrinsics:
         """Pinhole of the decoded images."""
         width, height = self.image_wh
-        return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, width=width, height=height)
+        return Intrinsics(
+            fx=self.fx,
+            fy=self.fy,
+            cx=self.cx,
+            cy=self.cy,
+            width=width,
+            height=height,
+            readout_ms=self.readout_ms,
+            readout_from=self.readout_from,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -195,9 +195,8 @@ class Sequence:
         self._all_paths = files.image_paths
         self._paths = files.image_paths[kept]
         self._stored_wh = size_wh
-        self._distortion = camera.distortion if camera is not None else ()
+        self._stored_camera = camera
         self._size_wh = resized_wh(*size_wh, resize)
-        self._camera = camera.undistorted().scaled_to(*self._size_wh) if camera is not None else None
         self._rectify = ImageRectifier(camera, self._size_wh)
         self._truth = (
             truth_at_frames(files.groundtruth, self.times_ns, _frame_period_s(files.times_ns))
@@ -239,14 +238,18 @@ class Sequence:
         Raises:
             SourceError: The recording says nothing about its camera and none was given.
         """
-        if self._camera is None:
-            raise SourceError(f"the camera of {self.name} is unknown: {HOW_TO_GIVE}")
-        return self._camera
+        return self.stored_camera.undistorted().scaled_to(*self._size_wh)
 
     @property
-    def distortion(self) -> tuple[float, ...]:
-        """OpenCV coefficients of the images as stored, which ``image`` removes; empty without distortion."""
-        return self._distortion
+    def stored_camera(self) -> Intrinsics:
+        """Camera of the images as stored, with the distortion that ``image`` removes.
+
+        Raises:
+            SourceError: The recording says nothing about its camera and none was given.
+        """
+        if self._stored_camera is None:
+            raise SourceError(f"the camera of {self.name} is unknown: {HOW_TO_GIVE}")
+        return self._stored_camera
 
     def image(self, index: int, camera: Intrinsics | None = None) -> NDArray[np.uint8]:
         """Return frame ``index`` as ``(H, W, 3)`` uint8 RGB, undistorted and resized.
@@ -267,8 +270,8 @@ class Sequence:
         image = self._rectify(raw)
         if camera is None or (camera.width, camera.height) == self._size_wh:
             return image
-        if self._camera is not None:
-            same = self._camera.scaled_to(camera.width, camera.height)
+        if self._stored_camera is not None:
+            same = self.intrinsics.scaled_to(camera.width, camera.height)
             if not np.allclose(same.K, camera.K, rtol=0.01, atol=1.0):
                 raise ValueError(f"camera must be {self.name}'s own at another size, {same}, got {camera}")
         return resized(image, (camera.width, camera.height))

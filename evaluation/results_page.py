@@ -227,11 +227,26 @@ def _recording(report: Report) -> Iterator[str]:
     yield from table(["figure", "value"], rows)
 
 
+def _readout(report: Report) -> Iterator[str]:
+    low_ms, high_ms = report["interval_ms"]
+    least = f"{report['least_ms']:.1f} ms along {report['axis']} ({low_ms:.1f} to {high_ms:.1f})"
+    yield f"Least at {least}. Below 0: from bottom or right.\n"
+    rows = sorted(report["trials"], key=lambda row: (row["axis"], row["signed_ms"]))
+    yield from table(
+        ["along", "readout ms", "reprojection error px", "frames"],
+        [
+            [row["axis"], f"{row['signed_ms']:g}", number(row["error_px"], 3), str(row["num_frames"])]
+            for row in rows
+        ],
+    )
+
+
 SECTIONS: dict[str, tuple[str, Tables]] = {
     "demo": ("The live demo", _demo),
     "codec": ("Image quality per channel use", _codec),
     "trajectory": ("Trajectories", _trajectory),
     "shutter": ("Rolling shutters, put right and not", _trajectory),
+    "readout": ("Readout times found", _readout),
     "pairs": ("Relative pose of frame pairs", _pairs),
     "confidence": ("What the confidence maps are worth", _confidence),
     "latency": ("Where the time goes", _latency),

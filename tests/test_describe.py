@@ -143,11 +143,16 @@ def test_a_folder_of_photos_says_what_is_missing(tmp_path):
     assert "intrinsics.json" in text
 
 
-def test_distortion_of_the_images_as_stored_is_shown(tmp_path):
+def test_distortion_and_shutter_of_the_images_as_stored_are_shown(tmp_path):
     write_images(tmp_path, 2)
     camera = {"fx": 50, "fy": 50, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48}
     (tmp_path / "intrinsics.json").write_text(json.dumps({**camera, "distortion": [-0.25, 0.08, 0, 0.0012]}))
-    assert "cy 23.5 px, with distortion -0.25 0.08 0 0.0012" in text_of(tmp_path)
+    text = text_of(tmp_path)
+    assert "cy 23.5 px, with distortion -0.25 0.08 0 0.0012" in text
+    assert "shutter: " not in text
+    rolling = {**camera, "readout_ms": 18.0, "readout_from": "left"}
+    (tmp_path / "intrinsics.json").write_text(json.dumps(rolling))
+    assert "shutter: rolling, 18 ms from left" in text_of(tmp_path)
     (tmp_path / "intrinsics.json").write_text(json.dumps(camera))
     assert "with distortion" not in text_of(tmp_path)
 

@@ -150,6 +150,6 @@ def render_scene(settings: RenderSettings) -> int:
         if not cv2.imwrite(str(path), image[..., ::-1]):
             raise SourceError(f"can't write {path}")
     (folder / "times.txt").write_text("".join(f"{t_s:.6f}\n" for t_s in times_s))
-    scene.camera.save(folder / "intrinsics.json")
+    replace(scene.camera, readout_ms=settings.readout_ms).save(folder / "intrinsics.json")
     write_tum(folder / "groundtruth.txt", Trajectory(times_s, T_world_cams))
     return len(times_s)

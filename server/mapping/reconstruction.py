@@ -69,7 +69,7 @@ class Reconstruction:
     def __init__(self, camera: Intrinsics, settings: ReconstructionSettings, bundle: BundleRunner) -> None:
         if any(camera.distortion):
             raise ValueError(f"camera must be without distortion, got {camera.distortion}")
-        self._camera = camera
+        self._camera = settings.with_readout(camera)
         self._settings = settings
         self._bundle = bundle
         self._map = MapBuilder(camera, settings, bundle)
@@ -81,7 +81,7 @@ class Reconstruction:
         self._tracks = TrackTable(s.confidence, s.max_features, s.seed)
         self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
         self._motion = ConstantVelocity()
-        self._shutter = RollingShutter(self._camera, s.readout_ms, s.readout_from)
+        self._shutter = RollingShutter(self._camera)
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
         self._last_posed_id: int | None = None

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import to_grey
-from semcast.server.mapping.settings import ReadoutFrom
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
 
@@ -83,17 +82,17 @@ class RollingShutter:
     """Puts images and the tracks in them right, one after the other.
 
     Args:
-        camera: Pinhole.
-        readout_ms: Time from the first row (or column) to the last; 0 for a global shutter: nothing is done.
-        readout_from: Side of the image that is exposed first.
+        camera: Pinhole and the shutter's readout; with a global shutter nothing is done.
     """
 
-    def __init__(self, camera: Intrinsics, readout_ms: float, readout_from: ReadoutFrom = "top") -> None:
+    def __init__(self, camera: Intrinsics) -> None:
         self._camera = camera
-        self._axis = int(readout_from in ("top", "bottom"))
+        self._axis = int(camera.readout_from in ("top", "bottom"))
         last = max(1, (camera.width, camera.height)[self._axis] - 1)
         self._middle = 0.5 * last
-        self._s_per_px = 1e-3 * readout_ms / last * (1 if readout_from in ("top", "left") else -1)
+        self._s_per_px = (
+            1e-3 * camera.readout_ms / last * (1 if camera.readout_from in ("top", "left") else -1)
+        )
         # Middles of cells, one cell more on each side: a resize puts samples there.
         x, y = (
             _GRID_PX * (np.arange(-1, -(-side // _GRID_PX) + 1) + 0.5) - 0.5

@@ -1,12 +1,10 @@
 """Settings of the reconstruction."""
 
-from dataclasses import dataclass, field
-from typing import Literal, get_args
+from dataclasses import dataclass, field, replace
+from typing import get_args
 
+from semcast.common.camera import Intrinsics, ReadoutFrom, check_readout
 from semcast.server.geometry.weighting import ConfidenceMode
-
-#: Side of the image that a rolling shutter exposes first.
-ReadoutFrom = Literal["top", "bottom", "left", "right"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,14 +41,15 @@ class ReconstructionSettings:
     min_parallax_deg: float = field(
         default=1.0, metadata={"help": "angle between rays from which a point is triangulated"}
     )
-    readout_ms: float = field(
-        default=0.0,
+    readout_ms: float | None = field(
+        default=None,
         metadata={
-            "help": "time a rolling shutter takes from the first row to the last, 0 for a global shutter"
+            "help": "time a rolling shutter takes from the first row to the last, 0 for a global shutter; "
+            "default: what the camera's calibration says"
         },
     )
-    readout_from: ReadoutFrom = field(
-        default="top",
+    readout_from: ReadoutFrom | None = field(
+        default=None,
         metadata={"help": "side of the image a rolling shutter begins at; left or right for upright phones"},
     )
     lost_after_frames: int = field(
@@ -62,9 +61,6 @@ class ReconstructionSettings:
         if self.confidence not in get_args(ConfidenceMode):
             allowed = ", ".join(get_args(ConfidenceMode))
             raise ValueError(f"confidence must be one of {allowed}, got {self.confidence!r}")
-        if self.readout_from not in get_args(ReadoutFrom):
-            allowed = ", ".join(get_args(ReadoutFrom))
-            raise ValueError(f"readout_from must be one of {allowed}, got {self.readout_from!r}")
         for name, low, high in (
             ("seed", 0, 2**31 - 1),
             ("max_features", 50, 5000),
@@ -74,9 +70,20 @@ class ReconstructionSettings:
             ("sigma0_px", 0.05, 20.0),
             ("beta", 0.0, 8.0),
             ("min_parallax_deg", 0.1, 10.0),
-            ("readout_ms", 0.0, 100.0),
             ("lost_after_frames", 1, 10_000),
         ):
             value = getattr(self, name)
             if not low <= value <= high:
                 raise ValueError(f"{name} must be in [{low}, {high}], got {value}")
+        check_readout(
+            0.0 if self.readout_ms is None else self.readout_ms,
+            "top" if self.readout_from is None else self.readout_from,
+        )
+
+    def with_readout(self, camera: Intrinsics) -> Intrinsics:
+        """Return a camera with the readout that is set here, else with its own."""
+        return replace(
+            camera,
+            readout_ms=camera.readout_ms if self.readout_ms is None else self.readout_ms,
+            readout_from=camera.readout_from if self.readout_from is None else self.readout_from,
+        )

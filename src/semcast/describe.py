@@ -176,7 +176,7 @@ def describe_sequence(path: Path) -> list[Section]:
         facts.append(("time", f"{times_s[-1] - times_s[0]:.1f} s, {rate_hz:.1f} images a second"))
     try:
         camera = sequence.intrinsics
-        coefficients = " ".join(f"{k:.4g}" for k in sequence.distortion)
+        coefficients = " ".join(f"{k:.4g}" for k in sequence.stored_camera.distortion)
         distortion = f", with distortion {coefficients}" if coefficients else ""
         facts.append(
             (
@@ -184,6 +184,8 @@ def describe_sequence(path: Path) -> list[Section]:
                 f"fx {camera.fx:.1f} fy {camera.fy:.1f} cx {camera.cx:.1f} cy {camera.cy:.1f} px{distortion}",
             )
         )
+        if camera.readout_ms:
+            facts.append(("shutter", f"rolling, {camera.readout_ms:g} ms from {camera.readout_from}"))
     except SourceError:
         facts.append(("camera", f"unknown: {HOW_TO_GIVE}"))
     truth = sequence.groundtruth()

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,11 +19,13 @@ from semcast.agent.source_settings import SourceSettings
 from semcast.channel.emulator import run_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
+from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.keys import status_key
 from semcast.common.messages import CameraInfo, StatusMessage
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
+from semcast.common.sequence import open_sequence
 from semcast.common.transport import free_endpoint, open_hub, open_session
 from semcast.common.wire import pack, unpack
 from semcast.server.receiver import Receiver
@@ -347,6 +350,16 @@ def test_a_folder_whose_name_is_no_text_can_be_sent(recording, codec, tmp_path):
     settings = AgentSettings(source=SourceSettings(source=folder))
     info = camera_info(settings, open_source(settings.source), codec, 1)
     assert unpack(pack(info), CameraInfo).source_name == "room?"
+
+
+def test_the_camera_s_shutter_is_told(recording, codec, tmp_path):
+    camera = replace(open_sequence(recording).intrinsics, readout_ms=17.0, readout_from="left")
+    camera.save(tmp_path / "rolling.json")
+    source = SourceSettings(
+        source=str(recording), camera=CameraSettings(intrinsics=tmp_path / "rolling.json"), resize=0.5
+    )
+    info = camera_info(AgentSettings(source=source), open_source(source), codec, 1)
+    assert (info.readout_ms, info.readout_from) == (17.0, "left")
 
 
 class AfterTheSource:

@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -36,10 +37,20 @@ def test_resizing_moves_pixels_and_intrinsics_alike():
 
 
 def test_json_round_trip(tmp_path):
-    camera = Intrinsics(**{**CAMERA.to_dict(), "distortion": (0.1, -0.2, 0.0, 0.001)})
+    camera = replace(CAMERA, distortion=(0.1, -0.2, 0.0, 0.001))
     camera.save(tmp_path / "intrinsics.json")
     assert Intrinsics.load(tmp_path / "intrinsics.json") == camera
     assert camera.undistorted() == CAMERA
+
+
+def test_the_readout_of_a_rolling_shutter_belongs_to_the_camera(tmp_path):
+    rolling = replace(CAMERA, distortion=(0.1, 0.0, 0.0, 0.0), readout_ms=21.5, readout_from="left")
+    rolling.save(tmp_path / "intrinsics.json")
+    assert Intrinsics.load(tmp_path / "intrinsics.json") == rolling
+    small = rolling.undistorted().scaled_to(320, 240)
+    assert (small.readout_ms, small.readout_from) == (21.5, "left")
+    without = {key: value for key, value in CAMERA.to_dict().items() if not key.startswith("readout")}
+    assert Intrinsics.from_dict(without) == CAMERA
 
 
 @pytest.mark.parametrize(
@@ -48,6 +59,10 @@ def test_json_round_trip(tmp_path):
         ({"fx": -1}, "fx must be a positive"),
         ({"width": 0}, "width must be"),
         ({"distortion": [1, 2]}, "distortion must be"),
+        ({"readout_ms": 101}, r"readout_ms must be in \[0, 100\], got 101"),
+        ({"readout_ms": "fast"}, "readout_ms must be a finite number, got 'fast'"),
+        ({"readout_from": "up"}, "readout_from must be one of top, bottom, left, right, got 'up'"),
+        ({"readout_from": ["top"]}, r"readout_from must be one of top, bottom, left, right, got \['top'\]"),
     ],
 )
 def test_bad_values_are_named(tmp_path, change, message):

@@ -56,7 +56,10 @@ def test_camera_info_gives_the_pinhole():
         agent_id="a", agent_epoch=1, fx=1.0, fy=2.0, cx=3.0, cy=4.0, image_wh=(6, 5), nominal_rate_hz=0.0,
         codec="x", digest="", modulation="analog", source_name="s", num_frames=None, lossless=False,
     )  # fmt: skip
-    assert info.intrinsics == Intrinsics(fx=1.0, fy=2.0, cx=3.0, cy=4.0, width=6, height=5)
+    pinhole = Intrinsics(fx=1.0, fy=2.0, cx=3.0, cy=4.0, width=6, height=5)
+    assert info.intrinsics == pinhole
+    rolling = dataclasses.replace(info, readout_ms=20.0, readout_from="left")
+    assert rolling.intrinsics == dataclasses.replace(pinhole, readout_ms=20.0, readout_from="left")
 
 
 def test_qam_symbols_travel_in_four_bits_and_come_back_exactly(rng):

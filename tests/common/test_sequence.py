@@ -96,7 +96,7 @@ def test_undistortion_moves_points_to_where_the_pinhole_has_them(tmp_path):
     cv2.imwrite(str(tmp_path / "images" / "0.png"), image)
     sequence = open_sequence(tmp_path, camera)
     assert sequence.intrinsics.distortion == ()
-    assert sequence.distortion == camera.distortion
+    assert sequence.stored_camera == camera
     weight = sequence.image(0)[:, :, 0].astype(float)
     centre_xy = [(weight * xs).sum() / weight.sum(), (weight * ys).sum() / weight.sum()]
     expected_xy = sequence.intrinsics.project(point_cam)[0]

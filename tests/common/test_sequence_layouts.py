@@ -161,7 +161,7 @@ def transforms_folder(tmp_path, write_images):
 @pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", None])
 def test_a_transforms_file_of_a_pinhole_model_is_read(transforms_folder, model):
     folder = transforms_folder(camera_model=model, k1=0.1, k4=0.0, is_fisheye=False)
-    assert open_sequence(folder).distortion == (0.1, 0.0, 0.0, 0.0)
+    assert open_sequence(folder).stored_camera.distortion == (0.1, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(

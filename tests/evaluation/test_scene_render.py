@@ -98,6 +98,13 @@ def test_settings_out_of_range_are_refused(values: dict[str, float], message: st
         RenderSettings(out=tmp_path / "x", **values)  # type: ignore[arg-type]
 
 
+def test_the_camera_of_a_rolling_shutter_says_so(tmp_path: Path) -> None:
+    folder = tmp_path / "rolling"
+    render_scene(RenderSettings(scene="orbit", seconds=0.1, readout_ms=12.5, out=folder))
+    camera = open_sequence(folder).intrinsics
+    assert (camera.readout_ms, camera.readout_from) == (12.5, "top")
+
+
 def test_rows_of_a_rolling_shutter_are_drawn_at_their_times() -> None:
     scene = SCENES["room"](0, "fast")
     rng = np.random.default_rng(0)

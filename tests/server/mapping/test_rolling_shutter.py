@@ -1,5 +1,7 @@
 """Images of a rolling shutter are put right by the movement of their points."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -50,6 +52,10 @@ def seen(offset_px_s, frame_id, readout_ms=READOUT_MS, readout_from="top", lost=
     return DecodedFrame(frame_id, t_ns, image, flat, flat, snr_db)
 
 
+def shutter_of(readout_ms, readout_from="top"):
+    return RollingShutter(replace(CAMERA, readout_ms=readout_ms, readout_from=readout_from))
+
+
 def run(shutter, offset_px_s, num_frames=4, **how):
     """Follow points through a few images; tracks, and where they are while the middle row is exposed."""
     tracks = TrackTable("robust", 200, 0)
@@ -72,9 +78,7 @@ def run(shutter, offset_px_s, num_frames=4, **how):
 @pytest.mark.parametrize("readout_from", ["top", "bottom", "left", "right"])
 @pytest.mark.parametrize("offset_px_s", [(300.0, 0.0), (-120.0, 150.0), (0.0, -200.0)])
 def test_an_image_is_put_right_to_that_of_a_global_shutter(offset_px_s, readout_from):
-    _, _, sight = run(
-        RollingShutter(CAMERA, READOUT_MS, readout_from), offset_px_s, readout_from=readout_from
-    )
+    _, _, sight = run(shutter_of(READOUT_MS, readout_from), offset_px_s, readout_from=readout_from)
     right = to_grey(seen(offset_px_s, 3, readout_ms=0.0).image).astype(float)[20:-20, 20:-20]
     rolled = to_grey(seen(offset_px_s, 3, readout_from=readout_from).image).astype(float)[20:-20, 20:-20]
     error, before = (np.abs(a - right).mean() for a in (sight.grey[20:-20, 20:-20].astype(float), rolled))
@@ -83,7 +87,7 @@ def test_an_image_is_put_right_to_that_of_a_global_shutter(offset_px_s, readout_
 
 def test_points_stay_where_the_scene_is():
     offset_px_s = (300.0, -60.0)
-    xy, truth, _ = run(RollingShutter(CAMERA, READOUT_MS), offset_px_s)
+    xy, truth, _ = run(shutter_of(READOUT_MS), offset_px_s)
     assert len(xy) > 50
     assert np.abs(xy - truth).max() < 0.8
     assert np.median(np.linalg.norm(xy - truth, axis=1)) < 0.1
@@ -91,7 +95,7 @@ def test_points_stay_where_the_scene_is():
 
 def test_a_point_is_shown_where_it_is_in_the_image_as_received():
     offset_px_s = (300.0, 90.0)
-    shutter = RollingShutter(CAMERA, READOUT_MS)
+    shutter = shutter_of(READOUT_MS)
     xy, _, _ = run(shutter, offset_px_s)
     there = shutter.in_image(xy)
     late_s = 1e-3 * READOUT_MS * (there[:, 1] / 239 - 0.5)
@@ -100,7 +104,7 @@ def test_a_point_is_shown_where_it_is_in_the_image_as_received():
 
 
 def test_a_global_shutter_is_left_as_it_is():
-    shutter = RollingShutter(CAMERA, 0.0)
+    shutter = shutter_of(0.0)
     frame = seen((300.0, 0.0), 0)
     sight = shutter.see(frame)
     assert sight.frame is frame
@@ -111,7 +115,7 @@ def test_a_global_shutter_is_left_as_it_is():
 
 def test_rows_that_did_not_arrive_go_with_the_image():
     offset_px_s = (0.0, 400.0)
-    _, _, sight = run(RollingShutter(CAMERA, READOUT_MS), offset_px_s, lost=(12,))
+    _, _, sight = run(shutter_of(READOUT_MS), offset_px_s, lost=(12,))
     # Row 200 is exposed 7 ms late: what is there belongs 2.7 rows further up.
     lost = np.flatnonzero(~sight.usable)
     assert lost[0] == pytest.approx(192 - 400 * 0.02 * (192 / 239 - 0.5), abs=1.1)
@@ -120,7 +124,7 @@ def test_rows_that_did_not_arrive_go_with_the_image():
 
 
 def test_that_images_before_were_not_right_is_said_once():
-    shutter = RollingShutter(CAMERA, READOUT_MS)
+    shutter = shutter_of(READOUT_MS)
     run(shutter, (300.0, 0.0))
     said = []
     tracks = TrackTable("robust", 200, 0)
@@ -136,7 +140,7 @@ def test_that_images_before_were_not_right_is_said_once():
 
 
 def test_without_enough_points_or_after_a_gap_nothing_is_assumed():
-    shutter = RollingShutter(CAMERA, READOUT_MS)
+    shutter = shutter_of(READOUT_MS)
     run(shutter, (300.0, 0.0))
     late = seen((300.0, 0.0), 60)
     assert shutter.see(late).frame is late
@@ -163,8 +167,14 @@ def test_the_flow_of_a_turning_camera_is_exact_though_points_are_wrong(rng):
 def test_the_reconstruction_follows_points_in_images_put_right_and_shows_them_as_received():
     offset_px_s = (300.0, 0.0)
     found = {}
-    for readout_ms in (0.0, READOUT_MS):
-        reconstruction = Reconstruction(CAMERA, ReconstructionSettings(readout_ms=readout_ms), InlineBundle())
+    rolling = replace(CAMERA, readout_ms=READOUT_MS)
+    for readout_ms, camera, settings in (
+        (0.0, CAMERA, ReconstructionSettings()),
+        (0.0, rolling, ReconstructionSettings(readout_ms=0.0)),
+        (READOUT_MS, rolling, ReconstructionSettings()),
+        (READOUT_MS, CAMERA, ReconstructionSettings(readout_ms=READOUT_MS)),
+    ):
+        reconstruction = Reconstruction(camera, settings, InlineBundle())
         results = [reconstruction.process(seen(offset_px_s, frame_id)) for frame_id in range(3)]
         found[readout_ms] = results[-1].keypoints_xy.astype(float)
         tracked = reconstruction._tracks.seen().xy

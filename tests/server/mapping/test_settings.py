@@ -13,7 +13,7 @@ from semcast.server.mapping.settings import ReconstructionSettings
         ({"window_size": 2}, "window_size"),
         ({"beta": 9.0}, "beta"),
         ({"seed": -1}, "seed"),
-        ({"readout_ms": -1.0}, r"readout_ms must be in \[0.0, 100.0\]"),
+        ({"readout_ms": -1.0}, r"readout_ms must be in \[0, 100\], got -1"),
         ({"readout_ms": float("nan")}, "readout_ms must be in"),
         ({"readout_from": "up"}, "readout_from must be one of top, bottom, left, right"),
     ],
