@@ -253,8 +253,8 @@ def fitted(best: Readout, trials: Sequence[Trial]) -> tuple[Readout, float, floa
 
     Noise and lean add up as squares, and the lean grows in proportion to how wrong the time is: the square of
     the error is a parabola. No trial of 0 is fitted: images that are left as they are keep the sharpness that
-    putting them right costs. The longer the readout, the more it costs, so that the least is some percent
-    short of the true time (18.7 ms where a room was drawn with 20).
+    putting them right costs. The longer the readout, the more the movement's own errors cost: the least is
+    some percent short of the true time, and the better one to put images right by.
 
     Args:
         best: As found by ``search``.
