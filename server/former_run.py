@@ -1,7 +1,10 @@
 """What an earlier run left in an output folder: known by its rows, out of the way before a new run begins."""
 
+import contextlib
+import errno
 import logging
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 from semcast.common.errors import ConfigError
@@ -17,6 +20,11 @@ from semcast.common.run_folder import (
     VIEWER_NAME,
     read_image_paths,
 )
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 logger = logging.getLogger(__name__)
 
@@ -68,6 +76,48 @@ def make_output_folder(folder: Path) -> None:
     except OSError as err:
         raise ConfigError(f"{folder} can't be made a folder for outputs: {err}") from err
     check_not_foreign(folder, IMAGES_NAME)
+
+
+@contextlib.contextmanager
+def output_folder(folder: Path | None) -> Iterator[None]:
+    """Make the folder a run is to write into, and keep other runs out of it until the block ends.
+
+    The lock is on the folder itself and goes with the process, however that ends. Where there are no locks
+    (Windows, some network drives) nothing keeps others out.
+
+    Args:
+        folder: The folder, or None for a run that writes nothing.
+
+    Raises:
+        ConfigError: It can't be made, holds images that no run wrote, or a run is writing into it.
+    """
+    if folder is None:
+        yield
+        return
+    make_output_folder(folder)
+    lock = _locked(folder)
+    try:
+        yield
+    finally:
+        if lock is not None:
+            os.close(lock)
+
+
+def _locked(folder: Path) -> int | None:
+    """Return an open folder that is locked until it is closed; None where there are no locks."""
+    if fcntl is None:
+        return None
+    lock = None
+    try:
+        lock = os.open(folder, os.O_RDONLY)
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as err:
+        if lock is not None:
+            os.close(lock)
+        if err.errno in (errno.EWOULDBLOCK, errno.EACCES) and lock is not None:
+            raise ConfigError(f"out must not be in use, another run is writing into {folder}") from err
+        return None
+    return lock
 
 
 def free_folder(folder: Path) -> Path:

@@ -25,7 +25,7 @@ from semcast.common.recording_reader import RecordingReader
 from semcast.common.symbol_payload import data_symbols, lost_slots_of, slots_of
 from semcast.common.wire import WireError, unpack
 from semcast.server.decoder import DecodedArrival, FrameDecoder
-from semcast.server.former_run import make_output_folder
+from semcast.server.former_run import output_folder
 from semcast.server.frame_views import missing_view
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.receiver import ReceivedFrame
@@ -132,13 +132,13 @@ def replay(
 
     Raises:
         SourceError: The file is no recording, or holds no frames of the kind asked for.
+        ConfigError: The folder for outputs can't be used, or another run is writing into it.
         CheckpointError: The recorded stream was encoded with other weights than those installed.
     """
     reader = RecordingReader(settings.file)
     stream = choose_stream(reader, settings.stream, settings.source)
-    agent_id, camera = stream.agent_id, stream.camera
     server = ServerSettings(
-        agent_id=agent_id,
+        agent_id=stream.agent_id,
         mode="replay",
         out=settings.out,
         save_images=settings.save_images,
@@ -150,8 +150,20 @@ def replay(
         view=settings.view,
     )
     check_viewer(server)
-    if settings.out is not None:
-        make_output_folder(settings.out)
+    with output_folder(settings.out):
+        return _replayed(settings, server, reader, stream, stop or threading.Event(), on_frame)
+
+
+def _replayed(
+    settings: ReplaySettings,
+    server: ServerSettings,
+    reader: RecordingReader,
+    stream: RecordedStream,
+    stop: threading.Event,
+    on_frame: Callable[[int], None] | None,
+) -> dict[str, Any]:
+    """Decode and reconstruct the frames of a stream; return the summary."""
+    agent_id, camera = stream.agent_id, stream.camera
     decoder = FrameDecoder(
         lambda name, modulation: load_codec(
             name, modulation=modulation, num_threads=settings.threads, weights=settings.weights
@@ -172,7 +184,6 @@ def replay(
     )
     session = Session(server, identity, settings.out, reference, program=settings)
     viewer = open_viewer(server, identity, reference.truth if reference is not None else None)
-    stop = stop if stop is not None else threading.Event()
     drops: dict[str, int] = {}
     processed = 0
     try:

@@ -22,7 +22,7 @@ from semcast.common.transport import open_session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import DecodedArrival, FrameDecoder, codec_loader
-from semcast.server.former_run import free_folder, make_output_folder
+from semcast.server.former_run import free_folder, output_folder
 from semcast.server.frame_views import missing_view
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.outbox import Outbox, map_message
@@ -93,6 +93,7 @@ class Server:
         self._new_map = False
         self._resources = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
+            stack.enter_context(output_folder(settings.out))
             if settings.record is not None:
                 stack.enter_context(recording(session, self._agent_id, settings.record, to_toml(settings)))
             self._receiver = stack.enter_context(
@@ -118,8 +119,6 @@ class Server:
     def _make_ready(self) -> None:
         """Do what takes long, or may fail, before others see that the server is there."""
         settings = self._settings
-        if settings.out is not None:
-            make_output_folder(settings.out)
         if settings.reference is not None:
             open_sequence(settings.reference, settings.camera)
         self._spare_bundle = self._new_bundle()

@@ -32,7 +32,7 @@ from semcast.common.transport import Session, free_endpoint, open_session
 from semcast.common.whole_file import check_writable
 from semcast.common.wire import WireError, unpack
 from semcast.real_time import plan_for
-from semcast.server.former_run import check_not_foreign, discard, make_output_folder
+from semcast.server.former_run import check_not_foreign, discard, output_folder
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
 START_DEADLINE_S = 60.0
@@ -289,15 +289,16 @@ def run_demo(
     for name, file in (("record", settings.record), ("json", settings.json)):
         if file is not None:
             check_writable(file, name)
-    make_output_folder(settings.out)
     summary_file = settings.out / SUMMARY_NAME
-    check_not_foreign(settings.out, SUMMARY_NAME)
     logs = settings.out / "logs"
-    try:
-        logs.mkdir(exist_ok=True)
-    except OSError as err:
-        raise ConfigError(f"{logs} can't be made a folder for logs: {err}") from err
-    discard(settings.out)
+    # The server takes the folder for itself as soon as it starts.
+    with output_folder(settings.out):
+        check_not_foreign(settings.out, SUMMARY_NAME)
+        try:
+            logs.mkdir(exist_ok=True)
+        except OSError as err:
+            raise ConfigError(f"{logs} can't be made a folder for logs: {err}") from err
+        discard(settings.out)
     endpoint = free_endpoint()
     commands = role_commands(settings, sequence, endpoint)
     children = {name: Role(name, command, logs / f"{name}.log") for name, command in commands.items()}

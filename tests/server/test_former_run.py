@@ -1,9 +1,20 @@
 """An output folder that is not empty."""
 
+import errno
+import subprocess
+import sys
+
 import pytest
 
 from semcast.common.errors import ConfigError
-from semcast.server.former_run import check_not_foreign, discard, is_run, make_output_folder, set_aside
+from semcast.server.former_run import (
+    check_not_foreign,
+    discard,
+    is_run,
+    make_output_folder,
+    output_folder,
+    set_aside,
+)
 
 OURS = ("trajectory.tum", "map.ply", "summary.json", "settings.toml", "frames.jsonl", "run.rrd")
 THEIRS = ("groundtruth.txt", "intrinsics.json", "run.mcap")
@@ -71,6 +82,51 @@ def test_a_folder_for_outputs_has_no_images_of_others_and_is_one(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match=r"file can't be made a folder for outputs"):
         make_output_folder(tmp_path / "file")
+
+
+def test_a_folder_in_use_is_refused_until_the_run_ends(tmp_path):
+    folder = tmp_path / "run"
+    with output_folder(folder):
+        with pytest.raises(
+            ConfigError, match=f"out must not be in use, another run is writing into {folder}"
+        ):
+            output_folder(folder).__enter__()
+        with output_folder(tmp_path / "other"), output_folder(None):
+            pass
+    with output_folder(folder):
+        assert list(folder.iterdir()) == []
+
+
+def test_a_killed_run_leaves_its_folder_free(tmp_path):
+    program = (
+        "import pathlib, sys, time\n"
+        "from semcast.server.former_run import output_folder\n"
+        "with output_folder(pathlib.Path(sys.argv[1])):\n"
+        "    print('held', flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    child = subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout.readline() == "held\n"
+        with pytest.raises(ConfigError, match="another run is writing into"):
+            output_folder(tmp_path).__enter__()
+    finally:
+        child.kill()
+        child.communicate()
+    with output_folder(tmp_path):
+        pass
+
+
+def test_where_there_are_no_locks_a_folder_is_used_without(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("semcast.server.former_run.fcntl.flock", refuse)
+    with output_folder(tmp_path), output_folder(tmp_path):
+        pass
+    monkeypatch.setattr("semcast.server.former_run.fcntl", None)
+    with output_folder(tmp_path), output_folder(tmp_path):
+        pass
 
 
 def test_a_name_that_is_taken_is_passed_over(tmp_path):

@@ -3,7 +3,9 @@
 import json
 
 import numpy as np
+import pytest
 
+from semcast.common.errors import ConfigError
 from semcast.common.recording_reader import RecordingReader
 from semcast.server.export.outputs import write_ply
 from semcast.server.recorded_streams import recorded_streams
@@ -26,6 +28,14 @@ def test_a_restarted_agent_begins_a_new_map_and_the_former_run_is_kept(tmp_path,
     assert former["frames"]["tracked"] == 8
     assert len((tmp_path / "previous-1" / "frames.jsonl").read_text().splitlines()) == 8
     assert len((tmp_path / "frames.jsonl").read_text().splitlines()) == 4
+
+
+def test_a_folder_that_another_server_writes_into_is_refused(tmp_path, open_air):
+    with open_air() as air, open_air() as other:
+        air.serve(out=tmp_path)
+        with pytest.raises(ConfigError, match=f"another run is writing into {tmp_path}"):
+            other.serve(out=tmp_path)
+        other.serve(out=tmp_path / "another")
 
 
 def test_a_restarted_server_goes_on_with_the_map_of_its_checkpoint(tmp_path, open_air):
