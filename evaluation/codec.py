@@ -4,13 +4,13 @@ Codecs take turns on every image, so slow drifts of the machine hit all alike, a
 under every codec.
 """
 
+import logging
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +30,8 @@ from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
 from semcast.common.phy.slots import layout_for
 from semcast.common.rate import NATIVE_RATE, Rate, from_coded, to_coded
+from semcast.common.sequence import read_image
+from semcast.common.sequence_layouts import IMAGE_SUFFIXES, images_in
 from semcast.evaluation.calibration import reliability
 from semcast.evaluation.image_quality import ms_ssim, ssim
 from semcast.evaluation.picture_strip import write_picture_strip
@@ -38,6 +40,8 @@ from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.statistics import finite_mean, percentiles, spearman
 from semcast.evaluation.uncertainty_maps import block_means, pixel_label
 
+logger = logging.getLogger(__name__)
+
 VERB = "eval codec"
 #: Fields of ``CodecSettings.link`` that have no meaning here: the SNR is a list, nothing is delayed.
 UNUSED_LINK_FIELDS = frozenset({"link.snr_db", "link.delay_ms", "link.jitter_ms"})
@@ -45,7 +49,6 @@ UNUSED_LINK_FIELDS = frozenset({"link.snr_db", "link.delay_ms", "link.jitter_ms"
 LABEL_ALPHA = 30.0
 #: What a receiver shows when a whole frame is lost.
 _LOST_GREY = 128
-_IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm"})
 _STRIP_SNR_DB = 10.0
 _STRIP_IMAGES = 2
 _FRAME_INTERVAL_S = 0.1
@@ -111,28 +114,32 @@ class _Sample:
     report_db: float
 
 
-def read_images(folder: Path, max_images: int | None = None) -> dict[str, NDArray[np.uint8]]:
+def read_images(
+    folder: Path, max_images: int | None = None
+) -> tuple[dict[str, NDArray[np.uint8]], list[str]]:
     """Read the images of a folder.
 
     Returns:
-        File name to ``(H, W, 3)`` uint8 RGB, in the order of the names.
+        File name to ``(H, W, 3)`` uint8 RGB, in the order of the names; and the names of those that can't be
+        read, each told with why.
 
     Raises:
-        SourceError: The folder can't be read, holds no image, or a file is no image.
+        SourceError: The folder can't be read or holds no image, or none of them can be read.
     """
-    try:
-        paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in _IMAGE_SUFFIXES)
-    except OSError as err:
-        raise SourceError(f"{folder} can't be read as a folder of images: {err}") from err
+    paths = images_in(folder)
     if not paths:
-        raise SourceError(f"{folder} holds no images ({', '.join(sorted(_IMAGE_SUFFIXES))})")
-    images = {}
-    for path in paths[:max_images]:
-        image_bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if image_bgr is None:
-            raise SourceError(f"{path} can't be read as an image")
-        images[path.name] = np.asarray(cv2.cvtColor(image_bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-    return images
+        raise SourceError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)})")
+    images: dict[str, NDArray[np.uint8]] = {}
+    left_out: list[str] = []
+    for path in (paths := paths[:max_images]):
+        try:
+            images[path.name] = read_image(path)
+        except SourceError as err:
+            if len(left_out) == len(paths) - 1:
+                raise
+            logger.warning("left out: %s", err)
+            left_out.append(path.name)
+    return images, left_out
 
 
 def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = None) -> dict[str, Any]:
@@ -159,7 +166,7 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         ConfigError: A codec is unknown.
         SemcastError: A result can't be written.
     """
-    images = read_images(settings.images, settings.max_images)
+    images, left_out = read_images(settings.images, settings.max_images)
     if codecs is None:
         under_name = {name: _load(name, settings) for name in settings.codec}
     else:
@@ -182,7 +189,14 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
             if snr_db == strip_snr_db and len(strip) < _STRIP_IMAGES:
                 strip.append(_strip_row(name, image, {n: s[-1] for n, s in samples.items()}))
         results += [_row(name, snr_db, list(images), rows) for name, rows in samples.items()]
-    report = json_ready({**provenance(VERB, settings), "num_images": len(images), "results": results})
+    report = json_ready(
+        {
+            **provenance(VERB, settings),
+            "num_images": len(images),
+            "images_left_out": left_out,
+            "results": results,
+        }
+    )
     if settings.json is not None:
         write_json(settings.json, report)
     if settings.out is not None:

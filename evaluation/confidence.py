@@ -15,7 +15,7 @@ from semcast.evaluation.pipeline import (
     FrameRun,
     StreamSettings,
     open_stream,
-    selected_frame_ids,
+    select_frames,
 )
 from semcast.evaluation.plots import plot_reliability
 from semcast.evaluation.report import json_ready, provenance, write_json
@@ -66,8 +66,13 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
         ConfigError: The codec is unknown or no frame was received.
     """
     sequence, codec = open_stream(settings, codec)
-    results = [_grade_at(settings, sequence, codec, snr_db) for snr_db in settings.snr_db]
-    report = {**provenance(VERB, settings), "results": json_ready(results)}
+    chosen = select_frames(sequence, settings)
+    results = [_grade_at(settings, sequence, chosen.ids, codec, snr_db) for snr_db in settings.snr_db]
+    report = {
+        **provenance(VERB, settings),
+        "frames_left_out": chosen.left_out,
+        "results": json_ready(results),
+    }
     if settings.json is not None:
         write_json(settings.json, report)
     if settings.out is not None:
@@ -79,12 +84,15 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
 
 
 def _grade_at(
-    settings: ConfidenceSettings, sequence: RecordedSequence, codec: Codec | None, snr_db: float
+    settings: ConfidenceSettings,
+    sequence: RecordedSequence,
+    frame_ids: list[int],
+    codec: Codec | None,
+    snr_db: float,
 ) -> dict[str, Any]:
     pixel, keypoint, slots = PixelGrader(settings.pixel_alpha), KeypointGrader(), SlotGrader()
     quality_db: list[float] = []
     num_lost = 0
-    frame_ids = selected_frame_ids(sequence, settings)
     for seed in settings.all_seeds:
         run = FrameRun(sequence, frame_ids, codec, settings.link_at(snr_db), seed, cache_bytes=0)
         for frame in run:

@@ -23,7 +23,7 @@ from semcast.evaluation.pipeline import (
     FrameRun,
     StreamSettings,
     open_stream,
-    selected_frame_ids,
+    select_frames,
 )
 from semcast.evaluation.reconstruct import as_received, cut_to_frames
 from semcast.evaluation.report import json_ready, provenance, write_json
@@ -100,11 +100,10 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
     """
     sequence, codec = open_stream(settings, codec)
     link = settings.link_at(settings.snr_db[0])
+    chosen = select_frames(sequence, settings)
     frames = [
         as_received(frame)
-        for frame in FrameRun(
-            sequence, selected_frame_ids(sequence, settings), codec, link, settings.seed, cache_bytes=0
-        )
+        for frame in FrameRun(sequence, chosen.ids, codec, link, settings.seed, cache_bytes=0)
         if frame.decoded is not None
     ]
     if not frames:
@@ -139,6 +138,7 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
             **provenance(VERB, settings),
             "sequence": sequence.name,
             "image_wh": [sequence.intrinsics.width, sequence.intrinsics.height],
+            "frames_left_out": chosen.left_out,
             "growth": {key: last[key] / middle[key] if middle[key] else None for key in keys},
             "results": rows,
         }

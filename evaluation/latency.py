@@ -17,7 +17,7 @@ from semcast.evaluation.pipeline import (
     FrameRun,
     StreamSettings,
     open_stream,
-    selected_frame_ids,
+    select_frames,
 )
 from semcast.evaluation.reconstruct import reconstruct
 from semcast.evaluation.report import json_ready, provenance, write_json
@@ -140,9 +140,10 @@ def evaluate_latency(settings: LatencySettings, codec: Codec | None = None) -> d
         ConfigError: The codec is unknown, or no frame is left behind the warm-up.
     """
     sequence, codec = open_stream(settings, codec)
+    chosen = select_frames(sequence, settings)
     frames = FrameRun(
         sequence,
-        selected_frame_ids(sequence, settings),
+        chosen.ids,
         codec,
         settings.link_at(settings.snr_db[0]),
         settings.seed,
@@ -167,6 +168,7 @@ def evaluate_latency(settings: LatencySettings, codec: Codec | None = None) -> d
             "sequence": sequence.name,
             "image_wh": [sequence.intrinsics.width, sequence.intrinsics.height],
             "num_frames": len(rows),
+            "frames_left_out": chosen.left_out,
             "completeness": run.summary["completeness"],
             **stage_profile(rows),
         }

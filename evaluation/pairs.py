@@ -33,7 +33,7 @@ from semcast.evaluation.pipeline import (
     LinkedFrame,
     StreamSettings,
     open_stream,
-    selected_frame_ids,
+    select_frames,
 )
 from semcast.evaluation.plots import plot_pair_errors
 from semcast.evaluation.pose_error import relative_pose_error
@@ -150,8 +150,8 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
         ConfigError: The codec is unknown, there is no ground truth, or no pair has the baseline asked for.
     """
     sequence, codec = open_stream(settings, codec)
-    frame_ids = selected_frame_ids(sequence, settings)
-    motions = {gap: true_motions(sequence, frame_ids, settings, gap) for gap in settings.gap}
+    chosen = select_frames(sequence, settings)
+    motions = {gap: true_motions(sequence, chosen.ids, settings, gap) for gap in settings.gap}
     methods = [*settings.confidence, *((*COMPETITORS, ORACLE) if settings.competitors else ())]
     # Without a link the SNR changes nothing: one cell stands for all.
     snrs_db: tuple[float | None, ...] = settings.snr_db if codec is not None else (None,)
@@ -164,7 +164,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
         link = settings.link_at(snr_db) if snr_db is not None else settings.link
         at_snr = {variant: PairCell(methods) for variant in variants}
         for seed in settings.all_seeds:
-            run = FrameRun(sequence, frame_ids, codec, link, seed, cache_bytes=0)
+            run = FrameRun(sequence, chosen.ids, codec, link, seed, cache_bytes=0)
             for gap, pair_idx, frame0, frame1 in _neighbours(run, settings.gap, quality_db):
                 T_cam1_cam0 = motions[gap].get((frame0.frame_id, frame1.frame_id))
                 if T_cam1_cam0 is None:
@@ -184,6 +184,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
             **provenance(VERB, settings),
             "sequence": sequence.name,
             "title": f"{sequence.name}, {settings.codec}, {settings.link.channel}",
+            "frames_left_out": chosen.left_out,
             "num_pairs": sum(len(of_gap) for of_gap in motions.values()),
             "results": merged.results(),
             "auroc": merged.auroc_of_cues(),

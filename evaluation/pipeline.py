@@ -4,6 +4,7 @@ Lossless and deterministic: every frame is sent, in order, and a frame's channel
 frame number alone. It is the same codec, link and equaliser the processes run.
 """
 
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,11 +19,13 @@ from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
 from semcast.common.codecs import load_codec, reported_snr_db
-from semcast.common.errors import ConfigError
+from semcast.common.errors import ConfigError, SourceError
 from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence import open_sequence
+
+logger = logging.getLogger(__name__)
 
 #: Name under which the original images are used as they are: the best any codec and link could do.
 CLEAN = "none"
@@ -123,18 +126,41 @@ def _elapsed_ms(since_ns: int) -> float:
     return (time.perf_counter_ns() - since_ns) * 1e-6
 
 
-def selected_frame_ids(sequence: RecordedSequence, settings: StreamSettings) -> list[int]:
-    """Return the indices that ``start``, ``stride`` and ``max_frames`` choose.
+@dataclass(frozen=True)
+class Selection:
+    """Frames of a recording that an evaluation sends.
+
+    Attributes:
+        ids: Indices in the recording, increasing.
+        left_out: Those that were chosen and whose image can't be read: an agent leaves them out as well.
+    """
+
+    ids: list[int]
+    left_out: list[int]
+
+
+def select_frames(sequence: RecordedSequence, settings: StreamSettings) -> Selection:
+    """Return the frames that ``start``, ``stride`` and ``max_frames`` choose; what can't be read is left out.
 
     Raises:
-        ConfigError: None is left.
+        ConfigError: None is chosen.
+        SourceError: None of them can be read.
     """
     ids = list(range(settings.start, len(sequence), settings.stride))
     if not ids:
         raise ConfigError(
             f"start must be below the {len(sequence)} frames of the sequence, got {settings.start}"
         )
-    return ids if settings.max_frames is None else ids[: settings.max_frames]
+    left_out: list[int] = []
+    for frame_id in (ids := ids[: settings.max_frames]):
+        try:
+            sequence.image(frame_id)
+        except SourceError as err:
+            if len(left_out) == len(ids) - 1:
+                raise
+            logger.warning("frame %d is left out: %s", frame_id, err)
+            left_out.append(frame_id)
+    return Selection([frame_id for frame_id in ids if frame_id not in left_out], left_out)
 
 
 def run_frames(

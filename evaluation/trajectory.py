@@ -18,7 +18,7 @@ from semcast.evaluation.pipeline import (
     FrameRun,
     StreamSettings,
     open_stream,
-    selected_frame_ids,
+    select_frames,
 )
 from semcast.evaluation.plots import plot_path
 from semcast.evaluation.reconstruct import ReconstructedRun, reconstruct
@@ -75,9 +75,10 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
 
     Returns:
         Provenance and ``cells``: one entry per SNR and mode with the median over seeds of each figure in
-        ``FIGURES``, ``num_failed`` (runs without a path), and ``runs``, the full summary of each
-        seed. ``comparisons`` holds, per SNR, the paired difference in ATE of each mode to the mode ``off``
-        where that was run. With one cell its figures and ``stage_ms`` also stand at the top level.
+        ``FIGURES``, ``num_failed`` (runs without a path), and ``runs``, the full summary of each seed.
+        ``comparisons`` holds, per SNR, the paired difference in ATE of each mode to the mode ``off`` where
+        that was run. ``frames_left_out`` are those that can't be read. With one cell its figures and
+        ``stage_ms`` also stand at the top level.
 
     Raises:
         SourceError: The recording can't be read.
@@ -93,14 +94,14 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
             "%s has a true path of %d poses and %.3g m: too short to say how far its poses are off",
             *(sequence.name, len(truth), truth.path_length),
         )
-    frame_ids = selected_frame_ids(sequence, settings)
+    chosen = select_frames(sequence, settings)
     # Without a link neither SNR nor channel seed changes an image: one SNR stands for all.
     snrs_db = settings.snr_db if codec is not None else settings.snr_db[:1]
     cells = []
     for snr_db in snrs_db:
         runs: dict[str, list[dict[str, Any]]] = {mode: [] for mode in settings.confidence}
         for seed in settings.all_seeds:
-            frames = FrameRun(sequence, frame_ids, codec, settings.link_at(snr_db), seed)
+            frames = FrameRun(sequence, chosen.ids, codec, settings.link_at(snr_db), seed)
             for mode in settings.confidence:
                 how = replace(settings.reconstruction, confidence=mode, seed=seed)
                 run = reconstruct(frames, sequence.intrinsics, how, truth)
@@ -114,7 +115,8 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     report = {
         **provenance(VERB, settings),
         "sequence": sequence.name,
-        "num_frames": len(frame_ids),
+        "num_frames": len(chosen.ids),
+        "frames_left_out": chosen.left_out,
         "cells": cells,
         "comparisons": _comparisons(cells, settings.seed),
     }

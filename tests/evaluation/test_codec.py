@@ -1,4 +1,5 @@
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -136,14 +137,29 @@ def test_perfect_csi_reaches_the_equaliser(folder):
 
 
 def test_image_folders_are_checked(folder, tmp_path):
-    assert list(read_images(folder, 2)) == ["image0.png", "image1.png"]
-    with pytest.raises(SourceError, match="can't be read as a folder"):
+    images, left_out = read_images(folder, 2)
+    assert list(images) == ["image0.png", "image1.png"]
+    assert left_out == []
+    with pytest.raises(SourceError, match="missing can't be read"):
         read_images(tmp_path / "missing")
     with pytest.raises(SourceError, match="holds no images"):
         read_images(tmp_path)
     (tmp_path / "broken.png").write_bytes(b"nothing")
-    with pytest.raises(SourceError, match=r"broken\.png can't be read as an image"):
+    with pytest.raises(SourceError, match=r"broken\.png"):
         read_images(tmp_path)
+
+
+def test_a_damaged_image_is_told_and_left_out(folder, tmp_path, caplog):
+    for image in folder.iterdir():
+        shutil.copy(image, tmp_path)
+    whole = (tmp_path / "image0.png").read_bytes()
+    (tmp_path / "image0.png").write_bytes(whole[: len(whole) // 2])
+    result = evaluate_codec(CodecSettings(images=tmp_path, codec=("jpeg-ldpc",), snr_db=(12.0,)))
+    assert result["images_left_out"] == ["image0.png"]
+    assert result["num_images"] == len(list(folder.glob("*.png"))) - 1
+    assert result["results"][0]["images"][0]["image"] == "image1.png"
+    assert caplog.text.count("left out") == 1
+    assert "image0.png" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.errors import ConfigError
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.pairs import PairSettings, evaluate_pairs, true_motions
-from semcast.evaluation.pipeline import selected_frame_ids
+from semcast.evaluation.pipeline import select_frames
 
 KEYS = {
     "rot_deg_mean",
@@ -123,7 +123,7 @@ def test_pairs_with_a_lost_frame_fail_under_every_method(room, phase_codec):
 def test_true_motion_maps_the_first_camera_to_the_second(room):
     sequence = open_sequence(room)
     wanted = settings(room)
-    motions = true_motions(sequence, selected_frame_ids(sequence, wanted), wanted, 4)
+    motions = true_motions(sequence, select_frames(sequence, wanted).ids, wanted, 4)
     assert list(motions) == [(k, k + 4) for k in range(3)]
     truth = sequence.groundtruth().T_world_cam
     np.testing.assert_allclose(truth[4] @ motions[0, 4], truth[0], atol=1e-7)
@@ -133,10 +133,10 @@ def test_short_baselines_are_left_out(room):
     sequence = open_sequence(room)
     wanted = settings(room, min_baseline_m=10.0)
     with pytest.raises(ConfigError, match="larger --gap"):
-        true_motions(sequence, selected_frame_ids(sequence, wanted), wanted, 4)
+        true_motions(sequence, select_frames(sequence, wanted).ids, wanted, 4)
     shared = settings(room, min_baseline_share=0.9)
     with pytest.raises(ConfigError, match="baseline"):
-        true_motions(sequence, selected_frame_ids(sequence, shared), shared, 4)
+        true_motions(sequence, select_frames(sequence, shared).ids, shared, 4)
 
 
 @pytest.mark.parametrize(

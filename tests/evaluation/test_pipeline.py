@@ -1,9 +1,11 @@
+import shutil
+
 import numpy as np
 import pytest
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
-from semcast.common.errors import ConfigError
+from semcast.common.errors import ConfigError, SourceError
 from semcast.common.image import psnr_db
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.pipeline import (
@@ -11,7 +13,7 @@ from semcast.evaluation.pipeline import (
     StreamSettings,
     open_stream,
     run_frames,
-    selected_frame_ids,
+    select_frames,
 )
 
 
@@ -107,9 +109,27 @@ def test_seeds_change_the_channel_and_nothing_else(sequence, phase_codec):
 
 def test_start_stride_and_limit_choose_frames(room, sequence):
     settings = StreamSettings(sequence=room, start=2, stride=5, max_frames=3)
-    assert selected_frame_ids(sequence, settings) == [2, 7, 12]
+    assert select_frames(sequence, settings).ids == [2, 7, 12]
     with pytest.raises(ConfigError, match="start"):
-        selected_frame_ids(sequence, StreamSettings(sequence=room, start=24))
+        select_frames(sequence, StreamSettings(sequence=room, start=24))
+
+
+def test_frames_that_can_not_be_read_are_told_and_left_out(room, tmp_path, caplog):
+    shutil.copytree(room, tmp_path / "room")
+    images = sorted((tmp_path / "room" / "images").iterdir())
+    for image in images[3:5]:
+        image.write_bytes(image.read_bytes()[:200])
+    damaged = open_sequence(tmp_path / "room")
+    chosen = select_frames(damaged, StreamSettings(sequence=tmp_path / "room", max_frames=6))
+    assert (chosen.ids, chosen.left_out) == ([0, 1, 2, 5], [3, 4])
+    assert [
+        frame.frame_id for frame in FrameRun(damaged, chosen.ids, None, ChannelSettings(), 0)
+    ] == chosen.ids
+    told = [record.getMessage() for record in caplog.records if "left out" in record.getMessage()]
+    assert [text.split(":")[0] for text in told] == ["frame 3 is left out", "frame 4 is left out"]
+    assert images[3].name in told[0]
+    with pytest.raises(SourceError, match=images[4].name):
+        select_frames(damaged, StreamSettings(sequence=tmp_path / "room", start=3, max_frames=2))
 
 
 def test_opening_gives_the_named_codec_or_none(room, phase_codec):

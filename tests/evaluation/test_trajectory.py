@@ -56,6 +56,15 @@ def test_one_run_has_the_promised_keys_and_files(room, phase_codec, tmp_path):
     assert cv2.imread(str(tmp_path / "path_20db_robust.png")) is not None
 
 
+def test_a_damaged_image_is_told_and_counts_for_nothing(room, tmp_path):
+    shutil.copytree(room, tmp_path / "room")
+    (tmp_path / "room" / "images" / sorted(p.name for p in (room / "images").iterdir())[7]).write_bytes(b"")
+    report = evaluate_trajectory(TrajectorySettings(sequence=tmp_path / "room", codec="none", max_frames=16))
+    assert report["frames_left_out"] == [7]
+    assert report["num_frames"] == len(report["cells"][0]["runs"][0]["rows"]) == 15
+    assert report["completeness"] >= 0.9
+
+
 def test_the_same_settings_give_the_same_trajectory_bit_for_bit(room, phase_codec, tmp_path):
     def run(folder):
         settings = TrajectorySettings(
