@@ -488,13 +488,13 @@ class Reconstruction:
             KeyError: An array is missing.
             ValueError: Arrays contradict each other.
         """
-        counters = np.asarray(arrays["counters"])
-        if counters.shape != (4,) or np.asarray(arrays["noise"]).shape != (2,):
-            raise ValueError("counters and noise of a snapshot must have 4 and 2 values")
+        counters, noise = np.asarray(arrays["counters"]), np.asarray(arrays["noise"], dtype=np.float64)
+        if counters.shape != (4,) or noise.shape != (2,) or not np.isfinite(noise).all():
+            raise ValueError("counters and noise of a snapshot must have 4 and 2 finite values")
         self._map.clear()
         self._begin()
         self._map.world.restore(dict(arrays))
-        self._map.noise.restore(np.asarray(arrays["noise"], dtype=np.float64))
+        self._map.noise.restore(noise)
         self._map_epoch, self._map.submap, self._tracks.next_id, self._last_frame_id = counters.tolist()
         if self._map.world.keyframes:
             self._state = TrackingState.LOST

@@ -105,7 +105,7 @@ def test_the_readout_of_a_drawn_shutter_is_found_and_written(rolling, tmp_path, 
     assert 16.0 < found.readout_ms < 22.0
     assert (found.fx, found.width) == (before.fx, before.width)
     assert f"--readout-ms {found.readout_ms:g} --readout-from top" in said.out
-    assert "20.0 ms from top" in said.err
+    assert "20.0 ms from top: reprojection error" in said.err
     report = json.loads(result.read_text())
     assert report["command"].startswith("semcast shutter ")
     assert report["readout_ms"] == found.readout_ms

@@ -5,6 +5,7 @@ import logging
 import sys
 from pathlib import Path
 
+from semcast.agent.source import is_camera_number
 from semcast.commands.running import add_settings, read_settings
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.whole_file import check_writable
@@ -31,11 +32,8 @@ def _check_file(path: Path | None, name: str) -> None:
 
 
 def _show(trial: Trial) -> None:
-    print(
-        f"{trial.readout!s:>20}  {trial.mean_px:.3f} px in {len(trial.error_px)} frames",
-        file=sys.stderr,
-        flush=True,
-    )
+    what = f"{trial.readout!s:>20}: reprojection error {trial.mean_px:.3f} px in {len(trial.error_px)} frames"
+    print(what, file=sys.stderr, flush=True)
 
 
 def _answer(found: ReadoutEstimate) -> str:
@@ -54,7 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
     settings = read_settings(ReadoutSettings, arguments)
     _check_file(arguments.out, "out")
     _check_file(settings.json, "json")
-    print("reprojection error by readout time:", file=sys.stderr)
+    if "://" in settings.source or is_camera_number(settings.source):
+        print(f"taking {settings.frames} images: move the camera, and turn it to and fro", file=sys.stderr)
     if not arguments.debug:
         logging.getLogger("semcast.server").setLevel(logging.WARNING)
     found = find_readout(settings, _show)

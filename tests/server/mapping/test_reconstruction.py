@@ -446,6 +446,8 @@ def test_a_snapshot_is_gone_on_with(room):
     assert ate_percent(trajectory, poses) < 1.5
     with pytest.raises(ValueError, match="counters"):
         make().restore({**arrays, "counters": np.zeros(2)})
+    with pytest.raises(ValueError, match="must have 4 and 2 finite values"):
+        make().restore({**arrays, "noise": np.array([np.nan, 1.0])})
     with pytest.raises(KeyError):
         make().restore({})
 
