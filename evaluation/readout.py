@@ -179,6 +179,11 @@ def find_readout(
     if len(frames) <= _MIN_FRAMES:
         raise SourceError(f"{source.name} must have more than {_MIN_FRAMES} images, got {len(frames)}")
     period_ms = float(np.median(np.diff([frame.t_source_ns for frame in frames]))) * 1e-6
+    if period_ms < _STEPS_MS[1]:
+        most_hz = 1e3 / _STEPS_MS[1]
+        raise SourceError(
+            f"{source.name} must have at most {most_hz:g} images a second, got {1e3 / period_ms:.0f}"
+        )
     trials: dict[Readout, Trial] = {}
 
     def error_px(readout: Readout) -> float:
@@ -186,7 +191,9 @@ def find_readout(
             trials[readout] = trial = _tried(frames, camera, readout)
             if on_trial is not None:
                 on_trial(trial)
-        return trials[readout].mean_px
+        # Where the camera was mostly lost, the few frames with a pose are the easy ones.
+        is_lost = 2 * len(trials[readout].error_px) < len(frames)
+        return np.inf if is_lost else trials[readout].mean_px
 
     best = search(error_px, min(period_ms, MAX_READOUT_MS))
     readout, low_ms, high_ms = fitted(best, tuple(trials.values()))

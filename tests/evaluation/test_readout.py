@@ -135,3 +135,24 @@ def test_too_few_images_are_refused(rolling, tmp_path, capsys):
     (tmp_path / "intrinsics.json").symlink_to(rolling / "intrinsics.json")
     assert main(["shutter", str(tmp_path)]) == 1
     assert "must have more than 30 images, got 20" in capsys.readouterr().err
+
+
+def test_a_camera_faster_than_any_readout_is_refused(rolling, tmp_path, capsys):
+    (tmp_path / "images").symlink_to(rolling / "images")
+    (tmp_path / "intrinsics.json").symlink_to(rolling / "intrinsics.json")
+    assert main(["shutter", str(tmp_path), "--rate-hz", "250"]) == 1
+    assert "must have at most 200 images a second, got 250" in capsys.readouterr().err
+
+
+def test_a_trial_that_lost_the_camera_is_not_the_best(rolling, monkeypatch):
+    def tried(frames, camera, at):
+        # The easy frames of a lost camera have the least error of all.
+        is_lost = at.signed_ms == -10
+        error_px = 0.1 if is_lost else 0.3 + 0.02 * abs(at.signed_ms - 10) + (at.axis == "columns")
+        count = len(frames) // 3 if is_lost else len(frames)
+        return Trial(at, {k: error_px * (1 + 0.1 * (k % 3)) for k in range(count)})
+
+    monkeypatch.setattr(readout, "_tried", tried)
+    found = readout.find_readout(ReadoutSettings(source=str(rolling)))
+    assert found.camera.readout_ms == pytest.approx(10.0, abs=1.0)
+    assert found.camera.readout_from == "top"
