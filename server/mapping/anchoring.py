@@ -1,8 +1,9 @@
-"""Takes the drift out of tracks: at keyframes they are aligned with how an earlier keyframe saw them.
+"""Takes the drift out of tracks: at keyframes they are aligned with how earlier keyframes saw them.
 
 Following a point from image to image makes a small error at every step, and a larger one where images are
-noisy: about a pixel in a dozen decoded frames. At a keyframe the pose is known, so that the patch of an older
-keyframe can be warped to how it should look now, and the point put back on it.
+noisy: about a pixel in a dozen decoded frames. At a keyframe the pose is known, so that patches of older
+keyframes can be warped to how they should look now, and the point put back on them. Every older image has
+noise of its own, so a point is aligned with all of them and put in the median of where they have it.
 """
 
 import numpy as np
@@ -23,6 +24,8 @@ NUM_ANCHORS = 10
 #: A point that would move further than this has found something else.
 _MAX_MOVE_PX = 3.0
 _MIN_CORRELATION = 0.7
+#: Landmarks next to a track without one, by which its patch is warped, and how many a keyframe must show.
+_NEIGHBOURS, _MIN_LANDMARKS = 5, 5
 
 
 def anchor_tracks(
@@ -35,9 +38,9 @@ def anchor_tracks(
     *,
     submap: int,
 ) -> int:
-    """Align the tracks of landmarks in sight, each with the oldest kept keyframe that saw it.
+    """Align the tracks in sight with the kept keyframes that saw them.
 
-    A track that does not fit there stays where it is.
+    Of each track the median of the positions that fit is taken; one that fits nowhere stays where it is.
 
     Args:
         camera: Pinhole.
@@ -53,38 +56,53 @@ def anchor_tracks(
     """
     by_id = {k.frame_id: k for k in world.keyframes_of(submap)}
     T_cam_world = invert_transform(T_world_cam)
-    landmark = world.landmarks.rows(tracks.ids)
-    waiting = tracks.visible & (landmark >= 0)
     parts: list[tuple[NDArray[np.intp], Array, Templates]] = []
-    for image in images.newest(NUM_ANCHORS):  # oldest first
+    for image in images.newest(NUM_ANCHORS):
         keyframe = by_id.get(image.frame_id)
         if keyframe is None:
             continue
-        rows, xy0 = _shared(tracks, waiting, keyframe)
-        T_anchor_world = invert_transform(keyframe.T_world_cam)
-        depth = world.landmarks.xyz[landmark[rows]] @ T_anchor_world[2, :3] + T_anchor_world[2, 3]
-        before = depth > MIN_DEPTH_MAP
-        rows, xy0, depth = rows[before], xy0[before], depth[before]
+        rows, xy0 = _shared(tracks, keyframe)
+        depth = _depths(world, keyframe, tracks.ids[rows], xy0)
         warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
-        alike = seen_alike(warps, depth_now)
+        alike = (depth > 0.0) & seen_alike(warps, depth_now)
         if alike.any():
             parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike])))
-            waiting[rows[alike]] = False
     if not parts:
         return 0
     rows, warps = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-    templates = Templates.join([part[2] for part in parts])
-    found = align_patches(templates, sight.grey, tracks.xy[rows], warps)
+    found = align_patches(Templates.join([part[2] for part in parts]), sight.grey, tracks.xy[rows], warps)
     near = np.linalg.norm(found.xy - tracks.xy[rows], axis=1) < _MAX_MOVE_PX
     fits = near & (found.correlation > _MIN_CORRELATION)
-    tracks.settle_at(rows[fits], found.xy[fits])
-    return int(fits.sum())
+    anchor = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
+    places = np.full((len(parts), len(tracks), 2), np.nan)
+    places[anchor[fits], rows[fits]] = found.xy[fits]
+    aligned = np.unique(rows[fits])
+    tracks.settle_at(aligned, np.nanmedian(places[:, aligned], axis=0))
+    return len(aligned)
 
 
-def _shared(
-    tracks: TrackTable, waiting: NDArray[np.bool_], keyframe: Keyframe
-) -> tuple[NDArray[np.intp], Array]:
-    """Rows of waiting tracks that a keyframe saw too, and where."""
-    rows = np.flatnonzero(waiting)
+def _shared(tracks: TrackTable, keyframe: Keyframe) -> tuple[NDArray[np.intp], Array]:
+    """Rows of visible tracks that a keyframe saw too, and where."""
+    rows = np.flatnonzero(tracks.visible)
     _, mine, theirs = np.intersect1d(tracks.ids[rows], keyframe.ids, assume_unique=True, return_indices=True)
     return rows[mine], keyframe.xy[theirs]
+
+
+def _depths(world: WorldMap, keyframe: Keyframe, ids: NDArray[np.int64], xy: Array) -> Array:
+    """Depth in a keyframe of each of its points ``(N,)``, in map units; 0 where nothing tells it.
+
+    That of its landmark; of a point that has none yet, or one behind the camera, the median of the inverse
+    depths of the landmarks next to it, which is near enough for a warp.
+    """
+    T_cam_world = invert_transform(keyframe.T_world_cam)
+    landmark = world.landmarks.rows(ids)
+    depth = np.zeros(len(ids))
+    known = landmark >= 0
+    depth[known] = world.landmarks.xyz[landmark[known]] @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    known = depth > MIN_DEPTH_MAP
+    depth[~known] = 0.0
+    if known.sum() >= _MIN_LANDMARKS and not known.all():
+        square = ((xy[~known][:, None] - xy[known][None]) ** 2).sum(axis=2)
+        near = np.argpartition(square, _NEIGHBOURS - 1, axis=1)[:, :_NEIGHBOURS]
+        depth[~known] = 1.0 / np.median(1.0 / depth[known][near], axis=1)
+    return depth

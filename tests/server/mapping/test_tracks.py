@@ -415,6 +415,49 @@ def test_drift_is_taken_out_at_a_keyframe(mapped, rng):
     assert np.all(tracks.confidence[settled] >= doubtful[settled])
 
 
+def noisy_keyframes(mapped, places, sd=18.0):
+    """Keyframes at several places whose images have noise of their own; all see the tracks of the first."""
+    world, _, tracks = mapped
+    first = world.keyframes[0]
+    rng, images = np.random.default_rng(5), KeyframeImages(10)
+    for frame_id, x in enumerate(places):
+        if frame_id:
+            xy = first.xy - (x - START_X, 0)
+            world.add_keyframe(replace(first, frame_id=frame_id, T_world_cam=pose_at(x), xy=xy))
+        grey = sight_at(x).grey + rng.normal(0, sd, SHAPE)
+        images.append(SeenFrom(frame_id, np.clip(grey, 0, 255).astype(np.uint8)))
+    return world, images, tracks
+
+
+def test_noise_of_older_keyframes_averages_out(mapped):
+    error = []
+    for places in ((20,), (20, 22, 24, 26, 28)):
+        world, images, _ = noisy_keyframes(mapped, places)
+        tracks = begin(START_X)
+        sight = sight_at(30, frame_id=9)
+        tracks.follow(sight, tracks.xy - (10, 0))
+        true = world.keyframes[0].xy[np.searchsorted(world.keyframes[0].ids, tracks.ids)] - (10, 0)
+        assert anchor((world, images, tracks), sight, 30) > 50
+        error.append(np.median(np.linalg.norm(tracks.xy - true, axis=1)[tracks.visible]))
+    assert error[1] < 0.7 * error[0]
+
+
+def test_tracks_without_a_landmark_are_aligned_by_the_depth_around_them(mapped):
+    world, _, tracks = mapped
+    new = np.arange(len(tracks)) % 3 == 0
+    true = dict(zip(tracks.ids, tracks.xy - (10, 0), strict=True))
+    new_ids = tracks.ids[new]
+    world.remove_landmarks(new)
+    sight = sight_at(30, frame_id=1)
+    tracks.follow(sight, tracks.xy - (10, 0))
+    tracks.xy = tracks.xy + 0.5
+    anchor(mapped, sight, 30)
+    mine = tracks.visible & np.isin(tracks.ids, new_ids)
+    error = np.linalg.norm(tracks.xy - np.array([true[i] for i in tracks.ids]), axis=1)[mine]
+    assert len(error) > 15
+    assert np.median(error) < 0.05
+
+
 def test_without_confidence_drift_is_taken_out_too(mapped):
     _, _, tracks = mapped
     tracks._mode = "off"
@@ -434,6 +477,6 @@ def test_a_track_that_fits_nowhere_stays_where_it_is(mapped):
     assert anchor((world, other, tracks), sight, 30) == 0
     np.testing.assert_array_equal(tracks.xy, followed)
     assert anchor(mapped, sight, 30, submap=1) == 0, "a keyframe of another submap has another world"
-    world.landmarks.keep(np.zeros(len(world.landmarks), bool))
-    assert anchor(mapped, sight, 30) == 0, "no depth, no warp"
     np.testing.assert_array_equal(tracks.xy, followed)
+    world.remove_landmarks(np.arange(len(world.landmarks)) >= 4)
+    assert anchor(mapped, sight, 30) == 4, "too few depths to tell those of others"
