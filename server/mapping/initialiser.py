@@ -16,7 +16,7 @@ from semcast.server.geometry.two_view import TwoViewResult, estimate_two_view
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.ambiguity import Side, decide
 from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
-from semcast.server.mapping.kept_frames import Observed, pose_of
+from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
 from semcast.server.mapping.mapper import gather_observations
 from semcast.server.mapping.world_map import Keyframe
 
@@ -227,7 +227,7 @@ class Initialiser:
         keyframes = []
         for o, T in zip(chosen, invert_transform(T_cam_world), strict=True):
             T[:3, 3] *= scale
-            keyframes.append(_keyframe(o, T))
+            keyframes.append(keyframe_of(o, T))
         _, point, _, confidence = gather_observations(chosen, all_ids[good])
         mean = np.bincount(point, weights=confidence) / np.bincount(point)
         return Start(keyframes, all_ids[good], scale * points.xyz[good], mean)
@@ -266,17 +266,3 @@ class Initialiser:
             & (points.parallax_deg > 0.5 * self._min_parallax_deg)
             & (points.error_sigma < 2.5)
         )
-
-
-def _keyframe(o: Observed, T_world_cam: Array) -> Keyframe:
-    return Keyframe(
-        frame_id=o.frame_id,
-        t_source_ns=o.t_source_ns,
-        T_world_cam=T_world_cam,
-        submap=0,
-        ids=o.ids,
-        xy=o.xy,
-        confidence=o.confidence,
-        descriptor_ids=np.zeros(0, np.int64),
-        descriptors=np.zeros((0, 32), np.uint8),
-    )

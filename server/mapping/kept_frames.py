@@ -27,6 +27,21 @@ class Observed:
     confidence: Array
 
 
+def keyframe_of(observed: Observed, T_world_cam: Array) -> Keyframe:
+    """Return a kept frame as a keyframe of part 0, without descriptors."""
+    return Keyframe(
+        frame_id=observed.frame_id,
+        t_source_ns=observed.t_source_ns,
+        T_world_cam=T_world_cam,
+        submap=0,
+        ids=observed.ids,
+        xy=observed.xy,
+        confidence=observed.confidence,
+        descriptor_ids=np.zeros(0, np.int64),
+        descriptors=np.zeros((0, 32), np.uint8),
+    )
+
+
 def pose_of(
     camera: Intrinsics,
     observed: Observed,
@@ -58,7 +73,7 @@ def pose_of(
 def backfill(
     camera: Intrinsics,
     world: WorldMap,
-    reference: Keyframe,
+    keyframes: Sequence[Keyframe],
     kept: Sequence[Observed],
     noise: NoiseModel,
     seed: int,
@@ -68,7 +83,7 @@ def backfill(
     Args:
         camera: Pinhole.
         world: The map; some of the frames may have a pose in it.
-        reference: Keyframe the poses hang on: they move with it.
+        keyframes: Those that poses may hang on; each moves with the one nearest in time.
         kept: The frames, in order of time.
         noise: Of the observations.
         seed: Of the searches.
@@ -76,7 +91,8 @@ def backfill(
     Returns:
         ``(frame_id, t_source_ns, T_world_cam)`` of those that have a pose now, in order of time.
     """
-    guess = reference.T_world_cam
+    keyframe_ids = np.array([k.frame_id for k in keyframes])
+    guess = keyframes[-1].T_world_cam
     posed = []
     for observed in reversed(kept):
         T_world_cam: Array | None
@@ -87,7 +103,8 @@ def backfill(
                 camera, observed, world.landmarks.ids, world.landmarks.xyz, noise, guess, seed
             )
             if T_world_cam is not None:
-                world.add_frame(observed.frame_id, reference.frame_id, T_world_cam)
+                nearest = keyframe_ids[np.abs(keyframe_ids - observed.frame_id).argmin()]
+                world.add_frame(observed.frame_id, int(nearest), T_world_cam)
         if T_world_cam is not None:
             guess = T_world_cam
             posed.append((observed.frame_id, observed.t_source_ns, T_world_cam))

@@ -105,48 +105,76 @@ def add_landmarks(
     *,
     num_keyframes: int = 12,
 ) -> int:
-    """Triangulate the tracks of the newest keyframe that are no landmarks yet; the number added.
+    """Triangulate the tracks of the newest keyframe that are no landmarks yet; the number added."""
+    newest = world.keyframes[-1]
+    wanted = newest.ids[world.landmarks.rows(newest.ids) < 0]
+    views = [k for k in world.keyframes[-num_keyframes:] if k.submap == newest.submap]
+    reach = median_depth(world, newest)
+    new = new_landmarks(camera, views, newest, wanted, noise, min_parallax_deg, reach)
+    row = np.searchsorted(newest.ids, new.ids)
+    rgb = sample_colours(image, newest.xy[row])
+    world.add_landmarks(new.ids, new.xyz, rgb, new.confidence, newest.submap, newest.frame_id)
+    return len(new.ids)
+
+
+@dataclass(frozen=True)
+class NewLandmarks:
+    """Points made of tracks.
+
+    Attributes:
+        ids: ``(P,)`` int64, ascending.
+        xyz: ``(P, 3)`` world frame.
+        confidence: ``(P,)`` mean over observations.
+    """
+
+    ids: Ids
+    xyz: Array
+    confidence: Array
+
+
+def new_landmarks(
+    camera: Intrinsics,
+    views: Sequence[Keyframe],
+    seen_from: Keyframe,
+    wanted: Ids,
+    noise: NoiseModel,
+    min_parallax_deg: float,
+    median_depth_map: float,
+) -> NewLandmarks:
+    """Triangulate tracks that are no landmarks yet.
 
     A point must have its rays more than ``min_parallax_deg`` apart, be in front of all its cameras and fit
     its observations within ``MAX_ERROR_SIGMA``.
+
+    Args:
+        camera: Pinhole.
+        views: Keyframes that may have seen them.
+        seen_from: The one of them that is to see more.
+        wanted: ``(W,)`` ids of the tracks, ascending.
+        noise: Of the observations.
+        min_parallax_deg: Angle between rays.
+        median_depth_map: Of what ``seen_from`` sees; points many times as far are as good as at infinity.
     """
-    newest = world.keyframes[-1]
-    wanted = newest.ids[world.landmarks.rows(newest.ids) < 0]
-    if len(wanted) == 0:
-        return 0
-    views = [k for k in world.keyframes[-num_keyframes:] if k.submap == newest.submap]
     view, point, xy, confidence = gather_observations(views, wanted)
     seen = np.bincount(point, minlength=len(wanted))
     if not (seen >= 2).any():
-        return 0
+        return NewLandmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
     T_cam_world = invert_transform(np.stack([k.T_world_cam for k in views]))
     sigma = noise.sigma_px(confidence)
-    new = triangulate(camera, T_cam_world, view, point, xy, sigma, len(wanted))
-    depth = (new.xyz @ T_cam_world[-1, 2, :3]) + T_cam_world[-1, 2, 3]
-    reach = _MAX_DEPTH_RATIO * median_depth(world, newest)
+    points = triangulate(camera, T_cam_world, view, point, xy, sigma, len(wanted))
+    T_seen_world = invert_transform(seen_from.T_world_cam)
+    depth = points.xyz @ T_seen_world[2, :3] + T_seen_world[2, 3]
     # A fixed error in pixels is what an angle is compared with: noisy images need more parallax.
     wanted_deg = max(min_parallax_deg, float(np.degrees(2.5 * np.median(sigma) / camera.fx)))
     good = (
         (seen >= 2)
-        & new.in_front
-        & (new.parallax_deg > wanted_deg)
-        & (new.error_sigma < MAX_ERROR_SIGMA)
-        & (depth < reach)
+        & points.in_front
+        & (points.parallax_deg > wanted_deg)
+        & (points.error_sigma < MAX_ERROR_SIGMA)
+        & (depth < _MAX_DEPTH_RATIO * median_depth_map)
     )
-    if not good.any():
-        return 0
-    ids = wanted[good]
-    row = np.searchsorted(newest.ids, ids)
     total = np.bincount(point, weights=confidence, minlength=len(wanted))
-    world.add_landmarks(
-        ids,
-        new.xyz[good],
-        sample_colours(image, newest.xy[row]),
-        (total / np.maximum(1, seen))[good],
-        newest.submap,
-        newest.frame_id,
-    )
-    return len(ids)
+    return NewLandmarks(wanted[good], points.xyz[good], (total / np.maximum(1, seen))[good])
 
 
 def sample_colours(image: NDArray[np.uint8], xy: Array) -> NDArray[np.uint8]:
@@ -193,12 +221,16 @@ def gather_observations(
 
 def median_depth(world: WorldMap, keyframe: Keyframe) -> float:
     """Median depth of a keyframe's landmarks in map units; infinite when it sees none."""
-    row = world.landmarks.rows(keyframe.ids)
-    row = row[row >= 0]
+    return median_depth_of(keyframe, world.landmarks.ids, world.landmarks.xyz)
+
+
+def median_depth_of(keyframe: Keyframe, ids: Ids, xyz: Array) -> float:
+    """Return the same for points ``ids (P,)``, ascending, at ``xyz (P, 3)``."""
+    _, row, _ = np.intersect1d(ids, keyframe.ids, assume_unique=True, return_indices=True)
     if len(row) == 0:
         return float("inf")
     T_cam_world = invert_transform(keyframe.T_world_cam)
-    depth = world.landmarks.xyz[row] @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    depth = xyz[row] @ T_cam_world[2, :3] + T_cam_world[2, 3]
     return float(np.median(np.maximum(depth, 1e-6)))
 
 

@@ -15,6 +15,7 @@ from semcast.server.mapping import mapper
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.initialiser import Initialiser, Start
 from semcast.server.mapping.kept_frames import Observed, backfill
+from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place
@@ -358,17 +359,16 @@ class Reconstruction:
     def _begin_map(self, sight: Sight, start: Start) -> FrameResult:
         """Bring a start into the map and pose the frames that waited for it."""
         since = time.perf_counter_ns()
-        first = start.keyframes[0]
-        guess = self._motion.predict(first.t_source_ns)
+        history = self._initialiser.history
+        start = look_back(self._camera, start, history, self._map.noise.model, self._settings)
+        guess = self._motion.predict(start.keyframes[0].t_source_ns)
         T_world_ref, scale = self._map.bridge(guess, self._motion.speed_map_per_s, start)
         self._map.take_start(start, sight, self._tracks, T_world_ref, scale)
-        reference = self._map.reference_keyframe()
-        assert reference is not None
         backfilled = backfill(
             self._camera,
             self._map.world,
-            reference,
-            self._initialiser.history[:-1],
+            start.keyframes,
+            history[:-1],
             self._map.noise.model,
             self._settings.seed,
         )

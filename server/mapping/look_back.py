@@ -1,0 +1,147 @@
+"""A new map grows into the past, over the frames that waited for it, as it later grows into the future.
+
+A map starts from the oldest frame that still shares tracks with the newest one. Of what earlier frames saw it
+has little: posed by the few landmarks left in their sight they would err several times as much as later
+frames, or get no pose. So from the start backwards frames become keyframes and their tracks landmarks, and
+all are adjusted together.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.bundle import optimise
+from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
+from semcast.server.mapping.mapper import (
+    gather_observations,
+    median_depth_of,
+    new_landmarks,
+)
+from semcast.server.mapping.settings import ReconstructionSettings
+
+Array = NDArray[np.float64]
+
+#: Keyframes from before a start at most.
+_MAX_EARLIER = 10
+#: Keyframes and steps of one adjustment: there is one for each of them, while the camera waits.
+_WINDOW, _ITERATIONS = 8, 5
+#: A frame becomes a keyframe where it sees less than this share of the landmarks of the one after it, or
+#: where tracks have gone further than this share of the image width.
+_FEW_KNOWN_SHARE, _FAR_FLOW_SHARE = 0.6, 0.1
+
+
+def look_back(
+    camera: Intrinsics,
+    start: Start,
+    history: Sequence[Observed],
+    noise: NoiseModel,
+    settings: ReconstructionSettings,
+) -> Start:
+    """Extend a start by frames from before it.
+
+    Args:
+        camera: Pinhole.
+        start: A new map in its own frame.
+        history: Frames that waited for it, in order of time; those before its first keyframe are looked at.
+        noise: Of the observations.
+        settings: Of the reconstruction.
+
+    Returns:
+        The start with earlier keyframes and what they see, the first of them at the origin, in the same unit.
+    """
+    extended = start
+    guess = start.keyframes[0].T_world_cam
+    before = [o for o in history if o.frame_id < start.keyframes[0].frame_id]
+    for observed in reversed(before):
+        T_world_cam = pose_of(camera, observed, extended.ids, extended.xyz, noise, guess, settings.seed)
+        if T_world_cam is None:
+            continue
+        guess = T_world_cam
+        if not _is_new_view(observed, extended, camera.width):
+            continue
+        keyframes = [keyframe_of(observed, T_world_cam), *extended.keyframes]
+        extended = _with_new_points(camera, replace(extended, keyframes=keyframes), noise, settings)
+        extended = _adjusted(camera, extended, noise)
+        guess = extended.keyframes[0].T_world_cam
+        if len(keyframes) == len(start.keyframes) + _MAX_EARLIER:
+            break
+    T_first_world = invert_transform(extended.keyframes[0].T_world_cam)
+    return replace(
+        extended,
+        keyframes=[replace(k, T_world_cam=T_first_world @ k.T_world_cam) for k in extended.keyframes],
+        xyz=transform_points(T_first_world, extended.xyz),
+    )
+
+
+def _is_new_view(observed: Observed, start: Start, width_px: int) -> bool:
+    """Whether a frame sees enough else than the first keyframe to become one before it.
+
+    Fewer of them than are made later on: each costs an adjustment at once.
+    """
+    first = start.keyframes[0]
+    _, row, row_k = np.intersect1d(observed.ids, first.ids, assume_unique=True, return_indices=True)
+    flow_px = np.linalg.norm(observed.xy[row] - first.xy[row_k], axis=1)
+    known, known_k = (np.isin(ids, start.ids, assume_unique=True).sum() for ids in (observed.ids, first.ids))
+    if len(row) == 0 or known < _FEW_KNOWN_SHARE * known_k:
+        return True
+    return bool(np.median(flow_px) > _FAR_FLOW_SHARE * width_px)
+
+
+def _with_new_points(
+    camera: Intrinsics, start: Start, noise: NoiseModel, settings: ReconstructionSettings
+) -> Start:
+    """Add what the first keyframe saw together with others."""
+    first = start.keyframes[0]
+    wanted = first.ids[~np.isin(first.ids, start.ids, assume_unique=True)]
+    depth = median_depth_of(first, start.ids, start.xyz)
+    parallax_deg = settings.min_parallax_deg
+    new = new_landmarks(camera, start.keyframes, first, wanted, noise, parallax_deg, depth)
+    ids = np.concatenate([start.ids, new.ids])
+    order = np.argsort(ids, kind="stable")
+    return replace(
+        start,
+        ids=ids[order],
+        xyz=np.concatenate([start.xyz, new.xyz])[order],
+        confidence=np.concatenate([start.confidence, new.confidence])[order],
+    )
+
+
+def _adjusted(camera: Intrinsics, start: Start, noise: NoiseModel) -> Start:
+    """Adjust the first keyframes and what they see; the last two of them hold the rest where it is."""
+    window = start.keyframes[:_WINDOW]
+    view, point, xy, confidence = gather_observations(window, start.ids)
+    seen = np.flatnonzero(np.bincount(point, minlength=len(start.ids)) >= 2)
+    row = np.full(len(start.ids), -1, np.intp)
+    row[seen] = np.arange(len(seen))
+    kept = row[point] >= 0
+    result = optimise(
+        BundleProblem(
+            intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+            keyframe_ids=np.array([k.frame_id for k in window], dtype=np.int64),
+            T_world_cam=np.stack([k.T_world_cam for k in window]),
+            fixed=np.arange(len(window)) >= len(window) - 2,
+            keep_baseline=False,
+            landmark_ids=start.ids[seen],
+            xyz=start.xyz[seen],
+            view=view[kept],
+            point=row[point[kept]],
+            xy=xy[kept],
+            sigma_px=noise.sigma_px(confidence[kept]),
+            confidence=confidence[kept],
+            iterations=_ITERATIONS,
+            with_covariance=False,
+        )
+    )
+    if not result.ok:
+        return start
+    xyz = start.xyz.copy()
+    xyz[seen] = result.xyz
+    adjusted = [replace(k, T_world_cam=T) for k, T in zip(window, result.T_world_cam, strict=True)]
+    return replace(start, keyframes=[*adjusted, *start.keyframes[_WINDOW:]], xyz=xyz)
