@@ -292,14 +292,17 @@ class Session:
         logger.info("frame %d: %s", result.frame_id, what)
 
     def _keep_image(self, frame: DecodedFrame, result: FrameResult, update: MapUpdate | None) -> None:
-        """Keep the decoded image where the settings want it. A start makes keyframes of earlier frames."""
+        """Keep the decoded image where the settings want it, as poses and observations fit it.
+
+        A start makes keyframes of earlier frames.
+        """
         if self._images is None:
             return
         waits = result.state is not TrackingState.TRACKING  # a later part of the map begins from lost frames
         if result.is_keyframe or waits or self._settings.save_images == "all":
-            self._images.put(
-                frame.frame_id, frame.image, provisional=waits and self._settings.save_images == "keyframes"
-            )
+            image = self._reconstruction.put_right(frame.image)
+            provisional = waits and self._settings.save_images == "keyframes"
+            self._images.put(frame.frame_id, image, provisional=provisional)
         if result.backfilled and update is not None:
             self._images.settle(update.keyframe_ids.tolist())
 
