@@ -21,6 +21,7 @@ from semcast.common.run_folder import (
     FRAMES_NAME,
     IMAGES_NAME,
     MAP_NAME,
+    RECONSTRUCTION_NAME,
     SETTINGS_NAME,
     SUMMARY_NAME,
     TRAJECTORY_NAME,
@@ -55,6 +56,8 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
+#: What is written at the end of a run, and when it is asked for.
+_RESULTS = (TRAJECTORY_NAME, MAP_NAME, RECONSTRUCTION_NAME, SETTINGS_NAME, SUMMARY_NAME)
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
 
@@ -445,12 +448,18 @@ class Session:
         return results
 
     def move_records(self, folder: Path) -> None:
-        """Move what was written on the way to another folder, after ``close``."""
+        """Move what was written on the way to another folder, after ``close``.
+
+        Results that were saved on the way, or by a run that this one resumed, give way to those there.
+        """
         if self._folder is None:
             return
-        for name in (FRAMES_NAME, IMAGES_NAME, CHECKPOINT_NAME):
+        for name in (FRAMES_NAME, IMAGES_NAME, CHECKPOINT_NAME, *_RESULTS):
             with contextlib.suppress(FileNotFoundError):
-                (self._folder / name).rename(folder / name)
+                if name in _RESULTS and (folder / name).exists():
+                    (self._folder / name).unlink()
+                else:
+                    (self._folder / name).rename(folder / name)
 
     def close(self) -> None:
         """End threads and processes. Idempotent; outputs are written by ``write_outputs`` before."""

@@ -30,6 +30,21 @@ def test_a_restarted_agent_begins_a_new_map_and_the_former_run_is_kept(tmp_path,
     assert len((tmp_path / "frames.jsonl").read_text().splitlines()) == 4
 
 
+def test_what_was_saved_of_a_former_start_is_not_taken_for_the_new_one(tmp_path, air):
+    running = air.serve(out=tmp_path)
+    first = air.agent(100)
+    first.stream(range(8))
+    assert first.ask("save").ok
+    assert (tmp_path / "trajectory.tum").exists()
+    first.close()
+    second = air.agent(200)
+    second.stream(range(4))
+    results = {"trajectory.tum", "map.ply", "reconstruction.npz", "settings.toml"}
+    assert not results & {path.name for path in tmp_path.iterdir()}
+    assert results < {path.name for path in (tmp_path / "previous-1").iterdir()}
+    running.finish(stop=True)
+
+
 def test_a_folder_that_another_server_writes_into_is_refused(tmp_path, open_air):
     with open_air() as air, open_air() as other:
         air.serve(out=tmp_path)
