@@ -25,6 +25,7 @@ from semcast.common.run_folder import (
     SETTINGS_NAME,
     SUMMARY_NAME,
     TRAJECTORY_NAME,
+    VIEWER_NAME,
     ImageWriter,
     RunData,
     write_run,
@@ -448,13 +449,13 @@ class Session:
         return results
 
     def move_records(self, folder: Path) -> None:
-        """Move what was written on the way to another folder, after ``close``.
+        """Move what was written on the way to another folder, the viewer's file too, after ``close``.
 
         Results that were saved on the way, or by a run that this one resumed, give way to those there.
         """
         if self._folder is None:
             return
-        for name in (FRAMES_NAME, IMAGES_NAME, CHECKPOINT_NAME, *_RESULTS):
+        for name in (FRAMES_NAME, IMAGES_NAME, CHECKPOINT_NAME, VIEWER_NAME, *_RESULTS):
             with contextlib.suppress(FileNotFoundError):
                 if name in _RESULTS and (folder / name).exists():
                     (self._folder / name).unlink()
