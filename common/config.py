@@ -6,6 +6,7 @@ may itself be such a dataclass: a table in the TOML file.
 
 import dataclasses
 import difflib
+import json
 import tomllib
 import types
 import typing
@@ -201,15 +202,19 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-        return f'"{escaped}"'
+        # Names of files may hold bytes that are no text, and control characters, which JSON writes like TOML.
+        text = value.encode("utf-8", "replace").decode()
+        return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, list):
         return "[" + ", ".join(_toml_value(v) for v in value) + "]"
     return repr(value)
 
 
 def to_toml(settings: Any) -> str:
-    """Write a settings object as TOML that ``build_settings`` reads back; unset values are left out."""
+    """Write a settings object as TOML that ``build_settings`` reads back; unset values are left out.
+
+    What is no text in the name of a file becomes a question mark.
+    """
     lines: list[str] = []
 
     def emit(values: Mapping[str, Any], table: str) -> None:

@@ -82,7 +82,7 @@ class MapMirror:
         session: An open session; the mirror ends with it.
         agent_id: Whose map.
         timeout_s: How long to wait for the server's answer; without one the map begins empty and is asked for
-            again when a server appears.
+            again when a server appears, and when its map changes.
 
     Raises:
         TransportError: The session is closed.
@@ -91,10 +91,12 @@ class MapMirror:
     def __init__(self, session: Session, agent_id: str, timeout_s: float = 5.0) -> None:
         self._session, self._agent_id, self._timeout_s = session, agent_id, timeout_s
         self._lock = threading.Lock()
+        self._asking = threading.Lock()
         self._map = _EMPTY
         self._early: list[MapMessage] | None = None
+        self._is_behind = True
         session.subscribe(map_key(agent_id), "every", self._on_change)
-        self._is_behind = not self._catch_up()
+        self._catch_up()
         session.watch_alive(agent_id, self._on_role)
 
     @property
@@ -103,29 +105,30 @@ class MapMirror:
         with self._lock:
             return self._map
 
-    def _catch_up(self) -> bool:
-        """Take the whole map from the server; whether it had one.
+    def _catch_up(self, *early: MapMessage) -> None:
+        """Take the whole map from the server, where it has one.
 
-        Changes that come meanwhile may be older or newer than the answer. Once more on top of it they give
-        the newest state: the last word on a landmark is either among them or in the answer.
+        Changes that come meanwhile, and those given, may be older or newer than the answer. Once more on top
+        of it they give the newest state: the last word on a landmark is either among them or in the answer.
         """
-        with self._lock:
-            self._early = []
-        try:
-            answer = self._session.request(map_key(self._agent_id), b"", self._timeout_s)
-            whole = unpack(answer, MapMessage) if answer is not None else None
-        except (TransportError, WireError) as err:
-            logger.warning("the map can't be taken from the server: %s", err)
-            whole = None
-        with self._lock:
-            early, self._early = self._early or [], None
-            if whole is not None:
-                self._map = _EMPTY.updated(whole)
-                now = (whole.agent_epoch, whole.map_epoch)
-                early = [message for message in early if (message.agent_epoch, message.map_epoch) >= now]
-            for message in early:
-                self._map = self._map.updated(message)
-        return whole is not None
+        with self._asking:
+            with self._lock:
+                self._early = [*early]
+            try:
+                answer = self._session.request(map_key(self._agent_id), b"", self._timeout_s)
+                whole = unpack(answer, MapMessage) if answer is not None else None
+            except (TransportError, WireError) as err:
+                logger.warning("the map can't be taken from the server: %s", err)
+                whole = None
+            with self._lock:
+                changes, self._early = self._early or [], None
+                if whole is not None:
+                    self._map = _EMPTY.updated(whole)
+                    now = (whole.agent_epoch, whole.map_epoch)
+                    changes = [m for m in changes if (m.agent_epoch, m.map_epoch) >= now]
+                    self._is_behind = False
+                for message in changes:
+                    self._map = self._map.updated(message)
 
     def _on_role(self, role: str, alive: bool) -> None:
         """A server that was away may be another one, with another map."""
@@ -134,7 +137,7 @@ class MapMirror:
         if not alive:
             self._is_behind = True
         elif self._is_behind:
-            self._is_behind = not self._catch_up()
+            self._catch_up()
 
     def _on_change(self, payload: bytes) -> None:
         try:
@@ -145,5 +148,9 @@ class MapMirror:
         with self._lock:
             if self._early is not None:
                 self._early.append(message)
-            else:
+                return
+            if not self._is_behind:
                 self._map = self._map.updated(message)
+                return
+        # When its server appeared there was no map yet, nor word of what became of that of the one before.
+        self._catch_up(message)

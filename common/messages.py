@@ -33,6 +33,8 @@ from semcast.common.phy.slots import SlotLayout, layout_for
 PROTOCOL_VERSION = 1
 MAX_PAYLOAD_BYTES = 16 * 1024**2
 MAX_SIDE_PX = 8192
+#: Keyframes of a day and more: all there ever were, also those that were thinned out since.
+MAX_KEYFRAMES = 200_000
 ROLES = ("agent", "channel", "server")
 PAYLOAD_FORMATS = ("qam16", "qam16_shaped", "iq16", "lost")
 TRACKING_STATES = ("initializing", "tracking", "lost")
@@ -328,7 +330,9 @@ class MapMessage:
     confidence: NDArray[np.float32] = field(metadata=rule(Array("float32", (None,))))
     removed: NDArray[np.int64] = field(metadata=rule(Array("int64", (None,))))
     keyframe_ids: NDArray[np.int64] = field(metadata=rule(Array("int64", (None,))))
-    keyframe_poses: NDArray[np.float64] = field(metadata=rule(Array("float64", (None, 4, 4))))
+    keyframe_poses: NDArray[np.float64] = field(
+        metadata=rule(Array("float64", (None, 4, 4), max_items=16 * MAX_KEYFRAMES))
+    )
 
     def consistent(self) -> None:
         """Check that the arrays have one row per landmark and keyframe.

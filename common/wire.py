@@ -49,7 +49,7 @@ def pack(message: Message) -> bytes:
     """Serialise a message, version and kind first.
 
     Raises:
-        WireError: A field holds what the receiver would refuse.
+        WireError: A field holds what the receiver would refuse, or the message is too large.
     """
     kind = message.kind
     values: dict[str, Any] = {}
@@ -62,7 +62,9 @@ def pack(message: Message) -> bytes:
             message.consistent()
     except FieldError as err:
         raise WireError(err.reason, f"{kind}.{name} {err}") from err
-    return bytes(msgpack.packb(values, use_bin_type=True))
+    data = bytes(msgpack.packb(values, use_bin_type=True))
+    _check_size(data)
+    return data
 
 
 def unpack(data: bytes, expected: type[M]) -> M:
@@ -76,8 +78,7 @@ def unpack(data: bytes, expected: type[M]) -> M:
         WireError: The bytes are not such a message. No more memory than their own size was allocated, or a
             few hundred kilobytes.
     """
-    if len(data) > MAX_MESSAGE_BYTES:
-        raise WireError("size", f"message must have at most {MAX_MESSAGE_BYTES} bytes, got {len(data)}")
+    _check_size(data)
     values = _parse(data)
     version = values.get("version")
     if type(version) is not int or version != PROTOCOL_VERSION:
@@ -107,6 +108,11 @@ def unpack(data: bytes, expected: type[M]) -> M:
     except FieldError as err:
         raise WireError(err.reason, f"{wanted}: {err}") from err
     return message
+
+
+def _check_size(data: bytes) -> None:
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise WireError("size", f"message must have at most {MAX_MESSAGE_BYTES} bytes, got {len(data)}")
 
 
 def _parse(data: bytes) -> dict[str, Any]:

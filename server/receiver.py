@@ -34,6 +34,8 @@ WINDOW = 4
 FLOW_INTERVAL_S = 0.2
 _RING_CAPACITY = 16
 _CAMERA_TIMEOUT_S = 0.5
+#: Between two questions for a camera: where nobody is there to answer, each comes back at once.
+_CAMERA_PAUSE_S = 0.05
 _KEPT_REPORTS = 256
 
 
@@ -258,8 +260,11 @@ class Receiver:
             frame = self._prepare(*entry)
             if frame is not None:
                 return frame
-            if self._held is not None and time.monotonic() >= deadline_s:
-                return None
+            if self._held is not None:
+                remaining_s = deadline_s - time.monotonic()
+                if remaining_s <= 0.0:
+                    return None
+                self._stopping.wait(min(remaining_s, _CAMERA_PAUSE_S))
         return None
 
     def _take_held(self) -> tuple[SymbolFrame, int] | None:

@@ -1,10 +1,15 @@
 """Requests of other processes, handed from the network's threads to the one thread that may serve them."""
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from typing import Any
+
+from semcast.common.errors import SemcastError
+
+logger = logging.getLogger(__name__)
 
 
 class RequestDesk:
@@ -24,9 +29,15 @@ class RequestDesk:
             return None
 
     def serve(self, handlers: Mapping[str, Callable[[], Any]]) -> None:
-        """Serve what was asked for, in the order of the handlers."""
+        """Serve what was asked for, in the order of the handlers; who asks must not end what serves."""
         with self._lock:
             waiting, self._waiting = self._waiting, {}
         for what, handle in handlers.items():
-            if what in waiting:
-                waiting[what].set_result(handle())
+            if what not in waiting:
+                continue
+            try:
+                answer = handle()
+            except SemcastError as err:
+                logger.warning("%s can't be served: %s", what, err)
+                answer = None
+            waiting[what].set_result(answer)

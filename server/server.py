@@ -7,11 +7,11 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from semcast.common.codec import Codec, Modulation
 from semcast.common.config import to_toml
-from semcast.common.errors import SemcastError
+from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.keys import camera_key, control_key, map_key
 from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
 from semcast.common.metrics import Metrics
@@ -32,10 +32,7 @@ from semcast.server.reference import Reference, sequence_reference
 from semcast.server.requests import RequestDesk
 from semcast.server.session import Arrival, Outcome, Session, StreamIdentity, new_bundle
 from semcast.server.settings import ServerSettings
-from semcast.server.view.choice import check_viewer, open_viewer
-
-if TYPE_CHECKING:  # Rerun is imported only when something is shown or recorded
-    from semcast.server.view.feed import ViewerFeed
+from semcast.server.view.choice import SuccessiveViews, check_viewer
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +76,7 @@ class Server:
         self._codec, installed = codec_loader(settings.codec, settings.threads, settings.device)
         self._decoder = FrameDecoder(load if load is not None else installed)
         self._session: Session | None = None
-        self._viewer: ViewerFeed | None = None
+        self._views = SuccessiveViews(settings)
         self._reference: Reference | None = None
         self._former_epochs: set[int] = set()
         self._begun_ns = 0
@@ -285,8 +282,7 @@ class Server:
         self._nearly_final = _is_nearly_final(message.frame_id, decoded.arrival.camera)
         if decoded.frame is None:
             self._metrics.drop("lost_on_air" if decoded.arrival.received is None else "outage")
-            if self._viewer is not None:
-                self._viewer.submit(missing_view(decoded, self._metrics.drops))
+            self._views.submit(missing_view(decoded, self._metrics.drops))
             return
         if message.frame_id <= session.last_frame_id:
             self._metrics.drop("processed")
@@ -339,9 +335,9 @@ class Server:
             self._metrics.count("posed")
         for stage, duration_ms in (("decode", decoded.decode_ms), *result.stage_ms.items()):
             self._metrics.observe(stage, duration_ms)
-        if self._viewer is not None:
+        if self._views.is_shown:
             started_ns = time.perf_counter_ns()
-            self._viewer.submit(outcome.view, outcome.update, new_map=self._new_map)
+            self._views.submit(outcome.view, outcome.update, new_map=self._new_map)
             self._metrics.observe("view", (time.perf_counter_ns() - started_ns) * 1e-6)
         self._new_map = False
 
@@ -358,6 +354,7 @@ class Server:
         former, self._session = self._session, None
         if former is not None:
             logger.info("the agent was started again: a new map is begun")
+            self._views.end_stream()
             self._end_former(former)
         self._former_epochs.discard(identity.agent_epoch)
         self._complete = self._nearly_final = False
@@ -372,12 +369,7 @@ class Server:
         self._session = self._new_session(identity, goes_on=former is not None)
         self._begun_ns = time.perf_counter_ns()
         self._drops_before = self._metrics.drops if former is not None else {}
-        if other_camera:
-            self._close_viewer()
-        if self._viewer is None:
-            self._open_viewer(identity, self._session.resumed)
-        else:
-            self._new_map = True
+        self._show(identity, self._session.resumed, goes_on=former is not None)
         width, height = camera.image_wh
         logger.info(
             "stream of %s (%s): %dx%d, codec %s, %s mode",
@@ -397,14 +389,16 @@ class Server:
             self._tell_not_written(out, err)
         return Session(self._settings, identity, None, self._reference, self._new_bundle())
 
-    def _open_viewer(self, identity: StreamIdentity, resumed: bool) -> None:
+    def _show(self, identity: StreamIdentity, resumed: bool, *, goes_on: bool) -> None:
+        """Show the stream; a server that ``goes_on`` tracks it unseen if need be."""
         truth = self._reference.truth if self._reference is not None else None
-        self._viewer = open_viewer(self._settings, identity, truth, resumed=resumed)
-
-    def _close_viewer(self) -> None:
-        viewer, self._viewer = self._viewer, None
-        if viewer is not None:
-            viewer.close(leave_window=self._complete and self._settings.view.leave_open)
+        try:
+            self._views.begin_stream(identity, truth, resumed=resumed)
+        except ConfigError as err:
+            if not goes_on:
+                raise
+            logger.error("the new stream is not shown: %s", err)
+            self._metrics.error(str(err))
 
     def _drops(self) -> dict[str, int]:
         """Drops since the present stream began."""
@@ -453,7 +447,7 @@ class Server:
         session, self._session = self._session, None
         if session is not None:
             session.close()
-        self._close_viewer()
+        self._views.close(leave_window=self._complete and self._settings.view.leave_open)
         reference, self._reference = self._reference, None
         if reference is not None:
             reference.close()

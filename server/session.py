@@ -21,9 +21,11 @@ from semcast.common.run_folder import (
     FRAMES_NAME,
     IMAGES_NAME,
     MAP_NAME,
+    RECONSTRUCTION_NAME,
     SETTINGS_NAME,
     SUMMARY_NAME,
     TRAJECTORY_NAME,
+    VIEWER_NAME,
     ImageWriter,
     RunData,
     write_run,
@@ -55,6 +57,8 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
+#: What is written at the end of a run, and when it is asked for.
+_RESULTS = (TRAJECTORY_NAME, MAP_NAME, RECONSTRUCTION_NAME, SETTINGS_NAME, SUMMARY_NAME)
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
 
@@ -292,14 +296,17 @@ class Session:
         logger.info("frame %d: %s", result.frame_id, what)
 
     def _keep_image(self, frame: DecodedFrame, result: FrameResult, update: MapUpdate | None) -> None:
-        """Keep the decoded image where the settings want it. A start makes keyframes of earlier frames."""
+        """Keep the decoded image where the settings want it, as poses and observations fit it.
+
+        A start makes keyframes of earlier frames.
+        """
         if self._images is None:
             return
         waits = result.state is not TrackingState.TRACKING  # a later part of the map begins from lost frames
         if result.is_keyframe or waits or self._settings.save_images == "all":
-            self._images.put(
-                frame.frame_id, frame.image, provisional=waits and self._settings.save_images == "keyframes"
-            )
+            image = self._reconstruction.put_right(frame.image)
+            provisional = waits and self._settings.save_images == "keyframes"
+            self._images.put(frame.frame_id, image, provisional=provisional)
         if result.backfilled and update is not None:
             self._images.settle(update.keyframe_ids.tolist())
 
@@ -442,12 +449,18 @@ class Session:
         return results
 
     def move_records(self, folder: Path) -> None:
-        """Move what was written on the way to another folder, after ``close``."""
+        """Move what was written on the way to another folder, the viewer's file too, after ``close``.
+
+        Results that were saved on the way, or by a run that this one resumed, give way to those there.
+        """
         if self._folder is None:
             return
-        for name in (FRAMES_NAME, IMAGES_NAME, CHECKPOINT_NAME):
+        for name in (FRAMES_NAME, IMAGES_NAME, CHECKPOINT_NAME, VIEWER_NAME, *_RESULTS):
             with contextlib.suppress(FileNotFoundError):
-                (self._folder / name).rename(folder / name)
+                if name in _RESULTS and (folder / name).exists():
+                    (self._folder / name).unlink()
+                else:
+                    (self._folder / name).rename(folder / name)
 
     def close(self) -> None:
         """End threads and processes. Idempotent; outputs are written by ``write_outputs`` before."""

@@ -4,6 +4,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from semcast import demo
@@ -32,6 +33,17 @@ def test_a_machine_that_keeps_up_plays_at_the_recorded_times(tmp_path, monkeypat
         DemoSettings(stride=stride, rate_hz=playback.rate_hz / 2, out=tmp_path), recorded
     )
     assert slower.speed == pytest.approx(0.5)
+
+
+def test_a_damaged_first_image_is_no_reason_not_to_play_a_recording(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(demo, "plan_for", lambda *given: seen.append(given[2]) or Plan(0.5, given[3]))
+    folder = shutil.copytree(SEQUENCE, tmp_path / "damaged")
+    for name in ("000000.jpg", "000001.jpg"):
+        (folder / "images" / name).write_bytes(b"no picture")
+    recorded = open_sequence(folder)
+    assert choose_playback(DemoSettings(out=tmp_path), recorded).resize == 0.5
+    assert np.array_equal(seen[0], recorded.image(2))
 
 
 def commands_of(settings):

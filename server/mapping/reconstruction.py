@@ -102,8 +102,6 @@ class Reconstruction:
         """End the bundle runner. Idempotent."""
         self._bundle.close()
 
-    # -- frames ----------------------------------------------------------------------------------------
-
     def process(
         self, frame: DecodedFrame, on_pose: Callable[[FrameResult], None] | None = None
     ) -> FrameResult:
@@ -286,8 +284,6 @@ class Reconstruction:
         self._moved(1.0)
         return anew
 
-    # -- starting and finding back -----------------------------------------------------------------------
-
     def _find(self, sight: Sight) -> FrameResult:
         """A frame without a running track: recognise a place, or work towards a new map."""
         found = self._recover(sight)
@@ -408,8 +404,6 @@ class Reconstruction:
         self._lap("relocalise", since)
         return 1.0 if scale is None else scale
 
-    # -- results ---------------------------------------------------------------------------------------
-
     def _result(
         self,
         frame: DecodedFrame,
@@ -446,6 +440,10 @@ class Reconstruction:
             stage_ms=dict(self._stage_ms),
         )
 
+    def put_right(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The image of the newest frame as its tracks have it: of a rolling shutter, put right."""
+        return self._shutter.put_right(image)
+
     def take_map_update(self) -> MapUpdate | None:
         """What changed in the map since this was last called, None when nothing did."""
         return self._map.take_update(self._map_epoch)
@@ -460,9 +458,7 @@ class Reconstruction:
             self._moved(1.0)
         return self._map.world.trajectory()
 
-    def landmarks(
-        self,
-    ) -> tuple[NDArray[np.int64], Array, NDArray[np.uint8], NDArray[np.float32]]:
+    def landmarks(self) -> tuple[Ids, Array, NDArray[np.uint8], NDArray[np.float32]]:
         """All landmarks: ids ``(N,)``, world ``xyz (N, 3)``, ``rgb (N, 3)``, confidence ``(N,)``."""
         marks = self._map.world.landmarks
         return marks.ids.copy(), marks.xyz.copy(), marks.rgb.copy(), marks.confidence.copy()

@@ -18,6 +18,8 @@ from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
 
 Array = NDArray[np.float64]
+#: x and y of each pixel, ``(H, W)`` each.
+Places = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 #: Tracks a movement is fitted to at least, and steps of reweighting (Huber).
 _MIN_TRACKS, _ITERATIONS = 30, 6
@@ -191,22 +193,15 @@ class RollingShutter:
         height, width = frame.image.shape[:2]
         usable = usable_rows(frame, height)
         self._applied = self._flow
-        if self._applied is None or self.is_global:
+        places = self._places((height, width))
+        if places is None:
             return Sight(frame, to_grey(frame.image), usable)
-        away = (self.in_image(self._grid) - self._grid).astype(np.float32)
-        fine = cv2.resize(away, None, fx=_GRID_PX, fy=_GRID_PX, interpolation=cv2.INTER_LINEAR)
-        fine = fine[_GRID_PX : _GRID_PX + height, _GRID_PX : _GRID_PX + width]
-        x = np.arange(width, dtype=np.float32) + fine[..., 0]
-        y = np.arange(height, dtype=np.float32)[:, None] + fine[..., 1]
-
-        def taken(values: NDArray) -> NDArray:
-            return cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
         def map_taken(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-            return None if values is None else np.asarray(taken(values), np.float32)
+            return None if values is None else np.asarray(_taken(values, places), np.float32)
 
-        image = np.asarray(taken(frame.image), np.uint8) if with_colours else frame.image
-        grey = to_grey(image) if with_colours else np.asarray(taken(to_grey(frame.image)), np.uint8)
+        image = np.asarray(_taken(frame.image, places), np.uint8) if with_colours else frame.image
+        grey = to_grey(image) if with_colours else np.asarray(_taken(to_grey(frame.image), places), np.uint8)
         right = replace(
             frame,
             image=image,
@@ -214,6 +209,27 @@ class RollingShutter:
             keypoint_confidence=map_taken(frame.keypoint_confidence),
         )
         if not usable.all():
-            rows = np.clip(np.rint(y[:, [0, width // 2, width - 1]]), 0, height - 1).astype(np.intp)
+            rows = np.clip(np.rint(places[1][:, [0, width // 2, width - 1]]), 0, height - 1).astype(np.intp)
             usable = np.asarray(usable[rows].all(axis=1))
         return Sight(right, grey, usable)
+
+    def put_right(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the newest image ``(H, W, 3)``, given as received, as its tracks have it."""
+        places = self._places((image.shape[0], image.shape[1]))
+        return image if places is None else np.asarray(_taken(image, places), np.uint8)
+
+    def _places(self, shape_hw: tuple[int, int]) -> Places | None:
+        """Return where each pixel of the image as put right is as received; None where that is the same."""
+        if self._applied is None or self.is_global:
+            return None
+        height, width = shape_hw
+        away = (self.in_image(self._grid) - self._grid).astype(np.float32)
+        fine = cv2.resize(away, None, fx=_GRID_PX, fy=_GRID_PX, interpolation=cv2.INTER_LINEAR)
+        fine = fine[_GRID_PX : _GRID_PX + height, _GRID_PX : _GRID_PX + width]
+        x = np.arange(width, dtype=np.float32) + fine[..., 0]
+        y = np.arange(height, dtype=np.float32)[:, None] + fine[..., 1]
+        return x, y
+
+
+def _taken(values: NDArray, places: Places) -> NDArray:
+    return cv2.remap(values, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -6,11 +6,14 @@ from typing import TYPE_CHECKING
 from semcast.common.former_file import keep_former
 from semcast.common.run_folder import VIEWER_NAME
 from semcast.common.trajectory import Trajectory
+from semcast.server.mapping.state import MapUpdate
 from semcast.server.session import StreamIdentity
 from semcast.server.settings import ServerSettings
+from semcast.server.view.scene import FrameView
 
 if TYPE_CHECKING:
     from semcast.server.view.feed import ViewerFeed
+    from semcast.server.view.process import ViewerProcess
 
 logger = logging.getLogger(__name__)
 
@@ -28,7 +31,12 @@ def check_viewer(settings: ServerSettings) -> None:
 
 
 def open_viewer(
-    settings: ServerSettings, identity: StreamIdentity, truth: Trajectory | None, *, resumed: bool = False
+    settings: ServerSettings,
+    identity: StreamIdentity,
+    truth: Trajectory | None,
+    *,
+    resumed: bool = False,
+    process: "ViewerProcess | None" = None,
 ) -> "ViewerFeed | None":
     """Open what the settings ask for; None where nothing is shown.
 
@@ -37,6 +45,10 @@ def open_viewer(
         identity: Of the stream; names the viewer's recording.
         truth: True path, or None.
         resumed: Keep the ``run.rrd`` that is there under another name.
+        process: The viewer that showed the stream before this one, or None.
+
+    Raises:
+        ConfigError: The viewer can't be started or ``run.rrd`` can't be written.
     """
     file = settings.out / VIEWER_NAME if settings.out is not None else None
     if not _is_shown(settings):
@@ -46,11 +58,69 @@ def open_viewer(
     if file is not None and resumed:
         keep_former(file)
     viewer = ViewerFeed(
-        settings.view, identity.camera, f"{identity.agent_id}-{identity.agent_epoch}", truth=truth, file=file
+        settings.view,
+        identity.camera,
+        f"{identity.agent_id}-{identity.agent_epoch}",
+        truth=truth,
+        file=file,
+        process=process,
     )
     if viewer.url is not None:
         logger.info("viewer: %s", viewer.url)
     return viewer
+
+
+class SuccessiveViews:
+    """What is shown of one stream after the other, each in a recording and file of its own, in one viewer.
+
+    Args:
+        settings: ``view`` and ``out``.
+    """
+
+    def __init__(self, settings: ServerSettings) -> None:
+        self._settings = settings
+        self._feed: ViewerFeed | None = None
+        self._process: ViewerProcess | None = None
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether the present stream is."""
+        return self._feed is not None
+
+    def begin_stream(self, identity: StreamIdentity, truth: Trajectory | None, *, resumed: bool) -> None:
+        """Show a stream, after ``end_stream`` of the one before.
+
+        Args:
+            identity: Of the stream.
+            truth: True path, or None.
+            resumed: Keep the ``run.rrd`` that is there under another name.
+
+        Raises:
+            ConfigError: The viewer can't be started or ``run.rrd`` can't be written.
+        """
+        process = self._process
+        self._feed = open_viewer(self._settings, identity, truth, resumed=resumed, process=process)
+        self._process = None
+
+    def submit(self, view: FrameView, update: MapUpdate | None = None, *, new_map: bool = False) -> None:
+        """Show a frame, as ``ViewerFeed.submit`` does, where anything is shown."""
+        if self._feed is not None:
+            self._feed.submit(view, update, new_map=new_map)
+
+    def end_stream(self) -> None:
+        """Finish recording and file of the present stream; the viewer waits for the next one."""
+        feed, self._feed = self._feed, None
+        if feed is not None:
+            self._process = feed.hand_over()
+
+    def close(self, *, leave_window: bool) -> None:
+        """End what is shown and the viewer, unless its window is to be left open. Idempotent."""
+        feed, self._feed = self._feed, None
+        if feed is not None:
+            feed.close(leave_window=leave_window)
+        process, self._process = self._process, None
+        if process is not None:
+            process.close()
 
 
 def _is_shown(settings: ServerSettings) -> bool:

@@ -64,10 +64,10 @@ class ViewerFeed:
         truth: True path with the sequence's times, or None.
         has_confidence: Whether frames carry confidence maps.
         file: Where the recording goes, or None for no file.
-        process: The viewer to look after; None makes one as ``settings.view`` says.
+        process: The viewer to look after, perhaps handed over; None makes one as ``settings.view`` says.
 
     Raises:
-        ConfigError: A viewer can't be started, or ``file`` is missing for ``--view file``.
+        ConfigError: A viewer can't be started, or ``--view file`` has no file or can't write it.
     """
 
     def __init__(
@@ -95,13 +95,14 @@ class ViewerFeed:
         self._live_work = threading.Event()
         self._stopping = threading.Event()
         self._drained = threading.Event()
+        self._keeps_viewer = False
         self._last_picture_s = -1e9
         self._last_align_s = -1e9
         self.num_connections = 0
         if process is None:
             check_view(settings, has_folder=file is not None)
         view = resolve_view(settings.view, has_folder=file is not None)
-        self._file = self._open_stream(file) if file is not None else None
+        self._file = self._open_file(file) if file is not None else None
         self._process = process
         if process is None and view in ("native", "web"):
             kind: Literal["native", "web"] = "web" if view == "web" else "native"
@@ -143,6 +144,12 @@ class ViewerFeed:
             file=file,
             port=self._settings.port,
         )
+
+    def _open_file(self, file: Path) -> RerunStream:
+        try:
+            return self._open_stream(file)
+        except RuntimeError as err:
+            raise ConfigError(f"{file} can't be written: {err}") from err
 
     def _run_scene(self) -> None:
         """Own the scene: take what was submitted, compress images, write the file."""
@@ -238,7 +245,7 @@ class ViewerFeed:
                 break
             self._live_work.wait(PROBE_INTERVAL_S if stream is None else self._image_interval_s)
             self._live_work.clear()
-        if stalled:
+        if stalled and not self._keeps_viewer:
             self._process.close()
         if stream is not None and not stream.close():
             logger.warning("the viewer is frozen and was left as it is")
@@ -250,6 +257,16 @@ class ViewerFeed:
         except ConfigError as err:
             logger.warning("%s", err)
 
+    def hand_over(self) -> ViewerProcess | None:
+        """Write what is pending and finish the file, but leave the viewer to the feed of another run.
+
+        Returns:
+            The viewer as it is, perhaps closed by the user; None where nothing was shown live.
+        """
+        self._keeps_viewer = True
+        self._end()
+        return self._process
+
     def close(self, *, leave_window: bool = False) -> None:
         """Write what is pending, finish the file and end the viewer. Idempotent.
 
@@ -258,14 +275,18 @@ class ViewerFeed:
         """
         if self._stopping.is_set():
             return
-        self._stopping.set()
-        self._work.set()
-        for thread in self._threads:
-            thread.join(JOIN_DEADLINE_S)
+        self._end()
         if self._process is not None:
             if leave_window and self._process.kind == "native":
                 self._process.release()
             self._process.close()
+
+    def _end(self) -> None:
+        """End both threads and finish the file."""
+        self._stopping.set()
+        self._work.set()
+        for thread in self._threads:
+            thread.join(JOIN_DEADLINE_S)
         if self._file is not None:
             self._file.flush(JOIN_DEADLINE_S)
             self._file.close()

@@ -116,11 +116,13 @@ class ViewerProcess:
         return [*arguments, "--memory-limit", self._memory_limit, "--expect-data-soon"]
 
     def start(self) -> None:
-        """Start the child unless a viewer already listens on the port.
+        """Start the child unless a viewer already listens on the port; only the first call does anything.
 
         Raises:
             ConfigError: The program can't be started.
         """
+        if self._done or self._child is not None:
+            return
         if is_listening(self._port):
             logger.info("using the viewer that already listens on port %d", self._port)
             self._done = True

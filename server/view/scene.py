@@ -214,7 +214,8 @@ class Scene:
         place = bisect_left(self._frame_ids, frame_id)
         if place < len(self._frame_ids) and self._frame_ids[place] == frame_id:
             return
-        reference = self._newest_keyframe
+        # A start makes keyframes of earlier frames: adjustments move each of them by itself.
+        reference = frame_id if frame_id in self._keyframes else self._newest_keyframe
         self._frame_ids.insert(place, frame_id)
         self._times_ns.insert(place, t_source_ns)
         self._references.insert(place, reference)

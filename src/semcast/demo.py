@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semcast.agent.pace_control import start_stride
 from semcast.channel.settings import ChannelName
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.codecs import check_codec
-from semcast.common.errors import ConfigError, SemcastError, TransportError
+from semcast.common.errors import ConfigError, SemcastError, SourceError, TransportError
 from semcast.common.keys import status_key
 from semcast.common.messages import StatusMessage
 from semcast.common.network_settings import NetworkSettings
@@ -360,10 +361,22 @@ def choose_playback(settings: DemoSettings, recorded: Sequence) -> Playback:
     rate_hz = settings.rate_hz or full_hz
     if settings.resize is not None and settings.rate_hz is not None:
         return Playback(settings.resize, stride, rate_hz, rate_hz / full_hz)
-    image = recorded.image(0)
+    image = _first_image(recorded)
     plan = plan_for(settings.codec, settings.modulation, image, rate_hz, settings.rate, settings.resize)
     rate_hz = settings.rate_hz or plan.rate_hz
     return Playback(plan.resize, stride, rate_hz, rate_hz / full_hz)
+
+
+def _first_image(recorded: Sequence) -> NDArray[np.uint8]:
+    """Return the first image that can be read: agents leave out those before it.
+
+    Raises:
+        SourceError: None can be read.
+    """
+    for index in range(len(recorded) - 1):
+        with contextlib.suppress(SourceError):
+            return recorded.image(index)
+    return recorded.image(len(recorded) - 1)
 
 
 def _reductions(settings: DemoSettings, playback: Playback) -> Iterator[str]:

@@ -134,6 +134,16 @@ def test_settings_written_as_toml_read_back_the_same(tmp_path):
     assert build_settings(Node, tomllib.loads(to_toml(node))) == node
 
 
+@pytest.mark.parametrize("name", ['a "b" \\ c', "tab\t, bell\x07, delete\x7f, line\n", "Zürich \N{SNOWMAN}"])
+def test_any_name_of_a_file_is_written_as_toml(name):
+    assert build_settings(Node, tomllib.loads(to_toml(Node(name="n", out=Path(name))))).out == Path(name)
+
+
+def test_a_name_that_is_no_text_does_not_keep_settings_from_being_written():
+    written = to_toml(Node(name="n", out=Path("Z\udcfcrich.mcap"))).encode()
+    assert build_settings(Node, tomllib.loads(written.decode())).out == Path("Z?rich.mcap")
+
+
 def test_help_lists_every_field(capsys):
     parser = argparse.ArgumentParser()
     add_flags(parser, Node)

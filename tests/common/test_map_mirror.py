@@ -115,3 +115,25 @@ def test_a_server_that_was_away_is_asked_again(hub, client, caplog):
     serving.publisher.put(b"\x93garbage")
     until(lambda: "a map message can't be read" in caplog.text)
     assert mirror.map.ids.tolist() == [1, 8]
+
+
+def test_nothing_is_left_of_a_former_server_whose_successor_had_no_map_at_first(hub, client):
+    serving = Serving(hub[0], message([1, 8], keyframes=[0, 10]))
+    with open_client(NetworkSettings(connect=(hub[1],)), 5) as server:
+        server.declare_alive(AGENT, "server")
+        mirror = MapMirror(client, AGENT)
+        assert mirror.map.ids.tolist() == [1, 8]
+    until(lambda: mirror._is_behind)
+    asked = []
+    serving.whole = None
+    hub[0].answer(map_key(AGENT), lambda _: asked.append(1))
+    with open_client(NetworkSettings(connect=(hub[1],)), 5) as server:
+        server.declare_alive(AGENT, "server")
+        until(lambda: asked)
+        # It restored a map of before 8 and keyframe 10, takes up the stream and says what it has.
+        serving.whole = message([1, 2], keyframes=[0])
+        serving.put(serving.whole)
+        until(lambda: mirror.map.ids.tolist() == [1, 2])
+        assert mirror.map.keyframe_ids.tolist() == [0]
+        serving.put(message([3]))
+        until(lambda: mirror.map.ids.tolist() == [1, 2, 3])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from semcast.common.errors import ProtocolError
 from semcast.common.messages import (
+    MAX_KEYFRAMES,
     CameraInfo,
     ChannelReport,
     ControlReply,
@@ -165,6 +166,22 @@ def test_wrong_values_are_refused_with_their_reason(cls, change, reason):
 def test_a_message_of_another_kind_does_not_pass():
     link = next(m for m in examples() if isinstance(m, LinkReport))
     assert refused(pack(link), SymbolFrame).reason == "kind"
+
+
+def test_a_message_that_would_be_refused_for_its_size_is_not_packed():
+    frame_ids = np.arange(MAX_KEYFRAMES)
+    poses = np.zeros((MAX_KEYFRAMES, 4, 4))
+    count = 300_000
+    values = {
+        "agent_epoch": 1, "map_epoch": 0, "ids": np.arange(count), "xyz": np.zeros((count, 3), np.float32),
+        "rgb": np.zeros((count, 3), np.uint8), "confidence": np.zeros(count, np.float32),
+        "removed": np.zeros(0, np.int64), "keyframe_ids": frame_ids, "keyframe_poses": poses,
+    }  # fmt: skip
+    with pytest.raises(WireError, match="at most") as refusal:
+        pack(MapMessage(**values))
+    assert refusal.value.reason == "size"
+    few = {name: values[name][:20_000] for name in ("ids", "xyz", "rgb", "confidence")}
+    assert len(pack(MapMessage(**{**values, **few}))) < MAX_MESSAGE_BYTES
 
 
 def test_oversized_messages_are_refused_unread():

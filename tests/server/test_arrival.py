@@ -86,6 +86,15 @@ def test_a_lossless_receiver_joins_at_the_first_unconfirmed_frame(metrics):
     assert metrics.drops == {"gap": 1}
 
 
+def test_a_frame_that_was_long_on_its_way_does_not_hold_a_new_receiver_up(metrics):
+    arrivals = Arrivals(lossless=True, drop=metrics.drop)
+    # Sent before the former receiver confirmed 6 and 7, which the sender has forgotten since.
+    assert accepted(arrivals, [frame(8, base_seq=6, lossless=True)]) == []
+    assert accepted(arrivals, [frame(k, base_seq=8, lossless=True) for k in (8, 9, 8)]) == [8, 9]
+    assert (arrivals.next_seq, arrivals.arrived_seq) == (8, 10)
+    assert metrics.drops == {"gap": 1, "duplicate": 1}
+
+
 def test_age_needs_no_common_clock():
     age = CaptureAge()
     offset_ns = 123456789 * MS

@@ -290,6 +290,17 @@ def test_replay_keeps_a_frame_until_the_camera_is_known(ends, make):
     assert e.metrics.drops == {}
 
 
+def test_a_camera_that_nobody_knows_is_asked_for_a_few_times_a_second(ends, make, monkeypatch):
+    e = ends("replay")
+    asked = []
+    monkeypatch.setattr(e.hub, "request", lambda key, payload, timeout_s: asked.append(key))
+    e.put(make(0, lossless=True))
+    until(lambda: e.receiver._arrivals.arrived_seq == 1)
+    assert e.receiver.next(0.2) is None
+    assert set(asked) == {camera_key("a")}
+    assert len(asked) <= 6
+
+
 def test_replay_drops_a_frame_whose_agent_was_restarted_before_its_camera_was_known(ends, make):
     e = ends("replay")
     e.put(make(0, lossless=True), make(1, lossless=True))

@@ -11,7 +11,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.config import build_settings, read_toml
 from semcast.common.run_folder import FRAMES_NAME, read_image_paths, read_run
-from semcast.common.sequence import open_sequence
+from semcast.common.sequence import open_sequence, read_image
 from semcast.server.export.outputs import read_ply
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
@@ -146,6 +146,17 @@ def test_every_keyframe_has_its_image_also_those_the_map_began_with(demo, tmp_pa
 def test_all_images_are_kept_where_all_are_wanted(demo, tmp_path):
     run_session(demo, tmp_path, range(8), save_images="all")
     assert list(read_image_paths(tmp_path)) == list(range(8))
+
+
+@pytest.mark.parametrize("readout_ms", [0.0, 60.0])
+def test_images_are_kept_as_poses_and_observations_fit_them(demo, tmp_path, readout_ms):
+    reconstruction = ReconstructionSettings(readout_ms=readout_ms)
+    session = run_session(demo, tmp_path, range(8), save_images="all", reconstruction=reconstruction)
+    kept = read_image(read_image_paths(tmp_path)[7]).astype(float)
+    received = demo.image(7)
+    put_right = session._reconstruction.put_right(received)
+    assert np.abs(kept - put_right).mean() < 3, "JPEG"
+    assert (np.abs(kept - received).mean() < 3) == (readout_ms == 0.0)
 
 
 def turned(demo, k):

@@ -50,3 +50,21 @@ def test_a_server_without_a_map_has_no_answer(air):
     with open_client(NetworkSettings(connect=(air.endpoint,)), DEADLINE_S) as client:
         assert len(MapMirror(client, AGENT, DEADLINE_S).map.ids) == 0
     running.finish(stop=True)
+
+
+def test_a_map_of_many_hours_is_sent_and_one_that_cannot_be_ends_no_stream(air, monkeypatch, caplog):
+    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
+    running = air.serve()
+    radio = air.agent(100)
+    radio.stream(range(8))
+    world = running.server._session._reconstruction._map.world
+    for frame_id in range(100, 100 + 70_000):  # thinned out since
+        world.poses[frame_id], world.submap_of[frame_id] = np.eye(4), 0
+    with open_client(NetworkSettings(connect=(air.endpoint,)), DEADLINE_S) as client:
+        assert len(MapMirror(client, AGENT, DEADLINE_S).map.keyframe_ids) > 70_000
+        world.poses[100] = np.full((4, 4), np.nan)
+        assert len(MapMirror(client, AGENT, DEADLINE_S).map.keyframe_ids) == 0
+    assert "map can't be served: map.keyframe_poses must be finite" in caplog.text
+    del world.poses[100]
+    radio.stream([8])
+    running.finish(stop=True)

@@ -9,6 +9,8 @@ from semcast.common.errors import ConfigError
 from semcast.common.recording_reader import RecordingReader
 from semcast.server.export.outputs import write_ply
 from semcast.server.recorded_streams import recorded_streams
+from semcast.server.settings import ViewSettings
+from semcast.server.view.rerun_viewer import RerunStream
 
 
 def centre(pose):
@@ -28,6 +30,55 @@ def test_a_restarted_agent_begins_a_new_map_and_the_former_run_is_kept(tmp_path,
     assert former["frames"]["tracked"] == 8
     assert len((tmp_path / "previous-1" / "frames.jsonl").read_text().splitlines()) == 8
     assert len((tmp_path / "frames.jsonl").read_text().splitlines()) == 4
+
+
+def test_what_was_saved_of_a_former_start_is_not_taken_for_the_new_one(tmp_path, air):
+    running = air.serve(out=tmp_path)
+    first = air.agent(100)
+    first.stream(range(8))
+    assert first.ask("save").ok
+    assert (tmp_path / "trajectory.tum").exists()
+    first.close()
+    second = air.agent(200)
+    second.stream(range(4))
+    results = {"trajectory.tum", "map.ply", "reconstruction.npz", "settings.toml"}
+    assert not results & {path.name for path in tmp_path.iterdir()}
+    assert results < {path.name for path in (tmp_path / "previous-1").iterdir()}
+    running.finish(stop=True)
+
+
+def test_each_start_of_the_agent_is_shown_in_a_recording_of_its_own(tmp_path, air):
+    running = air.serve(out=tmp_path, view=ViewSettings(view="file"))
+    for epoch in (100, 200):
+        radio = air.agent(epoch)
+        radio.stream(range(6))
+        radio.close()
+    running.finish(stop=True)
+    for folder, own, other in (
+        (tmp_path / "previous-1", b"cam0-100", b"cam0-200"),
+        (tmp_path, b"cam0-200", b"cam0-100"),
+    ):
+        shown = (folder / "run.rrd").read_bytes()
+        assert own in shown
+        assert other not in shown
+
+
+def test_a_new_start_that_cannot_be_shown_is_tracked_all_the_same(tmp_path, air, monkeypatch, caplog):
+    running = air.serve(out=tmp_path, view=ViewSettings(view="file"))
+    first = air.agent(100)
+    first.stream(range(6))
+    first.close()
+
+    def full(*_, **__):
+        raise RuntimeError("No space left on device")
+
+    monkeypatch.setattr(RerunStream, "__init__", full)
+    second = air.agent(200)
+    second.stream(range(4))
+    second.close()
+    assert running.finish(stop=True)["frames"]["tracked"] == 4
+    assert "run.rrd can't be written: No space left on device" in caplog.text
+    assert (tmp_path / "previous-1" / "run.rrd").stat().st_size > 0
 
 
 def test_a_folder_that_another_server_writes_into_is_refused(tmp_path, open_air):

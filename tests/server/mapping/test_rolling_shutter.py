@@ -85,6 +85,15 @@ def test_an_image_is_put_right_to_that_of_a_global_shutter(offset_px_s, readout_
     assert error < 0.25 * before
 
 
+def test_an_image_to_be_kept_is_put_right_like_that_of_its_tracks():
+    shutter, offset_px_s = shutter_of(READOUT_MS), (300.0, 90.0)
+    image = seen(offset_px_s, 3).image
+    assert shutter.put_right(image) is image, "before anything is known of a movement"
+    _, _, sight = run(shutter, offset_px_s)
+    np.testing.assert_array_equal(shutter.put_right(image), sight.frame.image)
+    assert np.abs(sight.frame.image.astype(float) - image).mean() > 3
+
+
 def test_points_stay_where_the_scene_is():
     offset_px_s = (300.0, -60.0)
     xy, truth, _ = run(shutter_of(READOUT_MS), offset_px_s)

@@ -222,6 +222,27 @@ def test_a_viewer_opened_by_hand_later_gets_the_whole_scene(tmp_path):
         late.wait(10)
 
 
+def test_a_viewer_shows_the_next_run_as_well(feed_and_proxy):
+    feed, process, port = feed_and_proxy
+    wait_until(lambda: feed.num_connections == 1, "the viewer")
+    feed.submit(frame(0), Update(0))
+    child = process.pid
+    assert feed.hand_over() is process
+    following = ViewerFeed(ViewSettings(view="web", port=port), CAMERA, "test-next", process=process)
+    wait_until(lambda: following.num_connections == 1, "the viewer again")
+    assert process.pid == child is not None
+    os.killpg(child, signal.SIGKILL)
+    wait_until(lambda: process.pid not in (None, child), "a viewer that is still looked after")
+    following.close()
+    assert process.pid is None
+
+
+def test_a_file_that_cannot_be_written_is_told(tmp_path):
+    (tmp_path / "run.rrd").mkdir()
+    with pytest.raises(ConfigError, match="run.rrd can't be written: .*Is a directory"):
+        ViewerFeed(ViewSettings(view="file"), CAMERA, "x", file=tmp_path / "run.rrd")
+
+
 def test_a_viewer_that_cannot_start_is_given_up_with_its_last_words(caplog):
     script = "import sys; sys.exit('no display here')"
     process = ViewerProcess("native", free_port(), 1, "1GB", command=(sys.executable, "-c", script))

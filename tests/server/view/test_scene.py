@@ -115,6 +115,16 @@ def test_frames_posed_later_take_their_place_in_the_line():
     assert scene.poses()[:, 0, 3].tolist() == [0.0, 1.0, 2.0]
 
 
+def test_earlier_frames_that_became_keyframes_of_a_start_move_by_themselves():
+    scene = Scene()
+    scene.add_frame(view(0))
+    scene.add_frame(view(1))
+    scene.set_keyframes(np.array([0, 2]), np.stack([at(0), at(2)]))
+    scene.add_frame(view(2, at(2), backfilled=((0, 0, at(0)), (1, 1, at(1)))))
+    scene.set_keyframes(np.array([0]), at(-1)[None])
+    assert scene.poses()[:, 0, 3].tolist() == [-1.0, 1.0, 2.0]
+
+
 def test_the_line_is_cut_where_tracking_was_lost():
     scene = Scene()
     for k in (0, 1):
