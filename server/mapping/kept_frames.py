@@ -83,7 +83,8 @@ def backfill(
     Args:
         camera: Pinhole.
         world: The map; some of the frames may have a pose in it.
-        keyframes: Those that poses may hang on; each moves with the one nearest in time.
+        keyframes: Those the poses hang on, in order of time, the last one not before any of the frames; each
+            frame moves with the next one after it.
         kept: The frames, in order of time.
         noise: Of the observations.
         seed: Of the searches.
@@ -103,8 +104,8 @@ def backfill(
                 camera, observed, world.landmarks.ids, world.landmarks.xyz, noise, guess, seed
             )
             if T_world_cam is not None:
-                nearest = keyframe_ids[np.abs(keyframe_ids - observed.frame_id).argmin()]
-                world.add_frame(observed.frame_id, int(nearest), T_world_cam)
+                after = keyframe_ids[np.searchsorted(keyframe_ids, observed.frame_id)]
+                world.add_frame(observed.frame_id, int(after), T_world_cam)
         if T_world_cam is not None:
             guess = T_world_cam
             posed.append((observed.frame_id, observed.t_source_ns, T_world_cam))

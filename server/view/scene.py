@@ -214,8 +214,10 @@ class Scene:
         place = bisect_left(self._frame_ids, frame_id)
         if place < len(self._frame_ids) and self._frame_ids[place] == frame_id:
             return
-        # A start makes keyframes of earlier frames: adjustments move each of them by itself.
-        reference = frame_id if frame_id in self._keyframes else self._newest_keyframe
+        reference = self._newest_keyframe
+        if frame_id < reference:
+            # Of a start: its frames move with the keyframe after them, as in the map.
+            reference = min(k for k in self._keyframes if k >= frame_id)
         self._frame_ids.insert(place, frame_id)
         self._times_ns.insert(place, t_source_ns)
         self._references.insert(place, reference)
