@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from semcast import demo
-from semcast.commands.demo import summary_table
+from semcast.commands.demo import summary_table, why_no_pose
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recording_reader import RecordingReader
@@ -196,3 +196,8 @@ def test_errors_are_shown_with_three_digits(value, told):
     names, values = ([str(cell) for cell in column.cells] for column in table.columns)
     assert values == ["98.8%", told]
     assert len(names) == 2
+
+
+def test_a_demo_without_a_pose_says_why():
+    assert "no image could be decoded" in why_no_pose({"frames": {"source": 51}, "completeness": 0.0})
+    assert "move sideways" in why_no_pose({"frames": {"tracked": 51}, "completeness": 0.0})
