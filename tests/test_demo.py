@@ -71,7 +71,7 @@ def test_bad_settings_are_refused_before_anything_starts(values, message):
         DemoSettings(**values)
 
 
-@pytest.mark.parametrize("wrong", ["codec", "camera", "channel", "record", "out"])
+@pytest.mark.parametrize("wrong", ["codec", "weights", "camera", "channel", "record", "out"])
 def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
     former = tmp_path / "out"
     former.mkdir()
@@ -80,14 +80,18 @@ def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
     if wrong == "camera":
         values["sequence"] = tmp_path / "plain"
         shutil.copytree(SEQUENCE / "images", values["sequence"])
+    encoder = tmp_path / "mine.onnx"
+    encoder.touch()
     values |= {
         "codec": {"codec": "no-such-codec"},
+        "weights": {"codec": str(encoder)},
         "channel": {"channel": "raleigh"},
         "record": {"record": former / "summary.json" / "run.mcap"},
         "out": {"out": former / "summary.json"},
     }.get(wrong, {})
     message = {
         "codec": "no-such-codec",
+        "weights": "can only send",
         "camera": "camera of plain is unknown",
         "channel": "raleigh",
         "record": r"record can't be written to .*run\.mcap",

@@ -20,7 +20,7 @@ from semcast.agent.pace_control import start_stride
 from semcast.channel.settings import ChannelName
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
-from semcast.common.codecs import check_codec
+from semcast.common.codecs import check_codec, named_weights
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import status_key
 from semcast.common.messages import StatusMessage
@@ -286,6 +286,7 @@ def run_demo(
     recorded = open_sequence(sequence, settings.camera)
     _ = recorded.intrinsics
     check_codec(settings.codec)
+    named_weights(settings.codec)
     for name, file in (("record", settings.record), ("json", settings.json)):
         if file is not None:
             check_writable(file, name)
