@@ -12,7 +12,16 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
-from semcast.demo import DemoSettings, Playback, agent_command, choose_playback, role_commands, run_demo
+from semcast.demo import (
+    Alive,
+    DemoSettings,
+    Playback,
+    Role,
+    agent_command,
+    choose_playback,
+    role_commands,
+    run_demo,
+)
 from semcast.real_time import Plan
 from semcast.server.replay import ReplaySettings, replay
 
@@ -121,6 +130,29 @@ def test_a_server_that_ends_before_it_listens_is_not_waited_for(tmp_path, monkey
             lambda done, text: None,
         )
     assert time.monotonic() - started_s < 20.0
+
+
+@pytest.mark.parametrize(
+    ("role", "says", "ends"),
+    [
+        ("server", "semcast server: no space left", True),
+        ("channel", "semcast channel: no trace", True),
+        ("server", 3, False),
+    ],
+)
+def test_a_role_that_gives_up_ends_the_demo_and_one_that_is_stopped_does_not(tmp_path, role, says, ends):
+    child = Role(role, [sys.executable, "-c", f"import sys; sys.exit({says!r})"], tmp_path / "log")
+    child.start()
+    stop, told = threading.Event(), []
+
+    def tell(line):
+        told.append(line)
+        stop.set()
+
+    alive = Alive(set(), threading.Condition())
+    error = demo._watch(tmp_path, {"server": child}, alive, tmp_path / "none", stop, tell, lambda *row: None)
+    assert error == (f"the {role} gave up: {says}" if ends else None)
+    assert ["start it again with" in line for line in told] == ([] if ends else [True])
 
 
 def test_a_folder_with_images_no_run_wrote_is_no_place_for_outputs(tmp_path):

@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     code = run_until_stopped(work)
     if failures:
-        talk.print(f"the agent gave up: {failures[0]}", soft_wrap=True)
+        talk.print(failures[0], soft_wrap=True)
         code = code or 1
     if not result:
         talk.print("no summary was written; the logs of the three processes say why:", settings.out / "logs")
