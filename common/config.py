@@ -209,7 +209,10 @@ def _toml_value(value: Any) -> str:
 
 
 def to_toml(settings: Any) -> str:
-    """Write a settings object as TOML that ``build_settings`` reads back; unset values are left out."""
+    """Write a settings object as TOML that ``build_settings`` reads back; unset values are left out.
+
+    File names that are no text get a ``?`` for each byte that is none: there is no TOML for them.
+    """
     lines: list[str] = []
 
     def emit(values: Mapping[str, Any], table: str) -> None:
@@ -223,4 +226,5 @@ def to_toml(settings: Any) -> str:
                 emit(value, f"{table}.{key}" if table else key)
 
     emit(settings_to_dict(settings), "")
-    return "\n".join(lines).lstrip("\n") + "\n"
+    text = "\n".join(lines).lstrip("\n") + "\n"
+    return text.encode(errors="replace").decode()

@@ -1,5 +1,6 @@
 import argparse
 import dataclasses
+import os
 import re
 import tomllib
 from dataclasses import dataclass, field
@@ -133,6 +134,13 @@ def test_a_broken_file_is_one_clear_error(tmp_path):
 def test_settings_written_as_toml_read_back_the_same(tmp_path):
     node = Node(name='a "quoted" \\ name', out=tmp_path / "x", levels=(0.5,), radio=Radio(snr_db=-1.5))
     assert build_settings(Node, tomllib.loads(to_toml(node))) == node
+
+
+def test_file_names_that_are_no_text_do_not_end_a_run():
+    assert tomllib.loads(to_toml(Node(out=Path(os.fsdecode(b"b\xff"))))) == {
+        **tomllib.loads(to_toml(Node())),
+        "out": "b?",
+    }
 
 
 def test_help_lists_every_field(capsys):
