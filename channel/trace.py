@@ -100,7 +100,7 @@ def read_trace_csv(path: Path) -> TableTrace:
     values_db: list[float] = []
     low, high = SNR_RANGE_DB
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
             names = [name.strip() for name in rows.fieldnames or []]
             rows.fieldnames = names

@@ -179,7 +179,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         ConfigError: The file can't be read or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
         raise ConfigError(f"{path} can't be read as settings: {err}") from err
 

@@ -202,7 +202,7 @@ def _nominal_times_ns(count: int, rate_hz: float) -> NDArray[np.int64]:
 def _fields(path: Path, at_least: int) -> Iterable[list[str]]:
     """Yield the blank- or comma-separated fields of each line that is no comment."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise SourceError(f"{path} can't be read: {err}") from err
     for number, line in enumerate(lines, start=1):
@@ -405,7 +405,7 @@ def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
             raise SourceError(f"{path} has no transforms.json, transforms_test.json or transforms_train.json")
         path = found
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
         frames = sorted(document["frames"], key=lambda f: natural_key(str(f["file_path"])))
         images = tuple(_transforms_image(path.parent, str(frame["file_path"])) for frame in frames)
         T_world_gl = np.array([f["transform_matrix"] for f in frames], dtype=np.float64).reshape(-1, 4, 4)

@@ -63,7 +63,7 @@ def read_tum(path: Path) -> Trajectory:
         SourceError: The file can't be read, a line has not eight finite numbers, or times do not increase.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise SourceError(f"{path} can't be read: {err}") from err
     times: list[float] = []

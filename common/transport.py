@@ -78,7 +78,7 @@ def zenoh_config(network: NetworkSettings) -> zenoh.Config:
 
 def _read_config(path: Path) -> zenoh.Config:
     try:
-        return zenoh.Config.from_json5(path.read_text(encoding="utf-8"))
+        return zenoh.Config.from_json5(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as err:
         raise ConfigError(f"zenoh_config {path} can't be read: {err}") from err
     except zenoh.ZError as err:

@@ -25,9 +25,10 @@ def check_writable(path: Path, name: str) -> None:
         raise ConfigError(f"{name} must be a file, {path} is a folder")
     if _is_no_file(path) and os.access(path, os.W_OK):
         return
+    folder = Path(os.path.realpath(path)).parent
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path.parent):
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as err:
         raise ConfigError(f"{name} can't be written to {path}: {err.strerror}") from err
@@ -53,7 +54,8 @@ def whole_file(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     """Open a binary file that takes the place of ``path`` when the block ends, and vanishes when it raises.
 
     Args:
-        path: In a folder that exists. A pipe or device is written as it is, and keeps its place.
+        path: In a folder that exists. A pipe or device is written as it is, and keeps its place; so does a
+            link, whose file is written.
         durable: Have the content on the disk before it takes the place, for files that outlive a power cut.
 
     Raises:
@@ -63,6 +65,7 @@ def whole_file(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
         with path.open("wb") as file:
             yield file
         return
+    path = Path(os.path.realpath(path))
     partial = path.with_name(path.name + ".part")
     try:
         with partial.open("w+b") as file:

@@ -26,7 +26,7 @@ from semcast.common.codec import (
     ReceivedImage,
 )
 from semcast.common.codecs import LEARNED_CODECS, load_codec, reported_snr_db
-from semcast.common.errors import SourceError
+from semcast.common.errors import ConfigError, SourceError
 from semcast.common.image import psnr_db
 from semcast.common.phy.slots import layout_for
 from semcast.common.rate import NATIVE_RATE, Rate, from_coded, to_coded
@@ -238,6 +238,11 @@ def _load(name: str, settings: CodecSettings) -> Codec:
     encoder = load_codec(
         name, modulation=settings.modulation, num_threads=settings.threads, runtime=settings.runtime
     )
+    if encoder.digest != codec.digest:
+        raise ConfigError(
+            f"the exported encoder of {name} is of other weights: its digest must be {codec.digest}, "
+            f"got {encoder.digest}"
+        )
     return _Exported(encoder, codec)
 
 

@@ -3,6 +3,7 @@
 Matplotlib lives here alone and is used through its object interface, without a window or global state.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
@@ -44,14 +46,21 @@ def new_grid(
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure in the format its name asks for, making the folder.
 
+    Its texts are names of files and curves, never formulas: a ``$`` is a ``$``.
+
     Raises:
         SemcastError: The file can't be written.
     """
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Without a date in the file the same result gives the same bytes.
         metadata = {"Date": None} if path.suffix == ".svg" else None
-        figure.savefig(path, dpi=150, metadata=metadata)
+        with warnings.catch_warnings():
+            # Of letters that the font lacks; what stands for them is seen in the picture.
+            warnings.filterwarnings("ignore", message="Glyph .* missing from")
+            figure.savefig(path, dpi=150, metadata=metadata)
     except (OSError, ValueError) as err:
         raise SemcastError(f"{path} can't be written as a plot: {err}") from err
 

@@ -43,6 +43,7 @@ class RunToPlot:
         truth: Reference path, None where unknown.
         num_source: Frames the source had, None where the run did not say.
         drops: Frames that never reached the tracker, by reason, as far as the run said.
+        num_parts: Parts of the map, whose poses don't fit together.
     """
 
     name: str
@@ -51,6 +52,7 @@ class RunToPlot:
     truth: Trajectory | None
     num_source: int | None = None
     drops: Mapping[str, int] = field(default_factory=dict)
+    num_parts: int = 1
 
     @staticmethod
     def read(folder: Path, truth: Trajectory | None) -> "RunToPlot":
@@ -79,6 +81,7 @@ class RunToPlot:
             truth=truth,
             num_source=summary.get("frames", {}).get("source"),
             drops=summary.get("drops", {}),
+            num_parts=max(1, len(summary.get("parts") or ())),
         )
 
 
@@ -132,7 +135,10 @@ def _plot_path(run: RunToPlot, path: Path) -> Path:
     figure.legend(*names, fontsize="small", loc="outside lower center", ncols=3)
     if result is not None:
         _plot_error(grid[1], result)
-    figure.suptitle(path_title(run, result))
+    title = path_title(run, result)
+    if run.num_parts > 1:
+        title += f"\nin {run.num_parts} parts; the place and scale of all but the first are guessed"
+    figure.suptitle(title)
     save_figure(figure, path)
     return path
 

@@ -1,4 +1,5 @@
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -68,6 +69,19 @@ def test_an_error_is_one_line_and_exit_code_1(tmp_path, capsys):
     err = capsys.readouterr().err
     assert "none.toml can't be read as settings" in err
     assert "Traceback" not in err
+
+
+def test_names_that_are_no_text_are_shown(tmp_path):
+    if sys.platform == "darwin":
+        pytest.skip("file names are text there")
+    folder = os.fsencode(tmp_path) + b"/b\xff"
+    os.mkdir(folder)
+    shutil.copy(ROOT / "deploy" / "demo" / "kitti_06" / "images" / "000000.jpg", folder + b"/0.jpg")
+    words = [sys.executable, "-m", "semcast", "info", folder]
+    environment = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
+    done = subprocess.run(words, capture_output=True, text=True, env=environment)
+    assert "b\\udcff" in done.stdout, done.stderr
+    assert done.returncode == 0
 
 
 def test_help_is_a_verb_too(capsys):

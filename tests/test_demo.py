@@ -8,12 +8,21 @@ import numpy as np
 import pytest
 
 from semcast import demo
-from semcast.commands.demo import summary_table
+from semcast.commands.demo import summary_table, why_no_pose
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
-from semcast.demo import DemoSettings, Playback, agent_command, choose_playback, role_commands, run_demo
+from semcast.demo import (
+    Alive,
+    DemoSettings,
+    Playback,
+    Role,
+    agent_command,
+    choose_playback,
+    role_commands,
+    run_demo,
+)
 from semcast.real_time import Plan
 from semcast.server.replay import ReplaySettings, replay
 
@@ -83,7 +92,7 @@ def test_bad_settings_are_refused_before_anything_starts(values, message):
         DemoSettings(**values)
 
 
-@pytest.mark.parametrize("wrong", ["codec", "camera", "channel", "record", "out"])
+@pytest.mark.parametrize("wrong", ["codec", "weights", "camera", "channel", "record", "out"])
 def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
     former = tmp_path / "out"
     former.mkdir()
@@ -92,14 +101,18 @@ def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
     if wrong == "camera":
         values["sequence"] = tmp_path / "plain"
         shutil.copytree(SEQUENCE / "images", values["sequence"])
+    encoder = tmp_path / "mine.onnx"
+    encoder.touch()
     values |= {
         "codec": {"codec": "no-such-codec"},
+        "weights": {"codec": str(encoder)},
         "channel": {"channel": "raleigh"},
         "record": {"record": former / "summary.json" / "run.mcap"},
         "out": {"out": former / "summary.json"},
     }.get(wrong, {})
     message = {
         "codec": "no-such-codec",
+        "weights": "can only send",
         "camera": "camera of plain is unknown",
         "channel": "raleigh",
         "record": r"record can't be written to .*run\.mcap",
@@ -129,6 +142,29 @@ def test_a_server_that_ends_before_it_listens_is_not_waited_for(tmp_path, monkey
             lambda done, text: None,
         )
     assert time.monotonic() - started_s < 20.0
+
+
+@pytest.mark.parametrize(
+    ("role", "says", "ends"),
+    [
+        ("server", "semcast server: no space left", True),
+        ("channel", "semcast channel: no trace", True),
+        ("server", 3, False),
+    ],
+)
+def test_a_role_that_gives_up_ends_the_demo_and_one_that_is_stopped_does_not(tmp_path, role, says, ends):
+    child = Role(role, [sys.executable, "-c", f"import sys; sys.exit({says!r})"], tmp_path / "log")
+    child.start()
+    stop, told = threading.Event(), []
+
+    def tell(line):
+        told.append(line)
+        stop.set()
+
+    alive = Alive(set(), threading.Condition())
+    error = demo._watch(tmp_path, {"server": child}, alive, tmp_path / "none", stop, tell, lambda *row: None)
+    assert error == (f"the {role} gave up: {says}" if ends else None)
+    assert ["start it again with" in line for line in told] == ([] if ends else [True])
 
 
 def test_a_folder_with_images_no_run_wrote_is_no_place_for_outputs(tmp_path):
@@ -208,3 +244,8 @@ def test_errors_are_shown_with_three_digits(value, told):
     names, values = ([str(cell) for cell in column.cells] for column in table.columns)
     assert values == ["98.8%", told]
     assert len(names) == 2
+
+
+def test_a_demo_without_a_pose_says_why():
+    assert "no image could be decoded" in why_no_pose({"frames": {"source": 51}, "completeness": 0.0})
+    assert "move sideways" in why_no_pose({"frames": {"tracked": 51}, "completeness": 0.0})

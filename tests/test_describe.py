@@ -205,6 +205,15 @@ def test_shipped_weights_are_described():
     assert "made by" in text
 
 
+def test_what_weights_of_ones_own_reached_is_told_with_digits_that_count(tiny_weights, tmp_path):
+    mine = tmp_path / "mine.safetensors"
+    mine.write_bytes(tiny_weights.read_bytes())
+    manifest = json.loads(tiny_weights.with_suffix(".json").read_text())
+    manifest["measured"] = {"validation": {"psnr_2db": 20.680639983714517}}
+    mine.with_suffix(".json").write_text(json.dumps(manifest))
+    assert "validation psnr_2db: 20.68\n" in text_of(mine) + "\n"
+
+
 @pytest.mark.parametrize("content", [b"hello", None])
 def test_what_it_does_not_know_is_one_clear_error(tmp_path, content):
     path = tmp_path / "x.txt"

@@ -57,13 +57,17 @@ def weights_path(name_or_path: str | Path) -> Path:
     """Return the weights file of a shipped name or of a path.
 
     Raises:
-        CheckpointError: There is no such file.
+        CheckpointError: There is no such file, or it is an exported encoder.
     """
     path = Path(name_or_path)
     if path.suffix == ".safetensors":
         if not path.is_file():
             raise CheckpointError(f"weights {path} do not exist")
         return path
+    if path.suffix == ".onnx":
+        raise CheckpointError(
+            f"{path} is an exported encoder, which can only send: give the .safetensors file it is of"
+        )
     folder = Path(__file__).resolve().parent.parent / "weights"
     shipped = folder / f"{name_or_path}.safetensors"
     if not shipped.is_file():

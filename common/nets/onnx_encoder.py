@@ -3,6 +3,7 @@
 The exported graph maps an image to the latent; padding, modulation and pairing are a little numpy.
 """
 
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +28,20 @@ OUTPUT = "latent"
 def encoder_path(name_or_path: str | Path) -> Path:
     """Return the file of an exported encoder, of a shipped name or of a path.
 
+    That of weights (``.safetensors``) lies beside them, as their manifest does.
+
     Raises:
         CheckpointError: There is no such file.
     """
     path = Path(name_or_path)
-    if path.suffix != SUFFIX:
+    if path.suffix == ".safetensors":
+        weights, path = path, path.with_suffix(SUFFIX)
+        if not path.is_file():
+            how = shlex.join(("semcast", "onnx", str(weights), "--out", str(path)))
+            raise CheckpointError(
+                f"no exported encoder {path} beside the weights; where torch is installed, {how} writes it"
+            )
+    elif path.suffix != SUFFIX:
         folder = Path(__file__).resolve().parent.parent / "weights"
         path = folder / f"{name_or_path}{SUFFIX}"
     if not path.is_file():

@@ -6,6 +6,7 @@ Only the chosen verb is imported, so ``semcast --help`` answers without torch, g
 
 import argparse
 import importlib
+import io
 import logging
 import os
 import sys
@@ -88,6 +89,12 @@ def _quieten_opencv() -> None:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
 
 
+def _show_all_names() -> None:
+    """Let stdout show names of files that are no text, or not in its encoding, by escapes: it would fail."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
 def _plain(err: SemcastError) -> str:
     """Return an error in words: what the system said of a file without its number and the file again."""
     cause = err.__cause__
@@ -99,6 +106,7 @@ def _plain(err: SemcastError) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
+    _show_all_names()
     overview = _overview()
     if words[:1] == ["help"]:
         words = [*words[1:2], "--help"]

@@ -21,7 +21,7 @@ from semcast.agent.pace_control import start_stride
 from semcast.channel.settings import ChannelName
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
-from semcast.common.codecs import check_codec
+from semcast.common.codecs import check_codec, named_weights
 from semcast.common.errors import ConfigError, SemcastError, SourceError, TransportError
 from semcast.common.keys import status_key
 from semcast.common.messages import StatusMessage
@@ -39,6 +39,8 @@ from semcast.server.former_run import check_not_foreign, discard, output_folder
 START_DEADLINE_S = 60.0
 #: How long a role may take to write everything after it was asked to stop.
 STOP_DEADLINE_S = 15.0
+#: What a role that gave up ends with; others are of signals or of wrong usage.
+ERROR_CODE = 1
 AGENT_ID = "demo"
 _PROGRAM = (sys.executable, "-m", "semcast")
 
@@ -268,7 +270,7 @@ def run_demo(
     """Run the three processes until the server has written its summary, or until ``stop``.
 
     A process that is killed does not end the demo: its command line is told, so that it can be started again
-    by hand, and the stream goes on when it is. An agent that gives up does: its source would fail again.
+    by hand, and the stream goes on when it is. One that gives up does: its source or disk would fail again.
 
     Args:
         settings: What to run.
@@ -287,6 +289,7 @@ def run_demo(
     recorded = open_sequence(sequence, settings.camera)
     _ = recorded.intrinsics
     check_codec(settings.codec)
+    named_weights(settings.codec)
     for name, file in (("record", settings.record), ("json", settings.json)):
         if file is not None:
             check_writable(file, name)
@@ -410,7 +413,7 @@ def _watch(
     tell: Callable[[str], None],
     progress: Callable[[int, str], None],
 ) -> str | None:
-    """Follow the rows the server writes until its summary is there; tell what made the agent give up."""
+    """Follow the rows the server writes until its summary is there; tell which process gave up, and why."""
     rows = out / "frames.jsonl"
     read_bytes = 0
     num_outages = 0
@@ -422,8 +425,8 @@ def _watch(
             code = child.returncode
             if code and not child.told:
                 child.told = True
-                if child.name == "agent" and code > 0:
-                    return child.last_words()
+                if code == ERROR_CODE or (child.name == "agent" and code > 0):
+                    return f"the {child.name} gave up: {child.last_words()}"
                 how = (
                     f"was killed by signal {-code}"
                     if code < 0

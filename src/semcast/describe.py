@@ -260,7 +260,7 @@ def _curves(value: Any) -> list[tuple[str, str]]:
             points = (f"{point['snr_db']:g} dB: {point.get('psnr_db', float('nan')):.1f}" for point in inner)
             lines.append((key, "PSNR dB at " + ", ".join(points)))
         else:
-            lines.append((key, _short(inner)))
+            lines.append((key, f"{inner:.4g}" if isinstance(inner, float) else _short(inner)))
     return lines
 
 

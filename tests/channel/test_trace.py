@@ -42,9 +42,10 @@ def test_a_walk_steps_by_its_deviation_and_stays_in_range():
     assert np.isfinite(wild.snr_db(1e9))
 
 
-def test_a_file_is_read_and_interpolated(tmp_path):
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_a_file_is_read_and_interpolated(tmp_path, encoding):
     path = tmp_path / "trace.csv"
-    path.write_text("t_s, snr_db, note\n0,10,start\n2.5,5,\n10,-1,end\n")
+    path.write_text("t_s, snr_db, note\n0,10,start\n2.5,5,\n10,-1,end\n", encoding)
     trace = read_trace_csv(path)
     assert [trace.snr_db(t) for t in (0, 1.25, 2.5, 100)] == [10, 7.5, 5, -1]
 

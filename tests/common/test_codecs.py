@@ -36,6 +36,23 @@ def test_a_file_of_weights_stands_for_its_codec(files):
     assert named_weights("jpeg-ldpc") == ("jpeg-ldpc", None)
 
 
+def test_weights_are_sent_with_by_the_exported_encoder_beside_them(files, tmp_path):
+    beside = load_codec(str(files["torch"]), runtime="onnx")
+    assert beside.digest == load_codec(str(files["torch"])).digest
+    alone = tmp_path / "two words.safetensors"
+    with pytest.raises(
+        CheckpointError, match=r"two words\.onnx beside the weights; .* semcast onnx '.*' --out '"
+    ):
+        load_codec(str(alone), runtime="onnx")
+
+
+def test_an_exported_encoder_is_refused_where_images_are_decoded(files):
+    with pytest.raises(
+        CheckpointError, match=r"onnx is an exported encoder, which can only send: .*safetensors"
+    ):
+        load_codec(str(files["onnx"]))
+
+
 def test_a_codec_is_checked_without_being_loaded(files, tmp_path):
     check_codec("jpeg-ldpc")
     check_codec(str(files["torch"]))

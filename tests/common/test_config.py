@@ -87,9 +87,10 @@ def toml(tmp_path):
     return write
 
 
-def test_flags_win_over_the_file_and_the_file_over_defaults(tmp_path):
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_flags_win_over_the_file_and_the_file_over_defaults(tmp_path, encoding):
     path = tmp_path / "node.toml"
-    path.write_text('name = "file"\ncount = 5\n[radio]\nsnr_db = 4\n')
+    path.write_text('name = "file"\ncount = 5\n[radio]\nsnr_db = 4\n', encoding)
     node = parse(["--count", "7", "--no-loud", "--levels", "3", "4"], path)
     assert node == Node(name="file", count=7, levels=(3.0, 4.0), radio=Radio(snr_db=4.0))
 

@@ -27,6 +27,16 @@ def test_native_layout_gives_images_times_camera_and_truth(native, poses):
     np.testing.assert_allclose(truth.T_world_cam, poses(5), atol=1e-6)
 
 
+def test_text_files_may_come_from_windows_editors(native):
+    before = open_sequence(native)
+    for name in ("times.txt", "groundtruth.txt"):
+        text = (native / name).read_text()
+        (native / name).write_text(text, "utf-8-sig", newline="\r\n")
+    after = open_sequence(native)
+    np.testing.assert_array_equal(after.times_ns, before.times_ns)
+    np.testing.assert_array_equal(after.groundtruth().T_world_cam, before.groundtruth().T_world_cam)
+
+
 def test_stride_and_max_frames_keep_the_ids_of_the_recording(native):
     sequence = open_sequence(native, stride=2, max_frames=2)
     np.testing.assert_array_equal(sequence.frame_ids, [0, 2])

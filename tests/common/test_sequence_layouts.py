@@ -135,11 +135,12 @@ def test_blender_layout_sorts_by_number_and_looks_along_z(tmp_path, write_images
     np.testing.assert_allclose(T_world_cam[:3, 1], [0, -1, 0], atol=1e-12)  # y down
 
 
-def test_a_transforms_file_with_pinhole_numbers_counts_from_pixel_corners(tmp_path, write_images):
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_a_transforms_file_with_pinhole_numbers_counts_from_pixel_corners(tmp_path, write_images, encoding):
     write_images(tmp_path / "images", 2)
     frames = [{"file_path": f"images/{k:06d}.png", "transform_matrix": np.eye(4).tolist()} for k in range(2)]
     document = {"fl_x": 30, "fl_y": 31, "cx": 16, "cy": 12, "w": 32, "h": 24, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    (tmp_path / "transforms.json").write_text(json.dumps(document), encoding)
     assert open_sequence(tmp_path).intrinsics == CAMERA
     assert open_sequence(tmp_path / "transforms.json").intrinsics == CAMERA
 

@@ -321,9 +321,10 @@ def test_a_hub_with_users_lets_only_them_in(tmp_path):
                 open_client(NetworkSettings(connect=(endpoint,), zenoh_config=stranger), 0.6)
 
 
-def test_endpoints_stay_as_they_were_asked_for(tmp_path):
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_endpoints_stay_as_they_were_asked_for(tmp_path, encoding):
     path = tmp_path / "all.json5"
-    path.write_text('{mode: "peer", listen: {endpoints: ["tcp/0.0.0.0:7000"]}} // JSON5')
+    path.write_text('{mode: "peer", listen: {endpoints: ["tcp/0.0.0.0:7000"]}} // JSON5', encoding)
     config = zenoh_config(NetworkSettings(connect=("tcp/127.0.0.1:7447",), zenoh_config=path))
     assert config.get_json("mode") == '"client"'
     assert config.get_json("listen/endpoints") == "[]"

@@ -32,6 +32,19 @@ def test_a_failure_leaves_the_old_content_and_nothing_else(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
 
 
+def test_a_link_keeps_its_place_and_its_file_is_written(tmp_path):
+    shared = tmp_path / "shared" / "a.txt"
+    shared.parent.mkdir()
+    shared.write_text("old")
+    link = tmp_path / "a.txt"
+    link.symlink_to("shared/a.txt")
+    check_writable(link, "json")
+    write_whole(link, "new")
+    assert link.is_symlink()
+    assert shared.read_text() == "new"
+    assert [p.name for p in shared.parent.iterdir()] == ["a.txt"]
+
+
 def test_a_file_without_a_folder_is_an_os_error(tmp_path):
     with pytest.raises(FileNotFoundError), whole_file(tmp_path / "no" / "a"):
         pass

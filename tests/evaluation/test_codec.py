@@ -10,6 +10,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.errors import ConfigError, SourceError
 from semcast.evaluation.codec import CodecSettings, evaluate_codec, read_images
 from semcast.evaluation.picture_strip import picture_strip, write_picture_strip
+from semcast.training.onnx_export import export_encoder
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +48,16 @@ def test_an_exported_encoder_serves_the_same_decoder(folder):
     }
     assert both["onnx"]["psnr_db"] != both["torch"]["psnr_db"], "other arithmetic"
     assert both["onnx"]["psnr_db"] == pytest.approx(both["torch"]["psnr_db"], abs=0.3)
+
+
+def test_an_exported_encoder_of_other_weights_is_refused(folder, tiny_weights, tmp_path):
+    mine = tmp_path / "mine.safetensors"
+    shutil.copy(tiny_weights, mine)
+    shutil.copy(tiny_weights.with_suffix(".json"), mine.with_suffix(".json"))
+    export_encoder("3dcsc-lite", mine.with_suffix(".onnx"))
+    settings = CodecSettings(images=folder, codec=(str(mine),), snr_db=(10.0,), max_images=1, runtime="onnx")
+    with pytest.raises(ConfigError, match=r"exported encoder of .*mine.safetensors is of other weights"):
+        evaluate_codec(settings)
 
 
 def test_weights_of_ones_own_stand_beside_the_shipped_ones(folder, tiny_weights):

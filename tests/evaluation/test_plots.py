@@ -41,6 +41,12 @@ def test_path_and_reliability_are_drawn(tmp_path):
     assert cv2.imread(str(tmp_path / "r.png")) is not None
 
 
+@pytest.mark.parametrize("name", [r"run $\foo$", "\u8d70\u308b"])
+def test_names_are_no_formulas_and_may_be_of_any_script(tmp_path, name):
+    plot_against_snr(tmp_path / "a.svg", [2, 4], {name: [1.0, 2.0]}, "y", title=name)
+    assert f"<!-- {name} -->" in (tmp_path / "a.svg").read_text("utf-8")
+
+
 def test_an_unknown_file_type_is_one_clear_error(tmp_path):
     with pytest.raises(SemcastError, match="plot"):
         plot_path(tmp_path / "a.nonsense", {"a": np.zeros((2, 3))})

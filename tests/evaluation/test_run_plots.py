@@ -6,7 +6,7 @@ import pytest
 
 from semcast.common.errors import SourceError
 from semcast.common.run_folder import FRAMES_NAME, SUMMARY_NAME, TRAJECTORY_NAME
-from semcast.common.trajectory import Trajectory
+from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.trajectory_error import ate
 from semcast.evaluation import run_plots
 from semcast.evaluation.run_plots import (
@@ -140,6 +140,19 @@ def test_the_title_says_how_many_poses_its_error_is_about():
     )
     without = RunToPlot(name="run", trajectory=line(range(10)), rows=[], truth=None)
     assert path_title(without, None) == "run: 10 poses, no ground truth"
+
+
+def test_the_title_says_that_a_path_is_of_several_parts(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(run_plots, "save_figure", lambda figure, path: drawn.append(figure))
+    for num_parts in (1, 2):
+        parts = [{"submap": k, "num_posed": 5} for k in range(num_parts)]
+        folder = write_run(tmp_path / str(num_parts), [row(k) for k in range(10)], {"parts": parts})
+        write_tum(folder / TRAJECTORY_NAME, line(range(10)))
+        plot_run(RunToPlot.read(folder, None), tmp_path)
+    whole, apart = (figure.get_suptitle() for figure in drawn[::2])
+    assert whole == "1: 10 poses, no ground truth"
+    assert apart.endswith("\nin 2 parts; the place and scale of all but the first are guessed")
 
 
 def test_a_truth_of_other_times_is_doubted():

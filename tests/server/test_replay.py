@@ -142,6 +142,16 @@ def test_the_command_shows_what_is_known_and_names_its_files(recording, tmp_path
     assert shown.endswith(f"in {tmp_path / 'out'}: {names}\n")
 
 
+def test_names_with_brackets_are_shown_as_they_are(recording, tmp_path, capsys):
+    # What rich would take for the end of a style that never began, and for a style.
+    copied = tmp_path / "walk [" / "end].mcap"
+    copied.parent.mkdir()
+    copied.write_bytes(recording.read_bytes())
+    out = tmp_path / "again [bold]"
+    assert main(["replay", str(copied), "--out", str(out), "--end-s", "0.6"]) == 0
+    assert f"in {out}: " in capsys.readouterr().out
+
+
 def test_a_part_is_measured_by_the_way_that_was_gone(recording):
     truth = open_sequence(SEQUENCE).groundtruth()
     part = replay(ReplaySettings(file=recording, reference=SEQUENCE, start_s=0.2, end_s=0.95))

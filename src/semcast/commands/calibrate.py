@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.progress import Progress
 
+from semcast.commands.console import plain_console
 from semcast.common.errors import ConfigError, SemcastError, SourceError
 
 if TYPE_CHECKING:
@@ -147,7 +147,7 @@ def _collect(
     views: list[BoardView] = []
     sample = None
     num_seen = 0
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with Progress(console=plain_console(stderr=True), transient=True) as progress:
         if arguments.camera is not None:
             total, pictures = arguments.views, camera_pictures(arguments.camera)
             what = "show the board from all sides, tilted too (Ctrl-C: enough)"

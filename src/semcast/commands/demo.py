@@ -1,14 +1,15 @@
 """``semcast demo``: the whole system on one machine, ending in a table of figures."""
 
 import argparse
+import shlex
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from semcast.commands.console import plain_console
 from semcast.commands.running import add_settings, read_settings, run_until_stopped
 from semcast.common.sequence import open_sequence
 from semcast.demo import DemoSettings, default_sequence, run_demo
@@ -57,10 +58,20 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
     return table
 
 
+def why_no_pose(summary: Mapping[str, Any]) -> str:
+    """Say in a line what is likely of a run that gave no frame a pose."""
+    if not (summary.get("frames") or {}).get("tracked"):
+        return "semcast demo: no frame has a pose, as no image could be decoded"
+    return (
+        "semcast demo: no frame has a pose: the camera must move sideways and see things with texture, large "
+        "enough in the images, and consecutive images must show much the same"
+    )
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo; exit code 1 when no frame got a pose."""
     settings = read_settings(DemoSettings, arguments)
-    talk = Console(stderr=True)
+    talk = plain_console(stderr=True)
     frames = len(open_sequence(settings.sequence or default_sequence()))
     result: dict[str, Any] = {}
     failures: list[str] = []
@@ -73,28 +84,28 @@ def run(arguments: argparse.Namespace) -> int:
             def show(num_done: int, text: str) -> None:
                 bar.update(task, completed=num_done, description=text)
 
-            summary, error = run_demo(
-                settings, stop, lambda line: talk.print(line, highlight=False, soft_wrap=True), show
-            )
+            summary, error = run_demo(settings, stop, lambda line: talk.print(line, soft_wrap=True), show)
             result.update(summary or {})
             if error is not None:
                 failures.append(error)
 
     code = run_until_stopped(work)
     if failures:
-        talk.print(f"the agent gave up: {failures[0]}", highlight=False, soft_wrap=True)
+        talk.print(failures[0], soft_wrap=True)
         code = code or 1
     if not result:
         talk.print("no summary was written; the logs of the three processes say why:", settings.out / "logs")
         return code or 1
-    Console().print(summary_table(result))
+    plain_console().print(summary_table(result))
     files = ("trajectory.tum", "map.ply", "run.rrd", "summary.json", "settings.toml")
     there = ", ".join(name for name in files if (settings.out / name).exists())
-    again = (
-        f"; look again with: rerun {settings.out / 'run.rrd'}" if (settings.out / "run.rrd").exists() else ""
-    )
+    show_again = shlex.join(("rerun", str(settings.out / "run.rrd")))
+    again = f"; look again with: {show_again}" if (settings.out / "run.rrd").exists() else ""
     print(f"in {settings.out}: {there}{again}")
     if settings.json is not None:
         # The demo's own settings in place of the server's, which name folders of this machine.
         write_json(settings.json, {**result, **provenance("demo", settings)})
-    return code or (0 if result.get("completeness") else 1)
+    if not code and not result.get("completeness"):
+        talk.print(why_no_pose(result), soft_wrap=True)
+        return 1
+    return code

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from semcast.commands.console import plain_console
 from semcast.common.cores import usable_cores
 from semcast.server.view.process import window_display
 
@@ -193,6 +194,6 @@ def run(arguments: argparse.Namespace) -> int:
     for check in checks:
         for finding in check:
             bad |= finding.verdict == "bad"
-            table.add_row(f"[{_STYLE[finding.verdict]}]{finding.verdict}[/]", finding.what, finding.text)
-    Console().print(table)
+            table.add_row(Text(finding.verdict, style=_STYLE[finding.verdict]), finding.what, finding.text)
+    plain_console().print(table)
     return 1 if bad else 0

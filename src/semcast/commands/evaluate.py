@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from semcast.commands.console import plain_console
 from semcast.commands.running import add_settings, read_settings
 from semcast.evaluation import codec, confidence, endurance, latency, pairs, recording, runtime, trajectory
 from semcast.evaluation.report import RESULT_NAME, check_outputs
@@ -116,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
     cls, evaluate, _, text = EVALUATIONS[arguments.what]
     settings: Any = read_settings(cls, arguments)
     out: Path | None = getattr(settings, "out", None)
-    talk = Console(stderr=True)
+    talk = plain_console(stderr=True)
     json_to_stdout = settings.json == STDOUT
     if json_to_stdout:
         settings = replace(settings, json=None)
@@ -129,8 +129,8 @@ def run(arguments: argparse.Namespace) -> int:
     with talk.status(f"{text} ..."):
         report = evaluate(settings)
     table = result_table(arguments.what, report)
-    (talk if json_to_stdout else Console()).print(
-        printed_table(arguments.what, table), *table.notes, sep="\n", markup=False, highlight=False
+    (talk if json_to_stdout else plain_console()).print(
+        printed_table(arguments.what, table), *table.notes, sep="\n"
     )
     if json_to_stdout:
         print(json.dumps(report, indent=1))

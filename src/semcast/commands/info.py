@@ -17,13 +17,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print what is there."""
-    from rich.console import Console
     from rich.table import Table
 
+    from semcast.commands.console import plain_console
     from semcast.describe import describe
 
     # Names of files may hold brackets, which are no markup.
-    console = Console(highlight=False, markup=False)
+    console = plain_console()
     for heading, lines in describe(arguments.path):
         if not lines:
             continue

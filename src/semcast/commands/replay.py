@@ -5,8 +5,9 @@ import threading
 from dataclasses import replace
 from typing import Any
 
-from rich.console import Console
+from rich.text import Text
 
+from semcast.commands.console import plain_console
 from semcast.commands.demo import summary_table
 from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
 from semcast.common.run_folder import (
@@ -35,17 +36,17 @@ def run(arguments: argparse.Namespace) -> int:
     settings = read_settings(ReplaySettings, arguments)
     if settings.symbols is None and "link" in read_given(ReplaySettings, arguments):
         settings = replace(settings, symbols="transmitted")  # a channel asked for by its default values
-    talk = Console(stderr=True)
+    talk = plain_console(stderr=True)
     summary: dict[str, Any] = {}
 
     def work(stop: threading.Event) -> None:
-        with talk.status(f"replaying {settings.file}") as status:
+        with talk.status(Text(f"replaying {settings.file}")) as status:
             summary.update(
-                replay(settings, stop, lambda k: status.update(f"replaying {settings.file}: frame {k}"))
+                replay(settings, stop, lambda k: status.update(Text(f"replaying {settings.file}: frame {k}")))
             )
 
     code = run_until_stopped(work)
-    Console().print(summary_table(summary))
+    plain_console().print(summary_table(summary))
     if settings.out is not None:
         there = ", ".join(name for name in _FILES if (settings.out / name).is_file())
         print(f"in {settings.out}: {there}")

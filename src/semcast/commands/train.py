@@ -3,9 +3,9 @@
 import argparse
 import threading
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from semcast.commands.console import plain_console
 from semcast.commands.running import add_settings, read_settings, run_until_stopped
 from semcast.training.loop import Progress as Step
 from semcast.training.loop import train
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Train until done or stopped; Ctrl-C leaves a checkpoint to go on from."""
     settings = read_settings(TrainSettings, arguments)
-    talk = Console(stderr=True)
+    talk = plain_console(stderr=True)
 
     def work(stop: threading.Event) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))

@@ -1,0 +1,24 @@
+"""What verbs print reaches the terminal as it is."""
+
+from pathlib import Path
+
+import pytest
+
+import semcast
+from semcast.commands.console import plain_console
+
+
+@pytest.mark.parametrize("text", ["photos [indoor]", "walk [/end]", "install 'semcast[edge]'", "a :smile: b"])
+def test_brackets_and_colons_are_no_styles(text, capsys):
+    plain_console(stderr=True).print(text)
+    plain_console().print(text)
+    shown = capsys.readouterr()
+    assert shown.err == shown.out == f"{text}\n"
+
+
+def test_verbs_print_through_no_other_console():
+    commands = Path(semcast.__file__).parent / "commands"
+    others = [
+        file.name for file in commands.glob("*.py") if "rich.console" in file.read_text(encoding="utf-8")
+    ]
+    assert others == ["console.py"]
