@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 
 #: Keyframes that are looked at, the newest ones, as many as an adjustment takes.
 NUM_ANCHORS = 10
+#: Side of the patches. A warp by depth alone takes them for planes that face the camera: on floors, ceilings
+#: and walls beside the way larger ones err by more than they average noise out.
+_PATCH_PX = 17
 #: A point that would move further than this has found something else.
 _MAX_MOVE_PX = 3.0
 _MIN_CORRELATION = 0.7
@@ -66,7 +69,7 @@ def anchor_tracks(
         warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
         alike = (depth > 0.0) & seen_alike(warps, depth_now)
         if alike.any():
-            parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike])))
+            parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike], _PATCH_PX)))
     if not parts:
         return 0
     rows, warps = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
