@@ -319,7 +319,7 @@ def _entry(cell: PairCell, variant: _Variant, settings: PairSettings) -> dict[st
         "auroc": cell.auroc_of_cues(),
         "auroc_confidence": _auroc_confidence(cell),
         "comparisons": cell.comparisons(
-            settings.confidence, rivals, np.random.default_rng(settings.seed), block=variant.gap
+            settings.confidence, rivals, np.random.default_rng(settings.seed), block=variant.gap + 1
         ),
     }
 

@@ -171,8 +171,9 @@ def paired_bootstrap(
             rows are resampled whole, so correlated replicates do not pass for new evidence.
         b: Same shape, paired with ``a`` entry by entry.
         rng: Source of the resamples.
-        block: Consecutive rows drawn together (circular block bootstrap): overlapping frame pairs are
-            correlated over about as many rows as the pair is apart. 1 resamples rows independently.
+        block: Consecutive rows drawn together (circular block bootstrap), more than rows are correlated over:
+            two pairs of frames ``gap`` apart share a frame when they are ``gap`` rows apart. 1 resamples rows
+            independently. The interval is as wide as so many fewer samples make it.
         level: Coverage of the interval.
         num_resamples: Resamples drawn.
 
@@ -207,7 +208,7 @@ def paired_bootstrap(
     idx = ((starts + np.arange(block)) % num_samples).reshape(num_resamples, -1)[:, :num_samples]
     mean_x, mean_y = x[idx].mean(axis=1), y[idx].mean(axis=1)
     tails = 100 * np.array([(1 - level) / 2, (1 + level) / 2])
-    widen = small_sample_factor(num_samples, level)
+    widen = small_sample_factor(max(MIN_SAMPLES, num_samples // block), level)
     low, high = difference + widen * (np.percentile(mean_x - mean_y, tails) - difference)
     bounds: tuple[float | None, ...] = (None, None)
     if ratio is not None and ratio > 0 and np.all(mean_x > 0) and np.all(mean_y > 0):

@@ -109,6 +109,21 @@ def test_replicates_are_not_new_evidence(rng):
     assert copies.num_samples == 30
 
 
+@pytest.mark.parametrize("gap", [1, 2])
+def test_blocks_cover_what_they_say_where_pairs_share_frames(gap):
+    rng = np.random.default_rng(4)
+    num_trials, num_pairs = 400, 26
+    hits = {1: 0, gap + 1: 0}
+    for _ in range(num_trials):
+        frames = rng.standard_normal(num_pairs + gap)
+        d = frames[:num_pairs] + frames[gap:]  # two pairs ``gap`` rows apart share a frame
+        for block in hits:
+            found = paired_bootstrap(d, np.zeros(num_pairs), rng, block=block, num_resamples=300)
+            hits[block] += found.low < 0 < found.high
+    assert hits[1] < 0.87 * num_trials
+    assert hits[gap + 1] > 0.87 * num_trials
+
+
 def test_blocks_widen_the_interval_of_correlated_rows(rng):
     d = np.repeat(rng.normal(size=40), 10)
     rows = paired_bootstrap(d, np.zeros(400), np.random.default_rng(0))
