@@ -178,8 +178,8 @@ def paired_bootstrap(
         num_resamples: Resamples drawn.
 
     Returns:
-        The difference with its interval (without one below ``MIN_SAMPLES``: resampling one or two values
-        says nothing about the others that could have come), or None for no samples.
+        The difference with its interval (without one below ``MIN_SAMPLES`` blocks: resampling one or two
+        values says nothing about the others that could have come), or None for no samples.
 
     Raises:
         ValueError: Shapes differ, a value is not finite, or ``level`` or ``block`` is out of range.
@@ -200,15 +200,14 @@ def paired_bootstrap(
     num_samples = len(x)
     difference = float(x.mean() - y.mean())
     ratio = float(x.mean() / y.mean()) if y.mean() != 0 else None
-    if num_samples < MIN_SAMPLES:
+    if num_samples // block < MIN_SAMPLES:
         return PairedDifference(difference, None, None, ratio, None, None, num_samples)
-    block = min(block, num_samples)
     num_blocks = -(-num_samples // block)
     starts = rng.integers(num_samples, size=(num_resamples, num_blocks, 1))
     idx = ((starts + np.arange(block)) % num_samples).reshape(num_resamples, -1)[:, :num_samples]
     mean_x, mean_y = x[idx].mean(axis=1), y[idx].mean(axis=1)
     tails = 100 * np.array([(1 - level) / 2, (1 + level) / 2])
-    widen = small_sample_factor(max(MIN_SAMPLES, num_samples // block), level)
+    widen = small_sample_factor(num_samples // block, level)
     low, high = difference + widen * (np.percentile(mean_x - mean_y, tails) - difference)
     bounds: tuple[float | None, ...] = (None, None)
     if ratio is not None and ratio > 0 and np.all(mean_x > 0) and np.all(mean_y > 0):

@@ -22,6 +22,8 @@ Values = NDArray[np.float32]
 _STRIDE_PX = 2
 #: Range of the contrast of one patch against the other.
 _GAIN_RANGE = (0.5, 2.0)
+#: OpenCV takes no picture of more than 32 766 rows, and here a patch is a row.
+_MAX_ROWS = 16_384
 #: Patches that move less in a step are there.
 _SMALL_STEP_PX = 0.03
 #: A structure tensor whose determinant is smaller than this share of its squared trace is an edge.
@@ -187,9 +189,11 @@ def _sample(grey: Values, x: Values, y: Values) -> Values:
     """Bilinear values at ``(N, M)`` pixels; the border goes on outside."""
     if x.size == 0:
         return np.zeros(x.shape, np.float32)
-    return np.asarray(
-        cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32
-    )
+    parts = [
+        cv2.remap(grey, x[k:end], y[k:end], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for k, end in ((k, k + _MAX_ROWS) for k in range(0, len(x), _MAX_ROWS))
+    ]
+    return np.asarray(parts[0] if len(parts) == 1 else np.concatenate(parts), dtype=np.float32)
 
 
 def _centred(values: Values) -> Values:

@@ -105,7 +105,8 @@ def _depths(world: WorldMap, keyframe: Keyframe, ids: NDArray[np.int64], xy: Arr
     known = depth > MIN_DEPTH_MAP
     depth[~known] = 0.0
     if known.sum() >= _MIN_LANDMARKS and not known.all():
-        square = ((xy[~known][:, None] - xy[known][None]) ** 2).sum(axis=2)
+        x, y = xy.astype(np.float32).T
+        square = (x[~known, None] - x[known]) ** 2 + (y[~known, None] - y[known]) ** 2
         near = np.argpartition(square, _NEIGHBOURS - 1, axis=1)[:, :_NEIGHBOURS]
         depth[~known] = 1.0 / np.median(1.0 / depth[known][near], axis=1)
     return depth

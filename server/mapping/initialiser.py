@@ -49,7 +49,7 @@ _MIN_MEDIAN_PARALLAX_DEG = 0.7
 
 @dataclass(frozen=True)
 class Start:
-    """A new map in its own frame: the reference at the origin, median depth 1.
+    """A new map in its own frame: the first keyframe at the origin, median depth about 1.
 
     Attributes:
         keyframes: In order of time, without descriptors.

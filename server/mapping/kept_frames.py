@@ -18,13 +18,24 @@ Ids = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Observed:
-    """The tracks of one frame."""
+    """The tracks of one frame, and the colours of their pixels where these are kept."""
 
     frame_id: int
     t_source_ns: int
     ids: Ids
     xy: Array
     confidence: Array
+    rgb: NDArray[np.uint8] | None = None
+
+
+def colours_of(ids: Ids, frames: Sequence[Observed]) -> NDArray[np.uint8]:
+    """Return the ``(N, 3)`` colours of tracks ``ids`` (ascending) at their last sight, grey without one."""
+    colours = np.full((len(ids), 3), 128, np.uint8)
+    for observed in frames:
+        if observed.rgb is not None:
+            _, row, row_o = np.intersect1d(ids, observed.ids, assume_unique=True, return_indices=True)
+            colours[row] = observed.rgb[row_o]
+    return colours
 
 
 def keyframe_of(observed: Observed, T_world_cam: Array) -> Keyframe:

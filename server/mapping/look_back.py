@@ -25,11 +25,14 @@ from semcast.server.mapping.mapper import (
     new_landmarks,
 )
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.window import MAX_OBSERVATIONS, scattered
 
 Array = NDArray[np.float64]
 
 #: Keyframes from before a start at most.
 _MAX_EARLIER = 10
+#: Frames in a row without a pose, from which on the camera was somewhere else.
+_MAX_MISSED = 15
 #: Keyframes and steps of one adjustment: there is one for each of them, while the camera waits.
 _WINDOW, _ITERATIONS = 8, 5
 #: A frame becomes a keyframe where it sees less than this share of the landmarks of the one after it, or
@@ -57,13 +60,16 @@ def look_back(
         The start with earlier keyframes and what they see, the first of them at the origin, in the same unit.
     """
     extended = start
-    guess = start.keyframes[0].T_world_cam
+    guess, num_missed = start.keyframes[0].T_world_cam, 0
     before = [o for o in history if o.frame_id < start.keyframes[0].frame_id]
     for observed in reversed(before):
         T_world_cam = pose_of(camera, observed, extended.ids, extended.xyz, noise, guess, settings.seed)
         if T_world_cam is None:
+            num_missed += 1
+            if num_missed > _MAX_MISSED:
+                break
             continue
-        guess = T_world_cam
+        guess, num_missed = T_world_cam, 0
         if not _is_new_view(observed, extended, camera.width):
             continue
         keyframes = [keyframe_of(observed, T_world_cam), *extended.keyframes]
@@ -117,7 +123,11 @@ def _adjusted(camera: Intrinsics, start: Start, noise: NoiseModel) -> Start:
     """Adjust the first keyframes and what they see; the last two of them hold the rest where it is."""
     window = start.keyframes[:_WINDOW]
     view, point, xy, confidence = gather_observations(window, start.ids)
-    seen = np.flatnonzero(np.bincount(point, minlength=len(start.ids)) >= 2)
+    count = np.bincount(point, minlength=len(start.ids))
+    order = np.lexsort((scattered(start.ids), -count))
+    chosen = np.zeros(len(start.ids), bool)
+    chosen[order[np.cumsum(count[order]) <= MAX_OBSERVATIONS]] = True
+    seen = np.flatnonzero(chosen & (count >= 2))
     row = np.full(len(start.ids), -1, np.intp)
     row[seen] = np.arange(len(seen))
     kept = row[point] >= 0

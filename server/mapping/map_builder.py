@@ -92,16 +92,23 @@ class MapBuilder:
         self._recognised = place.keyframe_id
 
     def take_start(
-        self, start: Start, sight: Sight, tracks: TrackTable, T_world_ref: Array, scale: float
+        self,
+        start: Start,
+        sight: Sight,
+        tracks: TrackTable,
+        T_world_ref: Array,
+        scale: float,
+        rgb: NDArray[np.uint8],
     ) -> None:
         """Bring a new map in and adjust it at once.
 
         Args:
-            start: The new map, reference at the origin.
+            start: The new map, first keyframe at the origin.
             sight: The newest image.
             tracks: Tracks in it.
-            T_world_ref: Pose of the reference in the world.
+            T_world_ref: Pose of the first keyframe in the world.
             scale: World units per unit of the start.
+            rgb: ``(P, 3)`` colours of its landmarks.
         """
         placed = make_transform(T_world_ref[:3, :3], T_world_ref[:3, 3])
         for keyframe in start.keyframes:
@@ -116,11 +123,10 @@ class MapBuilder:
             sight.grey, newest.ids, newest.xy
         )
         xyz = transform_points(placed, scale * start.xyz)
-        xy = np.full((len(start.ids), 2), -1.0)
-        seen = np.isin(start.ids, newest.ids, assume_unique=True)
-        xy[seen] = newest.xy[np.searchsorted(newest.ids, start.ids[seen])]
-        rgb = mapper.sample_colours(sight.frame.image, xy)
-        self.world.add_landmarks(start.ids, xyz, rgb, start.confidence, self.submap, newest.frame_id)
+        born = np.full(len(start.ids), newest.frame_id)
+        for keyframe in start.keyframes:
+            born[np.isin(start.ids, keyframe.ids, assume_unique=True)] = keyframe.frame_id
+        self.world.add_landmarks(start.ids, xyz, rgb, start.confidence, self.submap, born)
         self._submit(start=True)
         self.collect(wait=True)
         mapper.add_landmarks(

@@ -14,7 +14,7 @@ from semcast.server.geometry.motion import ConstantVelocity
 from semcast.server.mapping import mapper
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.initialiser import Initialiser, Start
-from semcast.server.mapping.kept_frames import Observed, backfill
+from semcast.server.mapping.kept_frames import Observed, backfill, colours_of
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.recall import recall_landmarks
@@ -307,6 +307,7 @@ class Reconstruction:
             tracks.ids[visible],
             tracks.xy[visible],
             tracks.confidence[visible],
+            mapper.sample_colours(frame.image, tracks.xy[visible]),
         )
         waits = self._state is TrackingState.LOST or float(sight.usable.mean()) < _MIN_USABLE_SHARE
         start = self._initialiser.add(observed, self._map.noise.model, is_damaged=waits)
@@ -356,14 +357,16 @@ class Reconstruction:
         """Bring a start into the map and pose the frames that waited for it."""
         since = time.perf_counter_ns()
         history = self._initialiser.history
-        start = look_back(self._camera, start, history, self._map.noise.model, self._settings)
-        guess = self._motion.predict(start.keyframes[0].t_source_ns)
+        grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
+        guess = self._motion.predict(grown.keyframes[0].t_source_ns)
+        # The unit is told by the start alone: before it, the camera may have stood still.
         T_world_ref, scale = self._map.bridge(guess, self._motion.speed_map_per_s, start)
-        self._map.take_start(start, sight, self._tracks, T_world_ref, scale)
+        rgb = colours_of(grown.ids, history)
+        self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, rgb)
         backfilled = backfill(
             self._camera,
             self._map.world,
-            start.keyframes,
+            grown.keyframes,
             history[:-1],
             self._map.noise.model,
             self._settings.seed,

@@ -26,7 +26,8 @@ _MAX_REVISITED, _NEIGHBOURS = 3, 1
 #: Keyframes right before the window that hold it too, among so many: those that saw enough of its landmarks.
 _MAX_BEFORE, _REACH_BACK, _MIN_SHARED = 6, 60, 6
 #: Extent of a window, in median depths, from which on it knows its scale, and how many of a submap's first
-#: keyframes do not hold it then: those of the start, which were placed with the least to go by.
+#: keyframes do not hold it then: those of the start, or the furthest before it, which were placed with the
+#: least to go by.
 _MIN_EXTENT, _NUM_UNSURE = 0.2, 5
 
 
@@ -72,7 +73,7 @@ def build_problem(
         # What ties the window to older keyframes is kept first, then what several keyframes see. Among
         # those the choice is even: the longest tracks alone would leave the newest one to half of its view.
         anchored = np.isin(np.arange(len(ids)), point[view < len(anchors)])
-        order = np.lexsort((_scattered(ids), -np.minimum(count, _WELL_SEEN), ~anchored))
+        order = np.lexsort((scattered(ids), -np.minimum(count, _WELL_SEEN), ~anchored))
         within = np.cumsum(count[order]) <= MAX_OBSERVATIONS
         chosen = np.zeros(len(ids), bool)
         chosen[order[within]] = True
@@ -106,7 +107,7 @@ def build_problem(
     )
 
 
-def _scattered(ids: Ids) -> Ids:
+def scattered(ids: Ids) -> Ids:
     """Return keys that order ids as good as at random, the same every time (multiplicative hashing)."""
     return np.asarray((ids * 2_654_435_761) % 4_294_967_296)
 

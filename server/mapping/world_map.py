@@ -57,9 +57,9 @@ class Landmarks:
         rgb: NDArray[np.uint8],
         confidence: NDArray,
         submap: int,
-        frame_id: int,
+        frame_id: int | Ids,
     ) -> None:
-        """Add landmarks whose ids are new."""
+        """Add landmarks whose ids are new, made by one keyframe or each by its own."""
         if len(ids) == 0:
             return
         columns = {
@@ -158,7 +158,13 @@ class WorldMap:
         self._moved_keyframes.add(keyframe.frame_id)
 
     def add_landmarks(
-        self, ids: Ids, xyz: Array, rgb: NDArray[np.uint8], confidence: NDArray, submap: int, frame_id: int
+        self,
+        ids: Ids,
+        xyz: Array,
+        rgb: NDArray[np.uint8],
+        confidence: NDArray,
+        submap: int,
+        frame_id: int | Ids,
     ) -> None:
         """Add new landmarks and note the change."""
         self.landmarks.add(ids, xyz, rgb, confidence, submap, frame_id)

@@ -4,7 +4,7 @@ The tracker moves old poses and landmarks whenever bundle adjustment ends. A sce
 has already seen and hands out only what changed: the path in segments, the landmarks in chunks.
 """
 
-from bisect import bisect_left
+from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -179,6 +179,7 @@ class Scene:
         self._breaks: list[bool] = []
         self._T_ref_cam: list[Array] = []
         self._keyframes: dict[int, Array] = {}
+        self._keyframe_ids: list[int] = []
         self._newest_keyframe = -1
         self._lost_since_pose = False
         self._segment_versions: list[int] = []
@@ -217,7 +218,7 @@ class Scene:
         reference = self._newest_keyframe
         if frame_id < reference:
             # Of a start: its frames move with the keyframe after them, as in the map.
-            reference = min(k for k in self._keyframes if k >= frame_id)
+            reference = self._keyframe_ids[bisect_left(self._keyframe_ids, frame_id)]
         self._frame_ids.insert(place, frame_id)
         self._times_ns.insert(place, t_source_ns)
         self._references.insert(place, reference)
@@ -264,6 +265,8 @@ class Scene:
             known = self._keyframes.get(keyframe_id)
             if known is not None and not np.array_equal(known, T):
                 moved.add(keyframe_id)
+            if known is None:
+                insort(self._keyframe_ids, keyframe_id)
             self._keyframes[keyframe_id] = T
             self._newest_keyframe = max(self._newest_keyframe, keyframe_id)
         if moved:

@@ -51,7 +51,7 @@ def test_auroc_and_inlier_share_count_all_matches(cell):
 
 
 def test_comparisons_pair_the_same_pairs(cell):
-    rows = cell.comparisons(["robust", "off"], ["off"], np.random.default_rng(0), block=2)
+    rows = cell.comparisons(["robust", "off"], ["off"], np.random.default_rng(0), block=1)
     assert [(r["mode"], r["figure"]) for r in rows] == [
         ("robust", "rot_deg_mean"),
         ("robust", "tdir_deg_mean"),

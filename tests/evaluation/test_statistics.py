@@ -124,6 +124,14 @@ def test_blocks_cover_what_they_say_where_pairs_share_frames(gap):
     assert hits[gap + 1] > 0.87 * num_trials
 
 
+def test_few_blocks_give_no_interval(rng):
+    d = rng.standard_normal(20)
+    assert paired_bootstrap(d, np.zeros(20), rng, block=4).low is not None
+    few = paired_bootstrap(d, np.zeros(20), rng, block=5)
+    assert few.low is None
+    assert few.difference == pytest.approx(d.mean())
+
+
 def test_blocks_widen_the_interval_of_correlated_rows(rng):
     d = np.repeat(rng.normal(size=40), 10)
     rows = paired_bootstrap(d, np.zeros(400), np.random.default_rng(0))

@@ -98,3 +98,12 @@ def test_a_point_behind_the_second_camera_has_no_warp_and_says_so():
     warps, depth1 = affine_warps(CAMERA, T, CENTRES[:1], np.array([3.0]))
     np.testing.assert_array_equal(warps[0], np.eye(2))
     assert depth1[0] == pytest.approx(-2.0)
+
+
+def test_many_patches_are_aligned_at_once():
+    image = np.tile(np.arange(64, dtype=np.uint8) * 3, (64, 1))
+    image = np.asarray(image ^ image.T, np.uint8)
+    count = 33_000  # OpenCV takes no picture of so many rows
+    centres = np.tile([[30.0, 31.0]], (count, 1))
+    found = align_patches(Templates.cut(image, centres, 9), image, centres, np.tile(np.eye(2), (count, 1, 1)))
+    assert np.abs(found.xy - centres).max() < 0.01

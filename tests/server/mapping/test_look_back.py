@@ -5,7 +5,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.initialiser import Start
-from semcast.server.mapping.kept_frames import Observed, backfill, keyframe_of, pose_of
+from semcast.server.mapping.kept_frames import Observed, backfill, colours_of, keyframe_of, pose_of
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.world_map import WorldMap
@@ -113,3 +113,19 @@ def test_frames_of_another_place_are_passed_over(start, rng):
     elsewhere = [Observed(k, k * 10**8, ids, rng.uniform(0, 480, (200, 2)), np.ones(200)) for k in range(5)]
     grown = look_back(CAMERA, start, elsewhere, NOISE, SETTINGS)
     assert len(grown.keyframes) == len(start.keyframes)
+
+
+def test_landmarks_have_the_colour_of_their_last_sight():
+    frames = [
+        Observed(
+            k,
+            k,
+            np.array(ids),
+            np.zeros((len(ids), 2)),
+            np.ones(len(ids)),
+            np.full((len(ids), 3), k, np.uint8),
+        )
+        for k, ids in ((1, [3, 5, 8]), (2, [5, 9]))
+    ]
+    frames.append(Observed(3, 3, np.array([8]), np.zeros((1, 2)), np.ones(1)))
+    assert colours_of(np.array([3, 4, 5, 8]), frames)[:, 0].tolist() == [1, 128, 2, 1]

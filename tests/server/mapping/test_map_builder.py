@@ -148,7 +148,8 @@ def test_parts_that_begin_and_are_lost_again_keep_the_map_within_its_size():
         frame = DecodedFrame(views[-1].frame_id, 0, IMAGE)
         sight = Sight(frame, IMAGE[..., 0], np.ones(480, bool))
         start = Start(views, ids, xyz, np.ones(150))
-        builder.take_start(start, sight, NewestFrame(ids, views[-1].xy), np.eye(4), 1.0)
+        rgb = np.full((len(start.ids), 3), 50, np.uint8)
+        builder.take_start(start, sight, NewestFrame(ids, views[-1].xy), np.eye(4), 1.0, rgb)
         assert len(builder.world.landmarks) <= 500
         assert len(builder.world.keyframes) <= 20
         assert {k.frame_id for k in views} <= {k.frame_id for k in builder.world.keyframes}
