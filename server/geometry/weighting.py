@@ -36,7 +36,7 @@ _LABEL_SHARPNESS = 30.0
 #: What tracking errs by without a link, and the expected error from which a position is worth nothing.
 _TRACKING_PX, _MOST_PX = 0.3, 5.0
 #: Median of |x| / sigma under normal noise.
-_MAD_TO_SIGMA = 1.0 / 0.67449
+MAD_TO_SIGMA = 1.0 / 0.67449
 
 
 def fuse_confidence(confidence0: Array, confidence1: Array) -> Array:
@@ -114,14 +114,14 @@ def fit_noise(
     if count < min_per_bin:
         return None
     size = np.abs(residual_px)
-    flat = NoiseModel(_clip_sigma0(float(np.median(size)) * _MAD_TO_SIGMA), 0.0)
+    flat = NoiseModel(_clip_sigma0(float(np.median(size)) * MAD_TO_SIGMA), 0.0)
     bins = min(num_bins, count // min_per_bin)
     if bins < 3 or float(np.ptp(confidence)) < 1e-3:
         return flat
     order = np.argsort(confidence, kind="stable")
     groups = np.array_split(order, bins)
     doubt = np.array([1.0 - float(np.mean(confidence[g])) for g in groups])
-    spread = np.array([float(np.median(size[g])) for g in groups]) * _MAD_TO_SIGMA
+    spread = np.array([float(np.median(size[g])) for g in groups]) * MAD_TO_SIGMA
     log_variance = 2.0 * np.log(np.maximum(spread, 1e-3))
     # The standard error of log sigma^2 from a median of n absolute values is about 2.33 / sqrt(n).
     precision = np.array([len(g) for g in groups]) / 2.33**2

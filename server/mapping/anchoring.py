@@ -13,6 +13,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches, seen_alike
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.geometry.weighting import MAD_TO_SIGMA
 from semcast.server.mapping.recall import KeyframeImages
 from semcast.server.mapping.tracks import Sight, TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -27,6 +28,8 @@ _PATCH_PX = 17
 #: A point that would move further than this has found something else.
 _MAX_MOVE_PX = 3.0
 _MIN_CORRELATION = 0.7
+#: Places from which on their scatter tells how well a track is known.
+_MIN_PLACES = 4
 #: Landmarks next to a track without one, by which its patch is warped, and how many a keyframe must show.
 _NEIGHBOURS, _MIN_LANDMARKS = 5, 5
 
@@ -43,7 +46,8 @@ def anchor_tracks(
 ) -> int:
     """Align the tracks in sight with the kept keyframes that saw them.
 
-    Of each track the median of the positions that fit is taken; one that fits nowhere stays where it is.
+    Of each track the median of the positions that fit is taken, and their scatter for how well it is known;
+    one that fits nowhere stays where it is.
 
     Args:
         camera: Pinhole.
@@ -80,8 +84,21 @@ def anchor_tracks(
     places = np.full((len(parts), len(tracks), 2), np.nan)
     places[anchor[fits], rows[fits]] = found.xy[fits]
     aligned = np.unique(rows[fits])
-    tracks.settle_at(aligned, np.nanmedian(places[:, aligned], axis=0))
+    middle, scatter_px2 = _middle(places[:, aligned])
+    tracks.settle_at(aligned, middle, scatter_px2)
     return len(aligned)
+
+
+def _middle(places: Array) -> tuple[Array, Array]:
+    """Median ``(N, 2)`` of places ``(K, N, 2)``, NaN for none, and their variance ``(N,)`` per coordinate.
+
+    The variance is that of a normal distribution with their median absolute deviation, NaN
+    where there are too few places.
+    """
+    middle = np.nanmedian(places, axis=0)
+    deviation_px = MAD_TO_SIGMA * np.nanmedian(np.abs(places - middle), axis=0).mean(axis=1)
+    enough = np.isfinite(places[..., 0]).sum(axis=0) >= _MIN_PLACES
+    return middle, np.where(enough, deviation_px**2, np.nan)
 
 
 def _shared(tracks: TrackTable, keyframe: Keyframe) -> tuple[NDArray[np.intp], Array]:

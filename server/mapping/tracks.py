@@ -348,15 +348,24 @@ class TrackTable:
         alive[ok] &= deduplicate(self.xy[ok])
         self.keep(alive)
 
-    def settle_at(self, rows: NDArray[np.intp], xy: Array) -> None:
-        """Put visible tracks where they were found from an image of long ago: they have no drift then."""
+    def settle_at(self, rows: NDArray[np.intp], xy: Array, scatter_px2: Array) -> None:
+        """Put visible tracks where they were found from images of long ago: they have no drift then.
+
+        Args:
+            rows: ``(M,)`` of the tracks.
+            xy: ``(M, 2)`` where.
+            scatter_px2: ``(M,)`` variance per coordinate of where the images have them, NaN where too few
+                tell it. It takes the place of what is expected of an image.
+        """
         self.xy = self.xy.copy()
         self.xy[rows] = xy
         self.drift_px2 = self.drift_px2.copy()
         self.drift_px2[rows] = 0.0
         if self._mode == "robust":
             self.confidence = self.confidence.copy()
-            self.confidence[rows] = variance_confidence(self.variance_px2[rows])
+            expected = self.variance_px2[rows]
+            variance_px2 = np.where(np.isfinite(scatter_px2), scatter_px2, expected)
+            self.confidence[rows] = variance_confidence(variance_px2)
 
     def beside(self, xy: Array, cell_px: float = 4.0) -> NDArray[np.bool_]:
         """Visible tracks next to ``(M, 2)`` points, ``(N,)``: in the same or a neighbouring cell."""

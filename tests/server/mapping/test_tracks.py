@@ -442,6 +442,20 @@ def test_noise_of_older_keyframes_averages_out(mapped):
     assert error[1] < 0.7 * error[0]
 
 
+def test_tracks_that_keyframes_disagree_about_are_trusted_less(mapped):
+    trusted = []
+    for sd in (2.0, 25.0):
+        world, images, _ = noisy_keyframes(mapped, (20, 22, 24, 26, 28), sd)
+        tracks = begin(START_X)
+        sight = sight_at(30, frame_id=9)
+        tracks.follow(sight, tracks.xy - (10, 0))
+        assert anchor((world, images, tracks), sight, 30) > 50
+        trusted.append(np.median(tracks.confidence[tracks.visible]))
+        world.keyframes[1:] = []
+    assert trusted[0] > 0.95
+    assert trusted[1] < trusted[0] - 0.05
+
+
 def test_tracks_without_a_landmark_are_aligned_by_the_depth_around_them(mapped):
     world, _, tracks = mapped
     new = np.arange(len(tracks)) % 3 == 0
