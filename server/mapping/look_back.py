@@ -2,8 +2,8 @@
 
 A map starts from the oldest frame that still shares tracks with the newest one. Of what earlier frames saw it
 has little: posed by the few landmarks left in their sight they would err several times as much as later
-frames, or get no pose. So from the start backwards frames become keyframes and their tracks landmarks, and
-all are adjusted together.
+frames, or get no pose. So from the start backwards frames become keyframes and their tracks landmarks, with
+an adjustment after each.
 """
 
 from collections.abc import Sequence

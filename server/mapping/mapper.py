@@ -178,11 +178,11 @@ def new_landmarks(
 
 
 def sample_colours(image: NDArray[np.uint8], xy: Array) -> NDArray[np.uint8]:
-    """Colour of the nearest pixel, ``(N, 3)`` uint8; grey for points with a negative coordinate."""
+    """Colour of the nearest pixel, ``(N, 3)`` uint8."""
     height, width = image.shape[:2]
     x = np.clip(np.rint(xy[:, 0]), 0, width - 1).astype(np.intp)
     y = np.clip(np.rint(xy[:, 1]), 0, height - 1).astype(np.intp)
-    return np.where(np.any(xy < 0, axis=1, keepdims=True), np.uint8(128), image[y, x])
+    return np.asarray(image[y, x])
 
 
 class Seen(Protocol):
