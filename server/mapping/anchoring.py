@@ -70,8 +70,10 @@ def anchor_tracks(
             continue
         rows, xy0 = _shared(tracks, keyframe)
         depth = _depths(world, keyframe, tracks.ids[rows], xy0)
+        told = depth > 0.0
+        rows, xy0, depth = rows[told], xy0[told], depth[told]
         warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
-        alike = (depth > 0.0) & seen_alike(warps, depth_now)
+        alike = seen_alike(warps, depth_now)
         if alike.any():
             parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike], _PATCH_PX)))
     if not parts:
@@ -92,8 +94,8 @@ def anchor_tracks(
 def _middle(places: Array) -> tuple[Array, Array]:
     """Median ``(N, 2)`` of places ``(K, N, 2)``, NaN for none, and their variance ``(N,)`` per coordinate.
 
-    The variance is that of a normal distribution with their median absolute deviation, NaN
-    where there are too few places.
+    The variance is that of a normal distribution with their median absolute deviation, NaN where there are
+    too few places.
     """
     middle = np.nanmedian(places, axis=0)
     deviation_px = MAD_TO_SIGMA * np.nanmedian(np.abs(places - middle), axis=0).mean(axis=1)

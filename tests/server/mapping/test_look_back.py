@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -129,3 +131,19 @@ def test_landmarks_have_the_colour_of_their_last_sight():
     ]
     frames.append(Observed(3, 3, np.array([8]), np.zeros((1, 2)), np.ones(1)))
     assert colours_of(np.array([3, 4, 5, 8]), frames)[:, 0].tolist() == [1, 128, 2, 1]
+
+
+def test_a_camera_that_was_somewhere_else_for_long_is_not_looked_for_further_back(walk, start, rng):
+    _, _, frames = walk
+    before = frames[: NUM_FRAMES - NUM_START]
+    found = {}
+    for num_elsewhere in (5, 16):
+        others = [
+            Observed(100, 0, np.arange(10**6, 10**6 + 50), rng.uniform(0, 480, (50, 2)), np.ones(50))
+            for _ in range(num_elsewhere)
+        ]
+        history = [replace(o, frame_id=k) for k, o in enumerate([*before[-12:], *others])]
+        later = [replace(k, frame_id=k.frame_id + 1000) for k in start.keyframes]
+        found[num_elsewhere] = look_back(CAMERA, replace(start, keyframes=later), history, NOISE, SETTINGS)
+    assert len(found[5].keyframes) > len(start.keyframes)
+    assert len(found[16].keyframes) == len(start.keyframes)

@@ -155,6 +155,23 @@ def test_parts_that_begin_and_are_lost_again_keep_the_map_within_its_size():
         assert {k.frame_id for k in views} <= {k.frame_id for k in builder.world.keyframes}
 
 
+def test_landmarks_of_a_start_belong_to_the_last_keyframe_that_saw_them(builder, rng):
+    xyz = rng.uniform((-0.5, -0.4, 0.8), (0.5, 0.4, 1.4), (160, 3))
+    ids = np.arange(160)
+    views = [keyframe(k, 0, ids, pose(0.05 * k), xyz) for k in range(5)]
+    for k in views[2:]:  # a camera that turned saw the first of them no more
+        k.drop_observations(k.ids < 60)
+    frame = DecodedFrame(4, 0, IMAGE)
+    sight = Sight(frame, IMAGE[..., 0], np.ones(480, bool))
+    rgb = np.repeat(ids[:, None], 3, axis=1).astype(np.uint8)
+    start = Start(views, ids, xyz, np.ones(160))
+    builder.take_start(start, sight, NewestFrame(views[-1].ids, views[-1].xy), np.eye(4), 1.0, rgb)
+    marks = builder.world.landmarks
+    assert set(marks.born[marks.ids < 60].tolist()) == {1}
+    assert set(marks.born[marks.ids >= 60].tolist()) == {4}
+    assert marks.rgb[:, 0].tolist() == marks.ids.tolist()
+
+
 def test_an_update_after_a_join_has_the_poses_of_all_frames(builder):
     add_part(builder, 0, 4, 0)
     add_part(builder, 1, 4, 40, seed=1)

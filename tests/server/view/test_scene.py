@@ -125,6 +125,14 @@ def test_earlier_frames_that_became_keyframes_of_a_start_move_by_themselves():
     assert scene.poses()[:, 0, 3].tolist() == [-1.0, 1.0, 2.0]
 
 
+def test_frames_before_a_start_move_with_the_keyframe_after_them():
+    scene = Scene()
+    scene.set_keyframes(np.array([0, 3, 6]), np.stack([at(0), at(3), at(6)]))
+    scene.add_frame(view(6, at(6), backfilled=tuple((k, k, at(k)) for k in (1, 2, 4))))
+    scene.set_keyframes(np.array([3]), at(13)[None])
+    assert scene.poses()[:, 0, 3].tolist() == [11.0, 12.0, 4.0, 6.0]
+
+
 def test_the_line_is_cut_where_tracking_was_lost():
     scene = Scene()
     for k in (0, 1):
