@@ -151,6 +151,7 @@ class Link:
             encoded.modulation,
             slot_lost=sent.slot_lost,
             knowledge=sent.truth if perfect_csi else None,
+            levels=encoded.levels,
         )
 
     def carry(

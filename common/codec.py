@@ -10,6 +10,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.common.levels import ALL_LEVELS, Levels
+
 Modulation = Literal["16qam", "analog"]
 MODULATIONS: tuple[Modulation, ...] = ("16qam", "analog")
 
@@ -33,11 +35,13 @@ class EncodedImage:
             encoder need not use all points alike, and the link scales what it is given. Under ``"16qam"``
             every symbol is a point of the Gray-mapped constellation in ``phy/qam.py``, plain or shaped.
         modulation: How the symbols travel.
+        levels: What the image's grey levels were stretched from; it travels with the frame's header.
     """
 
     shape_hw: tuple[int, int]
     symbols: NDArray[np.complex64]
     modulation: Modulation
+    levels: Levels = ALL_LEVELS
 
 
 @dataclass(frozen=True)
@@ -51,12 +55,14 @@ class ReceivedImage:
         effective_snr_db: ``(num_slots,)`` float32, ``|h|^2 / noise_var`` of each slot in dB as the
             receiver estimated it, never below ``LOST_SLOT_SNR_DB``.
         modulation: How the symbols travelled.
+        levels: What the image's grey levels were stretched from.
     """
 
     shape_hw: tuple[int, int]
     symbols: NDArray[np.complex64]
     effective_snr_db: NDArray[np.float32]
     modulation: Modulation
+    levels: Levels = ALL_LEVELS
 
 
 @dataclass(frozen=True)

@@ -133,6 +133,7 @@ class SymbolFrame:
         digest: Its digest.
         image_hw: Height and width in pixels; it fixes the slot grid.
         modulation: How symbols travel.
+        levels: Ends of the range of grey levels that was stretched to 0 .. 255 before encoding.
         num_slots: Of the grid.
         uses_per_slot: Of the grid, pilots included.
         direction: ``tx`` carries data symbols only, ``rx`` pilots and data as received.
@@ -157,6 +158,7 @@ class SymbolFrame:
     digest: str = field(metadata=_DIGEST)
     image_hw: tuple[int, int] = field(metadata=_SIZE)
     modulation: Modulation = field(metadata=rule(Choice(MODULATIONS)))
+    levels: tuple[int, int] = field(default=(0, 255), metadata=rule(Many(WholeNumber(0, 255), count=2)))
     num_slots: int = field(metadata=rule(WholeNumber(1, MAX_SIDE_PX)))
     uses_per_slot: int = field(metadata=rule(WholeNumber(1, 48 * MAX_SIDE_PX)))
     direction: Literal["tx", "rx"] = field(metadata=rule(Choice(("tx", "rx"))))
@@ -172,11 +174,13 @@ class SymbolFrame:
         return layout_for(self.image_hw)
 
     def consistent(self) -> None:
-        """Check that grid, payload and loss mask belong together.
+        """Check that grid, payload and loss mask belong together, and that levels rise.
 
         Raises:
             FieldError: They don't.
         """
+        if self.levels[0] >= self.levels[1]:
+            raise FieldError("range", f"levels must rise, got {list(self.levels)}")
         layout = self.layout
         if (self.num_slots, self.uses_per_slot) != (layout.num_slots, layout.uses_per_slot):
             raise FieldError(

@@ -202,7 +202,13 @@ def run_frames(
             yield LinkedFrame(frame_id, t_source_ns, original, None, None, None, stage_ms)
             continue
         since = time.perf_counter_ns()
-        equalised = equalise(sent.slots_rx, encoded.shape_hw, encoded.modulation, slot_lost=sent.slot_lost)
+        equalised = equalise(
+            sent.slots_rx,
+            encoded.shape_hw,
+            encoded.modulation,
+            slot_lost=sent.slot_lost,
+            levels=encoded.levels,
+        )
         stage_ms["equalise"] = _elapsed_ms(since)
         feedback_db = reported_snr_db(codec.name, equalised)
         since = time.perf_counter_ns()

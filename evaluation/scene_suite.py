@@ -1,6 +1,6 @@
 """The trajectory benchmark on drawn scenes: needs no recording, and nothing was tuned on it.
 
-Run by ``make bench-scenes``. About 80 minutes of one core with the default three seeds.
+Run by ``make bench-scenes``. About 90 minutes of one core with the default three seeds.
 """
 
 import argparse
@@ -28,6 +28,9 @@ SCENE_SECONDS: dict[SceneName, tuple[float, float]] = {
     "orbit": (10.0, 10.0),
     "block": (44.0, 30.0),
 }
+#: Scenes that are drawn at night as well: a fifth of the light, twice the noise.
+NIGHTS: tuple[SceneName, ...] = ("room", "street")
+_NIGHT_BRIGHTNESS, _NIGHT_NOISE_SD = 0.2, 3.0
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Run:
 
 
 def suite(folder: Path, results: Path, seeds: int) -> Iterator[Run]:
-    """Yield every scene at normal and fast pace, behind a Rayleigh fading link.
+    """Yield every scene at normal and fast pace and some at night, behind a Rayleigh fading link.
 
     Args:
         folder: Where the recordings are written.
@@ -48,25 +51,35 @@ def suite(folder: Path, results: Path, seeds: int) -> Iterator[Run]:
     """
     for number, (scene, seconds) in enumerate(SCENE_SECONDS.items()):
         for pace, length_s in zip(_PACES, seconds, strict=True):
-            name = f"{scene}_{pace}"
-            render = RenderSettings(
-                scene=scene,
-                pace=pace,
-                seed=_FIRST_SCENE_SEED + number,
-                seconds=length_s,
-                out=folder / name,
+            seed = _FIRST_SCENE_SEED + number
+            out = folder / f"{scene}_{pace}"
+            yield _run(
+                RenderSettings(scene=scene, pace=pace, seed=seed, seconds=length_s, out=out), results, seeds
             )
-            settings = TrajectorySettings(
-                sequence=folder / name,
-                link=ChannelSettings(channel="rayleigh"),
-                snr_db=(_LINK_DB,),
-                seeds=seeds,
-                threads=1,
-                confidence=("robust", "off"),
-                rows=False,
-                json=results / f"trajectory_rayleigh_{name}.json",
-            )
-            yield Run(render, settings)
+    for number, scene in enumerate(NIGHTS):
+        render = RenderSettings(
+            scene=scene,
+            seed=_FIRST_SCENE_SEED + len(SCENE_SECONDS) + number,
+            seconds=SCENE_SECONDS[scene][0],
+            brightness=_NIGHT_BRIGHTNESS,
+            noise_sd=_NIGHT_NOISE_SD,
+            out=folder / f"{scene}_night",
+        )
+        yield _run(render, results, seeds)
+
+
+def _run(render: RenderSettings, results: Path, seeds: int) -> Run:
+    settings = TrajectorySettings(
+        sequence=render.out,
+        link=ChannelSettings(channel="rayleigh"),
+        snr_db=(_LINK_DB,),
+        seeds=seeds,
+        threads=1,
+        confidence=("robust", "off"),
+        rows=False,
+        json=results / f"trajectory_rayleigh_{render.out.name}.json",
+    )
+    return Run(render, settings)
 
 
 def main() -> None:

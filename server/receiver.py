@@ -15,6 +15,7 @@ from semcast.common.codec import ReceivedImage
 from semcast.common.codecs import reported_snr_db
 from semcast.common.errors import TransportError
 from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
+from semcast.common.levels import Levels
 from semcast.common.mailbox import Mailbox
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
@@ -310,7 +311,11 @@ class Receiver:
         else:
             started_ns = time.perf_counter_ns()
             equalised = equalise(
-                slots_of(message), message.image_hw, message.modulation, slot_lost=lost_slots_of(message)
+                slots_of(message),
+                message.image_hw,
+                message.modulation,
+                slot_lost=lost_slots_of(message),
+                levels=Levels(*message.levels),
             )
             equalise_ms = (time.perf_counter_ns() - started_ns) * 1e-6
             received, snr_db = equalised.received, float(equalised.snr_db)

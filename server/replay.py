@@ -17,6 +17,7 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.codecs import load_codec
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.keys import agent_of
+from semcast.common.levels import Levels
 from semcast.common.messages import SymbolFrame
 from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
@@ -298,7 +299,9 @@ def _arrivals(
             equalise_ms=0.0,
         )
         if slots is not None:
-            equalised = equalise(slots, frame.image_hw, frame.modulation, slot_lost=lost)
+            equalised = equalise(
+                slots, frame.image_hw, frame.modulation, slot_lost=lost, levels=Levels(*frame.levels)
+            )
             arrival = replace(arrival, received=equalised.received, snr_db=float(equalised.snr_db))
         yield arrival
 

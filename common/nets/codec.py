@@ -18,6 +18,7 @@ from semcast.common.codec import (
     confidence_from_displacement_px,
 )
 from semcast.common.errors import ConfigError
+from semcast.common.levels import levels_of
 from semcast.common.nets.checkpoint import Manifest, load_transceiver, weights_path
 from semcast.common.nets.inference import inference_net
 from semcast.common.nets.latent import latent_from_symbols, symbols_from_latent
@@ -140,6 +141,8 @@ class NeuralCodec:
     def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
         """Encode one image for a link whose expected SNR is ``snr_db``.
 
+        An image that uses less than half of the grey levels is stretched to all of them first.
+
         Args:
             image: ``(H, W, 3)`` uint8 RGB.
             snr_db: Expected SNR in dB; values outside the trained range are clipped to it.
@@ -153,6 +156,8 @@ class NeuralCodec:
         layout_for((sizes["H"], sizes["W"]))  # refuses images without a pixel
         low, high = self.manifest.snr_range_db
         expected = float(np.clip(snr_db, low, high)) if np.isfinite(snr_db) else low
+        levels = levels_of(image)
+        image = levels.stretch(image)
         bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX
         if bottom or right:
             image = np.pad(image, ((0, bottom), (0, right), (0, 0)), mode="edge")
@@ -164,6 +169,7 @@ class NeuralCodec:
             shape_hw=(sizes["H"], sizes["W"]),
             symbols=symbols_from_latent(symbols.cpu().numpy()),
             modulation=self._modulation,
+            levels=levels,
         )
 
     def decode(self, received: ReceivedImage) -> DecodedImage:
@@ -201,7 +207,7 @@ class NeuralCodec:
             maps = self._net.decode(y_rx, plane, self._is_qam)
             image, confidence, moved_px = (m[:height, :width].contiguous().cpu().numpy() for m in maps)
         return DecodedImage(
-            image=image,
+            image=received.levels.unstretch(image),
             confidence=confidence,
             keypoint_confidence=confidence_from_displacement_px(moved_px),
             outage=bool((snr_db <= LOST_SLOT_SNR_DB).all()),

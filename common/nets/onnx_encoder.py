@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import MODULATIONS, DecodedImage, EncodedImage, Modulation, ReceivedImage
 from semcast.common.errors import CheckpointError, ConfigError
+from semcast.common.levels import levels_of
 from semcast.common.nets.latent import symbols_from_latent
 from semcast.common.nets.modulation_numpy import transmit
 from semcast.common.nets.rounding import rounded_snr_db
@@ -131,6 +132,8 @@ class OnnxEncoder:
         layout_for((sizes["H"], sizes["W"]))  # refuses images without a pixel
         low, high = self._snr_range_db
         expected = float(np.clip(snr_db, low, high)) if np.isfinite(snr_db) else low
+        levels = levels_of(image)
+        image = levels.stretch(image)
         bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX
         if bottom or right:
             image = np.pad(image, ((0, bottom), (0, right), (0, 0)), mode="edge")
@@ -144,6 +147,7 @@ class OnnxEncoder:
             shape_hw=(sizes["H"], sizes["W"]),
             symbols=symbols_from_latent(transmit(latent, self._modulation)),
             modulation=self._modulation,
+            levels=levels,
         )
 
     def decode(self, received: ReceivedImage) -> DecodedImage:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import LOST_SLOT_SNR_DB, Modulation, ReceivedImage
+from semcast.common.levels import ALL_LEVELS, Levels
 from semcast.common.phy.pilots import pilot_symbols, split
 from semcast.common.phy.slots import SlotLayout, layout_for
 from semcast.common.shapes import check_shape
@@ -206,6 +207,7 @@ def equalise(
     *,
     slot_lost: NDArray[np.bool_] | None = None,
     knowledge: ChannelKnowledge | None = None,
+    levels: Levels = ALL_LEVELS,
 ) -> Equalised:
     """Turn the received slots of one frame into data symbols and their reliability.
 
@@ -215,6 +217,7 @@ def equalise(
         modulation: Passed on to the decoder.
         slot_lost: ``(num_slots,)`` slots known not to have arrived; their symbols become zero.
         knowledge: True channel, for perfect-CSI curves; None estimates it.
+        levels: Passed on to the decoder.
 
     Raises:
         ValueError: An array doesn't have the size that ``shape_hw`` demands.
@@ -252,6 +255,10 @@ def equalise(
         10.0 * np.log10(np.maximum(ratio, floor_ratio)).astype(np.float32), np.float32(LOST_SLOT_SNR_DB)
     )
     received = ReceivedImage(
-        shape_hw=shape_hw, symbols=symbols, effective_snr_db=effective_snr_db, modulation=modulation
+        shape_hw=shape_hw,
+        symbols=symbols,
+        effective_snr_db=effective_snr_db,
+        modulation=modulation,
+        levels=levels,
     )
     return Equalised(received=received, snr_db=channel.snr_db, channel=channel)

@@ -54,7 +54,12 @@ SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street]] = {
 
 
 def frame_of(
-    scene: Scene, t_s: float, noise_sd: float, rng: np.random.Generator, readout_s: float = 0.0
+    scene: Scene,
+    t_s: float,
+    noise_sd: float,
+    rng: np.random.Generator,
+    readout_s: float = 0.0,
+    brightness: float = 1.0,
 ) -> NDArray[np.uint8]:
     """Return the ``(H, W, 3)`` RGB picture of a scene, with blur of motion and noise of the sensor.
 
@@ -64,6 +69,7 @@ def frame_of(
         noise_sd: In grey levels.
         rng: Of the noise.
         readout_s: Time a rolling shutter takes from the top to the bottom, 0 for a global one.
+        brightness: Factor on the grey levels, before the noise.
     """
     height = scene.camera.height
     edges = np.linspace(0, height, 2 if readout_s == 0 else _NUM_BANDS + 1, dtype=int)
@@ -81,7 +87,7 @@ def frame_of(
             )
             T_world_cam = scene.T_world_cam(moment_s)
             total[top:bottom] += draw(scene.surfaces(moment_s), band, T_world_cam, background[top:bottom])
-    noisy = total / len(_SAMPLES) + rng.normal(0, noise_sd, total.shape[:2])[..., None]
+    noisy = total * (brightness / len(_SAMPLES)) + rng.normal(0, noise_sd, total.shape[:2])[..., None]
     return np.asarray(np.clip(np.rint(noisy), 0, 255), np.uint8)
 
 
@@ -104,6 +110,9 @@ class RenderSettings:
     seed: int = field(default=0, metadata={"help": "seed of the scene, the path and the noise"})
     seconds: float = field(default=10.0, metadata={"help": "length of the recording, at most 120"})
     noise_sd: float = field(default=1.5, metadata={"help": "noise of the sensor in grey levels of 255"})
+    brightness: float = field(
+        default=1.0, metadata={"help": "factor on all grey levels, at most 1: less light and the same noise"}
+    )
     readout_ms: float = field(
         default=0.0,
         metadata={"help": "time a rolling shutter takes from the top row to the bottom, 0 for none"},
@@ -118,6 +127,8 @@ class RenderSettings:
             raise ValueError(f"seconds must be in (0, 120], got {self.seconds:g}")
         if not 0 <= self.noise_sd <= 50:
             raise ValueError(f"noise_sd must be in [0, 50], got {self.noise_sd:g}")
+        if not 0 < self.brightness <= 1:
+            raise ValueError(f"brightness must be in (0, 1], got {self.brightness:g}")
         if not 0 <= self.readout_ms <= 100:
             raise ValueError(f"readout_ms must be in [0, 100], got {self.readout_ms:g}")
 
@@ -145,7 +156,9 @@ def render_scene(settings: RenderSettings) -> int:
     T_world_cams = np.stack([scene.T_world_cam(float(t_s)) for t_s in times_s])
     for index, t_s in enumerate(times_s):
         rng = np.random.default_rng([settings.seed, index, 4])
-        image = frame_of(scene, float(t_s), settings.noise_sd, rng, 1e-3 * settings.readout_ms)
+        image = frame_of(
+            scene, float(t_s), settings.noise_sd, rng, 1e-3 * settings.readout_ms, settings.brightness
+        )
         path = folder / "images" / f"{index:06d}.png"
         if not cv2.imwrite(str(path), image[..., ::-1]):
             raise SourceError(f"can't write {path}")

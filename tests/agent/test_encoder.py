@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from semcast.agent.encoder import FrameEncoder, LinkFeedback
 from semcast.agent.source import SourceFrame
+from semcast.common.levels import Levels
 from semcast.common.messages import LinkReport
 from semcast.common.symbol_payload import data_symbols
 from semcast.common.wire import pack
@@ -57,6 +60,19 @@ def test_messages_carry_the_symbols_and_are_numbered(codec):
     np.testing.assert_allclose(data_symbols(first), codec.encode(image, 5.0).symbols, atol=1e-3)
     assert codec.snrs_db == [5.0, 5.0, 5.0]
     assert len(pack(first)) > 4 * 3 * 47 * 4
+
+
+def test_messages_say_what_grey_levels_were_stretched_from(codec):
+    class Stretching(type(codec)):
+        def encode(self, image, snr_db):
+            return replace(super().encode(image, snr_db), levels=Levels(3, 40))
+
+    image = np.zeros((16, 16, 3), np.uint8)
+    plain, stretched = (
+        FrameEncoder(c, 3, False).encode(SourceFrame(0, 0, 0, image), 5.0) for c in (codec, Stretching())
+    )
+    assert plain.levels == (0, 255)
+    assert stretched.levels == (3, 40)
 
 
 def test_symbols_that_do_not_fit_the_grid_are_refused_and_not_numbered(codec):

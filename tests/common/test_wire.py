@@ -107,7 +107,7 @@ def test_a_message_cut_anywhere_is_refused(message):
 def test_each_field_missing_or_of_another_type_is_refused(message):
     good = values_of(message)
     optional = {"base_seq", "slot_lost", "lossless", "final", "error", "settings", "submap", "last_frame_id"}
-    optional |= {"readout_ms", "readout_from"}
+    optional |= {"readout_ms", "readout_from", "levels"}
     for name in good:
         if name not in optional and name not in ("version", "kind"):
             without = {k: v for k, v in good.items() if k != name}
@@ -137,6 +137,8 @@ def test_each_field_missing_or_of_another_type_is_refused(message):
         (SymbolFrame, {"slot_lost": b""}, "shape"),
         (SymbolFrame, {"codec": "../../etc"}, "range"),
         (SymbolFrame, {"modulation": "qpsk"}, "range"),
+        (SymbolFrame, {"levels": [40, 40]}, "range"),
+        (SymbolFrame, {"levels": [0, 256]}, "range"),
         (CameraInfo, {"fx": math.nan}, "range"),
         (CameraInfo, {"fx": 0.0}, "range"),
         (CameraInfo, {"cx": math.inf}, "range"),

@@ -91,11 +91,25 @@ def test_seeds_and_paces_differ() -> None:
         ({"seconds": 0}, r"seconds must be in \(0, 120\], got 0"),
         ({"seed": -1}, "seed must be at least 0, got -1"),
         ({"noise_sd": 60}, r"noise_sd must be in \[0, 50\], got 60"),
+        ({"brightness": 0}, r"brightness must be in \(0, 1\], got 0"),
+        ({"brightness": 1.5}, r"brightness must be in \(0, 1\], got 1.5"),
     ],
 )
 def test_settings_out_of_range_are_refused(values: dict[str, float], message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         RenderSettings(out=tmp_path / "x", **values)  # type: ignore[arg-type]
+
+
+def test_a_night_has_less_light_and_the_same_noise() -> None:
+    scene = SCENES["room"](0, "normal")
+    day, night = (
+        frame_of(scene, 1.0, 2.0, np.random.default_rng(0), brightness=share).astype(float)
+        for share in (1.0, 0.2)
+    )
+    clear = frame_of(scene, 1.0, 0.0, np.random.default_rng(0)).astype(float)
+    bright = (clear > 60) & (clear < 240)
+    np.testing.assert_allclose(np.std((night - 0.2 * clear)[bright]), 2.0, rtol=0.1)
+    np.testing.assert_allclose(np.std((day - clear)[bright]), 2.0, rtol=0.1)
 
 
 def test_the_camera_of_a_rolling_shutter_says_so(tmp_path: Path) -> None:

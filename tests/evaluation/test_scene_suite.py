@@ -11,12 +11,15 @@ from semcast.evaluation import scene_suite
 from semcast.evaluation.scenes.render import SCENES
 
 
-def test_suite_has_every_scene_at_two_paces_and_files_of_their_own(tmp_path: Path) -> None:
+def test_suite_has_every_scene_at_two_paces_some_at_night_and_files_of_their_own(tmp_path: Path) -> None:
     runs = list(scene_suite.suite(tmp_path / "scenes", tmp_path / "results", seeds=2))
     names = [run.render.out.name for run in runs]
-    assert names == [f"{scene}_{pace}" for scene in scene_suite.SCENE_SECONDS for pace in ("normal", "fast")]
+    by_day = [f"{scene}_{pace}" for scene in scene_suite.SCENE_SECONDS for pace in ("normal", "fast")]
+    assert names == [*by_day, "room_night", "street_night"]
+    assert [run.render.brightness < 1 for run in runs] == [False] * len(by_day) + [True, True]
+    assert len({run.render.seed for run in runs}) == len(SCENES) + 2
     assert set(scene_suite.SCENE_SECONDS) == set(SCENES)
-    assert len({run.settings.json for run in runs}) == 2 * len(SCENES)
+    assert len({run.settings.json for run in runs}) == len(names)
     assert all(run.settings.sequence == run.render.out for run in runs)
 
 

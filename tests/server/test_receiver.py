@@ -7,6 +7,7 @@ import pytest
 
 from semcast.channel.awgn import complex_noise
 from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
+from semcast.common.levels import Levels
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
@@ -111,9 +112,10 @@ def test_a_frame_is_equalised_and_reported(ends, make, sent):
         frame_lost=False,
     )))  # fmt: skip
     until(lambda: e.receiver._snr_set)
-    message = make(3, lost=[2])
+    message = make(3, lost=[2], levels=(5, 60))
     e.put(message)
     frame = e.receiver.next(5)
+    assert frame.received.levels == Levels(5, 60)
     assert frame.message == message
     assert frame.camera == camera()
     assert frame.snr_db == pytest.approx(20.0, abs=1.5)
