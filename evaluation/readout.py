@@ -21,6 +21,7 @@ from semcast.common.errors import SemcastError, SourceError
 from semcast.common.sequence import resized
 from semcast.common.sequence_layouts import Layout
 from semcast.evaluation.report import provenance, write_json
+from semcast.evaluation.statistics import MIN_SAMPLES, small_sample_factor
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -130,7 +131,7 @@ class ReadoutEstimate:
 
     Attributes:
         readout: Where the error is least.
-        low_ms: Lower bound of ``signed_ms``, 95 %, frames resampled in blocks.
+        low_ms: Lower bound of ``signed_ms``, 95 %, frames resampled in blocks, widened for how few those are.
         high_ms: Upper bound.
         camera: As it was given, of the images as stored, with the readout found.
         trials: All that were made, in order.
@@ -290,10 +291,12 @@ def fitted(best: Readout, trials: Sequence[Trial]) -> tuple[Readout, float, floa
     errors_px = np.array([[trial.error_px[k] for k in ids] for trial in used])
     rng = np.random.default_rng(0)
     starts = rng.integers(len(ids), size=(_NUM_RESAMPLES, -(-len(ids) // _BLOCK_FRAMES), 1))
-    blocks = ((starts + np.arange(_BLOCK_FRAMES)) % len(ids)).reshape(_NUM_RESAMPLES, -1)
+    blocks = ((starts + np.arange(_BLOCK_FRAMES)) % len(ids)).reshape(_NUM_RESAMPLES, -1)[:, : len(ids)]
     resampled = errors_px[:, blocks].mean(axis=2)
     bend, least_ms = _parabolas(at_ms, np.column_stack([errors_px.mean(axis=1), resampled]) ** 2)
-    low_ms, high_ms = np.percentile(least_ms[1:], (2.5, 97.5))
+    # Fewer than five blocks count as five: with them the interval is still a little too narrow.
+    widen = small_sample_factor(max(MIN_SAMPLES, len(ids) // _BLOCK_FRAMES))
+    low_ms, high_ms = least_ms[0] + widen * (np.percentile(least_ms[1:], (2.5, 97.5)) - least_ms[0])
     if np.mean(bend <= 0) > 0.025 or bend[0] <= 0 or high_ms - low_ms > _MAX_INTERVAL_MS:
         raise SemcastError(
             "these images don't tell the readout time, and it matters little for images like them: take some "

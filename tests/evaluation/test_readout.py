@@ -75,6 +75,25 @@ def test_images_that_do_not_tell_are_refused(rng):
         fitted(Readout("rows", 0.0), few)
 
 
+@pytest.mark.parametrize("count", [31, 60])
+def test_the_bounds_of_few_frames_cover_what_they_say(count, rng):
+    at_ms = np.array([5.0, 7.5, 10.0, 12.5, 15.0, 20.0])
+    found = []
+    for _ in range(300):
+        # What frames after each other say is alike.
+        own_ms = np.convolve(rng.normal(0.0, 1.0, count + 1), (0.7, 0.7), mode="valid")
+        errors_px = np.sqrt(0.3**2 + 0.03**2 * (at_ms[:, None] - 11.0 - own_ms) ** 2)
+        errors_px *= rng.uniform(0.97, 1.03, errors_px.shape)
+        trials = [
+            Trial(Readout("rows", ms), dict(enumerate(e))) for ms, e in zip(at_ms, errors_px, strict=True)
+        ]
+        readout_, low_ms, high_ms = fitted(Readout("rows", 10.0), trials)
+        found.append((readout_.signed_ms, low_ms, high_ms))
+    least_ms, low_ms, high_ms = np.array(found).T
+    covered = np.mean((low_ms < least_ms.mean()) & (least_ms.mean() < high_ms))
+    assert 0.9 < covered < 0.99
+
+
 def test_a_side_and_a_time_say_what_is_read_first():
     assert str(Readout("rows", 20.0)) == "20.0 ms from top"
     assert str(Readout("rows", -20.0)) == "20.0 ms from bottom"
