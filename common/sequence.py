@@ -15,6 +15,7 @@ from semcast.common.errors import SourceError
 from semcast.common.geometry import interpolate_pose
 from semcast.common.sequence_layouts import Layout, SequenceFiles, ns_to_seconds, read_layout
 from semcast.common.sequence_sizes import size_in_header_wh
+from semcast.common.tiff_alpha import is_laid_on_black
 from semcast.common.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
@@ -46,12 +47,12 @@ def read_image(path: Path, bit_depth: Callable[[], int | None] | None = None) ->
     Raises:
         SourceError: The file is missing or damaged.
     """
-    raw = _read_raw(path)
+    raw, is_on_black = _read_raw(path)
     if raw.dtype == np.uint16:
         bits = (bit_depth() if bit_depth is not None else None) or _bits_for(int(raw.max()))
         raw = (np.minimum(raw, 2**bits - 1) >> (bits - 8)).astype(np.uint8)
     try:
-        return as_rgb(raw)
+        return as_rgb(raw, is_on_black=is_on_black)
     except SourceError as err:
         raise SourceError(f"{path}: {err}") from err
 
@@ -68,7 +69,7 @@ def bit_depth_of(paths: tuple[Path, ...]) -> int | None:
     spread = np.linspace(0, len(paths) - 1, min(len(paths), _MAX_DEPTH_IMAGES)).astype(int)
     for path in (paths[k] for k in spread):
         try:
-            raw = _read_raw(path)
+            raw, _ = _read_raw(path)
         except SourceError:
             continue
         if raw.dtype == np.uint16:
@@ -80,7 +81,8 @@ def _bits_for(brightest: int) -> int:
     return next(bits for bits in _BIT_DEPTHS if brightest < 2**bits)
 
 
-def _read_raw(path: Path) -> NDArray:
+def _read_raw(path: Path) -> tuple[NDArray, bool]:
+    """Read what OpenCV makes of a file, and whether its colours are multiplied by alpha."""
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as err:
@@ -88,11 +90,18 @@ def _read_raw(path: Path) -> NDArray:
     raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if raw is None:
         raise SourceError(f"{path} is not a readable image (damaged, or of an unknown format)")
-    return np.asarray(raw)
+    is_on_black = raw.ndim == 3 and raw.shape[2] == 4 and is_laid_on_black(data.tobytes(), 8 * raw.itemsize)
+    return np.asarray(raw), is_on_black
 
 
-def as_rgb(raw: NDArray) -> NDArray[np.uint8]:
+def as_rgb(raw: NDArray, *, is_on_black: bool = False) -> NDArray[np.uint8]:
     """Turn what OpenCV reads (grey, BGR or BGRA, of any number type) into ``(H, W, 3)`` uint8 RGB.
+
+    Transparency is laid on white.
+
+    Args:
+        raw: The image.
+        is_on_black: Colours are multiplied by alpha.
 
     Raises:
         SourceError: The values are neither those of 0..1 nor of 0..255, nor 16-bit.
@@ -102,8 +111,9 @@ def as_rgb(raw: NDArray) -> NDArray[np.uint8]:
         return np.asarray(cv2.cvtColor(raw, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
     if raw.shape[2] == 4:
         alpha = raw[:, :, 3:].astype(np.uint16)
-        laid = (raw[:, :, 2::-1].astype(np.uint16) * alpha + 255 * (255 - alpha) + 127) // 255
-        return laid.astype(np.uint8)
+        colours = raw[:, :, 2::-1].astype(np.uint16)
+        laid = ((colours * (255 if is_on_black else alpha)) + 255 * (255 - alpha) + 127) // 255
+        return np.minimum(laid, 255).astype(np.uint8)
     return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
