@@ -84,6 +84,22 @@ def test_names_that_are_no_text_are_shown(tmp_path):
     assert done.returncode == 0
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("words", [["info", "cnn"], ["info", "--help"]])
+def test_a_full_disk_behind_standard_output_is_told_in_a_line(words):
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    command = [sys.executable, "-m", "semcast", *words]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
+    assert done.returncode == 1
+    assert done.stderr == "semcast: standard output can't be written: No space left on device\n"
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, env=environment)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (1, ""), "who reads no further knows"
+
+
 def test_help_is_a_verb_too(capsys):
     for words, first in ((["help"], "usage: semcast VERB"), (["help", "replay"], "usage: semcast replay")):
         with pytest.raises(SystemExit) as ended:

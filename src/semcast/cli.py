@@ -5,6 +5,7 @@ Only the chosen verb is imported, so ``semcast --help`` answers without torch, g
 """
 
 import argparse
+import contextlib
 import importlib
 import io
 import logging
@@ -103,10 +104,40 @@ def _plain(err: SemcastError) -> str:
     return str(err)
 
 
+def _stdout_fails() -> bool:
+    try:
+        print(flush=True)
+    except OSError:
+        return True
+    return False
+
+
+def _drop_stdout() -> None:
+    """Let what stdout still holds go nowhere: the interpreter would try again at the end, and trace."""
+    with contextlib.suppress(OSError):  # one that is no file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     words = list(sys.argv[1:] if argv is None else argv)
     _show_all_names()
+    try:
+        try:
+            return _run(words)
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except OSError as err:
+        if not _stdout_fails() or "--debug" in words:
+            raise
+        _drop_stdout()
+        if not isinstance(err, BrokenPipeError):  # who reads no further knows
+            print(f"semcast: standard output can't be written: {err.strerror}", file=sys.stderr)
+        return EXIT_ERROR
+
+
+def _run(words: list[str]) -> int:
     overview = _overview()
     if words[:1] == ["help"]:
         words = [*words[1:2], "--help"]
@@ -146,8 +177,5 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_ERROR
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        sys.stderr.close()
-        return EXIT_ERROR
     finally:
         logging.getLogger("semcast").removeHandler(handler)
