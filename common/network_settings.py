@@ -62,26 +62,44 @@ class NetworkSettings:
                     check_endpoint(endpoint)
                 except ValueError as err:
                     raise ValueError(f"{name} {err}") from err
-        if not self.listen and not self.connect:
+        if not self.listens_on and not self.connect:
             raise ValueError("listen or connect must name an endpoint, got neither")
+
+    @property
+    def listens_on(self) -> tuple[str, ...]:
+        """Endpoints to listen on; a process with any is the hub."""
+        return self.listen
 
     @property
     def where(self) -> str:
         """Say in words where the process is to be met."""
-        if self.listen:
-            return f"listening on {', '.join(self.listen)}"
+        if self.listens_on:
+            return f"listening on {', '.join(self.listens_on)}"
         return f"connected to {', '.join(self.connect)}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class HubSettings(NetworkSettings):
-    """The same for the process that is the hub unless told otherwise: the server."""
+    """The same for the process that is the hub unless told to connect to one: the server."""
 
     listen: tuple[str, ...] = field(
-        default=(DEFAULT_ENDPOINT,),
-        metadata={"help": "endpoints agent and channel connect to", "takes": check_endpoint},
+        default=(),
+        metadata={
+            "help": "endpoints agent and channel connect to "
+            f"(default {DEFAULT_ENDPOINT}, none with --connect)",
+            "takes": check_endpoint,
+        },
     )
     connect: tuple[str, ...] = field(
         default=(),
-        metadata={"help": "endpoints of another Zenoh router to join", "takes": check_endpoint},
+        metadata={
+            "help": "endpoints of the hub to connect to instead; with --listen those of another Zenoh router "
+            "to join",
+            "takes": check_endpoint,
+        },
     )
+
+    @property
+    def listens_on(self) -> tuple[str, ...]:
+        """Endpoints to listen on: the default one where none is named to connect to either."""
+        return self.listen if self.listen or self.connect else (DEFAULT_ENDPOINT,)

@@ -51,12 +51,12 @@ def zenoh_config(network: NetworkSettings) -> zenoh.Config:
         ConfigError: That file can't be read or is not one.
     """
     config = zenoh.Config() if network.zenoh_config is None else _read_config(network.zenoh_config)
-    hub = bool(network.listen)
+    hub = bool(network.listens_on)
     values: dict[str, Any] = {
         "mode": "router" if hub else "client",
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "listen/endpoints": list(network.listen),
+        "listen/endpoints": list(network.listens_on),
         "connect/endpoints": list(network.connect),
         # A client tries for a moment and reports failure, so that the caller can be stopped in between; once
         # connected it reconnects by itself. A hub goes on without the routers it was told of.
@@ -357,15 +357,15 @@ def open_session(
         TransportError: The port is taken, or no hub was found in time.
         ConfigError: Zenoh's configuration file is not usable.
     """
-    for endpoint in network.listen:
+    for endpoint in network.listens_on:
         if not is_loopback(endpoint) and network.zenoh_config is None:
             logger.warning("listening on %s: whoever reaches it can send and receive", endpoint)
     config = zenoh_config(network)
-    if network.listen:
+    if network.listens_on:
         try:
             return Session(zenoh.open(config))
         except zenoh.ZError as err:
-            where = ", ".join(network.listen)
+            where = ", ".join(network.listens_on)
             hint = ", perhaps something already does" if _says_in_use(err) else ""
             raise TransportError(f"can't listen on {where}{hint}: {_first_line(err)}") from err
     started_s = time.monotonic()

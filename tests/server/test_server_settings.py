@@ -9,6 +9,8 @@ from semcast.agent.agent import camera_info
 from semcast.agent.settings import AgentSettings
 from semcast.agent.source import RecordedSource
 from semcast.agent.source_settings import SourceSettings
+from semcast.cli import verb_parser
+from semcast.commands.running import read_settings
 from semcast.common.errors import CheckpointError, ConfigError, SourceError
 from semcast.common.network_settings import HubSettings
 from semcast.common.sequence import open_sequence
@@ -63,7 +65,17 @@ def test_settings_out_of_range_say_so(changes, text):
 
 
 def test_the_hub_is_on_loopback_unless_told_otherwise():
-    assert HubSettings().listen == ("tcp/127.0.0.1:7447",)
+    assert HubSettings().listens_on == ("tcp/127.0.0.1:7447",)
+
+
+def test_a_server_that_connects_to_a_hub_opens_no_port_of_its_own_unasked():
+    other, own = "tcp/127.0.0.1:7448", "tcp/127.0.0.1:7449"
+    parser = verb_parser("server")
+    for words, listen in (([], ()), (["--listen", own], (own,))):
+        arguments = parser.parse_args(["--connect", other, *words])
+        network = read_settings(ServerSettings, arguments).network
+        assert (network.listens_on, network.connect) == (listen, (other,))
+    assert read_settings(ServerSettings, parser.parse_args([])).network == HubSettings()
 
 
 @pytest.mark.parametrize(
