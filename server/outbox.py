@@ -3,6 +3,8 @@
 import logging
 import threading
 from collections import OrderedDict
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -18,12 +20,15 @@ from semcast.server.receiver import ReceivedFrame
 
 logger = logging.getLogger(__name__)
 
-#: Messages that wait for slow subscribers; beyond it the oldest are dropped as ``outbox``.
+#: Poses that wait for slow subscribers; beyond it the oldest are dropped as ``outbox``.
 CAPACITY = 1024
 
 
 class Outbox:
     """Sends poses and map changes of one agent.
+
+    Of changes none may be missing, or who follows them has another map from then on, and would not know:
+    those that wait become one.
 
     Args:
         session: An open session.
@@ -35,7 +40,9 @@ class Outbox:
         self._pose = session.publisher(pose_key(agent_id), "every")
         self._map = session.publisher(map_key(agent_id), "every")
         self._metrics = metrics
-        self._box: Mailbox[tuple[Publisher, PoseMessage | MapMessage]] = Mailbox(CAPACITY, "newest")
+        self._box: Mailbox[PoseMessage | Literal["map"]] = Mailbox(CAPACITY, "newest")
+        self._change: MapMessage | None = None
+        self._change_lock = threading.Lock()
         self._t_capture_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
         self._thread = threading.Thread(target=self._run, name="semcast-outbox", daemon=True)
         self._thread.start()
@@ -62,26 +69,39 @@ class Outbox:
                 map_epoch=result.map_epoch,
                 submap=result.submap,
             )
-            self._put(self._pose, message)
-        self._put(self._pose, pose_message(arrival, result))
+            self._put(message)
+        self._put(pose_message(arrival, result))
 
     def put_map(self, arrival: ReceivedFrame, update: MapUpdate) -> None:
         """Send what a frame changed in the map."""
-        self._put(self._map, map_message(arrival.message.agent_epoch, update))
+        message = map_message(arrival.message.agent_epoch, update)
+        with self._change_lock:
+            waiting, self._change = self._change, message
+            if waiting is not None:
+                self._change = merged(waiting, message)
+        if waiting is None:
+            self._put("map")
 
-    def _put(self, publisher: Publisher, message: PoseMessage | MapMessage) -> None:
+    def _put(self, entry: PoseMessage | Literal["map"]) -> None:
         before = self._box.dropped
-        self._box.put((publisher, message))
+        self._box.put(entry)
         self._metrics.drop("outbox", self._box.dropped - before)
 
     def _run(self) -> None:
         while (entry := self._box.get()) is not None:
-            publisher, message = entry
-            try:
-                publisher.put(pack(message))
-            except SemcastError as err:
-                self._metrics.drop("unsent")
-                logger.debug("not sent: %s", err)
+            if isinstance(entry, PoseMessage):
+                self._send(self._pose, entry)
+            with self._change_lock:
+                change, self._change = self._change, None
+            if change is not None:
+                self._send(self._map, change)
+
+    def _send(self, publisher: Publisher, message: PoseMessage | MapMessage) -> None:
+        try:
+            publisher.put(pack(message))
+        except SemcastError as err:
+            self._metrics.drop("unsent")
+            logger.debug("not sent: %s", err)
 
     def close(self, deadline_s: float = 2.0) -> None:
         """Send what waits and end the thread. Idempotent."""
@@ -119,4 +139,22 @@ def map_message(agent_epoch: int, update: MapUpdate) -> MapMessage:
         removed=update.removed,
         keyframe_ids=update.keyframe_ids,
         keyframe_poses=update.keyframe_poses,
+    )
+
+
+def merged(earlier: MapMessage, later: MapMessage) -> MapMessage:
+    """Return the change that two changes after each other are together."""
+    if (earlier.agent_epoch, earlier.map_epoch) != (later.agent_epoch, later.map_epoch):
+        return later  # another map
+    stays = ~np.isin(earlier.ids, np.concatenate([later.ids, later.removed]))
+    kept = ~np.isin(earlier.keyframe_ids, later.keyframe_ids)
+    return replace(
+        later,
+        ids=np.concatenate([earlier.ids[stays], later.ids]),
+        xyz=np.concatenate([earlier.xyz[stays], later.xyz]),
+        rgb=np.concatenate([earlier.rgb[stays], later.rgb]),
+        confidence=np.concatenate([earlier.confidence[stays], later.confidence]),
+        removed=np.union1d(np.setdiff1d(earlier.removed, later.ids), later.removed),
+        keyframe_ids=np.concatenate([earlier.keyframe_ids[kept], later.keyframe_ids]),
+        keyframe_poses=np.concatenate([earlier.keyframe_poses[kept], later.keyframe_poses]),
     )
