@@ -5,6 +5,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
@@ -43,6 +44,11 @@ def serve(connection: Connection) -> None:
             return
 
 
+def _send(connection: Connection, problem: BundleProblem | None) -> None:
+    with contextlib.suppress(OSError):  # who waits for the result sees that the child is gone
+        connection.send(problem)
+
+
 class ProcessBundle:
     """Adjusts in a child process that is started again when it dies.
 
@@ -62,6 +68,7 @@ class ProcessBundle:
         self._process: SpawnProcess | None = None
         self._connection: Connection | None = None
         self._pending: BundleProblem | None = None
+        self._sender: threading.Thread | None = None
         self._since_s = 0.0
         self._closed = False
         self._failures = 0
@@ -109,21 +116,24 @@ class ProcessBundle:
             self._on_give_up(GIVEN_UP)
 
     def submit(self, problem: BundleProblem) -> bool:
-        """Send a problem to the child; False while it works on another or has failed for good."""
+        """Give a problem to the child; False while it works on another or has failed for good.
+
+        Sending is done by a thread: a child that is still starting, or stuck, does not read what it is sent,
+        and a problem may be larger than what a pipe holds.
+        """
         if self._closed or self._pending is not None:
             return False
         for _ in range(2):
             if self.given_up:
                 return False
-            assert self._connection is not None
-            try:
-                if self._process is None or not self._process.is_alive():
-                    raise BrokenPipeError
-                self._connection.send(problem)
+            if self._process is not None and self._process.is_alive():
                 self._pending, self._since_s = problem, time.monotonic()
+                self._sender = threading.Thread(
+                    target=_send, args=(self._connection, problem), name="semcast-bundle-send", daemon=True
+                )
+                self._sender.start()
                 return True
-            except (BrokenPipeError, OSError):
-                self._restart()
+            self._restart()
         return False
 
     def take(self, wait: bool = False) -> BundleResult | None:
@@ -159,11 +169,16 @@ class ProcessBundle:
 
     def _stop(self) -> None:
         connection, self._connection = self._connection, None
-        if connection is not None:
-            with contextlib.suppress(OSError):
-                connection.send(None)
-            connection.close()
         process, self._process = self._process, None
+        sender, self._sender = self._sender, None
+        if sender is not None and sender.is_alive() and process is not None:
+            process.kill()  # else it might never be done
+        if sender is not None:
+            sender.join(_CLOSE_DEADLINE_S)
+        if connection is not None:
+            if self._pending is None:
+                _send(connection, None)
+            connection.close()
         if process is not None:
             process.join(_CLOSE_DEADLINE_S if self._pending is None else 0.1)
             if process.is_alive():

@@ -4,6 +4,7 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -79,3 +80,27 @@ def test_a_child_that_hangs_is_ended_and_another_goes_on(wait):
         assert runner.submit(PROBLEM), "the next one is taken"
     finally:
         runner.close()
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_child_that_does_not_read_holds_nobody_up(goes_on):
+    large = replace(PROBLEM, xyz=np.zeros((500_000, 3)))
+    runner = ProcessBundle()
+    try:
+        os.kill(runner.pid, signal.SIGSTOP)
+        taken = []
+        caller = threading.Thread(target=lambda: taken.append(runner.submit(large)), daemon=True)
+        caller.start()
+        caller.join(DEADLINE_S)
+        assert taken == [True]
+        assert runner.take() is None
+        assert runner.busy
+        if goes_on:
+            os.kill(runner.pid, signal.SIGCONT)
+            assert runner.take(wait=True) is not None
+            assert runner.num_restarts == 0
+    finally:
+        since_s = time.monotonic()
+        runner.close()
+    assert time.monotonic() - since_s < DEADLINE_S
+    assert not any(thread.name == "semcast-bundle-send" for thread in threading.enumerate())
