@@ -14,7 +14,7 @@ _MOST_PATIENCE = 8
 class ReplayWindow:
     """Go-back-N over frames. Not synchronised; no network, no clock of its own.
 
-    The receiver says how far it is (``FlowMessage``). Frames its consumer has taken are forgotten, frames
+    The receiver says how far it is (``FlowMessage``). Frames its consumer is done with are forgotten, frames
     that arrived are not sent again unless the receiver was restarted, the others are repeated when nothing
     arrived for a while: so channel and server may be restarted and no frame is missing afterwards.
 
@@ -49,7 +49,7 @@ class ReplayWindow:
 
     @property
     def all_taken(self) -> bool:
-        """Whether the receiver's consumer has every frame."""
+        """Whether the receiver's consumer is done with every frame."""
         return not self._kept
 
     def on_flow(self, flow: FlowMessage) -> None:

@@ -255,7 +255,7 @@ class FlowMessage:
 
     Attributes:
         agent_epoch: Whose frames; 0 when the receiver has seen none yet.
-        next_seq: First frame the consumer has not taken yet; earlier ones need not be kept.
+        next_seq: First frame the consumer is not done with yet; earlier ones need not be kept.
         arrived_seq: First frame that has not arrived yet; earlier ones need not be sent again.
         window: Frames that may be sent from ``next_seq`` on.
     """

@@ -54,7 +54,7 @@ class Arrivals:
     Attributes:
         epoch: Of the newest agent, 0 before the first frame.
         arrived_seq: First frame that has not arrived.
-        next_seq: Lossless: first frame that was not taken by the consumer.
+        next_seq: Lossless: first frame the consumer is not done with.
     """
 
     def __init__(self, *, lossless: bool, drop: Callable[[str, int], None]) -> None:
@@ -109,8 +109,8 @@ class Arrivals:
         self._recent.clear()
         self._age = CaptureAge()
 
-    def took(self, frame: SymbolFrame) -> None:
-        """Note that the consumer has a frame."""
+    def done(self, frame: SymbolFrame) -> None:
+        """Note that the consumer is done with a frame."""
         if frame.agent_epoch == self.epoch:
             self.next_seq = max(self.next_seq, frame.seq + 1)
 

@@ -30,8 +30,8 @@ logger = logging.getLogger(__name__)
 
 Mode = Literal["live", "replay"]
 
-#: Frames under way at most in replay: enough to keep agent, channel and decoder busy at once.
-WINDOW = 4
+#: Frames under way at most in replay: enough to keep agent, channel, decoder and tracker busy at once.
+WINDOW = 6
 FLOW_INTERVAL_S = 0.2
 _RING_CAPACITY = 16
 _CAMERA_TIMEOUT_S = 0.5
@@ -77,10 +77,11 @@ class Receiver:
     """Takes the frames of one agent from the network. ``next`` belongs to one thread.
 
     In ``live`` mode the newest frame wins; in ``replay`` every frame is delivered once and in order, and the
-    agent is told how many it may send. Frames of the other kind are dropped as ``mode``. What does not get to
-    ``next`` is counted in ``metrics`` by reason, see ``Arrivals``; further reasons are ``camera`` (nobody
-    says what the camera is), ``too_old`` and ``protocol``. Agents wait until the role ``server`` is alive:
-    the caller declares that, once its decoder is ready.
+    agent is told how many it may send, and which it may forget: those that are ``done``. Frames of the other
+    kind are dropped as ``mode``. What does not get to ``next`` is counted in ``metrics`` by reason, see
+    ``Arrivals``; further reasons are ``camera`` (nobody says what the camera is), ``too_old`` and
+    ``protocol``. Agents wait until the role ``server`` is alive: the caller declares that, once its decoder
+    is ready.
 
     Args:
         session: An open session.
@@ -249,10 +250,7 @@ class Receiver:
             logger.debug("flow not sent: %s", err)
 
     def next(self, timeout_s: float) -> ReceivedFrame | None:
-        """Return the next frame, None when there is none in time.
-
-        In replay, taking a frame is what lets the agent send another.
-        """
+        """Return the next frame, None when there is none in time; tell when it is ``done``."""
         deadline_s = time.monotonic() + timeout_s
         while not self._stopping.is_set():
             entry = self._take_held() or self._box.get(max(0.0, deadline_s - time.monotonic()))
@@ -306,7 +304,7 @@ class Receiver:
             self._tell_once(
                 f"frames are {message.image_hw}, no coded size of the camera's {camera.intrinsics.shape_hw}"
             )
-            self._took(message)
+            self.done(message)
             return None
         else:
             started_ns = time.perf_counter_ns()
@@ -321,7 +319,6 @@ class Receiver:
             received, snr_db = equalised.received, float(equalised.snr_db)
             self._metrics.observe("equalise", equalise_ms)
             self._report(message, reported_snr_db(message.codec, equalised))
-        self._took(message)
         self._metrics.count("delivered")
         with self._lock:
             snr_db_set = self._snr_set.get((message.agent_epoch, message.frame_id))
@@ -336,9 +333,14 @@ class Receiver:
             equalise_ms=equalise_ms,
         )
 
-    def _took(self, message: SymbolFrame) -> None:
+    def done(self, message: SymbolFrame) -> None:
+        """Note that nothing more is done with a frame, whatever came of it.
+
+        In replay this lets the agent send another and forget this one: one that was received but not tracked
+        would be missing if the server ended now.
+        """
         with self._lock:
-            self._arrivals.took(message)
+            self._arrivals.done(message)
         if self._mode == "replay":
             self._send_flow()
 

@@ -143,21 +143,24 @@ def _line(row: FrameRow) -> str:
 def read_rows(path: Path) -> list[FrameRow]:
     """Read ``frames.jsonl`` up to its last whole line; none where there is no file.
 
+    Of a frame that was tracked again, after its server had ended before it could say so, the last row counts.
+
     Raises:
         SemcastError: A line before the last one is not a row.
     """
     if not path.exists():
         return []
-    rows: list[FrameRow] = []
+    rows: dict[int, FrameRow] = {}
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
     for number, line in enumerate(lines, start=1):
         try:
-            rows.append(FrameRow(**json.loads(line)))
+            row = FrameRow(**json.loads(line))
+            rows[row.frame_id] = row
         except (ValueError, TypeError) as err:
             if number == len(lines):
                 break
             raise SemcastError(f"{path}:{number} is not a frame row: {err}") from err
-    return rows
+    return list(rows.values())
 
 
 def unposed_ranges(frame_ids: list[int], posed: set[int]) -> list[tuple[int, int]]:

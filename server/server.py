@@ -150,6 +150,7 @@ class Server:
     def _on_failure(self, arrival: ReceivedFrame, reason: str) -> None:
         self._metrics.drop(reason)
         self._metrics.error(f"frame {arrival.message.frame_id} dropped: {reason}")
+        self._receiver.done(arrival.message)
 
     def _answer(self, payload: bytes) -> bytes:
         """Answer a control request: ``reset`` begins a new map, ``save`` writes what there is."""
@@ -191,6 +192,7 @@ class Server:
                 if decoded is not None:
                     last_frame_s = now_s
                     self._take(decoded)
+                    self._receiver.done(decoded.arrival.message)
                 elif self._ended(now_s - last_frame_s):
                     break
                 if self._settings.duration_s is not None and now_s - started_s >= self._settings.duration_s:

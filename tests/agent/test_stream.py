@@ -130,6 +130,7 @@ def take(receiver, count=None, deadline_s=60.0, pause_s=0.0):
                 receiver.announce_ready(epoch)
         else:
             frames.append(frame)
+            receiver.done(frame.message)
             if frame.message.final or len(frames) == count:
                 return frames
             tick.wait(pause_s)

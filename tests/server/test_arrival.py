@@ -73,8 +73,8 @@ def test_lossless_takes_each_frame_once_and_in_order(metrics):
     assert accepted(arrivals, [frame(k, lossless=True) for k in order]) == [0, 1, 2, 3, 4]
     assert metrics.drops == {"gap": 2, "duplicate": 2}
     assert (arrivals.arrived_seq, arrivals.next_seq) == (5, 0)
-    arrivals.took(frame(0))
-    arrivals.took(frame(1))
+    arrivals.done(frame(0))
+    arrivals.done(frame(1))
     assert arrivals.next_seq == 2
 
 

@@ -52,9 +52,9 @@ def test_rows_are_on_disk_at_once_and_a_torn_last_line_is_left_out(tmp_path):
 
 
 def test_a_resumed_run_goes_on_behind_its_rows_and_a_new_run_does_not(tmp_path):
-    for resume, expected in ((False, [0]), (True, [0, 0]), (False, [0])):
+    for k, resume, expected in ((0, False, [0]), (1, True, [0, 1]), (1, True, [0, 1]), (1, False, [1])):
         record = RunRecord(tmp_path, resume=resume)
-        record.add(row(0))
+        record.add(row(k))
         record.close()
         record.close()
         assert [r.frame_id for r in record.rows()] == expected

@@ -8,6 +8,7 @@ import pytest
 from semcast.common.errors import ConfigError
 from semcast.common.recording_reader import RecordingReader
 from semcast.server.export.outputs import write_ply
+from semcast.server.receiver import WINDOW
 from semcast.server.recorded_streams import recorded_streams
 from semcast.server.settings import ViewSettings
 from semcast.server.view.rerun_viewer import RerunStream
@@ -114,6 +115,26 @@ def test_a_restarted_server_goes_on_with_the_map_of_its_checkpoint(tmp_path, ope
     step = np.linalg.norm(centre(before[14]) - centre(before[13]))
     for k in after:
         assert np.linalg.norm(centre(after[k]) - centre(before[30 - k])) < 0.5 * step
+
+
+def test_a_lossless_server_that_is_stopped_on_the_way_and_started_again_loses_no_frame(tmp_path, open_air):
+    with open_air() as air:
+        running = air.serve(mode="replay", out=tmp_path)
+        radio = air.agent(100, lossless=True)
+        for k in range(WINDOW):  # more than one is in work
+            radio.send(k)
+        radio.wait(radio.posed_ids, "an answer")
+        tracked = running.finish(stop=True)["frames"]["tracked"]
+    confirmed = radio.allowed - WINDOW
+    assert confirmed <= tracked
+
+    with open_air() as air:
+        running = air.serve(mode="replay", out=tmp_path)
+        radio = air.agent(100, lossless=True)
+        radio.stream(range(confirmed, 24), base_seq=confirmed)
+        summary = running.finish()
+    assert summary["resumed"]
+    assert summary["frames"]["tracked"] == 24
 
 
 def test_another_agent_epoch_does_not_inherit_the_checkpoint(tmp_path, open_air):
