@@ -25,7 +25,7 @@ from semcast.server.mapping.mapper import (
     new_landmarks,
 )
 from semcast.server.mapping.settings import ReconstructionSettings
-from semcast.server.mapping.window import MAX_OBSERVATIONS, scattered
+from semcast.server.mapping.window import within_limit
 
 Array = NDArray[np.float64]
 
@@ -124,13 +124,7 @@ def _adjusted(camera: Intrinsics, start: Start, noise: NoiseModel) -> Start:
     window = start.keyframes[:_WINDOW]
     view, point, xy, confidence = gather_observations(window, start.ids)
     count = np.bincount(point, minlength=len(start.ids))
-    order = np.lexsort((scattered(start.ids), -count))
-    chosen = np.zeros(len(start.ids), bool)
-    chosen[order[np.cumsum(count[order]) <= MAX_OBSERVATIONS]] = True
-    seen = np.flatnonzero(chosen & (count >= 2))
-    row = np.full(len(start.ids), -1, np.intp)
-    row[seen] = np.arange(len(seen))
-    kept = row[point] >= 0
+    seen, kept, point = within_limit(start.ids, point, -count)
     result = optimise(
         BundleProblem(
             intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
@@ -141,7 +135,7 @@ def _adjusted(camera: Intrinsics, start: Start, noise: NoiseModel) -> Start:
             landmark_ids=start.ids[seen],
             xyz=start.xyz[seen],
             view=view[kept],
-            point=row[point[kept]],
+            point=point,
             xy=xy[kept],
             sigma_px=noise.sigma_px(confidence[kept]),
             confidence=confidence[kept],

@@ -5,6 +5,8 @@ little better, a real shelf worse), and a single fixed pose with a distance unti
 window (an orbit better, a drive worse).
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -69,21 +71,12 @@ def build_problem(
     views = [*anchors, *recent]
     view, point, xy, confidence = gather_observations(views, ids)
     count = np.bincount(point, minlength=len(ids))
-    if count.sum() > MAX_OBSERVATIONS:
-        # What ties the window to older keyframes is kept first, then what several keyframes see. Among
-        # those the choice is even: the longest tracks alone would leave the newest one to half of its view.
-        anchored = np.isin(np.arange(len(ids)), point[view < len(anchors)])
-        order = np.lexsort((scattered(ids), -np.minimum(count, _WELL_SEEN), ~anchored))
-        within = np.cumsum(count[order]) <= MAX_OBSERVATIONS
-        chosen = np.zeros(len(ids), bool)
-        chosen[order[within]] = True
-        count = np.where(chosen, count, 0)
-    used_points = np.flatnonzero(count >= 2)
+    # What ties the window to older keyframes is kept first, then what several keyframes see. Among those the
+    # choice is even: the longest tracks alone would leave the newest one to half of its view.
+    anchored = np.isin(np.arange(len(ids)), point[view < len(anchors)])
+    used_points, kept, point = within_limit(ids, point, -np.minimum(count, _WELL_SEEN), ~anchored)
     if len(used_points) < 8:
         return None
-    new_row = np.full(len(ids), -1, np.intp)
-    new_row[used_points] = np.arange(len(used_points))
-    kept = new_row[point] >= 0
     held = np.bincount(view[kept], minlength=len(views))[: len(anchors)] >= _MIN_SHARED
     fixed = np.zeros(len(views), bool)
     fixed[: len(anchors) + (1 if start or held.sum() >= 2 else 2)] = True
@@ -97,7 +90,7 @@ def build_problem(
         landmark_ids=landmark_ids,
         xyz=world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
         view=view[kept],
-        point=new_row[point[kept]],
+        point=point,
         xy=xy[kept],
         sigma_px=noise.sigma_px(confidence[kept]),
         confidence=confidence[kept],
@@ -107,7 +100,33 @@ def build_problem(
     )
 
 
-def scattered(ids: Ids) -> Ids:
+def within_limit(
+    ids: Ids, point: NDArray[np.intp], *priority: NDArray[Any]
+) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.intp]]:
+    """Choose landmarks for an adjustment: seen at least twice, of no more observations than it has time for.
+
+    Args:
+        ids: ``(P,)`` landmarks.
+        point: ``(M,)`` row into ``ids`` of each observation.
+        priority: ``(P,)`` each, as ``np.lexsort`` takes keys: the last one counts first, and lower values go
+            before higher ones. What is alike is chosen as good as at random.
+
+    Returns:
+        Rows of the landmarks that are taken, which observations are (``(M,)`` bool), and the row of each of
+        those into the former.
+    """
+    count = np.bincount(point, minlength=len(ids))
+    order = np.lexsort((_scattered(ids), *priority))
+    chosen = np.zeros(len(ids), bool)
+    chosen[order[np.cumsum(count[order]) <= MAX_OBSERVATIONS]] = True
+    taken = np.flatnonzero(chosen & (count >= 2))
+    row = np.full(len(ids), -1, np.intp)
+    row[taken] = np.arange(len(taken))
+    kept = row[point] >= 0
+    return taken, kept, row[point[kept]]
+
+
+def _scattered(ids: Ids) -> Ids:
     """Return keys that order ids as good as at random, the same every time (multiplicative hashing)."""
     return np.asarray((ids * 2_654_435_761) % 4_294_967_296)
 
