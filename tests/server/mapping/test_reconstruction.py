@@ -13,8 +13,10 @@ from semcast.common.geometry import (
     rotation_angle_deg,
 )
 from semcast.common.phy.slots import BLOCK_PX
+from semcast.server.mapping import reconstruction
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_process import ProcessBundle
+from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
 from semcast.server.mapping.relocalisation import Place, Relocaliser
@@ -246,6 +248,34 @@ def test_another_place_becomes_a_map_of_its_own(room):
     assert (results[7].submap, results[-1].submap) == (0, 1)
     assert results[-1].map_epoch == 0
     assert len(reconstruction.final_trajectory()) >= len(sequence) - 4
+
+
+def test_the_unit_of_a_new_part_is_told_by_its_start_alone(monkeypatch):
+    """Before the start the camera only turned: over that time it was not as fast as before and after."""
+    starts = []
+
+    def noted(camera, start, *rest):
+        starts.append((start, look_back(camera, start, *rest)))
+        return starts[-1][1]
+
+    monkeypatch.setattr(reconstruction, "look_back", noted)
+    truth = [make_transform(np.eye(3), (0.12 * k, 0.05 * np.sin(k), 0.0)) for k in range(8)]
+    truth += [make_transform(exp_so3((0.0, 0.026 * k, 0.0)), (13.0, 0.0, 0.0)) for k in range(30, 0, -1)]
+    truth += [make_transform(np.eye(3), (13.0 - 0.15 * k, 0.05 * np.sin(k), 0.0)) for k in range(1, 26)]
+    core = make(lost_after_frames=2)
+    for k, T in enumerate(truth):
+        result = core.process(frame_of(k, render(T)))
+        if k == 7:
+            speed_map_per_s = core._motion.speed_map_per_s
+        if len(starts) == 2:
+            break
+    start, grown = ([keyframe.frame_id for keyframe in s.keyframes] for s in starts[1])
+    assert result.submap == 1
+    assert grown[0] < start[0], "the part has grown over frames in which the camera turned"
+    trajectory = core.final_trajectory()
+    way = np.linalg.norm(trajectory[start[-1]][:3, 3] - trajectory[start[0]][:3, 3])
+    elapsed_s = (start[-1] - start[0]) * FRAME_NS * 1e-9
+    assert way / elapsed_s == pytest.approx(speed_map_per_s, rel=0.1)
 
 
 def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch):
