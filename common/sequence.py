@@ -112,8 +112,8 @@ def as_rgb(raw: NDArray, *, is_on_black: bool = False) -> NDArray[np.uint8]:
     if raw.shape[2] == 4:
         alpha = raw[:, :, 3:].astype(np.uint16)
         colours = raw[:, :, 2::-1].astype(np.uint16)
-        laid = ((colours * (255 if is_on_black else alpha)) + 255 * (255 - alpha) + 127) // 255
-        return np.minimum(laid, 255).astype(np.uint8)
+        on_black = colours if is_on_black else (colours * alpha + 127) // 255
+        return np.asarray(np.minimum(on_black + (255 - alpha), 255), dtype=np.uint8)
     return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
