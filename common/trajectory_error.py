@@ -72,7 +72,8 @@ def match_times(
     Args:
         estimate_s: ``(N,)`` increasing seconds.
         truth_s: ``(M,)`` increasing seconds.
-        max_gap_s: Pairs further apart are left out; None takes half the truth's median interval.
+        max_gap_s: Pairs further apart are left out; None takes half the median interval of the denser one:
+            a true pose at every tenth frame is not that of the frames around where its own has no estimate.
 
     Returns:
         Indices into ``estimate_s`` and ``truth_s``, both increasing.
@@ -81,7 +82,8 @@ def match_times(
     if len(estimate_s) == 0 or len(truth_s) == 0:
         return empty, empty
     if max_gap_s is None:
-        max_gap_s = float(np.median(np.diff(truth_s))) / 2 if len(truth_s) > 1 else 0.0
+        steps_s = [float(np.median(np.diff(t_s))) for t_s in (estimate_s, truth_s) if len(t_s) > 1]
+        max_gap_s = min(steps_s, default=0.0) / 2
     after = np.clip(np.searchsorted(truth_s, estimate_s), 0, len(truth_s) - 1)
     before = np.maximum(after - 1, 0)
     nearest = np.where(estimate_s - truth_s[before] < np.abs(truth_s[after] - estimate_s), before, after)

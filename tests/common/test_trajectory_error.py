@@ -97,6 +97,17 @@ def test_every_true_time_is_used_once_and_far_times_are_left_out():
     assert match_times(np.zeros(0), np.array([0.0]))[0].size == 0
 
 
+def test_a_sparse_truth_is_not_taken_for_that_of_frames_around_one_without_a_pose():
+    times_s = np.arange(100) * 0.1
+    x_m = np.cumsum(1.0 + 0.5 * np.sin(np.arange(100)))
+    at_tenth = Trajectory(times_s[::10], line(x_m[::10]).T_world_cam)
+    posed = np.delete(np.arange(100), [30, 31, 50])
+    estimate = Trajectory(times_s[posed], line(x_m[posed]).T_world_cam)
+    error = ate(estimate, at_tenth)
+    assert error.rmse_m < 1e-9
+    assert len(error.t_s) == 8
+
+
 @pytest.mark.parametrize(
     "estimate",
     [
