@@ -306,8 +306,7 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
     times_ns = _times_beside(path, len(images), rate_hz)
     projection = _kitti_projection(path / "calib.txt", camera_idx)
     name = path.resolve().name
-    places = (path / "poses.txt", path / f"{name}.txt", path.resolve().parents[1] / "poses" / f"{name}.txt")
-    poses_path = next((place for place in places if place.is_file()), None)
+    poses_path = next((place for place in kitti_pose_places(path) if place.is_file()), None)
     truth = None
     if poses_path is not None:
         _check_times(path, len(images), times_ns)
@@ -327,6 +326,16 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
         return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
     return SequenceFiles(name, images, times_ns, camera, truth)
+
+
+def kitti_pose_places(path: Path) -> tuple[Path, Path, Path]:
+    """Return where the true poses of a KITTI sequence may be: in its folder, or ``poses/`` beside its parent.
+
+    The root of a file system is its own parent.
+    """
+    folder = path.resolve()
+    name = f"{folder.name}.txt"
+    return folder / "poses.txt", folder / name, folder.parent.parent / "poses" / name
 
 
 def _kitti_projection(path: Path, camera_idx: int) -> NDArray[np.float64] | None:

@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, quat_wxyz_from_rotation
 from semcast.common.sequence import open_sequence, truth_at_frames
+from semcast.common.sequence_layouts import kitti_pose_places
 from semcast.common.trajectory import Trajectory, write_tum
 
 CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
@@ -84,6 +86,12 @@ def test_what_is_wrong_with_a_kitti_recording_is_said(tmp_path, write_images, ti
     (tmp_path / "poses.txt").write_text(3 * f"{pose}\n")
     with pytest.raises(SourceError, match=message):
         open_sequence(tmp_path)
+
+
+def test_a_kitti_folder_may_stand_at_the_root_of_a_file_system(tmp_path):
+    root = Path(tmp_path.anchor)
+    assert kitti_pose_places(root / "kitti")[-1] == root / "poses" / "kitti.txt"
+    assert kitti_pose_places(root / "data" / "sequences" / "06")[-1] == root / "data" / "poses" / "06.txt"
 
 
 def test_euroc_layout_gives_poses_of_the_camera_not_of_the_body(tmp_path, write_images, poses):
