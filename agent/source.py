@@ -262,6 +262,8 @@ def _opened(settings: SourceSettings) -> Source:
         return LiveSource(settings)
     if path.is_file() and path.suffix.lower() != ".json":
         return VideoSource(settings)
+    # How fast a recording is played says nothing of when its images were taken.
+    recorded_hz = None if settings.pace == "rate" else settings.rate_hz
     sequence = open_sequence(
         path,
         settings.camera,
@@ -269,6 +271,6 @@ def _opened(settings: SourceSettings) -> Source:
         settings.resize,
         settings.stride,
         settings.max_frames if settings.repeat == "once" else None,
-        settings.rate_hz or 10.0,
+        recorded_hz or 10.0,
     )
     return RecordedSource(sequence, settings)

@@ -41,7 +41,10 @@ class SourceSettings:
     )
     rate_hz: float | None = field(
         default=None,
-        metadata={"help": "frames per second for --pace rate, and for folders that record no times"},
+        metadata={
+            "help": "frames per second for --pace rate; with another pace those at which a folder that "
+            "records no times was taken (10 where nothing is said)"
+        },
     )
     repeat: Repeat = field(
         default="once", metadata={"help": "at the end: stop, start again (loop), or go back (swing)"}

@@ -1,7 +1,7 @@
 """A recorded image sequence with random access: images as the codec gets them, times, camera, true path."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 
@@ -375,6 +375,26 @@ def truth_at_frames(truth: Trajectory, times_ns: NDArray[np.int64], period_s: fl
             continue
         kept.append(k)
     return Trajectory(times_s[kept], np.array(poses)) if kept else None
+
+
+def retimed(truth: Trajectory, times_ns: NDArray[np.int64], t_source_ns: Mapping[int, int]) -> Trajectory:
+    """Bring a true path to the times of a stream: an agent may have said how fast a folder was taken.
+
+    Args:
+        truth: Of a sequence, at the times of its frames.
+        times_ns: ``(N,)`` times of the sequence's frames, by frame id.
+        t_source_ns: Frame id to time in the stream, of frames that came; ids beyond N are of a later pass.
+
+    Returns:
+        The path as it is where the times are the same; else its part between the frames that came.
+    """
+    ids = np.array(sorted(k for k in t_source_ns if k < len(times_ns)), dtype=np.int64)
+    own_s = ns_to_seconds(times_ns[ids])
+    stream_s = ns_to_seconds(np.array([t_source_ns[k] for k in ids.tolist()], dtype=np.int64))
+    if len(ids) < 2 or np.array_equal(own_s, stream_s) or not (np.diff(stream_s) > 0).all():
+        return truth
+    between = (truth.t_s >= own_s[0]) & (truth.t_s <= own_s[-1])
+    return Trajectory(np.interp(truth.t_s[between], own_s, stream_s), truth.T_world_cam[between])
 
 
 def open_sequence(

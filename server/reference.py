@@ -1,7 +1,7 @@
 """The original of what was sent, where it is known: image quality and true path while the run goes on."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
 from semcast.common.messages import CameraInfo, SourceImage
 from semcast.common.recording_reader import RecordingReader
-from semcast.common.sequence import open_sequence
+from semcast.common.sequence import open_sequence, retimed
 from semcast.common.trajectory import Trajectory
 from semcast.common.wire import WireError, unpack
 
@@ -31,14 +31,27 @@ class Reference:
     Args:
         originals: Asked on that thread, with increasing frame ids.
         truth: True path in metres, None where it is not known.
+        times_ns: ``(N,)`` times by frame id on the clock of ``truth``; None where that is the stream's.
     """
 
-    def __init__(self, originals: Originals, truth: Trajectory | None = None) -> None:
+    def __init__(
+        self,
+        originals: Originals,
+        truth: Trajectory | None = None,
+        times_ns: NDArray[np.int64] | None = None,
+    ) -> None:
         self.truth = truth
+        self._times_ns = times_ns
         self._originals = originals
         self._failed = False
         self._job: Future[float | None] | None = None
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="semcast-reference")
+
+    def truth_of(self, t_source_ns: Mapping[int, int]) -> Trajectory | None:
+        """Return the true path on the clock of a stream, given the times of its frames by frame id."""
+        if self.truth is None or self._times_ns is None:
+            return self.truth
+        return retimed(self.truth, self._times_ns, t_source_ns)
 
     def psnr_db(self, frame_id: int, x_hat: NDArray[np.uint8]) -> "Future[float | None] | None":
         """Compare a decoded image with its original.
@@ -80,7 +93,9 @@ def sequence_reference(folder: Path, camera: Intrinsics, given: CameraSettings |
         SourceError: The folder is no sequence.
     """
     sequence = open_sequence(folder, given)
-    return Reference(lambda frame_id: sequence.image(frame_id, camera), sequence.groundtruth())
+    return Reference(
+        lambda frame_id: sequence.image(frame_id, camera), sequence.groundtruth(), sequence.times_ns
+    )
 
 
 def recording_reference(reader: RecordingReader, camera: CameraInfo) -> Reference | None:

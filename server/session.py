@@ -370,7 +370,7 @@ class Session:
 
     def _summary(self, results: Results, drops: Mapping[str, int], complete: bool) -> dict[str, Any]:
         rows = self._record.rows()
-        truth = self._reference.truth if self._reference is not None else None
+        truth = self._reference.truth_of(self._t_source_ns) if self._reference is not None else None
         if truth is not None and rows:
             # Errors are a share of the way that was gone, and not of all that the source has.
             truth = truth.between(rows[0].t_source_ns * 1e-9, rows[-1].t_source_ns * 1e-9)

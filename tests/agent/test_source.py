@@ -117,6 +117,19 @@ def test_a_rate_that_recorded_times_overrule_is_said(recording, tmp_path, caplog
     assert "rate_hz: no effect on" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("how", "step_ns"),
+    [
+        ({"pace": "receiver"}, 100_000_000),
+        ({"pace": "receiver", "rate_hz": 20.0}, 50_000_000),
+        ({"pace": "rate", "rate_hz": 1000.0}, 100_000_000),
+    ],
+)
+def test_a_folder_without_times_has_the_same_however_fast_it_is_played(recording, how, step_ns):
+    _, frames = play(SourceSettings(source=str(recording / "images"), camera=PINHOLE, **how), 3)
+    assert [frame.t_source_ns for frame in frames] == [0, step_ns, 2 * step_ns]
+
+
 def test_a_rate_that_the_times_of_a_video_overrule_is_said(tmp_path, caplog):
     video = tmp_path / "steady.avi"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (64, 48))

@@ -7,7 +7,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
-from semcast.common.sequence import open_sequence
+from semcast.common.sequence import open_sequence, retimed
 from semcast.common.sequence_layouts import natural_key
 from semcast.common.trajectory import Trajectory, write_tum
 
@@ -25,6 +25,20 @@ def test_native_layout_gives_images_times_camera_and_truth(native, poses):
     truth = sequence.groundtruth()
     np.testing.assert_array_equal(truth.t_s, sequence.times_ns * 1e-9)
     np.testing.assert_allclose(truth.T_world_cam, poses(5), atol=1e-6)
+
+
+def test_a_true_path_follows_the_times_that_a_stream_gives_its_frames(native):
+    sequence = open_sequence(native)
+    truth, times_ns = sequence.groundtruth(), sequence.times_ns
+    same = dict(enumerate(times_ns.tolist()))
+    assert retimed(truth, times_ns, same) is truth
+    assert retimed(truth, times_ns, {}) is truth
+    # Three times as fast, the first frame and one between were lost, and the source begins again.
+    stream = {1: 5_000_000_000, 3: 5_066_666_667, 4: 5_100_000_000, 5: 5_133_333_333}
+    there = retimed(truth, times_ns, stream)
+    np.testing.assert_allclose(there.t_s, [5.0, 5.0333333335, 5.066666667, 5.1], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(there.T_world_cam, truth.T_world_cam[1:])
+    assert {stream[k] * 1e-9 for k in (1, 3, 4)} <= set(there.t_s.tolist()), "a frame's time is met exactly"
 
 
 def test_text_files_may_come_from_windows_editors(native):

@@ -1,5 +1,6 @@
 """Image quality against the recorded originals."""
 
+import shutil
 import threading
 from pathlib import Path
 
@@ -45,6 +46,19 @@ def test_frames_are_compared_with_the_original_of_their_number_at_their_size():
     assert other < 20
     assert len(reference.truth) == 51
     reference.close()
+    reference.close()
+
+
+def test_the_true_path_is_that_of_the_frames_whatever_times_the_agent_gives_them(tmp_path):
+    untimed = tmp_path / "untimed"
+    shutil.copytree(DEMO, untimed, ignore=shutil.ignore_patterns("times.txt"))
+    sequence = open_sequence(untimed)
+    reference = sequence_reference(untimed, sequence.intrinsics)
+    t_source_ns = {k: round(k * 1e9 / 30.0) for k in range(5, 40)}
+    there = reference.truth_of(t_source_ns)
+    np.testing.assert_array_equal(there.t_s, np.array(list(t_source_ns.values())) * 1e-9)
+    np.testing.assert_array_equal(there.positions, sequence.groundtruth().positions[5:40])
+    assert reference.truth_of({}) is reference.truth
     reference.close()
 
 
