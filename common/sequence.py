@@ -208,20 +208,7 @@ class Sequence:
         self._stored_camera = camera
         self._size_wh = resized_wh(*size_wh, resize)
         self._rectify = ImageRectifier(camera, self._size_wh)
-        self._truth = (
-            truth_at_frames(files.groundtruth, self.times_ns, _frame_period_s(files.times_ns))
-            if files.groundtruth is not None
-            else None
-        )
-        if self._truth is None and files.groundtruth is not None and len(files.groundtruth):
-            true_s, own_s = files.groundtruth.t_s, ns_to_seconds(self.times_ns)
-            logger.warning(
-                "%s: none of its %d true poses, from %.3f to %.3f s, is at the time of an image, "
-                "from %.3f to %.3f s: they are not used",
-                self.name,
-                len(true_s),
-                *(true_s[0], true_s[-1], own_s[0], own_s[-1]),
-            )
+        self._truth = _truth_of(files, self.times_ns)
 
     def __len__(self) -> int:
         return len(self._paths)
@@ -327,6 +314,35 @@ class Sequence:
         Times are exactly ``times_ns * 1e-9`` of the frames; frames without a true pose nearby are absent.
         """
         return self._truth
+
+
+def _truth_of(files: SequenceFiles, times_ns: NDArray[np.int64]) -> Trajectory | None:
+    """Return the true poses at some of a recording's frames; say so where it has some, but none at those."""
+    if files.groundtruth is None:
+        return None
+    truth = truth_at_frames(files.groundtruth, times_ns, _frame_period_s(files.times_ns))
+    if truth is None and len(files.groundtruth):
+        true_s, own_s = files.groundtruth.t_s, ns_to_seconds(times_ns)
+        logger.warning(
+            "%s: none of its %d true poses, from %.3f to %.3f s, is at the time of an image, "
+            "from %.3f to %.3f s: they are not used",
+            files.name,
+            len(true_s),
+            *(true_s[0], true_s[-1], own_s[0], own_s[-1]),
+        )
+    return truth
+
+
+def open_truth(path: Path) -> tuple[Trajectory | None, NDArray[np.int64]]:
+    """Return a recording's true path, None without one, and the times of its frames by frame id.
+
+    Its images and its camera, which may be unknown, are not looked at.
+
+    Raises:
+        SourceError: A part is missing or damaged.
+    """
+    files = read_layout(path, "auto", 10.0)
+    return _truth_of(files, files.times_ns), files.times_ns
 
 
 def _frame_period_s(times_ns: NDArray[np.int64]) -> float:

@@ -15,6 +15,7 @@ from semcast.common.nets.onnx_encoder import encoder_path
 from semcast.common.recording import RecordingWriter, recording_metadata
 from semcast.common.run_folder import RECONSTRUCTION_NAME, RunData, write_run
 from semcast.common.trajectory import Trajectory, write_tum
+from semcast.common.trajectory_error import ate
 from semcast.describe import describe
 from semcast.server.run_record import FrameRow, RunRecord
 
@@ -248,6 +249,28 @@ def test_plots_as_svg_name_what_they_show(run_folder, tmp_path, capsys):
     # The estimate is the truth at half the size, which Sim(3) removes.
     assert (out / "trajectory.svg").stat().st_size > 5_000
     assert (out / "timeline.svg").stat().st_size > 5_000
+
+
+def test_a_plot_takes_the_true_path_of_the_frames_whatever_their_camera_and_times(
+    run_folder, tmp_path, monkeypatch
+):
+    sequence = tmp_path / "sequence"
+    write_images(sequence, 6)
+    # The user gave another camera, and the rate: without times.txt these count ten images a second.
+    wrong = {"fx": 9, "fy": 9, "cx": 4, "cy": 4, "width": 8, "height": 8}
+    (sequence / "intrinsics.json").write_text(json.dumps(wrong))
+    truth = straight_path()
+    write_tum(sequence / "groundtruth.txt", Trajectory(np.arange(6) * 0.1, truth.T_world_cam))
+    summary = {"settings": {"reference": str(sequence)}}
+    (run_folder / "summary.json").write_text(json.dumps(summary))
+    drawn = []
+    monkeypatch.setattr(
+        "semcast.evaluation.run_plots.plot_run", lambda run, out, form: drawn.append(run) or []
+    )
+    assert main(["plot", str(run_folder)]) == 0
+    (run,) = drawn
+    np.testing.assert_allclose(run.truth.t_s, truth.t_s)
+    assert len(ate(run.trajectory, run.truth).t_s) == 6
 
 
 def test_a_folder_that_is_no_run_is_one_clear_error(tmp_path, capsys):

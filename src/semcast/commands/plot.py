@@ -28,22 +28,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Draw the pictures and name their files on stdout."""
     from semcast.common.errors import SourceError
+    from semcast.common.run_folder import FRAMES_NAME
     from semcast.common.run_summary import read_summary
-    from semcast.common.sequence import open_sequence
+    from semcast.common.sequence import open_truth, retimed
     from semcast.common.trajectory import read_tum
     from semcast.evaluation.run_plots import RunToPlot, plot_run
+    from semcast.server.run_record import read_rows
 
     folder: Path = arguments.run
     truth = None
     if arguments.truth is not None:
         is_tum = arguments.truth.is_file() and arguments.truth.suffix.lower() != ".json"
-        truth = read_tum(arguments.truth) if is_tum else open_sequence(arguments.truth).groundtruth()
+        truth = read_tum(arguments.truth) if is_tum else open_truth(arguments.truth)[0]
         if truth is None:
             raise SourceError(f"{arguments.truth} is a sequence without a true path")
     else:
         reference = read_summary(folder).get("settings", {}).get("reference")
         if reference and Path(reference).exists():
-            truth = open_sequence(Path(reference)).groundtruth()
+            truth, times_ns = open_truth(Path(reference))
+            if truth is not None:
+                rows = read_rows(folder / FRAMES_NAME)
+                truth = retimed(truth, times_ns, {row.frame_id: row.t_source_ns for row in rows})
         elif reference:
             logger.warning("the sequence %s is gone: no true path is drawn; give it by --truth", reference)
     files = plot_run(RunToPlot.read(folder, truth), arguments.out or folder / "plots", arguments.format)
