@@ -170,7 +170,9 @@ def _row(
     if truth is not None and len(posed) >= 3:
         # The same places at the times of this pass.
         at_ns = {k: k * interval_ns for k, _ in seen}
-        places = {k: truth.T_world_cam[_nearest(truth, frames[index].t_source_ns)] for k, index in seen}
+        true_poses = dict(zip(truth.t_s.tolist(), truth.T_world_cam, strict=True))
+        own_s = {k: frames[index].t_source_ns * 1e-9 for k, index in seen}
+        places = {k: true_poses[t_s] for k, t_s in own_s.items() if t_s in true_poses}
         summary = trajectory_summary(trajectory_of(posed, at_ns), trajectory_of(places, at_ns), len(seen))
         row["ate_rmse_m"] = summary["ate_rmse_m"]
         # Of one pass, as for a run that ends there: ridden back and forth, the path grows and errors do not.
@@ -178,7 +180,3 @@ def _row(
         if summary["ate_rmse_m"] is not None and one_pass_m > 0:
             row["ate_percent"] = 100.0 * summary["ate_rmse_m"] / one_pass_m
     return row
-
-
-def _nearest(truth: Trajectory, t_source_ns: int) -> int:
-    return int(np.argmin(np.abs(np.asarray(truth.t_s) - t_source_ns * 1e-9)))
