@@ -4,11 +4,14 @@ import threading
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from semcast import demo
+from semcast.cli import main
 from semcast.commands.demo import summary_table, why_no_pose
+from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recording_reader import RecordingReader
@@ -53,6 +56,12 @@ def test_a_damaged_first_image_is_no_reason_not_to_play_a_recording(tmp_path, mo
     recorded = open_sequence(folder)
     assert choose_playback(DemoSettings(out=tmp_path), recorded).resize == 0.5
     assert np.array_equal(seen[0], recorded.image(2))
+
+
+def write_images(folder, count):
+    folder.mkdir()
+    for k in range(count):
+        cv2.imwrite(str(folder / f"{k}.png"), np.full((48, 64, 3), 20 * k, np.uint8))
 
 
 def commands_of(settings):
@@ -244,6 +253,19 @@ def test_errors_are_shown_with_three_digits(value, told):
     names, values = ([str(cell) for cell in column.cells] for column in table.columns)
     assert values == ["98.8%", told]
     assert len(names) == 2
+
+
+def test_a_camera_given_by_hand_takes_the_place_of_one_that_does_not_fit_the_images(tmp_path, monkeypatch):
+    sequence = tmp_path / "halved"
+    write_images(sequence, 3)
+    Intrinsics(fx=90, fy=90, cx=63.5, cy=47.5, width=128, height=96).save(sequence / "intrinsics.json")
+    called = []
+    monkeypatch.setattr(
+        "semcast.commands.demo.run_demo", lambda settings, *_: called.append(settings) or (None, None)
+    )
+    words = ["demo", "--sequence", str(sequence), "--out", str(tmp_path / "run")]
+    assert main([*words, "--focal-35mm", "26"]) == 1, "no summary was written"
+    assert [settings.camera.focal_35mm for settings in called] == [26.0]
 
 
 def test_a_demo_without_a_pose_says_why():

@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo; exit code 1 when no frame got a pose."""
     settings = read_settings(DemoSettings, arguments)
     talk = plain_console(stderr=True)
-    frames = len(open_sequence(settings.sequence or default_sequence()))
+    frames = len(open_sequence(settings.sequence or default_sequence(), settings.camera))
     result: dict[str, Any] = {}
     failures: list[str] = []
 
