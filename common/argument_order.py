@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
-_NEGATIVE = re.compile(r"-\.?\d")
+#: How a negative number begins, ``-1.8e-05`` too.
+NEGATIVE = re.compile(r"-\.?\d")
 
 
 class SeveralValues(argparse.Action):
@@ -58,7 +59,7 @@ def arguments_last(parser: argparse.ArgumentParser, words: Sequence[str]) -> lis
     end = words.index("--") if "--" in words else len(words)
     kept = list(words[:end])
     moved: list[str] = []
-    flags = [k for k, word in enumerate(kept) if word.startswith("-") and not _NEGATIVE.match(word)]
+    flags = [k for k, word in enumerate(kept) if word.startswith("-") and not NEGATIVE.match(word)]
     for start, stop in reversed(list(pairwise([*flags, end]))):
         flag, values = parser._option_string_actions.get(kept[start]), kept[start + 1 : stop]
         if not isinstance(flag, SeveralValues) or len(values) < 2 or flag.can_take(values[-1]):

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
-from semcast.common.argument_order import SeveralValues
+from semcast.common.argument_order import NEGATIVE, SeveralValues
 from semcast.common.config import (
     MissingSettingError,
     build_settings,
@@ -104,6 +104,8 @@ def add_flags(parser: argparse.ArgumentParser, cls: type, skip: frozenset[str] =
         cls: A settings class.
         skip: Dotted field names the command fills itself.
     """
+    # That of older Pythons, 3.11 among them, takes a negative number with an exponent for a flag.
+    parser._negative_number_matcher = NEGATIVE
     for flag in _flags_of(cls, skip):
         text = (str(flag.field.metadata.get("help", "")) + _default_text(flag.default)).replace("%", "%%")
         options = _flag_options(flag.annotation, flag.field.metadata.get("takes"))

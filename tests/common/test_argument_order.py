@@ -29,6 +29,8 @@ def parse(text):
     ("text", "expected"),
     [
         ("--levels 0 -0.5 .1 mine.mcap", Player(file=Path("mine.mcap"), levels=(0.0, -0.5, 0.1))),
+        ("--levels .2 -1.8e-05 -2E3", Player(levels=(0.2, -1.8e-05, -2000.0))),
+        ("--levels -1e-05 mine.mcap", Player(file=Path("mine.mcap"), levels=(-1e-05,))),
         ("--levels 1 mine.mcap --loud", Player(file=Path("mine.mcap"), levels=(1.0,), loud=True)),
         ("mine.mcap --levels 1 2", Player(file=Path("mine.mcap"), levels=(1.0, 2.0))),
         ("--levels 1 -- mine.mcap", Player(file=Path("mine.mcap"), levels=(1.0,))),
