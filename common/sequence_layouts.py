@@ -314,10 +314,9 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
         if projection is not None:
             t_cam_cam0 = np.linalg.solve(projection[:, :3], projection[:, 3])
             poses = poses @ make_transform(np.eye(3), -t_cam_cam0)
-        # The first poses of a cut recording are still those of its images.
         if len(poses) < len(times_ns):
             raise SourceError(f"{poses_path} must have a pose per image, got {len(poses)} of {len(times_ns)}")
-        truth = Trajectory(ns_to_seconds(times_ns), poses[: len(times_ns)])
+        truth = Trajectory(ns_to_seconds(times_ns), poses[_kitti_rows(images, len(poses))])
 
     def camera(width: int, height: int) -> Intrinsics | None:
         if projection is None:
@@ -326,6 +325,18 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
         return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
     return SequenceFiles(name, images, times_ns, camera, truth)
+
+
+def _kitti_rows(images: tuple[Path, ...], num_rows: int) -> NDArray[np.int64]:
+    """Return which rows of a file are those of a recording's images, which may be cut out of a longer one.
+
+    KITTI numbers its images; where these have other names they are taken for the first.
+    """
+    rows = np.arange(len(images), dtype=np.int64)
+    if num_rows == len(images) or not all(p.stem.isascii() and p.stem.isdecimal() for p in images):
+        return rows
+    numbers = [int(p.stem) for p in images]
+    return np.array(numbers, dtype=np.int64) if max(numbers, default=0) < num_rows else rows
 
 
 def kitti_pose_places(path: Path) -> tuple[Path, Path, Path]:

@@ -88,6 +88,19 @@ def test_what_is_wrong_with_a_kitti_recording_is_said(tmp_path, write_images, ti
         open_sequence(tmp_path)
 
 
+@pytest.mark.parametrize(("pattern", "first"), [("{:06d}.png", 0), ("{:06d}.png", 4), ("night_{}.png", 0)])
+def test_images_cut_out_of_a_kitti_recording_keep_their_poses(tmp_path, write_images, poses, pattern, first):
+    write_images(tmp_path / "image_0", 8, pattern)
+    for path in sorted((tmp_path / "image_0").iterdir())[:first]:
+        path.unlink()
+    for path in sorted((tmp_path / "image_0").iterdir())[3:]:
+        path.unlink()
+    lines = (" ".join(f"{v:.9f}" for v in T[:3].ravel()) for T in poses(8))
+    (tmp_path / "poses.txt").write_text("\n".join(lines) + "\n")
+    found = open_sequence(tmp_path).groundtruth().T_world_cam
+    np.testing.assert_allclose(found, poses(8)[first : first + 3], atol=1e-7)
+
+
 def test_a_kitti_folder_may_stand_at_the_root_of_a_file_system(tmp_path):
     root = Path(tmp_path.anchor)
     assert kitti_pose_places(root / "kitti")[-1] == root / "poses" / "kitti.txt"
