@@ -9,6 +9,14 @@ def independent_losses(num: int, probability: float, rng: np.random.Generator) -
     return rng.random(num) < probability
 
 
+def least_burst(bad_share: float) -> float:
+    """Return the mean length that bursts must have at least, for so many slots to be bad.
+
+    Not above the very limit, where a single good slot parts them, by what 1 - ``bad_share`` is rounded off.
+    """
+    return (1.0 - 1e-9) * bad_share / (1.0 - bad_share)
+
+
 def gilbert_elliott(
     num: int, bad_share: float, mean_burst: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
@@ -31,8 +39,8 @@ def gilbert_elliott(
         raise ValueError(f"mean_burst must be at least 1, got {mean_burst}")
     leave_bad = 1.0 / mean_burst
     leave_good = leave_bad * bad_share / (1.0 - bad_share)
-    if leave_good > 1.0:
-        least = bad_share / (1.0 - bad_share)
+    least = least_burst(bad_share)
+    if mean_burst < least:
         raise ValueError(
             f"mean_burst must be at least {least:g} for a share of {bad_share}, got {mean_burst}"
         )

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal, get_args
 
+from semcast.channel.erasure import least_burst
 from semcast.channel.trace import SNR_RANGE_DB
 
 ChannelName = Literal["awgn", "rayleigh", "rician", "erasure", "burst", "trace"]
@@ -113,7 +114,7 @@ class ChannelSettings:
         _check_range("trace_step_db", self.trace_step_db, 0.0, 10.0)
         _check_range("delay_ms", self.delay_ms, 0.0, 10000.0)
         _check_range("jitter_ms", self.jitter_ms, 0.0, 10000.0)
-        least = self.slot_loss / (1.0 - self.slot_loss)
+        least = least_burst(self.slot_loss)
         if self.channel == "burst" and self.burst_slots < least:
             raise ValueError(
                 f"burst_slots must be at least {least:g} for a slot_loss of {self.slot_loss:g}, "

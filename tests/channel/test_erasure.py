@@ -19,7 +19,7 @@ def test_independent_losses_have_their_rate_and_no_memory(rng):
     assert abs(after_loss.mean() - 0.2) < 4 * math.sqrt(0.16 / after_loss.size)
 
 
-@pytest.mark.parametrize(("share", "mean_burst"), [(0.2, 4.0), (0.1, 10.0), (0.5, 1.0)])
+@pytest.mark.parametrize(("share", "mean_burst"), [(0.2, 4.0), (0.1, 10.0), (0.5, 1.0), (0.8, 4.0)])
 def test_bursts_have_their_share_and_mean_length(share, mean_burst, rng):
     bad = gilbert_elliott(200_000, share, mean_burst, rng)
     lengths = run_lengths(bad)

@@ -32,6 +32,11 @@ def test_bad_settings_name_field_value_and_range(values, message):
         ChannelSettings(**values)
 
 
+def test_bursts_may_be_as_short_as_their_share_allows():
+    for share, slots in ((0.8, 4.0), (0.9, 9.0), (0.99, 99.0)):
+        assert ChannelSettings(channel="burst", slot_loss=share, burst_slots=slots).burst_slots == slots
+
+
 def test_settings_are_read_from_toml_values():
     settings = build_settings(ChannelSettings, {"channel": "erasure", "snr_db": 4})
     assert (settings.channel, settings.snr_db, settings.slot_loss) == ("erasure", 4.0, 0.2)
