@@ -174,7 +174,7 @@ class SymbolFrame:
         return layout_for(self.image_hw)
 
     def consistent(self) -> None:
-        """Check that grid, payload and loss mask belong together, and that levels rise.
+        """Check that levels rise, grid, payload and loss mask belong together and received samples can be sent.
 
         Raises:
             FieldError: They don't.
@@ -188,12 +188,20 @@ class SymbolFrame:
                 f"slots of a {self.image_hw} image must be {layout.num_slots}x{layout.uses_per_slot}, "
                 f"got {self.num_slots}x{self.uses_per_slot}",
             )
+        received_bytes = 4 * layout.num_uses
+        if received_bytes > MAX_PAYLOAD_BYTES:
+            # Small on its way to the channel, or lost, it would become large only where it is worked on.
+            raise FieldError(
+                "range",
+                f"samples of a {self.image_hw} image must have at most {MAX_PAYLOAD_BYTES} bytes, "
+                f"got {received_bytes}",
+            )
         if self.direction == "tx":
             symbols = layout.num_slots * layout.data_per_slot
             packed = (symbols + 1) // 2
             sizes = {"qam16": packed, "qam16_shaped": packed, "iq16": 4 * symbols}
         else:
-            sizes = {"iq16": 4 * layout.num_uses, "lost": 0}
+            sizes = {"iq16": received_bytes, "lost": 0}
         if self.payload_format not in sizes:
             raise FieldError("range", f"payload_format {self.payload_format} is not for {self.direction}")
         if len(self.payload) != sizes[self.payload_format]:

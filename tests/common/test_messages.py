@@ -5,6 +5,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import EncodedImage
+from semcast.common.message_fields import FieldError
 from semcast.common.messages import CameraInfo, SymbolFrame
 from semcast.common.phy.qam import SHAPED_SPACING, constellation
 from semcast.common.phy.slots import layout_for
@@ -114,6 +115,20 @@ def test_a_lost_frame_is_all_zero_and_lost_slots_are_the_flagged_ones():
     message = frame(direction="rx", payload_format="lost", slot_lost=pack_lost(lost))
     assert not slots_of(message).any()
     np.testing.assert_array_equal(lost_slots_of(message), lost)
+
+
+@pytest.mark.parametrize("direction", ["tx", "rx"])
+def test_frames_too_large_to_be_received_are_refused_before_they_are_worked_on(direction):
+    layout = layout_for((8192, 8192))
+    packed = bytes((layout.num_slots * layout.data_per_slot + 1) // 2)
+    changes = {"image_hw": (8192, 8192), "num_slots": layout.num_slots, "uses_per_slot": layout.uses_per_slot}
+    if direction == "tx":
+        changes |= {"payload_format": "qam16", "payload": packed}
+    else:
+        changes |= {"direction": "rx", "payload_format": "lost", "slot_lost": bytes(layout.num_slots // 8)}
+    with pytest.raises(FieldError, match="must have at most 16777216 bytes, got 50331648") as refused:
+        frame(**changes).consistent()
+    assert refused.value.reason == "range"
 
 
 def test_directions_are_not_mixed_up():
