@@ -154,8 +154,15 @@ class Run:
             [{name: v for name, v in group.items() if name != "params"} for group in o.param_groups]
             for o in self.optimisers
         ]
-        for optimiser, saved, groups in zip(self.optimisers, state["optimisers"], fresh, strict=True):
-            optimiser.load_state_dict(saved)
+        try:
+            for optimiser, saved in zip(self.optimisers, state["optimisers"], strict=True):
+                optimiser.load_state_dict(saved)
+        except ValueError as err:
+            raise CheckpointError(
+                f"checkpoint {self.checkpoint_path} was made with another optimiser or only_heads: give the "
+                "same, another out, or resume = false"
+            ) from err
+        for optimiser, groups in zip(self.optimisers, fresh, strict=True):
             for group, values in zip(optimiser.param_groups, groups, strict=True):
                 group.update(values)
         self.step, self.elapsed_s = state["step"], state["elapsed_s"]
@@ -349,7 +356,8 @@ def train(
 
     Raises:
         SourceError: There are no images.
-        CheckpointError: The checkpoint in ``out`` belongs to another architecture or is damaged.
+        CheckpointError: The checkpoint in ``out`` belongs to another architecture or other optimisers, or is
+            damaged.
         ConfigError: ``start`` or ``grow_from`` does not suit the architecture.
     """
     world = int(os.environ.get("WORLD_SIZE", "1"))

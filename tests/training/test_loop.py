@@ -161,6 +161,18 @@ def test_a_checkpoint_of_another_architecture_is_refused(tiny_network, photos, t
         train(settings_for(photos, tmp_path / "run", architecture="other"))
 
 
+@pytest.mark.parametrize("change", ["optimiser", "only_heads"])
+def test_a_checkpoint_of_other_optimisers_is_refused(change, tiny_network, photos, tmp_path):
+    settings = settings_for(photos, tmp_path / "run", steps=1)
+    done = train(settings)
+    other = {
+        "optimiser": {"optimiser": "adamw" if settings.optimiser == "muon" else "muon"},
+        "only_heads": {"only_heads": True, "grow_from": done.weights},
+    }[change]
+    with pytest.raises(CheckpointError, match="was made with another optimiser or only_heads"):
+        train(replace(settings, steps=2, **other))
+
+
 def test_a_damaged_checkpoint_is_refused(tiny_network, photos, tmp_path):
     (tmp_path / "last.pt").write_bytes(b"nothing")
     with pytest.raises(CheckpointError, match="can't be read"):
