@@ -11,6 +11,9 @@ from torch import Tensor
 
 from semcast.common.codec import LOST_SLOT_SNR_DB
 
+#: Networks are told no more than this.
+_MAX_SNR_DB = 30.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelSettings:
@@ -43,12 +46,20 @@ class ChannelSettings:
     )
 
     def __post_init__(self) -> None:
+        for name in ("snr_min_db", "snr_max_db"):
+            value = getattr(self, name)
+            if not LOST_SLOT_SNR_DB <= value <= _MAX_SNR_DB:
+                raise ValueError(f"{name} must be in [{LOST_SLOT_SNR_DB:g}, {_MAX_SNR_DB:g}], got {value:g}")
         if self.snr_min_db > self.snr_max_db:
             raise ValueError(f"snr_min_db must be <= snr_max_db ({self.snr_max_db}), got {self.snr_min_db}")
         for name in ("share_16qam", "share_faded", "share_lossy", "lost_max"):
             value = getattr(self, name)
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {value}")
+        for name in ("feedback_sd_db", "estimate_sd_db"):
+            value = getattr(self, name)
+            if not 0.0 <= value <= _MAX_SNR_DB:
+                raise ValueError(f"{name} must be in [0, {_MAX_SNR_DB:g}], got {value:g}")
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ class CropSettings:
                 "scale_min and scale_max must be in (0, 2] and ordered, "
                 f"got {self.scale_min}, {self.scale_max}"
             )
+        if not 0.0 <= self.share_grey <= 1.0:
+            raise ValueError(f"share_grey must be in [0, 1], got {self.share_grey}")
 
 
 def read_images(folder: Path) -> list[NDArray[np.uint8]]:

@@ -1,5 +1,6 @@
 """The loss terms: reconstruction, descriptor consistency, confidence."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -44,9 +45,9 @@ class LossSettings:
 
     def __post_init__(self) -> None:
         for name in ("mse", "descriptor", "confidence", "mse_knee"):
-            if getattr(self, name) < 0.0:
+            if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
-        if self.confidence_sharpness <= 0.0:
+        if not 0.0 < self.confidence_sharpness < math.inf:
             raise ValueError(f"confidence_sharpness must be > 0, got {self.confidence_sharpness}")
 
 

@@ -1,5 +1,6 @@
 """Settings of a training run."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -7,6 +8,9 @@ from typing import Literal
 from semcast.training.channel import ChannelSettings
 from semcast.training.data import CropSettings
 from semcast.training.losses import LossSettings
+
+#: The seed of a step is made of this one, the step and the process, and has 63 bits.
+_MAX_SEED = 2**32 - 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,11 +101,13 @@ class TrainSettings:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}")
         for name in ("warmup_steps", "minutes", "threads", "weight_decay"):
-            if getattr(self, name) < 0:
+            if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
         for name in ("lr", "lr_muon", "lr_linear", "clip"):
-            if getattr(self, name) <= 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
+        if not 0 <= self.seed <= _MAX_SEED:
+            raise ValueError(f"seed must be in [0, {_MAX_SEED}], got {self.seed}")
         if self.only_heads and self.grow_from is None:
             raise ValueError("grow_from must name the weights whose heads are trained when only_heads is set")
         if self.only_heads and self.loss.confidence == 0.0:

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -62,3 +64,6 @@ def test_shares_and_ranges_are_checked():
         ChannelSettings(share_lossy=1.5)
     with pytest.raises(ValueError, match="snr_min_db must be <="):
         ChannelSettings(snr_min_db=20.0)
+    for values in ({"snr_min_db": math.nan}, {"snr_min_db": -500.0}, {"feedback_sd_db": -1.0}):
+        with pytest.raises(ValueError, match=next(iter(values)) + " must be in"):
+            ChannelSettings(**values)

@@ -98,3 +98,5 @@ def test_crop_settings_are_checked():
         CropSettings(scale_min=0.9, scale_max=0.5)
     with pytest.raises(ValueError, match=r"scale_max must be in \(0, 2\] and ordered, got 0.5, 2.5"):
         CropSettings(scale_max=2.5)
+    with pytest.raises(ValueError, match=r"share_grey must be in \[0, 1\], got 18"):
+        CropSettings(share_grey=18.0)

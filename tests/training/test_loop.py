@@ -1,4 +1,5 @@
 import json
+import math
 import os
 import socket
 import subprocess
@@ -201,6 +202,15 @@ def test_settings_are_checked():
         TrainSettings(batch=0)
     with pytest.raises(ValueError, match="lr must be > 0"):
         TrainSettings(lr=0.0)
+    for values in (
+        {"lr": math.nan},
+        {"clip": math.inf},
+        {"minutes": math.nan},
+        {"seed": -1},
+        {"seed": 2**40},
+    ):
+        with pytest.raises(ValueError, match=next(iter(values)) + " must be"):
+            TrainSettings(**values)
 
 
 def test_heads_alone_leave_every_image_as_it_is(tiny_network, photos, tmp_path):

@@ -121,3 +121,5 @@ def test_each_term_can_be_switched_on():
 def test_bad_weights_are_refused():
     with pytest.raises(ValueError, match="descriptor must be >= 0, got -1"):
         LossSettings(descriptor=-1.0)
+    with pytest.raises(ValueError, match="mse must be >= 0, got nan"):
+        LossSettings(mse=math.nan)
