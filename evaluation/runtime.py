@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from semcast.common.codec import DEFAULT_CODEC
-from semcast.common.errors import SemcastError
+from semcast.common.codecs import LEARNED_CODECS, available_codecs
+from semcast.common.errors import ConfigError, SemcastError
 from semcast.evaluation.report import json_ready, provenance, write_json
 
 VERB = "eval runtime"
@@ -125,8 +126,12 @@ def evaluate_runtime(settings: RuntimeSettings) -> dict[str, Any]:
         codec has no weights or no exported encoder; and provenance.
 
     Raises:
+        ConfigError: A codec is not a learned one: neither runtime nor instruction set makes it another.
         SemcastError: No variant ran.
     """
+    for name in settings.codecs:
+        if name in available_codecs() and name not in LEARNED_CODECS:
+            raise ConfigError(f"codec must be a learned one, got {name!r}, which has no runtime to choose")
     children: list[_Child] = []
     try:
         for variant in variants(settings):

@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from semcast.common.errors import SemcastError
+from semcast.common.errors import ConfigError, SemcastError
 from semcast.evaluation.runtime import RuntimeSettings, evaluate_runtime, variants
 
 
@@ -25,6 +25,13 @@ def test_all_variants_are_timed(tmp_path):
     for row in report["results"]:
         assert 0.0 < row["p50_ms"] <= row["p95_ms"]
         assert row["fps"] == pytest.approx(1000.0 / row["p50_ms"])
+
+
+def test_a_codec_without_a_runtime_is_not_timed_under_the_name_of_one():
+    with pytest.raises(ConfigError, match="codec must be a learned one, got 'jpeg-ldpc'"):
+        evaluate_runtime(
+            RuntimeSettings(codecs=("jpeg-ldpc",), width=32, height=32, threads=(1,), rounds=1, calls=1)
+        )
 
 
 def test_an_unknown_codec_is_one_clear_error():
