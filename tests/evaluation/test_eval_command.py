@@ -84,3 +84,20 @@ def test_without_a_file_the_table_is_printed_and_it_is_said_that_nothing_else_is
     assert "written" not in said.err
     assert "PSNR dB" in said.out
     assert "{" not in said.out
+
+
+@pytest.mark.parametrize(
+    ("words", "idle"),
+    [
+        (["--channel", "rayleigh", "--slot-loss", "0.5"], "slot_loss: no effect on channel rayleigh"),
+        (["--channel", "trace", "--trace", "file"], "snr_db: no effect on channel trace"),
+        (["--channel", "erasure", "--slot-loss", "0.5"], None),
+    ],
+)
+def test_what_does_nothing_on_the_channel_is_said(words, idle, codec_words, tmp_path, caplog):
+    if "file" in words:
+        (tmp_path / "trace.csv").write_text("t_s,snr_db\n0,12\n")
+        words = [*words, "--trace-file", str(tmp_path / "trace.csv")]
+    assert main([*codec_words, *words]) == 0
+    said = [record.message for record in caplog.records if "no effect" in record.message]
+    assert said == ([] if idle is None else [idle + " as it is set"])

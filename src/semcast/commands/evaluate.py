@@ -12,6 +12,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from semcast.channel.emulator import warn_of_idle
 from semcast.commands.console import plain_console
 from semcast.commands.running import add_settings, read_settings
 from semcast.evaluation import codec, confidence, endurance, latency, pairs, recording, runtime, trajectory
@@ -125,6 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
     elif settings.json is None:
         _tell("only the table will be left of this run: --json FILE keeps all figures")
     check_outputs(settings.json, out)
+    _warn_of_idle_link(settings)
     before_ns = _write_times_ns(out)
     with talk.status(f"{text} ..."):
         report = evaluate(settings)
@@ -140,6 +142,13 @@ def run(arguments: argparse.Namespace) -> int:
     for path in written:
         _tell(f"written: {path}")
     return 0
+
+
+def _warn_of_idle_link(settings: Any) -> None:
+    """Say which values of the channel do nothing on it, the SNRs of a trace from a file too."""
+    if hasattr(settings, "link"):
+        link = replace(settings.link, snr_db=settings.snr_db[0])
+        warn_of_idle(link, link.without_effect())
 
 
 def _tell(line: str) -> None:
