@@ -18,6 +18,7 @@ from semcast.common.codec import Codec
 from semcast.common.codecs import load_codec
 from semcast.common.errors import SourceError, TransportError
 from semcast.common.keys import camera_key, flow_key, link_key, tx_key
+from semcast.common.message_fields import sendable
 from semcast.common.messages import CameraInfo, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.rate import RateControl
@@ -53,8 +54,7 @@ def camera_info(settings: AgentSettings, source: Source, codec: Codec, agent_epo
         codec=codec.name,
         digest=codec.digest,
         modulation=codec.modulation,
-        # The name of a folder may hold bytes that are no text.
-        source_name=source.name[:200].encode("utf-8", "replace").decode(),
+        source_name=sendable(source.name, 200),
         num_frames=source.num_frames,
         last_frame_id=source.last_frame_id,
         lossless=settings.mode == "replay",

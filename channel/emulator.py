@@ -16,6 +16,7 @@ from semcast.common.config import build_settings, settings_to_dict
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import channel_key, control_key, rx_key, tx_key
 from semcast.common.mailbox import Mailbox
+from semcast.common.message_fields import sendable
 from semcast.common.messages import ChannelReport, ControlReply, ControlRequest, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
@@ -163,7 +164,7 @@ class Emulator:
             request = unpack(payload, ControlRequest)
             return pack(ControlReply(ok=True, settings=self._control(request)))
         except SemcastError as err:
-            return pack(ControlReply(ok=False, error=str(err)[:1000]))
+            return pack(ControlReply(ok=False, error=sendable(str(err), 1000)))
 
     def _control(self, request: ControlRequest) -> dict[str, Any]:
         if request.op not in ("get", "set"):

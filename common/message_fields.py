@@ -263,6 +263,11 @@ def _short(value: Any) -> str:
     return text if len(text) <= 40 else text[:37] + "..."
 
 
+def sendable(text: str, max_chars: int) -> str:
+    """Return what may be sent of a text for people; names of files may hold what is no text."""
+    return text[:max_chars].encode("utf-8", "replace").decode()
+
+
 def rule(how: Any) -> dict[str, Any]:
     """Return dataclass field metadata that carries a check."""
     return {"wire": how}

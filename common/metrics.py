@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from semcast.common.message_fields import sendable
 from semcast.common.messages import StatusMessage
 
 #: Times kept per stage, and so what percentiles are over.
@@ -68,7 +69,7 @@ class Metrics:
     def error(self, text: str) -> None:
         """Remember one line as the last error."""
         with self._lock:
-            self._last_error = text[:1000]
+            self._last_error = sendable(text, 1000)
             self._counts["errors"] = self._counts.get("errors", 0) + 1
 
     @property

@@ -13,6 +13,7 @@ from semcast.common.codec import Codec, Modulation
 from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.keys import camera_key, control_key, map_key
+from semcast.common.message_fields import sendable
 from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
 from semcast.common.metrics import Metrics
 from semcast.common.sequence import open_sequence
@@ -163,7 +164,7 @@ class Server:
         # A busy server answers that it will serve it.
         error = (self._desk.ask(request.op, SERVE_WAIT_S) or "") if request.op != "get" else ""
         values = {"mode": self._settings.mode, "view": self._settings.view.view}
-        return pack(ControlReply(ok=not error, error=error[:1000], settings=values))
+        return pack(ControlReply(ok=not error, error=sendable(error, 1000), settings=values))
 
     def _answer_map(self, _payload: bytes) -> bytes | None:
         """Give the whole map to who comes late."""

@@ -83,6 +83,11 @@ def test_the_status_travels(metrics, clock):
     assert metrics.summary()["stage_ms"]["encode"] == {"p50": 4.0, "p95": 4.0, "max": 4.0}
 
 
+def test_an_error_about_a_file_whose_name_is_no_text_does_not_end_the_status(metrics):
+    metrics.error("room\udcff can't be written to")
+    assert unpack(pack(metrics.status(1)), StatusMessage).last_error == "room? can't be written to"
+
+
 def test_the_closing_line_says_what_was_dropped(metrics):
     metrics.count("sent", 45)
     assert metrics.closing_line("sent") == "45 frames sent; dropped: none"

@@ -1,5 +1,6 @@
 """What other processes ask of a server."""
 
+import os
 import time
 
 import pytest
@@ -42,5 +43,19 @@ def test_a_save_that_fails_is_answered_and_the_stream_goes_on(tmp_path, air, cap
     assert reply.error in caplog.text
     assert running.server._metrics.status(100).last_error == reply.error
     radio.stream([2, 3])
+    with pytest.raises(SemcastError, match="map.ply"):
+        running.finish(stop=True)
+
+
+def test_a_save_that_fails_in_a_folder_whose_name_is_no_text_is_answered(tmp_path, air, monkeypatch):
+    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
+    folder = tmp_path / os.fsdecode(b"out\xff")
+    (folder / "map.ply").mkdir(parents=True)
+    running = air.serve(out=folder)
+    radio = air.agent(100)
+    radio.stream([0, 1])
+    reply = radio.ask("save")
+    assert not reply.ok
+    assert reply.error.startswith(f"outputs can't be written to {tmp_path}/out?: ")
     with pytest.raises(SemcastError, match="map.ply"):
         running.finish(stop=True)
