@@ -7,6 +7,9 @@ from typing import Any
 
 import numpy as np
 
+#: Largest whole number that travels.
+MAX_COUNT = 2**63 - 1
+
 
 class FieldError(Exception):
     """A value is not what the field allows.
@@ -25,7 +28,7 @@ class WholeNumber:
     """An ``int`` in [low, high]."""
 
     low: int = 0
-    high: int = 2**63 - 1
+    high: int = MAX_COUNT
 
     def load(self, value: Any) -> int:
         """Return the value as received."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from semcast.common.message_fields import sendable
+from semcast.common.message_fields import MAX_COUNT, sendable
 from semcast.common.messages import StatusMessage
 
 #: Times kept per stage, and so what percentiles are over.
@@ -50,7 +50,7 @@ class Metrics:
         """Count dropped frames; ``by`` 0 is allowed and counts nothing."""
         if by:
             with self._lock:
-                self._drops[reason] = self._drops.get(reason, 0) + by
+                self._drops[reason] = min(self._drops.get(reason, 0) + by, MAX_COUNT)
 
     def observe(self, stage: str, duration_ms: float) -> None:
         """Add the duration of one run of a stage."""

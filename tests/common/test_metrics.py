@@ -88,6 +88,12 @@ def test_an_error_about_a_file_whose_name_is_no_text_does_not_end_the_status(met
     assert unpack(pack(metrics.status(1)), StatusMessage).last_error == "room? can't be written to"
 
 
+def test_absurd_numbers_of_missing_frames_do_not_end_the_status(metrics):
+    for _ in range(2):
+        metrics.drop("missing", 2**63 - 1)  # what one frame with an absurd number leaves missing
+    assert unpack(pack(metrics.status(1)), StatusMessage).drops == {"missing": 2**63 - 1}
+
+
 def test_the_closing_line_says_what_was_dropped(metrics):
     metrics.count("sent", 45)
     assert metrics.closing_line("sent") == "45 frames sent; dropped: none"
