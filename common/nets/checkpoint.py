@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ MAX_BYTES = 16 * 1024 * 1024
 #: Raised when keys of the manifest change, or when the same weights mean another network (2: leaky units;
 #: 3: told how well values arrive, not how they travel).
 FORMAT = 3
+_KINDS = {"architecture": str, "sizes": dict, "sha256": str, "snr_range_db": list, "modulations": list}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -100,15 +102,29 @@ def read_manifest(weights: Path) -> Manifest:
     wanted = {f.name for f in dataclasses.fields(Manifest)}
     if set(raw) != wanted:
         raise CheckpointError(f"manifest {path} must have the keys {sorted(wanted)}, got {sorted(raw)}")
-    raw["snr_range_db"] = tuple(raw["snr_range_db"])
-    raw["modulations"] = tuple(raw["modulations"])
-    manifest = Manifest(**raw)
+    for key, kind in _KINDS.items():
+        if not isinstance(raw[key], kind):
+            raise CheckpointError(f"{key} in manifest {path} must be {kind.__name__}, got {raw[key]!r:.80}")
+    low_db, high_db = _snr_range_db(raw["snr_range_db"], path)
+    manifest = Manifest(
+        **{**raw, "snr_range_db": (low_db, high_db), "modulations": tuple(raw["modulations"])}
+    )
     digest = file_sha256(weights)
     if digest != manifest.sha256:
         raise CheckpointError(
             f"weights {weights} have sha256 {digest[:16]}, the manifest says {manifest.sha256[:16]}"
         )
     return manifest
+
+
+def _snr_range_db(value: list[Any], path: Path) -> tuple[float, float]:
+    try:
+        low_db, high_db = (float(end) for end in value)
+    except (TypeError, ValueError):
+        low_db, high_db = math.nan, math.nan
+    if not -math.inf < low_db <= high_db < math.inf:
+        raise CheckpointError(f"snr_range_db in manifest {path} must be two ascending numbers, got {value}")
+    return low_db, high_db
 
 
 def load_transceiver(weights: Path) -> tuple[Transceiver, Manifest]:
@@ -118,8 +134,14 @@ def load_transceiver(weights: Path) -> tuple[Transceiver, Manifest]:
         CheckpointError: Anything does not fit; the message says what.
     """
     manifest = read_manifest(weights)
-    with torch.device("meta"):
-        model = build(manifest.architecture, manifest.sizes)
+    try:
+        with torch.device("meta"):
+            model = build(manifest.architecture, manifest.sizes)
+    except (TypeError, ValueError, RuntimeError) as err:
+        why = str(err).partition("\n")[0]
+        raise CheckpointError(
+            f"sizes in manifest {manifest_path(weights)} make no {manifest.architecture}: {why}"
+        ) from err
     try:
         tensors = load_file(weights)
     except (OSError, SafetensorError) as err:

@@ -166,6 +166,15 @@ def test_a_changed_weights_file_is_refused(weights):
         ({"format": 99}, "format 3, got 99"),
         ({"format": 1}, "format 3, got 1"),
         ({"more": 1}, "must have the keys"),
+        ({"architecture": ["3dcsc"]}, "architecture in manifest .* must be str"),
+        ({"sizes": 3}, "sizes in manifest .* must be dict, got 3"),
+        ({"modulations": None}, "modulations in manifest .* must be list, got None"),
+        ({"snr_range_db": [14.0, 0.0]}, "must be two ascending numbers"),
+        ({"snr_range_db": ["low"]}, "must be two ascending numbers"),
+        (
+            {"sizes": {"widths": 8, "encoder_units": 1, "decoder_units": 1, "confidence_channels": 8}},
+            "sizes in manifest .* make no 3dcsc",
+        ),
         (
             {
                 "sizes": {
