@@ -174,7 +174,7 @@ class SymbolFrame:
         return layout_for(self.image_hw)
 
     def consistent(self) -> None:
-        """Check that levels rise, grid, payload and loss mask belong together and received samples can be sent.
+        """Check that levels rise, grid, payload and losses belong together, and received samples can be sent.
 
         Raises:
             FieldError: They don't.
