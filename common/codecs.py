@@ -10,7 +10,6 @@ from semcast.common.codec import MODULATIONS, Codec, Modulation
 from semcast.common.config import near_match
 from semcast.common.conventional_source import ImageFormat
 from semcast.common.errors import ConfigError
-from semcast.common.phy.equaliser import Equalised
 
 Runtime = Literal["auto", "torch", "onnx"]
 
@@ -43,17 +42,9 @@ def available_codecs() -> list[str]:
     return [*_shipped_weights(), *_conventional_names()]
 
 
-def reported_snr_db(codec: str, equalised: Equalised) -> float:
-    """Return the SNR in dB that a receiver reports to the transmitter of a codec.
-
-    Learned codecs are told the link's average. A conventional one has to choose what still gets through, and
-    is told the SNR of a steady link that carries as much.
-    """
-    if codec not in _conventional_names():
-        return equalised.snr_db
-    from semcast.common.conventional import reachable_snr_db
-
-    return reachable_snr_db(equalised)
+def is_conventional(codec: str) -> bool:
+    """Tell whether a codec of this name is made of an image format and a channel code."""
+    return codec in _conventional_names()
 
 
 def _choose_runtime(runtime: Runtime, weights: Path | None) -> Literal["torch", "onnx"]:

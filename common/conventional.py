@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from semcast.common.codec import LOST_SLOT_SNR_DB, DecodedImage, EncodedImage, Modulation, ReceivedImage
 from semcast.common.conventional_source import ImageFormat, compress_to_fit, decompress
 from semcast.common.conventional_transport import Transport, hash_words
-from semcast.common.phy.equaliser import Equalised
 from semcast.common.phy.qam import indices_to_symbols
 from semcast.common.phy.slots import SlotLayout, layout_for
 from semcast.common.shapes import check_shape
@@ -48,7 +47,7 @@ class Mode:
         bits_per_symbol: 2, 4 or 6.
         rate: Information bits per coded bit.
         min_snr_db: Link SNR from which on a 768x512 image gets through (measured, AWGN with pilots), with
-            a margin of about half a dB.
+            a margin of about ``MODE_MARGIN_DB``.
     """
 
     bits_per_symbol: int
@@ -56,6 +55,7 @@ class Mode:
     min_snr_db: float
 
 
+MODE_MARGIN_DB = 0.5
 FIXED_MODE = Mode(bits_per_symbol=4, rate=0.5, min_snr_db=7.0)
 #: Ascending in bits per channel use. The receiver learns the position in this table.
 ADAPTIVE_MODES = (
@@ -68,26 +68,6 @@ ADAPTIVE_MODES = (
     Mode(bits_per_symbol=4, rate=0.8, min_snr_db=11.7),
     Mode(bits_per_symbol=6, rate=0.7, min_snr_db=15.4),
 )
-
-
-#: SNR in dB from which on a symbol of so many bits carries all of them, about.
-_ENOUGH_DB = {2: 8.0, 4: 15.0, 6: 21.0}
-
-
-def reachable_snr_db(equalised: Equalised) -> float:
-    """Return the SNR in dB by which an adaptive transmitter chooses a mode that gets through this link.
-
-    That of a steady link that carries as much: by the highest mode of which the slots, none of which counts
-    for more than its constellation holds, carry what it needs.
-    """
-    reachable = LOST_SLOT_SNR_DB
-    for mode, above in zip(ADAPTIVE_MODES, (*ADAPTIVE_MODES[1:], None), strict=True):
-        steady_db = equalised.steady_snr_db(_ENOUGH_DB[mode.bits_per_symbol])
-        if steady_db >= mode.min_snr_db:
-            # Not so far that the next mode, which was not asked yet, would be taken.
-            most_db = np.inf if above is None else np.nextafter(above.min_snr_db, -np.inf)
-            reachable = float(min(steady_db, most_db))
-    return reachable
 
 
 def _activity_class(image: NDArray[np.uint8]) -> NDArray[np.intp]:

@@ -241,7 +241,7 @@ class LinkReport:
     Attributes:
         agent_epoch: Whose frame.
         frame_id: Of the frame.
-        snr_db_estimate: What the transmitter should expect, see ``codecs.reported_snr_db``.
+        snr_db_estimate: What the transmitter should expect, see ``link_report``.
         t_capture_ns: The agent's own time of capture, for the age.
         num_superseded: Frames of this epoch that arrived and were passed over so far, since newer ones came.
     """

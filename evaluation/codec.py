@@ -19,15 +19,17 @@ from semcast.channel.settings import ChannelSettings
 from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.codec import (
     DEFAULT_CODEC,
+    LOST_SLOT_SNR_DB,
     Codec,
     DecodedImage,
     EncodedImage,
     Modulation,
     ReceivedImage,
 )
-from semcast.common.codecs import LEARNED_CODECS, load_codec, reported_snr_db
+from semcast.common.codecs import LEARNED_CODECS, is_conventional, load_codec
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.image import psnr_db
+from semcast.common.link_report import LinkReporter
 from semcast.common.phy.slots import layout_for
 from semcast.common.rate import NATIVE_RATE, Rate, from_coded, to_coded
 from semcast.common.sequence import read_image
@@ -52,6 +54,7 @@ _LOST_GREY = 128
 _STRIP_SNR_DB = 10.0
 _STRIP_IMAGES = 2
 _FRAME_INTERVAL_S = 0.1
+_SOUNDING_FRAME = 10**6
 #: Every third pixel of a map is graded.
 _PIXEL_STEP = 3
 
@@ -146,8 +149,9 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
     """Send every image through every codec at every SNR and measure what arrives.
 
     A lost frame or an outage counts with the grey picture the receiver shows then, and in ``outage``. The
-    transmitter is told what the receiver reported on the image before, and before the first the SNR that is
-    set.
+    transmitter is told what the receiver reported on the image before; before the first, a learned one is
+    told the SNR that is set, and one that chooses a rate what the receiver reported on a frame that is not
+    counted.
 
     Args:
         settings: What to measure.
@@ -179,11 +183,17 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         samples: dict[str, list[_Sample]] = {label: [] for label in under_name}
         # One link per codec for all images, so that traces and fading go on from image to image; all see the
         # same noise, which belongs to the image's number.
-        told_db = dict.fromkeys(under_name, snr_db)
         links = {label: Link(replace(settings.link, snr_db=snr_db), settings.seed) for label in under_name}
+        reporters = {label: LinkReporter(codec.name) for label, codec in under_name.items()}
+        told_db = {
+            label: _told_at_first(
+                codec, next(iter(images.values())), links[label], reporters[label], settings
+            )
+            for label, codec in under_name.items()
+        }
         for k, (name, image) in enumerate(images.items()):
             for label, codec in under_name.items():
-                sample = _run(codec, image, links[label], k, told_db[label], settings)
+                sample = _run(codec, image, links[label], reporters[label], k, told_db[label], settings)
                 samples[label].append(sample)
                 told_db[label] = sample.report_db
             if snr_db == strip_snr_db and len(strip) < _STRIP_IMAGES:
@@ -254,8 +264,28 @@ def _warm_up(codecs: Iterable[Codec], image: NDArray[np.uint8]) -> None:
             codec.decode(received)
 
 
+def _told_at_first(
+    codec: Codec, image: NDArray[np.uint8], link: Link, reporter: LinkReporter, settings: CodecSettings
+) -> float:
+    """Return what the transmitter is told before the first image.
+
+    Who chooses a rate asks the link first: a frame that is not counted, of a number that no image has.
+    """
+    if not is_conventional(codec.name):
+        return link.settings.snr_db
+    encoded = codec.encode(to_coded(image, settings.rate), link.settings.snr_db)
+    sounding = link.receive(encoded, 0.0, _SOUNDING_FRAME)
+    return LOST_SLOT_SNR_DB if sounding is None else reporter.snr_db(sounding)
+
+
 def _run(
-    codec: Codec, image: NDArray[np.uint8], link: Link, k: int, told_db: float, settings: CodecSettings
+    codec: Codec,
+    image: NDArray[np.uint8],
+    link: Link,
+    reporter: LinkReporter,
+    k: int,
+    told_db: float,
+    settings: CodecSettings,
 ) -> _Sample:
     start_ns = time.perf_counter_ns()
     encoded = codec.encode(to_coded(image, settings.rate), told_db)
@@ -281,7 +311,7 @@ def _run(
         "outage": float(decoded.outage),
         "snr_db_estimate": None if equalised is None else equalised.snr_db,
     }
-    report_db = told_db if equalised is None else reported_snr_db(codec.name, equalised)
+    report_db = told_db if equalised is None else reporter.snr_db(equalised)
     return _Sample(figures, _grade_confidence(decoded, image), times_ms, decoded, report_db)
 
 

@@ -18,8 +18,9 @@ from semcast.channel.settings import ChannelSettings
 from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
-from semcast.common.codecs import load_codec, reported_snr_db
+from semcast.common.codecs import load_codec
 from semcast.common.errors import ConfigError, SourceError
+from semcast.common.link_report import LinkReporter
 from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.sequence import Sequence as RecordedSequence
@@ -184,10 +185,11 @@ def run_frames(
     if (codec is None) != (link is None):
         raise ValueError("codec and link must be given both or neither")
     feedback_db = link.settings.snr_db if link is not None else 0.0
+    reporter = LinkReporter(codec.name) if codec is not None else None
     for frame_id in frame_ids:
         original = sequence.image(frame_id)
         t_source_ns = int(sequence.times_ns[frame_id])
-        if codec is None or link is None:
+        if codec is None or link is None or reporter is None:
             clean = DecodedImage(original, np.ones(original.shape[:2], dtype=np.float32))
             yield LinkedFrame(frame_id, t_source_ns, original, clean, None, None, {})
             continue
@@ -210,7 +212,7 @@ def run_frames(
             levels=encoded.levels,
         )
         stage_ms["equalise"] = _elapsed_ms(since)
-        feedback_db = reported_snr_db(codec.name, equalised)
+        feedback_db = reporter.snr_db(equalised)
         since = time.perf_counter_ns()
         decoded = codec.decode(equalised.received)
         stage_ms["decode"] = _elapsed_ms(since)

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import ReceivedImage
-from semcast.common.codecs import reported_snr_db
 from semcast.common.errors import TransportError
 from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.levels import Levels
+from semcast.common.link_report import LinkReporter
 from semcast.common.mailbox import Mailbox
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
@@ -115,6 +115,7 @@ class Receiver:
         self._cameras: dict[int, CameraInfo] = {}
         self._snr_set: OrderedDict[tuple[int, int], float] = OrderedDict()
         self._num_superseded = 0
+        self._reporter: tuple[tuple[int, str], LinkReporter] | None = None
         self._roles: set[str] = set()
         self._told: set[str] = set()
         self._link = session.publisher(link_key(agent_id), "newest")
@@ -318,7 +319,7 @@ class Receiver:
             equalise_ms = (time.perf_counter_ns() - started_ns) * 1e-6
             received, snr_db = equalised.received, float(equalised.snr_db)
             self._metrics.observe("equalise", equalise_ms)
-            self._report(message, reported_snr_db(message.codec, equalised))
+            self._report(message, self._reporter_of(message).snr_db(equalised))
         self._metrics.count("delivered")
         with self._lock:
             snr_db_set = self._snr_set.get((message.agent_epoch, message.frame_id))
@@ -357,6 +358,12 @@ class Receiver:
             self._on_camera(answer)
         with self._lock:
             return self._cameras.get(epoch)
+
+    def _reporter_of(self, message: SymbolFrame) -> LinkReporter:
+        stream = (message.agent_epoch, message.codec)
+        if self._reporter is None or self._reporter[0] != stream:
+            self._reporter = (stream, LinkReporter(message.codec))
+        return self._reporter[1]
 
     def _report(self, message: SymbolFrame, snr_db: float) -> None:
         with self._lock:

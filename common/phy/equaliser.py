@@ -24,8 +24,6 @@ NOMINAL_SNR_DB = 10.0
 #: A slot whose noise differs from the pooled noise by more standard deviations than this keeps its own.
 OUTLIER_SIGMAS = 3.7
 _POOLING_ROUNDS = 4
-#: Quantile of the normal distribution.
-_ONE_IN_TWENTY = 1.645
 _LOWER_QUARTILE_SIGMAS = -0.6745
 
 
@@ -94,27 +92,6 @@ class Equalised:
     received: ReceivedImage
     snr_db: float
     channel: ChannelEstimate
-
-    def steady_snr_db(self, enough_db: float = np.inf) -> float:
-        """Return the SNR in dB of a link without fading and losses that a rate may be chosen by.
-
-        Such a link carries ``log(1 + snr)``. A code that spans all slots has the mean of that over the slots,
-        lost ones with 0; one frame of twenty has ``_ONE_IN_TWENTY`` standard errors less than another, not
-        counting what the estimate of each gain varies by itself. Slots are taken to differ independently:
-        where bursts or slow fading hit many together, more than one frame of twenty has less.
-
-        Args:
-            enough_db: Above this SNR a slot carries no more: what is lost elsewhere can't be made up for by
-                symbols that hold so many bits and no others.
-        """
-        snr = 10.0 ** (self.received.effective_snr_db.astype(np.float64) / 10.0)
-        snr[self.received.effective_snr_db <= LOST_SLOT_SNR_DB] = 0.0
-        carried = np.log1p(np.minimum(snr, 10.0 ** (enough_db / 10.0)))
-        variance = float(np.var(carried))
-        if self.channel.num_pilots:
-            variance -= float(np.mean(2.0 * snr / (self.channel.num_pilots * np.square(1.0 + snr))))
-        error = np.sqrt(2.0 * max(variance, 0.0) / carried.size)  # of the difference of two frames
-        return _to_db(float(np.expm1(np.maximum(np.mean(carried) - _ONE_IN_TWENTY * error, 0.0))))
 
 
 def _to_db(ratio: float) -> float:

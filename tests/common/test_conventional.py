@@ -5,12 +5,13 @@ import pytest
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import ReceivedImage
-from semcast.common.codecs import available_codecs, load_codec, reported_snr_db
+from semcast.common.codecs import available_codecs, load_codec
 from semcast.common.conventional import ADAPTIVE_MODES, ConventionalCodec
 from semcast.common.conventional_source import compress, compress_to_fit, decompress, supported
 from semcast.common.conventional_transport import Transport
 from semcast.common.errors import ConfigError
 from semcast.common.image import psnr_db
+from semcast.common.link_report import LinkReporter
 from semcast.common.phy.qam import indices_to_symbols, symbols_to_indices
 from semcast.common.phy.slots import layout_for
 
@@ -79,11 +80,11 @@ def test_lost_slots_leave_the_adaptive_codec_few_outages(snr_db, picture):
     """What a strong link has in excess in some slots can't make up for those that are lost."""
     codec, image = load_codec("jpeg-amc"), np.vstack([picture] * 3)
     link = Link(ChannelSettings(channel="erasure", slot_loss=0.2, snr_db=snr_db), 4)
-    reported_db, outages = snr_db, 0
+    reporter, reported_db, outages = LinkReporter(codec.name), snr_db, 0
     for k in range(30):
         equalised = link.receive(codec.encode(image, reported_db), 0.1 * k)
         outages += codec.decode(equalised.received).outage
-        reported_db = reported_snr_db(codec.name, equalised)
+        reported_db = reporter.snr_db(equalised)
     assert outages <= 4
 
 

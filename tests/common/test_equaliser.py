@@ -152,33 +152,3 @@ def test_wrong_sizes_are_named():
         equalise(np.zeros((2, 48), np.complex64), (32, 32), "16qam")
     with pytest.raises(ValueError, match=r"slot_lost must have shape \(2\), got \(3,\)"):
         equalise(np.zeros((2, 96), np.complex64), (32, 32), "16qam", slot_lost=np.zeros(3, bool))
-
-
-def steady(snr, lost, *enough_db):
-    layout = layout_for((64, 64))
-    known = ChannelKnowledge(
-        h=np.ones(layout.num_slots, np.complex64), noise_var=(1 / np.array(snr)).astype(np.float32)
-    )
-    slots = insert_pilots(np.ones((layout.num_slots, layout.data_per_slot), np.complex64))
-    lost = np.array(lost, bool)
-    return equalise(slots, (64, 64), "16qam", slot_lost=lost, knowledge=known).steady_snr_db(*enough_db)
-
-
-def test_the_steady_snr_is_the_links_own_where_all_slots_are_alike():
-    assert steady([5, 5, 5, 5], [0, 0, 0, 0]) == pytest.approx(10 * math.log10(5), abs=1e-3)
-
-
-def test_the_steady_snr_carries_what_slots_carry_less_a_margin():
-    # 2, 2, 4 and 4 bits: 3 on average with a standard deviation of 1, so half of it for the mean of four.
-    bits = 3 - 1.645 * math.sqrt(2) * 0.5
-    assert steady([3, 3, 15, 15], [0, 0, 0, 0]) == pytest.approx(10 * math.log10(2**bits - 1), abs=1e-3)
-
-
-def test_a_slot_carries_no_more_than_is_enough():
-    assert steady([5, 5, 5, 5], [0, 0, 0, 0], 3.0) == pytest.approx(3.0, abs=1e-3)
-    assert steady([1000, 1000, 1000, 1000], [0, 0, 0, 1]) > steady([1000] * 4, [0, 0, 0, 1], 15.0) + 5.0
-
-
-def test_a_lost_slot_carries_nothing():
-    assert steady([3, 3, 3, 3], [0, 0, 0, 1]) < steady([3, 3, 3, 3], [0, 0, 0, 0]) - 3
-    assert steady([3, 3, 3, 3], [1, 1, 1, 1]) == LOST_SLOT_SNR_DB

@@ -1,0 +1,103 @@
+"""The report on a link: what a steady one carries, learned from a few frames."""
+
+import math
+
+import numpy as np
+import pytest
+
+from semcast.channel.link import Link
+from semcast.channel.settings import ChannelSettings
+from semcast.common.codec import LOST_SLOT_SNR_DB, EncodedImage
+from semcast.common.conventional import ADAPTIVE_MODES, MODE_MARGIN_DB
+from semcast.common.link_report import LinkReporter, SlotSnrs, reachable_snr_db, steady_snr_db
+from semcast.common.phy.qam import constellation
+from semcast.common.phy.slots import layout_for
+
+
+def frames(*snrs):
+    return [SlotSnrs(np.array(snr, float), 0) for snr in snrs]
+
+
+def db(ratio):
+    return 10 * math.log10(ratio)
+
+
+def test_the_steady_snr_is_the_links_own_where_all_slots_are_alike():
+    assert steady_snr_db(frames([5, 5, 5, 5]), 30.0) == pytest.approx(db(5))
+
+
+def test_the_steady_snr_carries_what_slots_carry_less_what_one_frame_of_twenty_has_less():
+    # 2, 2, 4 and 4 bits: 3 on average with a standard deviation of 1, so half of it for the mean of four.
+    one = 3 - 1.645 * math.sqrt(2) * 0.5
+    assert steady_snr_db(frames([3, 3, 15, 15]), 30.0) == pytest.approx(db(2**one - 1) + MODE_MARGIN_DB)
+    three = 3 - 1.645 * math.sqrt(4 / 3) * 0.5
+    known = frames(*[[3, 3, 15, 15]] * 3)
+    assert steady_snr_db(known, 30.0) == pytest.approx(db(2**three - 1) + MODE_MARGIN_DB)
+
+
+def test_the_margin_of_the_modes_is_not_counted_twice():
+    slots = np.full(32, 10.0)
+    slots[::2] = 9.0  # fluctuates by far less than the modes' own margin
+    mean = np.expm1(np.log1p(slots).mean())
+    assert steady_snr_db(frames(slots), 30.0) == pytest.approx(db(mean))
+
+
+def test_a_slot_carries_no_more_than_is_enough_and_a_lost_one_nothing():
+    assert steady_snr_db(frames([5, 5, 5, 5]), 3.0) == pytest.approx(3.0)
+    assert steady_snr_db(frames([1000] * 3 + [0]), 30.0) > steady_snr_db(frames([1000] * 3 + [0]), 15.0) + 5
+    assert steady_snr_db(frames([3, 3, 3, 0]), 30.0) < steady_snr_db(frames([3, 3, 3, 3]), 30.0) - 3
+    assert steady_snr_db(frames([0, 0, 0, 0]), 30.0) == LOST_SLOT_SNR_DB
+    assert reachable_snr_db(frames([0, 0, 0, 0])) == LOST_SLOT_SNR_DB
+
+
+def test_no_mode_is_reached_that_its_constellation_cannot_hold():
+    # A third of the slots lost: 64-QAM of rate .7 would need more than all bits of the others.
+    lossy = frames([1e4, 1e4, 0] * 20)
+    assert ADAPTIVE_MODES[4].min_snr_db <= reachable_snr_db(lossy) < ADAPTIVE_MODES[5].min_snr_db
+
+
+HW = (512, 256)
+
+
+def reports(reporter, settings, numbers, seed=0):
+    layout = layout_for(HW)
+    rng = np.random.default_rng(9)
+    symbols = constellation()[rng.integers(0, 16, (layout.num_slots, layout.data_per_slot))]
+    link = Link(settings, seed)
+    encoded = EncodedImage(HW, symbols, "16qam")
+    return [reporter.snr_db(link.receive(encoded, 0.1 * k, k)) for k in numbers]
+
+
+def test_reports_on_a_fading_link_settle():
+    fading = ChannelSettings(channel="rayleigh", snr_db=10.0)
+    alone = [reports(LinkReporter("jpeg-amc"), fading, [k])[0] for k in range(40)]
+    together = reports(LinkReporter("jpeg-amc"), fading, range(40))[8:]
+    assert np.std(together) < 0.6 * np.std(alone)
+    assert np.mean(together) > np.mean(alone)
+
+
+def test_a_link_that_changes_is_believed_at_once():
+    reporter = LinkReporter("jpeg-amc")
+    good, bad = ChannelSettings(snr_db=14.0), ChannelSettings(snr_db=6.0)
+    before = reports(reporter, good, range(8))
+    after = reports(reporter, bad, [8])
+    assert before[-1] == pytest.approx(14.0, abs=1.0)
+    assert after[0] == pytest.approx(6.0, abs=1.0)
+
+
+def test_frames_of_another_size_begin_anew():
+    reporter = LinkReporter("jpeg-amc")
+    fading = ChannelSettings(channel="rayleigh", snr_db=10.0)
+    reports(reporter, fading, range(5))
+    layout = layout_for((64, 64))
+    small = EncodedImage((64, 64), np.ones((layout.num_slots, layout.data_per_slot), np.complex64), "16qam")
+    equalised = Link(fading, 3).receive(small, 0.0)
+    assert reporter.snr_db(equalised) == LinkReporter("jpeg-amc").snr_db(equalised)
+
+
+def test_learned_codecs_are_told_the_average():
+    layout = layout_for(HW)
+    symbols = np.ones((layout.num_slots, layout.data_per_slot), np.complex64)
+    link = Link(ChannelSettings(channel="erasure", snr_db=9.0), 0)
+    equalised = link.receive(EncodedImage(HW, symbols, "16qam"), 0.0)
+    assert LinkReporter("3dcsc-lite").snr_db(equalised) == equalised.snr_db
