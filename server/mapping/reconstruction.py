@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.motion import ConstantVelocity
 from semcast.server.mapping import mapper
+from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.initialiser import Initialiser, Start
 from semcast.server.mapping.kept_frames import Observed, backfill, colours_of
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.recall import recall_landmarks
-from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
@@ -125,6 +125,9 @@ class Reconstruction:
         if frame.frame_id <= self._last_frame_id:
             return self._result(frame, self._map.world.pose_of_frame(frame.frame_id), None)
         self._last_frame_id = frame.frame_id
+        if shows_nothing(frame.image):
+            # As a frame that never came: tracks outlive a covered lens as they outlive a gap.
+            return result_of_nothing(frame, self._state, self._map_epoch, self._map.submap)
         self._collect()
         since = time.perf_counter_ns()
         sight = self._shutter.see(frame)
@@ -398,9 +401,7 @@ class Reconstruction:
             return 1.0
         since = time.perf_counter_ns()
         self._keyframes_since_join = 0
-        place: Place | None = self._map.relocaliser.find(
-            sight, self._map.world, self._map.noise.model, others
-        )
+        place = self._map.relocaliser.find(sight, self._map.world, self._map.noise.model, others)
         scale = None if place is None else self._map.join(place, T_world_cam, self._tracks, self._moved)
         if scale is not None:
             logger.info("frame %d: submaps are joined", sight.frame.frame_id)

@@ -238,6 +238,26 @@ def test_it_finds_back_when_the_view_returns(room):
     assert ate_percent(trajectory, truth) < 1.5
 
 
+def test_a_covered_lens_is_a_gap(room):
+    _, images = room
+    rng = np.random.default_rng(0)
+    covered = [rng.normal(5, 2, images[0].shape).clip(0, 255).astype(np.uint8) for _ in range(6)]
+    with_them, without = make(), make()
+    seen = list(enumerate(images[:14] + covered + images[16:22]))
+    results = [with_them.process(frame_of(k, image)) for k, image in seen]
+    for k, image in seen[:14] + seen[20:]:
+        other = without.process(frame_of(k, image))
+        assert other.state is results[k].state
+        np.testing.assert_array_equal(other.keypoints_xy, results[k].keypoints_xy)
+    for result in results[14:20]:
+        assert result.state is TrackingState.LOST
+        assert (result.T_world_cam, result.num_tracked, len(result.keypoints_xy)) == (None, 0, 0)
+    assert results[20].state is TrackingState.TRACKING
+    one, other = with_them.final_trajectory(), without.final_trajectory()
+    assert one.keys() == other.keys()
+    np.testing.assert_array_equal(np.stack(list(one.values())), np.stack(list(other.values())))
+
+
 def test_another_place_becomes_a_map_of_its_own(room):
     _, images = room
     other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]

@@ -1,0 +1,41 @@
+"""Images that show nothing: a covered lens, a white-out, a frame that was guessed from nothing."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.server.mapping.state import DecodedFrame, FrameResult, TrackingState
+
+#: Side of the cells that are averaged: the noise of a sensor is gone then.
+_CELL_PX = 8
+#: Standard deviation of the cells' grey levels below which there is nothing to see. A view with a fiftieth of
+#: the usual contrast has more.
+_LEAST_SD_GREY = 1.0
+
+
+def shows_nothing(image: NDArray[np.uint8]) -> bool:
+    """Tell whether an ``(H, W, 3)`` image is even, up to noise."""
+    height, width = image.shape[:2]
+    size = (max(1, width // _CELL_PX), max(1, height // _CELL_PX))
+    cells = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return float(cells.mean(axis=2).std()) < _LEAST_SD_GREY
+
+
+def result_of_nothing(frame: DecodedFrame, state: TrackingState, map_epoch: int, submap: int) -> FrameResult:
+    """Return the result of a frame that shows nothing: no pose, and nothing followed."""
+    return FrameResult(
+        frame_id=frame.frame_id,
+        t_source_ns=frame.t_source_ns,
+        state=TrackingState.LOST if state is TrackingState.TRACKING else state,
+        T_world_cam=None,
+        num_tracked=0,
+        num_inliers=0,
+        reprojection_error_px=None,
+        covariance=None,
+        is_keyframe=False,
+        map_epoch=map_epoch,
+        submap=submap,
+        keypoints_xy=np.zeros((0, 2), np.float32),
+        keypoint_inlier=np.zeros(0, bool),
+        keypoint_confidence=np.zeros(0, np.float32),
+    )
