@@ -164,13 +164,13 @@ def test_a_killed_viewer_is_back_soon_and_gets_the_stream_again(feed_and_proxy):
     os.kill(first, signal.SIGKILL)
     killed_s = time.monotonic()
     k = 1
-    while feed.num_connections < 2:
+    # What the killed one had started may listen for a moment longer.
+    while feed.num_connections < 2 or process.pid in (first, None):
         feed.submit(frame(k))
         k += 1
         assert time.monotonic() - killed_s < DEADLINE_S
         time.sleep(0.02)
     assert time.monotonic() - killed_s < 5.0
-    assert process.pid != first
 
 
 def test_a_frozen_viewer_never_holds_up_the_tracker(feed_and_proxy):
