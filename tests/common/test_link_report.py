@@ -10,6 +10,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import LOST_SLOT_SNR_DB, EncodedImage
 from semcast.common.conventional import ADAPTIVE_MODES, MODE_MARGIN_DB
 from semcast.common.link_report import LinkReporter, SlotSnrs, reachable_snr_db, steady_snr_db
+from semcast.common.phy.mutual_information import mutual_information, snr_db_that_carries
 from semcast.common.phy.qam import constellation
 from semcast.common.phy.slots import layout_for
 
@@ -23,37 +24,36 @@ def db(ratio):
 
 
 def test_the_steady_snr_is_the_links_own_where_all_slots_are_alike():
-    assert steady_snr_db(frames([5, 5, 5, 5]), 30.0) == pytest.approx(db(5))
+    for bits in (2, 4, 6):
+        assert steady_snr_db(frames([5, 5, 5, 5]), bits) == pytest.approx(db(5), abs=0.01)
 
 
 def test_the_steady_snr_carries_what_slots_carry_less_what_one_frame_of_twenty_has_less():
-    # 2, 2, 4 and 4 bits: 3 on average with a standard deviation of 1, so half of it for the mean of four.
-    one = 3 - 1.645 * math.sqrt(2) * 0.5
-    assert steady_snr_db(frames([3, 3, 15, 15]), 30.0) == pytest.approx(db(2**one - 1) + MODE_MARGIN_DB)
-    three = 3 - 1.645 * math.sqrt(4 / 3) * 0.5
-    known = frames(*[[3, 3, 15, 15]] * 3)
-    assert steady_snr_db(known, 30.0) == pytest.approx(db(2**three - 1) + MODE_MARGIN_DB)
+    carried = mutual_information(4, np.array([3.0, 3.0, 15.0, 15.0]))
+    for count, factor in ((1, 2.0), (3, 4 / 3)):
+        bits = carried.mean() - 1.645 * math.sqrt(factor * carried.var() / 4)
+        expected = snr_db_that_carries(4, bits) + MODE_MARGIN_DB
+        assert steady_snr_db(frames(*[[3, 3, 15, 15]] * count), 4) == pytest.approx(expected)
 
 
 def test_the_margin_of_the_modes_is_not_counted_twice():
     slots = np.full(32, 10.0)
     slots[::2] = 9.0  # fluctuates by far less than the modes' own margin
-    mean = np.expm1(np.log1p(slots).mean())
-    assert steady_snr_db(frames(slots), 30.0) == pytest.approx(db(mean))
+    mean = mutual_information(4, slots).mean()
+    assert steady_snr_db(frames(slots), 4) == pytest.approx(snr_db_that_carries(4, mean))
 
 
-def test_a_slot_carries_no_more_than_is_enough_and_a_lost_one_nothing():
-    assert steady_snr_db(frames([5, 5, 5, 5]), 3.0) == pytest.approx(3.0)
-    assert steady_snr_db(frames([1000] * 3 + [0]), 30.0) > steady_snr_db(frames([1000] * 3 + [0]), 15.0) + 5
-    assert steady_snr_db(frames([3, 3, 3, 0]), 30.0) < steady_snr_db(frames([3, 3, 3, 3]), 30.0) - 3
-    assert steady_snr_db(frames([0, 0, 0, 0]), 30.0) == LOST_SLOT_SNR_DB
-    assert reachable_snr_db(frames([0, 0, 0, 0])) == LOST_SLOT_SNR_DB
+def test_a_slot_carries_no_more_than_its_constellation_and_a_lost_one_nothing():
+    assert steady_snr_db(frames([1000] * 3 + [0]), 6) > steady_snr_db(frames([1000] * 3 + [0]), 2) + 5
+    assert steady_snr_db(frames([3, 3, 3, 0]), 4) < steady_snr_db(frames([3, 3, 3, 3]), 4) - 3
+    assert steady_snr_db(frames([0, 0, 0, 0]), 4) <= LOST_SLOT_SNR_DB + MODE_MARGIN_DB
+    assert reachable_snr_db(frames([0, 0, 0, 0])) <= LOST_SLOT_SNR_DB + MODE_MARGIN_DB
 
 
 def test_no_mode_is_reached_that_its_constellation_cannot_hold():
     # A third of the slots lost: 64-QAM of rate .7 would need more than all bits of the others.
     lossy = frames([1e4, 1e4, 0] * 20)
-    assert ADAPTIVE_MODES[4].min_snr_db <= reachable_snr_db(lossy) < ADAPTIVE_MODES[5].min_snr_db
+    assert reachable_snr_db(lossy) < ADAPTIVE_MODES[5].min_snr_db
 
 
 HW = (512, 256)
