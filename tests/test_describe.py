@@ -144,6 +144,14 @@ def test_a_folder_of_photos_says_what_is_missing(tmp_path):
     assert "intrinsics.json" in text
 
 
+def test_times_that_nobody_recorded_are_said_to_be_assumed(tmp_path):
+    write_images(tmp_path / "images", 5)
+    assert "0.4 s, 10.0 images a second, assumed: no times are recorded" in text_of(tmp_path)
+    (tmp_path / "times.txt").write_text("".join(f"{0.1 * k:.1f}\n" for k in range(5)))
+    assert "10.0 images a second" in text_of(tmp_path)
+    assert "assumed" not in text_of(tmp_path)
+
+
 def test_distortion_and_shutter_of_the_images_as_stored_are_shown(tmp_path):
     write_images(tmp_path, 2)
     camera = {"fx": 50, "fy": 50, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48}

@@ -173,7 +173,10 @@ def describe_sequence(path: Path) -> list[Section]:
     times_s = sequence.times_ns * 1e-9
     if len(times_s) > 1:
         rate_hz = (len(times_s) - 1) / (times_s[-1] - times_s[0])
-        facts.append(("time", f"{times_s[-1] - times_s[0]:.1f} s, {rate_hz:.1f} images a second"))
+        # Where a folder records no times, they follow the rate it is opened with.
+        is_assumed = (sequence.times_ns != open_sequence(path, rate_hz=2.0 * rate_hz).times_ns).any()
+        note = ", assumed: no times are recorded" if is_assumed else ""
+        facts.append(("time", f"{times_s[-1] - times_s[0]:.1f} s, {rate_hz:.1f} images a second{note}"))
     try:
         camera = sequence.intrinsics
         coefficients = " ".join(f"{k:.4g}" for k in sequence.stored_camera.distortion)
