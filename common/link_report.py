@@ -57,6 +57,17 @@ class SlotSnrs:
         slope = (more - less) / (2.0 * step)
         return float(np.mean(np.square(slope) * 2.0 * self.linear / self.num_pilots))
 
+    def common_error(self, bits_per_symbol: int) -> float:
+        """Standard error of the mean of ``carried`` that the noise, estimated once for all slots, brings."""
+        arrived = int(np.count_nonzero(self.linear))
+        if not self.num_pilots or not arrived:
+            return 0.0
+        factor = 1.0 + 1.0 / np.sqrt(arrived * max(self.num_pilots - 1, 1))
+        more, less = (
+            mutual_information(bits_per_symbol, snr) for snr in (self.linear * factor, self.linear / factor)
+        )
+        return float(np.mean(more - less)) / 2.0
+
 
 class LinkReporter:
     """Makes the reports of one stream.
@@ -127,6 +138,6 @@ def _has_jumped(frames: Sequence[SlotSnrs], newest: SlotSnrs) -> bool:
         return True
     finest = ADAPTIVE_MODES[-1].bits_per_symbol
     before, now = (np.concatenate([f.carried(finest) for f in some]) for some in (frames, [newest]))
-    spread = np.sqrt((np.var(before) + np.var(now)) / 2.0)
-    error = spread * np.sqrt((1.0 + 1.0 / len(frames)) / len(now))
+    variance = (np.var(before) + np.var(now)) / 2.0 / len(now) + newest.common_error(finest) ** 2
+    error = np.sqrt(variance * (1.0 + 1.0 / len(frames)))
     return bool(abs(np.mean(now) - np.mean(before)) > _JUMP * error)

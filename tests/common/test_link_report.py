@@ -76,6 +76,13 @@ def test_reports_on_a_fading_link_settle():
     assert np.mean(together) > np.mean(alone)
 
 
+def test_reports_on_a_steady_link_settle():
+    steady = ChannelSettings(snr_db=14.0)
+    alone = [reports(LinkReporter("jpeg-amc"), steady, [k])[0] for k in range(40)]
+    together = reports(LinkReporter("jpeg-amc"), steady, range(40))[8:]
+    assert np.std(together) < 0.6 * np.std(alone)
+
+
 def test_a_link_that_changes_is_believed_at_once():
     reporter = LinkReporter("jpeg-amc")
     good, bad = ChannelSettings(snr_db=14.0), ChannelSettings(snr_db=6.0)
