@@ -274,7 +274,7 @@ def _told_at_first(
     if not is_conventional(codec.name):
         return link.settings.snr_db
     encoded = codec.encode(to_coded(image, settings.rate), link.settings.snr_db)
-    sounding = link.receive(encoded, 0.0, _SOUNDING_FRAME)
+    sounding = link.receive(encoded, 0.0, _SOUNDING_FRAME, perfect_csi=settings.perfect_csi)
     return LOST_SLOT_SNR_DB if sounding is None else reporter.snr_db(sounding)
 
 

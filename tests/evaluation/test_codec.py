@@ -7,8 +7,10 @@ import pytest
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
+from semcast.common.codecs import load_codec
 from semcast.common.errors import ConfigError, SourceError
-from semcast.evaluation.codec import CodecSettings, evaluate_codec, read_images
+from semcast.common.link_report import LinkReporter
+from semcast.evaluation.codec import CodecSettings, _told_at_first, evaluate_codec, read_images
 from semcast.evaluation.picture_strip import picture_strip, write_picture_strip
 from semcast.training.onnx_export import export_encoder
 
@@ -65,6 +67,20 @@ def test_weights_of_ones_own_stand_beside_the_shipped_ones(folder, tiny_weights)
     settings = CodecSettings(images=folder, codec=("3dcsc", file), snr_db=(10.0,), max_images=1)
     found = rows(evaluate_codec(settings))
     assert found[file, 10.0]["psnr_db"] < found["3dcsc", 10.0]["psnr_db"] - 3, "they were never trained"
+
+
+def test_who_chooses_a_rate_is_told_at_first_what_the_receiver_knows(folder):
+    image = next(iter(read_images(folder)[0].values()))
+
+    def told(codec, perfect_csi):
+        settings = CodecSettings(images=folder, perfect_csi=perfect_csi)
+        link = Link(ChannelSettings(snr_db=10.0), 0)
+        return _told_at_first(load_codec(codec), image, link, LinkReporter(codec), settings)
+
+    assert told("jpeg-amc", True) == pytest.approx(10.0, abs=0.05)
+    assert told("jpeg-amc", False) == pytest.approx(10.0, abs=1.0)
+    assert abs(told("jpeg-amc", False) - 10.0) > 0.1, "estimated from pilots"
+    assert told("3dcsc-lite", False) == 10.0
 
 
 def rows(report):
