@@ -65,6 +65,7 @@ class Arrivals:
         self._drop = drop
         self._last_ns = 0
         self._recent: deque[int] = deque(maxlen=_REMEMBERED)
+        self._done_early: set[int] = set()
         self._age = CaptureAge()
 
     def accept(self, frame: SymbolFrame, arrival_ns: int) -> bool:
@@ -107,12 +108,23 @@ class Arrivals:
         self.arrived_seq = frame.base_seq if self._lossless else frame.seq
         self.next_seq = self.arrived_seq
         self._recent.clear()
+        self._done_early.clear()
         self._age = CaptureAge()
 
     def done(self, frame: SymbolFrame) -> None:
-        """Note that the consumer is done with a frame."""
-        if frame.agent_epoch == self.epoch:
+        """Note that the consumer is done with a frame; lossless: it counts once those before it are done too.
+
+        A frame that is refused is done while the one before it is still in work.
+        """
+        if frame.agent_epoch != self.epoch:
+            return
+        self._done_early.add(frame.seq)
+        if not self._lossless or len(self._done_early) > _REMEMBERED:
+            # Some before it never came to the consumer: the sender does not keep to the window.
             self.next_seq = max(self.next_seq, frame.seq + 1)
+        while self.next_seq in self._done_early:
+            self.next_seq += 1
+        self._done_early = {seq for seq in self._done_early if seq > self.next_seq}
 
     def age_ms(self, frame: SymbolFrame, now_ns: int) -> float:
         """Return how old a frame is; 0 for one of a former epoch."""

@@ -78,6 +78,28 @@ def test_lossless_takes_each_frame_once_and_in_order(metrics):
     assert arrivals.next_seq == 2
 
 
+def test_a_frame_that_is_refused_confirms_none_before_it(metrics):
+    arrivals = Arrivals(lossless=True, drop=metrics.drop)
+    frames = [frame(k, lossless=True) for k in range(4)]
+    assert accepted(arrivals, frames) == [0, 1, 2, 3]
+    confirmed = []
+    for k in (1, 3, 0, 2):
+        arrivals.done(frames[k])
+        confirmed.append(arrivals.next_seq)
+    assert confirmed == [0, 0, 2, 4]
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_a_frame_that_never_comes_to_the_consumer_holds_nothing_up_for_ever(metrics, lossless):
+    arrivals = Arrivals(lossless=lossless, drop=metrics.drop)
+    arrivals.accept(frame(0, lossless=lossless), 0)
+    for k in range(1, 1000):
+        arrivals.accept(frame(k, lossless=lossless), 0)
+        arrivals.done(frame(k))
+    assert arrivals.next_seq == 1000
+    assert not arrivals._done_early
+
+
 def test_a_lossless_receiver_joins_at_the_first_unconfirmed_frame(metrics):
     arrivals = Arrivals(lossless=True, drop=metrics.drop)
     # 7 was lost on its way to the new receiver: 8 must not be taken before it.
