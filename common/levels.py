@@ -96,4 +96,4 @@ def _end(counts: NDArray[np.float64]) -> int:
 
 def _looked_up(image: NDArray[np.uint8], values: NDArray[np.float32]) -> NDArray[np.uint8]:
     table = np.clip(np.rint(values), 0, _NUM_LEVELS - 1).astype(np.uint8)
-    return np.asarray(cv2.LUT(image, table), dtype=np.uint8)
+    return np.asarray(cv2.LUT(image, table), dtype=np.uint8).reshape(image.shape)

@@ -66,6 +66,13 @@ def test_an_even_image_is_not_stretched_beyond_what_noise_fills(level):
     assert levels.low <= level <= levels.high
 
 
+@pytest.mark.parametrize("shape", [(4, 5, 3), (4, 5, 1), (4, 5)])
+def test_the_shape_stays(shape):
+    image = np.full(shape, 50, np.uint8)
+    for found, level in ((Levels(0, 100).stretch(image), 128), (Levels(0, 51).unstretch(image), 10)):
+        np.testing.assert_array_equal(found, np.full(shape, level))
+
+
 @pytest.mark.parametrize(("low", "high"), [(-1, 10), (10, 10), (20, 10), (0, 256)])
 def test_levels_out_of_order_are_refused(low, high):
     with pytest.raises(ValueError, match="levels must be 0 <= low < high <= 255, got"):
