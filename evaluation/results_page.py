@@ -17,6 +17,13 @@ from semcast.evaluation.trajectory_summary import trajectory_summary
 RESULTS = Path("evaluation/results")
 PAGE = Path("docs/results.md")
 README = Path("README.md")
+#: Channel and SNR in dB, or clean images, to the column of the README's table.
+README_LINKS: dict[tuple[str, float] | None, str] = {
+    None: "clean images",
+    ("rayleigh", 6.0): "fading, 6 dB",
+    ("erasure", 6.0): "one slot in five lost, 6 dB",
+    ("awgn", 2.0): "noise, 2 dB",
+}
 CONFIDENCE_PAGE = Path("docs/confidence.md")
 
 Report = Mapping[str, Any]
@@ -280,23 +287,22 @@ def results_page(folder: Path = RESULTS) -> str:
 
 
 def readme_table(folder: Path = RESULTS) -> str:
-    """Return the README's short table: of every trajectory file the default mode at the lowest SNR."""
-    rows = []
+    """Return the README's short table: path errors in the default mode, recordings by links."""
+    errors: dict[str, dict[str, str]] = {}
     for file in sorted(folder.glob("trajectory_*.json")):
         report = json.loads(file.read_text(encoding="utf-8"))
         channel = report["settings"]["link"]["channel"]
-        lowest_db = min((c["snr_db"] for c in report["cells"] if c["snr_db"] is not None), default=None)
         for cell in report["cells"]:
-            if cell["confidence"] == "robust" and cell["snr_db"] == lowest_db:
-                link = "clean images" if cell["snr_db"] is None else f"{channel}, {cell['snr_db']:g} dB"
-                figures = (
-                    number(cell["psnr_db"], 1),
-                    number(cell["ate_percent"]),
-                    f"{cell['completeness']:.0%}",
+            link = None if cell["snr_db"] is None else (channel, cell["snr_db"])
+            if cell["confidence"] == "robust" and link in README_LINKS:
+                posed = cell["completeness"]
+                share = "" if posed > 0.995 else f" ({posed:.0%} posed)"
+                errors.setdefault(report["sequence"], {})[README_LINKS[link]] = (
+                    number(cell["ate_percent"]) + share
                 )
-                rows.append([report["sequence"], link, *figures])
-    head = ("sequence", "link", "PSNR dB", "path error (ATE, % of path)", "frames with a pose")
-    return "\n".join(table(head, sorted(rows)))
+    links = list(README_LINKS.values())
+    rows = [[name, *(of.get(link, "-") for link in links)] for name, of in sorted(errors.items())]
+    return "\n".join(table(("recording", *links), rows))
 
 
 def confidence_part(folder: Path = RESULTS) -> str:
