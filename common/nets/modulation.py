@@ -27,7 +27,7 @@ from semcast.common.nets.rounding import (
 )
 from semcast.common.phy.qam import SHAPED_OUTER_SHARE
 
-#: Amplitude of the carrier against a latent whose rms is about 0.9: 1.7 % of the power, on Kodak's images.
+#: Amplitude of the carrier against a latent whose rms is about 0.9: some 2 % of the power.
 CARRIER_AMPLITUDE = 0.12
 _MAX_SCALE = 6.0
 #: From an analog value, of power 1/2, to one that is rounded.
