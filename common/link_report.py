@@ -114,10 +114,10 @@ def steady_snr_db(frames: Sequence[SlotSnrs], bits_per_symbol: int) -> float:
 
     A code that spans all slots has the mean over the slots of the mutual information of its constellation
     (mutual-information effective SNR mapping, Brueninghaus et al. 2005). One frame of twenty has
-    ``_ONE_IN_TWENTY`` standard errors less than the mean of the frames before it, not counting what the estimate of each gain varies by itself:
-    that much less is counted on, or ``MODE_MARGIN_DB`` less, which the modes keep anyway. Slots are taken to
-    differ independently: where bursts or slow fading hit many together, more than one frame of twenty has
-    less.
+    ``_ONE_IN_TWENTY`` standard errors less than the mean of the frames before it, not counting what the
+    estimate of each gain varies by itself: that much less is counted on, or ``MODE_MARGIN_DB`` less, which
+    the modes keep anyway. Slots are taken to differ independently: where bursts or slow fading hit many
+    together, more than one frame of twenty has less.
 
     Args:
         frames: The newest ones, of equally many slots.
