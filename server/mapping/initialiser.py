@@ -18,6 +18,7 @@ from semcast.server.mapping.ambiguity import Side, decide
 from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
 from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
 from semcast.server.mapping.mapper import gather_observations
+from semcast.server.mapping.start_alignment import aligned_views
 from semcast.server.mapping.world_map import Keyframe
 
 Array = NDArray[np.float64]
@@ -25,6 +26,8 @@ Ids = NDArray[np.int64]
 
 #: Frames kept for poses in retrospect.
 MAX_HISTORY = 300
+#: Of them, those whose images are kept too: 10 MB of 640x480.
+_MAX_IMAGES = 32
 #: Keyframes of a new map at most.
 START_KEYFRAMES = 5
 MIN_POINTS = 40
@@ -120,6 +123,7 @@ class Initialiser:
             self.history.pop(0)
             self._reference = max(0, self._reference - 1)
         self._move_reference()
+        self._forget_images()
         if is_damaged or self._reference == len(self.history) - 1:
             return None
         reference = self.history[self._reference]
@@ -193,6 +197,15 @@ class Initialiser:
             # Its tracks begin anew. Attempts are counted on: a fast camera would never use them up.
             self._undecided_flow_px = 0.0
 
+    def _forget_images(self) -> None:
+        """Keep the images of a few frames among those that may become keyframes of the start."""
+        span = range(self._reference, len(self.history))
+        with_image = [k for k in span if self.history[k].grey is not None]
+        gone = [*range(self._reference), *(with_image[1:-1:2] if len(with_image) > _MAX_IMAGES else [])]
+        for k in gone:
+            if self.history[k].grey is not None:
+                self.history[k] = replace(self.history[k], grey=None)
+
     def _build(self, found: TwoViewResult, ids: Ids, noise: NoiseModel) -> Start | None:
         """Triangulate, place the frames between, and triangulate again from all."""
         span = self.history[self._reference :]
@@ -202,8 +215,7 @@ class Initialiser:
         good = self._passes(points)
         if int(good.sum()) < MIN_POINTS:
             return None
-        between = np.unique(np.linspace(0, len(span) - 1, START_KEYFRAMES).round().astype(int))
-        for k in between[1:-1].tolist():
+        for k in _between(span):
             guess = interpolate_pose(T_world[0], T_world[len(span) - 1], k / (len(span) - 1))
             T_cam = pose_of(self._camera, span[k], ids[good], points.xyz[good], noise, guess, self._seed)
             if T_cam is not None:
@@ -212,6 +224,7 @@ class Initialiser:
             return None
         chosen = [span[k] for k in sorted(T_world)]
         poses = np.stack([T_world[k] for k in sorted(T_world)])
+        chosen = aligned_views(self._camera, chosen, poses)
         side = self._decide(chosen, poses, noise)
         if side is None:
             return None
@@ -266,3 +279,12 @@ class Initialiser:
             & (points.parallax_deg > 0.5 * self._min_parallax_deg)
             & (points.error_sigma < 2.5)
         )
+
+
+def _between(span: list[Observed]) -> list[int]:
+    """Which frames between the first and the last become keyframes: spread out, with an image if one has."""
+    inner = [k for k in range(1, len(span) - 1) if span[k].grey is not None] or [*range(1, len(span) - 1)]
+    if not inner:
+        return []
+    wanted = np.linspace(0, len(span) - 1, START_KEYFRAMES)[1:-1]
+    return sorted({min(inner, key=lambda k: abs(k - w)) for w in wanted.tolist()})

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
+from semcast.server.geometry.features import Grey
 from semcast.server.geometry.pnp import refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -18,7 +19,7 @@ Ids = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Observed:
-    """The tracks of one frame, and the colours of their pixels where these are kept."""
+    """The tracks of one frame, the colours of their pixels, and its image where that is kept."""
 
     frame_id: int
     t_source_ns: int
@@ -26,6 +27,7 @@ class Observed:
     xy: Array
     confidence: Array
     rgb: NDArray[np.uint8] | None = None
+    grey: Grey | None = None
 
 
 def colours_of(ids: Ids, frames: Sequence[Observed]) -> NDArray[np.uint8]:

@@ -1,7 +1,7 @@
 """The map as it grows: keyframes, their landmarks, adjustments, and submaps that are joined."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from semcast.server.mapping import mapper
 from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.kept_frames import Observed, colours_of
 from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, View, share_out
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom
@@ -98,17 +99,17 @@ class MapBuilder:
         tracks: TrackTable,
         T_world_ref: Array,
         scale: float,
-        rgb: NDArray[np.uint8],
+        history: Sequence[Observed],
     ) -> None:
         """Bring a new map in and adjust it at once.
 
         Args:
             start: The new map, first keyframe at the origin.
             sight: The newest image.
-            tracks: Tracks in it.
+            tracks: Tracks in it; put where the start has them.
             T_world_ref: Pose of the first keyframe in the world.
             scale: World units per unit of the start.
-            rgb: ``(P, 3)`` colours of its landmarks.
+            history: The frames it was made from, with colours, and with the images of keyframes.
         """
         placed = make_transform(T_world_ref[:3, :3], T_world_ref[:3, 3])
         for keyframe in start.keyframes:
@@ -117,8 +118,12 @@ class MapBuilder:
             keyframe.T_world_cam = placed @ T
             keyframe.submap = self.submap
             self.world.add_keyframe(keyframe)
+        for observed in history:
+            if observed.grey is not None and any(k.frame_id == observed.frame_id for k in start.keyframes):
+                self.images.append(SeenFrom(observed.frame_id, observed.grey))
         newest = start.keyframes[-1]
-        self.images.append(SeenFrom(newest.frame_id, sight.grey))
+        _, row, row_k = np.intersect1d(tracks.ids, newest.ids, assume_unique=True, return_indices=True)
+        tracks.settle_at(row, newest.xy[row_k], np.full(len(row), np.nan))
         newest.descriptor_ids, newest.descriptors = self.relocaliser.describe(
             sight.grey, newest.ids, newest.xy
         )
@@ -126,6 +131,7 @@ class MapBuilder:
         born = np.full(len(start.ids), newest.frame_id)
         for keyframe in start.keyframes:
             born[np.isin(start.ids, keyframe.ids, assume_unique=True)] = keyframe.frame_id
+        rgb = colours_of(start.ids, history)
         self.world.add_landmarks(start.ids, xyz, rgb, start.confidence, self.submap, born)
         self._submit(start=True)
         self.collect(wait=True)

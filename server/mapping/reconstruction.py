@@ -15,7 +15,7 @@ from semcast.server.mapping import mapper
 from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.initialiser import Initialiser, Start
-from semcast.server.mapping.kept_frames import Observed, backfill, colours_of
+from semcast.server.mapping.kept_frames import Observed, backfill
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.recall import recall_landmarks
@@ -311,6 +311,7 @@ class Reconstruction:
             tracks.xy[visible],
             tracks.confidence[visible],
             mapper.sample_colours(frame.image, tracks.xy[visible]),
+            sight.grey,
         )
         waits = self._state is TrackingState.LOST or float(sight.usable.mean()) < _MIN_USABLE_SHARE
         start = self._initialiser.add(observed, self._map.noise.model, is_damaged=waits)
@@ -364,8 +365,7 @@ class Reconstruction:
         guess = self._motion.predict(grown.keyframes[0].t_source_ns)
         # The unit is told by the start alone: before it, the camera may have stood still.
         T_world_ref, scale = self._map.bridge(guess, self._motion.speed_map_per_s, start)
-        rgb = colours_of(grown.ids, history)
-        self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, rgb)
+        self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, history)
         backfilled = backfill(
             self._camera,
             self._map.world,

@@ -16,13 +16,13 @@ CAMERA = Intrinsics(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=48
 NOISE = NoiseModel(1.0, 0.0)
 
 
-def ride(num_frames, num_points=150, step_m=0.12, noise_px=0.3, seed=0):
+def ride(num_frames, num_points=150, step_m=0.12, noise_px=0.3, seed=0, turn_rad=0.01):
     """Frames of a camera that moves sideways, and their true poses."""
     rng = np.random.default_rng(seed)
     xyz = rng.uniform([-3.0, -2.0, 3.0], [3.0, 2.0, 7.0], (num_points, 3))
     frames, poses = [], []
     for k in range(num_frames):
-        T_world_cam = make_transform(exp_so3(np.array([0.0, 0.01 * k, 0.0])), [step_m * k, 0.0, 0.0])
+        T_world_cam = make_transform(exp_so3(np.array([0.0, turn_rad * k, 0.0])), [step_m * k, 0.0, 0.0])
         T = invert_transform(T_world_cam)
         xy = CAMERA.project(xyz @ T[:3, :3].T + T[:3, 3])
         seen = ((xy > 0) & (xy < [640, 480])).all(axis=1)
@@ -188,3 +188,22 @@ def test_a_start_is_the_same_with_ids_that_were_renewed_on_the_way():
     again = initialiser.add(last, NOISE)
     assert np.array_equal(again.ids - 10**6, np.searchsorted(before, start.ids))
     assert np.array_equal(again.xyz, start.xyz)
+
+
+def test_of_frames_that_wait_long_a_few_keep_their_image_and_the_start_takes_those():
+    image = np.full((480, 640), 128, np.uint8)
+    frames = [replace(f, grey=image) for f in ride(140, step_m=0.002, turn_rad=0.0)[0]]
+    initialiser = Initialiser(CAMERA, "off", 1.0, 0)
+    start = None
+    for frame in frames:
+        start = initialiser.add(frame, NOISE)
+        with_image = [o.frame_id for o in initialiser.history if o.grey is not None]
+        assert len(with_image) <= 33
+        assert (with_image[0], with_image[-1]) == (0, frame.frame_id)
+        if start is not None:
+            break
+    assert len(initialiser.history) > 50, "all frames wait for their poses"
+    chosen = [k.frame_id for k in start.keyframes]
+    assert len(chosen) == 5
+    assert set(chosen) <= set(with_image)
+    assert np.diff(chosen).max() < 0.4 * frame.frame_id, "spread out"

@@ -1,5 +1,7 @@
 """What the map asks of bundle adjustment, and what it tells about a pose."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.kept_frames import Observed
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -43,9 +46,13 @@ class NewestFrame:
     """The tracks of a frame."""
 
     def __init__(self, ids, xy):
-        self.ids, self.xy = ids, xy
+        self.ids, self.xy = ids, xy.copy()
         self.visible = np.ones(len(ids), bool)
         self.confidence = np.full(len(ids), 0.8)
+
+    def settle_at(self, rows, xy, scatter_px2):
+        assert np.isnan(scatter_px2).all()
+        self.xy[rows] = xy
 
 
 @pytest.fixture
@@ -84,6 +91,22 @@ def keyframe(frame_id, submap, ids, T_world_cam, xyz):
         descriptor_ids=np.zeros(0, np.int64),
         descriptors=np.zeros((0, 32), np.uint8),
     )
+
+
+def observed(keyframes):
+    """Frames they were made from, with a grey level for each id."""
+    return [
+        Observed(
+            k.frame_id,
+            k.t_source_ns,
+            k.ids,
+            k.xy,
+            k.confidence,
+            np.repeat(k.ids[:, None] % 256, 3, axis=1).astype(np.uint8),
+            IMAGE[..., 0],
+        )
+        for k in keyframes
+    ]
 
 
 def test_coming_back_to_an_old_part_keeps_its_scale(builder):
@@ -148,8 +171,7 @@ def test_parts_that_begin_and_are_lost_again_keep_the_map_within_its_size():
         frame = DecodedFrame(views[-1].frame_id, 0, IMAGE)
         sight = Sight(frame, IMAGE[..., 0], np.ones(480, bool))
         start = Start(views, ids, xyz, np.ones(150))
-        rgb = np.full((len(start.ids), 3), 50, np.uint8)
-        builder.take_start(start, sight, NewestFrame(ids, views[-1].xy), np.eye(4), 1.0, rgb)
+        builder.take_start(start, sight, NewestFrame(ids, views[-1].xy), np.eye(4), 1.0, observed(views))
         assert len(builder.world.landmarks) <= 500
         assert len(builder.world.keyframes) <= 20
         assert {k.frame_id for k in views} <= {k.frame_id for k in builder.world.keyframes}
@@ -163,13 +185,27 @@ def test_landmarks_of_a_start_belong_to_the_last_keyframe_that_saw_them(builder,
         k.drop_observations(k.ids < 60)
     frame = DecodedFrame(4, 0, IMAGE)
     sight = Sight(frame, IMAGE[..., 0], np.ones(480, bool))
-    rgb = np.repeat(ids[:, None], 3, axis=1).astype(np.uint8)
     start = Start(views, ids, xyz, np.ones(160))
-    builder.take_start(start, sight, NewestFrame(views[-1].ids, views[-1].xy), np.eye(4), 1.0, rgb)
+    tracks = NewestFrame(views[-1].ids, views[-1].xy)
+    builder.take_start(start, sight, tracks, np.eye(4), 1.0, observed(views))
     marks = builder.world.landmarks
     assert set(marks.born[marks.ids < 60].tolist()) == {1}
     assert set(marks.born[marks.ids >= 60].tolist()) == {4}
     assert marks.rgb[:, 0].tolist() == marks.ids.tolist()
+
+
+def test_a_start_leaves_its_images_and_the_tracks_where_it_has_them(builder, rng):
+    xyz = rng.uniform((-0.5, -0.4, 0.8), (0.5, 0.4, 1.4), (160, 3))
+    views = [keyframe(k, 0, np.arange(160), pose(0.05 * k), xyz) for k in range(5)]
+    history = [*observed(views)[:3], replace(observed(views)[3], grey=None), observed(views)[4]]
+    other = replace(history[0], frame_id=77)
+    tracks = NewestFrame(np.arange(10, 200), np.zeros((190, 2)))
+    sight = Sight(DecodedFrame(4, 0, IMAGE), IMAGE[..., 0], np.ones(480, bool))
+    start = Start(views, np.arange(160), xyz, np.ones(160))
+    builder.take_start(start, sight, tracks, np.eye(4), 1.0, [other, *history])
+    assert [image.frame_id for image in builder.images] == [0, 1, 2, 4]
+    np.testing.assert_array_equal(tracks.xy[:150], views[4].xy[10:])
+    np.testing.assert_array_equal(tracks.xy[150:], 0.0)
 
 
 def test_an_update_after_a_join_has_the_poses_of_all_frames(builder):

@@ -280,7 +280,7 @@ def test_the_unit_of_a_new_part_is_told_by_its_start_alone(monkeypatch):
 
     monkeypatch.setattr(reconstruction, "look_back", noted)
     truth = [make_transform(np.eye(3), (0.12 * k, 0.05 * np.sin(k), 0.0)) for k in range(8)]
-    truth += [make_transform(exp_so3((0.0, 0.026 * k, 0.0)), (13.0, 0.0, 0.0)) for k in range(30, 0, -1)]
+    truth += [make_transform(exp_so3((0.0, 0.03 * k, 0.0)), (13.0, 0.0, 0.0)) for k in range(30, 0, -1)]
     truth += [make_transform(np.eye(3), (13.0 - 0.15 * k, 0.05 * np.sin(k), 0.0)) for k in range(1, 26)]
     core = make(lost_after_frames=2)
     for k, T in enumerate(truth):
