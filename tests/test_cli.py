@@ -85,9 +85,10 @@ def test_names_that_are_no_text_are_shown(tmp_path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-@pytest.mark.parametrize("words", [["info", "cnn"], ["info", "--help"]])
-def test_a_full_disk_behind_standard_output_is_told_in_a_line(words):
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+@pytest.mark.parametrize("buffered", [True, False])
+@pytest.mark.parametrize("words", [["info", "cnn"], ["info", "--help"], ["--help"], ["--version"]])
+def test_a_full_disk_behind_standard_output_is_told_in_a_line(words, buffered):
+    environment = {**os.environ, "PYTHONUNBUFFERED": "" if buffered else "1"}
     command = [sys.executable, "-m", "semcast", *words]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)

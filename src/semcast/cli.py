@@ -13,10 +13,14 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from semcast import SemcastError, __version__
 from semcast.common.argument_order import arguments_last
 from semcast.common.config import MissingSettingError, near_match
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 #: verb -> (module in semcast.commands, one line of help)
 VERBS: dict[str, tuple[str, str]] = {
@@ -45,10 +49,20 @@ _EXTRAS = {"agent": "agent", "train": "train", "onnx": "train"}
 EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose help fails where standard output can't be written; argparse keeps that to itself."""
+
+    def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
+        if sys.stdout is not None and file is sys.stdout:
+            file.write(message)
+        else:
+            super()._print_message(message, file)
+
+
 def _overview() -> argparse.ArgumentParser:
     width = max(len(verb) for verb in VERBS) + 2
     rows = "\n".join(f"  {verb:<{width}}{text}" for verb, (_, text) in VERBS.items())
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="semcast",
         usage="semcast VERB [options]",
         description="Live 3D reconstruction over a link too poor for video.",
@@ -64,7 +78,7 @@ def _overview() -> argparse.ArgumentParser:
 def verb_parser(verb: str) -> argparse.ArgumentParser:
     """Return the full parser of one verb, with the options every verb has."""
     module, text = VERBS[verb]
-    parser = argparse.ArgumentParser(prog=f"semcast {verb}", description=text[0].upper() + text[1:] + ".")
+    parser = _Parser(prog=f"semcast {verb}", description=text[0].upper() + text[1:] + ".")
     parser.add_argument("--debug", action="store_true", help="show tracebacks and debug messages")
     command = importlib.import_module(f"semcast.commands.{module}")
     command.add_arguments(parser)
