@@ -20,6 +20,7 @@ from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
 from semcast.server.run_record import FrameRow, summarise
+from semcast.server.sent_frames import stretches
 
 #: Called after each processed frame; may add stages of its own to the row's ``stage_ms``.
 FrameHook = Callable[[DecodedFrame, FrameResult, FrameRow, MapUpdate | None], None]
@@ -128,7 +129,8 @@ def reconstruct(
     trajectory = trajectory_of(poses, frame_times_ns)
     truth = cut_to_frames(truth, frame_times_ns) if truth is not None else None
     drops = {"lost": num_lost} if num_lost else {}
-    summary = summarise(rows, trajectory, part_of, truth, len(frame_times_ns), drops, num_keyframes)
+    sent = stretches({frame_id: k for k, frame_id in enumerate(frame_times_ns)})
+    summary = summarise(rows, trajectory, part_of, truth, sent, len(sent), drops, num_keyframes)
     return ReconstructedRun(summary, _plain_rows(rows, trajectory, truth), trajectory, num_landmarks, truth)
 
 

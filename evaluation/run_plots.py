@@ -15,7 +15,8 @@ from semcast.common.run_summary import read_summary
 from semcast.common.trajectory import Trajectory, read_tum
 from semcast.common.trajectory_error import AteResult, ate, match_times
 from semcast.evaluation.plots import new_grid, save_figure
-from semcast.server.run_record import FrameRow, read_rows, sent_frame_ids
+from semcast.server.run_record import FrameRow, read_rows
+from semcast.server.sent_frames import stretches
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +42,7 @@ class RunToPlot:
         trajectory: All posed frames.
         rows: One per frame that reached the tracker, in order.
         truth: Reference path, None where unknown.
-        num_source: Frames the source had, None where the run did not say.
+        num_sent: Frames that were sent, None where the run did not say.
         drops: Frames that never reached the tracker, by reason, as far as the run said.
         num_parts: Parts of the map, whose poses don't fit together.
     """
@@ -50,7 +51,7 @@ class RunToPlot:
     trajectory: Trajectory
     rows: Sequence[FrameRow]
     truth: Trajectory | None
-    num_source: int | None = None
+    num_sent: int | None = None
     drops: Mapping[str, int] = field(default_factory=dict)
     num_parts: int = 1
 
@@ -74,12 +75,13 @@ class RunToPlot:
         if not rows and not len(trajectory):
             raise SourceError(f"{folder}: no frame was decoded: nothing to plot")
         summary = read_summary(folder)
+        counts = summary.get("frames", {})
         return RunToPlot(
             name=folder.name,
             trajectory=trajectory,
             rows=rows,
             truth=truth,
-            num_source=summary.get("frames", {}).get("source"),
+            num_sent=counts.get("sent", counts.get("source")),
             drops=summary.get("drops", {}),
             num_parts=max(1, len(summary.get("parts") or ())),
         )
@@ -225,7 +227,7 @@ def _plot_timeline(run: RunToPlot, path: Path) -> Path:
     meaning = "recorded time (s); yellow: no map yet, red: lost, |: keyframe"
     keyframes = t_s[[row.is_keyframe for row in rows]]
     top.plot(keyframes, np.ones(len(keyframes)), "|", color="k", transform=top.get_xaxis_transform())
-    missing = missing_times(np.array([row.frame_id for row in rows]), t_s)
+    missing = missing_times({row.frame_id: row.seq for row in rows}, t_s)
     if len(missing):
         at_bottom = np.zeros(len(missing))
         top.plot(missing, at_bottom, "x", color="r", transform=top.get_xaxis_transform(), clip_on=False)
@@ -239,23 +241,23 @@ def _plot_timeline(run: RunToPlot, path: Path) -> Path:
 def timeline_title(run: RunToPlot) -> str:
     """Return how many frames there are, of how many where that is known, and what became of the others."""
     count = str(len(run.rows))
-    if run.num_source is not None and run.num_source > len(run.rows):
-        count += f" of {run.num_source}"
+    if run.num_sent is not None and run.num_sent > len(run.rows):
+        count += f" of {run.num_sent}"
     dropped = ", ".join(f"{number} {reason}" for reason, number in sorted(run.drops.items()) if number)
     posed = sum(row.posed for row in run.rows)
     return f"{run.name}: {count} frames{f' ({dropped})' if dropped else ''}, {posed} with a pose at once"
 
 
-def missing_times(frame_ids: NDArray[np.int64], t_s: Array) -> Array:
-    """Return when the frames were recorded that are missing between others, evenly spread in each gap.
+def missing_times(numbers: Mapping[int, int | None], t_s: Array) -> Array:
+    """Return when the frames were recorded that were sent and are missing between others, evenly spread.
 
     Args:
-        frame_ids: ``(N,)`` of the frames that are there.
+        numbers: N frame ids, each with its number among those that were sent, or None.
         t_s: ``(N,)`` their times in seconds.
     """
-    known, index = np.unique(frame_ids, return_index=True)
-    missing = np.setdiff1d(sent_frame_ids(known.tolist()), known)
-    return np.interp(missing, known, t_s[index])
+    ids, index = np.unique(np.array(list(numbers), dtype=np.int64), return_index=True)
+    sent = np.concatenate([stretch.frame_ids for stretch in stretches(numbers)])
+    return np.asarray(np.interp(np.setdiff1d(sent, ids), ids, t_s[index]), dtype=np.float64)
 
 
 def held(values: Array) -> Array:

@@ -191,6 +191,7 @@ def _replayed(
         for arrival in _paced(_arrivals(reader, stream, settings), settings.pace, stop):
             if stop.is_set():
                 break
+            session.note_arrival(arrival.message.frame_id, arrival.message.seq)
             decoded = decoder.decode(arrival)
             if decoded.frame is None:
                 reason = "lost_on_air" if arrival.received is None else "outage"

@@ -4,7 +4,7 @@ import contextlib
 import json
 import logging
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
@@ -18,6 +18,7 @@ from semcast.common.whole_file import whole_file
 from semcast.server.export.outputs import percentiles, plain
 from semcast.server.export.parts import count_parts
 from semcast.server.mapping.state import DecodedFrame, FrameResult
+from semcast.server.sent_frames import Stretch, unposed_ranges
 
 logger = logging.getLogger(__name__)
 
@@ -41,6 +42,7 @@ class FrameRow:
         map_epoch: Map it belongs to.
         submap: Part of the map the tracker was in after the frame. Parts that meet become one later:
             ``RunData.frame_submap`` says where posed frames belong at the end. 0 in rows of older runs.
+        seq: Its number among the frames that were sent. None in rows of older runs.
         snr_set_db: What the channel node says it applies.
         snr_estimated_db: What the receiver estimated from the pilots.
         psnr_db: Of the decoded image, where the original is known.
@@ -65,6 +67,7 @@ class FrameRow:
     age_ms: float
     stage_ms: dict[str, float] = field(default_factory=dict)
     submap: int = 0
+    seq: int | None = None
 
     @classmethod
     def of(cls, frame: DecodedFrame, result: FrameResult, **rest: Any) -> "FrameRow":
@@ -163,35 +166,12 @@ def read_rows(path: Path) -> list[FrameRow]:
     return list(rows.values())
 
 
-def unposed_ranges(frame_ids: list[int], posed: set[int]) -> list[tuple[int, int]]:
-    """Return first and last frame id of each run of frames without a pose, in order."""
-    ranges: list[tuple[int, int]] = []
-    first: int | None = None
-    last = 0
-    for frame_id in frame_ids:
-        if frame_id not in posed:
-            first = frame_id if first is None else first
-            last = frame_id
-        elif first is not None:
-            ranges.append((first, last))
-            first = None
-    return ranges if first is None else [*ranges, (first, last)]
-
-
-def sent_frame_ids(frame_ids: list[int]) -> list[int]:
-    """Return all ids between the first and last one that were seen, at their common stride."""
-    seen = np.unique(np.array(frame_ids, dtype=np.int64))
-    if len(seen) < 2:
-        return [int(k) for k in seen]
-    stride = int(np.gcd.reduce(np.diff(seen)))
-    return list(range(int(seen[0]), int(seen[-1]) + 1, stride))
-
-
 def summarise(
     rows: list[FrameRow],
     trajectory: Trajectory,
     part_of: Mapping[int, int],
     truth: Trajectory | None,
+    sent: Sequence[Stretch],
     num_frames: int | None,
     drops: Mapping[str, int],
     num_keyframes: int,
@@ -203,20 +183,20 @@ def summarise(
         trajectory: All posed frames after the last correction.
         part_of: Frame id of each -> the part of the map it is in.
         truth: Reference poses in metres, or None.
-        num_frames: Frames the source had; None takes what frame ids up to the newest one imply.
+        sent: Frames that were sent: those count for completeness.
+        num_frames: Frames the source had; None where it did not come to its end.
         drops: Frames that never reached the tracker, by reason.
         num_keyframes: Keyframes the map rests on.
     """
     posed_ids = set(part_of)
-    frame_ids = sent_frame_ids([row.frame_id for row in rows])
-    num_frames = max(num_frames if num_frames is not None else len(frame_ids), len(posed_ids))
+    num_sent = max(sum(stretch.num for stretch in sent), len(posed_ids))
     psnr_db = np.array([row.psnr_db for row in rows if row.psnr_db is not None and np.isfinite(row.psnr_db)])
     stages = sorted({stage for row in rows for stage in row.stage_ms})
     stage_ms = {s: percentiles(row.stage_ms[s] for row in rows if s in row.stage_ms) for s in stages}
     stage_ms["arrival_to_pose"] = percentiles(row.age_ms for row in rows)
     span_s = (rows[-1].t_source_ns - rows[0].t_source_ns) * 1e-9 if len(rows) > 1 else 0.0
     return {
-        **trajectory_summary(trajectory, truth, num_frames),
+        **trajectory_summary(trajectory, truth, num_sent),
         "psnr_db": float(psnr_db.mean()) if len(psnr_db) else None,
         "psnr_p50_db": float(np.median(psnr_db)) if len(psnr_db) else None,
         "snr_estimated_db": _mean(row.snr_estimated_db for row in rows),
@@ -225,7 +205,8 @@ def summarise(
         "reprojection_error_px": _mean(row.reprojection_error_px for row in rows),
         "stage_ms": {name: value for name, value in stage_ms.items() if value is not None},
         "frames": {
-            "source": num_frames,
+            "source": max(num_frames or 0, num_sent),
+            "sent": num_sent,
             "tracked": len(rows),
             "posed": len(posed_ids),
             "keyframes": num_keyframes,
@@ -234,7 +215,7 @@ def summarise(
         "frame_rate_hz": (len(rows) - 1) / span_s if span_s > 0 else None,
         "drops": dict(drops),
         "states": dict(Counter(row.state for row in rows)),
-        "unposed_frames": unposed_ranges(frame_ids, posed_ids),
+        "unposed_frames": unposed_ranges(sent, posed_ids),
     }
 
 

@@ -281,6 +281,7 @@ class Server:
             return
         if session is None or session.identity.agent_epoch != message.agent_epoch:
             session = self._begin(decoded.arrival.camera)
+        session.note_arrival(message.frame_id, message.seq)
         self._complete = message.final
         self._nearly_final = _is_nearly_final(message.frame_id, decoded.arrival.camera)
         if decoded.frame is None:

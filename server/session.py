@@ -50,6 +50,7 @@ from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.reference import Reference
 from semcast.server.run_record import FrameRow, RunRecord, run_line, summarise
+from semcast.server.sent_frames import stretches
 from semcast.server.settings import ServerSettings
 from semcast.server.view.scene import FrameView
 
@@ -164,6 +165,7 @@ class Session:
         bundle = bundle if bundle is not None else new_bundle(settings)
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
         self._t_source_ns: dict[int, int] = {}
+        self._numbers: dict[int, int | None] = {}
         self._map_epoch = 0
         self._last_frame_id = -1
         self._state = TrackingState.INITIALIZING
@@ -178,7 +180,9 @@ class Session:
             except BaseException:
                 self.close()
                 raise
-        self._t_source_ns.update((row.frame_id, row.t_source_ns) for row in self._record.rows())
+        for row in self._record.rows():
+            self._t_source_ns[row.frame_id] = row.t_source_ns
+            self._numbers[row.frame_id] = row.seq
         #: Poses of a restored map that the viewer has not seen yet.
         self._restored = self._reconstruction.final_trajectory() if self.resumed else {}
 
@@ -226,6 +230,10 @@ class Session:
         logger.info("map restored from the checkpoint, up to frame %d", self._last_frame_id)
         return True
 
+    def note_arrival(self, frame_id: int, seq: int) -> None:
+        """Note the number of a frame that is processed next, or of which there is nothing to process."""
+        self._numbers[frame_id] = seq
+
     def process(
         self, frame: DecodedFrame, arrival: Arrival, on_pose: Callable[[FrameResult], None] | None = None
     ) -> Outcome:
@@ -263,6 +271,7 @@ class Session:
             snr_set_db=arrival.snr_set_db,
             snr_estimated_db=arrival.snr_estimated_db,
             psnr_db=psnr,
+            seq=self._numbers.setdefault(frame.frame_id, None),
             age_ms=(tracked_ns - arrival.t_arrival_ns) * 1e-6,
             stage_ms={
                 **arrival.stage_ms,
@@ -352,7 +361,7 @@ class Session:
         Args:
             folder: Where to, or None to only make the summary.
             drops: Frames that never reached the tracker, by reason.
-            complete: The source came to its end, so all its frames count for completeness.
+            complete: The source came to its end, so frames that were sent before any arrived count too.
 
         Raises:
             OSError: Files can't be written; the others are.
@@ -374,12 +383,14 @@ class Session:
         if truth is not None and rows:
             # Errors are a share of the way that was gone, and not of all that the source has.
             truth = truth.between(rows[0].t_source_ns * 1e-9, rows[-1].t_source_ns * 1e-9)
+        num_frames = self.identity.num_frames if complete else None
         summary = summarise(
             rows,
             results.trajectory,
             results.part_of,
             truth,
-            self.identity.num_frames if complete else None,
+            stretches(self._numbers, from_first=num_frames is not None),
+            num_frames,
             drops,
             results.num_keyframes,
         )

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -83,17 +84,19 @@ def test_the_line_of_the_snr_that_is_set_has_no_gap_where_a_report_came_late(tmp
 
 
 def test_missing_frames_lie_between_those_that_are_there():
-    ids = np.array([0, 2, 4, 10, 12])
+    older_run = dict.fromkeys([0, 2, 4, 10, 12])
     t_s = np.array([0.0, 0.2, 0.4, 1.3, 1.5])
     # Every second frame was sent: 6 and 8 are missing, in thirds of the way from 4 to 10.
-    np.testing.assert_allclose(missing_times(ids, t_s), [0.7, 1.0])
-    assert len(missing_times(ids[:3], t_s[:3])) == 0
-    assert len(missing_times(ids[:1], t_s[:1])) == 0
+    np.testing.assert_allclose(missing_times(older_run, t_s), [0.7, 1.0])
+    assert len(missing_times(dict.fromkeys([0, 2, 4]), t_s[:3])) == 0
+    assert len(missing_times({7: None}, t_s[:1])) == 0
+    np.testing.assert_allclose(missing_times({0: 0, 2: 1, 4: 2, 10: 4, 12: 5}, t_s), [0.85])
 
 
 def test_missing_frames_are_marked(tmp_path):
     there = [row(k, snr_estimated_db=None) for k in (0, 1, 2, 3, 5, 6, 7, 8)]
     renumbered = [row(k, snr_estimated_db=None, t_source_ns=r.t_source_ns) for k, r in enumerate(there)]
+    left_out = [replace(r, seq=k) for k, r in enumerate(there)]
     marked, unmarked = timeline(there, tmp_path, "marked"), timeline(renumbered, tmp_path, "unmarked")
 
     def red(image):
@@ -101,11 +104,12 @@ def test_missing_frames_are_marked(tmp_path):
         return int(((red > 200) & (green < 60) & (blue < 60)).sum())
 
     assert red(unmarked) == 0 < red(marked)
+    assert red(timeline(left_out, tmp_path, "left_out")) == 0, "the agent did not send it"
 
 
 def test_the_title_says_how_many_frames_were_sent_and_where_the_others_went(tmp_path):
     rows = [row(k, posed=k > 0) for k in range(3)]
-    summary = {"frames": {"source": 7}, "drops": {"superseded": 3, "lost": 1, "damaged": 0}}
+    summary = {"frames": {"source": 20, "sent": 7}, "drops": {"superseded": 3, "lost": 1, "damaged": 0}}
     known = RunToPlot.read(write_run(tmp_path / "known", rows, summary), None)
     assert timeline_title(known) == "known: 3 of 7 frames (1 lost, 3 superseded), 2 with a pose at once"
     cut_off = RunToPlot.read(write_run(tmp_path / "cut_off", rows), None)

@@ -9,7 +9,8 @@ import pytest
 from semcast.common.errors import SemcastError
 from semcast.common.trajectory import Trajectory
 from semcast.server.export.outputs import write_json
-from semcast.server.run_record import FILE_NAME, FrameRow, RunRecord, read_rows, summarise, unposed_ranges
+from semcast.server.run_record import FILE_NAME, FrameRow, RunRecord, read_rows, summarise
+from semcast.server.sent_frames import stretches
 
 
 def row(frame_id, posed=True, psnr_db=30.0, **changes):
@@ -98,29 +99,24 @@ def test_a_full_disk_does_not_stop_the_stream(tmp_path, caplog):
     assert [r.frame_id for r in record.rows()] == [0, 1, 2]
 
 
-def test_unposed_ranges_by_hand():
-    assert unposed_ranges([0, 1, 2, 3, 5, 6, 9], {2, 6}) == [(0, 1), (3, 5), (9, 9)]
-    assert unposed_ranges([0, 1], {0, 1}) == []
-    assert unposed_ranges([], set()) == []
-
-
 def test_the_summary_has_the_promised_keys_and_values(tmp_path):
     rows = [row(k, posed=k != 3, psnr_db=30.0 + k) for k in range(10)]
     rows.append(row(10, psnr_db=float("inf")))
     kept = [k for k in range(11) if k != 3]
     part_of = {k: 0 if k < 3 else 2 for k in kept}
+    sent = stretches({k: k for k in range(16)})
     summary = summarise(
-        rows, line_trajectory(kept), part_of, line_trajectory(range(20)), 20, {"superseded": 2}, 7
+        rows, line_trajectory(kept), part_of, line_trajectory(range(20)), sent, 20, {"superseded": 5}, 7
     )
     assert summary["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
-    assert summary["completeness"] == 10 / 20
+    assert summary["completeness"] == 10 / 16
     assert summary["psnr_db"] == pytest.approx(34.5)
     assert summary["stage_ms"]["decode"]["p50"] == pytest.approx(25.0)
     assert summary["stage_ms"]["decode"]["p95"] == pytest.approx(29.5)
-    assert summary["drops"] == {"superseded": 2}
-    assert summary["unposed_frames"] == [(3, 3)]
+    assert summary["drops"] == {"superseded": 5}
+    assert summary["unposed_frames"] == [(3, 3), (11, 15)]
     assert summary["parts"] == [{"submap": 0, "num_posed": 3}, {"submap": 2, "num_posed": 7}]
-    assert summary["frames"] == {"source": 20, "tracked": 11, "posed": 10, "keyframes": 7}
+    assert summary["frames"] == {"source": 20, "sent": 16, "tracked": 11, "posed": 10, "keyframes": 7}
     assert summary["frame_rate_hz"] == pytest.approx(10.0)
     assert {"ate_percent", "rpe_trans_percent", "rpe_rot_deg"} <= set(summary)
     write_json(tmp_path / "summary.json", summary)
@@ -128,7 +124,7 @@ def test_the_summary_has_the_promised_keys_and_values(tmp_path):
 
 
 def test_a_run_without_frames_has_a_summary_too():
-    summary = summarise([], line_trajectory([]), {}, None, None, {}, 0)
+    summary = summarise([], line_trajectory([]), {}, None, [], None, {}, 0)
     assert summary["parts"] == []
     assert summary["completeness"] == 0.0
     assert summary["ate_rmse_m"] is None

@@ -136,6 +136,29 @@ def test_every_frame_tells_once_what_became_of_it(demo, tmp_path):
         assert 0 < row.stage_ms["decoded_to_pose"] <= ms
 
 
+def test_frames_that_the_agent_left_out_don_t_count_as_unposed(demo, tmp_path):
+    identity = StreamIdentity(
+        agent_id="a", agent_epoch=5, codec="x", digest="", camera=demo.intrinsics, num_frames=51
+    )
+    session = Session(ServerSettings(bundle="inline", out=tmp_path), identity, tmp_path, None)
+    sent = [*range(8), *range(8, 20, 2), *range(20, 30, 3)]  # one in two, then one in three
+    for seq, k in enumerate(sent):
+        if k == 14:
+            continue  # never arrived
+        session.note_arrival(k, seq)
+        if k == sent[-1]:
+            continue  # can't be decoded
+        now_ns = time.perf_counter_ns()
+        frame = DecodedFrame(k, int(demo.times_ns[k]), demo.image(k), None)
+        session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}))
+    summary = session.write_outputs(tmp_path, {}, complete=True)
+    session.close()
+    assert summary["frames"] == {**summary["frames"], "source": 51, "sent": len(sent), "posed": len(sent) - 2}
+    assert summary["completeness"] == (len(sent) - 2) / len(sent)
+    assert summary["unposed_frames"] == [(14, 14), (29, 29)]
+    assert [row.seq for row in read_rows(tmp_path / FRAMES_NAME)] == [k for k in range(17) if k != 11]
+
+
 def test_every_keyframe_has_its_image_also_those_the_map_began_with(demo, tmp_path):
     run_session(demo, tmp_path, range(12), save_images="keyframes")
     keyframes = read_run(tmp_path).keyframe_ids.tolist()

@@ -58,11 +58,12 @@ def test_bad_frames_are_counted_and_never_stop_the_stream(air):
     radio.send(3, slot_lost=pack_lost(np.ones(layout.num_slots, bool)))
     running.wait_for_drop("outage")
     radio.stream([4, 5])
+    radio.stream([9], seq=6)  # frames 6 to 8 were not sent
     summary = running.finish(stop=True)
     assert summary["drops"]["protocol"] == 1
     assert summary["drops"]["codec"] == 1
     assert summary["drops"]["outage"] == 1
-    assert summary["frames"]["tracked"] == 4
+    assert (summary["frames"]["tracked"], summary["frames"]["sent"]) == (5, 7)
 
 
 def test_a_bundle_adjustment_that_gave_up_is_in_the_status(air):
