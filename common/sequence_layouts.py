@@ -4,6 +4,7 @@ Images are not opened here. Poses are brought to ``T_world_cam`` of the camera w
 """
 
 import json
+import logging
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -19,7 +20,10 @@ from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transfor
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
 from semcast.common.lens import check_pinhole, distortion_in
+from semcast.common.numbered_images import lines_of_images, numbers_in_names
 from semcast.common.trajectory import Trajectory, read_tum
+
+logger = logging.getLogger(__name__)
 
 Layout = Literal["auto", "native", "tum", "kitti", "euroc", "transforms", "folder"]
 
@@ -303,7 +307,7 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
     if camera_idx is None:
         raise SourceError(f"{path} must have image_2 or image_0 to be a KITTI sequence")
     images = images_in(path / f"image_{camera_idx}")
-    times_ns = _times_beside(path, len(images), rate_hz)
+    times_ns = _kitti_times_ns(path, images, rate_hz)
     projection = _kitti_projection(path / "calib.txt", camera_idx)
     name = path.resolve().name
     poses_path = next((place for place in kitti_pose_places(path) if place.is_file()), None)
@@ -316,7 +320,11 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
             poses = poses @ make_transform(np.eye(3), -t_cam_cam0)
         if len(poses) < len(times_ns):
             raise SourceError(f"{poses_path} must have a pose per image, got {len(poses)} of {len(times_ns)}")
-        truth = Trajectory(ns_to_seconds(times_ns), poses[_kitti_rows(images, len(poses))])
+        lines = lines_of_images(images, len(poses))
+        if lines is None and numbers_in_names(images):
+            raise SourceError(f"{poses_path} has {len(poses)} poses: none for image {images[-1].name}")
+        # Images with other names are taken for the first ones.
+        truth = Trajectory(ns_to_seconds(times_ns), poses[lines if lines is not None else slice(len(images))])
 
     def camera(width: int, height: int) -> Intrinsics | None:
         if projection is None:
@@ -327,16 +335,15 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
     return SequenceFiles(name, images, times_ns, camera, truth)
 
 
-def _kitti_rows(images: tuple[Path, ...], num_rows: int) -> NDArray[np.int64]:
-    """Return which rows of a file are those of a recording's images, which may be cut out of a longer one.
-
-    KITTI numbers its images; where these have other names they are taken for the first.
-    """
-    rows = np.arange(len(images), dtype=np.int64)
-    if num_rows == len(images) or not all(p.stem.isascii() and p.stem.isdecimal() for p in images):
-        return rows
-    numbers = [int(p.stem) for p in images]
-    return np.array(numbers, dtype=np.int64) if max(numbers, default=0) < num_rows else rows
+def _kitti_times_ns(path: Path, images: tuple[Path, ...], rate_hz: float) -> NDArray[np.int64]:
+    times_ns = _times_beside(path, len(images), rate_hz)
+    lines = lines_of_images(images, len(times_ns))
+    if lines is None or len(lines) == len(times_ns):
+        return times_ns
+    logger.info(
+        "%s has %d of %d images: times and poses are those of their numbers", path, len(lines), len(times_ns)
+    )
+    return times_ns[lines]
 
 
 def kitti_pose_places(path: Path) -> tuple[Path, Path, Path]:

@@ -76,7 +76,7 @@ def test_kitti_layout_moves_poses_to_the_camera_that_is_used(tmp_path, write_ima
     ("times", "pose", "message"),
     [
         ("0\n2\n1\n", "1 0 0 0 0 1 0 0 0 0 1 0", "must strictly increase, image 3 has 1 s after 2 s"),
-        ("0\n1\n2\n3\n", "1 0 0 0 0 1 0 0 0 0 1 0", "one time per image, got 4 times and 3 images"),
+        ("0\n1\n", "1 0 0 0 0 1 0 0 0 0 1 0", "one time per image, got 2 times and 3 images"),
         ("0\n1\n2\n", "nan 0 0 0 0 1 0 0 0 0 1 0", "poses.txt: every line must have 12 numbers: .*finite"),
     ],
 )
@@ -99,6 +99,46 @@ def test_images_cut_out_of_a_kitti_recording_keep_their_poses(tmp_path, write_im
     (tmp_path / "poses.txt").write_text("\n".join(lines) + "\n")
     found = open_sequence(tmp_path).groundtruth().T_world_cam
     np.testing.assert_allclose(found, poses(8)[first : first + 3], atol=1e-7)
+
+
+@pytest.fixture
+def cut_kitti(tmp_path, write_images, poses):
+    """Return a function that writes a recording of eight frames, of which some images are left."""
+
+    def write(pattern, kept, num_poses):
+        write_images(tmp_path / "image_0", 8, pattern)
+        for k in set(range(8)) - set(kept):
+            (tmp_path / "image_0" / pattern.format(k)).unlink()
+        (tmp_path / "times.txt").write_text("".join(f"{0.1 * k * k}\n" for k in range(8)))
+        chosen = poses(8) if num_poses != len(kept) else poses(8)[list(kept)]
+        lines = (" ".join(f"{v:.9f}" for v in T[:3].ravel()) for T in chosen[:num_poses])
+        (tmp_path / "poses.txt").write_text("\n".join(lines) + "\n")
+        return tmp_path
+
+    return write
+
+
+@pytest.mark.parametrize("kept", [(0, 1, 2), (3, 4, 6)])
+@pytest.mark.parametrize("num_poses", [8, 3])
+def test_the_numbers_of_kitti_images_tell_their_times(cut_kitti, poses, kept, num_poses, caplog):
+    caplog.set_level("INFO", "semcast")
+    sequence = open_sequence(cut_kitti("{:06d}.png", kept, num_poses))
+    np.testing.assert_allclose(sequence.times_ns, [1e8 * k * k for k in kept])
+    np.testing.assert_allclose(sequence.groundtruth().T_world_cam, poses(8)[list(kept)], atol=1e-7)
+    assert "has 3 of 8 images: times and poses are those of their numbers" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("pattern", "num_poses", "message"),
+    [
+        ("night_{}.png", 8, "one time per image, got 8 times and 3 images"),
+        ("1{:05d}.png", 8, "one time per image, got 8 times and 3 images"),
+        ("{:06d}.png", 5, "poses.txt has 5 poses: none for image 000006.png"),
+    ],
+)
+def test_a_cut_kitti_recording_whose_numbers_don_t_tell_is_refused(cut_kitti, pattern, num_poses, message):
+    with pytest.raises(SourceError, match=message):
+        open_sequence(cut_kitti(pattern, (3, 4, 6), num_poses))
 
 
 def test_a_kitti_folder_may_stand_at_the_root_of_a_file_system(tmp_path):
