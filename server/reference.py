@@ -41,7 +41,7 @@ class Reference:
         times_ns: NDArray[np.int64] | None = None,
     ) -> None:
         self.truth = truth
-        self._times_ns = times_ns
+        self.times_ns = times_ns
         self._originals = originals
         self._failed = False
         self._job: Future[float | None] | None = None
@@ -49,9 +49,9 @@ class Reference:
 
     def truth_of(self, t_source_ns: Mapping[int, int]) -> Trajectory | None:
         """Return the true path on the clock of a stream, given the times of its frames by frame id."""
-        if self.truth is None or self._times_ns is None:
+        if self.truth is None or self.times_ns is None:
             return self.truth
-        return retimed(self.truth, self._times_ns, t_source_ns)
+        return retimed(self.truth, self.times_ns, t_source_ns)
 
     def psnr_db(self, frame_id: int, x_hat: NDArray[np.uint8]) -> "Future[float | None] | None":
         """Compare a decoded image with its original.

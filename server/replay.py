@@ -184,7 +184,7 @@ def _replayed(
         else recording_reference(reader, camera)
     )
     session = Session(server, identity, settings.out, reference, program=settings)
-    viewer = open_viewer(server, identity, reference.truth if reference is not None else None)
+    viewer = open_viewer(server, identity, reference)
     drops: dict[str, int] = {}
     processed = 0
     try:

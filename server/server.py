@@ -395,9 +395,8 @@ class Server:
 
     def _show(self, identity: StreamIdentity, resumed: bool, *, goes_on: bool) -> None:
         """Show the stream; a server that ``goes_on`` tracks it unseen if need be."""
-        truth = self._reference.truth if self._reference is not None else None
         try:
-            self._views.begin_stream(identity, truth, resumed=resumed)
+            self._views.begin_stream(identity, self._reference, resumed=resumed)
         except ConfigError as err:
             if not goes_on:
                 raise

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 from semcast.common.former_file import keep_former
 from semcast.common.run_folder import VIEWER_NAME
-from semcast.common.trajectory import Trajectory
 from semcast.server.mapping.state import MapUpdate
+from semcast.server.reference import Reference
 from semcast.server.session import StreamIdentity
 from semcast.server.settings import ServerSettings
 from semcast.server.view.scene import FrameView
@@ -33,7 +33,7 @@ def check_viewer(settings: ServerSettings) -> None:
 def open_viewer(
     settings: ServerSettings,
     identity: StreamIdentity,
-    truth: Trajectory | None,
+    reference: Reference | None,
     *,
     resumed: bool = False,
     process: "ViewerProcess | None" = None,
@@ -43,7 +43,7 @@ def open_viewer(
     Args:
         settings: ``view`` and ``out``.
         identity: Of the stream; names the viewer's recording.
-        truth: True path, or None.
+        reference: Whose true path is shown, or None.
         resumed: Keep the ``run.rrd`` that is there under another name.
         process: The viewer that showed the stream before this one, or None.
 
@@ -61,7 +61,8 @@ def open_viewer(
         settings.view,
         identity.camera,
         f"{identity.agent_id}-{identity.agent_epoch}",
-        truth=truth,
+        truth=reference.truth if reference is not None else None,
+        truth_times_ns=reference.times_ns if reference is not None else None,
         file=file,
         process=process,
     )
@@ -87,19 +88,19 @@ class SuccessiveViews:
         """Whether the present stream is."""
         return self._feed is not None
 
-    def begin_stream(self, identity: StreamIdentity, truth: Trajectory | None, *, resumed: bool) -> None:
+    def begin_stream(self, identity: StreamIdentity, reference: Reference | None, *, resumed: bool) -> None:
         """Show a stream, after ``end_stream`` of the one before.
 
         Args:
             identity: Of the stream.
-            truth: True path, or None.
+            reference: Whose true path is shown, or None.
             resumed: Keep the ``run.rrd`` that is there under another name.
 
         Raises:
             ConfigError: The viewer can't be started or ``run.rrd`` can't be written.
         """
         process = self._process
-        self._feed = open_viewer(self._settings, identity, truth, resumed=resumed, process=process)
+        self._feed = open_viewer(self._settings, identity, reference, resumed=resumed, process=process)
         self._process = None
 
     def submit(self, view: FrameView, update: MapUpdate | None = None, *, new_map: bool = False) -> None:

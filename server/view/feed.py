@@ -11,6 +11,9 @@ from collections import deque
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError
 from semcast.common.trajectory import Trajectory
@@ -61,7 +64,8 @@ class ViewerFeed:
         settings: What to show where.
         camera: Intrinsics of the decoded images.
         recording_id: Names the run; a restarted server that uses the same one continues in the same viewer.
-        truth: True path with the sequence's times, or None.
+        truth: True path, or None.
+        truth_times_ns: See ``Scene``.
         has_confidence: Whether frames carry confidence maps.
         file: Where the recording goes, or None for no file.
         process: The viewer to look after, perhaps handed over; None makes one as ``settings.view`` says.
@@ -77,6 +81,7 @@ class ViewerFeed:
         recording_id: str,
         *,
         truth: Trajectory | None = None,
+        truth_times_ns: NDArray[np.int64] | None = None,
         has_confidence: bool = True,
         file: Path | None = None,
         process: ViewerProcess | None = None,
@@ -86,7 +91,7 @@ class ViewerFeed:
         self._recording_id = recording_id
         self._has_truth = truth is not None
         self._has_confidence = has_confidence
-        self._scene = Scene(truth)
+        self._scene = Scene(truth, truth_times_ns)
         self._scene_lock = threading.Lock()
         self._pending: deque[tuple[FrameView, MapUpdate | None, bool]] = deque(maxlen=MAX_PENDING)
         self._newest: FrameView | None = None

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, project_to_so3
+from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import match_times
 from semcast.server.view.landmark_table import LandmarkTable
@@ -162,10 +163,18 @@ class Cursor:
 
 
 class Scene:
-    """Collects frames and map updates; ``changes_since`` says what a viewer lacks. Not thread-safe."""
+    """Collects frames and map updates; ``changes_since`` says what a viewer lacks. Not thread-safe.
 
-    def __init__(self, truth: Trajectory | None = None) -> None:
+    Args:
+        truth: True path, or None.
+        truth_times_ns: ``(N,)`` times by frame id on the clock of ``truth``; None where that is the stream's.
+    """
+
+    def __init__(
+        self, truth: Trajectory | None = None, truth_times_ns: NDArray[np.int64] | None = None
+    ) -> None:
         self._truth = truth
+        self._truth_times_ns = truth_times_ns
         self._generation = 0
         self._rows: deque[Row] = deque(maxlen=MAX_ROWS)
         self._num_rows = 0
@@ -289,8 +298,12 @@ class Scene:
         """Fit the truth to the path anew; a no-op while the path is too short to fit."""
         if self._truth is None or len(self._frame_ids) < 3:
             return
-        t_s = np.array(self._times_ns, dtype=np.float64) * 1e-9
-        place, truth_idx = match_times(t_s, self._truth.t_s)
+        times_ns = np.array(self._times_ns, dtype=np.int64)
+        if self._truth_times_ns is not None:
+            # Frames of a later pass have no time there.
+            num_timed = bisect_left(self._frame_ids, len(self._truth_times_ns))
+            times_ns = self._truth_times_ns[self._frame_ids[:num_timed]]
+        place, truth_idx = match_times(ns_to_seconds(times_ns), self._truth.t_s)
         fit = align_poses(self._truth.T_world_cam[truth_idx], self.poses()[place])
         if fit is None:
             return

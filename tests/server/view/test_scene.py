@@ -199,6 +199,20 @@ def test_the_truth_is_fitted_to_the_map_even_on_a_straight_line():
     np.testing.assert_allclose(aligned, 0.5 * truth.positions @ R.T + t, atol=1e-6)
 
 
+@pytest.mark.parametrize("rate_hz", [10, 25, 4])
+def test_the_truth_of_a_folder_that_is_played_at_another_rate_is_that_of_its_frames(rate_hz):
+    bend = [make_transform(exp_so3([0.0, 0.2 * k, 0.0]), (k, 0.1 * k * k, 0.0)) for k in range(12)]
+    own_ns = np.arange(12) * 100_000_000
+    truth = Trajectory(own_ns * 1e-9, np.array(bend))
+    scene = Scene(truth, own_ns)
+    for k in range(12):
+        scene.add_frame(replace(view(k, bend[k]), t_source_ns=k * 10**9 // rate_hz))
+    for k in range(12, 18):  # the folder again, backwards
+        scene.add_frame(replace(view(k, bend[22 - k]), t_source_ns=k * 10**9 // rate_hz))
+    scene.align_truth()
+    np.testing.assert_allclose(scene.changes_since(Cursor()).truth, truth.positions, atol=1e-5)
+
+
 def test_cameras_that_stand_or_move_against_each_other_have_no_fit():
     forth, back = np.array([at(k) for k in range(4)]), np.array([at(-k) for k in range(4)])
     assert align_poses(forth, back) is None
