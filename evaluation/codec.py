@@ -19,14 +19,13 @@ from semcast.channel.settings import ChannelSettings
 from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.codec import (
     DEFAULT_CODEC,
-    LOST_SLOT_SNR_DB,
     Codec,
     DecodedImage,
     EncodedImage,
     Modulation,
     ReceivedImage,
 )
-from semcast.common.codecs import LEARNED_CODECS, is_conventional, load_codec
+from semcast.common.codecs import LEARNED_CODECS, load_codec
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.image import psnr_db
 from semcast.common.link_report import LinkReporter
@@ -39,6 +38,7 @@ from semcast.evaluation.image_quality import ms_ssim, ssim
 from semcast.evaluation.picture_strip import write_picture_strip
 from semcast.evaluation.plots import plot_against_snr
 from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.sounding import told_at_first
 from semcast.evaluation.statistics import finite_mean, percentiles, spearman
 from semcast.evaluation.uncertainty_maps import block_means, pixel_label
 
@@ -54,7 +54,6 @@ _LOST_GREY = 128
 _STRIP_SNR_DB = 10.0
 _STRIP_IMAGES = 2
 _FRAME_INTERVAL_S = 0.1
-_SOUNDING_FRAME = 10**6
 #: Every third pixel of a map is graded.
 _PIXEL_STEP = 3
 
@@ -185,9 +184,10 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         # same noise, which belongs to the image's number.
         links = {label: Link(replace(settings.link, snr_db=snr_db), settings.seed) for label in under_name}
         reporters = {label: LinkReporter(codec.name) for label, codec in under_name.items()}
+        first = to_coded(next(iter(images.values())), settings.rate)
         told_db = {
-            label: _told_at_first(
-                codec, next(iter(images.values())), links[label], reporters[label], settings
+            label: told_at_first(
+                codec, first, links[label], reporters[label], 0.0, perfect_csi=settings.perfect_csi
             )
             for label, codec in under_name.items()
         }
@@ -262,20 +262,6 @@ def _warm_up(codecs: Iterable[Codec], image: NDArray[np.uint8]) -> None:
         received = Link(ChannelSettings(snr_db=15.0), 0).carry(codec.encode(image, 15.0), 0.0)
         if received is not None:
             codec.decode(received)
-
-
-def _told_at_first(
-    codec: Codec, image: NDArray[np.uint8], link: Link, reporter: LinkReporter, settings: CodecSettings
-) -> float:
-    """Return what the transmitter is told before the first image.
-
-    Who chooses a rate asks the link first: a frame that is not counted, of a number that no image has.
-    """
-    if not is_conventional(codec.name):
-        return link.settings.snr_db
-    encoded = codec.encode(to_coded(image, settings.rate), link.settings.snr_db)
-    sounding = link.receive(encoded, 0.0, _SOUNDING_FRAME, perfect_csi=settings.perfect_csi)
-    return LOST_SLOT_SNR_DB if sounding is None else reporter.snr_db(sounding)
 
 
 def _run(

@@ -25,6 +25,7 @@ from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence import open_sequence
+from semcast.evaluation.sounding import told_at_first
 
 logger = logging.getLogger(__name__)
 
@@ -170,7 +171,7 @@ def run_frames(
     """Send frames of a recording through a codec and a link, one after the other.
 
     The encoder is told what the agent would be told: the receiver's report on the last frame that
-    arrived; before the first one, the SNR the link is set to.
+    arrived; before the first one, see ``told_at_first``.
 
     Args:
         sequence: The recording.
@@ -184,8 +185,8 @@ def run_frames(
     """
     if (codec is None) != (link is None):
         raise ValueError("codec and link must be given both or neither")
-    feedback_db = link.settings.snr_db if link is not None else 0.0
     reporter = LinkReporter(codec.name) if codec is not None else None
+    feedback_db: float | None = None
     for frame_id in frame_ids:
         original = sequence.image(frame_id)
         t_source_ns = int(sequence.times_ns[frame_id])
@@ -193,6 +194,8 @@ def run_frames(
             clean = DecodedImage(original, np.ones(original.shape[:2], dtype=np.float32))
             yield LinkedFrame(frame_id, t_source_ns, original, clean, None, None, {})
             continue
+        if feedback_db is None:
+            feedback_db = told_at_first(codec, original, link, reporter, t_source_ns * 1e-9)
         stage_ms: dict[str, float] = {}
         since = time.perf_counter_ns()
         encoded = codec.encode(original, feedback_db)

@@ -10,8 +10,9 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codecs import load_codec
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.link_report import LinkReporter
-from semcast.evaluation.codec import CodecSettings, _told_at_first, evaluate_codec, read_images
+from semcast.evaluation.codec import CodecSettings, evaluate_codec, read_images
 from semcast.evaluation.picture_strip import picture_strip, write_picture_strip
+from semcast.evaluation.sounding import told_at_first
 from semcast.training.onnx_export import export_encoder
 
 
@@ -73,9 +74,10 @@ def test_who_chooses_a_rate_is_told_at_first_what_the_receiver_knows(folder):
     image = next(iter(read_images(folder)[0].values()))
 
     def told(codec, perfect_csi):
-        settings = CodecSettings(images=folder, perfect_csi=perfect_csi)
         link = Link(ChannelSettings(snr_db=10.0), 0)
-        return _told_at_first(load_codec(codec), image, link, LinkReporter(codec), settings)
+        return told_at_first(
+            load_codec(codec), image, link, LinkReporter(codec), 0.0, perfect_csi=perfect_csi
+        )
 
     assert told("jpeg-amc", True) == pytest.approx(10.0, abs=0.05)
     assert told("jpeg-amc", False) == pytest.approx(10.0, abs=1.0)

@@ -5,6 +5,8 @@ import pytest
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
+from semcast.common.codec import LOST_SLOT_SNR_DB
+from semcast.common.codecs import load_codec
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.image import psnr_db
 from semcast.common.sequence import open_sequence
@@ -66,6 +68,23 @@ def test_the_encoder_hears_the_receivers_estimate(sequence, phase_codec):
     link = Link(ChannelSettings(snr_db=4.0), 0)
     frames = list(run_frames(sequence, [0, 1, 2], phase_codec, link))
     assert told == [4.0, frames[0].snr_db_estimate, frames[1].snr_db_estimate]
+
+
+def test_an_adaptive_codec_sounds_the_link_before_the_first_frame(sequence):
+    codec, told = load_codec("jpeg-amc"), []
+    encode = codec.encode
+    codec.encode = lambda image, snr_db: told.append(snr_db) or encode(image, snr_db)
+    frames = [
+        next(run_frames(sequence, [3], codec, Link(ChannelSettings(channel="rayleigh", snr_db=10.0), seed)))
+        for seed in range(6)
+    ]
+    assert told[::2] == [10.0] * 6, "the frame that sounds is sent for the SNR that is set"
+    assert max(told[1::2]) < 9.3, "fading lets less through than a steady link of that SNR"
+    assert [f.frame_id for f in frames] == [3] * 6
+    assert sum(f.decoded is None for f in frames) <= 1
+    told.clear()
+    next(run_frames(sequence, [3], codec, Link(ChannelSettings(frame_loss=1.0), 0)))
+    assert told[1] == LOST_SLOT_SNR_DB, "nothing was heard of the link"
 
 
 def test_lost_frames_are_kept_as_such(sequence, phase_codec):
