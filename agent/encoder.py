@@ -105,7 +105,7 @@ class FrameEncoder:
             digest=self._codec.digest,
             image_hw=encoded.shape_hw,
             modulation=encoded.modulation,
-            levels=(encoded.levels.low, encoded.levels.high),
+            levels=encoded.levels.numbers,
             num_slots=layout.num_slots,
             uses_per_slot=layout.uses_per_slot,
             direction="tx",

@@ -133,7 +133,8 @@ class SymbolFrame:
         digest: Its digest.
         image_hw: Height and width in pixels; it fixes the slot grid.
         modulation: How symbols travel.
-        levels: Ends of the range of grey levels that was stretched to 0 .. 255 before encoding.
+        levels: Ends of the range of grey levels that was stretched to 0 .. 255 before encoding; with a knee
+            also the level it is at, and the one it became, see ``Levels``.
         num_slots: Of the grid.
         uses_per_slot: Of the grid, pilots included.
         direction: ``tx`` carries data symbols only, ``rx`` pilots and data as received.
@@ -158,7 +159,7 @@ class SymbolFrame:
     digest: str = field(metadata=_DIGEST)
     image_hw: tuple[int, int] = field(metadata=_SIZE)
     modulation: Modulation = field(metadata=rule(Choice(MODULATIONS)))
-    levels: tuple[int, int] = field(default=(0, 255), metadata=rule(Many(WholeNumber(0, 255), count=2)))
+    levels: tuple[int, ...] = field(default=(0, 255), metadata=rule(Many(WholeNumber(0, 255), at_most=4)))
     num_slots: int = field(metadata=rule(WholeNumber(1, MAX_SIDE_PX)))
     uses_per_slot: int = field(metadata=rule(WholeNumber(1, 48 * MAX_SIDE_PX)))
     direction: Literal["tx", "rx"] = field(metadata=rule(Choice(("tx", "rx"))))
@@ -179,7 +180,11 @@ class SymbolFrame:
         Raises:
             FieldError: They don't.
         """
-        if self.levels[0] >= self.levels[1]:
+        if len(self.levels) not in (2, 4):
+            raise FieldError("shape", f"levels must have 2 or 4 elements, got {len(self.levels)}")
+        low, high, *knee = self.levels
+        rising = (low, knee[0], high) if knee else (low, high)
+        if list(rising) != sorted(set(rising)) or (knee and not 0 < knee[1] < 255):
             raise FieldError("range", f"levels must rise, got {list(self.levels)}")
         layout = self.layout
         if (self.num_slots, self.uses_per_slot) != (layout.num_slots, layout.uses_per_slot):

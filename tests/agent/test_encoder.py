@@ -5,10 +5,10 @@ import pytest
 
 from semcast.agent.encoder import FrameEncoder, LinkFeedback
 from semcast.agent.source import SourceFrame
-from semcast.common.levels import Levels
-from semcast.common.messages import LinkReport
+from semcast.common.levels import ALL_LEVELS, Levels
+from semcast.common.messages import LinkReport, SymbolFrame
 from semcast.common.symbol_payload import data_symbols
-from semcast.common.wire import pack
+from semcast.common.wire import pack, unpack
 
 
 class Clock:
@@ -64,15 +64,22 @@ def test_messages_carry_the_symbols_and_are_numbered(codec):
 
 def test_messages_say_what_grey_levels_were_stretched_from(codec):
     class Stretching(type(codec)):
-        def encode(self, image, snr_db):
-            return replace(super().encode(image, snr_db), levels=Levels(3, 40))
+        levels = ALL_LEVELS
 
-    image = np.zeros((16, 16, 3), np.uint8)
-    plain, stretched = (
-        FrameEncoder(c, 3, False).encode(SourceFrame(0, 0, 0, image), 5.0) for c in (codec, Stretching())
-    )
-    assert plain.levels == (0, 255)
-    assert stretched.levels == (3, 40)
+        def encode(self, image, snr_db):
+            return replace(super().encode(image, snr_db), levels=self.levels)
+
+    stretching = Stretching()
+    frame = SourceFrame(0, 0, 0, np.zeros((16, 16, 3), np.uint8))
+    for levels, numbers in (
+        (ALL_LEVELS, (0, 255)),
+        (Levels(3, 40), (3, 40)),
+        (Levels(0, 255, 50, 180), (0, 255, 50, 180)),
+    ):
+        stretching.levels = levels
+        message = FrameEncoder(stretching, 3, False).encode(frame, 5.0)
+        assert message.levels == numbers
+        assert Levels(*unpack(pack(message), SymbolFrame).levels) == levels
 
 
 def test_symbols_that_do_not_fit_the_grid_are_refused_and_not_numbered(codec):

@@ -53,10 +53,50 @@ def test_the_ends_are_the_last_ones_that_cost_a_quarter_of_a_squared_level():
     assert cost(levels.high) <= 0.25 < cost(levels.high - 1)
 
 
-def test_lamps_in_the_night_are_kept():
-    image = uniform(0, 40, (100, 100, 3))
+@pytest.fixture
+def night():
+    """A dark picture with a lamp."""
+    image = uniform(3, 43, (100, 100, 3))
     image[40:44, 40:44] = 255
-    assert levels_of(image) == ALL_LEVELS
+    image[50, 50:60] = 150
+    return image
+
+
+def test_a_dark_picture_with_lamps_has_a_knee(night):
+    levels = levels_of(night)
+    assert 3 <= levels.low <= 6
+    assert levels.high >= 240
+    assert 40 <= levels.knee <= 46
+    assert 128 <= levels.knee_at <= 220, "most of the levels are for the dark part"
+    assert Levels(*levels.numbers) == levels
+    stretched = levels.stretch(night)
+    dark = night <= levels.knee
+    assert stretched[dark].max() - stretched[dark].min() > 2.5 * 40
+    clipped = np.clip(night, levels.low, levels.high)
+    np.testing.assert_array_equal(levels.unstretch(stretched)[dark], clipped[dark])
+    assert np.abs(levels.unstretch(stretched).astype(int) - clipped).max() <= 1, "lamps are put back as well"
+    assert stretched[night == 150].max() < stretched[night == 255].min()
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_a_picture_that_is_not_dark_or_that_has_much_light_stays_as_it_is(night, share):
+    assert levels_of(uniform(0, 150)) == ALL_LEVELS
+    num_rows = round(share * 100)
+    night[:num_rows] = uniform(100, 255, (num_rows, 100, 3))
+    assert levels_of(night) == ALL_LEVELS
+
+
+def test_a_knee_is_where_noise_costs_least(night):
+    levels = levels_of(night)
+    values = night[::2, ::2].astype(float)
+
+    def cost(knee, knee_at):
+        dark = (values <= knee).sum() * ((knee - levels.low) / knee_at) ** 2
+        return dark + 8.0 * (values > knee).sum() * ((levels.high - knee) / (255 - knee_at)) ** 2
+
+    others = [(levels.knee + k, levels.knee_at + at) for k in (-2, 0, 2) for at in (-4, 0, 4)]
+    assert cost(levels.knee, levels.knee_at) == min(cost(*other) for other in others)
+    assert cost(levels.knee, levels.knee_at) < 0.5 * values.size
 
 
 @pytest.mark.parametrize("level", [0, 7, 128, 255])
@@ -77,6 +117,43 @@ def test_the_shape_stays(shape):
 def test_levels_out_of_order_are_refused(low, high):
     with pytest.raises(ValueError, match="levels must be 0 <= low < high <= 255, got"):
         Levels(low, high)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "knee", "knee_at"),
+    [
+        (0, 255, 50, None),
+        (0, 255, None, 50),
+        (10, 255, 10, 99),
+        (0, 90, 90, 99),
+        (0, 255, 50, 0),
+        (0, 255, 50, 255),
+    ],
+)
+def test_a_knee_outside_the_range_is_refused(low, high, knee, knee_at):
+    with pytest.raises(ValueError, match="knee"):
+        Levels(low, high, knee, knee_at)
+
+
+def test_a_night_with_lamps_arrives_better(monkeypatch):
+    image = np.rint(0.2 * cv2.imread(str(PHOTO))[:256, :512, ::-1]).astype(np.uint8)
+    for x, y in ((60, 40), (200, 90), (380, 60)):
+        cv2.circle(image, (x, y), 4, (255, 240, 200), -1, cv2.LINE_AA)
+    codec = load_codec("3dcsc-lite")
+    dark = image.max(axis=2) < 64
+
+    def arriving_db():
+        received = Link(ChannelSettings(channel="awgn", snr_db=6.0), seed=0).carry(
+            codec.encode(image, 6.0), 0.0
+        )
+        decoded = codec.decode(received).image
+        return psnr_db(decoded, image), psnr_db(decoded[dark][None], image[dark][None])
+
+    with_knee = arriving_db()
+    monkeypatch.setattr(nets_codec, "levels_of", lambda _: ALL_LEVELS)
+    without = arriving_db()
+    assert with_knee[0] > without[0] + 0.5
+    assert with_knee[1] > without[1] + 1.0
 
 
 @pytest.mark.parametrize(("contrast", "black"), [(0.15, 0), (0.25, 120)])

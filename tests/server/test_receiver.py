@@ -112,10 +112,10 @@ def test_a_frame_is_equalised_and_reported(ends, make, sent):
         frame_lost=False,
     )))  # fmt: skip
     until(lambda: e.receiver._snr_set)
-    message = make(3, lost=[2], levels=(5, 60))
+    message = make(3, lost=[2], levels=(5, 255, 60, 180))
     e.put(message)
     frame = e.receiver.next(5)
-    assert frame.received.levels == Levels(5, 60)
+    assert frame.received.levels == Levels(5, 255, 60, 180)
     assert frame.message == message
     assert frame.camera == camera()
     assert frame.snr_db == pytest.approx(20.0, abs=1.5)
