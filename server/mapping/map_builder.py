@@ -34,6 +34,8 @@ Ids = NDArray[np.int64]
 _MAX_BRIDGE_S = 5.0
 #: Keyframes whose images are kept: 45 MB of 640x480.
 _MAX_IMAGES = 150
+#: A keyframe has landmarks enough with one for this share of the tracks that are wanted.
+_ENOUGH_SHARE = 0.2
 #: Landmarks seen again may take the tracks to so many times the number that is wanted.
 _MAX_TRACKS_SHARE = 1.2
 
@@ -135,9 +137,7 @@ class MapBuilder:
         self.world.add_landmarks(start.ids, xyz, rgb, start.confidence, self.submap, born)
         self._submit(start=True)
         self.collect(wait=True)
-        mapper.add_landmarks(
-            self.world, self._camera, self.noise.model, sight.frame.image, self._settings.min_parallax_deg
-        )
+        self._add_landmarks(sight.frame.image)
         self._bound()
         self._submit(start=True)
         self.collect(wait=True)
@@ -245,9 +245,7 @@ class MapBuilder:
                 descriptors=descriptors,
             )
         )
-        mapper.add_landmarks(
-            world, self._camera, self.noise.model, frame.image, self._settings.min_parallax_deg
-        )
+        self._add_landmarks(frame.image)
         self.num_inliers_at_keyframe = int((world.landmarks.rows(ids) >= 0).sum())
         self._bound()
         self._submit()
@@ -262,6 +260,13 @@ class MapBuilder:
         window = self.world.keyframes_of(self.submap)[-self._settings.window_size :]
         if recognised is not None and recognised not in {k.frame_id for k in window}:
             self.world.revisits.setdefault(frame_id, recognised)
+
+    def _add_landmarks(self, image: NDArray[np.uint8]) -> None:
+        s = self._settings
+        enough = round(_ENOUGH_SHARE * s.max_features)
+        mapper.add_landmarks(
+            self.world, self._camera, self.noise.model, image, s.min_parallax_deg, enough=enough
+        )
 
     def _bound(self) -> None:
         """Keep the map, and the images of its keyframes, within its size."""

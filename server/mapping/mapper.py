@@ -23,6 +23,9 @@ MAX_ERROR_SIGMA = 1.8
 _MAX_DEPTH_RATIO = 60.0
 #: Noise is judged by residuals that keep at least this share of its variance.
 _MIN_LEFT = 0.1
+#: Where landmarks run out, points under smaller angles do, down to this share of the usual one: a camera that
+#: turns leaves all it knows, and sees hardly anything from two sides.
+_LEAST_PARALLAX_SHARE = 0.3
 #: Observations in a row that disagree before a landmark is given up.
 _MAX_MISSED = 4
 
@@ -103,11 +106,26 @@ def add_landmarks(
     image: NDArray[np.uint8],
     min_parallax_deg: float,
     *,
+    enough: int = 0,
     num_keyframes: int = 12,
 ) -> int:
-    """Triangulate the tracks of the newest keyframe that are no landmarks yet; the number added."""
+    """Triangulate the tracks of the newest keyframe that are no landmarks yet; the number added.
+
+    Args:
+        world: The map, grown.
+        camera: Pinhole.
+        noise: Of the observations.
+        image: The newest keyframe's, ``(H, W, 3)``, for the colours.
+        min_parallax_deg: Angle between the rays of a point.
+        enough: Landmarks in sight, with fewer of which smaller angles do.
+        num_keyframes: That may have seen the points, the newest ones.
+    """
     newest = world.keyframes[-1]
-    wanted = newest.ids[world.landmarks.rows(newest.ids) < 0]
+    is_new = world.landmarks.rows(newest.ids) < 0
+    wanted = newest.ids[is_new]
+    num_known = len(newest.ids) - len(wanted)
+    if num_known < enough:
+        min_parallax_deg *= max(num_known / enough, _LEAST_PARALLAX_SHARE)
     views = [k for k in world.keyframes[-num_keyframes:] if k.submap == newest.submap]
     reach = median_depth(world, newest)
     new = new_landmarks(camera, views, newest, wanted, noise, min_parallax_deg, reach)

@@ -106,6 +106,21 @@ def test_without_parallax_nothing_is_triangulated():
     assert add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0) == 0
 
 
+def test_smaller_angles_do_where_landmarks_run_out():
+    def added(num_known, enough):
+        world, points, _ = make_world(step=0.04)
+        known = np.arange(num_known)
+        rgb = np.zeros((num_known, 3), np.uint8)
+        world.add_landmarks(known, points[known], rgb, np.ones(num_known), 0, 0)
+        return add_landmarks(world, CAMERA, NOISE, IMAGE, 1.5, enough=enough)
+
+    assert added(0, enough=0) < 20, "few have the parallax that is asked for"
+    assert added(0, enough=40) > 60
+    assert added(40, enough=40) < 10, "there are enough"
+    assert added(10, enough=40) > 60
+    assert added(10, enough=40) > added(35, enough=40) > added(40, enough=40)
+
+
 def test_a_slipped_track_is_no_landmark():
     world, _, _ = make_world()
     world.keyframes[-1].xy[:10] += 12.0

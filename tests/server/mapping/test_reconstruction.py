@@ -380,8 +380,18 @@ def test_turning_costs_no_rotation_while_landmarks_run_out():
         assert rotation_angle_deg(turned.T @ truth[9][:3, :3].T @ truth[k][:3, :3]) < 0.5
 
 
-def test_a_part_begun_after_a_turn_is_not_taken_for_the_old_one(caplog):
-    # Many tracks survive the turn, but no landmark does.
+def test_a_turn_that_leaves_all_landmarks_behind_is_part_of_the_map():
+    truth = turning_away()
+    reconstruction = make(lost_after_frames=4)
+    results = [reconstruction.process(frame_of(k, render(T))) for k, T in enumerate(truth)]
+    assert all(r.state is TrackingState.TRACKING for r in results[3:])
+    assert results[-1].submap == 0
+    assert ate_percent(reconstruction.final_trajectory(), truth) < 4.0
+
+
+def test_a_part_begun_after_a_turn_is_not_taken_for_the_old_one(caplog, monkeypatch):
+    # Many tracks survive the turn, but no landmark does, nor do points under small angles replace them.
+    monkeypatch.setattr("semcast.server.mapping.map_builder._ENOUGH_SHARE", 0.0)
     truth = turning_away()
     reconstruction = make(lost_after_frames=4)
     with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
