@@ -1,5 +1,6 @@
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -152,3 +153,21 @@ def test_a_damaged_image_is_told_by_us_and_by_opencv_only_on_request(tmp_path):
         shown = subprocess.run([*words, *debug], capture_output=True, text=True, check=True, env=env)
         assert "1 of these images" in shown.stdout
         assert ("[ WARN:" in shown.stderr) == is_told
+
+
+def test_ctrl_c_while_a_verb_is_imported_waits_until_it_is(monkeypatch, capsys):
+    done = []
+
+    def import_module(name):
+        signal.raise_signal(signal.SIGINT)
+        done.append(name)  # gtsam would fail here with another error
+
+    monkeypatch.setattr("importlib.import_module", import_module)
+    assert main(["server"]) == 130
+    assert done == ["semcast.commands.server"]
+    assert capsys.readouterr().err == ""
+
+
+def test_ctrl_c_is_no_traceback_before_the_verb_is_known_either(monkeypatch):
+    monkeypatch.setattr("semcast.cli._overview", lambda: signal.raise_signal(signal.SIGINT))
+    assert main(["server"]) == 130

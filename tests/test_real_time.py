@@ -1,5 +1,8 @@
 """What the demo sends: as large and as often as this machine can serve."""
 
+import multiprocessing
+import threading
+
 import numpy as np
 import pytest
 
@@ -70,3 +73,10 @@ def test_the_plan_follows_from_a_measurement_in_a_process_of_its_own():
     assert 0.0 < plan.rate_hz <= 10.0
     with pytest.raises(ConfigError, match="codec must be"):
         plan_for("3dcs", "16qam", noise(64, 64), 10.0)
+
+
+def test_a_measurement_is_given_up_when_the_demo_is_stopped():
+    stop = threading.Event()
+    stop.set()
+    assert plan_for("3dcsc-lite", "16qam", noise(720, 1280), 10.0, stop=stop) is None
+    assert not multiprocessing.active_children()

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 
+from semcast.common.interrupts import deaf_children
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
 
 logger = logging.getLogger(__name__)
@@ -27,7 +28,7 @@ GIVEN_UP = (
 
 def serve(connection: Connection) -> None:
     """Answer problems until the other end closes; the body of the child process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows nothing else keeps Ctrl-C away
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from semcast.server.mapping.bundle import optimise
 
@@ -96,7 +97,8 @@ class ProcessBundle:
         self._process = self._context.Process(
             target=serve, args=(theirs,), name="semcast-bundle", daemon=True
         )
-        self._process.start()
+        with deaf_children():  # Ctrl-C is the parent's business
+            self._process.start()
         theirs.close()
         self._connection = ours
 

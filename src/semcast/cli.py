@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from semcast import SemcastError, __version__
 from semcast.common.argument_order import arguments_last
 from semcast.common.config import MissingSettingError, near_match
+from semcast.common.interrupts import ctrl_c_held
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
@@ -80,7 +81,8 @@ def verb_parser(verb: str) -> argparse.ArgumentParser:
     module, text = VERBS[verb]
     parser = _Parser(prog=f"semcast {verb}", description=text[0].upper() + text[1:] + ".")
     parser.add_argument("--debug", action="store_true", help="show tracebacks and debug messages")
-    command = importlib.import_module(f"semcast.commands.{module}")
+    with ctrl_c_held():  # what gtsam makes of it while it is imported is another error
+        command = importlib.import_module(f"semcast.commands.{module}")
     command.add_arguments(parser)
     parser.set_defaults(command=command.run)
     return parser
@@ -142,6 +144,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         finally:
             if sys.stdout is not None:
                 sys.stdout.flush()
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
     except OSError as err:
         if not _stdout_fails() or "--debug" in words:
             raise
@@ -189,7 +193,5 @@ def _run(words: list[str]) -> int:
             file=sys.stderr,
         )
         return EXIT_ERROR
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
     finally:
         logging.getLogger("semcast").removeHandler(handler)

@@ -316,7 +316,9 @@ def run_demo(
             session.watch_alive(AGENT_ID, alive.on_change)
             session.subscribe(status_key(AGENT_ID, "server"), "newest", alive.on_status)
             children["channel"].start()
-            playback = choose_playback(settings, recorded)
+            playback = choose_playback(settings, recorded, stop)
+            if playback is None:
+                return None, None
             for text in _reductions(settings, playback):
                 tell(text)
             command = agent_command(settings, sequence, endpoint, playback)
@@ -351,8 +353,12 @@ def _join(endpoint: str, server: Role, stop: threading.Event) -> Session | None:
                 raise
 
 
-def choose_playback(settings: DemoSettings, recorded: Sequence) -> Playback:
+def choose_playback(
+    settings: DemoSettings, recorded: Sequence, stop: threading.Event | None = None
+) -> Playback | None:
     """Return how the recording is played: as asked for, and the rest as this machine can serve it.
+
+    None when ``stop`` was set before that was measured.
 
     Raises:
         ConfigError: The codec is unknown.
@@ -365,7 +371,9 @@ def choose_playback(settings: DemoSettings, recorded: Sequence) -> Playback:
     if settings.resize is not None and settings.rate_hz is not None:
         return Playback(settings.resize, stride, rate_hz, rate_hz / full_hz)
     image = _first_image(recorded)
-    plan = plan_for(settings.codec, settings.modulation, image, rate_hz, settings.rate, settings.resize)
+    plan = plan_for(settings.codec, settings.modulation, image, rate_hz, settings.rate, settings.resize, stop)
+    if plan is None:
+        return None
     rate_hz = settings.rate_hz or plan.rate_hz
     return Playback(plan.resize, stride, rate_hz, rate_hz / full_hz)
 

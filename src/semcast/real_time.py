@@ -2,8 +2,9 @@
 
 import math
 import multiprocessing
+import threading
 import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from semcast.common.codec import Codec, Modulation, ReceivedImage
 from semcast.common.codecs import load_codec
 from semcast.common.cores import usable_cores
+from semcast.common.interrupts import deaf_children
 from semcast.common.rate import NATIVE_RATE, RateChoice, to_coded
 
 #: Larger images gain little.
@@ -29,6 +31,7 @@ _MAX_CORES = 4
 #: A recording is played slower only if it is worth it: the measurement is no better.
 _FULL_PACE = 0.9
 _MEASURE_S = 1.0
+_POLL_S = 0.1
 _MAX_CALLS = 7
 _SNR_DB = 10.0
 
@@ -168,8 +171,9 @@ def plan_for(
     rate_hz: float,
     rate: RateChoice = NATIVE_RATE,
     resize: float | None = None,
-) -> Plan:
-    """Measure this machine and choose what it can serve.
+    stop: threading.Event | None = None,
+) -> Plan | None:
+    """Measure this machine and choose what it can serve; None when ``stop`` was set before.
 
     It is measured in a process of its own, so that the codec's libraries don't stay in this one.
 
@@ -180,6 +184,7 @@ def plan_for(
         rate_hz: Images a second of the recording.
         rate: Channel uses per pixel value.
         resize: Factor on the image size that is asked for, or None to choose it.
+        stop: Ends it early.
 
     Raises:
         ConfigError: The codec is unknown.
@@ -191,6 +196,13 @@ def plan_for(
     size_wh = (max(1, round(width * largest)), max(1, round(height * largest)))
     smaller = np.asarray(cv2.resize(image, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        measured = pool.submit(measure_speed, codec, modulation, smaller, rate, min(cores, _MAX_CORES))
+        with deaf_children():  # Ctrl-C is this process's business
+            measured = pool.submit(measure_speed, codec, modulation, smaller, rate, min(cores, _MAX_CORES))
+            children = multiprocessing.active_children()
+        while not wait([measured], _POLL_S).done:
+            if stop is not None and stop.is_set():
+                for child in children:
+                    child.kill()
+                return None
         speed = measured.result()
     return make_plan(speed, (height, width), rate_hz, cores, resize)

@@ -104,3 +104,14 @@ def test_a_child_that_does_not_read_holds_nobody_up(goes_on):
         runner.close()
     assert time.monotonic() - since_s < DEADLINE_S
     assert not any(thread.name == "semcast-bundle-send" for thread in threading.enumerate())
+
+
+def test_ctrl_c_does_not_reach_a_child_that_still_starts():
+    runner = ProcessBundle(lossless=True)
+    try:
+        os.kill(runner.pid, signal.SIGINT)
+        assert runner.submit(PROBLEM)
+        runner.take()
+        assert runner.num_restarts == 0
+    finally:
+        runner.close()
