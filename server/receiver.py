@@ -88,7 +88,7 @@ class Receiver:
         agent_id: Whose frames.
         mode: Service.
         metrics: Where to count.
-        max_age_ms: Live frames older than this are dropped.
+        max_age_ms: Live frames older than this are dropped, but for a source's last one.
     """
 
     def __init__(
@@ -286,7 +286,7 @@ class Receiver:
     def _prepare(self, message: SymbolFrame, arrival_ns: int) -> ReceivedFrame | None:
         age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
         live = self._mode == "live"
-        if live and age_ms > self._max_age_ms:
+        if live and age_ms > self._max_age_ms and not message.final:  # the final one ends the stream
             self._metrics.drop("too_old")
             return None
         camera = self._camera_of(message.agent_epoch)

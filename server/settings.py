@@ -84,7 +84,7 @@ class ServerSettings:
         agent_id: Whose stream.
         network: Where the processes meet.
         mode: ``live`` takes the newest frame and drops the others; ``replay`` loses none and repeats exactly.
-        max_age_ms: Live frames older than this are dropped.
+        max_age_ms: Live frames older than this are dropped, but for a source's last one.
         out: Folder for outputs, or None.
         codec: Codec to load before the server reports itself ready; others are loaded when they arrive. A
             file of weights takes the place of the shipped ones of its codec.

@@ -196,6 +196,18 @@ def test_old_live_frames_are_dropped(ends, make):
     assert e.metrics.drops["too_old"] == 1
 
 
+def test_the_last_frame_of_a_source_is_never_too_old(ends, make):
+    e = ends(max_age_ms=200.0)
+    e.answer_camera(camera())
+    e.put(make(0))
+    assert e.receiver.next(5).message.seq == 0
+    e.put(make(1, t_capture_ns=time.monotonic_ns() - 10**9, final=True))
+    last = e.receiver.next(5)
+    assert last is not None, "without it the server would never end"
+    assert last.message.final
+    assert "too_old" not in e.metrics.drops
+
+
 def test_a_late_receiver_learns_the_camera_by_asking(ends, make):
     e = ends()
     e.put(make(0))
