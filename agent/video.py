@@ -178,7 +178,7 @@ class VideoSource(_Captured):
             if image is None:
                 image = _read(self._capture)
             if image is None:
-                self._warn_if_cut(count)
+                self._warn_if_cut(count, t_ns)
                 return
             stamp_ns = round(float(np.nan_to_num(self._capture.get(cv2.CAP_PROP_POS_MSEC))) * 1e6)
             began_ns = stamp_ns if count == 0 else began_ns
@@ -194,13 +194,15 @@ class VideoSource(_Captured):
             yield t_ns, image
             image = None
 
-    def _warn_if_cut(self, count: int) -> None:
+    def _warn_if_cut(self, count: int, last_ns: int) -> None:
         """Containers count frames roughly; a good deal fewer are a sign of damage, said once.
 
-        Phones trim by an edit list that hides frames, which are counted all the same.
+        Phones trim by an edit list that hides frames, which are counted all the same. Matroska counts none:
+        OpenCV makes a number of duration and usual rate, which a varying rate need not reach before its end.
         """
         stored = self._stored_frames
-        if stored is None or self._is_cut or count >= min(0.98 * stored, stored - 3):
+        reached = max(count, last_ns * 1e-9 * self._fps + 1)
+        if stored is None or self._is_cut or reached >= min(0.98 * stored, stored - 3):
             return
         self._is_cut = True
         logger.warning(

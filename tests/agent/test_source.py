@@ -303,6 +303,18 @@ def test_a_damaged_video_says_how_much_of_it_can_be_read(tmp_path, caplog):
     assert not caplog.text, "an end that was asked for is none"
 
 
+@pytest.mark.parametrize(("period_ms", "is_damaged"), [(20, True), (30, False)])
+def test_a_video_of_varying_rate_is_not_damaged_where_it_lasts_to_its_end(
+    video, period_ms, is_damaged, caplog
+):
+    source = open_source(fast(video, camera=PINHOLE))
+    source._capture = Stamped(source._capture, [period_ms * k for k in range(11)])
+    source._stored_frames = 14  # 280 ms at its usual rate, as counted of a container that says no number
+    assert len(list(source.frames(threading.Event()))) in (9, 10)
+    source.close()
+    assert ("may be damaged" in caplog.text) == is_damaged
+
+
 def test_a_video_needs_a_camera_that_fits(video, tmp_path):
     with pytest.raises(SourceError, match="camera of .* is unknown: put intrinsics.json"):
         open_source(fast(video))
