@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from semcast.common.errors import SourceError
+from semcast.common.errors import SemcastError, SourceError
 from semcast.common.run_folder import VIEWER_NAME, RunData
-from semcast.server.view.rerun_viewer import RerunStream
+from semcast.server.view.rerun_viewer import Delivery, RerunStream
 from semcast.server.view.scene import Cursor, FrameView, Scene, compress_picture
 
 JPEG_QUALITY = 80
@@ -29,20 +29,24 @@ def write_rrd(
         copy: False where ``data`` is not all the run's own recording shows.
 
     Raises:
-        SourceError: An image can't be read, or the file can't be finished.
+        SourceError: An image can't be read.
+        SemcastError: The file can't be written, or not to its end.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     recorded = folder / VIEWER_NAME
     if copy and recorded.is_file():
         shutil.copyfile(recorded, path)
         return [path]
-    stream = RerunStream(
-        recording_id=folder.name or "run",
-        camera=data.intrinsics,
-        has_truth=False,
-        has_confidence=False,
-        file=path,
-    )
+    try:
+        stream = RerunStream(
+            recording_id=folder.name or "run",
+            camera=data.intrinsics,
+            has_truth=False,
+            has_confidence=False,
+            file=path,
+        )
+    except RuntimeError as err:
+        raise SemcastError(f"{path} can't be written: {err}") from err
     scene, cursor = Scene(), Cursor()
     scene.add_landmarks(data.landmark_ids, data.xyz, data.rgb, data.confidence, np.zeros(0, dtype=np.int64))
     for frame_id, t_ns, T_world_cam in zip(
@@ -53,8 +57,10 @@ def write_rrd(
         if view.image is not None:
             scene.set_picture(compress_picture(view, JPEG_QUALITY))
         stream.write(scene.changes_since(cursor))
-    if not stream.close(CLOSE_DEADLINE_S):
-        raise SourceError(f"{path} could not be finished in {CLOSE_DEADLINE_S:g} s")
+    # Rerun writes on a thread of its own, and says only here that it could not, as on a full disk.
+    delivery = stream.flush(CLOSE_DEADLINE_S)
+    if not stream.close(CLOSE_DEADLINE_S) or delivery is not Delivery.DONE:
+        raise SemcastError(f"{path} can't be written to its end: is there room on the disk?")
     return [path]
 
 

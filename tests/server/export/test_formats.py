@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from evo.tools import file_interface
 
-from semcast import SourceError
+from semcast import SemcastError, SourceError
 from semcast.cli import main
 from semcast.commands.export import FORMATS as command_formats
 from semcast.common.geometry import invert_transform
@@ -247,6 +247,19 @@ def test_without_one_a_rerun_recording_is_made_of_poses_images_and_points(tmp_pa
         str(chunk.entity_path): 0 for chunk in rr.chunk.RrdReader(tmp_path / "made.rrd").stream().to_chunks()
     }
     assert {"/world/camera", "/world/camera/image", "/world/map_colour/0000"} <= set(entities)
+
+
+@pytest.mark.parametrize("room", [0, 3000])
+def test_a_rerun_recording_that_finds_no_room_is_an_error(tmp_path, arc_run, write_arc_run, room):
+    resource = pytest.importorskip("resource")
+    write_arc_run(tmp_path / "run", arc_run())
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+    try:
+        with pytest.raises(SemcastError, match=r"made.rrd can't be written"):
+            export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize(
