@@ -4,6 +4,7 @@ import contextlib
 import errno
 import logging
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -69,10 +70,12 @@ def make_output_folder(folder: Path) -> None:
     somebody else for its own.
 
     Raises:
-        ConfigError: It can't be made, or holds images that no run wrote.
+        ConfigError: It can't be made or written into, or holds images that no run wrote.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
     except OSError as err:
         raise ConfigError(f"{folder} can't be made a folder for outputs: {err}") from err
     check_not_foreign(folder, IMAGES_NAME)
@@ -89,7 +92,8 @@ def output_folder(folder: Path | None) -> Iterator[None]:
         folder: The folder, or None for a run that writes nothing.
 
     Raises:
-        ConfigError: It can't be made, holds images that no run wrote, or a run is writing into it.
+        ConfigError: It can't be made or written into, holds images that no run wrote, or a run is writing
+            into it.
     """
     if folder is None:
         yield

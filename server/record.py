@@ -15,6 +15,7 @@ from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
 from semcast.common.recording import recording_metadata
 from semcast.common.transport import Session, open_session
+from semcast.common.whole_file import check_writable
 from semcast.common.wire import WireError, unpack
 
 CAMERA_TIMEOUT_S = 0.5
@@ -131,9 +132,10 @@ def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any
         ``messages``, ``bytes`` and ``drops`` by reason.
 
     Raises:
-        SourceError: The file can't be written.
+        ConfigError: The file can't be written, said before anything is waited for.
         TransportError: The session failed.
     """
+    check_writable(settings.file, "file")
     session = open_session(settings.network, stop)
     if session is None:
         return {"messages": 0, "bytes": 0, "drops": {}}

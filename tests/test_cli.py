@@ -171,3 +171,14 @@ def test_ctrl_c_while_a_verb_is_imported_waits_until_it_is(monkeypatch, capsys):
 def test_ctrl_c_is_no_traceback_before_the_verb_is_known_either(monkeypatch):
     monkeypatch.setattr("semcast.cli._overview", lambda: signal.raise_signal(signal.SIGINT))
     assert main(["server"]) == 130
+
+
+def test_a_folder_that_may_not_be_looked_into_is_an_error_in_a_line(tmp_path, monkeypatch, capsys):
+    def may_not(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "is_file", may_not)
+    assert main(["export", str(tmp_path), "--format", "tum", "--out", str(tmp_path / "x")]) == 1
+    err = capsys.readouterr().err
+    assert "Permission denied" in err
+    assert err.count("\n") == 1

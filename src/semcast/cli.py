@@ -184,6 +184,11 @@ def _run(words: list[str]) -> int:
             traceback.print_exc()
         print(f"semcast {verb}: {_plain(err)}", file=sys.stderr)
         return EXIT_ERROR
+    except PermissionError as err:  # Path.is_file raises it in a folder that may not be looked into
+        if debug:
+            traceback.print_exc()
+        print(f"semcast {verb}: {err.strerror or err}: {err.filename}", file=sys.stderr)
+        return EXIT_ERROR
     except ModuleNotFoundError as err:
         if debug or (err.name or "").startswith("semcast"):
             raise

@@ -84,6 +84,15 @@ def test_a_folder_for_outputs_has_no_images_of_others_and_is_one(tmp_path):
         make_output_folder(tmp_path / "file")
 
 
+def test_a_folder_that_nothing_can_be_written_into_is_refused_at_once(tmp_path, monkeypatch):
+    def may_not(**given):
+        raise PermissionError(13, "Permission denied", given["dir"])
+
+    monkeypatch.setattr("tempfile.TemporaryFile", may_not)
+    with pytest.raises(ConfigError, match=r"can't be made a folder for outputs: .*Permission denied"):
+        make_output_folder(tmp_path)
+
+
 def test_a_folder_in_use_is_refused_until_the_run_ends(tmp_path):
     folder = tmp_path / "run"
     with output_folder(folder):

@@ -278,3 +278,11 @@ def test_a_time_range_without_frames_is_one_clear_error(recording):
         replay(ReplaySettings(file=recording, start_s=0.21, end_s=0.22))
     with pytest.raises(ValueError, match="end_s must be later"):
         ReplaySettings(file=recording, start_s=2.0, end_s=1.0)
+
+
+def test_a_recorder_that_can_not_write_says_so_before_it_waits_for_anybody(tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    stopped = threading.Event()
+    stopped.set()
+    with pytest.raises(ConfigError, match="file can't be written to"):
+        run_record(RecordSettings(file=tmp_path / "file" / "run.mcap"), stopped)
