@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+#: A footer of the file costs memory with every frame: longer streams, and those without end, get none.
+MAX_FRAMES_WITH_FOOTER = 3000
+
 
 def check_viewer(settings: ServerSettings) -> None:
     """Check early that what is asked for can be shown.
@@ -64,6 +67,7 @@ def open_viewer(
         truth=reference.truth if reference is not None else None,
         truth_times_ns=reference.times_ns if reference is not None else None,
         file=file,
+        footer=identity.num_frames is not None and identity.num_frames <= MAX_FRAMES_WITH_FOOTER,
         process=process,
     )
     if viewer.url is not None:

@@ -68,6 +68,7 @@ class ViewerFeed:
         truth_times_ns: See ``Scene``.
         has_confidence: Whether frames carry confidence maps.
         file: Where the recording goes, or None for no file.
+        footer: Whether that ends with an index, see ``RerunStream``.
         process: The viewer to look after, perhaps handed over; None makes one as ``settings.view`` says.
 
     Raises:
@@ -84,6 +85,7 @@ class ViewerFeed:
         truth_times_ns: NDArray[np.int64] | None = None,
         has_confidence: bool = True,
         file: Path | None = None,
+        footer: bool = True,
         process: ViewerProcess | None = None,
     ) -> None:
         self._settings = settings
@@ -91,6 +93,7 @@ class ViewerFeed:
         self._recording_id = recording_id
         self._has_truth = truth is not None
         self._has_confidence = has_confidence
+        self._footer = footer
         self._scene = Scene(truth, truth_times_ns)
         self._scene_lock = threading.Lock()
         self._pending: deque[tuple[FrameView, MapUpdate | None, bool]] = deque(maxlen=MAX_PENDING)
@@ -147,6 +150,7 @@ class ViewerFeed:
             has_truth=self._has_truth,
             has_confidence=self._has_confidence,
             file=file,
+            footer=self._footer,
             port=self._settings.port,
         )
 

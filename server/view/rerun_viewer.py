@@ -111,6 +111,8 @@ class RerunStream:
         has_truth: Whether a true path will be shown.
         has_confidence: Whether there will be confidence maps.
         file: Write to this file; None sends to a viewer.
+        footer: End the file with an index of it, which programs that read parts of it want. Rerun collects it
+            in memory, about 30 kB a frame.
         port: Where the viewer listens, on loopback.
     """
 
@@ -122,6 +124,7 @@ class RerunStream:
         has_truth: bool,
         has_confidence: bool,
         file: Path | None = None,
+        footer: bool = True,
         port: int = 9876,
     ) -> None:
         self._camera = camera
@@ -130,7 +133,7 @@ class RerunStream:
             APPLICATION_ID, recording_id=recording_id
         )
         if file is not None:
-            self._stream.save(file)
+            self._stream.save(file, write_footer=footer)
         else:
             self._stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
         self._stream.send_blueprint(blueprint(has_truth, has_confidence))

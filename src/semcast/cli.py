@@ -97,13 +97,15 @@ def _configure_logging(debug: bool) -> logging.Handler:
     return handler
 
 
-def _quieten_opencv() -> None:
-    """Keep OpenCV's and FFmpeg's own lines, which our messages say in words, off the terminal.
+def _quieten_libraries() -> None:
+    """Keep lines of OpenCV, FFmpeg and Rerun, which say what we know or say in words, off the terminal.
 
-    OpenCV reads this when a verb imports it. What the user has set holds.
+    They read this when a verb imports them. What the user has set holds.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
+    # Rerun warns of every file without a footer.
+    os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error")
 
 
 def _show_all_names() -> None:
@@ -171,7 +173,7 @@ def _run(words: list[str]) -> int:
     debug = "--debug" in words
     handler = _configure_logging(debug)
     if not debug:
-        _quieten_opencv()
+        _quieten_libraries()
     try:
         parser = verb_parser(verb)
         arguments = parser.parse_args(arguments_last(parser, words[1:]))

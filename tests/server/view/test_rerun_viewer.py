@@ -1,5 +1,6 @@
 """Viewers: what lands in the file, and that a dead, frozen or late viewer never holds the tracker up."""
 
+import contextlib
 import os
 import signal
 import socket
@@ -13,11 +14,15 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError
 from semcast.common.geometry import make_transform
-from semcast.server.settings import ViewSettings
+from semcast.server.settings import ServerSettings, ViewSettings
 from semcast.server.view.scene import FrameView
 
 pytest.importorskip("rerun")
 
+import rerun as rr
+
+from semcast.server.session import StreamIdentity
+from semcast.server.view.choice import open_viewer
 from semcast.server.view.feed import ViewerFeed, check_view, resolve_view
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
 from semcast.server.view.rerun_viewer import SERIES, blueprint
@@ -263,6 +268,17 @@ def test_a_window_the_user_closed_stays_closed():
     process.supervise()
     assert process.pid is None
     process.close()
+
+
+@pytest.mark.parametrize(("num_frames", "footer"), [(3, True), (None, False), (100_000, False)])
+def test_a_file_of_a_stream_without_end_collects_no_footer_in_memory(tmp_path, num_frames, footer):
+    identity = StreamIdentity("a", 1, "cnn", "0" * 16, CAMERA, num_frames)
+    feed = open_viewer(ServerSettings(out=tmp_path, view=ViewSettings(view="file")), identity, None)
+    feed.submit(frame(0))
+    feed.close()
+    expected = contextlib.nullcontext() if footer else pytest.warns(match="no footer")
+    with expected:
+        rr.chunk.RrdReader(tmp_path / "run.rrd")
 
 
 def test_a_window_is_left_open_for_the_user_when_asked():
