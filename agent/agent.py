@@ -29,6 +29,7 @@ from semcast.common.wire import WireError, pack, unpack
 logger = logging.getLogger(__name__)
 
 ROLE = "agent"
+_PEERS = frozenset({"channel", "server"})
 _POLL_S = 0.1
 _FLOW_POLL_S = 0.05
 _BUSY_POLL_S = 0.005
@@ -209,14 +210,17 @@ def _send_lossless(
 
 
 def _wait_for_peers(session: Session, agent_id: str, stop: threading.Event) -> None:
-    """Wait until channel and server are alive, or ``stop`` is set."""
-    missing = {"channel", "server"}
+    """Wait until channel and server are alive, or ``stop`` is set; say later when one goes or comes back."""
+    missing = set(_PEERS)
     both = threading.Event()
 
     def on_change(role: str, alive: bool) -> None:
-        if alive:
-            missing.discard(role)
-        if not missing:
+        if role not in _PEERS or alive == (role not in missing):
+            return
+        (missing.discard if alive else missing.add)(role)
+        if both.is_set():  # frames are sent all the same, and live ones are lost
+            logger.info("%s %s", role, "is there" if alive else "is gone")
+        elif not missing:
             both.set()
 
     session.watch_alive(agent_id, on_change)

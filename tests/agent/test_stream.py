@@ -283,6 +283,23 @@ def test_an_agent_waits_for_the_others_unless_told_not_to(bench, until, caplog):
     eager.end()
 
 
+def test_an_agent_says_when_the_channel_is_gone_and_when_it_is_back(bench, until, caplog):
+    caplog.set_level("INFO", "semcast.agent.agent")
+
+    def told():  # the receiver says so too
+        own = [r.message for r in caplog.records if r.name == "semcast.agent.agent"]
+        return [text for text in own if text.startswith("channel")]
+
+    first = bench.channel()
+    receiver = bench.receiver()
+    bench.agent(source={"repeat": "loop"})
+    take(receiver, count=1)
+    first.end()
+    until(lambda: told() == ["channel is gone"])
+    bench.channel()
+    until(lambda: told() == ["channel is gone", "channel is there"])
+
+
 def test_status_comes_once_a_second_and_at_the_end(bench, until):
     statuses = []
     bench.hub.subscribe(
