@@ -1,11 +1,13 @@
 """Writes the encoder of trained weights as an ONNX file, which agents without torch run."""
 
+import tempfile
 import warnings
 from pathlib import Path
 
 import numpy as np
 import onnx
 import torch
+from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
@@ -13,6 +15,7 @@ from semcast.common.errors import CheckpointError
 from semcast.common.nets.checkpoint import load_transceiver, weights_path
 from semcast.common.nets.onnx_encoder import FORMAT, INPUTS, OUTPUT
 from semcast.common.nets.rounding import rounded_snr_db
+from semcast.common.whole_file import write_whole
 from semcast.training.data import read_images
 from semcast.training.onnx_int8 import quantise
 
@@ -52,26 +55,12 @@ def export_encoder(name_or_path: str | Path, out: Path, int8_images: Path | None
     images = [] if int8_images is None else read_images(int8_images)
     model, manifest = load_transceiver(weights_path(name_or_path))
     example = (torch.zeros(1, 64, 96, 3, dtype=torch.uint8), torch.full((1,), 10.0))
-    sides = {1: "height", 2: "width"}
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of the exporter, about its own future
-            torch.onnx.export(
-                _ImageToLatent(model.encoder).eval(),
-                example,
-                str(out),
-                input_names=list(INPUTS),
-                output_names=[OUTPUT],
-                opset_version=OPSET,
-                dynamic_axes={"image": sides, OUTPUT: {2: "rows", 3: "columns"}},
-                dynamo=False,
+        with tempfile.TemporaryDirectory() as folder:
+            graph = _exported(
+                model.encoder, example, Path(folder) / "encoder.onnx", images, manifest.snr_range_db
             )
-        if images:
-            low_db, high_db = manifest.snr_range_db
-            names = [node.name for node in onnx.load(str(out)).graph.node if node.op_type == "Conv"]
-            quantise(out, names, images, (float(rounded_snr_db(low_db)), high_db))
-        graph = onnx.load(str(out))
         halve_weights(graph)
         facts = {
             "semcast_format": FORMAT,
@@ -82,10 +71,41 @@ def export_encoder(name_or_path: str | Path, out: Path, int8_images: Path | None
             "snr_max_db": str(manifest.snr_range_db[1]),
         }
         helper.set_model_props(graph, facts)
-        onnx.save(graph, str(out))
+        write_whole(out, graph.SerializeToString())
     except OSError as err:
         raise CheckpointError(f"encoder {out} can't be written: {err}") from err
     return out
+
+
+def _exported(
+    encoder: nn.Module,
+    example: tuple[Tensor, Tensor],
+    path: Path,
+    images: list[NDArray[np.uint8]],
+    snr_range_db: tuple[float, float],
+) -> onnx.ModelProto:
+    """Return the graph of an encoder, with eight-bit convolutions where there are images.
+
+    ``path`` is a file to work in.
+    """
+    sides = {1: "height", 2: "width"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the exporter, about its own future
+        torch.onnx.export(
+            _ImageToLatent(encoder).eval(),
+            example,
+            str(path),
+            input_names=list(INPUTS),
+            output_names=[OUTPUT],
+            opset_version=OPSET,
+            dynamic_axes={"image": sides, OUTPUT: {2: "rows", 3: "columns"}},
+            dynamo=False,
+        )
+    if images:
+        low_db, high_db = snr_range_db
+        names = [node.name for node in onnx.load(str(path)).graph.node if node.op_type == "Conv"]
+        quantise(path, names, images, (float(rounded_snr_db(low_db)), high_db))
+    return onnx.load(str(path))
 
 
 def halve_weights(graph: onnx.ModelProto) -> None:

@@ -193,3 +193,16 @@ load_codec("3dcsc-lite", runtime="auto")
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "semcast[edge]" in done.stderr.splitlines()[-1]
+
+
+def test_an_export_that_is_stopped_leaves_the_encoder_that_was_there(weights, tmp_path, monkeypatch):
+    def stopped(graph):
+        raise KeyboardInterrupt
+
+    out = tmp_path / "mine.onnx"
+    out.write_bytes(b"the one before")
+    monkeypatch.setattr("semcast.training.onnx_export.halve_weights", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        export_encoder(weights, out)
+    assert out.read_bytes() == b"the one before"
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.onnx"]
