@@ -1,6 +1,6 @@
 """The trajectory benchmark on drawn scenes: needs no recording, and nothing was tuned on it.
 
-Run by ``make bench-scenes``. About 90 minutes of one core with the default three seeds.
+Run by ``make bench-scenes``. About two hours of one core with the default three seeds.
 """
 
 import argparse
@@ -20,6 +20,8 @@ SCENES_FOLDER = Path("runs/scenes")
 #: Seeds of the scenes; those below were looked at while the renderer was written.
 _FIRST_SCENE_SEED = 100
 _LINK_DB = 6.0
+#: The longest scene and the nights are measured behind that link alone, all others behind a worse one too.
+_POOR_LINK_DB = 2.0
 _PACES: tuple[Pace, ...] = ("normal", "fast")
 #: Most recordings have 100 to 300 frames; round the block, a lap and a bit.
 SCENE_SECONDS: dict[SceneName, tuple[float, float]] = {
@@ -53,9 +55,9 @@ def suite(folder: Path, results: Path, seeds: int) -> Iterator[Run]:
         for pace, length_s in zip(_PACES, seconds, strict=True):
             seed = _FIRST_SCENE_SEED + number
             out = folder / f"{scene}_{pace}"
-            yield _run(
-                RenderSettings(scene=scene, pace=pace, seed=seed, seconds=length_s, out=out), results, seeds
-            )
+            render = RenderSettings(scene=scene, pace=pace, seed=seed, seconds=length_s, out=out)
+            links_db = (_LINK_DB,) if scene == "block" else (_POOR_LINK_DB, _LINK_DB)
+            yield _run(render, links_db, results, seeds)
     for number, scene in enumerate(NIGHTS):
         render = RenderSettings(
             scene=scene,
@@ -65,14 +67,14 @@ def suite(folder: Path, results: Path, seeds: int) -> Iterator[Run]:
             noise_sd=_NIGHT_NOISE_SD,
             out=folder / f"{scene}_night",
         )
-        yield _run(render, results, seeds)
+        yield _run(render, (_LINK_DB,), results, seeds)
 
 
-def _run(render: RenderSettings, results: Path, seeds: int) -> Run:
+def _run(render: RenderSettings, links_db: tuple[float, ...], results: Path, seeds: int) -> Run:
     settings = TrajectorySettings(
         sequence=render.out,
         link=ChannelSettings(channel="rayleigh"),
-        snr_db=(_LINK_DB,),
+        snr_db=links_db,
         seeds=seeds,
         threads=1,
         confidence=("robust", "off"),
