@@ -24,6 +24,7 @@ from semcast.common.errors import ConfigError, TransportError
 from semcast.common.keys import agent_of, alive_agents, alive_key, alive_keys, role_of
 from semcast.common.messages import ROLES
 from semcast.common.network_settings import NetworkSettings, is_loopback
+from semcast.common.reachability import Knocks
 from semcast.common.wire import MAX_MESSAGE_BYTES
 
 logger = logging.getLogger(__name__)
@@ -35,6 +36,9 @@ LEASE_MS = 2000
 RING_CAPACITY = 2
 _FIFO_CAPACITY = 64
 _CONNECT_TRY_MS = 300
+#: Where something answers, the next try may take twice as long: meeting takes several round trips, and over
+#: a slow network these take longer than the first. After one of this length it is none of ours that answers.
+_LONGEST_TRY_MS = 8 * _CONNECT_TRY_MS
 #: How long a sender that drops under congestion waits for room first: half a frame's time at 30 a second.
 #: A process on a busy machine waits for its turn for longer than the 1 ms that Zenoh gives it.
 _WAIT_FOR_ROOM_US = 15_000
@@ -369,21 +373,38 @@ def open_session(
             hint = ", perhaps something already does" if _says_in_use(err) else ""
             raise TransportError(f"can't listen on {where}{hint}: {_first_line(err)}") from err
     started_s = time.monotonic()
-    told = False
+    knocks, try_ms, told, told_why = Knocks(network.connect), _CONNECT_TRY_MS, False, False
     while stop is None or not stop.is_set():
+        config.insert_json5("connect/timeout_ms", json.dumps(try_ms))
         try:
             return Session(zenoh.open(config))
         except zenoh.ZError as err:
+            answering = knocks.answering()
+            # What has just begun to listen may be ours.
+            why = _why_not_met(answering) if answering is not None and try_ms > _CONNECT_TRY_MS else ""
             if deadline_s is not None and time.monotonic() - started_s >= deadline_s:
-                raise TransportError(
+                nothing = (
                     f"nothing answers at {', '.join(network.connect)} within {deadline_s:g} s: is "
                     f"'semcast server' running there? ({_first_line(err)})"
-                ) from err
+                )
+                raise TransportError(why or nothing) from err
             if not told:
                 logger.info("waiting for the server at %s", ", ".join(network.connect))
                 told = True
+            if why and try_ms == _LONGEST_TRY_MS and not told_why:
+                logger.warning("%s", why)
+                told_why = True
+            may_be_there = answering is not None or not knocks.all_can_be_asked
+            try_ms = min(2 * try_ms, _LONGEST_TRY_MS) if may_be_there else _CONNECT_TRY_MS
             _pause(stop)
     return None
+
+
+def _why_not_met(endpoint: str) -> str:
+    return (
+        f"something answers at {endpoint}, but not as a server of semcast would: is the protocol right (tcp, "
+        "tls), and are certificates and users what both ends expect (--zenoh-config)?"
+    )
 
 
 def _pause(stop: threading.Event | None) -> None:

@@ -1,4 +1,7 @@
+import asyncio
+import contextlib
 import json
+import socket
 import subprocess
 import sys
 import threading
@@ -213,6 +216,46 @@ def test_nobody_there_and_a_port_in_use_are_said(hub):
         open_session(NetworkSettings(listen=(hub[1],), connect=()))
 
 
+def test_what_answers_but_is_no_hub_is_said_once(caplog, monkeypatch):
+    monkeypatch.setattr("semcast.common.transport._LONGEST_TRY_MS", 600)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        network = NetworkSettings(connect=(f"tcp/127.0.0.1:{listening.getsockname()[1]}",))
+        stop = threading.Event()
+        waiting = threading.Thread(target=lambda: open_session(network, stop))
+        with caplog.at_level("INFO"):
+            waiting.start()
+            until(lambda: "something answers at tcp/127.0.0.1" in caplog.text)
+        with pytest.raises(TransportError, match="something answers at .* is the protocol right"):
+            open_client(network, 0.5)
+        stop.set()
+        waiting.join(10)
+    assert caplog.text.count("something answers") == 1
+
+
+def test_a_hub_behind_a_slow_network_is_met(hub):
+    host, port = hub[1].removeprefix("tcp/").split(":")
+
+    async def pass_on(reader, writer):
+        with contextlib.suppress(OSError), contextlib.closing(writer):
+            while received := await reader.read(65536):
+                await asyncio.sleep(0.1)  # of the network, in each direction
+                writer.write(received)
+                await writer.drain()
+
+    async def on_connection(reader, writer):
+        far_reader, far_writer = await asyncio.open_connection(host, port)
+        await asyncio.gather(pass_on(reader, far_writer), pass_on(far_reader, writer))
+
+    async def meet():
+        async with await asyncio.start_server(on_connection, "127.0.0.1", 0) as network:
+            endpoint = f"tcp/127.0.0.1:{network.sockets[0].getsockname()[1]}"
+            session = await asyncio.to_thread(open_client, NetworkSettings(connect=(endpoint,)), 5)
+            assert session.connected
+            session.close()
+
+    asyncio.run(meet())
+
+
 def test_only_an_address_in_use_is_said_to_be_in_use(tmp_path):
     # An address kept for documentation (RFC 5737), which is no machine's.
     with pytest.raises(TransportError, match="^can't listen on tcp/192.0.2.1:7447: (?!.*in use)"):
@@ -317,7 +360,7 @@ def test_a_hub_with_users_lets_only_them_in(tmp_path):
         with open_client(NetworkSettings(connect=(endpoint,), zenoh_config=alice), 5):
             pass
         for stranger in (mallory, None):
-            with pytest.raises(TransportError, match="nothing answers"):
+            with pytest.raises(TransportError, match="something answers at .* users"):
                 open_client(NetworkSettings(connect=(endpoint,), zenoh_config=stranger), 0.6)
 
 
