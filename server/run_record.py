@@ -47,6 +47,8 @@ class FrameRow:
         snr_estimated_db: What the receiver estimated from the pilots.
         psnr_db: Of the decoded image, where the original is known.
         confidence_mean: Mean of the confidence map.
+        t_arrival_ns: When it arrived, on the server's monotonic clock, which begins anew with the machine.
+            None in rows of older runs.
         age_ms: From arrival at the server to the pose.
         stage_ms: Duration of each stage, and ``decoded_to_pose`` from the end of the decoder to the pose.
     """
@@ -68,6 +70,7 @@ class FrameRow:
     stage_ms: dict[str, float] = field(default_factory=dict)
     submap: int = 0
     seq: int | None = None
+    t_arrival_ns: int | None = None
 
     @classmethod
     def of(cls, frame: DecodedFrame, result: FrameResult, **rest: Any) -> "FrameRow":
@@ -178,6 +181,8 @@ def summarise(
 ) -> dict[str, Any]:
     """Return the figures of a run; None where one has no meaning.
 
+    ``frame_rate_hz`` counts tracked frames by the source's time, ``processed_rate_hz`` by when they arrived.
+
     Args:
         rows: One per frame that reached the tracker.
         trajectory: All posed frames after the last correction.
@@ -213,6 +218,7 @@ def summarise(
         },
         "parts": count_parts(part_of.values()),
         "frame_rate_hz": (len(rows) - 1) / span_s if span_s > 0 else None,
+        "processed_rate_hz": _arrival_rate_hz([r.t_arrival_ns for r in rows if r.t_arrival_ns is not None]),
         "drops": dict(drops),
         "states": dict(Counter(row.state for row in rows)),
         "unposed_frames": unposed_ranges(sent, posed_ids),
@@ -225,6 +231,12 @@ def run_line(summary: Mapping[str, Any]) -> str:
     dropped = ", ".join(f"{count} {reason}" for reason, count in drops.items())
     text = f"{frames['tracked']} frames tracked, {frames['posed']} with a pose"
     return f"{text}; dropped: {dropped}" if dropped else text
+
+
+def _arrival_rate_hz(times_ns: Sequence[int]) -> float | None:
+    gaps_ns = np.diff(np.array(times_ns, dtype=np.int64))
+    gaps_ns = gaps_ns[gaps_ns > 0]  # the clock begins anew where the machine was started again in between
+    return float(1e9 / gaps_ns.mean()) if len(gaps_ns) else None
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

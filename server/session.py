@@ -272,6 +272,7 @@ class Session:
             snr_estimated_db=arrival.snr_estimated_db,
             psnr_db=psnr,
             seq=self._numbers.setdefault(frame.frame_id, None),
+            t_arrival_ns=arrival.t_arrival_ns,
             age_ms=(tracked_ns - arrival.t_arrival_ns) * 1e-6,
             stage_ms={
                 **arrival.stage_ms,

@@ -101,10 +101,13 @@ def test_a_run_without_summary_is_said_to_be_going_on(run_folder):
 
 
 def test_a_run_is_described(run_folder):
-    (run_folder / "summary.json").write_text(json.dumps({"psnr_db": 27.123, "completeness": 0.5}))
+    figures = {"psnr_db": 27.123, "completeness": 0.5, "frame_rate_hz": 7.7, "processed_rate_hz": 3.9}
+    (run_folder / "summary.json").write_text(json.dumps(figures))
     text = text_of(run_folder)
     assert "image quality (PSNR): 27.12 dB" in text
     assert "frames with a pose: 50.0%" in text
+    assert "tracked by recorded time: 7.7 frames a second" in text
+    assert "tracked by time of arrival: 3.9 frames a second" in text
 
 
 def test_a_run_of_one_part_says_nothing_of_parts_and_one_of_two_says_so(run_folder):

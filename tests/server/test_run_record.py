@@ -34,6 +34,12 @@ def row(frame_id, posed=True, psnr_db=30.0, **changes):
     return FrameRow(**{**values, **changes})
 
 
+def summary_of(rows):
+    sent = stretches({r.frame_id: r.frame_id for r in rows})
+    part_of = {r.frame_id: 0 for r in rows}
+    return summarise(rows, line_trajectory(list(part_of)), part_of, None, sent, None, {}, 0)
+
+
 def line_trajectory(frame_ids):
     poses = np.tile(np.eye(4), (len(frame_ids), 1, 1))
     poses[:, 2, 3] = frame_ids
@@ -118,6 +124,7 @@ def test_the_summary_has_the_promised_keys_and_values(tmp_path):
     assert summary["parts"] == [{"submap": 0, "num_posed": 3}, {"submap": 2, "num_posed": 7}]
     assert summary["frames"] == {"source": 20, "sent": 16, "tracked": 11, "posed": 10, "keyframes": 7}
     assert summary["frame_rate_hz"] == pytest.approx(10.0)
+    assert summary["processed_rate_hz"] is None
     assert {"ate_percent", "rpe_trans_percent", "rpe_rot_deg"} <= set(summary)
     write_json(tmp_path / "summary.json", summary)
     json.loads((tmp_path / "summary.json").read_text(), parse_constant=pytest.fail)
@@ -130,3 +137,15 @@ def test_a_run_without_frames_has_a_summary_too():
     assert summary["ate_rmse_m"] is None
     assert summary["psnr_db"] is None
     assert summary["stage_ms"] == {}
+
+
+def test_a_recording_played_at_half_pace_is_processed_at_half_its_rate():
+    summary = summary_of([row(k, t_arrival_ns=7 + k * 200_000_000) for k in range(5)])
+    assert summary["frame_rate_hz"] == pytest.approx(10.0)
+    assert summary["processed_rate_hz"] == pytest.approx(5.0)
+
+
+def test_the_rate_by_arrival_survives_a_clock_that_began_anew():
+    times_ns = [9_000_000_000, 9_250_000_000, 10_000_000, 260_000_000]
+    summary = summary_of([row(k, t_arrival_ns=t) for k, t in enumerate(times_ns)])
+    assert summary["processed_rate_hz"] == pytest.approx(4.0)
