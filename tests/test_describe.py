@@ -181,7 +181,7 @@ def test_images_that_will_be_refused_are_named(tmp_path, capsys):
     assert main(["info", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     assert "9 of these images" in shown
-    assert "/[4].jpg is not a readable image" in "".join(line.strip() for line in shown.splitlines())
+    assert "/[4].jpgisnotareadableimage" in "".join(shown.split())  # wherever the line was broken
     assert "and 4 more" in shown
 
 
