@@ -117,6 +117,11 @@ class CameraInfo:
             readout_from=self.readout_from,
         )
 
+    @property
+    def frame_step(self) -> int:
+        """Usual difference of the ids of two frames that follow each other; 1 where it is not known."""
+        return max(1, (self.last_frame_id or 0) // max(1, (self.num_frames or 0) - 1))
+
 
 @dataclass(frozen=True, kw_only=True)
 class SymbolFrame:

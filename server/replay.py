@@ -32,8 +32,9 @@ from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_streams import RecordedStream, choose_stream
 from semcast.server.reference import recording_reference, sequence_reference
-from semcast.server.session import Arrival, Outcome, Session, StreamIdentity
+from semcast.server.session import Arrival, Outcome, Session
 from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.choice import check_viewer, open_viewer
 
 logger = logging.getLogger(__name__)
@@ -170,14 +171,7 @@ def _replayed(
             name, modulation=modulation, num_threads=settings.threads, weights=settings.weights
         )
     )
-    identity = StreamIdentity(
-        agent_id=agent_id,
-        agent_epoch=camera.agent_epoch,
-        codec=camera.codec,
-        digest=camera.digest,
-        camera=camera.intrinsics,
-        num_frames=camera.num_frames,
-    )
+    identity = StreamIdentity.of(agent_id, camera)
     reference = (
         sequence_reference(settings.reference, camera.intrinsics, settings.camera)
         if settings.reference is not None
@@ -191,7 +185,8 @@ def _replayed(
         for arrival in _paced(_arrivals(reader, stream, settings), settings.pace, stop):
             if stop.is_set():
                 break
-            session.note_arrival(arrival.message.frame_id, arrival.message.seq)
+            message = arrival.message
+            session.note_arrival(message.frame_id, message.seq, final=message.final)
             decoded = decoder.decode(arrival)
             if decoded.frame is None:
                 reason = "lost_on_air" if arrival.received is None else "outage"
@@ -204,7 +199,7 @@ def _replayed(
                 viewer.submit(outcome.view, outcome.update)
             processed += 1
             if on_frame is not None:
-                on_frame(arrival.message.frame_id)
+                on_frame(message.frame_id)
         if not processed and not drops and not stop.is_set():
             raise SourceError(_none_in_part(reader, stream, settings))
         if not processed:

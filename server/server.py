@@ -31,8 +31,9 @@ from semcast.server.receiver import ReceivedFrame, Receiver
 from semcast.server.record import recording
 from semcast.server.reference import Reference, sequence_reference
 from semcast.server.requests import RequestDesk
-from semcast.server.session import Arrival, Outcome, Session, StreamIdentity, new_bundle
+from semcast.server.session import Arrival, Outcome, Session, new_bundle
 from semcast.server.settings import ServerSettings
+from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.choice import SuccessiveViews, check_viewer
 
 logger = logging.getLogger(__name__)
@@ -281,7 +282,7 @@ class Server:
             return
         if session is None or session.identity.agent_epoch != message.agent_epoch:
             session = self._begin(decoded.arrival.camera)
-        session.note_arrival(message.frame_id, message.seq)
+        session.note_arrival(message.frame_id, message.seq, final=message.final)
         self._complete = message.final
         self._nearly_final = _is_nearly_final(message.frame_id, decoded.arrival.camera)
         if decoded.frame is None:
@@ -347,14 +348,7 @@ class Server:
 
     def _begin(self, camera: CameraInfo) -> Session:
         """Start on the stream of an agent heard for the first time, ending that of the one before."""
-        identity = StreamIdentity(
-            agent_id=self._agent_id,
-            agent_epoch=camera.agent_epoch,
-            codec=camera.codec,
-            digest=camera.digest,
-            camera=camera.intrinsics,
-            num_frames=camera.num_frames,
-        )
+        identity = StreamIdentity.of(self._agent_id, camera)
         former, self._session = self._session, None
         if former is not None:
             logger.info("the agent was started again: a new map is begun")
@@ -461,9 +455,8 @@ def _is_nearly_final(frame_id: int, camera: CameraInfo) -> bool:
     last_id = camera.last_frame_id
     if camera.num_frames is None or last_id is None:
         return False
-    step = max(1, last_id // max(1, camera.num_frames - 1))
     nearly = min(NEARLY_FINAL_FRAMES, max(1, camera.num_frames // 5))
-    return frame_id > last_id - nearly * step
+    return frame_id > last_id - nearly * camera.frame_step
 
 
 def _not_written(folder: Path | None, err: Exception) -> str:

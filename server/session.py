@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics
 from semcast.common.config import settings_to_dict, to_toml
 from semcast.common.errors import CheckpointError, SemcastError
 from semcast.common.run_folder import (
@@ -52,6 +51,7 @@ from semcast.server.reference import Reference
 from semcast.server.run_record import FrameRow, RunRecord, run_line, summarise
 from semcast.server.sent_frames import stretches
 from semcast.server.settings import ServerSettings
+from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.scene import FrameView
 
 logger = logging.getLogger(__name__)
@@ -62,27 +62,6 @@ Array = NDArray[np.float64]
 _RESULTS = (TRAJECTORY_NAME, MAP_NAME, RECONSTRUCTION_NAME, SETTINGS_NAME, SUMMARY_NAME)
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
-
-
-@dataclass(frozen=True)
-class StreamIdentity:
-    """What a map belongs to.
-
-    Attributes:
-        agent_id: The camera's name.
-        agent_epoch: Start of the agent, nanoseconds.
-        codec: Codec name.
-        digest: Its digest.
-        camera: Intrinsics of the decoded images.
-        num_frames: Frames of a finite source, or None.
-    """
-
-    agent_id: str
-    agent_epoch: int
-    codec: str
-    digest: str
-    camera: Intrinsics
-    num_frames: int | None
 
 
 @dataclass(frozen=True)
@@ -166,6 +145,7 @@ class Session:
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
         self._t_source_ns: dict[int, int] = {}
         self._numbers: dict[int, int | None] = {}
+        self._num_frames = identity.num_frames
         self._map_epoch = 0
         self._last_frame_id = -1
         self._state = TrackingState.INITIALIZING
@@ -230,9 +210,14 @@ class Session:
         logger.info("map restored from the checkpoint, up to frame %d", self._last_frame_id)
         return True
 
-    def note_arrival(self, frame_id: int, seq: int) -> None:
-        """Note the number of a frame that is processed next, or of which there is nothing to process."""
+    def note_arrival(self, frame_id: int, seq: int, *, final: bool = False) -> None:
+        """Note the number of a frame that is processed next, or of which there is nothing to process.
+
+        The ``final`` one tells how many frames the source had, which videos only estimate before.
+        """
         self._numbers[frame_id] = seq
+        if final:
+            self._num_frames = self.identity.num_until(frame_id)
 
     def process(
         self, frame: DecodedFrame, arrival: Arrival, on_pose: Callable[[FrameResult], None] | None = None
@@ -384,7 +369,7 @@ class Session:
         if truth is not None and rows:
             # Errors are a share of the way that was gone, and not of all that the source has.
             truth = truth.between(rows[0].t_source_ns * 1e-9, rows[-1].t_source_ns * 1e-9)
-        num_frames = self.identity.num_frames if complete else None
+        num_frames = self._num_frames if complete else None
         summary = summarise(
             rows,
             results.trajectory,

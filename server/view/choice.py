@@ -7,8 +7,8 @@ from semcast.common.former_file import keep_former
 from semcast.common.run_folder import VIEWER_NAME
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.reference import Reference
-from semcast.server.session import StreamIdentity
 from semcast.server.settings import ServerSettings
+from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.scene import FrameView
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ from semcast.agent.source_settings import SourceSettings
 from semcast.cli import verb_parser
 from semcast.commands.running import read_settings
 from semcast.common.errors import CheckpointError, ConfigError, SourceError
+from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import HubSettings
 from semcast.common.sequence import open_sequence
 from semcast.common.transport import open_hub
@@ -91,7 +92,23 @@ def test_a_server_that_connects_to_a_hub_opens_no_port_of_its_own_unasked():
     ],
 )
 def test_the_last_frames_are_known_by_their_ids(num_frames, last_id, frame_id, is_near):
-    camera = SimpleNamespace(num_frames=num_frames, last_frame_id=last_id)
+    camera = CameraInfo(
+        agent_id="a",
+        agent_epoch=1,
+        fx=60.0,
+        fy=60.0,
+        cx=47.5,
+        cy=31.5,
+        image_wh=(96, 64),
+        nominal_rate_hz=10.0,
+        codec="webp",
+        digest="0" * 16,
+        modulation="qam16",
+        source_name="film",
+        num_frames=num_frames,
+        last_frame_id=last_id,
+        lossless=False,
+    )
     assert _is_nearly_final(frame_id, camera) is is_near
 
 

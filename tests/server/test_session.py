@@ -1,8 +1,10 @@
 """One start of an agent, frame by frame, without a network."""
 
+import contextlib
 import json
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +20,9 @@ from semcast.server.mapping.state import DecodedFrame
 from semcast.server.reference import Reference
 from semcast.server.replay import ReplaySettings
 from semcast.server.run_record import read_rows
-from semcast.server.session import Arrival, Session, StreamIdentity
+from semcast.server.session import Arrival, Session
 from semcast.server.settings import ServerSettings
+from semcast.server.stream_identity import StreamIdentity
 
 CAMERA = Intrinsics(fx=60, fy=60, cx=47.5, cy=31.5, width=96, height=64)
 IDENTITY = StreamIdentity(agent_id="a", agent_epoch=5, codec="x", digest="", camera=CAMERA, num_frames=None)
@@ -134,6 +137,16 @@ def test_every_frame_tells_once_what_became_of_it(demo, tmp_path):
     assert told[-1].T_world_cam is not None
     for row, ms in zip(rows, told_ms, strict=True):
         assert 0 < row.stage_ms["decoded_to_pose"] <= ms
+
+
+@pytest.mark.parametrize(("final", "source"), [(True, 4), (False, 98)])
+def test_a_source_had_as_many_frames_as_came_until_its_last(demo, final, source):
+    identity = replace(IDENTITY, camera=demo.intrinsics, num_frames=98, last_frame_id=97)
+    with contextlib.closing(Session(ServerSettings(bundle="inline"), identity, None, None)) as session:
+        for k in range(4):
+            session.note_arrival(k, k, final=final and k == 3)
+        summary = session.write_outputs(None, {}, complete=True)
+    assert (summary["frames"]["source"], summary["frames"]["sent"]) == (source, 4)
 
 
 def test_frames_that_the_agent_left_out_don_t_count_as_unposed(demo, tmp_path):

@@ -15,13 +15,13 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError
 from semcast.common.geometry import make_transform
 from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.scene import FrameView
 
 pytest.importorskip("rerun")
 
 import rerun as rr
 
-from semcast.server.session import StreamIdentity
 from semcast.server.view.choice import open_viewer
 from semcast.server.view.feed import ViewerFeed, check_view, resolve_view
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
