@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.trajectory import Trajectory, write_tum
+from semcast.common.whole_file import write_whole
 from semcast.evaluation.scenes.block import Block
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.orbit import Orbit
@@ -149,8 +150,12 @@ def render_scene(settings: RenderSettings) -> int:
         if folder.exists() and any(folder.iterdir()):
             raise SourceError(f"out must be a new or an empty folder, {folder} has files in it")
         (folder / "images").mkdir(parents=True, exist_ok=True)
+        return _draw_into(folder, settings)
     except OSError as err:
         raise SourceError(f"can't write to {folder}: {err.strerror}") from err
+
+
+def _draw_into(folder: Path, settings: RenderSettings) -> int:
     scene = SCENES[settings.scene](settings.seed, settings.pace)
     times_s = np.arange(max(1, round(settings.seconds * scene.rate_hz))) / scene.rate_hz
     T_world_cams = np.stack([scene.T_world_cam(float(t_s)) for t_s in times_s])
@@ -159,10 +164,9 @@ def render_scene(settings: RenderSettings) -> int:
         image = frame_of(
             scene, float(t_s), settings.noise_sd, rng, 1e-3 * settings.readout_ms, settings.brightness
         )
-        path = folder / "images" / f"{index:06d}.png"
-        if not cv2.imwrite(str(path), image[..., ::-1]):
-            raise SourceError(f"can't write {path}")
-    (folder / "times.txt").write_text("".join(f"{t_s:.6f}\n" for t_s in times_s))
+        _, png = cv2.imencode(".png", image[..., ::-1])
+        write_whole(folder / "images" / f"{index:06d}.png", png.tobytes())
+    write_whole(folder / "times.txt", "".join(f"{t_s:.6f}\n" for t_s in times_s))
     replace(scene.camera, readout_ms=settings.readout_ms).save(folder / "intrinsics.json")
     write_tum(folder / "groundtruth.txt", Trajectory(times_s, T_world_cams))
     return len(times_s)

@@ -5,7 +5,6 @@ half a pixel more than ours (https://colmap.github.io/format.html).
 """
 
 import logging
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, quat_wxyz_from_rotation
 from semcast.common.run_folder import RunData, image_name
+from semcast.common.whole_file import write_whole
 from semcast.server.export.geometry import reprojection_errors_px, unique_observations
 
 logger = logging.getLogger(__name__)
@@ -33,12 +33,12 @@ def copy_images(images: Mapping[int, Path], frame_ids: list[int], folder: Path) 
     folder.mkdir(parents=True, exist_ok=True)
     kept = [k for k in frame_ids if k in images]
     for frame_id in kept:
-        shutil.copyfile(images[frame_id], folder / image_name(frame_id))
+        write_whole(folder / image_name(frame_id), images[frame_id].read_bytes())
     return len(kept)
 
 
 def write_colmap(folder: Path, data: RunData, images: Mapping[int, Path]) -> list[Path]:
-    """Write ``sparse/0/*.txt`` and ``images/``.
+    """Write ``images/`` and, last, ``sparse/0/*.txt``, each file whole or not at all.
 
     COLMAP's image id is the frame id + 1 and its point id the landmark id + 1. Points seen in fewer than two
     keyframes are left out: they have no track. ``ERROR`` is the mean reprojection error of the track.
@@ -59,8 +59,6 @@ def write_colmap(folder: Path, data: RunData, images: Mapping[int, Path]) -> lis
         "images.txt": _images(data, exported_frame_ids(data, images), rows),
         "points3D.txt": _points(data, rows, point_rows),
     }
-    for name, lines in files.items():
-        (model / name).write_text("\n".join(lines) + "\n", encoding="ascii")
     frame_ids = exported_frame_ids(data, images)
     num_copied = copy_images(images, frame_ids, folder / "images")
     if num_copied < len(frame_ids):
@@ -70,6 +68,8 @@ def write_colmap(folder: Path, data: RunData, images: Mapping[int, Path]) -> lis
             len(frame_ids) - num_copied,
             len(frame_ids),
         )
+    for name, lines in files.items():
+        write_whole(model / name, "\n".join(lines) + "\n")
     return [model / name for name in files]
 
 

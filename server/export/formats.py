@@ -1,7 +1,6 @@
 """Exports of a run folder by format name."""
 
 import logging
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -66,7 +65,7 @@ def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> li
         logger.warning("parts of the map: %s; --part %s writes one that fits together", parts, LARGEST)
     try:
         return writers[format_name]()
-    except (OSError, shutil.Error) as err:
+    except OSError as err:
         raise SemcastError(f"{out} can't be written: {err}") from err
 
 

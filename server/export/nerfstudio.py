@@ -13,6 +13,7 @@ import numpy as np
 from semcast.common.errors import SourceError
 from semcast.common.geometry import transform_points
 from semcast.common.run_folder import RunData, image_name
+from semcast.common.whole_file import write_whole
 from semcast.server.export.colmap import PIXEL_CENTRE, copy_images
 from semcast.server.export.outputs import write_ply
 
@@ -23,8 +24,9 @@ T_up_world = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]
 
 
 def write_nerfstudio(folder: Path, data: RunData, images: Mapping[int, Path]) -> list[Path]:
-    """Write ``transforms.json``, ``points3D.ply`` and ``images/`` of all posed frames whose image was kept.
+    """Write ``images/`` of all posed frames whose image was kept, ``points3D.ply`` and ``transforms.json``.
 
+    Each file is whole or not there, and ``transforms.json``, which names the others, comes last.
     Poses and points are in the world with z up; ``applied_transform`` says how it came from ours.
 
     Raises:
@@ -60,7 +62,6 @@ def write_nerfstudio(folder: Path, data: RunData, images: Mapping[int, Path]) ->
         "frames": frames,
     }
     transforms, points = folder / "transforms.json", folder / "points3D.ply"
-    transforms.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     write_ply(
         points,
         transform_points(T_up_world, data.xyz),
@@ -68,4 +69,5 @@ def write_nerfstudio(folder: Path, data: RunData, images: Mapping[int, Path]) ->
         data.confidence,
         axes="z up, y forward of the first camera",
     )
+    write_whole(transforms, json.dumps(content, indent=1) + "\n")
     return [transforms, points]

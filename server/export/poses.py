@@ -6,6 +6,7 @@ import numpy as np
 
 from semcast.common.run_folder import RunData
 from semcast.common.trajectory import Trajectory, write_tum
+from semcast.common.whole_file import write_whole
 
 
 def write_run_tum(path: Path, data: RunData) -> list[Path]:
@@ -29,9 +30,7 @@ def write_run_kitti(path: Path, data: RunData) -> list[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     times, frames = (path.with_name(f"{path.stem}.{what}.txt") for what in ("times", "frames"))
     poses = data.T_world_cam[:, :3].reshape(-1, 12)
-    path.write_text(
-        "".join(" ".join(f"{v:.12e}" for v in row) + "\n" for row in poses.tolist()), encoding="ascii"
-    )
-    times.write_text("".join(f"{t * 1e-9:.9f}\n" for t in data.t_source_ns.tolist()), encoding="ascii")
-    frames.write_text("".join(f"{k}\n" for k in data.frame_ids.tolist()), encoding="ascii")
+    write_whole(path, "".join(" ".join(f"{v:.12e}" for v in row) + "\n" for row in poses.tolist()))
+    write_whole(times, "".join(f"{t * 1e-9:.9f}\n" for t in data.t_source_ns.tolist()))
+    write_whole(frames, "".join(f"{k}\n" for k in data.frame_ids.tolist()))
     return [path, times, frames]

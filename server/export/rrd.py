@@ -9,6 +9,7 @@ import numpy as np
 
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.run_folder import VIEWER_NAME, RunData
+from semcast.common.whole_file import whole_file
 from semcast.server.view.rerun_viewer import Delivery, RerunStream
 from semcast.server.view.scene import Cursor, FrameView, Scene, compress_picture
 
@@ -35,7 +36,8 @@ def write_rrd(
     path.parent.mkdir(parents=True, exist_ok=True)
     recorded = folder / VIEWER_NAME
     if copy and recorded.is_file():
-        shutil.copyfile(recorded, path)
+        with recorded.open("rb") as source, whole_file(path) as copied:
+            shutil.copyfileobj(source, copied)
         return [path]
     try:
         stream = RerunStream(

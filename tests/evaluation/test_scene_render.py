@@ -43,6 +43,21 @@ def test_the_same_settings_give_the_same_files(orbit: Path, tmp_path: Path) -> N
         assert filecmp.cmp(orbit / "images" / name, again / "images" / name, shallow=False)
 
 
+def test_a_disk_without_room_is_said_with_its_reason(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, before[1]))
+    try:
+        with pytest.raises(SourceError, match=r"can't write to .*: File too large"):
+            render_scene(RenderSettings(scene="orbit", seconds=0.1, out=tmp_path))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert not capfd.readouterr().err
+
+
 def test_a_folder_with_files_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(SourceError, match="has files in it"):

@@ -302,3 +302,20 @@ def test_trimesh_reads_the_points_with_their_colours(tmp_path, arc_run, write_ar
     cloud = trimesh.load(tmp_path / "map.ply")
     np.testing.assert_allclose(cloud.vertices, data.xyz, atol=1e-5)
     np.testing.assert_array_equal(np.asarray(cloud.colors)[:, :3], data.rgb)
+
+
+@pytest.mark.parametrize("format_name", ["colmap", "nerfstudio", "kitti"])
+def test_an_export_that_finds_no_room_leaves_no_truncated_file(tmp_path, arc_run, write_arc_run, format_name):
+    resource = pytest.importorskip("resource")
+    write_arc_run(tmp_path / "run", arc_run())
+    folder = tmp_path / "out"
+    folder.mkdir()
+    out = folder / "poses.txt" if format_name == "kitti" else folder
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200, before[1]))
+    try:
+        with pytest.raises(SemcastError, match=r"can't be written: .*File too large"):
+            export_run(tmp_path / "run", format_name, out)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not [p for p in folder.rglob("*") if p.is_file()]
