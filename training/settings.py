@@ -68,7 +68,7 @@ class TrainSettings:
     only_heads: bool = field(
         default=False,
         metadata={
-            "help": "train nothing but the confidence heads of the network in grow_from: the images it "
+            "help": "train nothing but the confidence heads of the network of --grow-from: the images it "
             "decodes stay the same to the bit"
         },
     )

@@ -101,7 +101,7 @@ def check_weights() -> Iterator[Finding]:
 
     for name in available_codecs():
         try:
-            yield Finding(f"codec {name}", "good", load_codec(name, runtime="auto").digest)
+            yield Finding(f"codec {name}", "good", f"digest {load_codec(name, runtime='auto').digest}")
         except SemcastError as err:
             yield Finding(f"codec {name}", "note", str(err))
 

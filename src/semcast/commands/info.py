@@ -11,7 +11,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="PATH",
         help="recording (.mcap), folder that --out wrote, sequence folder or transforms.json, "
-        "weights (.safetensors) or the name of shipped weights",
+        "weights (.safetensors, .onnx) or the name of shipped weights",
     )
 
 

@@ -19,7 +19,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="true path: a TUM file or a sequence folder; by default the sequence the run was compared with",
     )
-    parser.add_argument("--format", choices=("png", "svg"), default="png", help="of the pictures")
+    parser.add_argument(
+        "--format", choices=("png", "svg"), default="png", help="of the pictures (default png)"
+    )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the pictures; by default RUN/plots"
     )

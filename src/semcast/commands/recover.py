@@ -8,7 +8,7 @@ from semcast.common.recording import recover_file
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("file", type=Path, help="recording that was cut off or damaged")
+    parser.add_argument("file", type=Path, metavar="FILE", help="recording that was cut off or damaged")
     parser.add_argument(
         "--out", type=Path, metavar="PATH", help="where to write it; without it FILE is replaced"
     )
