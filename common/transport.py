@@ -481,14 +481,17 @@ def loopback_round_trip_ms(timeout_s: float = 3.0) -> float:
     raise TransportError(f"a request over loopback did not come back within {timeout_s:g} s")
 
 
-def alive_roles(connect: str, agent_id: str, timeout_s: float = 2.0) -> set[str]:
+def alive_roles(
+    connect: str, agent_id: str, zenoh_config: Path | None = None, timeout_s: float = 2.0
+) -> set[str]:
     """Connect to a hub and return which of agent, channel and server are alive.
 
     Raises:
         TransportError: Nothing answers there.
+        ConfigError: Zenoh's configuration file is not usable.
     """
     try:
-        network = NetworkSettings(connect=(connect,))
+        network = NetworkSettings(connect=(connect,), zenoh_config=zenoh_config)
     except ValueError as err:
         raise TransportError(str(err)) from err
     with open_client(network, timeout_s) as session:

@@ -357,8 +357,9 @@ def test_a_hub_with_users_lets_only_them_in(tmp_path):
     hub = file("hub.json5", dictionary_file=str(tmp_path / "users.txt"))
     alice, mallory = file("a.json5", user="alice", password="secret"), file("m.json5", user="m", password="x")
     with open_session(NetworkSettings(listen=(endpoint,), connect=(), zenoh_config=hub)):
-        with open_client(NetworkSettings(connect=(endpoint,), zenoh_config=alice), 5):
-            pass
+        with open_client(NetworkSettings(connect=(endpoint,), zenoh_config=alice), 5) as session:
+            session.declare_alive("a", "agent")
+            assert alive_roles(endpoint, "a", alice) == {"agent"}
         for stranger in (mallory, None):
             with pytest.raises(TransportError, match="something answers at .* users"):
                 open_client(NetworkSettings(connect=(endpoint,), zenoh_config=stranger), 0.6)

@@ -147,13 +147,13 @@ def check_loopback() -> Iterator[Finding]:
         yield Finding("zenoh loopback", "bad", str(err))
 
 
-def check_system(connect: str, agent_id: str) -> Iterator[Finding]:
+def check_system(connect: str, agent_id: str, zenoh_config: Path | None = None) -> Iterator[Finding]:
     """Ask a running system which roles are alive."""
     from semcast import TransportError
     from semcast.common.transport import alive_roles
 
     try:
-        roles = alive_roles(connect, agent_id)
+        roles = alive_roles(connect, agent_id, zenoh_config)
     except TransportError as err:
         yield Finding(f"system at {connect}", "bad", str(err))
         return
@@ -174,6 +174,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--agent-id", default="agent0", metavar="NAME", help="whose roles to look for (default agent0)"
     )
+    parser.add_argument(
+        "--zenoh-config",
+        type=Path,
+        metavar="PATH",
+        help="file of Zenoh's own configuration (JSON5), where that system wants certificates or users",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -188,7 +194,7 @@ def run(arguments: argparse.Namespace) -> int:
     ]
     checks.append(check_loopback())
     if arguments.connect:
-        checks.append(check_system(arguments.connect, arguments.agent_id))
+        checks.append(check_system(arguments.connect, arguments.agent_id, arguments.zenoh_config))
     table = Table(show_header=False, box=None, pad_edge=False)
     bad = False
     for check in checks:
