@@ -21,6 +21,7 @@ README = Path("README.md")
 README_LINKS: dict[tuple[str, float] | None, str] = {
     None: "clean images",
     ("rayleigh", 6.0): "fading, 6 dB",
+    ("rayleigh", 2.0): "fading, 2 dB",
     ("erasure", 6.0): "one slot in five lost, 6 dB",
     ("awgn", 2.0): "noise, 2 dB",
 }
