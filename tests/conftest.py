@@ -1,7 +1,15 @@
 """Shared fixtures."""
 
+import signal
+
 import numpy as np
 import pytest
+
+
+def pytest_configure() -> None:
+    """Hear Ctrl-C, which a shell lets everything ignore that it starts in the background, tests included."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
