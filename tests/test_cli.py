@@ -173,12 +173,17 @@ def test_ctrl_c_is_no_traceback_before_the_verb_is_known_either(monkeypatch):
     assert main(["server"]) == 130
 
 
-def test_a_folder_that_may_not_be_looked_into_is_an_error_in_a_line(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("names_the_path", [True, False])
+def test_a_folder_that_may_not_be_looked_into_is_an_error_in_a_line(
+    tmp_path, monkeypatch, capsys, names_the_path
+):
     def may_not(path):
-        raise PermissionError(13, "Permission denied", str(path))
+        raise PermissionError(13, "Permission denied", *([str(path)] if names_the_path else []))
 
     monkeypatch.setattr(Path, "is_file", may_not)
     assert main(["export", str(tmp_path), "--format", "tum", "--out", str(tmp_path / "x")]) == 1
     err = capsys.readouterr().err
-    assert "Permission denied" in err
+    assert err.startswith("semcast export: Permission denied")
+    assert (str(tmp_path) in err) == names_the_path
+    assert "None" not in err
     assert err.count("\n") == 1

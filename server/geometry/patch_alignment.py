@@ -18,6 +18,12 @@ from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 Array = NDArray[np.float64]
 Values = NDArray[np.float32]
 
+#: Side of the patches by which drift is taken out of tracks. A warp by depth alone takes them for planes that
+#: face the camera: on floors, ceilings and walls beside the way larger ones err by more than they average
+#: noise out.
+ANCHOR_PATCH_PX = 17
+#: A track that would move further than this has found something else, as has one that fits less well.
+_MAX_MOVE_PX, _MIN_CORRELATION = 3.0, 0.7
 #: Every so many pixels of the window are looked at: noise of decoded images is alike over several.
 _STRIDE_PX = 2
 #: Range of the contrast of one patch against the other.
@@ -95,6 +101,11 @@ class AlignedPatches:
 
     xy: Array
     correlation: Array
+
+    def fits(self, expected_xy: Array) -> NDArray[np.bool_]:
+        """Which show what they were cut from, ``(N,)``: alike enough, and near ``(N, 2)`` tracks."""
+        near = np.linalg.norm(self.xy - expected_xy, axis=1) < _MAX_MOVE_PX
+        return np.asarray(near & (self.correlation > _MIN_CORRELATION))
 
 
 def affine_warps(

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
-from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches, seen_alike
+from semcast.server.geometry.patch_alignment import (
+    ANCHOR_PATCH_PX,
+    Templates,
+    affine_warps,
+    align_patches,
+    seen_alike,
+)
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 from semcast.server.geometry.weighting import MAD_TO_SIGMA
 from semcast.server.mapping.recall import KeyframeImages
@@ -20,14 +26,8 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
 
-#: Keyframes that are looked at, the newest ones, as many as an adjustment takes.
+#: Keyframes that are looked at, the newest ones.
 NUM_ANCHORS = 10
-#: Side of the patches. A warp by depth alone takes them for planes that face the camera: on floors, ceilings
-#: and walls beside the way larger ones err by more than they average noise out.
-_PATCH_PX = 17
-#: A point that would move further than this has found something else.
-_MAX_MOVE_PX = 3.0
-_MIN_CORRELATION = 0.7
 #: Places from which on their scatter tells how well a track is known.
 _MIN_PLACES = 4
 #: Landmarks next to a track without one, by which its patch is warped, and how many a keyframe must show.
@@ -75,13 +75,12 @@ def anchor_tracks(
         warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
         alike = seen_alike(warps, depth_now)
         if alike.any():
-            parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike], _PATCH_PX)))
+            parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike], ANCHOR_PATCH_PX)))
     if not parts:
         return 0
     rows, warps = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
     found = align_patches(Templates.join([part[2] for part in parts]), sight.grey, tracks.xy[rows], warps)
-    near = np.linalg.norm(found.xy - tracks.xy[rows], axis=1) < _MAX_MOVE_PX
-    fits = near & (found.correlation > _MIN_CORRELATION)
+    fits = found.fits(tracks.xy[rows])
     anchor = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     places = np.full((len(parts), len(tracks), 2), np.nan)
     places[anchor[fits], rows[fits]] = found.xy[fits]

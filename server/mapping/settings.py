@@ -21,7 +21,7 @@ class ReconstructionSettings:
     )
     seed: int = field(default=0, metadata={"help": "seed of every random search"})
     max_features: int = field(default=500, metadata={"help": "keypoints followed at most"})
-    window_size: int = field(default=10, metadata={"help": "keyframes in one bundle adjustment"})
+    window_size: int = field(default=20, metadata={"help": "keyframes in one bundle adjustment"})
     max_landmarks: int = field(
         default=20_000, metadata={"help": "landmarks kept at most; the longest unseen go first"}
     )

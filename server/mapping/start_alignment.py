@@ -14,16 +14,11 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import Grey
-from semcast.server.geometry.patch_alignment import Templates, align_patches, seen_alike
+from semcast.server.geometry.patch_alignment import ANCHOR_PATCH_PX, Templates, align_patches, seen_alike
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 from semcast.server.mapping.kept_frames import Observed
 
 Array = NDArray[np.float64]
-
-_PATCH_PX = 17
-#: A point that would move further than this has found something else.
-_MAX_MOVE_PX = 3.0
-_MIN_CORRELATION = 0.7
 
 
 def aligned_views(camera: Intrinsics, views: Sequence[Observed], T_world_cam: Array) -> list[Observed]:
@@ -49,11 +44,10 @@ def _aligned(camera: Intrinsics, views: Sequence[Observed], T_world_cam: Array, 
             continue
         R = T_world_cam[index, :3, :3].T @ T_world_cam[other, :3, :3]
         turned, turned_xy, alike = _turned(camera, seen.grey, seen.xy[theirs], R)
-        templates = Templates.cut(turned, turned_xy, _PATCH_PX)
+        templates = Templates.cut(turned, turned_xy, ANCHOR_PATCH_PX)
         no_warps = np.tile(np.eye(2), (len(mine), 1, 1))
         found = align_patches(templates, view.grey, view.xy[mine], no_warps)
-        near = np.linalg.norm(found.xy - view.xy[mine], axis=1) < _MAX_MOVE_PX
-        fits = near & (found.correlation > _MIN_CORRELATION) & alike
+        fits = found.fits(view.xy[mine]) & alike
         places[other, mine[fits]] = found.xy[fits]
     return replace(view, xy=np.nanmedian(places, axis=0))
 

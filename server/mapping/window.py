@@ -2,7 +2,8 @@
 
 Tried without gain: tracks that are no landmarks yet as further points of an adjustment (drawn streets a
 little better, a real shelf worse), and a single fixed pose with a distance until the map outgrows the
-window (an orbit better, a drive worse).
+window (an orbit better, a drive worse). Twenty keyframes instead of ten, with as many observations, cost the
+same time and correct for longer what the start of a map got wrong.
 """
 
 from typing import Any

@@ -189,7 +189,8 @@ def _run(words: list[str]) -> int:
     except PermissionError as err:  # Path.is_file raises it in a folder that may not be looked into
         if debug:
             traceback.print_exc()
-        print(f"semcast {verb}: {err.strerror or err}: {err.filename}", file=sys.stderr)
+        where = "" if err.filename is None else f": {err.filename}"
+        print(f"semcast {verb}: {err.strerror or err}{where}", file=sys.stderr)
         return EXIT_ERROR
     except ModuleNotFoundError as err:
         if debug or (err.name or "").startswith("semcast"):
