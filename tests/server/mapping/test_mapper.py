@@ -225,7 +225,7 @@ def test_a_large_window_is_cut_to_what_several_keyframes_see():
         keyframe.drop_observations(keyframe.ids % 2 == 1)
     problem = build_problem(world, CAMERA, NOISE, 10)
     assert problem is not None
-    assert len(problem.xy) <= 3500
+    assert len(problem.xy) <= window.MAX_OBSERVATIONS
     assert (problem.landmark_ids % 2 == 0).sum() >= (world.landmarks.ids % 2 == 0).sum() - 1
 
 

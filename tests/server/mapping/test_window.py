@@ -1,9 +1,18 @@
 """What an adjustment takes of what keyframes saw."""
 
 import numpy as np
+from numpy.typing import NDArray
 
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import make_transform
+from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping import window
-from semcast.server.mapping.window import within_limit
+from semcast.server.mapping.window import build_problem, within_limit
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Ids = NDArray[np.int64]
+
+CAMERA = Intrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 
 #: Of eight landmarks so many observations each, in any order.
 COUNT = np.array([2, 5, 1, 3, 5, 2, 4, 3])
@@ -25,3 +34,42 @@ def test_beyond_the_limit_the_last_key_counts_first(monkeypatch):
     taken, kept, _ = within_limit(IDS, POINT, -COUNT, last)
     assert taken.tolist() == [0, 1, 4, 5]
     assert kept.sum() == 14
+
+
+def test_the_newest_keyframe_keeps_its_part_where_long_tracks_would_take_all(monkeypatch):
+    """A camera that turns away from what it saw for long: nothing else places its newest keyframe."""
+    monkeypatch.setattr(window, "MAX_OBSERVATIONS", 400)
+    long_seen, new = np.arange(60), np.arange(100, 160)
+    world = WorldMap()
+    world.add_landmarks(
+        np.concatenate([long_seen, new]),
+        np.random.default_rng(0).uniform((-2, -2, 4), (2, 2, 8), (120, 3)),
+        np.zeros((120, 3), np.uint8),
+        np.ones(120),
+        0,
+        0,
+    )
+    for k in range(20):
+        ids = long_seen if k < 18 else np.concatenate([long_seen[:4], new])
+        world.add_keyframe(_keyframe(k, ids))
+    problem = build_problem(world, CAMERA, NoiseModel(0.5, 0.0), 10)
+    assert problem is not None
+    assert len(problem.xy) <= 400
+    newest = problem.landmark_ids[problem.point[problem.view == len(problem.fixed) - 1]]
+    assert np.isin(newest, new).sum() >= 50
+    # And what ties the window to the keyframes before it keeps its own.
+    assert np.isin(problem.landmark_ids, long_seen).sum() >= 5
+
+
+def _keyframe(number: int, ids: Ids) -> Keyframe:
+    return Keyframe(
+        frame_id=number,
+        t_source_ns=number * 10**8,
+        T_world_cam=make_transform(np.eye(3), np.array([0.2 * number, 0.0, 0.0])),
+        submap=0,
+        ids=ids,
+        xy=np.full((len(ids), 2), 100.0),
+        confidence=np.ones(len(ids)),
+        descriptor_ids=np.zeros(0, np.int64),
+        descriptors=np.zeros((0, 32), np.uint8),
+    )
