@@ -22,6 +22,8 @@ def write_rrd(
 ) -> list[Path]:
     """Copy the run's own recording, plots included; without one, show its poses, kept images and points.
 
+    The file is whole or stays as it was.
+
     Args:
         path: The ``.rrd`` file.
         folder: The run folder.
@@ -32,6 +34,7 @@ def write_rrd(
     Raises:
         SourceError: An image can't be read.
         SemcastError: The file can't be written, or not to its end.
+        OSError: The folder, or a file in it, can't be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     recorded = folder / VIEWER_NAME
@@ -39,16 +42,31 @@ def write_rrd(
         with recorded.open("rb") as source, whole_file(path) as copied:
             shutil.copyfileobj(source, copied)
         return [path]
-    try:
-        stream = RerunStream(
-            recording_id=folder.name or "run",
-            camera=data.intrinsics,
-            has_truth=False,
-            has_confidence=False,
-            file=path,
-        )
-    except RuntimeError as err:
-        raise SemcastError(f"{path} can't be written: {err}") from err
+    # Rerun opens files by name: this one keeps the name until what is written is whole.
+    with whole_file(path) as file:
+        try:
+            stream = RerunStream(
+                recording_id=folder.name or "run",
+                camera=data.intrinsics,
+                has_truth=False,
+                has_confidence=False,
+                file=Path(file.name),
+            )
+        except RuntimeError as err:
+            raise SemcastError(f"{path} can't be written: {err}") from err
+        try:
+            _show(stream, data, images)
+            # Rerun writes on a thread of its own, and says only here that it could not, as on a full disk.
+            delivery = stream.flush(CLOSE_DEADLINE_S)
+        finally:
+            is_closed = stream.close(CLOSE_DEADLINE_S)
+        if not is_closed or delivery is not Delivery.DONE:
+            raise SemcastError(f"{path} can't be written to its end: is there room on the disk?")
+    return [path]
+
+
+def _show(stream: RerunStream, data: RunData, images: Mapping[int, Path]) -> None:
+    """Send points, poses and images, frame by frame."""
     scene, cursor = Scene(), Cursor()
     scene.add_landmarks(data.landmark_ids, data.xyz, data.rgb, data.confidence, np.zeros(0, dtype=np.int64))
     for frame_id, t_ns, T_world_cam in zip(
@@ -59,11 +77,6 @@ def write_rrd(
         if view.image is not None:
             scene.set_picture(compress_picture(view, JPEG_QUALITY))
         stream.write(scene.changes_since(cursor))
-    # Rerun writes on a thread of its own, and says only here that it could not, as on a full disk.
-    delivery = stream.flush(CLOSE_DEADLINE_S)
-    if not stream.close(CLOSE_DEADLINE_S) or delivery is not Delivery.DONE:
-        raise SemcastError(f"{path} can't be written to its end: is there room on the disk?")
-    return [path]
 
 
 def _view(

@@ -260,6 +260,19 @@ def test_a_rerun_recording_that_finds_no_room_is_an_error(tmp_path, arc_run, wri
             export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+
+
+def test_an_image_that_cannot_be_read_leaves_the_rerun_recording_of_before(tmp_path, arc_run, write_arc_run):
+    data = arc_run()
+    write_arc_run(tmp_path / "run", data)
+    last = tmp_path / "run" / "images" / f"{data.keyframe_ids[-1]:06d}.jpg"
+    last.write_bytes(b"no picture")
+    (tmp_path / "made.rrd").write_bytes(b"of before")
+    with pytest.raises(SourceError, match=rf"{last.name} can't be read as an image"):
+        export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
+    assert (tmp_path / "made.rrd").read_bytes() == b"of before"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["made.rrd", "run"]
 
 
 @pytest.mark.parametrize(
