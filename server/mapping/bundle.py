@@ -33,7 +33,16 @@ def quantised_sigma(sigma_px: Array) -> tuple[Array, NDArray[np.intp]]:
 
 
 def residuals_px(problem: BundleProblem, T_world_cam: Array, xyz: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Observed minus projected, ``(M, 2)``, and which observations have the landmark in front."""
+    """Observed minus projected, and which observations have the landmark in front.
+
+    Args:
+        problem: Whose observations.
+        T_world_cam: ``(K, 4, 4)`` poses to take instead of the problem's.
+        xyz: ``(P, 3)`` points in the world frame, as well.
+
+    Returns:
+        ``(M, 2)`` pixels, NaN where the landmark is not in front of the camera, and ``(M,)`` bool.
+    """
     T_cam_world = invert_transform(T_world_cam)[problem.view]
     points_cam = np.einsum("mij,mj->mi", T_cam_world[:, :3, :3], xyz[problem.point]) + T_cam_world[:, :3, 3]
     front = points_cam[:, 2] > MIN_DEPTH_MAP
@@ -84,13 +93,17 @@ def _build(
 
 
 def optimise(problem: BundleProblem) -> BundleResult:
-    """Adjust a window; never raises on degenerate input."""
+    """Adjust a window; never raises on degenerate input, poses and pixels that are not finite included.
+
+    Observations are left out where the landmark is behind the camera or seen by no other view.
+    """
     started = time.perf_counter_ns()
     residual, front = residuals_px(problem, problem.T_world_cam, problem.xyz)
     count = np.bincount(problem.point[front], minlength=len(problem.xyz))
     used = front & (count[problem.point] >= 2) & np.isfinite(problem.xy).all(axis=1)
     T_world_cam, xyz, covariance, ok = problem.T_world_cam.copy(), problem.xyz.copy(), None, False
-    if int(used.sum()) >= 10 and problem.fixed.any():
+    is_posed = bool(np.isfinite(problem.T_world_cam).all())
+    if int(used.sum()) >= 10 and problem.fixed.any() and is_posed:
         graph, values = _build(problem, used)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(problem.iterations)

@@ -144,6 +144,16 @@ def test_degenerate_windows_end_without_an_exception(changes):
         assert np.array_equal(result.xyz, result.problem.xyz)
 
 
+def test_a_pose_that_is_not_finite_is_an_adjustment_that_failed():
+    problem, _, _ = make_problem()
+    T_world_cam = problem.T_world_cam.copy()
+    T_world_cam[3, 0, 0] = np.nan
+    result = optimise(BundleProblem(**{**vars(problem), "T_world_cam": T_world_cam}))
+    assert not result.ok
+    np.testing.assert_array_equal(result.T_world_cam, T_world_cam)
+    np.testing.assert_array_equal(result.xyz, problem.xyz)
+
+
 def test_sigmas_share_sixteen_models():
     sigmas, step = quantised_sigma(np.array([0.0001, 0.1, 1.0, 12.0, 500.0]))
     assert len(sigmas) == 16
