@@ -32,6 +32,8 @@ _SHAPES = {
     "frames.keyframe_id": "F",
     "frames.T_keyframe_cam": "F 4 4",
 }
+#: Arrays that older checkpoints lack.
+_ADDED = {"revisits": "R 2"}
 #: Keyframes and frames refer to poses by frame id.
 _OF_POSES = {"keyframes.frame_id": "keyframes", "frames.keyframe_id": "frames"}
 
@@ -48,7 +50,8 @@ def check_map_arrays(arrays: Mapping[str, NDArray], parts: tuple[str, ...]) -> N
         ValueError: Arrays contradict each other.
     """
     sizes: dict[str, int] = {}
-    for name, shape in _SHAPES.items():
+    added = {name: shape for name, shape in _ADDED.items() if name in arrays}
+    for name, shape in {**_SHAPES, **added}.items():
         for word, size in check_shape(arrays[name], shape, name).items():
             if sizes.setdefault(word, size) != size:
                 raise ValueError(f"{name} must have {sizes[word]} rows, got {size}")
