@@ -10,6 +10,7 @@ import pytest
 from semcast.common.errors import SourceError
 from semcast.common.trajectory import Trajectory, read_tum, write_tum
 from semcast.server.export.outputs import (
+    PLY_VERTEX,
     percentiles,
     plain,
     read_ply,
@@ -69,6 +70,14 @@ def test_ply_of_an_empty_map_is_valid_and_other_files_are_refused(tmp_path):
         read_ply(tmp_path / "other.ply")
     with pytest.raises(SourceError, match="can't be read"):
         read_ply(tmp_path / "missing.ply")
+
+
+def test_a_ply_that_lacks_points_is_refused(tmp_path):
+    path = tmp_path / "map.ply"
+    write_ply(path, np.ones((3, 3)), np.zeros((3, 3), np.uint8), np.ones(3, np.float32))
+    path.write_bytes(path.read_bytes()[: -PLY_VERTEX.itemsize])
+    with pytest.raises(SourceError, match="does not hold as many points as it says"):
+        read_ply(path)
 
 
 def test_ply_opens_in_colmap(tmp_path):
