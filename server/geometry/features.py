@@ -17,7 +17,7 @@ Grey = NDArray[np.uint8]
 BORDER_PX = 8
 #: OpenCV's KLT gives the smaller eigenvalue of the mean structure tensor in units of 32^2 / 2^20 grey^2.
 _EIGEN_UNIT = 1024.0
-#: Corners weaker than this mean gradient energy (grey levels^2 per pixel) are noise.
+#: Corners weaker than this mean gradient energy (grey levels^2 per pixel^2) are noise.
 _MIN_EIGEN_GREY2 = 2.0
 #: Nor are corners weaker than this share of the strongest worth following.
 _MIN_EIGEN_SHARE = 0.004
@@ -34,7 +34,7 @@ def to_grey(image: NDArray[np.uint8]) -> Grey:
 
 
 def corner_strength(grey: Grey, block_px: int = 5) -> NDArray[np.float32]:
-    """Smaller eigenvalue of the structure tensor, mean over the block, in grey levels^2 per pixel^2."""
+    """Smaller eigenvalue of the mean structure tensor of each block, ``(H, W)`` grey levels^2 per pixel^2."""
     scaled = cv2.cornerMinEigenVal(grey, block_px, ksize=3)
     return np.asarray(scaled * np.float32(255.0**2 / 4.0), dtype=np.float32)
 

@@ -38,11 +38,14 @@ def test_grey_weighs_green_most():
 
 
 def test_corner_strength_by_hand():
-    # A ramp of 3 grey levels per pixel in x only has no corner; in x and y alone 9 each along both.
+    # A ramp of 3 grey levels per pixel in x alone has no corner.
     ramp = np.tile((3 * np.arange(60)).astype(np.uint8), (60, 1))
     assert corner_strength(ramp)[30, 30] == pytest.approx(0.0, abs=1e-4)
-    chequer = np.where((np.indices((60, 60)) // 5).sum(axis=0) % 2 == 0, 0, 40).astype(np.uint8)
-    assert corner_strength(chequer)[10, 10] > 20
+    # One of 4 in y that turns from 3 to -3 in x: the five columns around the ridge have slopes of 3, 3, 0, -3
+    # and -3 along x, 36 / 5 in the mean of their squares, against 16 along y.
+    y, x = np.mgrid[:50, :60]
+    ridge = (4 * y + 3 * (10 - np.abs(x - 30)).clip(0)).astype(np.uint8)
+    assert corner_strength(ridge)[30, 30] == pytest.approx(36 / 5, rel=1e-4)
 
 
 def test_corners_are_spread_and_away_from_the_border():
