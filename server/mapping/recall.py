@@ -36,10 +36,15 @@ class KeyframeImages:
     """Images of keyframes, bounded in number: of too many, an older one close to others goes.
 
     Args:
-        capacity: Images kept at most.
+        capacity: Images kept at most, three or more.
+
+    Raises:
+        ValueError: There is no older one between others to go.
     """
 
     def __init__(self, capacity: int) -> None:
+        if capacity < 3:
+            raise ValueError(f"capacity must be at least 3, got {capacity}")
         self._capacity = capacity
         self._images: list[SeenFrom] = []
 
