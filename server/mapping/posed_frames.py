@@ -63,7 +63,10 @@ class PosedFrames:
         """
         count = len(ids)
         if keyframe_ids.shape != (count,) or T_keyframe_cam.shape != (count, 4, 4):
-            raise ValueError(f"columns of {count} frames must be as long, got {len(keyframe_ids)}")
+            raise ValueError(
+                f"columns of {count} frames must be as long, got {len(keyframe_ids)} and "
+                f"{len(T_keyframe_cam)}"
+            )
         row = {frame_id: k for k, frame_id in enumerate(ids.tolist())}
         if len(row) != count:
             raise ValueError(f"ids of frames must differ, got {count - len(row)} twice")

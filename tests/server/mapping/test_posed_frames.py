@@ -61,8 +61,10 @@ def test_columns_ascend_and_bring_the_table_back(many):
 
 def test_columns_that_contradict_each_other_are_refused(many):
     ids, keyframe_ids, T = many.columns()
-    with pytest.raises(ValueError, match="columns of 1000 frames must be as long, got 999"):
+    with pytest.raises(ValueError, match="columns of 1000 frames must be as long, got 999 and 1000"):
         PosedFrames().take(ids, keyframe_ids[1:], T)
+    with pytest.raises(ValueError, match="columns of 1000 frames must be as long, got 1000 and 999"):
+        PosedFrames().take(ids, keyframe_ids, T[1:])
     with pytest.raises(ValueError, match="ids of frames must differ, got 2 twice"):
         PosedFrames().take(np.maximum(ids, 2), keyframe_ids, T)
 
