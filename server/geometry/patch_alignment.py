@@ -95,8 +95,9 @@ class AlignedPatches:
 
     Attributes:
         xy: ``(N, 2)`` pixels.
-        correlation: ``(N,)`` in [-1, 1], zero-mean normalised cross-correlation there; -1 where the patch has
-            too little structure or the search left the numbers.
+        correlation: ``(N,)`` in [-1, 1], zero-mean normalised cross-correlation before the last step, which
+            is a small one where the search came to rest; -1 where the patch has too little structure or the
+            search left the numbers.
     """
 
     xy: Array

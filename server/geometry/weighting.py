@@ -149,7 +149,7 @@ class OnlineNoise:
     Args:
         mode: ``paper`` keeps what is given; ``off`` fits sigma0 alone.
         sigma0_px: Start.
-        beta: In mode ``paper``; the others start at 0 and fit.
+        beta: In mode ``paper``, and where nothing is fitted; a fit starts at 0, and mode ``off`` stays there.
         fit: False keeps the start in every mode.
     """
 

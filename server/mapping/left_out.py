@@ -14,7 +14,7 @@ from semcast.server.mapping.bundle_problem import BundleResult
 from semcast.server.mapping.mapper import MAX_ERROR_SIGMA, gather_observations
 from semcast.server.mapping.world_map import WorldMap
 
-#: Keyframes whose observations place a point: those of a window and as many before it.
+#: Keyframes whose observations place a point, the newest ones: as many as a usual window has.
 _NUM_KEYFRAMES = 20
 
 
