@@ -29,7 +29,16 @@ def exported_frame_ids(data: RunData, images: Mapping[int, Path]) -> list[int]:
 
 
 def copy_images(images: Mapping[int, Path], frame_ids: list[int], folder: Path) -> int:
-    """Copy the kept images of these frames and return how many there were."""
+    """Copy the kept images of these frames and return how many there were.
+
+    Args:
+        images: Frame id to file of the kept images.
+        frame_ids: Frames that are wanted.
+        folder: Where the copies go; it is made.
+
+    Raises:
+        OSError: An image can't be read, or its copy not be written.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     kept = [k for k in frame_ids if k in images]
     for frame_id in kept:
@@ -53,13 +62,13 @@ def write_colmap(folder: Path, data: RunData, images: Mapping[int, Path]) -> lis
     """
     model = folder / "sparse" / "0"
     model.mkdir(parents=True, exist_ok=True)
+    frame_ids = exported_frame_ids(data, images)
     rows, point_rows = _tracks(data)
     files = {
         "cameras.txt": _cameras(data),
-        "images.txt": _images(data, exported_frame_ids(data, images), rows),
+        "images.txt": _images(data, frame_ids, rows),
         "points3D.txt": _points(data, rows, point_rows),
     }
-    frame_ids = exported_frame_ids(data, images)
     num_copied = copy_images(images, frame_ids, folder / "images")
     if num_copied < len(frame_ids):
         logger.warning(

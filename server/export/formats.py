@@ -39,6 +39,7 @@ def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> li
     Raises:
         SourceError: The run can't be read, has no such part, or lacks what the format needs.
         SemcastError: ``out`` can't be written.
+        ValueError: ``format_name`` is none of ``FORMATS``, or ``part`` neither a number nor a word for parts.
     """
     if format_name not in FORMATS:
         raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {format_name!r}")

@@ -14,12 +14,12 @@ _GENERATORS = np.stack([skew(axis) for axis in np.eye(3)])
 
 
 def essential_matrix(T_cam1_cam0: Array) -> Array:
-    """``E = [t]x R`` with ``p1^T E p0 = 0`` for rays ``p0`` and ``p1`` (Eq. 14)."""
+    """``E = [t]x R (3, 3)`` with ``p1^T E p0 = 0`` for rays ``p0`` and ``p1`` (Eq. 14)."""
     return skew(T_cam1_cam0[:3, 3]) @ T_cam1_cam0[:3, :3]
 
 
 def fundamental_matrix(camera: Intrinsics, T_cam1_cam0: Array) -> Array:
-    """``F = K^-T [t]x R K^-1`` for pixels (Eq. 14)."""
+    """``F = K^-T [t]x R K^-1 (3, 3)`` for pixels of one camera, without distortion (Eq. 14)."""
     K_inv = np.linalg.inv(camera.K)
     return np.asarray(K_inv.T @ essential_matrix(T_cam1_cam0) @ K_inv)
 
@@ -58,7 +58,18 @@ def msac_score(residual_px: Array, threshold_px: float, weight: Array | None = N
 
 
 def depths(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> tuple[Array, Array]:
-    """Depths of matches along both rays by the midpoint method, ``(N,)`` each, for a unit baseline."""
+    """Depths of matches in both cameras, where their rays come nearest to each other.
+
+    Args:
+        camera: Of both images.
+        T_cam1_cam0: ``(4, 4)``; its translation is the unit of the depths.
+        xy0: ``(N, 2)`` pixels.
+        xy1: ``(N, 2)`` pixels, matched row by row.
+
+    Returns:
+        ``(N,)`` depths along the axis of the first camera, and of the second; negative behind it, and without
+        meaning where rays are parallel.
+    """
     ray0 = camera.unproject(xy0) @ T_cam1_cam0[:3, :3].T
     ray1 = camera.unproject(xy1)
     t = T_cam1_cam0[:3, 3]
@@ -71,12 +82,18 @@ def depths(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> tu
 
 
 def rays_angle_deg(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
-    """Angle between the two rays of each match, ``(N,)`` degrees: the parallax."""
+    """Angle between the two rays of each match, ``(N,)`` degrees: the parallax.
+
+    Of the pose the rotation alone counts; pixels are ``(N, 2)``, matched row by row.
+    """
     return angles_between_deg(camera.unproject(xy0) @ T_cam1_cam0[:3, :3].T, camera.unproject(xy1))
 
 
 def rotation_residual_px(camera: Intrinsics, R_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
-    """Distance in pixels between ``xy1`` and ``xy0`` turned by a rotation alone, ``(N,)``."""
+    """Distance in pixels between ``xy1 (N, 2)`` and ``xy0 (N, 2)`` turned by a rotation alone, ``(N,)``.
+
+    Where the turned ray points behind the camera it is as a rule huge.
+    """
     turned = camera.unproject(xy0) @ R_cam1_cam0.T
     z = np.maximum(turned[:, 2], 1e-6)
     x = camera.fx * turned[:, 0] / z + camera.cx
@@ -85,7 +102,17 @@ def rotation_residual_px(camera: Intrinsics, R_cam1_cam0: Array, xy0: Array, xy1
 
 
 def fit_rotation(camera: Intrinsics, xy0: Array, xy1: Array, iterations: int = 8) -> Array:
-    """Rotation ``R_cam1_cam0`` that explains matches best, reweighted towards the majority."""
+    """Rotation ``R_cam1_cam0`` that explains matches best, reweighted towards the majority.
+
+    Args:
+        camera: Of both images.
+        xy0: ``(N, 2)`` pixels.
+        xy1: ``(N, 2)`` pixels, matched row by row.
+        iterations: Fits, each with weights of the one before.
+
+    Returns:
+        ``(3, 3)``; the identity without matches.
+    """
     ray0, ray1 = camera.unproject(xy0), camera.unproject(xy1)
     ray0 /= np.linalg.norm(ray0, axis=1, keepdims=True)
     ray1 /= np.linalg.norm(ray1, axis=1, keepdims=True)

@@ -246,7 +246,7 @@ def sample_map(values: NDArray[np.float32], keypoints_xy: Array) -> Array:
 
 
 def deduplicate(keypoints_xy: Array, cell_px: float = 4.0) -> NDArray[np.bool_]:
-    """Mark the first of all points that share a cell."""
+    """Mark the first of all points ``(N, 2)`` that share a cell of this side, ``(N,)`` bool."""
     key = np.floor(keypoints_xy / cell_px).astype(np.int64)
     _, first = np.unique(key[:, 0] * 1_000_003 + key[:, 1], return_index=True)
     keep = np.zeros(len(keypoints_xy), bool)
@@ -266,6 +266,11 @@ class Describer:
         self, grey: Grey, keypoints_xy: Array, octaves: tuple[int, ...] = (0,)
     ) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
         """Describe points, each at every given octave of a pyramid with factor 1.2.
+
+        Args:
+            grey: ``(H, W)``; in images with a side below 64 nothing is described.
+            keypoints_xy: ``(N, 2)`` pixels.
+            octaves: From 0, the image as it is, to 4.
 
         Returns:
             ``(M,)`` row of each descriptor's point and ``(M, 32)`` uint8 descriptors; points near the

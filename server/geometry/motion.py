@@ -29,7 +29,10 @@ class ConstantVelocity:
         return float(np.linalg.norm(self._translation_per_s))
 
     def observe(self, t_source_ns: int, T_world_cam: Array) -> None:
-        """Take the pose of a frame."""
+        """Take the pose of a frame, in the map's unit.
+
+        A frame not after the one before, or too long after it, tells no motion: the camera then rests.
+        """
         if self._last is not None:
             t_ns, T_world_before = self._last
             elapsed_s = (t_source_ns - t_ns) * 1e-9
@@ -48,7 +51,10 @@ class ConstantVelocity:
             self._translation_per_s = self._translation_per_s * scale
 
     def predict(self, t_source_ns: int) -> Array | None:
-        """``T_world_cam`` expected at a time, None without any pose."""
+        """``T_world_cam`` expected at a time, None without any pose.
+
+        The motion goes on for ``MAX_EXTRAPOLATION_S`` and ends there; before the last pose it is that one.
+        """
         if self._last is None:
             return None
         t_ns, T_world_last = self._last

@@ -58,7 +58,13 @@ class Templates:
 
     @staticmethod
     def cut(image: Grey, centres_xy: Array, window_px: int = KLT_WINDOW_PX) -> "Templates":
-        """Cut the windows around ``(N, 2)`` points of an image."""
+        """Cut the windows around ``(N, 2)`` pixels of an image; beyond the border its last values go on.
+
+        Args:
+            image: ``(H, W)``.
+            centres_xy: ``(N, 2)``.
+            window_px: Side of a window, odd.
+        """
         half = window_px // 2
         offset = np.arange(-half, half + 1, _STRIDE_PX, dtype=np.float32)
         dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
@@ -76,7 +82,7 @@ class Templates:
 
     @staticmethod
     def join(parts: "list[Templates]") -> "Templates":
-        """Put templates of several images, cut alike, into one set."""
+        """Put templates of several images, cut alike, into one set; of one image at least."""
         return Templates(
             values=np.concatenate([p.values for p in parts]),
             slope_x=np.concatenate([p.slope_x for p in parts]),

@@ -70,7 +70,14 @@ def project_with_jacobian(camera: Intrinsics, points_cam: Array) -> tuple[Array,
 def reprojection_residual(
     camera: Intrinsics, T_cam_world: Array, points_world: Array, keypoints_xy: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Observed minus projected, ``(N, 2)`` pixels, and which points are in front; zero where they are not."""
+    """Observed minus projected, ``(N, 2)`` pixels, and which points are in front, ``(N,)``; zero where not.
+
+    Args:
+        camera: Pinhole.
+        T_cam_world: ``(4, 4)``.
+        points_world: ``(N, 3)``.
+        keypoints_xy: ``(N, 2)`` their observations.
+    """
     points_cam = transform_points(T_cam_world, points_world)
     front = points_cam[:, 2] > MIN_DEPTH_MAP
     z = np.where(front, points_cam[:, 2], 1.0)
@@ -200,6 +207,17 @@ def search_pose(
     """Find a pose without a prior by PoseLib's LO-RANSAC over three points, then refine it with weights.
 
     It draws uniformly: three points are found soon, and a misleading order would cost the pose.
+
+    Args:
+        camera: Pinhole.
+        points_world: ``(N, 3)`` landmarks, map units.
+        keypoints_xy: ``(N, 2)`` their observations in pixels.
+        sigma_px: ``(N,)`` standard deviation of each observation per coordinate.
+        gate_px: ``(N,)`` reprojection error up to which an observation is an inlier. The search has a single
+            threshold, their median within 2 to 8 pixels.
+        seed: Of the search.
+        min_inliers: Observations that must agree with what the search found, and after the refinement.
+        max_iterations: Hypotheses at most.
 
     Returns:
         The pose, or None when fewer than ``min_inliers`` agree.

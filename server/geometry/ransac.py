@@ -121,7 +121,17 @@ def confidence_ransac(
 
 
 def in_front(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
-    """Of the four poses with the same essential matrix, the one with most points in front of both cameras."""
+    """Of the four poses with the same essential matrix, the one with most points in front of both cameras.
+
+    Args:
+        camera: Of both images.
+        T_cam1_cam0: ``(4, 4)`` one of the four; its translation must have a length.
+        xy0: ``(N, 2)`` pixels.
+        xy1: ``(N, 2)`` pixels, matched row by row.
+
+    Returns:
+        ``(4, 4)``; the one that was given where others have no more points in front.
+    """
     R, t = T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3]
     twisted = (2.0 * np.outer(t, t) / float(t @ t) - np.eye(3)) @ R
     candidates = [make_transform(r, sign * t) for r in (R, twisted) for sign in (1.0, -1.0)]

@@ -119,13 +119,26 @@ def triangulate(
 
 
 def mean_centre(centre: Array, point: NDArray[np.intp], num_points: int) -> Array:
-    """Mean camera centre of each point's views, ``(P, 3)``."""
+    """Mean camera centre of each point's views, ``(P, 3)``; zero for a point without one.
+
+    Args:
+        centre: ``(M, 3)`` world position of the camera of each observation.
+        point: ``(M,)`` its point, in [0, num_points).
+        num_points: Number of points.
+    """
     count = np.maximum(1, np.bincount(point, minlength=num_points))
     return _sum_by(point, centre, num_points) / count[:, None]
 
 
 def parallax_deg(centre: Array, xyz: Array, point: NDArray[np.intp], num_points: int) -> Array:
-    """Largest angle at each point between its first ray and any other, ``(P,)`` degrees."""
+    """Largest angle at each point between its first ray and any other, ``(P,)`` degrees; 0 without one.
+
+    Args:
+        centre: ``(M, 3)`` world position of the camera of each observation.
+        xyz: ``(P, 3)`` the points in the world frame.
+        point: ``(M,)`` point of each observation, in [0, num_points).
+        num_points: Number of points.
+    """
     to_camera = centre - xyz[point]
     to_camera /= np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
     first = np.full(num_points, -1)

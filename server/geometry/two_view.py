@@ -322,7 +322,14 @@ def _result(
 
 
 def in_front_sign(camera: Intrinsics, T: Array, xy0: Array, xy1: Array) -> Array:
-    """Turn the translation round when that puts more points in front of both cameras."""
+    """Turn the translation of ``T_cam1_cam0`` round when that puts more points in front of both cameras.
+
+    Args:
+        camera: Of both images.
+        T: ``(4, 4)`` relative pose.
+        xy0: ``(N, 2)`` pixels.
+        xy1: ``(N, 2)`` pixels, matched row by row.
+    """
     turned = make_transform(T[:3, :3], -T[:3, 3])
     counts = []
     for candidate in (T, turned):

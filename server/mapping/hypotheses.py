@@ -47,7 +47,14 @@ class Hypothesis:
 
 
 def hypothesis_of(side: Side, views: Sequence[Observed], camera: Intrinsics, noise: NoiseModel) -> Hypothesis:
-    """Return a structure with all points its views have seen, not only those that it was judged by."""
+    """Return a structure with all points its views have seen, not only those that it was judged by.
+
+    Args:
+        side: The structure, with a pose for each view.
+        views: In order of time.
+        camera: Pinhole.
+        noise: Of the observations.
+    """
     ids = np.unique(np.concatenate([o.ids for o in views]))
     view, point, xy, confidence = gather_observations(views, ids)
     sigma = noise.sigma_px(confidence)
@@ -61,7 +68,18 @@ def hypothesis_of(side: Side, views: Sequence[Observed], camera: Intrinsics, noi
 def poses_in(
     hypothesis: Hypothesis, views: Sequence[Observed], camera: Intrinsics, noise: NoiseModel, seed: int
 ) -> Array | None:
-    """Poses ``T_world_cam (K, 4, 4)`` of other views in a structure, None where one can't be posed."""
+    """Poses of other views in a structure.
+
+    Args:
+        hypothesis: The structure.
+        views: In order of time; some may have a pose in it.
+        camera: Pinhole.
+        noise: Of the observations.
+        seed: Of the searches.
+
+    Returns:
+        ``T_world_cam (K, 4, 4)`` in the structure's own frame, None where one can't be posed.
+    """
     frames = np.array(sorted(hypothesis.poses))
     poses: list[Array] = []
     for o in views:

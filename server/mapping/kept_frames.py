@@ -19,7 +19,17 @@ Ids = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Observed:
-    """The tracks of one frame, the colours of their pixels, and its image where that is kept."""
+    """The tracks of one frame, the colours of their pixels, and its image where that is kept.
+
+    Attributes:
+        frame_id: Of the frame.
+        t_source_ns: Of the frame.
+        ids: ``(N,)`` int64, ascending.
+        xy: ``(N, 2)`` pixels.
+        confidence: ``(N,)`` of the positions.
+        rgb: ``(N, 3)`` uint8, or None.
+        grey: ``(H, W)`` uint8, or None.
+    """
 
     frame_id: int
     t_source_ns: int
@@ -65,7 +75,21 @@ def pose_of(
     seed: int,
     min_inliers: int = 15,
 ) -> Array | None:
-    """``T_world_cam`` of a kept frame from landmarks (``ids`` ascending), None where too few agree."""
+    """Pose of a kept frame from landmarks.
+
+    Args:
+        camera: Pinhole.
+        observed: The frame.
+        ids: ``(P,)`` landmarks, ascending.
+        xyz: ``(P, 3)`` world frame.
+        noise: Of the observations.
+        T_world_guess: ``(4, 4)`` pose to begin with; where fewer than half agree, it is searched for without.
+        seed: Of the search.
+        min_inliers: Landmarks that must agree.
+
+    Returns:
+        ``T_world_cam (4, 4)``, None where too few agree.
+    """
     _, row, row_o = np.intersect1d(ids, observed.ids, assume_unique=True, return_indices=True)
     if len(row) < min_inliers:
         return None

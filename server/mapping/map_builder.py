@@ -308,6 +308,14 @@ class MapBuilder:
 
         It begins where the camera was heading. Its unit makes the camera go on at its old speed, or, where it
         stood or too long ago, makes things as far away as they were.
+
+        Args:
+            T_world_guess: ``(4, 4)`` where the first camera of the start should be, None where nobody knows.
+            speed_map_per_s: How fast the camera was before.
+            start: The new submap.
+
+        Returns:
+            ``T_world_cam (4, 4)`` of its first camera, and world units per unit of the start.
         """
         before = self.reference_before()
         if T_world_guess is None or before is None:

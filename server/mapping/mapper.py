@@ -84,7 +84,19 @@ def keyframe_cues(
     frames_since: int,
     usable_share: float,
 ) -> KeyframeCues:
-    """Cues of a frame whose tracks ``ids`` (ascending) are at ``xy``, against its reference keyframe."""
+    """Cues of a frame against its reference keyframe.
+
+    Args:
+        reference: The keyframe.
+        ids: ``(N,)`` tracks in sight, ascending.
+        xy: ``(N, 2)`` where.
+        num_inliers: As in ``KeyframeCues``, like all that follow.
+        num_inliers_at_keyframe: See there.
+        max_features: See there.
+        width_px: See there; taken for the flow where no track is shared with the keyframe.
+        frames_since: See there.
+        usable_share: See there.
+    """
     _, row, row_k = np.intersect1d(ids, reference.ids, assume_unique=True, return_indices=True)
     flow_px = np.linalg.norm(xy[row] - reference.xy[row_k], axis=1)
     return KeyframeCues(
@@ -196,7 +208,7 @@ def new_landmarks(
 
 
 def sample_colours(image: NDArray[np.uint8], xy: Array) -> NDArray[np.uint8]:
-    """Colour of the nearest pixel, ``(N, 3)`` uint8."""
+    """Colour ``(N, 3)`` uint8 of the pixel of an ``(H, W, 3)`` image nearest to each of ``(N, 2)`` pixels."""
     height, width = image.shape[:2]
     x = np.clip(np.rint(xy[:, 0]), 0, width - 1).astype(np.intp)
     y = np.clip(np.rint(xy[:, 1]), 0, height - 1).astype(np.intp)
@@ -222,9 +234,15 @@ class Seen(Protocol):
 def gather_observations(
     views: Sequence[Seen], ids: Ids
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-    """View, row into ``ids``, pixel and confidence of every observation of ``ids`` in the views.
+    """Find every observation of some tracks in some views.
 
-    ``ids`` must ascend.
+    Args:
+        views: One at least; each sees a track once.
+        ids: ``(P,)`` tracks, ascending.
+
+    Returns:
+        View, row into ``ids``, pixel and confidence of each observation: ``(M,)``, ``(M,)``, ``(M, 2)`` and
+        ``(M,)``, view by view.
     """
     view, point, xy, confidence = [], [], [], []
     for k, keyframe in enumerate(views):
@@ -328,7 +346,14 @@ def _drop(world: WorldMap, problem: BundleProblem, bad: NDArray[np.bool_]) -> No
 
 
 def note_sight(world: WorldMap, ids: Ids, agrees: NDArray[np.bool_], frame_id: int) -> None:
-    """Note which landmarks a frame saw and which of them agreed; those that keep disagreeing are removed."""
+    """Note which landmarks a frame saw and which of them agreed; those that keep disagreeing are removed.
+
+    Args:
+        world: The map.
+        ids: ``(N,)`` landmarks the frame saw; those that are not there any more are passed over.
+        agrees: ``(N,)`` which agree with its pose.
+        frame_id: The frame.
+    """
     row = world.landmarks.rows(ids)
     there = row >= 0
     row, agrees = row[there], agrees[there]

@@ -194,7 +194,11 @@ class WorldMap:
                     return
 
     def add_frame(self, frame_id: int, keyframe_id: int, T_world_cam: Array) -> None:
-        """Note a frame's pose relative to a keyframe."""
+        """Note a frame's pose relative to a keyframe, with which it then moves.
+
+        Raises:
+            KeyError: There is no such keyframe.
+        """
         self.frames[frame_id] = (keyframe_id, invert_transform(self.poses[keyframe_id]) @ T_world_cam)
 
     def keyframes_of(self, submap: int) -> list[Keyframe]:
@@ -202,7 +206,14 @@ class WorldMap:
         return [k for k in self.keyframes if k.submap == submap]
 
     def transform_submap(self, submap: int, into: int, scale: float, T_new_old: Array) -> None:
-        """Move a submap by a similarity ``x' = T (s x)`` and make it part of another."""
+        """Move a submap by a similarity ``x' = T (s x)`` and make it part of another.
+
+        Args:
+            submap: The one that moves: landmarks, keyframes and frames.
+            into: The one it becomes part of.
+            scale: Units of the other in one of its own.
+            T_new_old: ``(4, 4)``.
+        """
         mine = self.landmarks.submap == submap
         xyz = scale * self.landmarks.xyz[mine]
         self.landmarks.xyz[mine] = transform_points(T_new_old, xyz)
@@ -255,6 +266,11 @@ class WorldMap:
 
     def bound(self, max_landmarks: int, max_keyframes: int, recent: int) -> bool:
         """Keep the map within its size: longest unseen landmarks and every second old keyframe go.
+
+        Args:
+            max_landmarks: Landmarks at most.
+            max_keyframes: Keyframes at most.
+            recent: So many of the newest keyframes stay, one at least.
 
         Returns:
             Whether keyframes went.
