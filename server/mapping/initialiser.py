@@ -210,20 +210,22 @@ class Initialiser:
         """Triangulate, place the frames between, and triangulate again from all."""
         span = self.history[self._reference :]
         first, last = span[0], span[-1]
-        T_world = {0: np.eye(4), len(span) - 1: invert_transform(found.T_cam1_cam0)}
+        T_world_cam = {0: np.eye(4), len(span) - 1: invert_transform(found.T_cam1_cam0)}
         points = self._triangulate([first, last], np.stack([np.eye(4), found.T_cam1_cam0]), ids, noise)
         good = self._passes(points)
         if int(good.sum()) < MIN_POINTS:
             return None
         for k in _between(span):
-            guess = interpolate_pose(T_world[0], T_world[len(span) - 1], k / (len(span) - 1))
-            T_cam = pose_of(self._camera, span[k], ids[good], points.xyz[good], noise, guess, self._seed)
-            if T_cam is not None:
-                T_world[k] = T_cam
-        if len(T_world) < _MIN_VIEWS and self._is_too_short():
+            guess = interpolate_pose(T_world_cam[0], T_world_cam[len(span) - 1], k / (len(span) - 1))
+            T_world_inner = pose_of(
+                self._camera, span[k], ids[good], points.xyz[good], noise, guess, self._seed
+            )
+            if T_world_inner is not None:
+                T_world_cam[k] = T_world_inner
+        if len(T_world_cam) < _MIN_VIEWS and self._is_too_short():
             return None
-        chosen = [span[k] for k in sorted(T_world)]
-        poses = np.stack([T_world[k] for k in sorted(T_world)])
+        chosen = [span[k] for k in sorted(T_world_cam)]
+        poses = np.stack([T_world_cam[k] for k in sorted(T_world_cam)])
         chosen = aligned_views(self._camera, chosen, poses)
         side = self._decide(chosen, poses, noise)
         if side is None:

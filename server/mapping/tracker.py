@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
-from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
+from semcast.server.geometry.pnp import MIN_DEPTH_MAP, PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.rays import rays_of
 from semcast.server.mapping.tracks import Seen, TrackTable
@@ -110,7 +110,7 @@ def expected_positions(
             continue
         T_then_world = invert_transform(T_world_then)
         seen = transform_points(T_then_world, around)
-        seen = seen[seen[:, 2] > 1e-3]
+        seen = seen[seen[:, 2] > MIN_DEPTH_MAP]
         if len(seen) == 0:
             continue
         square = ((tracks.xy[unknown][:, None] - camera.project(seen)[None]) ** 2).sum(axis=2)
