@@ -41,7 +41,7 @@ class DecodedFrame:
     slot_snr_db: NDArray[np.float32] | None = None
 
     def check(self, shape_hw: tuple[int, int]) -> None:
-        """Check that image and confidence maps are of a camera's size, and hold what they should.
+        """Check that image and confidence maps are of a camera's size, and that all hold what they should.
 
         Raises:
             ValueError: An array has another shape or number type.
@@ -56,6 +56,8 @@ class DecodedFrame:
                 check_shape(values, f"{height} {width}", name)
                 if values.dtype.kind != "f":
                     raise ValueError(f"{name} must be floating point in [0, 1], got {values.dtype}")
+        if self.slot_snr_db is not None:
+            check_shape(self.slot_snr_db, "num_slots", "slot_snr_db")
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ def test_a_frame_of_a_cameras_size_is_taken():
         ({"confidence": MAP[1:]}, "confidence must have shape"),
         ({"confidence": MAP.astype(np.uint8)}, "confidence must be floating point in .0, 1., got uint8"),
         ({"keypoint_confidence": MAP > 0}, "keypoint_confidence must be floating point .*, got bool"),
+        ({"slot_snr_db": np.zeros((2, 3), np.float32)}, r"slot_snr_db must have shape .*, got \(2, 3\)"),
     ],
 )
 def test_other_arrays_are_refused(arrays, message):
