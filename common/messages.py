@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import MAX_READOUT_MS, Intrinsics, ReadoutFrom
 from semcast.common.codec import MODULATIONS, Modulation
 from semcast.common.message_fields import (
+    MAX_COUNT,
     Array,
     Bytes,
     Choice,
@@ -45,6 +46,8 @@ AGENT_ID_PATTERN = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 _VERSION = rule(WholeNumber(PROTOCOL_VERSION, PROTOCOL_VERSION))
 _AGENT_ID = rule(Text(64, AGENT_ID_PATTERN))
 _COUNT = rule(WholeNumber())
+#: Receivers answer with the number of the next frame, which has to fit as well.
+_SEQ = rule(WholeNumber(0, MAX_COUNT - 1))
 _TIME_NS = rule(WholeNumber(-(2**63)))
 _NAME = rule(Text(64, "[A-Za-z0-9_.+-]{1,64}"))
 _DIGEST = rule(Text(64, "[0-9a-f]{0,64}"))
@@ -155,7 +158,7 @@ class SymbolFrame:
     version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("symbols")
     agent_epoch: int = field(metadata=_COUNT)
-    seq: int = field(metadata=_COUNT)
+    seq: int = field(metadata=_SEQ)
     base_seq: int = field(default=0, metadata=_COUNT)
     frame_id: int = field(metadata=_COUNT)
     t_capture_ns: int = field(metadata=_TIME_NS)

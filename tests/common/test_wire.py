@@ -125,6 +125,7 @@ def test_each_field_missing_or_of_another_type_is_refused(message):
         (SymbolFrame, {"surprise": 1}, "unknown"),
         (SymbolFrame, {"seq": -1}, "range"),
         (SymbolFrame, {"seq": 2**64 - 1}, "range"),
+        (SymbolFrame, {"seq": 2**63 - 1}, "range"),  # none could follow it
         (SymbolFrame, {"seq": True}, "type"),
         (SymbolFrame, {"seq": 1.0}, "type"),
         (SymbolFrame, {"image_hw": [0, 5]}, "range"),

@@ -1,9 +1,12 @@
-from dataclasses import replace
+from dataclasses import fields, replace
 
+import msgpack
 import pytest
 
-from semcast.common.messages import SymbolFrame
+from semcast.common.message_fields import MAX_COUNT
+from semcast.common.messages import FlowMessage, SymbolFrame
 from semcast.common.metrics import Metrics
+from semcast.common.wire import WireError, pack, unpack
 from semcast.server.arrival import Arrivals, CaptureAge
 
 MS = 1_000_000
@@ -115,6 +118,21 @@ def test_a_frame_that_was_long_on_its_way_does_not_hold_a_new_receiver_up(metric
     assert accepted(arrivals, [frame(k, base_seq=8, lossless=True) for k in (8, 9, 8)]) == [8, 9]
     assert (arrivals.next_seq, arrivals.arrived_seq) == (8, 10)
     assert metrics.drops == {"gap": 1, "duplicate": 1}
+
+
+@pytest.mark.parametrize("seq", [MAX_COUNT - 1, MAX_COUNT])
+def test_how_far_a_receiver_is_can_be_told_whatever_number_it_takes(metrics, seq):
+    arrivals = Arrivals(lossless=True, drop=metrics.drop)
+    sent = replace(frame(0, lossless=True), seq=seq, base_seq=seq)
+    values = {field.name: getattr(sent, field.name) for field in fields(sent)}
+    try:
+        message = unpack(msgpack.packb(values), SymbolFrame)
+    except WireError:
+        return
+    assert arrivals.accept(message, 1)
+    arrivals.done(message)
+    flow = FlowMessage(agent_epoch=1, next_seq=arrivals.next_seq, arrived_seq=arrivals.arrived_seq, window=6)
+    assert unpack(pack(flow), FlowMessage) == flow
 
 
 def test_age_needs_no_common_clock():
