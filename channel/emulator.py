@@ -176,7 +176,9 @@ class Emulator:
                 self._link.update(changed)
                 logger.info("channel set: %s", ", ".join(f"{k}={v}" for k, v in request.settings.items()))
                 warn_of_idle(changed, request.settings)
-            return settings_to_dict(self._link.settings)
+            in_force = settings_to_dict(self._link.settings)
+        # Given on the command line, the name of a file may be no text.
+        return {k: sendable(v, 1000) if isinstance(v, str) else v for k, v in in_force.items()}
 
     def close(self) -> None:
         """End the delay line's thread. Idempotent."""

@@ -174,7 +174,12 @@ class Named:
             raise FieldError("shape", f"must have at most {self.at_most} entries, got {len(value)}")
         return {self.name.load(key): self.item.load(item) for key, item in value.items()}
 
-    dump = load
+    def dump(self, value: Any) -> dict[str, Any]:
+        """Return what goes on the wire."""
+        return {self.name.dump(key): self.item.dump(item) for key, item in self.load(value).items()}
+
+
+_SETTING_TEXT = Text(max_chars=1000)
 
 
 @dataclass(frozen=True)
@@ -187,9 +192,11 @@ class Setting:
             return value
         if type(value) is int:
             return WholeNumber(-(2**63)).load(value)
-        return Number().load(value) if type(value) is float else Text(max_chars=1000).load(value)
+        return Number().load(value) if type(value) is float else _SETTING_TEXT.load(value)
 
-    dump = load
+    def dump(self, value: Any) -> Any:
+        """Return what goes on the wire."""
+        return _SETTING_TEXT.dump(value) if type(value) is str else self.load(value)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import EncodedImage
-from semcast.common.errors import ConfigError, TransportError
+from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import channel_key, rx_key, status_key, tx_key
 from semcast.common.messages import ChannelReport, StatusMessage, SymbolFrame
 from semcast.common.network_settings import NetworkSettings
@@ -152,6 +152,16 @@ def test_settings_change_while_it_runs_and_bad_ones_are_refused(ends, make):
     assert set_channel(e.network, "a", {"channel": "rayleigh"})["channel"] == "rayleigh"
     e.pass_one(make(2))
     assert e.reports[-1].channel == "rayleigh"
+
+
+def test_a_trace_file_whose_name_is_no_text_does_not_silence_the_channel(ends, tmp_path):
+    file = tmp_path / os.fsdecode(b"walk\xff.csv")
+    file.write_text("t_s,snr_db\n0,7\n")
+    e = ends(channel="trace", trace="file", trace_file=file)
+    in_force = set_channel(e.network, "a", {"frame_loss": 0.5})
+    assert (in_force["frame_loss"], in_force["trace_file"]) == (0.5, f"{tmp_path}/walk?.csv")
+    with pytest.raises(SemcastError, match="settings must be text that UTF-8 can hold"):
+        set_channel(e.network, "a", {"trace_file": str(file)})
 
 
 def test_nobody_to_set_is_said(ends):

@@ -239,6 +239,9 @@ def test_what_may_not_be_received_can_not_be_sent():
     camera = next(m for m in examples() if isinstance(m, CameraInfo))
     with pytest.raises(WireError, match="source_name must be text that UTF-8 can hold"):
         pack(dataclasses.replace(camera, source_name="room\udcff"))
+    for values in ({"trace_file": "/tmp/\udcff.csv"}, {"\udcff": 1}):
+        with pytest.raises(WireError, match="settings must be text that UTF-8 can hold"):
+            pack(ControlRequest(op="set", settings=values))
 
 
 REASONS = ("good", "syntax", "version", "kind", "unknown", "missing", "type", "range", "shape")
