@@ -27,7 +27,9 @@ class CaptureAge:
         """Learn from a frame."""
         offset_ns = t_arrival_ns - t_capture_ns
         if self._current_ns is None or t_arrival_ns - self._since_ns > _OFFSET_WINDOW_NS:
-            self._previous_ns, self._current_ns = self._current_ns, offset_ns
+            # After a longer silence all is older: an agent that was suspended has its clock stand still.
+            is_recent = t_arrival_ns - self._since_ns <= 2 * _OFFSET_WINDOW_NS
+            self._previous_ns, self._current_ns = self._current_ns if is_recent else None, offset_ns
             self._since_ns = t_arrival_ns
         self._current_ns = min(self._current_ns, offset_ns)
 

@@ -146,6 +146,15 @@ def test_age_needs_no_common_clock():
     assert CaptureAge().age_ms(0, 5) == 0.0
 
 
+def test_frames_of_an_agent_that_slept_are_no_older_than_before():
+    age = CaptureAge()  # the agent's clock stood still while it was suspended, the server's did not
+    for k in range(100):
+        age.arrived(k * 100 * MS, k * 100 * MS)
+    for k in range(100, 200):
+        age.arrived(k * 100 * MS, k * 100 * MS + 60_000 * MS)
+        assert age.age_ms(k * 100 * MS, k * 100 * MS + 60_005 * MS) == pytest.approx(5.0)
+
+
 def test_age_adapts_to_a_link_that_became_slower():
     age = CaptureAge()
     for k in range(400):
