@@ -38,6 +38,7 @@ _CAMERA_TIMEOUT_S = 0.5
 #: Between two questions for a camera: where nobody is there to answer, each comes back at once.
 _CAMERA_PAUSE_S = 0.05
 _KEPT_REPORTS = 256
+_KEPT_CAMERAS = 16
 
 
 @dataclass(frozen=True)
@@ -169,9 +170,11 @@ class Receiver:
             self._refuse(err)
             return
         with self._lock:
+            # The one announced last stays: that of an agent whose clock was set back has the lowest epoch.
+            self._cameras.pop(camera.agent_epoch, None)
             self._cameras[camera.agent_epoch] = camera
-            while len(self._cameras) > 16:
-                del self._cameras[min(self._cameras)]
+            while len(self._cameras) > _KEPT_CAMERAS:
+                del self._cameras[next(iter(self._cameras))]
 
     def _on_report(self, payload: bytes) -> None:
         try:

@@ -239,6 +239,18 @@ def test_no_frame_is_delivered_twice_and_a_new_agent_is_followed(ends, make):
     assert e.metrics.drops == {"duplicate": 2, "missing": 1, "stale": 1, "epoch": 1}
 
 
+def test_the_camera_of_an_agent_whose_clock_went_back_is_kept_beside_many_later_ones(ends, make):
+    e = ends()
+    publisher = e.client.publisher(camera_key("a"), "every")
+    until(lambda: publisher.has_receiver)
+    for epoch in (*range(EPOCH + 1, EPOCH + 41), EPOCH):
+        publisher.put(pack(camera(epoch)))
+    until(lambda: EPOCH in e.receiver._cameras)
+    e.put(make(0))
+    assert e.receiver.next(5).camera == camera(EPOCH)
+    assert len(e.receiver._cameras) <= 16
+
+
 def test_bad_messages_are_counted_and_do_no_harm(ends, make):
     e = ends()
     e.answer_camera(camera())
