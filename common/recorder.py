@@ -1,6 +1,7 @@
 """Records messages beside a running system: a bounded queue and a thread, so the live path never waits."""
 
 import logging
+import struct
 import threading
 import time
 from collections import Counter, deque
@@ -111,7 +112,8 @@ class Recorder:
                 self._writer.flush_if_due()
                 if ending:
                     self._writer.finish()
-            except (OSError, ValueError) as err:
+            except (OSError, ValueError, struct.error) as err:
+                # struct: of a number that the format has no room for.
                 self._fail(err, batch)
                 return
             if ending:
@@ -156,7 +158,8 @@ class Recorder:
     def _drop_empty(self) -> None:
         """Leave things as they were where nothing came: a start that fails must not move a good recording."""
         if self._is_own and self.num_written == 0 and self.error is None:
-            self._path.unlink(missing_ok=True)
+            if self._path.is_file():  # not a device, such as /dev/null
+                self._path.unlink()
             if self._former is not None:
                 self._former.rename(self._path)
 

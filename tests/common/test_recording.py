@@ -1,6 +1,7 @@
 import errno
 import io
 import json
+import os
 import threading
 
 import numpy as np
@@ -264,6 +265,23 @@ def test_a_recorder_that_heard_nothing_leaves_all_as_it_was(tmp_path):
             pass
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
     assert [m.data for m in RecordingReader(path).messages()] == [b"x"]
+
+
+def test_a_link_to_a_device_stays_where_nothing_came(tmp_path):
+    link = tmp_path / "run.mcap"
+    link.symlink_to(os.devnull)
+    with Recorder(link, HEADER):
+        pass
+    assert link.is_symlink()
+
+
+def test_a_message_that_the_format_can_not_hold_ends_the_recording_with_a_word(tmp_path, caplog):
+    with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
+        recorder.put("t", "pose", b"x", log_time_ns=-1)  # a clock before 1970
+        recorder.put("t", "pose", b"x")
+    assert recorder.error is not None
+    assert recorder.drops["disk"] == 2
+    assert "recording into" in caplog.text
 
 
 class SlowStream(io.BytesIO):
