@@ -103,8 +103,9 @@ def alive_agents() -> str:
 
 
 def agent_of(key: str) -> str:
-    """Return the agent's name in any key."""
-    return key.split("/")[1]
+    """Return the agent's name in a key; empty in one that names none, of another tool's recording perhaps."""
+    parts = key.split("/")
+    return parts[1] if len(parts) > 2 and re.fullmatch(AGENT_ID_PATTERN, parts[1]) is not None else ""
 
 
 def all_keys(agent_id: str) -> str:

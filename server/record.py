@@ -42,8 +42,11 @@ class RecordSettings:
 
 
 def kind_of_key(key: str) -> str:
-    """Return the kind of message a key carries: ``symbols`` for both directions, else the key's own word."""
-    word = key.split("/")[2]
+    """Return the kind of message a key carries: ``symbols`` for both directions, else the key's own word.
+
+    Empty for one that ends with the agent's name, where only a stranger sends.
+    """
+    word = next(iter(key.split("/")[2:3]), "")
     return "symbols" if word in ("tx", "rx") else word
 
 

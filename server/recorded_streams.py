@@ -48,6 +48,9 @@ def recorded_streams(reader: RecordingReader) -> list[RecordedStream]:
     frames: Counter[tuple[str, int, str]] = Counter()
     for message in reader.messages(frozenset({"camera", "symbols"})):
         agent_id = agent_of(message.topic)
+        if not agent_id:
+            logger.debug("messages of %s are left out: it names no agent", message.topic)
+            continue
         try:
             if message.kind == "camera":
                 camera = unpack(message.data, CameraInfo)

@@ -22,6 +22,11 @@ def test_role_and_agent_come_back_out_of_a_key():
     assert (keys.agent_of(key), keys.role_of(key)) == ("cam-0_b", "channel")
 
 
+@pytest.mark.parametrize("key", ["", "camera", "semcast/cam0", "/front camera/image", "semcast//camera"])
+def test_a_key_of_somebody_else_names_no_agent(key):
+    assert keys.agent_of(key) == ""
+
+
 @pytest.mark.parametrize("name", ["", "a/b", "*", "a b", "-a", "x" * 65, "ä", "a\n"])
 def test_names_that_would_change_the_key_are_refused(name):
     with pytest.raises(ValueError, match="agent_id must be"):

@@ -236,6 +236,18 @@ def test_a_start_without_frames_does_not_hide_the_one_before(recording, with_a_l
     assert first == second
 
 
+def test_topics_that_another_tool_renamed_are_no_streams(recording, tmp_path):
+    path = tmp_path / "renamed.mcap"
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, recording_metadata("", "0"))
+        for k, m in enumerate(RecordingReader(recording).messages(frozenset({"camera", "symbols"}))):
+            writer.add("camera" if k % 2 else "/front camera/camera", m.kind, m.log_time_ns, 0, m.data)
+        writer.finish()
+    with pytest.raises(SourceError, match="says nothing about a camera"):
+        replay(ReplaySettings(file=path))
+    assert kind_of_key("semcast/agent0") == ""
+
+
 def test_an_unreadable_message_costs_its_frame_alone(recording, tmp_path, caplog):
     path = tmp_path / "damaged.mcap"
     damaged = 0
