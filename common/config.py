@@ -87,9 +87,14 @@ def _check(name: str, value: Any, annotation: Any) -> Any:
             raise ConfigError(f"{name} must be a list, got {value!r}")
         return tuple(_check(f"{name}[{k}]", item, inner) for k, item in enumerate(value))
     if plain is Path and isinstance(value, (str, Path)):
+        if "\0" in str(value):  # with an error of its own kind wherever it is opened
+            raise ConfigError(f"{name} must be the name of a file or folder, got {value!r}")
         return Path(value)
     if plain is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError as err:
+            raise ConfigError(f"{name} must fit a float, got a larger number") from err
     if plain in (int, bool, str) and type(value) is plain:
         return value
     if nested_settings(plain) is not None:
@@ -180,7 +185,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
+    except (OSError, ValueError, RecursionError) as err:  # bad TOML, no text, endless numbers or nesting
         raise ConfigError(f"{path} can't be read as settings: {err}") from err
 
 

@@ -110,6 +110,8 @@ def test_an_unknown_key_is_an_error_with_a_hint(tmp_path):
         ({"count": 1.5}, "count must be of type int, got 1.5"),
         ({"count": True}, "count must be of type int, got True"),
         ({"levels": 3.0}, "levels must be a list"),
+        ({"out": "runs\0"}, r"out must be the name of a file or folder, got 'runs\\x00'"),
+        ({"radio": {"snr_db": 10**400}}, "radio.snr_db must fit a float"),
     ],
 )
 def test_a_bad_value_is_named_with_what_was_allowed(values, message):
@@ -123,9 +125,10 @@ def test_only_a_close_name_is_proposed():
     assert near_match("resize", names) == ""
 
 
-def test_a_broken_file_is_one_clear_error(tmp_path):
+@pytest.mark.parametrize("text", ["name = ", "count = " + 5000 * "9", "levels = " + 5000 * "["])
+def test_a_broken_file_is_one_clear_error(tmp_path, text):
     path = tmp_path / "node.toml"
-    path.write_text("name = ")
+    path.write_text(text)
     with pytest.raises(ConfigError, match="node.toml can't be read as settings"):
         parse([], path)
 
