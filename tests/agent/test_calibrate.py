@@ -202,6 +202,7 @@ def test_too_few_views_are_an_error():
         (["{}/broken"], "a.jpg is not a readable image"),
         (["{}/blank", "--picture", "{}/p.json"], "picture must be an image file (.png"),
         (["--camera", "{}/no.mp4"], "can't be opened"),
+        (["--camera", "{}/no.mp4", "--picture", "{}/broken/a.jpg/p.png"], "picture can't be written to"),
     ],
 )
 def test_mistakes_are_one_clear_line(tmp_path, capsys, words, message):
@@ -218,6 +219,21 @@ def test_mistakes_are_one_clear_line(tmp_path, capsys, words, message):
     assert main(["calibrate", *words, *out]) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out.json").exists()
+
+
+def test_the_password_of_a_camera_is_not_shown(tmp_path, capsys):
+    words = ["--camera", "http://user:secret@127.0.0.1:1/x", "--out", str(tmp_path / "out.json")]
+    assert main(["calibrate", *words]) == 1
+    said = capsys.readouterr().err
+    assert "camera http://127.0.0.1:1/x can't be opened" in said
+    assert "secret" not in said
+
+
+def test_a_file_that_can_not_be_written_is_told_before_any_view_is_taken(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    words = ["--camera", str(tmp_path / "no.mp4"), "--out", str(tmp_path / "file" / "out.json")]
+    assert main(["calibrate", *words]) == 1
+    assert "out can't be written to" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["x.png", "x.yaml", "x"])

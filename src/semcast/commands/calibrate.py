@@ -121,15 +121,16 @@ def camera_pictures(camera: str) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
     import numpy as np
 
     from semcast.agent.source import is_camera_number
+    from semcast.agent.video import public_name
 
     capture = cv2.VideoCapture(int(camera) if is_camera_number(camera) else camera)
     try:
         if not capture.isOpened():
-            raise SourceError(f"camera {camera!r} can't be opened")
+            raise SourceError(f"camera {public_name(camera)} can't be opened")
         for number in range(sys.maxsize):
             if not capture.grab():
                 if number == 0:
-                    raise SourceError(f"camera {camera!r} gives no picture")
+                    raise SourceError(f"camera {public_name(camera)} gives no picture")
                 return
             if number % LIVE_STRIDE == 0:
                 good, bgr = capture.retrieve()
@@ -182,11 +183,14 @@ def _collect(
 
 def _check_outputs(out: Path, picture: Path) -> None:
     from semcast.common.sequence_layouts import IMAGE_SUFFIXES
+    from semcast.common.whole_file import check_writable
 
     if out.suffix.lower() != ".json":
         raise ConfigError(f"out must be a .json file, got {out}")
     if picture.suffix.lower() not in IMAGE_SUFFIXES:
         raise ConfigError(f"picture must be an image file ({', '.join(IMAGE_SUFFIXES)}), got {picture}")
+    check_writable(out, "out")
+    check_writable(picture, "picture")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -205,7 +209,6 @@ def run(arguments: argparse.Namespace) -> int:
     views, sample = _collect(arguments, board)
     result = calibrate(views, board, (sample.shape[1], sample.shape[0]), arguments.distortion)
     try:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
         result.intrinsics.save(arguments.out)
         good = cv2.imwrite(str(picture), cv2.cvtColor(calibration_picture(result, sample), cv2.COLOR_RGB2BGR))
     except (OSError, cv2.error) as err:
