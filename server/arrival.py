@@ -66,7 +66,8 @@ class Arrivals:
         self._lossless = lossless
         self._drop = drop
         self._last_ns = 0
-        self._recent: deque[int] = deque(maxlen=_REMEMBERED)
+        self._recent: deque[int] = deque()
+        self._forgotten_seq = 0  # the newest one that may have come without being remembered
         self._done_early: set[int] = set()
         self._age = CaptureAge()
 
@@ -91,24 +92,31 @@ class Arrivals:
             self._drop("duplicate", 1)
             return False
         elif frame.seq < self.arrived_seq:
-            # It was counted as missing when a later one came, unless that was before this receiver's time.
-            if self._recent and frame.seq > self._recent[0]:
+            # It was counted as missing when a later one came, unless that was before this receiver's time, or
+            # it came and is no longer remembered.
+            if frame.seq > self._forgotten_seq:
                 self._drop("missing", -1)
-            self._recent.append(frame.seq)
+            self._remember(frame.seq)
             self._drop("stale", 1)
             return False
         else:
             self._drop("missing", frame.seq - self.arrived_seq)
         self.arrived_seq = frame.seq + 1
-        self._recent.append(frame.seq)
+        self._remember(frame.seq)
         self._age.arrived(frame.t_capture_ns, arrival_ns)
         return True
+
+    def _remember(self, seq: int) -> None:
+        if len(self._recent) == _REMEMBERED:
+            self._forgotten_seq = max(self._forgotten_seq, self._recent.popleft())
+        self._recent.append(seq)
 
     def _start(self, frame: SymbolFrame) -> None:
         """Take up a stream, from its first unconfirmed frame, or where it is now."""
         self.epoch = frame.agent_epoch
         self.arrived_seq = frame.base_seq if self._lossless else frame.seq
         self.next_seq = self.arrived_seq
+        self._forgotten_seq = self.arrived_seq
         self._recent.clear()
         self._done_early.clear()
         self._age = CaptureAge()

@@ -4,7 +4,7 @@ import msgpack
 import pytest
 
 from semcast.common.message_fields import MAX_COUNT
-from semcast.common.messages import FlowMessage, SymbolFrame
+from semcast.common.messages import FlowMessage, StatusMessage, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.wire import WireError, pack, unpack
 from semcast.server.arrival import Arrivals, CaptureAge
@@ -51,6 +51,15 @@ def test_frames_before_the_first_one_seen_are_not_missing(metrics):
     arrivals = Arrivals(lossless=False, drop=metrics.drop)
     assert accepted(arrivals, [frame(1000), frame(999), frame(1001)]) == [1000, 1001]
     assert metrics.drops == {"stale": 1}
+
+
+def test_a_frame_that_comes_again_long_after_is_not_taken_for_a_missing_one(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    accepted(arrivals, [frame(k) for k in (5, 6, 8, 7, *range(9, 9 + 255))])
+    assert metrics.drops["missing"] == 0, "7 came late"
+    accepted(arrivals, [frame(8), frame(8)])
+    assert metrics.drops["missing"] == 0
+    assert unpack(pack(metrics.status(1)), StatusMessage).drops["stale"] == 2
 
 
 @pytest.mark.parametrize("lossless", [False, True])
