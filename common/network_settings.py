@@ -10,7 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-_ENDPOINT = re.compile(r"(tcp|udp|quic|tls|ws)/\S+?:(?P<port>\d+)([?#]\S*)?|unixsock-stream/\S+")
+#: A name or address, an IPv6 one best in brackets; ``::1`` alone is no address ``:`` with port 1.
+_HOST = r"(\[[^\[\]\s]+\]|[^\[\]\s]*?[^\[\]\s:])"
+_ENDPOINT = re.compile(rf"(tcp|udp|quic|tls|ws)/{_HOST}:(?P<port>\d+)([?#]\S*)?|unixsock-stream/\S+")
 _MAX_PORT = 65535
 _LOOPBACK = re.compile(r"\w+/(127\.\d+\.\d+\.\d+|localhost|\[::1\]):\d+.*|unixsock-stream/.*")
 

@@ -1,6 +1,7 @@
 import asyncio
 import contextlib
 import json
+import re
 import socket
 import subprocess
 import sys
@@ -322,11 +323,20 @@ def test_endpoints_are_checked():
         "tcp/127.0.0.1:",
         "tcp/127.0.0.1:99999",
         "tls/host:port",
+        "tcp/::1",
+        "tcp/[::1",
+        "tcp/::1]:7447",
         "unixsock-stream/",
     ):
-        with pytest.raises(ValueError, match=f"listen must be an endpoint .*, got '{endpoint}'"):
+        with pytest.raises(ValueError, match=f"listen must be an endpoint .*, got '{re.escape(endpoint)}'"):
             NetworkSettings(listen=(endpoint,))
-    for endpoint in ("tcp/[::1]:7447", "udp/host:1?rel=1", "tcp/0.0.0.0:0#iface=eth0", "unixsock-stream/a:b"):
+    for endpoint in (
+        "tcp/[::1]:7447",
+        "tcp/::1:7447",
+        "udp/host:1?rel=1",
+        "tcp/0.0.0.0:0#iface=eth0",
+        "unixsock-stream/a:b",
+    ):
         assert NetworkSettings(connect=(endpoint,)).connect == (endpoint,)
     with pytest.raises(ValueError, match="listen or connect must name an endpoint"):
         NetworkSettings(connect=())
