@@ -100,6 +100,13 @@ def test_a_run_without_summary_is_said_to_be_going_on(run_folder):
     assert "the run is going on, or was killed" in text_of(run_folder)
 
 
+@pytest.mark.parametrize("text", ['{"frames": 5}', '{"stream": {"image_wh": 5}}', '{"psnr_db": "good"}'])
+def test_the_summary_of_another_program_is_one_line(run_folder, text):
+    (run_folder / "summary.json").write_text(text)
+    with pytest.raises(SourceError, match=r"summary\.json is none that a run wrote"):
+        describe(run_folder)
+
+
 def test_a_run_is_described(run_folder):
     figures = {"psnr_db": 27.123, "completeness": 0.5, "frame_rate_hz": 7.7, "processed_rate_hz": 3.9}
     (run_folder / "summary.json").write_text(json.dumps(figures))

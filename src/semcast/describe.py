@@ -110,30 +110,12 @@ def _stream(stream: RecordedStream) -> str:
 def describe_run(path: Path) -> list[Section]:
     """Say what came out of a run, from its summary and its arrays."""
     summary = read_summary(path)
-    facts: list[tuple[str, str]] = []
+    facts = [("state", f"no {SUMMARY_NAME}: the run is going on, or was killed")]
     if summary:
-        stream, frames = summary.get("stream") or {}, summary.get("frames") or {}
-        size = "x".join(str(v) for v in stream.get("image_wh", ()))
-        facts.append(("stream", f"{stream.get('agent_id', '?')}, {stream.get('codec', '?')}, {size}"))
-        facts.append(("frames", ", ".join(f"{count} {name}" for name, count in frames.items())))
-        for key, name, form in (
-            ("completeness", "frames with a pose", "{:.1%}"),
-            ("ate_percent", "position error (ATE)", "{:.2f} % of the path"),
-            ("psnr_db", "image quality (PSNR)", "{:.2f} dB"),
-            ("snr_estimated_db", "SNR at the receiver", "{:.1f} dB"),
-            ("confidence_mean", "mean confidence", "{:.2f}"),
-            ("frame_rate_hz", "tracked by recorded time", "{:.1f} frames a second"),
-            ("processed_rate_hz", "tracked by time of arrival", "{:.1f} frames a second"),
-        ):
-            if summary.get(key) is not None:
-                facts.append((name, form.format(summary[key])))
-        age = (summary.get("stage_ms") or {}).get("arrival_to_pose")
-        if age:
-            facts.append(("arrival to pose", f"p50 {age['p50']:.0f} ms, p95 {age['p95']:.0f} ms"))
-        if summary.get("drops"):
-            facts.append(("dropped frames", ", ".join(f"{n} {why}" for why, n in summary["drops"].items())))
-    else:
-        facts.append(("state", f"no {SUMMARY_NAME}: the run is going on, or was killed"))
+        try:
+            facts = _figures(summary)
+        except (AttributeError, KeyError, TypeError, ValueError) as err:
+            raise SourceError(f"{path / SUMMARY_NAME} is none that a run wrote: {err}") from err
     parts = summary.get("parts") or []
     if (path / RECONSTRUCTION_NAME).is_file():
         data = read_run(path)
@@ -162,6 +144,32 @@ def describe_run(path: Path) -> list[Section]:
         files.append(("images/", f"{len(images)} decoded images"))
     versions = [(name, str(value)) for name, value in (summary.get("versions") or {}).items()]
     return [(f"run {path}", facts), ("files", files), ("made with", versions)]
+
+
+def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return what a run's summary says, in words."""
+    facts: list[tuple[str, str]] = []
+    stream, frames = summary.get("stream") or {}, summary.get("frames") or {}
+    size = "x".join(str(v) for v in stream.get("image_wh", ()))
+    facts.append(("stream", f"{stream.get('agent_id', '?')}, {stream.get('codec', '?')}, {size}"))
+    facts.append(("frames", ", ".join(f"{count} {name}" for name, count in frames.items())))
+    for key, name, form in (
+        ("completeness", "frames with a pose", "{:.1%}"),
+        ("ate_percent", "position error (ATE)", "{:.2f} % of the path"),
+        ("psnr_db", "image quality (PSNR)", "{:.2f} dB"),
+        ("snr_estimated_db", "SNR at the receiver", "{:.1f} dB"),
+        ("confidence_mean", "mean confidence", "{:.2f}"),
+        ("frame_rate_hz", "tracked by recorded time", "{:.1f} frames a second"),
+        ("processed_rate_hz", "tracked by time of arrival", "{:.1f} frames a second"),
+    ):
+        if summary.get(key) is not None:
+            facts.append((name, form.format(summary[key])))
+    age = (summary.get("stage_ms") or {}).get("arrival_to_pose")
+    if age:
+        facts.append(("arrival to pose", f"p50 {age['p50']:.0f} ms, p95 {age['p95']:.0f} ms"))
+    if summary.get("drops"):
+        facts.append(("dropped frames", ", ".join(f"{n} {why}" for why, n in summary["drops"].items())))
+    return facts
 
 
 def describe_sequence(path: Path) -> list[Section]:
