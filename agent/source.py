@@ -144,6 +144,22 @@ class RecordedSource:
         self._sequence = sequence
         self._settings = settings
         self._intrinsics = sequence.intrinsics
+        # Repeated, there is always another frame for one that is left out.
+        self._length = self._readable_length() if settings.repeat == "once" else len(sequence)
+
+    def _readable_length(self) -> int:
+        """Return how many images there are without the unreadable ones at the end, if these are few."""
+        length, refused = len(self._sequence), list[tuple[int, SourceError]]()
+        for index in range(length - 1, max(-1, length - 1 - MAX_BAD_IN_A_ROW), -1):
+            try:
+                self._sequence.image(index)
+            except SourceError as err:
+                refused.append((int(self._sequence.frame_ids[index]), err))
+            else:
+                for frame_id, refusal in reversed(refused):
+                    logger.warning("frame %d is left out: %s", frame_id, refusal)
+                return index + 1
+        return length
 
     @property
     def name(self) -> str:
@@ -163,7 +179,7 @@ class RecordedSource:
     @property
     def num_frames(self) -> int | None:
         """Frames of one pass, or as many as were asked for; None when it is repeated for ever."""
-        return len(self._sequence) if self._settings.repeat == "once" else self._settings.max_frames
+        return self._length if self._settings.repeat == "once" else self._settings.max_frames
 
     @property
     def last_frame_id(self) -> int | None:
@@ -191,23 +207,22 @@ class RecordedSource:
         """Yield frames when they are due; unreadable ones are left out.
 
         Raises:
-            SourceError: ``MAX_BAD_IN_A_ROW`` images in a row, or the last one of the only pass, can't be
-                read.
+            SourceError: ``MAX_BAD_IN_A_ROW`` images in a row can't be read, or the last one of the only pass
+                no longer.
         """
         pacer = Pacer(self._settings, stop.wait)
         times_ns = self._sequence.times_ns
-        last = len(self._sequence) - 1
+        last = self._length - 1
         once, sent = self._settings.repeat == "once", 0
         period_ns = round(self._period_ns())
         frame_id, t_source_ns, previous, bad = -1, 0, -1, 0
-        for count, index in enumerate(playback_order(len(self._sequence), self._settings.repeat)):
+        for count, index in enumerate(playback_order(self._length, self._settings.repeat)):
             if count <= last:
                 frame_id, t_source_ns = int(self._sequence.frame_ids[index]), int(times_ns[index])
             else:
                 step_ns = abs(int(times_ns[index] - times_ns[previous])) if abs(index - previous) == 1 else 0
                 frame_id, t_source_ns = frame_id + 1, t_source_ns + (step_ns or period_ns)
             previous = index
-            # Repeated, there is always another frame for one that is left out.
             final = count == last if once else sent + 1 == self._settings.max_frames
             try:
                 image = self._sequence.image(index)

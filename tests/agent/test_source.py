@@ -173,6 +173,20 @@ def test_a_damaged_image_is_left_out_and_many_end_the_source(recording, tmp_path
         play(fast(folder))
 
 
+@pytest.mark.parametrize("damaged", [1, MAX_BAD_IN_A_ROW - 1])
+def test_a_recording_ends_with_its_last_readable_image(recording, tmp_path, caplog, damaged):
+    folder = tmp_path / "damaged"
+    shutil.copytree(recording, folder)
+    for k in range(12 - damaged, 12):
+        (folder / "images" / f"{k:06d}.png").write_bytes(b"broken")
+    source, frames = play(fast(folder))
+    assert [f.frame_id for f in frames] == list(range(12 - damaged))
+    assert [f.final for f in frames] == [False] * (11 - damaged) + [True]
+    assert (source.num_frames, source.last_frame_id) == (12 - damaged, 11 - damaged)
+    left_out = [record.getMessage().split(":")[0] for record in caplog.records]
+    assert left_out == [f"frame {k} is left out" for k in range(12 - damaged, 12)]
+
+
 @pytest.mark.parametrize("repeat", ["loop", "swing"])
 def test_a_repeated_recording_makes_up_for_damaged_images(recording, tmp_path, repeat):
     folder = tmp_path / "damaged"
