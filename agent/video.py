@@ -54,7 +54,8 @@ def _open(source: str, live: bool) -> cv2.VideoCapture:
     if not capture.isOpened():
         capture.release()
         what = "camera" if live else "video"
-        raise SourceError(f"{what} {public_name(source)} can't be opened")
+        way = ": 'semcast replay' takes recordings of a stream" if source.endswith(".mcap") else ""
+        raise SourceError(f"{what} {public_name(source)} can't be opened{way}")
     return capture
 
 

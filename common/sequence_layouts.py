@@ -176,9 +176,11 @@ def _check_times(path: Path, num_images: int, times_ns: NDArray[np.int64]) -> No
 def _check_there(path: Path) -> None:
     if path.is_file():
         if path.suffix.lower() != ".json":
+            way = f"videos go through 'semcast agent --source {path}'"
+            if path.suffix.lower() == ".mcap":
+                way = f"recordings of a stream go through 'semcast replay {path}'"
             raise SourceError(
-                f"a sequence must be a folder or a transforms .json file, got the file {path}: "
-                f"videos go through 'semcast agent --source {path}'"
+                f"a sequence must be a folder or a transforms .json file, got the file {path}: {way}"
             )
     elif not path.is_dir():
         raise SourceError(f"no sequence at {path}: there is no such file or folder")
@@ -439,7 +441,8 @@ def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
         if not np.isfinite(T_world_gl).all():
             raise ValueError("transform_matrix must be finite")
     except (OSError, ValueError, KeyError, TypeError) as err:
-        raise SourceError(f"{path} can't be used as transforms.json: {err}") from err
+        what = f"{err} is missing" if isinstance(err, KeyError) else str(err)
+        raise SourceError(f"{path} can't be used as transforms.json: {what}") from err
     for T in T_world_gl:
         T[:3, :3] = project_to_so3(T[:3, :3])
     times_ns = _nominal_times_ns(len(images), rate_hz)

@@ -55,11 +55,14 @@ def describe(path: Path) -> list[Section]:
         with path.open("rb") as file:
             if file.read(5) == b"\x89MCAP":
                 return describe_recording(path)
-    got = f"{path} is another kind of file" if path.exists() else f"there is no file or folder {path}"
-    raise SourceError(
-        f"{got}: it must be a recording (.mcap), a folder that --out wrote, a sequence folder or transforms "
-        ".json, or weights (.safetensors, .onnx or a shipped name)"
+    known = (
+        "it must be a recording (.mcap), a folder that --out wrote, a sequence folder or transforms .json, "
+        "or weights (.safetensors, .onnx or a shipped name)"
     )
+    if path.exists():
+        way = f"videos go through 'semcast agent --source {path}'"
+        raise SourceError(f"{path} is another kind of file: {known}; {way}")
+    raise SourceError(f"there is no file or folder {path}: {known}")
 
 
 def _is_bare_name(path: Path) -> bool:

@@ -354,6 +354,9 @@ def test_what_can_not_be_opened_is_said(tmp_path):
     (tmp_path / "notes.txt").write_text("no video")
     with pytest.raises(SourceError, match=r"video .*notes.txt can't be opened"):
         open_source(fast(tmp_path / "notes.txt", camera=PINHOLE))
+    (tmp_path / "run.mcap").write_bytes(b"recording")
+    with pytest.raises(SourceError, match="run.mcap can't be opened: 'semcast replay' takes recordings"):
+        open_source(fast(tmp_path / "run.mcap", camera=PINHOLE))
     with pytest.raises(SourceError, match="there is no such file or folder"):
         open_source(fast(tmp_path / "nowhere"))
 

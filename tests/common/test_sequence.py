@@ -149,6 +149,9 @@ def test_a_video_is_sent_to_where_videos_go(tmp_path, layout):
         SourceError, match="got the file .*normal.mp4: videos go through 'semcast agent --source"
     ):
         open_sequence(tmp_path / "normal.mp4", layout=layout)
+    (tmp_path / "run.mcap").write_bytes(b"recording")
+    with pytest.raises(SourceError, match="run.mcap: recordings of a stream go through 'semcast replay"):
+        open_sequence(tmp_path / "run.mcap", layout=layout)
 
 
 def test_a_folder_of_images_needs_a_camera_only_when_it_is_asked_for_one(tmp_path, write_images):

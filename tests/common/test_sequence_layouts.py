@@ -258,3 +258,9 @@ def test_nonsense_in_a_transforms_file_is_said(tmp_path, write_images, angle_rad
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     with pytest.raises(SourceError, match=message):
         open_sequence(tmp_path)
+
+
+def test_a_json_file_of_another_kind_is_said_to_have_no_frames(tmp_path):
+    (tmp_path / "intrinsics.json").write_text('{"fx": 50}')
+    with pytest.raises(SourceError, match="can't be used as transforms.json: 'frames' is missing"):
+        open_sequence(tmp_path / "intrinsics.json")
