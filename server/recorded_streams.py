@@ -1,7 +1,7 @@
 """The streams in a recording: one per start of an agent, with how many frames of each there are."""
 
 import logging
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,7 +24,7 @@ class RecordedStream:
     Attributes:
         agent_id: Its name.
         camera: As last announced.
-        num_received: Frames after the link.
+        num_received: Frames after the link; one that was sent again counts once.
         num_transmitted: Frames before it.
     """
 
@@ -45,7 +45,7 @@ def recorded_streams(reader: RecordingReader) -> list[RecordedStream]:
     can't be read count for nothing.
     """
     cameras: dict[tuple[str, int], CameraInfo] = {}
-    frames: Counter[tuple[str, int, str]] = Counter()
+    frames: defaultdict[tuple[str, int, str], set[int]] = defaultdict(set)
     for message in reader.messages(frozenset({"camera", "symbols"})):
         agent_id = agent_of(message.topic)
         if not agent_id:
@@ -57,11 +57,13 @@ def recorded_streams(reader: RecordingReader) -> list[RecordedStream]:
                 cameras[agent_id, camera.agent_epoch] = camera
             else:
                 frame = unpack(message.data, SymbolFrame)
-                frames[agent_id, frame.agent_epoch, frame.direction] += 1
+                frames[agent_id, frame.agent_epoch, frame.direction].add(frame.frame_id)
         except WireError as err:
             logger.debug("a message of %s is left out: %s", message.topic, err)
     return [
-        RecordedStream(agent_id, camera, frames[agent_id, epoch, "rx"], frames[agent_id, epoch, "tx"])
+        RecordedStream(
+            agent_id, camera, len(frames[agent_id, epoch, "rx"]), len(frames[agent_id, epoch, "tx"])
+        )
         for (agent_id, epoch), camera in cameras.items()
     ]
 

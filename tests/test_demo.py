@@ -238,9 +238,13 @@ def test_an_agent_that_gives_up_ends_the_demo_with_what_came_out_so_far(tmp_path
     settings = DemoSettings(
         sequence=sequence, codec="jpeg-ldpc", view="none", resize=0.4, out=tmp_path / "out"
     )
-    summary, error = run_demo(settings, threading.Event(), lambda line: None, lambda done, text: None)
+    told = []
+    summary, error = run_demo(settings, threading.Event(), told.append, lambda done, text: None)
     assert error is not None
     assert "images" in error
+    assert [line.partition(", see")[0] for line in told if "left out" in line] == [
+        "images left out, unreadable or of another size: 9"
+    ]
     assert summary is not None
     assert summary["frames"]["tracked"] > 0
 

@@ -208,6 +208,10 @@ class Role:
         lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return lines[-1] if lines else "no output"
 
+    def images_left_out(self) -> int:
+        """Return how many images the log says were left out of the stream."""
+        return len(re.findall(r": frame \d+ is left out: ", self.log.read_text("utf-8", errors="replace")))
+
     def viewer_address(self) -> str | None:
         """Return the address of the viewer's page, once the log names it."""
         log = self.log.read_text(encoding="utf-8", errors="replace")
@@ -329,6 +333,9 @@ def run_demo(
                 alive.wait_for(name, child, stop)
                 tell(f"{name} is up: {shlex.join(child.command)}")
             error = _watch(settings.out, children, alive, summary_file, stop, tell, progress)
+            if left_out := children["agent"].images_left_out():
+                where = children["agent"].log
+                tell(f"images left out, unreadable or of another size: {left_out}, see {where}")
     finally:
         for child in reversed(children.values()):
             child.stop()

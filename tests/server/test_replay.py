@@ -248,6 +248,18 @@ def test_topics_that_another_tool_renamed_are_no_streams(recording, tmp_path):
     assert kind_of_key("semcast/agent0") == ""
 
 
+def test_a_frame_that_was_sent_again_counts_once(recording, tmp_path):
+    path = tmp_path / "again.mcap"
+    messages = list(RecordingReader(recording).messages())
+    messages += [m for m in messages if m.kind == "symbols"][-2:]
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, recording_metadata("", "0"))
+        for m in messages:
+            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, m.data)
+        writer.finish()
+    assert recorded_streams(RecordingReader(path)) == recorded_streams(RecordingReader(recording))
+
+
 def test_an_unreadable_message_costs_its_frame_alone(recording, tmp_path, caplog):
     path = tmp_path / "damaged.mcap"
     damaged = 0
