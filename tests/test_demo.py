@@ -73,11 +73,12 @@ def commands_of(settings):
 def test_every_setting_reaches_a_process(tmp_path):
     settings = DemoSettings(
         codec="webp-ldpc", modulation="analog", snr_db=3, channel="burst", confidence="paper", view="web",
-        seed=7, out=tmp_path / "o",
+        seed=7, out=tmp_path / "o", viewer_port=9877, web_port=9091,
     )  # fmt: skip
     words = [w for command in commands_of(settings).values() for w in command]
     for value in ("webp-ldpc", "analog", "3", "burst", "paper", "web", "7", "0.5", "8", str(tmp_path / "o")):
         assert value in words
+    assert tuple(words[words.index(f"--{name}-port") + 1] for name in ("viewer", "web")) == ("9877", "9091")
 
 
 def test_the_camera_reaches_the_agent_and_the_reference_it_is_compared_with(tmp_path):

@@ -3,6 +3,7 @@
 import logging
 from typing import TYPE_CHECKING
 
+from semcast.common.errors import ConfigError
 from semcast.common.former_file import keep_former
 from semcast.common.run_folder import VIEWER_NAME
 from semcast.server.mapping.state import MapUpdate
@@ -25,12 +26,22 @@ def check_viewer(settings: ServerSettings) -> None:
     """Check early that what is asked for can be shown.
 
     Raises:
-        ConfigError: ``file`` without an output folder, or no viewer is installed.
+        ConfigError: ``file`` without an output folder, no viewer is installed, or another program has the
+            port of its page.
     """
     if settings.view.view != "none":
         from semcast.server.view.feed import check_view
 
         check_view(settings.view, has_folder=settings.out is not None)
+    if settings.view.view == "web":
+        from semcast.server.view.process import is_listening
+
+        # A viewer that listens already serves the page, too.
+        if not is_listening(settings.view.port) and is_listening(settings.view.web_port):
+            raise ConfigError(
+                f"the viewer's page can't be served on port {settings.view.web_port}, where another program "
+                "listens: choose another port with --web-port"
+            )
 
 
 def open_viewer(

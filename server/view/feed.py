@@ -32,6 +32,8 @@ FLUSH_TIMEOUT_S = 1.0
 ALIGN_INTERVAL_S = 1.0
 FILE_FLUSH_INTERVAL_S = 1.0
 JOIN_DEADLINE_S = 5.0
+#: After so many connections in a row that took nothing, what listens is left alone until it no longer does.
+MAX_REFUSALS = 5
 
 
 def resolve_view(view: str, *, has_folder: bool) -> str:
@@ -226,13 +228,17 @@ class ViewerFeed:
         stream: RerunStream | None = None
         cursor = Cursor()
         stalled = False
+        refusals = 0
         last_supervised_s = -1e9
         while True:
             last_round = self._drained.is_set()
             if time.monotonic() - last_supervised_s > SUPERVISE_INTERVAL_S:
                 last_supervised_s = time.monotonic()
                 self._supervise()
-            if stream is None and not last_round and is_listening(self._settings.port):
+            listening = stream is None and not last_round and is_listening(self._settings.port)
+            if stream is None and not listening:
+                refusals = 0
+            if listening and refusals < MAX_REFUSALS:
                 stream, cursor = self._open_stream(None), Cursor()
                 self.num_connections += 1
                 logger.info("viewer connected on port %d", self._settings.port)
@@ -243,10 +249,18 @@ class ViewerFeed:
                     if not changes.empty:
                         stream.write(changes)
                 delivery = stream.flush(FLUSH_TIMEOUT_S)
+                if delivery is Delivery.DONE:
+                    refusals = 0
                 if delivery is Delivery.SEVERED:
                     logger.info("viewer is gone, the stream goes on")
                     stream.close()
                     stream = None
+                    refusals += 1
+                    if refusals == MAX_REFUSALS:
+                        logger.warning(
+                            "what listens on port %d is no viewer, nothing is shown: see --viewer-port",
+                            self._settings.port,
+                        )
                 elif (delivery is Delivery.STALLED) != stalled:
                     stalled = not stalled
                     logger.info("viewer %s", "does not answer, sending waits" if stalled else "answers again")

@@ -34,6 +34,7 @@ from semcast.common.whole_file import check_writable
 from semcast.common.wire import WireError, unpack
 from semcast.real_time import plan_for
 from semcast.server.former_run import check_not_foreign, discard, output_folder
+from semcast.server.settings import ViewSettings
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
 START_DEADLINE_S = 60.0
@@ -76,6 +77,12 @@ class DemoSettings:
     view: Literal["auto", "native", "web", "file", "none"] = field(
         default="auto", metadata={"help": "viewer: a window, the browser, only run.rrd, or none"}
     )
+    viewer_port: int = field(
+        default=ViewSettings.port, metadata={"help": "loopback port the viewer takes the stream on"}
+    )
+    web_port: int = field(
+        default=ViewSettings.web_port, metadata={"help": "loopback port of the web viewer's page"}
+    )
     resize: float | None = field(
         default=None,
         metadata={"help": "factor on the image size; by default what this machine can serve"},
@@ -100,6 +107,7 @@ class DemoSettings:
 
     def __post_init__(self) -> None:
         """Check what the three processes would only notice after their start."""
+        ViewSettings(port=self.viewer_port, web_port=self.web_port)
         if self.channel not in get_args(ChannelName):
             raise ValueError(
                 f"channel must be one of {', '.join(get_args(ChannelName))}, got {self.channel!r}"
@@ -151,6 +159,7 @@ def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict
     server = [*_PROGRAM, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
     server += ["--reference", str(sequence), *_camera_flags(settings.camera)]
     server += ["--confidence", settings.confidence, "--view", settings.view]
+    server += ["--viewer-port", str(settings.viewer_port), "--web-port", str(settings.web_port)]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
     server += ["--save-images", settings.save_images]
     if settings.record is not None:

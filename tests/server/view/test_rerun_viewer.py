@@ -7,6 +7,9 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -22,8 +25,8 @@ pytest.importorskip("rerun")
 
 import rerun as rr
 
-from semcast.server.view.choice import open_viewer
-from semcast.server.view.feed import ViewerFeed, check_view, resolve_view
+from semcast.server.view.choice import check_viewer, open_viewer
+from semcast.server.view.feed import MAX_REFUSALS, ViewerFeed, check_view, resolve_view
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
 from semcast.server.view.rerun_viewer import SERIES, blueprint
 
@@ -159,6 +162,32 @@ def test_a_window_without_a_display_is_refused_unless_a_viewer_is_open_elsewhere
         check_view(settings, has_folder=True)
     monkeypatch.setenv("DISPLAY", ":7")
     check_view(settings, has_folder=True)
+
+
+def test_a_page_on_the_port_of_another_program_is_refused():
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = other.getsockname()[1]
+        settings = ServerSettings(view=ViewSettings(view="web", port=free_port(), web_port=taken))
+        with pytest.raises(ConfigError, match=f"page can't be served on port {taken}, .* with --web-port"):
+            check_viewer(settings)
+        # Where a viewer is open already, the page is its own.
+        check_viewer(replace(settings, view=replace(settings.view, port=taken)))
+
+
+def test_what_listens_and_is_no_viewer_is_left_alone(caplog):
+    class Quiet(BaseHTTPRequestHandler):
+        def log_message(self, *_):
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Quiet) as other:
+        Thread(target=other.serve_forever, daemon=True).start()
+        feed = ViewerFeed(ViewSettings(view="web", port=other.server_port, web_port=free_port()), CAMERA, "r")
+        feed.submit(frame(0))
+        wait_until(lambda: "is no viewer, nothing is shown" in caplog.text, "it is told")
+        time.sleep(1.0)
+        feed.close()
+        other.shutdown()
+    assert feed.num_connections == MAX_REFUSALS
 
 
 def test_a_killed_viewer_is_back_soon_and_gets_the_stream_again(feed_and_proxy):
