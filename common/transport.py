@@ -420,7 +420,8 @@ def _says_in_use(err: zenoh.ZError) -> bool:
 
 
 def _first_line(err: Exception) -> str:
-    return str(err).split(" at /", 1)[0].splitlines()[0]
+    line = str(err).split(" at /", 1)[0].splitlines()[0]
+    return line + "]" * (line.count("[") - line.count("]"))  # the cut may have taken the end of a list
 
 
 def free_endpoint() -> str:

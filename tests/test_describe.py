@@ -240,7 +240,7 @@ def test_what_it_does_not_know_is_one_clear_error(tmp_path, content):
         path.write_bytes(content)
     with pytest.raises(SemcastError, match="must be a recording") as refused:
         describe(path)
-    assert ("videos go through 'semcast agent --source" in str(refused.value)) == (content is not None)
+    assert ("a video is read by 'semcast agent --source" in str(refused.value)) == (content is not None)
 
 
 def test_what_is_not_there_is_said_to_be_neither_file_nor_folder_nor_codec(tmp_path):

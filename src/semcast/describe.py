@@ -60,7 +60,7 @@ def describe(path: Path) -> list[Section]:
         "or weights (.safetensors, .onnx or a shipped name)"
     )
     if path.exists():
-        way = f"videos go through 'semcast agent --source {path}'"
+        way = f"a video is read by 'semcast agent --source {path}'"
         raise SourceError(f"{path} is another kind of file: {known}; {way}")
     raise SourceError(f"there is no file or folder {path}: {known}")
 
