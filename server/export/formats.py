@@ -1,10 +1,10 @@
 """Exports of a run folder by format name."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from semcast.common.errors import SemcastError, SourceError
+from semcast.common.errors import ConfigError, SemcastError, SourceError
 from semcast.common.run_folder import RunData, read_image_paths, read_run
 from semcast.server.export.colmap import write_colmap
 from semcast.server.export.nerfstudio import write_nerfstudio
@@ -38,6 +38,7 @@ def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> li
 
     Raises:
         SourceError: The run can't be read, has no such part, or lacks what the format needs.
+        ConfigError: ``out`` is a folder with somebody else's images.
         SemcastError: ``out`` can't be written.
         ValueError: ``format_name`` is none of ``FORMATS``, or ``part`` neither a number nor a word for parts.
     """
@@ -65,9 +66,29 @@ def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> li
     if parts is not None and part == ALL:
         logger.warning("parts of the map: %s; --part %s writes one that fits together", parts, LARGEST)
     try:
+        if FORMATS[format_name].startswith("FOLDER"):
+            _check_not_foreign(out, images)
         return writers[format_name]()
     except OSError as err:
         raise SemcastError(f"{out} can't be written: {err}") from err
+
+
+def _check_not_foreign(out: Path, images: Mapping[int, Path]) -> None:
+    """Refuse a folder with images or a ``transforms.json`` that no export wrote: they would be written over.
+
+    An export that found no room has left some of its images, and no list of them.
+    """
+    if (out / "sparse" / "0" / "points3D.txt").exists() or (out / "points3D.ply").exists():
+        return
+    ours = {path.name: path for path in images.values()}
+    there = sorted((out / "images").iterdir()) if (out / "images").is_dir() else []
+    foreign = [
+        f for f in there if f.name not in ours or f.is_dir() or f.read_bytes() != ours[f.name].read_bytes()
+    ]
+    if (out / "transforms.json").exists():
+        foreign.append(out / "transforms.json")
+    if foreign:
+        raise ConfigError(f"out must hold no images of others, there is {foreign[0]}: give another folder")
 
 
 def _write_run_ply(path: Path, data: RunData) -> list[Path]:

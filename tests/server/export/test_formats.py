@@ -12,6 +12,7 @@ from evo.tools import file_interface
 from semcast import SemcastError, SourceError
 from semcast.cli import main
 from semcast.commands.export import FORMATS as command_formats
+from semcast.common.errors import ConfigError
 from semcast.common.geometry import invert_transform
 from semcast.common.run_folder import read_image_paths
 from semcast.server.export.colmap import write_colmap
@@ -306,6 +307,30 @@ def test_export_says_in_one_line_what_is_wrong(tmp_path, arc_run, write_arc_run,
     (tmp_path / "file").write_text("")
     assert main(["export", str(tmp_path / "run"), "--format", "colmap", "--out", str(tmp_path / "file")]) == 1
     assert "is a file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("format_name", ["colmap", "nerfstudio"])
+@pytest.mark.parametrize("foreign", ["images/000000.jpg", "images/mine.png", "transforms.json"])
+def test_images_of_others_are_not_written_over(tmp_path, arc_run, write_arc_run, format_name, foreign):
+    write_arc_run(tmp_path / "run", arc_run())
+    out = tmp_path / "sequence"
+    (out / "images").mkdir(parents=True)
+    (out / foreign).write_bytes(b"original")
+    with pytest.raises(ConfigError, match=f"images of others, there is .*{foreign}: give another folder"):
+        export_run(tmp_path / "run", format_name, out)
+    assert [p for p in out.rglob("*") if p.is_file()] == [out / foreign]
+    assert (out / foreign).read_bytes() == b"original"
+
+
+def test_exports_into_one_folder_follow_each_other(tmp_path, arc_run, write_arc_run):
+    write_arc_run(tmp_path / "run", arc_run())
+    out = tmp_path / "out"
+    # As an export that found no room leaves it: some images, no list.
+    name, image = next((p.name, p.read_bytes()) for p in read_image_paths(tmp_path / "run").values())
+    (out / "images").mkdir(parents=True)
+    (out / "images" / name).write_bytes(image)
+    for format_name in ("colmap", "nerfstudio", "colmap"):
+        export_run(tmp_path / "run", format_name, out)
 
 
 def test_trimesh_reads_the_points_with_their_colours(tmp_path, arc_run, write_arc_run):
