@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from semcast import TransportError, __version__
+from semcast import SourceError, TransportError, __version__
 from semcast.common.config import to_toml
 from semcast.common.keys import DEFAULT_AGENT_ID, agent_of, all_keys, camera_key, check_agent_id
 from semcast.common.messages import CameraInfo, StatusMessage
@@ -19,6 +19,8 @@ from semcast.common.whole_file import check_writable
 from semcast.common.wire import WireError, unpack
 
 CAMERA_TIMEOUT_S = 0.5
+#: How often a recorder with nothing else to do looks whether it still records.
+_LOOK_INTERVAL_S = 0.5
 #: Name of the metadata record of a stream, followed by its epoch.
 STREAM_METADATA = "semcast.stream"
 
@@ -136,6 +138,7 @@ def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any
 
     Raises:
         ConfigError: The file can't be written, said before anything is waited for.
+        SourceError: It can't be written any more, as on a full disk.
         TransportError: The session failed.
     """
     check_writable(settings.file, "file")
@@ -146,7 +149,10 @@ def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any
         session,
         recording(session, settings.agent_id, settings.file, to_toml(settings)) as recorder,
     ):
-        stop.wait()
+        while not stop.wait(_LOOK_INTERVAL_S) and recorder.error is None:
+            pass
+    if recorder.error is not None:
+        raise SourceError(f"{settings.file} is not complete: {recorder.error}")
     return {
         "messages": recorder.num_written,
         "bytes": recorder.bytes_written,
