@@ -3,7 +3,6 @@
 import contextlib
 import logging
 import multiprocessing
-import os
 import signal
 import threading
 import time
@@ -29,7 +28,6 @@ GIVEN_UP = (
 def serve(connection: Connection) -> None:
     """Answer problems until the other end closes; the body of the child process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows nothing else keeps Ctrl-C away
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     from semcast.server.mapping.bundle import optimise
 
     while True:
