@@ -35,7 +35,7 @@ from semcast.server.mapping.state import DecodedFrame
 
 VERB = "eval endurance"
 #: One run; its seed is also that of the search.
-UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.seed", "seeds"}
+UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.seed", "reconstruction.final_adjustment", "seeds"}
 
 
 @dataclass(frozen=True, kw_only=True)

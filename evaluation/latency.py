@@ -31,7 +31,7 @@ from semcast.server.view.scene import Cursor, Scene, compress_picture
 
 VERB = "eval latency"
 #: Flags that have no meaning here: one run, whose seed is also that of the search.
-UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.seed", "seeds"}
+UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.seed", "reconstruction.final_adjustment", "seeds"}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -120,6 +120,7 @@ def reconstruct(
                 num_lost += 1
                 continue
             rows.append(_process(reconstruction, bundle, frame, on_frame))
+        reconstruction.conclude()
         poses = reconstruction.final_trajectory()
         num_landmarks = len(reconstruction.landmarks()[0])
         part_of = frame_parts(reconstruction.snapshot())

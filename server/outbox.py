@@ -72,9 +72,9 @@ class Outbox:
             self._put(message)
         self._put(pose_message(arrival, result))
 
-    def put_map(self, arrival: ReceivedFrame, update: MapUpdate) -> None:
-        """Send what a frame changed in the map."""
-        message = map_message(arrival.message.agent_epoch, update)
+    def put_map(self, agent_epoch: int, update: MapUpdate) -> None:
+        """Send what a frame, or the end of a stream, changed in the map."""
+        message = map_message(agent_epoch, update)
         with self._change_lock:
             waiting, self._change = self._change, message
             if waiting is not None:

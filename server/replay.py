@@ -204,6 +204,9 @@ def _replayed(
             raise SourceError(_none_in_part(reader, stream, settings))
         if not processed:
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
+        update = session.conclude()
+        if viewer is not None and update is not None:
+            viewer.submit(None, update)
         try:
             whole = settings.start_s == 0.0 and settings.end_s is None and not stop.is_set()
             return session.write_outputs(settings.out, drops, complete=whole)

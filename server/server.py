@@ -334,7 +334,7 @@ class Server:
         """Publish what a frame did to the map, show and count what it led to; its pose is on its way."""
         result = outcome.result
         if outcome.update is not None:
-            self._outbox.put_map(decoded.arrival, outcome.update)
+            self._outbox.put_map(decoded.arrival.message.agent_epoch, outcome.update)
         self._metrics.count("tracked")
         if result.T_world_cam is not None:
             self._metrics.count("posed")
@@ -352,6 +352,7 @@ class Server:
         former, self._session = self._session, None
         if former is not None:
             logger.info("the agent was started again: a new map is begun")
+            self._conclude(former)
             self._views.end_stream()
             self._end_former(former)
         self._former_epochs.discard(identity.agent_epoch)
@@ -397,6 +398,13 @@ class Server:
             logger.error("the new stream is not shown: %s", err)
             self._metrics.error(str(err))
 
+    def _conclude(self, session: Session) -> None:
+        """Adjust the whole map of a stream that has ended, and tell who follows it."""
+        update = session.conclude()
+        if update is not None:
+            self._outbox.put_map(session.identity.agent_epoch, update)
+            self._views.submit(None, update)
+
     def _drops(self) -> dict[str, int]:
         """Drops since the present stream began."""
         now = self._metrics.drops
@@ -430,6 +438,9 @@ class Server:
         session, self._session = self._session, None
         if session is None:
             return {}
+        if not self._complete:
+            self._save(session)  # who stopped the server may not wait for the adjustment
+        self._conclude(session)
         try:
             summary = self._end(session, self._settings.out)
         except OSError as err:

@@ -22,6 +22,7 @@ from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, 
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.tracks import Sight, TrackTable
+from semcast.server.mapping.whole_map import adjust_whole_map
 from semcast.server.mapping.window import build_problem
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -300,6 +301,17 @@ class MapBuilder:
         if result.covariance is not None:
             self._adjusted = (int(result.problem.keyframe_ids[-1]), result.covariance)
         return result
+
+    def adjust_whole(self) -> int:
+        """Adjust all keyframes with all they see, and say how many. Takes seconds where there are many."""
+        self.collect(wait=True)
+        if not self._settings.final_adjustment:
+            return 0
+        num_adjusted = adjust_whole_map(self.world, self._camera, self.noise.model)
+        if num_adjusted:
+            self._version += 1
+            self._adjusted = None
+        return num_adjusted
 
     def bridge(
         self, T_world_guess: Array | None, speed_map_per_s: float, start: Start

@@ -308,8 +308,14 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
     )
     as_noise = np.abs(result.residual_px[telling]) / np.sqrt(left[telling, None])
     noise.add(np.repeat(problem.confidence[telling], 2), as_noise.ravel())
-    bad = ~known | (size > 1.3 * noise.model.threshold_px(problem.confidence))
-    _drop(world, problem, bad)
+    drop_outliers(world, result, noise.model)
+
+
+def drop_outliers(world: WorldMap, result: BundleResult, noise: NoiseModel) -> None:
+    """Drop observations outside the gate, and landmarks left with fewer than two of them."""
+    residual_px, problem = result.residual_px, result.problem
+    size = np.linalg.norm(np.nan_to_num(residual_px, nan=np.inf), axis=1)
+    _drop(world, problem, size > 1.3 * noise.threshold_px(problem.confidence))
 
 
 def _share_left(problem: BundleProblem, known: NDArray[np.bool_]) -> Array:

@@ -31,8 +31,6 @@ from semcast.server.mapping.tracker import (
 )
 from semcast.server.mapping.tracks import Seen, Sight, TrackTable
 
-__all__ = ["Reconstruction", "ReconstructionSettings"]
-
 logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
@@ -264,8 +262,7 @@ class Reconstruction:
             self._frames_since_keyframe = 0
             self._lap("map", since)
             pose = pose.with_unit(self._try_to_join(sight, pose.T_world_cam))
-        T_world_cam = self._map.world.pose_of_frame(frame.frame_id)
-        return self._result(frame, T_world_cam, pose, is_keyframe=is_keyframe)
+        return self._result(frame, self._last_pose(), pose, is_keyframe=is_keyframe)
 
     def _improved(self, sight: Sight, pose: TrackedPose) -> TrackedPose:
         """Take drift out of a keyframe to be: out of its tracks, and where the camera has been before."""
@@ -419,9 +416,7 @@ class Reconstruction:
     ) -> FrameResult:
         visible = self._tracks.visible
         ids = self._tracks.ids[visible]
-        agrees = np.zeros(len(ids), bool)
-        if pose is not None:
-            agrees = np.isin(ids, pose.ids[pose.inliers], assume_unique=True)
+        agrees = np.isin(ids, [] if pose is None else pose.ids[pose.inliers], assume_unique=True)
         covariance = None
         if pose is not None and frame.frame_id in self._map.world.frames:
             covariance = self._map.pose_covariance(pose.covariance, pose.T_world_cam)
@@ -455,6 +450,11 @@ class Reconstruction:
     def whole_map(self) -> MapUpdate:
         """The map as one update, whatever was taken before."""
         return self._map.whole(self._map_epoch)
+
+    def conclude(self) -> None:
+        """Adjust the whole map, if the settings want that: the stream has ended, and no pose waits."""
+        if self._map.adjust_whole():
+            self._moved(1.0)
 
     def final_trajectory(self) -> dict[int, Array]:
         """Best current ``T_world_cam`` of all posed frames, by frame id; waits for a running adjustment."""

@@ -22,6 +22,10 @@ class ReconstructionSettings:
     seed: int = field(default=0, metadata={"help": "seed of every random search"})
     max_features: int = field(default=500, metadata={"help": "keypoints followed at most"})
     window_size: int = field(default=20, metadata={"help": "keyframes in one bundle adjustment"})
+    final_adjustment: bool = field(
+        default=True,
+        metadata={"help": "adjust all keyframes at once when a stream has ended, before results are written"},
+    )
     max_landmarks: int = field(
         default=20_000, metadata={"help": "landmarks kept at most; the longest unseen go first"}
     )

@@ -80,7 +80,8 @@ def build_problem(
     is_anchored = np.isin(np.arange(len(ids)), point[view < len(anchors)])
     is_newest = np.isin(ids, recent[-1].ids, assume_unique=True)
     turn = _turns(ids, count, (is_newest, _NEWEST_SHARE), (is_anchored, _ANCHORED_SHARE))
-    used_points, kept, point = within_limit(ids, point, -np.minimum(count, _WELL_SEEN), turn)
+    order = -np.minimum(count, _WELL_SEEN), turn
+    used_points, kept, point = within_limit(ids, point, *order, limit=MAX_OBSERVATIONS)
     if len(used_points) < 8:
         return None
     held = np.bincount(view[kept], minlength=len(views))[: len(anchors)] >= _MIN_SHARED
@@ -107,7 +108,7 @@ def build_problem(
 
 
 def within_limit(
-    ids: Ids, point: NDArray[np.intp], *priority: NDArray[Any]
+    ids: Ids, point: NDArray[np.intp], *priority: NDArray[Any], limit: int = MAX_OBSERVATIONS
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.intp]]:
     """Choose landmarks for an adjustment: seen at least twice, of no more observations than it has time for.
 
@@ -116,6 +117,7 @@ def within_limit(
         point: ``(M,)`` row into ``ids`` of each observation.
         priority: ``(P,)`` each, as ``np.lexsort`` takes keys: the last one counts first, and lower values go
             before higher ones. What is alike is chosen as good as at random.
+        limit: Observations at most.
 
     Returns:
         Rows of the landmarks that are taken, which observations are (``(M,)`` bool), and the row of each of
@@ -124,7 +126,7 @@ def within_limit(
     count = np.bincount(point, minlength=len(ids))
     order = np.lexsort((_scattered(ids), *priority))
     chosen = np.zeros(len(ids), bool)
-    chosen[order[np.cumsum(count[order]) <= MAX_OBSERVATIONS]] = True
+    chosen[order[np.cumsum(count[order]) <= limit]] = True
     taken = np.flatnonzero(chosen & (count >= 2))
     row = np.full(len(ids), -1, np.intp)
     row[taken] = np.arange(len(taken))

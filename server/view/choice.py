@@ -118,8 +118,10 @@ class SuccessiveViews:
         self._feed = open_viewer(self._settings, identity, reference, resumed=resumed, process=process)
         self._process = None
 
-    def submit(self, view: FrameView, update: MapUpdate | None = None, *, new_map: bool = False) -> None:
-        """Show a frame, as ``ViewerFeed.submit`` does, where anything is shown."""
+    def submit(
+        self, view: FrameView | None, update: MapUpdate | None = None, *, new_map: bool = False
+    ) -> None:
+        """Show a frame or what changed in the map, as ``ViewerFeed.submit`` does, where anything is shown."""
         if self._feed is not None:
             self._feed.submit(view, update, new_map=new_map)
 

@@ -98,7 +98,7 @@ class ViewerFeed:
         self._footer = footer
         self._scene = Scene(truth, truth_times_ns)
         self._scene_lock = threading.Lock()
-        self._pending: deque[tuple[FrameView, MapUpdate | None, bool]] = deque(maxlen=MAX_PENDING)
+        self._pending: deque[tuple[FrameView | None, MapUpdate | None, bool]] = deque(maxlen=MAX_PENDING)
         self._newest: FrameView | None = None
         self._queue_lock = threading.Lock()
         self._work = threading.Event()
@@ -129,19 +129,21 @@ class ViewerFeed:
         """Where the live viewer is, None without one."""
         return self._process.url if self._process is not None else None
 
-    def submit(self, view: FrameView, update: MapUpdate | None = None, *, new_map: bool = False) -> None:
+    def submit(
+        self, view: FrameView | None, update: MapUpdate | None = None, *, new_map: bool = False
+    ) -> None:
         """Show a frame and what changed in the map before it. Returns at once.
 
         Of images waiting to be shown only the newest is kept; poses, plot values and map changes all are.
 
         Args:
-            view: The processed frame.
+            view: The processed frame; None when the map alone has changed.
             update: Map changes up to and including this frame.
             new_map: The map was started anew just before this frame.
         """
         with self._queue_lock:
-            self._pending.append((view.without_image(), update, new_map))
-            if view.image is not None:
+            self._pending.append((None if view is None else view.without_image(), update, new_map))
+            if view is not None and view.image is not None:
                 self._newest = view
         self._work.set()
 
@@ -211,7 +213,8 @@ class ViewerFeed:
                     self._scene.add_landmarks(
                         update.ids, update.xyz, update.rgb, update.confidence, update.removed
                     )
-                self._scene.add_frame(view)
+                if view is not None:
+                    self._scene.add_frame(view)
             if picture is not None:
                 self._scene.set_picture(picture)
             if self._has_truth and items and (force or now - self._last_align_s > ALIGN_INTERVAL_S):

@@ -54,10 +54,10 @@ def test_a_slow_subscriber_misses_nothing_of_the_map(rng):
         updates = [some_change(rng, e) for e in map_epochs for _ in range(CAPACITY + 50)]
         session, metrics = SlowSession(), Metrics("server")
         outbox = Outbox(session, AGENT, metrics)
-        outbox.put_map(ARRIVAL, updates[0])
+        outbox.put_map(ARRIVAL.message.agent_epoch, updates[0])
         assert session.holding.wait(30.0)
         for update in updates[1:]:
-            outbox.put_map(ARRIVAL, update)
+            outbox.put_map(ARRIVAL.message.agent_epoch, update)
         session.may_go_on.set()
         outbox.close()
         expected = found = _EMPTY

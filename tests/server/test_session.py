@@ -108,6 +108,7 @@ def run_session(demo, folder, frame_ids, epoch=5, program=None, **settings):
         if killed:
             session.save_checkpoint()
         else:
+            session.conclude()
             session.write_outputs(folder, {}, complete=True)
     finally:
         session.close()
@@ -286,6 +287,28 @@ def test_a_file_that_can_not_be_written_costs_no_other(demo, tmp_path):
     assert len(read_run(tmp_path).frame_ids) >= 5
     assert len(read_ply(tmp_path / "map.ply")) > 20
     assert read_toml(tmp_path / "settings.toml")
+
+
+def test_results_have_the_map_as_it_was_adjusted_at_the_end_where_that_is_wanted(demo, tmp_path):
+    runs = {}
+    for wanted in (True, False):
+        how = ReconstructionSettings(final_adjustment=wanted)
+        run_session(demo, tmp_path / str(wanted), range(24), reconstruction=how)
+        runs[wanted] = read_run(tmp_path / str(wanted))
+    assert np.array_equal(runs[True].frame_ids, runs[False].frame_ids)
+    moved_m = np.linalg.norm((runs[True].T_world_cam - runs[False].T_world_cam)[:, :3, 3], axis=1)
+    way_m = np.linalg.norm(np.ptp(runs[False].T_world_cam[:, :3, 3], axis=0))
+    assert 1e-5 < moved_m.max() / way_m < 0.05
+
+
+def test_results_are_written_where_the_adjustment_at_the_end_fails(demo, tmp_path, monkeypatch, caplog):
+    def fail(*_):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr("semcast.server.mapping.map_builder.adjust_whole_map", fail)
+    run_session(demo, tmp_path, range(12))
+    assert "could not be adjusted as a whole" in caplog.text
+    assert len(read_run(tmp_path).frame_ids) >= 8
 
 
 def test_the_records_hold_the_settings_of_the_program(demo, tmp_path):

@@ -6,8 +6,10 @@ import numpy as np
 
 from semcast.common.map_mirror import MapMirror
 from semcast.common.network_settings import NetworkSettings
+from semcast.common.run_folder import read_run
 from semcast.common.transport import open_client
 from semcast.server.export.outputs import read_ply
+from semcast.server.mapping.settings import ReconstructionSettings
 
 AGENT = "cam0"
 DEADLINE_S = 60.0
@@ -43,6 +45,26 @@ def test_who_comes_late_has_the_whole_map_and_follows_it(tmp_path, air, monkeypa
             for name in ("ids", "xyz", "rgb", "confidence", "keyframe_ids", "keyframe_poses"):
                 assert np.array_equal(getattr(early.map, name), getattr(late.map, name)), name
     running.finish(stop=True)
+
+
+def test_who_follows_the_map_has_it_as_it_was_adjusted_at_the_end(tmp_path, air):
+    running = air.serve(out=tmp_path, reconstruction=ReconstructionSettings(window_size=3))
+    radio = air.agent(100)
+    with open_client(NetworkSettings(connect=(air.endpoint,)), DEADLINE_S) as client:
+        mirror = MapMirror(client, AGENT, DEADLINE_S)
+        radio.stream(range(20))
+        assert radio.ask("save").ok
+        before = read_run(tmp_path)
+        running.finish(stop=True)
+        after = read_run(tmp_path)
+        of_keyframes = np.isin(after.frame_ids, after.keyframe_ids)
+        assert np.array_equal(before.keyframe_ids, after.keyframe_ids)
+        assert np.abs(after.T_world_cam - before.T_world_cam).max() > 1e-4
+        written = after.T_world_cam[of_keyframes]
+        until(
+            lambda: np.allclose(mirror.map.keyframe_poses, written, rtol=0.0, atol=1e-5),
+            "the keyframes where the results have them",
+        )
 
 
 def test_a_server_without_a_map_has_no_answer(air):

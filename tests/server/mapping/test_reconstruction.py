@@ -18,8 +18,9 @@ from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
-from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
+from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.relocalisation import Place, Relocaliser
+from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, TrackingState
 
 CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)

@@ -1,0 +1,133 @@
+"""The adjustment of all keyframes at once, when a stream has ended and nothing waits for a pose.
+
+A window corrects what its own keyframes see. That a place seen again is where it was, and that an error of
+the start was bent into all that came after, takes all observations of the map together.
+"""
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.bundle import optimise
+from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
+from semcast.server.mapping.mapper import drop_outliers, gather_observations
+from semcast.server.mapping.window import within_limit
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Observations at most, for a stream to end within seconds: those of a hundred to two hundred keyframes.
+MAX_OBSERVATIONS = 60_000
+#: Below that many keyframes a window held them all, most of the time.
+_MIN_KEYFRAMES = 5
+#: Landmarks a keyframe shares at least with those it hangs together with: fewer don't say where it is.
+_MIN_SHARED = 12
+#: The second time without what the first one found to be outliers.
+_ROUNDS, _ITERATIONS = 2, 15
+
+
+def adjust_whole_map(world: WorldMap, camera: Intrinsics, noise: NoiseModel) -> int:
+    """Adjust every keyframe with all it sees, part by part of what hangs together.
+
+    A part's first keyframe stays, and so does the distance to the one furthest from it. What no adjustment
+    holds (landmarks left out, frames that are no keyframes, keyframes that were thinned out) follows the
+    keyframe before it, in its scale.
+
+    Args:
+        world: The map, which is changed where an adjustment succeeds.
+        camera: Pinhole.
+        noise: Gives each observation its sigma.
+
+    Returns:
+        Number of keyframes that were adjusted.
+    """
+    num_adjusted = 0
+    for submap in sorted({k.submap for k in world.keyframes}):
+        for part in _hanging_together(world, world.keyframes_of(submap)):
+            if len(part) < _MIN_KEYFRAMES:
+                continue
+            results = [_adjust(world, part, camera, noise) for _ in range(_ROUNDS)]
+            num_adjusted += len(part) if any(results) else 0
+    return num_adjusted
+
+
+def _hanging_together(world: WorldMap, keyframes: Sequence[Keyframe]) -> list[list[Keyframe]]:
+    """Sort keyframes into parts that share landmarks; each part, and the parts, in order of time.
+
+    Parts that share none can't be adjusted together: nothing would hold one's place and scale to the other's.
+    """
+    parts: list[tuple[list[Keyframe], set[int]]] = []
+    for keyframe in keyframes:
+        seen = set(keyframe.ids[world.landmarks.rows(keyframe.ids) >= 0].tolist())
+        linked = [part for part in parts if len(part[1] & seen) >= _MIN_SHARED]
+        parts = [part for part in parts if len(part[1] & seen) < _MIN_SHARED]
+        members = [k for part, _ in linked for k in part]
+        parts.append(([*members, keyframe], seen.union(*(ids for _, ids in linked))))
+    ordered = [sorted(part, key=lambda k: k.frame_id) for part, _ in parts]
+    return sorted(ordered, key=lambda part: part[0].frame_id)
+
+
+def _adjust(world: WorldMap, part: list[Keyframe], camera: Intrinsics, noise: NoiseModel) -> bool:
+    """Adjust one part and drop what does not fit it; whether that succeeded."""
+    ids = np.unique(np.concatenate([k.ids for k in part]))
+    ids = ids[world.landmarks.rows(ids) >= 0]
+    view, point, xy, confidence = gather_observations(part, ids)
+    taken, kept, point = within_limit(ids, point, limit=MAX_OBSERVATIONS)
+    landmark_ids = ids[taken]
+    result = optimise(
+        BundleProblem(
+            intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+            keyframe_ids=np.array([k.frame_id for k in part], dtype=np.int64),
+            T_world_cam=np.stack([k.T_world_cam for k in part]),
+            fixed=np.arange(len(part)) == 0,
+            keep_baseline=True,
+            landmark_ids=landmark_ids,
+            xyz=world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
+            view=view[kept],
+            point=point,
+            xy=xy[kept],
+            sigma_px=noise.sigma_px(confidence[kept]),
+            confidence=confidence[kept],
+            iterations=_ITERATIONS,
+            with_covariance=False,
+        )
+    )
+    if not result.ok:
+        logger.debug("the map of %d keyframes can't be adjusted as a whole", len(part))
+        return False
+    problem = result.problem
+    world.bend(problem.keyframe_ids, result.T_world_cam, _scales(result))
+    world.move_landmarks(problem.landmark_ids, result.xyz)
+    drop_outliers(world, result, noise)
+    return True
+
+
+def _scales(result: BundleResult) -> Array:
+    """Factor on lengths around each keyframe, ``(K,)``: what its landmarks' depths have become.
+
+    The first is 1: it stays, and so does all that was before it.
+    """
+    problem = result.problem
+    before = _depths(problem, problem.T_world_cam, problem.xyz)
+    after = _depths(problem, result.T_world_cam, result.xyz)
+    sound = (before > 0.0) & (after > 0.0)
+    scale = np.ones(len(problem.T_world_cam))
+    for k in range(1, len(scale)):
+        mine = sound & (problem.view == k)
+        if mine.any():
+            scale[k] = np.median(after[mine] / before[mine])
+    return scale
+
+
+def _depths(problem: BundleProblem, T_world_cam: Array, xyz: Array) -> Array:
+    """Depth of each observation's landmark in its view, ``(M,)`` map units."""
+    row = invert_transform(T_world_cam)[problem.view, 2]
+    return np.asarray(np.einsum("mj,mj->m", row[:, :3], xyz[problem.point]) + row[:, 3])
