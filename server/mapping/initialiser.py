@@ -105,6 +105,11 @@ class Initialiser:
         self.history = [replace(o, ids=after[np.searchsorted(before, o.ids)]) for o in self.history]
         self._hypotheses = [replace(h, ids=after[np.searchsorted(before, h.ids)]) for h in self._hypotheses]
 
+    def leave_out(self, ids: Ids) -> None:
+        """Forget tracks that turned out to be of no scene, in the frames that saw them too."""
+        if self.history and np.isin(self.history[-1].ids, ids).any():
+            self.history = [o.without(ids) for o in self.history]
+
     def add(self, observed: Observed, noise: NoiseModel, *, is_damaged: bool = False) -> Start | None:
         """Take a frame and try to start a map with it.
 

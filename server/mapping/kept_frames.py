@@ -1,7 +1,7 @@
 """Frames kept from before there is a map, and their poses once there is one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,8 @@ from semcast.common.geometry import invert_transform
 from semcast.server.geometry.features import Grey
 from semcast.server.geometry.pnp import refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.mapper import sample_colours
+from semcast.server.mapping.tracks import Sight, TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
@@ -38,6 +40,25 @@ class Observed:
     confidence: Array
     rgb: NDArray[np.uint8] | None = None
     grey: Grey | None = None
+
+    def without(self, ids: Ids) -> "Observed":
+        """Return the same without some tracks."""
+        kept = ~np.isin(self.ids, ids)
+        rgb = None if self.rgb is None else self.rgb[kept]
+        return replace(self, ids=self.ids[kept], xy=self.xy[kept], confidence=self.confidence[kept], rgb=rgb)
+
+
+def observed_of(sight: Sight, tracks: TrackTable, rows: NDArray[np.bool_]) -> Observed:
+    """Return some tracks of the newest image, with that."""
+    return Observed(
+        sight.frame.frame_id,
+        sight.frame.t_source_ns,
+        tracks.ids[rows],
+        tracks.xy[rows],
+        tracks.confidence[rows],
+        sample_colours(sight.frame.image, tracks.xy[rows]),
+        sight.grey,
+    )
 
 
 def colours_of(ids: Ids, frames: Sequence[Observed]) -> NDArray[np.uint8]:

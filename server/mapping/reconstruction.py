@@ -15,7 +15,7 @@ from semcast.server.mapping import mapper
 from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.initialiser import Initialiser, Start
-from semcast.server.mapping.kept_frames import Observed, backfill
+from semcast.server.mapping.kept_frames import backfill, observed_of
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.recall import recall_landmarks
@@ -239,6 +239,7 @@ class Reconstruction:
         self._map.world.add_frame(frame.frame_id, reference.frame_id, pose.T_world_cam)
         mapper.note_sight(self._map.world, pose.ids, pose.inliers, frame.frame_id)
         tracks.keep(~np.isin(tracks.ids, pose.ids[~pose.inliers], assume_unique=True))
+        tracks.vouch(pose.ids[pose.inliers])
         is_keyframe = mapper.wants_keyframe(
             mapper.keyframe_cues(
                 reference,
@@ -301,15 +302,8 @@ class Reconstruction:
         tracks.refill(sight)
         # Tracks of old landmarks serve to find back, not to start anew: a landmark has one id.
         visible = tracks.visible & (self._map.world.landmarks.rows(tracks.ids) < 0)
-        observed = Observed(
-            frame.frame_id,
-            frame.t_source_ns,
-            tracks.ids[visible],
-            tracks.xy[visible],
-            tracks.confidence[visible],
-            mapper.sample_colours(frame.image, tracks.xy[visible]),
-            sight.grey,
-        )
+        observed = observed_of(sight, tracks, visible)
+        self._initialiser.leave_out(tracks.ids[tracks.fixed])
         waits = self._state is TrackingState.LOST or float(sight.usable.mean()) < _MIN_USABLE_SHARE
         start = self._initialiser.add(observed, self._map.noise.model, is_damaged=waits)
         self._lap("two_view", since)

@@ -24,6 +24,8 @@ from semcast.server.geometry.weighting import (
     variance_confidence,
 )
 from semcast.server.geometry.wide_search import search_wide
+from semcast.server.mapping.found import Found
+from semcast.server.mapping.standing import is_fixed, scene_motion_px, stood
 from semcast.server.mapping.state import DecodedFrame
 
 Array = NDArray[np.float64]
@@ -99,34 +101,12 @@ class Seen:
 #: After a jump a point is looked for no further than this from where descriptors put it.
 _MAX_FROM_JUMP_PX = 25.0
 #: What a track has, by attribute of ``TrackTable``.
-_COLUMNS = ("ids", "xy", "velocity", "confidence", "variance_px2", "drift_px2", "age", "missed")
+_MOTION = ("ids", "xy", "velocity", "confidence", "variance_px2", "drift_px2", "age", "missed")
+_COLUMNS = (*_MOTION, "anchor_xy", "stood_widths")
 #: Share of an image's localisation variance that stays with a point followed on from it. Most of it goes with
 #: the image: the next step begins where this one ended, and takes its error back. Measured against tracks of
 #: the original images.
 _KEPT_VARIANCE = 0.2
-
-
-@dataclass
-class _Found:
-    """Where tracks were found, row by row, filled in step by step."""
-
-    ok: NDArray[np.bool_]
-    xy: Array
-    forward_backward: Array
-    photometric: Array
-    gradient: Array
-
-    @staticmethod
-    def nothing(xy: Array) -> "_Found":
-        count = len(xy)
-        return _Found(np.zeros(count, bool), xy.copy(), np.full(count, 9.0), np.zeros(count), np.zeros(count))
-
-    def take(self, rows: NDArray[np.intp], points: TrackedPoints) -> None:
-        self.ok[rows] = points.ok
-        self.xy[rows] = points.xy
-        self.forward_backward[rows] = points.forward_backward_px
-        self.photometric[rows] = points.photometric_grey
-        self.gradient[rows] = points.gradient_grey2
 
 
 class TrackTable:
@@ -141,6 +121,8 @@ class TrackTable:
         drift_px2: ``(N,)`` variance that a next position takes over from those before.
         age: ``(N,)`` int64, frames it was seen in.
         missed: ``(N,)`` int64, frames since its last sight; 0 is visible now.
+        anchor_xy: ``(N, 2)`` where it began to stand still in the image.
+        stood_widths: ``(N,)`` image widths the scene went since then.
     """
 
     def __init__(self, mode: ConfidenceMode, max_features: int, seed: int) -> None:
@@ -163,6 +145,8 @@ class TrackTable:
         self.drift_px2: Array = np.zeros(0)
         self.age: Ids = np.zeros(0, np.int64)
         self.missed: Ids = np.zeros(0, np.int64)
+        self.anchor_xy: Array = np.zeros((0, 2))
+        self.stood_widths: Array = np.zeros(0)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -178,8 +162,17 @@ class TrackTable:
 
     @property
     def visible(self) -> NDArray[np.bool_]:
-        """Tracks seen in the newest image."""
-        return np.asarray(self.missed == 0)
+        """Tracks of the scene that are seen in the newest image."""
+        return np.asarray((self.missed == 0) & ~self.fixed)
+
+    @property
+    def fixed(self) -> NDArray[np.bool_]:
+        """Tracks on something that moves with the camera: followed, lest it is taken for the scene again."""
+        return is_fixed(self.stood_widths)
+
+    def vouch(self, ids: Ids) -> None:
+        """Tracks that agree with the pose are of the scene, however still they stand."""
+        self.stood_widths = np.where(np.isin(self.ids, ids), 0.0, self.stood_widths)
 
     def seen(self) -> Seen:
         """Tracks that are visible now."""
@@ -209,6 +202,8 @@ class TrackTable:
         self.drift_px2 = np.zeros(count)
         self.age = np.ones(count, np.int64)
         self.missed = np.zeros(count, np.int64)
+        self.anchor_xy = self.xy.copy()
+        self.stood_widths = np.zeros(count)
 
     def renew(self, others: Ids) -> tuple[Ids, Ids]:
         """Give all tracks new ids, as if they began now, and ids kept elsewhere with them.
@@ -241,22 +236,22 @@ class TrackTable:
             guess_xy: ``(N, 2)`` expected positions.
             max_level: KLT pyramid levels.
         """
-        count = len(self)
         self._before = {name: getattr(self, name).copy() for name in _COLUMNS}
-        found = _Found.nothing(self.xy)
+        found = Found.nothing(self.xy)
+        guess_xy = np.where(self.fixed[:, None], self.xy, guess_xy)
         for back in range(min(len(self._greys), MAX_COAST + 1)):
             rows = np.flatnonzero(self.missed == back)
             if len(rows) == 0:
                 continue
             grey = self._greys[-1 - back]
-            found.take(
-                rows, track_points(grey, sight.grey, self.xy[rows], guess_xy[rows], max_level=max_level)
-            )
+            points = track_points(grey, sight.grey, self.xy[rows], guess_xy[rows], max_level=max_level)
+            found.take(rows, points)
             if not sight.usable.all():
                 self._look_again(grey, sight, found, guess_xy, rows)
         hidden = self._hidden(sight, found, guess_xy)
         coasting = hidden & ~found.ok
-        if found.ok.sum() < _MIN_FOUND_SHARE * max(1, count - int(hidden.sum())):
+        of_scene = ~self.fixed
+        if (found.ok & of_scene).sum() < _MIN_FOUND_SHARE * max(1, int((of_scene & ~hidden).sum())):
             jumped = self._jump(sight, found) if len(self._greys) else False
             self._before = None  # a second look would be the same one
             coasting = self._hidden(sight, found, guess_xy) & ~found.ok if jumped else ~found.ok
@@ -264,7 +259,7 @@ class TrackTable:
         self.remember(sight)
 
     def _look_again(
-        self, grey: Grey, sight: Sight, found: _Found, guess_xy: Array, rows: NDArray[np.intp]
+        self, grey: Grey, sight: Sight, found: Found, guess_xy: Array, rows: NDArray[np.intp]
     ) -> None:
         """Look for the missed ones of some tracks where those found next to them say they should be.
 
@@ -293,7 +288,7 @@ class TrackTable:
             setattr(self, name, values)
         self._before = None
         newest = self._greys.pop()
-        found = _Found.nothing(self.xy)
+        found = Found.nothing(self.xy)
         jumped = self._jump(sight, found)
         hidden = self._hidden(sight, found, self.xy)
         self._greys.append(newest)
@@ -304,13 +299,13 @@ class TrackTable:
         self._settle(sight, found, hidden & ~found.ok)
         return True
 
-    def _hidden(self, sight: Sight, found: "_Found", guess_xy: Array) -> NDArray[np.bool_]:
+    def _hidden(self, sight: Sight, found: Found, guess_xy: Array) -> NDArray[np.bool_]:
         """Which tracks are, or would be, next to rows that did not arrive; none of them counts as found."""
         hidden = sight.near_lost(np.where(found.ok[:, None], found.xy, guess_xy), _LOST_MARGIN_PX)
         found.ok &= ~hidden
         return hidden
 
-    def _jump(self, sight: Sight, found: "_Found") -> bool:
+    def _jump(self, sight: Sight, found: Found) -> bool:
         """Find tracks of the last image by descriptors, where that finds more; whether it did."""
         rows = np.flatnonzero(self.missed == 0)
         usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
@@ -325,13 +320,16 @@ class TrackTable:
         found.take(rows, replace(points, ok=points.ok & near))
         return True
 
-    def _settle(self, sight: Sight, found: "_Found", coasting: NDArray[np.bool_]) -> None:
+    def _settle(self, sight: Sight, found: Found, coasting: NDArray[np.bool_]) -> None:
         """Move tracks to where they were found, and forget those that neither were nor coast."""
         ok = found.ok
         steps = (self.missed + 1)[:, None]
         self.velocity = np.where(ok[:, None], (found.xy - self.xy) / steps, self.velocity)
         self.xy = np.where(ok[:, None], found.xy, self.xy)
         self.age = self.age + ok
+        width = sight.grey.shape[1]
+        scene_px = scene_motion_px(self.xy[ok], np.linalg.norm(self.velocity[ok], axis=1), width)
+        self.anchor_xy, self.stood_widths = stood(self.xy, self.anchor_xy, self.stood_widths, scene_px, width)
         self.missed = np.where(ok, 0, self.missed + 1)
         cues = replace(
             self._cues(
@@ -412,7 +410,7 @@ class TrackTable:
         """
         ok = points.ok & ~sight.near_lost(points.xy, _LOST_MARGIN_PX)
         xy = points.xy[ok]
-        taken = np.concatenate([self.xy[self.visible], xy])
+        taken = np.concatenate([self.xy[self.missed == 0], xy])
         ok[ok] = deduplicate(taken)[len(taken) - len(xy) :]
         taken_up: Ids = ids[ok]
         if len(taken_up) == 0:
@@ -437,6 +435,8 @@ class TrackTable:
             "drift_px2": np.zeros(len(ids)),
             "age": np.ones(len(ids), np.int64),
             "missed": np.zeros(len(ids), np.int64),
+            "anchor_xy": xy,
+            "stood_widths": np.zeros(len(ids)),
         }
         order = np.argsort(np.concatenate([self.ids, ids]), kind="stable")
         for name in _COLUMNS:
@@ -473,7 +473,7 @@ class TrackTable:
         height, width = sight.grey.shape
         cell_px = int(np.clip(np.sqrt(height * width / max(1.0, self._max_features / 2.5)), 16, 96))
         strength = corner_strength(sight.grey)
-        found = detect_corners(sight.grey, wanted, self.xy[self.visible], usable, cell_px, strength)
+        found = detect_corners(sight.grey, wanted, self.xy[self.missed == 0], usable, cell_px, strength)
         corners: Array = found.astype(np.float64)
         count = len(corners)
         if count == 0:

@@ -207,3 +207,28 @@ def test_of_frames_that_wait_long_a_few_keep_their_image_and_the_start_takes_tho
     assert len(chosen) == 5
     assert set(chosen) <= set(with_image)
     assert np.diff(chosen).max() < 0.4 * frame.frame_id, "spread out"
+
+
+def test_tracks_that_stand_hold_no_start_up_once_they_are_left_out():
+    """A bonnet: its tracks last, those of the scene pass, and between far views most tracks stand."""
+    rng = np.random.default_rng(7)
+    bonnet = np.column_stack((rng.uniform(0, 640, 300), rng.uniform(400, 480, 300)))
+    ids = 1000 + np.arange(300)
+    frames = [
+        replace(
+            f,
+            ids=np.concatenate([f.ids, ids]),
+            xy=np.concatenate([f.xy, bonnet]),
+            confidence=np.ones(len(f.ids) + 300),
+        )
+        for f in ride(8)[0]
+    ]
+    assert begin(frames) is None
+    initialiser = Initialiser(CAMERA, "off", 1.0, 0)
+    for frame in frames[:6]:
+        assert initialiser.add(frame, NOISE) is None
+    initialiser.leave_out(ids)
+    assert not np.isin(initialiser.ids, ids).any()
+    start = initialiser.add(frames[6].without(ids), NOISE)
+    assert start is not None
+    assert not np.isin(start.ids, ids).any()

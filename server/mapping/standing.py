@@ -1,0 +1,63 @@
+"""Tracks that stand in the image while the scene moves through it: a bonnet, a watermark, dirt on the lens.
+
+They never leave the image, and each frame adds to them, until they are most of all tracks: what is seen of
+the scene is too little then, and a start waits for ever for a camera that seems to stand still. Whether the
+scene moves is therefore asked of the image's area, not of the tracks. Something large that drives past a
+camera that stands still moves through less than half of it.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: A track stands as long as it is no further from where it began to: share of the width, at least pixels.
+_STANDING_SHARE, _STANDING_PX = 0.0015, 1.0
+#: The scene must go so many image widths while a track stands. A point so far away that it does the same is
+#: in the direction the camera moves, and few are.
+_SCENE_WIDTHS = 0.1
+#: Cells along the width by which the area counts.
+_COLUMNS = 12
+#: Less than this from one frame to the next is no motion, but noise.
+_LEAST_MOTION_PX = 0.5
+
+
+def scene_motion_px(xy: Array, motion_px: Array, width: int) -> float:
+    """How far the scene moved in the image from one frame to the next: the median over its area.
+
+    Args:
+        xy: ``(N, 2)`` tracks.
+        motion_px: ``(N,)`` how far each moved.
+        width: Of the image.
+    """
+    if len(xy) == 0:
+        return 0.0
+    cell = np.floor(xy * (_COLUMNS / width)).astype(np.int64)
+    _, group = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_inverse=True)
+    order = np.lexsort((motion_px, group))
+    begins = np.searchsorted(group[order], np.arange(group.max() + 1))
+    middle = begins + (np.bincount(group) - 1) // 2
+    motion = float(np.median(motion_px[order[middle]]))
+    return motion if motion >= _LEAST_MOTION_PX else 0.0
+
+
+def stood(xy: Array, anchor_xy: Array, widths: Array, scene_px: float, width: int) -> tuple[Array, Array]:
+    """Count on how far the scene went while tracks stood.
+
+    Args:
+        xy: ``(N, 2)`` where they are now.
+        anchor_xy: ``(N, 2)`` where each began to stand.
+        widths: ``(N,)`` image widths the scene went since.
+        scene_px: How far it went with this frame.
+        width: Of the image.
+
+    Returns:
+        The new ``anchor_xy`` and ``widths``: a track that moved begins anew where it is.
+    """
+    stands = np.linalg.norm(xy - anchor_xy, axis=1) <= max(_STANDING_PX, _STANDING_SHARE * width)
+    return np.where(stands[:, None], anchor_xy, xy), np.where(stands, widths + scene_px / width, 0.0)
+
+
+def is_fixed(widths: Array) -> NDArray[np.bool_]:
+    """Which tracks belong to the camera: the scene went ``(N,)`` image widths while they stood."""
+    return np.asarray(widths >= _SCENE_WIDTHS)

@@ -1,0 +1,135 @@
+"""What stands in the image while the scene moves: it moves with the camera."""
+
+import cv2
+import numpy as np
+
+from semcast.common.camera import Intrinsics
+from semcast.server.geometry.features import to_grey
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
+from semcast.server.mapping.standing import is_fixed, scene_motion_px, stood
+from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.tracks import Sight, TrackTable
+
+CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
+WIDTH, HEIGHT = CAMERA.width, CAMERA.height
+#: The bonnet begins at this row.
+BONNET_Y = 170
+
+
+def texture(shape_hw, seed=0):
+    rng = np.random.default_rng(seed)
+    layers = [
+        cv2.GaussianBlur(rng.standard_normal(shape_hw).astype(np.float32), None, sigma) for sigma in (2, 6)
+    ]
+    return np.clip(sum(layer / layer.std() for layer in layers) * 40 + 128, 0, 255).astype(np.uint8)
+
+
+SCENE, BONNET = texture((HEIGHT, 1200)), texture((HEIGHT, WIDTH), seed=1)
+
+
+def sight_at(x, frame_id, bonnet_x=0):
+    """The scene behind a bonnet, seen by a camera that went to x."""
+    image = SCENE[:, x : x + WIDTH].copy()
+    image[BONNET_Y:] = np.roll(BONNET, -bonnet_x, axis=1)[BONNET_Y:]
+    image = np.repeat(image[..., None], 3, axis=2)
+    frame = DecodedFrame(frame_id, frame_id * 10**8, image)
+    return Sight(frame, to_grey(image), np.ones(HEIGHT, bool))
+
+
+def on_bonnet(tracks):
+    return tracks.xy[:, 1] > BONNET_Y - 8
+
+
+def follow(tracks, xs, **changes):
+    for k, x in enumerate(xs):
+        sight = sight_at(x, k, **changes)
+        if len(tracks):
+            tracks.follow(sight, tracks.xy + tracks.velocity)
+        else:
+            tracks.remember(sight)
+        tracks.refill(sight)
+
+
+def test_the_motion_of_the_scene_is_that_of_most_of_the_area_not_of_most_tracks():
+    crowd = np.column_stack((np.linspace(10, 600, 400), np.full(400, 460.0)))
+    few = np.stack(np.meshgrid(np.arange(20, 640, 60.0), np.arange(20, 400, 60.0)), axis=-1).reshape(-1, 2)
+    xy = np.concatenate([crowd, few])
+    motion = np.concatenate([np.zeros(400), np.full(len(few), 7.0)])
+    assert scene_motion_px(xy, motion, 640) == 7.0
+    assert scene_motion_px(xy, 7.0 - motion, 640) == 0.0, "something that drives past a camera at rest"
+    assert scene_motion_px(xy, np.full(len(xy), 0.2), 640) == 0.0, "noise"
+    assert scene_motion_px(np.zeros((0, 2)), np.zeros(0), 640) == 0.0
+
+
+def test_a_track_that_moves_begins_anew():
+    anchor, widths = np.zeros((2, 2)), np.full(2, 0.5)
+    xy = np.array([(0.5, 0.5), (4.0, 0.0)])
+    anchor, widths = stood(xy, anchor, widths, 32.0, 320)
+    assert np.array_equal(anchor, [(0.0, 0.0), (4.0, 0.0)])
+    assert np.allclose(widths, (0.6, 0.0))
+    assert is_fixed(widths).tolist() == [True, False]
+
+
+def test_tracks_on_a_bonnet_take_no_room_from_those_of_the_scene():
+    tracks = TrackTable("robust", 200, 0)
+    follow(tracks, range(0, 240, 8))
+    assert tracks.fixed.sum() > 20
+    assert on_bonnet(tracks)[tracks.fixed].all()
+    assert (tracks.visible & ~on_bonnet(tracks)).sum() > 130
+    assert not np.isin(tracks.ids[tracks.fixed], tracks.seen().ids).any()
+
+
+def test_a_camera_at_rest_makes_nothing_fixed():
+    tracks = TrackTable("robust", 200, 0)
+    follow(tracks, [40] * 30)
+    assert not tracks.fixed.any()
+
+
+def test_what_moves_after_all_is_of_the_scene_again():
+    tracks = TrackTable("robust", 200, 0)
+    follow(tracks, range(0, 160, 8))
+    fixed = tracks.ids[tracks.fixed]
+    assert len(fixed)
+    tracks.follow(sight_at(160, 20, bonnet_x=3), tracks.xy + tracks.velocity)
+    moved = np.isin(tracks.ids, fixed)
+    assert moved.sum() > 0.8 * len(fixed)
+    assert not tracks.fixed[moved].any()
+
+
+def test_tracks_that_agree_with_the_pose_are_vouched_for():
+    tracks = TrackTable("robust", 200, 0)
+    follow(tracks, range(0, 160, 8))
+    some = tracks.ids[tracks.fixed][:5]
+    tracks.vouch(some)
+    assert not tracks.fixed[np.isin(tracks.ids, some)].any()
+    assert tracks.fixed.any()
+
+
+WALL = texture((700, 1800), seed=2)
+
+
+def corridor(z):
+    """The image of a camera at depth z of a corridor that is 4 m wide and ends at 12 m, behind a bonnet."""
+    x, y = np.meshgrid(np.arange(WIDTH) - CAMERA.cx, np.arange(HEIGHT) - CAMERA.cy)
+    depth = np.minimum(2.0 * CAMERA.fx / np.abs(x), 12.0 - z)
+    along = np.where(depth < 12.0 - z, depth + z, 14.0 + x / CAMERA.fx * depth)
+    rows = 350.0 + 110.0 * y / CAMERA.fy * depth
+    image = cv2.remap(WALL, (110.0 * along).astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR)
+    image[BONNET_Y:] = BONNET[BONNET_Y:]
+    return np.repeat(image[..., None], 3, axis=2)
+
+
+def test_a_drive_behind_a_bonnet_is_followed_as_one_without():
+    settings = ReconstructionSettings(max_features=250)
+    reconstruction = Reconstruction(CAMERA, settings, InlineBundle())
+    for k in range(40):
+        reconstruction.process(DecodedFrame(k, k * 10**8, corridor(0.2 * k)))
+    trajectory = reconstruction.final_trajectory()
+    reconstruction.close()
+    assert len(trajectory) == 40
+    t = np.array([trajectory[k][:3, 3] for k in range(40)])
+    steps = np.linalg.norm(np.diff(t, axis=0), axis=1)
+    assert steps.std() < 0.1 * steps.mean(), "it drove at one speed"
+    way = t[-1] - t[0]
+    assert np.abs(np.cross(t - t[0], way / np.linalg.norm(way))).max() < 0.02 * np.linalg.norm(way)
