@@ -1,4 +1,4 @@
-"""Images that show nothing: a covered lens, a white-out, a frame that was guessed from nothing."""
+"""Images that show nothing: a covered lens, a white-out, bare sky, a frame that was guessed from nothing."""
 
 import cv2
 import numpy as np
@@ -8,17 +8,27 @@ from semcast.server.mapping.state import DecodedFrame, FrameResult, TrackingStat
 
 #: Side of the cells that are averaged: the noise of a sensor is gone then.
 _CELL_PX = 8
-#: Standard deviation of the cells' grey levels below which there is nothing to see. A view with a fiftieth of
-#: the usual contrast has more.
+#: Standard deviation of the cells' grey levels about a smooth shade below which there is nothing to see. A
+#: view with a fiftieth of the usual contrast has more.
 _LEAST_SD_GREY = 1.0
+#: So few cells along a side say nothing about a shade.
+_LEAST_CELLS = 6
 
 
 def shows_nothing(image: NDArray[np.uint8]) -> bool:
-    """Tell whether an ``(H, W, 3)`` image is even, up to noise."""
+    """Tell whether an ``(H, W, 3)`` image is even or shaded smoothly (to second order), up to noise."""
     height, width = image.shape[:2]
     size = (max(1, width // _CELL_PX), max(1, height // _CELL_PX))
     cells = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return float(cells.mean(axis=2).std()) < _LEAST_SD_GREY
+    grey = cells.mean(axis=2)
+    if float(grey.std()) < _LEAST_SD_GREY:
+        return True
+    if min(grey.shape) < _LEAST_CELLS:
+        return False
+    y, x = np.mgrid[-1.0 : 1.0 : grey.shape[0] * 1j, -1.0 : 1.0 : grey.shape[1] * 1j]
+    shades = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).reshape(6, -1)
+    shade = np.linalg.solve(shades @ shades.T, shades @ grey.ravel()) @ shades
+    return float((grey.ravel() - shade).std()) < _LEAST_SD_GREY
 
 
 def result_of_nothing(frame: DecodedFrame, state: TrackingState, map_epoch: int, submap: int) -> FrameResult:

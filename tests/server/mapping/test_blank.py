@@ -24,3 +24,27 @@ def test_a_view_shows_something_in_the_dark_too(contrast):
 
 def test_images_smaller_than_a_cell_are_looked_at_as_they_are():
     assert shows_nothing(np.full((5, 5, 3), 7, np.uint8))
+
+
+def sky(noise_sd):
+    """Brighter towards the horizon and the sun."""
+    y, x = np.mgrid[0.0:1.0:120j, 0.0:1.0:160j]
+    shade = 150 + 70 * y - 30 * (x - 0.3) ** 2
+    noise = np.random.default_rng(2).normal(0, noise_sd, (120, 160, 3))
+    return (shade[..., None] + noise).clip(0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("noise_sd", [0.0, 4.0])
+def test_bare_sky_shows_nothing(noise_sd):
+    assert shows_nothing(sky(noise_sd))
+
+
+def test_a_little_below_the_sky_is_something():
+    image = sky(2.0)
+    image[100:, 40:80] //= 2
+    assert not shows_nothing(image)
+
+
+@pytest.mark.parametrize("shape", [(8, 400, 3), (400, 20, 3), (47, 400, 3), (48, 48, 3)])
+def test_images_of_few_cells_have_no_shade(shape):
+    assert not shows_nothing(np.random.default_rng(0).integers(0, 255, shape, dtype=np.uint8))
