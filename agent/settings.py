@@ -8,6 +8,7 @@ from semcast.agent.source_settings import SourceSettings
 from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.codecs import Runtime
+from semcast.common.cores import check_threads
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.rate import NATIVE_RATE, RateChoice
@@ -80,8 +81,7 @@ class AgentSettings:
             raise ValueError(
                 "rate 'auto' needs mode 'live', got mode 'replay': frames are not to depend on timing"
             )
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
+        check_threads(self.threads)
         low, high = SNR_RANGE_DB
         if not low <= self.snr_db <= high:
             raise ValueError(f"snr_db must be in [{low:g}, {high:g}], got {self.snr_db:g}")

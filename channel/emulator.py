@@ -1,6 +1,7 @@
 """The channel process: takes the agent's symbols, does to them what a radio link does, passes them on."""
 
 import logging
+import math
 import threading
 from collections.abc import Collection, Mapping
 from dataclasses import replace
@@ -242,9 +243,12 @@ def set_channel(
         All settings now in force.
 
     Raises:
-        ConfigError: The channel refused; the message is its own.
+        ConfigError: A value is no number, or the channel refused; the message is its own.
         TransportError: No hub or no channel answered.
     """
+    for name, value in changes.items():
+        if isinstance(value, float) and not math.isfinite(value):  # no message carries it
+            build_settings(ChannelSettings, {name: value})
     op = "set" if changes else "get"
     plain = {name: str(value) if hasattr(value, "__fspath__") else value for name, value in changes.items()}
     with open_client(network, timeout_s) as session:

@@ -1,7 +1,7 @@
 """How a user says what the camera is: a calibration file, or the four numbers of a pinhole."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from semcast.common.camera import Intrinsics
@@ -57,6 +57,19 @@ class CameraSettings:
             raise ValueError(f"focal_35mm must be in [5, 1000], got {self.focal_35mm:g}")
         if self.distortion and not given:
             raise ValueError("distortion must come with fx, fy, cx and cy")
+
+    def check_has(self, reference: Path | None) -> None:
+        """Check that there is a reference these are the camera of, where a receiver was given any of them.
+
+        Raises:
+            ValueError: There is none: they would do nothing.
+        """
+        given = [entry.name for entry in fields(self) if getattr(self, entry.name) not in (None, ())]
+        if given and reference is None:
+            raise ValueError(
+                f"{given[0]} is of the camera of the reference, and there is none (--reference); the camera "
+                "of a stream comes from its agent"
+            )
 
     def resolve(self, width: int, height: int) -> Intrinsics | None:
         """Return the intrinsics for images of this size, None when nothing was given.

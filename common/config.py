@@ -87,7 +87,8 @@ def _check(name: str, value: Any, annotation: Any) -> Any:
             raise ConfigError(f"{name} must be a list, got {value!r}")
         return tuple(_check(f"{name}[{k}]", item, inner) for k, item in enumerate(value))
     if plain is Path and isinstance(value, (str, Path)):
-        if "\0" in str(value):  # with an error of its own kind wherever it is opened
+        # A NUL has an error of its own kind wherever it is opened; Path("") would be the working folder.
+        if value == "" or "\0" in str(value):
             raise ConfigError(f"{name} must be the name of a file or folder, got {value!r}")
         return Path(value)
     if plain is float and isinstance(value, (int, float)) and not isinstance(value, bool):

@@ -39,7 +39,11 @@ def _flag_options(annotation: Any, takes: Callable[[str], Any] | None = None) ->
         return {"action": SeveralValues, "takes": takes or options["type"], **options}
     if plain is bool:
         return {"action": argparse.BooleanOptionalAction}
-    return {"type": plain, "metavar": {int: "N", float: "X", Path: "PATH", str: "NAME"}.get(plain, "VALUE")}
+    # A path stays text until it is checked: Path("") would be the working folder.
+    return {
+        "type": str if plain is Path else plain,
+        "metavar": {int: "N", float: "X", Path: "PATH", str: "NAME"}.get(plain, "VALUE"),
+    }
 
 
 def _default_text(default: Any) -> str:

@@ -1,10 +1,22 @@
-"""The processor cores this process may use."""
+"""The processor cores this process may use, and the threads it may be told to begin."""
 
 import os
 from pathlib import Path
 
 #: Where Linux mounts control groups; a container sees its own here.
 _CGROUP = Path("/sys/fs/cgroup")
+#: More than any machine has cores for; tens of thousands end the process without a word.
+MAX_THREADS = 1024
+
+
+def check_threads(num_threads: int) -> None:
+    """Check that so many threads can be begun.
+
+    Raises:
+        ValueError: They can't.
+    """
+    if not 1 <= num_threads <= MAX_THREADS:
+        raise ValueError(f"threads must be in [1, {MAX_THREADS}], got {num_threads}")
 
 
 def usable_cores(cgroup: Path = _CGROUP) -> int:

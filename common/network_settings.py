@@ -29,7 +29,7 @@ def check_endpoint(text: str) -> None:
         ValueError: It does not.
     """
     found = _ENDPOINT.fullmatch(text)
-    if found is None or int(found["port"] or 0) > _MAX_PORT:
+    if found is None or not 1 <= int(found["port"] or 1) <= _MAX_PORT:
         raise ValueError(f"must be an endpoint such as {DEFAULT_ENDPOINT}, got {text!r}")
 
 

@@ -26,6 +26,7 @@ from semcast.common.codec import (
     ReceivedImage,
 )
 from semcast.common.codecs import LEARNED_CODECS, load_codec
+from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.image import psnr_db
 from semcast.common.link_report import LinkReporter
@@ -99,10 +100,11 @@ class CodecSettings:
             raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
         if not self.codec or len(set(self.codec)) != len(self.codec):
             raise ValueError(f"codec must be one or more different names, got {self.codec}")
-        for name, least in (("seed", 0), ("threads", 1), ("max_images", 1)):
+        for name, least in (("seed", 0), ("max_images", 1)):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
+        check_threads(self.threads)
 
 
 @dataclass(frozen=True)

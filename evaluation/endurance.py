@@ -56,6 +56,8 @@ class EnduranceSettings(StreamSettings):
     def __post_init__(self) -> None:
         """Check ranges."""
         super().__post_init__()
+        if self.frames < 1:
+            raise ValueError(f"frames must be at least 1, got {self.frames}")
         if not 1 <= self.every <= self.frames:
             raise ValueError(f"every must be in [1, {self.frames}], got {self.every}")
         if len(self.snr_db) != 1 or self.seeds != 1:

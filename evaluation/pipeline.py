@@ -19,6 +19,7 @@ from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
 from semcast.common.codecs import load_codec
+from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.link_report import LinkReporter
 from semcast.common.phy.equaliser import equalise
@@ -73,9 +74,10 @@ class StreamSettings:
         low, high = SNR_RANGE_DB
         if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
             raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
-        for name, least in (("seed", 0), ("seeds", 1), ("start", 0), ("stride", 1), ("threads", 1)):
+        for name, least in (("seed", 0), ("seeds", 1), ("start", 0), ("stride", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        check_threads(self.threads)
         if self.max_frames is not None and self.max_frames < 1:
             raise ValueError(f"max_frames must be at least 1, got {self.max_frames}")
         if not 0.05 <= self.resize <= 1.0:

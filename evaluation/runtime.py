@@ -12,6 +12,7 @@ import numpy as np
 
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.common.codecs import LEARNED_CODECS, available_codecs
+from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.evaluation.report import json_ready, provenance, write_json
 
@@ -44,8 +45,10 @@ class RuntimeSettings:
         for name in ("width", "height", "rounds", "calls"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not self.threads or min(self.threads) < 1:
-            raise ValueError(f"threads must be at least 1 each, got {self.threads}")
+        if not self.threads:
+            raise ValueError("threads must be one or more numbers, got none")
+        for num_threads in self.threads:
+            check_threads(num_threads)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Replays a recording through the same decoder, tracker and outputs as the live server, without a network."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +16,7 @@ from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codecs import load_codec
+from semcast.common.cores import check_threads
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.keys import agent_of
 from semcast.common.levels import Levels
@@ -59,7 +61,7 @@ class ReplaySettings:
     link: ChannelSettings = field(
         default=ChannelSettings(), metadata={"help": "the channel for transmitted symbols"}
     )
-    seed: int = field(default=0, metadata={"help": "seed of the channel"})
+    seed: int = field(default=0, metadata={"help": "seed of channel and estimation"})
     stream: int | None = field(
         default=None,
         metadata={
@@ -104,9 +106,14 @@ class ReplaySettings:
             )
         if not 0.0 <= self.pace <= 100.0:
             raise ValueError(f"pace must be in [0, 100], got {self.pace:g}")
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
-        if self.end_s is not None and self.end_s <= self.start_s:
+        check_threads(self.threads)
+        replace(self.reconstruction, seed=self.seed)  # which has the narrower range of the two
+        self.camera.check_has(self.reference)
+        if self.save_images != "none" and self.out is None:
+            raise ValueError(f"save_images needs out, got save_images={self.save_images!r} without a folder")
+        if not 0.0 <= self.start_s < math.inf:
+            raise ValueError(f"start_s must be at least 0 and finite, got {self.start_s:g}")
+        if self.end_s is not None and not self.end_s > self.start_s:
             raise ValueError(f"end_s must be later than start_s ({self.start_s:g}), got {self.end_s:g}")
 
     @property
@@ -137,6 +144,7 @@ def replay(
         ConfigError: The folder for outputs can't be used, or another run is writing into it.
         CheckpointError: The recorded stream was encoded with other weights than those installed.
     """
+    settings = replace(settings, reconstruction=replace(settings.reconstruction, seed=settings.seed))
     reader = RecordingReader(settings.file)
     stream = choose_stream(reader, settings.stream, settings.source)
     server = ServerSettings(

@@ -7,6 +7,7 @@ from typing import Literal
 
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import Modulation
+from semcast.common.cores import check_threads
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import HubSettings
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -62,9 +63,11 @@ class ViewSettings:
         Raises:
             ValueError: A value is out of range.
         """
-        for name in ("port", "web_port"):
-            if not 1 <= getattr(self, name) <= 65535:
-                raise ValueError(f"{name} must be in [1, 65535], got {getattr(self, name)}")
+        for name, port in (("viewer_port", self.port), ("web_port", self.web_port)):
+            if not 1 <= port <= 65535:
+                raise ValueError(f"{name} must be in [1, 65535], got {port}")
+        if self.port == self.web_port:
+            raise ValueError(f"viewer_port and web_port must differ, got {self.port} for both")
         if not _MEMORY.fullmatch(self.memory_limit):
             raise ValueError(
                 f"memory_limit must be a number of MB, GB ... or a percentage up to 100%, such as 1GB, "
@@ -165,8 +168,8 @@ class ServerSettings:
             ValueError: A value is out of range.
         """
         check_agent_id(self.agent_id)
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
+        check_threads(self.threads)
+        self.camera.check_has(self.reference)
         if not 0.1 <= self.checkpoint_interval_s <= 3600:
             raise ValueError(
                 f"checkpoint_interval_s must be in [0.1, 3600], got {self.checkpoint_interval_s}"

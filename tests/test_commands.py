@@ -199,6 +199,8 @@ def test_a_trace_of_this_folder_is_found_by_a_channel_in_another(channel, tmp_pa
     [
         ("snr_bd = 3", "unknown setting 'snr_bd', did you mean 'snr_db'"),
         ("snr_db = 'low'", "link.snr_db must be of type float, got 'low'"),
+        ("snr_db = nan", "snr_db must be in [-5, 30], got nan"),
+        ("jitter_ms = inf", "jitter_ms must be in [0, 10000], got inf"),
         ("", "set needs a value to change"),
     ],
 )
@@ -251,6 +253,11 @@ print([finding.verdict for finding in check_weights() if finding.what == "codec 
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == "['good']\n", done.stderr
+
+
+def test_doctor_does_not_pass_over_a_configuration_of_no_system(tmp_path, capsys):
+    assert main(["doctor", "--zenoh-config", str(tmp_path / "nowhere")]) == 1
+    assert "is of the system that --connect names" in capsys.readouterr().err
 
 
 def test_a_run_is_not_exported_onto_itself(tmp_path, capsys):

@@ -16,6 +16,7 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
+from semcast.common.transport import free_endpoint
 from semcast.demo import (
     Alive,
     DemoSettings,
@@ -95,15 +96,23 @@ def test_the_camera_reaches_the_agent_and_the_reference_it_is_compared_with(tmp_
 
 @pytest.mark.parametrize(
     ("values", "message"),
-    [({"snr_db": 42.0}, "snr_db must be in"), ({"resize": 2.0}, "resize"), ({"stride": 0}, "stride")],
+    [
+        ({"snr_db": 42.0}, "snr_db must be in"),
+        ({"resize": 2.0}, "resize"),
+        ({"stride": 0}, "stride"),
+        ({"seed": -1}, r"seed must be in \[0, 2147483647\], got -1"),
+        ({"viewer_port": 0}, r"viewer_port must be in \[1, 65535\], got 0"),
+        ({"viewer_port": 9090}, "viewer_port and web_port must differ, got 9090 for both"),
+    ],
 )
 def test_bad_settings_are_refused_before_anything_starts(values, message):
     with pytest.raises(ValueError, match=message):
         DemoSettings(**values)
 
 
-@pytest.mark.parametrize("wrong", ["codec", "weights", "camera", "channel", "record", "out"])
-def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
+@pytest.mark.parametrize("wrong", ["codec", "weights", "camera", "channel", "record", "out", "view"])
+def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong, monkeypatch):
+    monkeypatch.setattr("semcast.server.view.feed.window_display", lambda: None)
     former = tmp_path / "out"
     former.mkdir()
     (former / "summary.json").write_text("{}")
@@ -119,6 +128,7 @@ def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
         "channel": {"channel": "raleigh"},
         "record": {"record": former / "summary.json" / "run.mcap"},
         "out": {"out": former / "summary.json"},
+        "view": {"view": "native", "viewer_port": int(free_endpoint().rpartition(":")[2])},
     }.get(wrong, {})
     message = {
         "codec": "no-such-codec",
@@ -127,6 +137,7 @@ def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong):
         "channel": "raleigh",
         "record": r"record can't be written to .*run\.mcap",
         "out": "summary.json can't be made a folder for outputs",
+        "view": "no display: use --view web",
     }[wrong]
     with pytest.raises((SemcastError, ValueError), match=message):
         run_demo(DemoSettings(**values), threading.Event(), lambda line: None, lambda done, text: None)

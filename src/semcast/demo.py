@@ -34,7 +34,9 @@ from semcast.common.whole_file import check_writable
 from semcast.common.wire import WireError, unpack
 from semcast.real_time import plan_for
 from semcast.server.former_run import check_not_foreign, discard, output_folder
-from semcast.server.settings import ViewSettings
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.view.choice import check_viewer
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
 START_DEADLINE_S = 60.0
@@ -107,7 +109,8 @@ class DemoSettings:
 
     def __post_init__(self) -> None:
         """Check what the three processes would only notice after their start."""
-        ViewSettings(port=self.viewer_port, web_port=self.web_port)
+        _ = self.view_settings
+        ReconstructionSettings(seed=self.seed)
         if self.channel not in get_args(ChannelName):
             raise ValueError(
                 f"channel must be one of {', '.join(get_args(ChannelName))}, got {self.channel!r}"
@@ -120,6 +123,11 @@ class DemoSettings:
             raise ValueError(f"stride must be at least 1, got {self.stride}")
         if self.rate_hz is not None and not 0.01 <= self.rate_hz <= 1000.0:
             raise ValueError(f"rate_hz must be in [0.01, 1000], got {self.rate_hz:g}")
+
+    @property
+    def view_settings(self) -> ViewSettings:
+        """The server's viewer."""
+        return ViewSettings(view=self.view, port=self.viewer_port, web_port=self.web_port)
 
 
 def default_sequence() -> Path:
@@ -303,6 +311,7 @@ def run_demo(
     _ = recorded.intrinsics
     check_codec(settings.codec)
     named_weights(settings.codec)
+    check_viewer(ServerSettings(out=settings.out, view=settings.view_settings))
     for name, file in (("record", settings.record), ("json", settings.json)):
         if file is not None:
             check_writable(file, name)

@@ -479,7 +479,7 @@ def test_real_processes_survive_each_others_death_in_any_order(recording, until)
     ("changes", "message"),
     [
         ({"source": SourceSettings(source="x", pace="receiver")}, "pace 'receiver' needs mode 'replay'"),
-        ({"threads": 0}, "threads must be at least 1, got 0"),
+        ({"threads": 0}, r"threads must be in \[1, 1024\], got 0"),
         ({"snr_db": 500.0}, r"snr_db must be in \[.*\], got 500"),
         ({"feedback_max_age_s": 0.0}, r"feedback_max_age_s must be in \(0, 3600\], got 0"),
         ({"agent_id": "a/b"}, "agent_id must be"),

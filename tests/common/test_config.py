@@ -111,12 +111,18 @@ def test_an_unknown_key_is_an_error_with_a_hint(tmp_path):
         ({"count": True}, "count must be of type int, got True"),
         ({"levels": 3.0}, "levels must be a list"),
         ({"out": "runs\0"}, r"out must be the name of a file or folder, got 'runs\\x00'"),
+        ({"out": ""}, "out must be the name of a file or folder, got ''"),
         ({"radio": {"snr_db": 10**400}}, "radio.snr_db must fit a float"),
     ],
 )
 def test_a_bad_value_is_named_with_what_was_allowed(values, message):
     with pytest.raises(ConfigError, match=message):
         build_settings(Node, values)
+
+
+def test_a_folder_without_a_name_is_not_the_working_folder():
+    with pytest.raises(ConfigError, match="out must be the name of a file or folder, got ''"):
+        parse(["--out", ""])
 
 
 def test_only_a_close_name_is_proposed():

@@ -325,6 +325,7 @@ def test_endpoints_are_checked():
         "tcp/127.0.0.1:99999",
         "tls/host:port",
         "tcp/::1",
+        "tcp/127.0.0.1:0",
         "tcp/[::1",
         "tcp/::1]:7447",
         "unixsock-stream/",
@@ -335,7 +336,7 @@ def test_endpoints_are_checked():
         "tcp/[::1]:7447",
         "tcp/::1:7447",
         "udp/host:1?rel=1",
-        "tcp/0.0.0.0:0#iface=eth0",
+        "tcp/0.0.0.0:7447#iface=eth0",
         "unixsock-stream/a:b",
     ):
         assert NetworkSettings(connect=(endpoint,)).connect == (endpoint,)

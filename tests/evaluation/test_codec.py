@@ -198,7 +198,7 @@ def test_a_damaged_image_is_told_and_left_out(folder, tmp_path, caplog):
         ({"snr_db": ()}, "snr_db must be one or more values"),
         ({"codec": ("a", "a")}, "codec must be one or more different names"),
         ({"max_images": 0}, "max_images must be at least 1, got 0"),
-        ({"threads": 0}, "threads must be at least 1, got 0"),
+        ({"threads": 0}, r"threads must be in \[1, 1024\], got 0"),
         ({"seed": -1}, "seed must be at least 0, got -1"),
     ],
 )

@@ -68,6 +68,8 @@ def test_frames_without_a_true_pose_have_no_error(room, tmp_path):
 
 
 def test_settings_that_give_no_run_are_refused(room, phase_codec):
+    with pytest.raises(ValueError, match="frames must be at least 1, got 0"):
+        EnduranceSettings(sequence=room, frames=0)
     with pytest.raises(ValueError, match=r"every must be in \[1, 10\], got 11"):
         EnduranceSettings(sequence=room, frames=10, every=11)
     lost = ChannelSettings(frame_loss=1.0)

@@ -37,5 +37,5 @@ def test_a_codec_without_a_runtime_is_not_timed_under_the_name_of_one():
 def test_an_unknown_codec_is_one_clear_error():
     with pytest.raises(SemcastError, match="no variant ran: .*codec must be one of .*got '3dcsc-huge'"):
         evaluate_runtime(RuntimeSettings(codecs=("3dcsc-huge",), threads=(1,), rounds=1))
-    with pytest.raises(ValueError, match="threads must be at least 1"):
+    with pytest.raises(ValueError, match="threads must be in"):
         RuntimeSettings(threads=(0,))

@@ -305,6 +305,32 @@ def test_a_time_range_without_frames_is_one_clear_error(recording):
         ReplaySettings(file=recording, start_s=2.0, end_s=1.0)
 
 
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--start-s", "nan"], "start_s must be at least 0 and finite, got nan"),
+        (["--start-s", "-1"], "start_s must be at least 0 and finite, got -1"),
+        (["--end-s", "nan"], "end_s must be later than start_s (0), got nan"),
+        (["--save-images", "all"], "save_images needs out, got save_images='all' without a folder"),
+        (["--fx", "9", "--fy", "9", "--cx", "9", "--cy", "9"], "fx is of the camera of the reference"),
+        (["--seed", "-1"], "seed must be in [0, 2147483647], got -1"),
+        (["--threads", "99999"], "threads must be in [1, 1024], got 99999"),
+        (["--out", ""], "out must be the name of a file or folder, got ''"),
+    ],
+)
+def test_settings_that_can_not_be_are_one_clear_error(recording, words, text, capsys):
+    assert main(["replay", str(recording), *words]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"semcast replay: {text}")
+    assert said.count("\n") == 1
+
+
+def test_the_seed_is_that_of_the_estimation_too(recording, tmp_path):
+    replay(ReplaySettings(file=recording, out=tmp_path, seed=7))
+    in_force = read_toml(tmp_path / "settings.toml")
+    assert in_force["seed"] == in_force["reconstruction"]["seed"] == 7
+
+
 def test_a_recorder_that_can_not_write_says_so_before_it_waits_for_anybody(tmp_path):
     (tmp_path / "file").write_text("no folder")
     stopped = threading.Event()

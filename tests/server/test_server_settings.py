@@ -11,6 +11,7 @@ from semcast.agent.source import RecordedSource
 from semcast.agent.source_settings import SourceSettings
 from semcast.cli import verb_parser
 from semcast.commands.running import read_settings
+from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import CheckpointError, ConfigError, SourceError
 from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import HubSettings
@@ -53,7 +54,9 @@ def test_what_cannot_work_is_said_before_the_server_shows_itself(session, tmp_pa
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"threads": 0}, "threads must be at least 1, got 0"),
+        ({"threads": 0}, r"threads must be in \[1, 1024\], got 0"),
+        ({"threads": 100_000}, r"threads must be in \[1, 1024\], got 100000"),
+        ({"camera": CameraSettings(focal_35mm=26.0)}, "of the reference, and there is none"),
         ({"checkpoint_interval_s": 0.0}, r"checkpoint_interval_s must be in \[0.1, 3600\]"),
         ({"duration_s": -1.0}, "duration_s must be positive"),
         ({"save_images": "all"}, "save_images needs out"),

@@ -17,6 +17,7 @@ from rich.text import Text
 
 from semcast.commands.console import plain_console
 from semcast.common.cores import usable_cores
+from semcast.common.errors import ConfigError
 from semcast.server.view.process import window_display
 
 Verdict = Literal["good", "note", "bad"]
@@ -184,6 +185,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print all findings; exit code 1 when one is bad."""
+    if arguments.zenoh_config is not None and arguments.connect is None:
+        raise ConfigError("--zenoh-config is of the system that --connect names, and there is none")
     checks = [
         check_python(),
         check_packages(),
@@ -193,7 +196,7 @@ def run(arguments: argparse.Namespace) -> int:
         check_port(7447),
     ]
     checks.append(check_loopback())
-    if arguments.connect:
+    if arguments.connect is not None:
         checks.append(check_system(arguments.connect, arguments.agent_id, arguments.zenoh_config))
     table = Table(show_header=False, box=None, pad_edge=False)
     bad = False
