@@ -4,7 +4,8 @@
 ``trajectory.tum``    poses of all frames, ``t tx ty tz qx qy qz qw``, camera to world
 ``map.ply``           landmarks with colour and confidence
 ``summary.json``      figures of the run
-``settings.toml``     resolved settings
+``settings.toml``     resolved settings of the server or the replay
+``demo.toml``         resolved settings of a demo, its link among them
 ``frames.jsonl``      one row per frame: state, part, SNR, PSNR, inliers, stage times
 ``run.rrd``           what the viewer showed
 ``reconstruction.npz`` what ``semcast export`` needs, see ``RunData``
@@ -44,6 +45,7 @@ TRAJECTORY_NAME = "trajectory.tum"
 MAP_NAME = "map.ply"
 SUMMARY_NAME = "summary.json"
 SETTINGS_NAME = "settings.toml"
+DEMO_SETTINGS_NAME = "demo.toml"
 FRAMES_NAME = "frames.jsonl"
 VIEWER_NAME = "run.rrd"
 RECONSTRUCTION_NAME = "reconstruction.npz"

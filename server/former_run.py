@@ -11,6 +11,7 @@ from pathlib import Path
 from semcast.common.errors import ConfigError
 from semcast.common.run_folder import (
     CHECKPOINT_NAME,
+    DEMO_SETTINGS_NAME,
     FRAMES_NAME,
     IMAGES_NAME,
     MAP_NAME,
@@ -34,6 +35,7 @@ _FILES = (
     MAP_NAME,
     SUMMARY_NAME,
     SETTINGS_NAME,
+    DEMO_SETTINGS_NAME,
     FRAMES_NAME,
     VIEWER_NAME,
     RECONSTRUCTION_NAME,

@@ -13,6 +13,7 @@ from semcast.cli import main
 from semcast.commands.demo import summary_table, why_no_pose
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
+from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
@@ -21,13 +22,13 @@ from semcast.demo import (
     Alive,
     DemoSettings,
     Playback,
-    Role,
     agent_command,
     choose_playback,
     role_commands,
     run_demo,
 )
 from semcast.real_time import Plan
+from semcast.role import Role
 from semcast.server.replay import ReplaySettings, replay
 
 SEQUENCE = Path(__file__).resolve().parents[1] / "deploy" / "demo" / "kitti_06"
@@ -211,6 +212,9 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
     assert rows[-1][1].startswith("tracking ")
     for name in ("trajectory.tum", "map.ply", "summary.json", "settings.toml"):
         assert (tmp_path / name).stat().st_size > 0
+    in_force = build_settings(DemoSettings, read_toml(tmp_path / "demo.toml"))
+    assert (in_force.sequence, in_force.channel, in_force.snr_db) == (SEQUENCE, "awgn", 10.0)
+    assert None not in (in_force.stride, in_force.rate_hz), "what this machine could serve"
     assert summary["completeness"] > 0.3  # live, so a loaded machine drops frames
     assert summary["ate_percent"] < 5.0
     info = RecordingReader(recording).info()

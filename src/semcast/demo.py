@@ -2,15 +2,12 @@
 
 import contextlib
 import json
-import re
 import shlex
-import signal
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -22,17 +19,19 @@ from semcast.channel.settings import ChannelName
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.codecs import check_codec, named_weights
+from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError, SourceError, TransportError
 from semcast.common.keys import status_key
 from semcast.common.messages import StatusMessage
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.rate import NATIVE_RATE, RateChoice
-from semcast.common.run_folder import SUMMARY_NAME
+from semcast.common.run_folder import DEMO_SETTINGS_NAME, SUMMARY_NAME
 from semcast.common.sequence import Sequence, open_sequence
 from semcast.common.transport import Session, free_endpoint, open_session
-from semcast.common.whole_file import check_writable
+from semcast.common.whole_file import check_writable, write_whole
 from semcast.common.wire import WireError, unpack
 from semcast.real_time import plan_for
+from semcast.role import Role
 from semcast.server.former_run import check_not_foreign, discard, output_folder
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.settings import ServerSettings, ViewSettings
@@ -40,8 +39,6 @@ from semcast.server.view.choice import check_viewer
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
 START_DEADLINE_S = 60.0
-#: How long a role may take to write everything after it was asked to stop.
-STOP_DEADLINE_S = 15.0
 #: What a role that gave up ends with; others are of signals or of wrong usage.
 ERROR_CODE = 1
 AGENT_ID = "demo"
@@ -200,53 +197,6 @@ def _camera_flags(camera: CameraSettings) -> list[str]:
     return words
 
 
-class Role:
-    """One child process with its log file."""
-
-    def __init__(self, name: str, command: list[str], log: Path) -> None:
-        self.name, self.command, self.log = name, command, log
-        self._process: subprocess.Popen[bytes] | None = None
-        self.told = False
-
-    def start(self) -> None:
-        """Start the process in a group of its own, so that Ctrl-C reaches it only through us."""
-        with self.log.open("wb") as log:
-            self._process = subprocess.Popen(
-                self.command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
-            )
-
-    @property
-    def returncode(self) -> int | None:
-        """Exit code, negative for a signal; None while it runs."""
-        return None if self._process is None else self._process.poll()
-
-    def last_words(self) -> str:
-        """Return the last line of the log."""
-        lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        return lines[-1] if lines else "no output"
-
-    def images_left_out(self) -> int:
-        """Return how many images the log says were left out of the stream."""
-        return len(re.findall(r": frame \d+ is left out: ", self.log.read_text("utf-8", errors="replace")))
-
-    def viewer_address(self) -> str | None:
-        """Return the address of the viewer's page, once the log names it."""
-        log = self.log.read_text(encoding="utf-8", errors="replace")
-        found = re.search(r"viewer: (http\S+)", log)
-        return found.group(1) if found else None
-
-    def stop(self) -> None:
-        """Ask the process to end; kill it when it does not in time."""
-        if self._process is None or self._process.poll() is not None:
-            return
-        self._process.send_signal(signal.SIGTERM)
-        try:
-            self._process.wait(STOP_DEADLINE_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-
-
 @dataclass
 class Alive:
     """Which roles are there, as their liveliness tokens say; restarts by hand count like ours."""
@@ -351,6 +301,7 @@ def run_demo(
                 alive.wait_for(name, child, stop)
                 tell(f"{name} is up: {shlex.join(child.command)}")
             error = _watch(settings.out, children, alive, summary_file, stop, tell, progress)
+            _keep_settings(settings, sequence, playback, tell)
             if left_out := children["agent"].images_left_out():
                 where = children["agent"].log
                 tell(f"images left out, unreadable or of another size: {left_out}, see {where}")
@@ -359,6 +310,24 @@ def run_demo(
             child.stop()
     summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
     return summary, error
+
+
+def _keep_settings(
+    settings: DemoSettings, sequence: Path, playback: Playback, tell: Callable[[str], None]
+) -> None:
+    """Write what was in force beside the results: the server's settings know nothing of agent and link."""
+    in_force = replace(
+        settings,
+        sequence=sequence,
+        resize=playback.resize,
+        stride=playback.stride,
+        rate_hz=playback.rate_hz,
+    )
+    file = settings.out / DEMO_SETTINGS_NAME
+    try:
+        write_whole(file, to_toml(in_force))
+    except OSError as err:
+        tell(f"{file} can't be written: {err}")
 
 
 def _join(endpoint: str, server: Role, stop: threading.Event) -> Session | None:

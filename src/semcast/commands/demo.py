@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         talk.print("no summary was written; the logs of the three processes say why:", settings.out / "logs")
         return code or 1
     plain_console().print(summary_table(result))
-    files = ("trajectory.tum", "map.ply", "run.rrd", "summary.json", "settings.toml")
+    files = ("trajectory.tum", "map.ply", "run.rrd", "summary.json", "settings.toml", "demo.toml")
     there = ", ".join(name for name in files if (settings.out / name).exists())
     show_again = shlex.join(("rerun", str(settings.out / "run.rrd")))
     again = f"; look again with: {show_again}" if (settings.out / "run.rrd").exists() else ""
