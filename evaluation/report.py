@@ -22,6 +22,8 @@ from semcast.common.whole_file import check_writable, whole_file
 
 #: File of a result in the folder its pictures go to.
 RESULT_NAME = "result.json"
+#: What ``--json`` is to have the result on stdout.
+STDOUT = Path("-")
 #: Libraries whose version can change a result.
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "gtsam", "poselib")
 #: Instruction sets that decide how fast a codec runs, widest last.

@@ -1,3 +1,4 @@
+import json
 import shutil
 import sys
 import threading
@@ -286,6 +287,17 @@ def test_a_camera_given_by_hand_takes_the_place_of_one_that_does_not_fit_the_ima
     words = ["demo", "--sequence", str(sequence), "--out", str(tmp_path / "run")]
     assert main([*words, "--focal-35mm", "26"]) == 1, "no summary was written"
     assert [settings.camera.focal_35mm for settings in called] == [26.0]
+
+
+def test_the_summary_may_have_stdout_for_itself(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    summary = {"completeness": 1.0, "num_landmarks": 7}
+    monkeypatch.setattr("semcast.commands.demo.run_demo", lambda *_: (summary, None))
+    assert main(["demo", "--sequence", str(SEQUENCE), "--json", "-"]) == 0
+    shown = capsys.readouterr()
+    assert json.loads(shown.out)["num_landmarks"] == 7
+    assert "landmarks" in shown.err
+    assert not Path("-").exists()
 
 
 def test_a_demo_without_a_pose_says_why():

@@ -102,7 +102,9 @@ class DemoSettings:
     )
     seed: int = field(default=0, metadata={"help": "seed of channel and estimation"})
     out: Path = field(default=Path("runs/demo"), metadata={"help": "folder for all outputs"})
-    json: Path | None = field(default=None, metadata={"help": "also write the summary to this file"})
+    json: Path | None = field(
+        default=None, metadata={"help": "also write the summary to this file, - for stdout"}
+    )
 
     def __post_init__(self) -> None:
         """Check what the three processes would only notice after their start."""

@@ -1,9 +1,11 @@
 """``semcast demo``: the whole system on one machine, ending in a table of figures."""
 
 import argparse
+import json
 import shlex
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -13,7 +15,7 @@ from semcast.commands.console import plain_console
 from semcast.commands.running import add_settings, read_settings, run_until_stopped
 from semcast.common.sequence import open_sequence
 from semcast.demo import DemoSettings, default_sequence, run_demo
-from semcast.evaluation.report import provenance, write_json
+from semcast.evaluation.report import STDOUT, provenance, write_json
 from semcast.server.export.parts import parts_line
 
 
@@ -69,8 +71,14 @@ def why_no_pose(summary: Mapping[str, Any]) -> str:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the demo; exit code 1 when no frame got a pose."""
+    """Run the demo; exit code 1 when no frame got a pose.
+
+    With ``--json -`` the summary has stdout for itself.
+    """
     settings = read_settings(DemoSettings, arguments)
+    json_to_stdout = settings.json == STDOUT
+    if json_to_stdout:
+        settings = replace(settings, json=None)
     talk = plain_console(stderr=True)
     frames = len(open_sequence(settings.sequence or default_sequence(), settings.camera))
     result: dict[str, Any] = {}
@@ -96,15 +104,19 @@ def run(arguments: argparse.Namespace) -> int:
     if not result:
         talk.print("no summary was written; the logs of the three processes say why:", settings.out / "logs")
         return code or 1
-    plain_console().print(summary_table(result))
+    shown = talk if json_to_stdout else plain_console()
+    shown.print(summary_table(result))
     files = ("trajectory.tum", "map.ply", "run.rrd", "summary.json", "settings.toml", "demo.toml")
     there = ", ".join(name for name in files if (settings.out / name).exists())
     show_again = shlex.join(("rerun", str(settings.out / "run.rrd")))
     again = f"; look again with: {show_again}" if (settings.out / "run.rrd").exists() else ""
-    print(f"in {settings.out}: {there}{again}")
-    if settings.json is not None:
-        # The demo's own settings in place of the server's, which name folders of this machine.
-        write_json(settings.json, {**result, **provenance("demo", settings)})
+    shown.print(f"in {settings.out}: {there}{again}", soft_wrap=True)
+    # The demo's own settings in place of the server's, which name folders of this machine.
+    report = {**result, **provenance("demo", settings)}
+    if json_to_stdout:
+        print(json.dumps(report, indent=1))
+    elif settings.json is not None:
+        write_json(settings.json, report)
     if not code and not result.get("completeness"):
         talk.print(why_no_pose(result), soft_wrap=True)
         return 1

@@ -16,11 +16,8 @@ from semcast.channel.emulator import warn_of_idle
 from semcast.commands.console import plain_console
 from semcast.commands.running import add_settings, read_settings
 from semcast.evaluation import codec, confidence, endurance, latency, pairs, recording, runtime, trajectory
-from semcast.evaluation.report import RESULT_NAME, check_outputs
+from semcast.evaluation.report import RESULT_NAME, STDOUT, check_outputs
 from semcast.evaluation.result_table import ResultTable, result_table
-
-#: What ``--json`` is to have the result on stdout.
-STDOUT = Path("-")
 
 _Evaluation = tuple[type, Callable[[Any], dict[str, Any]], frozenset[str], str]
 #: what -> settings, function, settings the evaluation sets itself, one line of help
