@@ -86,7 +86,7 @@ def _read_config(path: Path) -> zenoh.Config:
     except (OSError, UnicodeDecodeError) as err:
         raise ConfigError(f"zenoh_config {path} can't be read: {err}") from err
     except zenoh.ZError as err:
-        raise ConfigError(f"zenoh_config {path} is no Zenoh configuration: {_first_line(err)}") from err
+        raise ConfigError(f"zenoh_config {path} is no Zenoh configuration: {_in_a_line(err)}") from err
 
 
 class Publisher:
@@ -371,7 +371,7 @@ def open_session(
         except zenoh.ZError as err:
             where = ", ".join(network.listens_on)
             hint = ", perhaps something already does" if _says_in_use(err) else ""
-            raise TransportError(f"can't listen on {where}{hint}: {_first_line(err)}") from err
+            raise TransportError(f"can't listen on {where}{hint}: {_in_a_line(err)}") from err
     started_s = time.monotonic()
     knocks, try_ms, told, told_why = Knocks(network.connect), _CONNECT_TRY_MS, False, False
     while stop is None or not stop.is_set():
@@ -385,7 +385,7 @@ def open_session(
             if deadline_s is not None and time.monotonic() - started_s >= deadline_s:
                 nothing = (
                     f"nothing answers at {', '.join(network.connect)} within {deadline_s:g} s: is "
-                    f"'semcast server' running there? ({_first_line(err)})"
+                    f"'semcast server' running there? ({_in_a_line(err)})"
                 )
                 raise TransportError(why or nothing) from err
             if not told:
@@ -419,8 +419,8 @@ def _says_in_use(err: zenoh.ZError) -> bool:
     return f"os error {errno.EADDRINUSE}" in str(err) or "acquire lock: EAGAIN" in str(err)
 
 
-def _first_line(err: Exception) -> str:
-    line = str(err).split(" at /", 1)[0].splitlines()[0]
+def _in_a_line(err: Exception) -> str:
+    line = " ".join(str(err).split(" at /", 1)[0].split())
     return line + "]" * (line.count("[") - line.count("]"))  # the cut may have taken the end of a list
 
 

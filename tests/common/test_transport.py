@@ -388,7 +388,12 @@ def test_endpoints_stay_as_they_were_asked_for(tmp_path, encoding):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(None, "can't be read"), ("{", "no Zenoh configuration"), ("{tarnsport: 1}", "no Zenoh configuration")],
+    [
+        (None, "can't be read"),
+        ("hello", "no Zenoh configuration: --> 1:1 .* = expected array"),
+        ("{", "no Zenoh configuration"),
+        ("{tarnsport: 1}", "no Zenoh configuration"),
+    ],
 )
 def test_a_bad_configuration_of_zenoh_is_one_clear_line(tmp_path, content, message):
     path = tmp_path / "z.json5"
