@@ -171,7 +171,8 @@ def test_a_page_on_the_port_of_another_program_is_refused():
         with pytest.raises(ConfigError, match=f"page can't be served on port {taken}, .* with --web-port"):
             check_viewer(settings)
         # Where a viewer is open already, the page is its own.
-        check_viewer(replace(settings, view=replace(settings.view, port=taken)))
+        with socket.create_server(("127.0.0.1", 0)) as viewer:
+            check_viewer(replace(settings, view=replace(settings.view, port=viewer.getsockname()[1])))
 
 
 def test_what_listens_and_is_no_viewer_is_left_alone(caplog):
