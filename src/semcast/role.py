@@ -6,7 +6,7 @@ import subprocess
 from pathlib import Path
 
 #: How long a role may take to write everything after it was asked to stop.
-STOP_DEADLINE_S = 15.0
+STOP_DEADLINE_S = 30.0
 
 
 class Role:
