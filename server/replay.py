@@ -179,6 +179,8 @@ def _replayed(
             name, modulation=modulation, num_threads=settings.threads, weights=settings.weights
         )
     )
+    # Before a former run is set aside.
+    decoder.codec_for(camera.codec, camera.modulation, camera.digest)
     identity = StreamIdentity.of(agent_id, camera)
     reference = (
         sequence_reference(settings.reference, camera.intrinsics, settings.camera)

@@ -20,7 +20,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.cli import main
 from semcast.common.codecs import load_codec
 from semcast.common.config import build_settings, read_toml
-from semcast.common.errors import ConfigError, SourceError
+from semcast.common.errors import ConfigError, SemcastError, SourceError
 from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
@@ -103,6 +103,14 @@ def test_everything_that_was_sent_is_in_the_recording(recording):
 def test_weights_are_those_of_the_recorded_codec(recording, tiny_weights):
     with pytest.raises(ConfigError, match="codec 'jpeg-ldpc' has no weights, got .*tiny.safetensors"):
         replay(ReplaySettings(file=recording, weights=tiny_weights))
+
+
+def test_weights_that_do_not_fit_leave_a_former_run_where_it_is(recording, tiny_weights, tmp_path):
+    (tmp_path / "summary.json").write_text("{}")
+    for weights in (tiny_weights, tmp_path / "missing.safetensors"):
+        with pytest.raises(SemcastError):
+            replay(ReplaySettings(file=recording, weights=weights, out=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
 
 
 def test_the_recording_names_the_weights_that_decode_it(recording):
