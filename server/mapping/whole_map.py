@@ -24,8 +24,11 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Observations at most, for a stream to end within seconds: those of a hundred to two hundred keyframes.
-MAX_OBSERVATIONS = 60_000
+#: Observations at most, for a stream to end within seconds: those of a hundred to two hundred keyframes; and
+#: where there are more keyframes than by default, so many each, for with fewer they go astray.
+MAX_OBSERVATIONS, OBSERVATIONS_EACH = 60_000, 200
+#: Keyframes at most: so many take ten seconds, and several times as many minutes and gigabytes.
+MAX_KEYFRAMES = 1000
 #: Below that many keyframes a window held them all, most of the time.
 _MIN_KEYFRAMES = 5
 #: Landmarks a keyframe shares at least with those it hangs together with: fewer don't say where it is.
@@ -39,7 +42,7 @@ def adjust_whole_map(world: WorldMap, camera: Intrinsics, noise: NoiseModel) -> 
 
     A part's first keyframe stays, and so does the distance to the one furthest from it. What no adjustment
     holds (landmarks left out, frames that are no keyframes, keyframes that were thinned out) follows the
-    keyframe before it, in its scale.
+    keyframe before it, in its scale. A submap of more than ``MAX_KEYFRAMES`` stays.
 
     Args:
         world: The map, which is changed where an adjustment succeeds.
@@ -51,11 +54,17 @@ def adjust_whole_map(world: WorldMap, camera: Intrinsics, noise: NoiseModel) -> 
     """
     num_adjusted = 0
     for submap in sorted({k.submap for k in world.keyframes}):
-        for part in _hanging_together(world, world.keyframes_of(submap)):
+        mine, settled = world.keyframes_of(submap), list[Keyframe]()
+        if len(mine) > MAX_KEYFRAMES:
+            logger.info("a map of %d keyframes is too large to be adjusted as a whole", len(mine))
+            continue
+        for part in _hanging_together(world, mine):
             if len(part) < _MIN_KEYFRAMES:
                 continue
-            results = [_adjust(world, part, camera, noise) for _ in range(_ROUNDS)]
-            num_adjusted += len(part) if any(results) else 0
+            results = [_adjust(world, part, settled, camera, noise) for _ in range(_ROUNDS)]
+            if any(results):
+                settled += part
+        num_adjusted += len(settled)
     return num_adjusted
 
 
@@ -75,12 +84,18 @@ def _hanging_together(world: WorldMap, keyframes: Sequence[Keyframe]) -> list[li
     return sorted(ordered, key=lambda part: part[0].frame_id)
 
 
-def _adjust(world: WorldMap, part: list[Keyframe], camera: Intrinsics, noise: NoiseModel) -> bool:
-    """Adjust one part and drop what does not fit it; whether that succeeded."""
+def _adjust(
+    world: WorldMap, part: list[Keyframe], settled: list[Keyframe], camera: Intrinsics, noise: NoiseModel
+) -> bool:
+    """Adjust one part and drop what does not fit it; whether that succeeded.
+
+    Keyframes of parts that are ``settled`` stay, those between and after this part's ones too.
+    """
     ids = np.unique(np.concatenate([k.ids for k in part]))
     ids = ids[world.landmarks.rows(ids) >= 0]
     view, point, xy, confidence = gather_observations(part, ids)
-    taken, kept, point = within_limit(ids, point, limit=MAX_OBSERVATIONS)
+    limit = max(MAX_OBSERVATIONS, OBSERVATIONS_EACH * len(part))
+    taken, kept, point = within_limit(ids, point, limit=limit)
     landmark_ids = ids[taken]
     result = optimise(
         BundleProblem(
@@ -104,7 +119,11 @@ def _adjust(world: WorldMap, part: list[Keyframe], camera: Intrinsics, noise: No
         logger.debug("the map of %d keyframes can't be adjusted as a whole", len(part))
         return False
     problem = result.problem
-    world.bend(problem.keyframe_ids, result.T_world_cam, _scales(result))
+    frame_ids = np.array([k.frame_id for k in (*part, *settled)], dtype=np.int64)
+    T_world_cam = np.stack([*result.T_world_cam, *(k.T_world_cam for k in settled)])
+    scale = np.concatenate([_scales(result), np.ones(len(settled))])
+    order = np.argsort(frame_ids)
+    world.bend(frame_ids[order], T_world_cam[order], scale[order])
     world.move_landmarks(problem.landmark_ids, result.xyz)
     drop_outliers(world, result, noise)
     return True

@@ -166,6 +166,7 @@ def test_keyframes_that_were_thinned_out_follow_the_one_before():
 
 def test_a_map_larger_than_the_limit_is_adjusted_by_a_part_of_its_landmarks(monkeypatch):
     monkeypatch.setattr(whole_map, "MAX_OBSERVATIONS", 3000)
+    monkeypatch.setattr(whole_map, "OBSERVATIONS_EACH", 0)
     world, points = drifted_world()
     assert sum(len(k.ids) for k in world.keyframes) > 5000
     before, points_before = errors_m(world).max(), median_error_m(world, points)
@@ -191,3 +192,40 @@ def test_a_map_that_can_not_be_adjusted_stays_as_it_is(monkeypatch):
     xyz = world.landmarks.xyz.copy()
     assert adjust_whole_map(world, CAMERA, NOISE) == 0
     np.testing.assert_array_equal(world.landmarks.xyz, xyz)
+
+
+def test_a_part_within_the_time_of_another_one_does_not_tear_that_apart():
+    """The camera left, the keyframes between went, and it came back: the way back is not bent again."""
+    out, back = 12, 26
+    world, _ = drifted_world(lambda k, ids: ids[ids % 2 == (out <= k < back)])
+    before = errors_m(world)[back:].max()
+    assert adjust_whole_map(world, CAMERA, NOISE) == NUM_KEYFRAMES
+    assert before > 0.1
+    assert errors_m(world)[back:].max() < 0.2 * before
+    for k in (out, back, NUM_KEYFRAMES - 1):
+        np.testing.assert_allclose(world.pose_of_frame(10 * k), world.keyframes[k].T_world_cam, atol=1e-12)
+
+
+def test_a_map_of_too_many_keyframes_stays_as_it_is(monkeypatch):
+    monkeypatch.setattr(whole_map, "MAX_KEYFRAMES", NUM_KEYFRAMES - 1)
+    world, _ = drifted_world()
+    places = {k: T.copy() for k, T in world.poses.items()}
+    assert adjust_whole_map(world, CAMERA, NOISE) == 0
+    assert all(np.array_equal(world.poses[k], T) for k, T in places.items())
+
+
+def test_each_keyframe_keeps_observations_enough_where_there_are_many(monkeypatch):
+    """Of many keyframes with few observations each, the limit alone would let every one go astray."""
+
+    def steps(world):
+        T_world_cam = np.stack([k.T_world_cam for k in world.keyframes])
+        T_true = np.stack([true_pose(k) for k in range(NUM_KEYFRAMES)])
+        error = (invert_transform(T_world_cam[:-1]) @ T_world_cam[1:])[:, :3, 3]
+        error -= (invert_transform(T_true[:-1]) @ T_true[1:])[:, :3, 3]
+        return np.median(np.linalg.norm(error, axis=1))
+
+    monkeypatch.setattr(whole_map, "MAX_OBSERVATIONS", 200)
+    world, _ = drifted_world()
+    before = steps(world)
+    assert adjust_whole_map(world, CAMERA, NOISE) == NUM_KEYFRAMES
+    assert steps(world) < before
