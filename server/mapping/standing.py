@@ -41,14 +41,16 @@ def scene_motion_px(xy: Array, motion_px: Array, width: int) -> float:
     return motion if motion >= _LEAST_MOTION_PX else 0.0
 
 
-def stood(xy: Array, anchor_xy: Array, widths: Array, scene_px: float, width: int) -> tuple[Array, Array]:
+def stood(
+    xy: Array, anchor_xy: Array, widths: Array, scene_px: Array | float, width: int
+) -> tuple[Array, Array]:
     """Count on how far the scene went while tracks stood.
 
     Args:
         xy: ``(N, 2)`` where they are now.
         anchor_xy: ``(N, 2)`` where each began to stand.
         widths: ``(N,)`` image widths the scene went since.
-        scene_px: How far it went with this frame.
+        scene_px: How far it went with this frame, for all tracks or ``(N,)``.
         width: Of the image.
 
     Returns:

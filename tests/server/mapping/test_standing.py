@@ -106,6 +106,26 @@ def test_tracks_that_agree_with_the_pose_are_vouched_for():
     assert tracks.fixed.any()
 
 
+def test_a_track_that_is_hidden_does_not_stand():
+    """Rows do not arrive for three frames of fast motion: tracks there are found again behind the gap."""
+    tracks = TrackTable("robust", 200, 0)
+    for k in range(9):
+        sight = sight_at(16 * k, k)
+        if 5 <= k < 8:
+            sight.usable[60:140] = False
+            sight.grey[60:140] = 128
+        if len(tracks):
+            tracks.follow(sight, tracks.xy + tracks.velocity * (tracks.missed + 1)[:, None])
+        else:
+            tracks.remember(sight)
+        if k < 5:
+            tracks.refill(sight)
+        if k == 4:
+            hidden = tracks.ids[(tracks.xy[:, 0] > 90) & (np.abs(tracks.xy[:, 1] - 100) < 20)]
+    assert len(hidden) > 10
+    assert np.isin(hidden, tracks.ids[tracks.visible]).mean() > 0.9
+
+
 WALL = texture((700, 1800), seed=2)
 
 
