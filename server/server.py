@@ -438,13 +438,15 @@ class Server:
         session, self._session = self._session, None
         if session is None:
             return {}
-        if not self._complete:
-            self._save(session)  # who stopped the server may not wait for the adjustment
-        self._conclude(session)
         try:
+            if not self._complete:
+                self._save(session)  # who stopped the server may not wait for the adjustment
+            self._conclude(session)
             summary = self._end(session, self._settings.out)
         except OSError as err:
             raise SemcastError(_not_written(self._settings.out, err)) from err
+        finally:
+            session.close()  # a second Ctrl-C may have ended the adjustment
         if self._settings.out is not None:
             logger.info("outputs are in %s", self._settings.out)
         return summary

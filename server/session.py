@@ -343,13 +343,11 @@ class Session:
         """Adjust the whole map, as the settings want it, now that the stream has ended; what that changed."""
         since = time.monotonic()
         try:
-            self._reconstruction.conclude()
+            num_adjusted = self._reconstruction.conclude()
+            logger.debug("%d keyframes are adjusted, in %.1f s", num_adjusted, time.monotonic() - since)
         except Exception:
             logger.exception("the map could not be adjusted as a whole and stays as it was")
-        update = self._reconstruction.take_map_update()
-        if update is not None:
-            logger.debug("the whole map is adjusted, in %.1f s", time.monotonic() - since)
-        return update
+        return self._reconstruction.take_map_update()
 
     def write_outputs(
         self, folder: Path | None, drops: Mapping[str, int], *, complete: bool

@@ -9,7 +9,7 @@ from semcast.server.mapping.state import DecodedFrame, FrameResult, TrackingStat
 #: Side of the cells that are averaged: the noise of a sensor is gone then.
 _CELL_PX = 8
 #: Standard deviation of the cells' grey levels about a smooth shade below which there is nothing to see. A
-#: view with a fiftieth of the usual contrast has more.
+#: view with a thirtieth of the usual contrast has more.
 _LEAST_SD_GREY = 1.0
 #: So few cells along a side say nothing about a shade.
 _LEAST_CELLS = 6

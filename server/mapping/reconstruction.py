@@ -445,10 +445,16 @@ class Reconstruction:
         """The map as one update, whatever was taken before."""
         return self._map.whole(self._map_epoch)
 
-    def conclude(self) -> None:
-        """Adjust the whole map, if the settings want that: the stream has ended, and no pose waits."""
-        if self._map.adjust_whole():
+    def conclude(self) -> int:
+        """Adjust the whole map, if the settings want that: the stream has ended, and no pose waits.
+
+        Returns:
+            Number of keyframes that were adjusted.
+        """
+        num_adjusted = self._map.adjust_whole()
+        if num_adjusted:
             self._moved(1.0)
+        return num_adjusted
 
     def final_trajectory(self) -> dict[int, Array]:
         """Best current ``T_world_cam`` of all posed frames, by frame id; waits for a running adjustment."""

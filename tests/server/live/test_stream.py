@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,22 @@ def test_a_lossless_stream_leaves_every_promised_file_and_repeats_bit_for_bit(tm
         assert "[reconstruction]" in (out / "settings.toml").read_text()
         assert set(radio.posed_ids()) == set(range(24))
     assert trajectories[0] == trajectories[1]
+
+
+def test_a_stream_is_saved_and_released_where_the_adjustment_at_its_end_is_broken_off(
+    air, tmp_path, monkeypatch
+):
+    def break_off(session):
+        raise RuntimeError("a second Ctrl-C")
+
+    monkeypatch.setattr("semcast.server.session.Session.conclude", break_off)
+    running = air.serve(out=tmp_path, save_images="all")
+    air.agent(100).stream(range(12))
+    with pytest.raises(RuntimeError, match="second Ctrl-C"):
+        running.finish(stop=True)
+    assert len(read_run(tmp_path).frame_ids) >= 8
+    names = {thread.name for thread in threading.enumerate()}
+    assert names.isdisjoint({"semcast-checkpoint", "semcast-images"})
 
 
 def test_bad_frames_are_counted_and_never_stop_the_stream(air):
