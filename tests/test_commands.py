@@ -260,6 +260,17 @@ def test_doctor_does_not_pass_over_a_configuration_of_no_system(tmp_path, capsys
     assert "is of the system that --connect names" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "words",
+    [["info", ""], ["export", "run", "--format", "tum", "--out", ""], ["plot", "run", "--out", ""]],
+)
+def test_a_path_without_a_name_is_not_the_working_folder(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert "must be the name of a file or folder, got ''" in capsys.readouterr().err
+
+
 def test_a_run_is_not_exported_onto_itself(tmp_path, capsys):
     (tmp_path / "run").mkdir()
     out = tmp_path / "run" / ".." / "run"

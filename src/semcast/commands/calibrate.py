@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress
 
 from semcast.commands.console import plain_console
+from semcast.commands.paths import named_path
 from semcast.common.errors import ConfigError, SemcastError, SourceError
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ LIVE_STRIDE = 5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "images", type=Path, nargs="*", metavar="PATH", help="pictures of the board, or folders of them"
+        "images", type=named_path, nargs="*", metavar="PATH", help="pictures of the board, or folders of them"
     )
     parser.add_argument("--camera", metavar="N|URL", help="take views from this live camera instead")
     parser.add_argument(
@@ -44,13 +45,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--out",
-        type=Path,
+        type=named_path,
         default=Path("intrinsics.json"),
         metavar="FILE",
         help="result (default intrinsics.json)",
     )
     parser.add_argument(
-        "--picture", type=Path, metavar="FILE", help="picture to judge the result by (default beside --out)"
+        "--picture",
+        type=named_path,
+        metavar="FILE",
+        help="picture to judge the result by (default beside --out)",
     )
 
 

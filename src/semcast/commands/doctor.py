@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from semcast.commands.console import plain_console
+from semcast.commands.paths import named_path
 from semcast.common.cores import usable_cores
 from semcast.common.errors import ConfigError
 from semcast.server.view.process import window_display
@@ -177,7 +178,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--zenoh-config",
-        type=Path,
+        type=named_path,
         metavar="PATH",
         help="file of Zenoh's own configuration (JSON5), where that system wants certificates or users",
     )

@@ -3,7 +3,8 @@
 import argparse
 import re
 import sys
-from pathlib import Path
+
+from semcast.commands.paths import named_path
 
 #: Kept here so that ``--help`` loads neither numpy nor OpenCV; a test holds it equal to the server's list.
 FORMATS = ("tum", "kitti", "ply", "colmap", "nerfstudio", "rrd")
@@ -12,7 +13,7 @@ FORMATS = ("tum", "kitti", "ply", "colmap", "nerfstudio", "rrd")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "run", type=Path, metavar="RUN", help="folder that --out of demo, server or replay wrote"
+        "run", type=named_path, metavar="RUN", help="folder that --out of demo, server or replay wrote"
     )
     parser.add_argument(
         "--format",
@@ -28,7 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N|largest|all",
         help="part of the map; 'semcast info RUN' lists them where there are several (default: all)",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="PATH", help="file or folder to write")
+    parser.add_argument(
+        "--out", type=named_path, required=True, metavar="PATH", help="file or folder to write"
+    )
 
 
 def _part(word: str) -> str:

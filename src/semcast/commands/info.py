@@ -1,14 +1,15 @@
 """``semcast info``: what a recording, run, sequence or weights file is."""
 
 import argparse
-from pathlib import Path
+
+from semcast.commands.paths import named_path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
         "path",
-        type=Path,
+        type=named_path,
         metavar="PATH",
         help="recording (.mcap), folder that --out wrote, sequence folder or transforms.json, "
         "weights (.safetensors, .onnx) or the name of shipped weights",

@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from semcast.commands.paths import named_path
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -12,11 +14,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="name of shipped weights such as 3dcsc-lite, or a .safetensors file",
     )
     parser.add_argument(
-        "--out", type=Path, metavar="FILE", help="file to write; by default the name with .onnx, here"
+        "--out", type=named_path, metavar="FILE", help="file to write; by default the name with .onnx, here"
     )
     parser.add_argument(
         "--int8",
-        type=Path,
+        type=named_path,
         metavar="FOLDER",
         help="eight-bit convolutions, about twice as fast; learns the ranges of values from photos in FOLDER",
     )

@@ -5,17 +5,19 @@ import logging
 import sys
 from pathlib import Path
 
+from semcast.commands.paths import named_path
+
 logger = logging.getLogger(__name__)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "run", type=Path, metavar="RUN", help="folder that --out of demo, server or replay wrote"
+        "run", type=named_path, metavar="RUN", help="folder that --out of demo, server or replay wrote"
     )
     parser.add_argument(
         "--truth",
-        type=Path,
+        type=named_path,
         metavar="PATH",
         help="true path: a TUM file or a sequence folder; by default the sequence the run was compared with",
     )
@@ -23,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--format", choices=("png", "svg"), default="png", help="of the pictures (default png)"
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the pictures; by default RUN/plots"
+        "--out", type=named_path, metavar="DIR", help="folder for the pictures; by default RUN/plots"
     )
 
 

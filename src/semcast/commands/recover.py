@@ -1,16 +1,16 @@
 """``semcast recover``: make a recording that was cut off whole again."""
 
 import argparse
-from pathlib import Path
 
+from semcast.commands.paths import named_path
 from semcast.common.recording import recover_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("file", type=Path, metavar="FILE", help="recording that was cut off or damaged")
+    parser.add_argument("file", type=named_path, metavar="FILE", help="recording that was cut off or damaged")
     parser.add_argument(
-        "--out", type=Path, metavar="PATH", help="where to write it; without it FILE is replaced"
+        "--out", type=named_path, metavar="PATH", help="where to write it; without it FILE is replaced"
     )
 
 

@@ -5,9 +5,9 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, TypeVar
 
+from semcast.commands.paths import named_path
 from semcast.common.config_flags import add_flags, given_values, settings_from
 
 S = TypeVar("S")
@@ -17,7 +17,7 @@ def add_settings(parser: argparse.ArgumentParser, cls: type, skip: frozenset[str
     """Add ``--config`` and one flag per setting of ``cls`` but those to skip, which are the command's own."""
     parser.add_argument(
         "--config",
-        type=Path,
+        type=named_path,
         metavar="FILE",
         help="TOML file with any of these settings, written as snr_db for --snr-db; flags win over it",
     )

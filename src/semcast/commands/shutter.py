@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from semcast.agent.source import is_camera_number
+from semcast.commands.paths import named_path
 from semcast.commands.running import add_settings, read_settings
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.whole_file import check_writable
@@ -17,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, ReadoutSettings)
     parser.add_argument(
         "--out",
-        type=Path,
+        type=named_path,
         metavar="FILE",
         help="intrinsics.json to write: the camera with the readout found; may be the file it was read from",
     )
