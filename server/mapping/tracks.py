@@ -101,10 +101,8 @@ class Seen:
 #: After a jump a point is looked for no further than this from where descriptors put it.
 _MAX_FROM_JUMP_PX = 25.0
 #: What a track has, by attribute of ``TrackTable``.
-_COLUMNS = (
-    *("ids", "xy", "velocity", "confidence", "variance_px2", "drift_px2", "age", "missed"),
-    *("anchor_xy", "stood_widths"),
-)
+_MOTION = ("ids", "xy", "velocity", "confidence", "variance_px2", "drift_px2", "age", "missed")
+_COLUMNS = (*_MOTION, "anchor_xy", "stood_widths")
 #: Share of an image's localisation variance that stays with a point followed on from it. Most of it goes with
 #: the image: the next step begins where this one ended, and takes its error back. Measured against tracks of
 #: the original images.
@@ -331,8 +329,7 @@ class TrackTable:
         self.age = self.age + ok
         width = sight.grey.shape[1]
         scene_px = scene_motion_px(self.xy[ok], np.linalg.norm(self.velocity[ok], axis=1), width)
-        # Where a track that coasts is, nobody knows: it does not stand because its last place is kept.
-        passed = np.where(ok, scene_px, 0.0)
+        passed = np.where(ok, scene_px, 0.0)  # where a track that coasts is, nobody knows
         self.anchor_xy, self.stood_widths = stood(self.xy, self.anchor_xy, self.stood_widths, passed, width)
         self.missed = np.where(ok, 0, self.missed + 1)
         cues = replace(
