@@ -21,7 +21,8 @@ from semcast.server.geometry.patch_alignment import (
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 from semcast.server.geometry.weighting import MAD_TO_SIGMA
 from semcast.server.mapping.recall import KeyframeImages
-from semcast.server.mapping.tracks import Sight, TrackTable
+from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]

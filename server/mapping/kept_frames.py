@@ -12,7 +12,8 @@ from semcast.server.geometry.features import Grey
 from semcast.server.geometry.pnp import refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.mapper import sample_colours
-from semcast.server.mapping.tracks import Sight, TrackTable
+from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]

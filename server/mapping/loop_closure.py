@@ -22,7 +22,7 @@ from semcast.server.mapping.mapper import median_depth
 from semcast.server.mapping.pose_graph import Edge, SolvedGraph, solve_graph
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit
-from semcast.server.mapping.tracks import Sight
+from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]

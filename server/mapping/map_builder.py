@@ -20,8 +20,9 @@ from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, place_anew
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import MapUpdate
-from semcast.server.mapping.tracks import Sight, TrackTable
+from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.whole_map import adjust_whole_map
 from semcast.server.mapping.window import build_problem
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -224,6 +225,31 @@ class MapBuilder:
         world.revisits[frame_id] = found.keyframe_id
         self.loops.note_tie()
         return len(ids)
+
+    def wants_keyframe(
+        self, reference: Keyframe, tracks: TrackTable, sight: Sight, num_inliers: int, frames_since: int
+    ) -> bool:
+        """Tell whether a frame should become a keyframe.
+
+        Args:
+            reference: The newest keyframe.
+            tracks: Of the frame.
+            sight: Its image.
+            num_inliers: Landmarks its pose rests on.
+            frames_since: Frames since the newest keyframe.
+        """
+        cues = mapper.keyframe_cues(
+            reference,
+            tracks.ids[tracks.visible],
+            tracks.xy[tracks.visible],
+            num_inliers=num_inliers,
+            num_inliers_at_keyframe=self.num_inliers_at_keyframe,
+            max_features=self._settings.max_features,
+            width_px=self._camera.width,
+            frames_since=frames_since,
+            usable_share=float(sight.usable.mean()),
+        )
+        return mapper.wants_keyframe(cues)
 
     def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
         """Turn the newest frame into a keyframe, triangulate, and ask for an adjustment."""

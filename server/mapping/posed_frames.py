@@ -4,7 +4,7 @@ A run of hours has many more frames than its map has keyframes: what is done wit
 every checkpoint, must not go through them one by one.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +76,14 @@ class PosedFrames:
         self._T_keyframe_cam = np.zeros((room, 4, 4))
         self._ids[:count], self._keyframe_ids[:count] = ids, keyframe_ids
         self._T_keyframe_cam[:count] = T_keyframe_cam
+
+    def forget(self, frame_ids: Collection[int]) -> None:
+        """Take frames out; those that are not there are no error."""
+        gone = {frame_id for frame_id in frame_ids if frame_id in self._row}
+        if gone:
+            ids, keyframe_ids, T_keyframe_cam = self.columns()
+            kept = ~np.isin(ids, list(gone))
+            self.take(ids[kept], keyframe_ids[kept], T_keyframe_cam[kept])
 
     def rescale(self, factor: Mapping[int, float]) -> None:
         """Scale the translations of the frames of some keyframes, by frame id of the keyframe."""

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.features import Grey
-from semcast.server.mapping.tracks import Sight, TrackTable
+from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]

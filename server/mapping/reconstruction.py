@@ -4,16 +4,17 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.server.geometry.motion import ConstantVelocity
 from semcast.server.mapping import mapper
 from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
+from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Initialiser, Start
 from semcast.server.mapping.kept_frames import backfill, observed_of
 from semcast.server.mapping.look_back import look_back
@@ -21,6 +22,7 @@ from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.mapping.tracker import (
     MIN_INLIERS,
@@ -29,7 +31,7 @@ from semcast.server.mapping.tracker import (
     expected_positions,
     track_pose,
 )
-from semcast.server.mapping.tracks import Seen, Sight, TrackTable
+from semcast.server.mapping.tracks import TrackTable
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +81,7 @@ class Reconstruction:
         s = self._settings
         self._tracks = TrackTable(s.confidence, s.max_features, s.seed)
         self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
-        self._motion = ConstantVelocity()
+        self._motion = CameraMotion(self._camera)
         self._shutter = RollingShutter(self._camera)
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
@@ -158,19 +160,26 @@ class Reconstruction:
         if T_world_last is not None:
             self._motion.correct(T_world_last, scale)
 
+    def _moves_to(self, frame_id: int, t_source_ns: int, T_world_cam: Array, ids: Ids) -> None:
+        """Let the motion go on; frames that now turn out to have shown an older image have no pose."""
+        xyz = self._map.world.landmarks.xyz_of(ids)
+        self._map.world.forget_frames(self._motion.observe(frame_id, t_source_ns, T_world_cam, xyz))
+
     def _follow(self, sight: Sight, T_world_guess: Array | None) -> None:
         tracks = self._tracks
         if len(tracks) == 0:
             tracks.remember(sight)
             return
         if self._state is TrackingState.TRACKING and T_world_guess is not None:
-            world = self._map.world
-            T_world_seen = [world.pose_of_frame(frame_id) for frame_id in tracks.frame_ids]
-            guess = expected_positions(self._camera, world, tracks, T_world_guess, T_world_seen)
-            tracks.follow(sight, guess)
+            tracks.follow(sight, self._expected(T_world_guess, tracks))
         else:
             ahead = tracks.xy + tracks.velocity * (tracks.missed + 1)[:, None]
             tracks.follow(sight, ahead, max_level=_START_LEVELS)
+
+    def _expected(self, T_world_cam: Array, tracks: TrackTable) -> Array:
+        world = self._map.world
+        T_world_seen = [world.pose_of_frame(frame_id) for frame_id in tracks.frame_ids]
+        return expected_positions(self._camera, world, tracks, T_world_cam, T_world_seen)
 
     def _last_pose(self) -> Array | None:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
@@ -181,13 +190,19 @@ class Reconstruction:
     def _pose_from(
         self, seen: Seen, T_world_guess: Array | None, **how: Unpack[Believing]
     ) -> TrackedPose | None:
-        world, noise = self._map.world, self._map.noise.model
         known = {"submap": self._map.submap, "seed": self._settings.seed}
-        return track_pose(self._camera, world, noise, seen, T_world_guess, **known, **how)
+        noise = self._map.noise.model
+        return track_pose(self._camera, self._map.world, noise, seen, T_world_guess, **known, **how)
 
     def _track(self, sight: Sight, T_world_guess: Array | None) -> FrameResult:
         since = time.perf_counter_ns()
         pose = self._pose(T_world_guess, may_carry=True)
+        if (
+            pose is None
+            and (T_world_on := self._motion.predict_on(sight.frame.t_source_ns)) is not None
+            and self._tracks.follow_again(sight, partial(self._expected, T_world_on))
+        ):
+            pose = self._pose(T_world_on)
         if pose is None and self._tracks.follow_jump(sight):
             pose = self._pose(T_world_guess)
         pose = self._with_more(sight, pose, T_world_guess)
@@ -235,23 +250,13 @@ class Reconstruction:
         self._frames_lost = 0
         self._frames_since_keyframe += 1
         self._last_posed_id = frame.frame_id
-        self._motion.observe(frame.t_source_ns, pose.T_world_cam)
+        self._moves_to(frame.frame_id, frame.t_source_ns, pose.T_world_cam, pose.ids[pose.inliers])
         self._map.world.add_frame(frame.frame_id, reference.frame_id, pose.T_world_cam)
         mapper.note_sight(self._map.world, pose.ids, pose.inliers, frame.frame_id)
         tracks.keep(~np.isin(tracks.ids, pose.ids[~pose.inliers], assume_unique=True))
         tracks.vouch(pose.ids[pose.inliers])
-        is_keyframe = mapper.wants_keyframe(
-            mapper.keyframe_cues(
-                reference,
-                tracks.ids[tracks.visible],
-                tracks.xy[tracks.visible],
-                num_inliers=pose.num_inliers,
-                num_inliers_at_keyframe=self._map.num_inliers_at_keyframe,
-                max_features=self._settings.max_features,
-                width_px=self._camera.width,
-                frames_since=self._frames_since_keyframe,
-                usable_share=float(sight.usable.mean()),
-            )
+        is_keyframe = self._map.wants_keyframe(
+            reference, tracks, sight, pose.num_inliers, self._frames_since_keyframe
         )
         if self._on_pose is not None:
             self._on_pose(self._result(frame, pose.T_world_cam, pose, is_keyframe=is_keyframe))
@@ -277,8 +282,7 @@ class Reconstruction:
 
     def _posed_anew(self, sight: Sight, T_world_guess: Array) -> TrackedPose | None:
         """Estimate the pose of a frame again whose tracks or landmarks have moved."""
-        reference = self._map.reference_keyframe()
-        anew = self._pose(T_world_guess)
+        anew, reference = self._pose(T_world_guess), self._map.reference_keyframe()
         if anew is None or reference is None:
             return None
         self._map.world.add_frame(sight.frame.frame_id, reference.frame_id, anew.T_world_cam)
@@ -287,8 +291,7 @@ class Reconstruction:
 
     def _find(self, sight: Sight) -> FrameResult:
         """A frame without a running track: recognise a place, or work towards a new map."""
-        found = self._recover(sight)
-        if found is not None:
+        if (found := self._recover(sight)) is not None:
             return self._accept(sight, found)
         frame, tracks = sight.frame, self._tracks
         if self._state is TrackingState.LOST:
@@ -297,6 +300,7 @@ class Reconstruction:
             if self._frames_lost >= self._settings.lost_after_frames:
                 logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
                 self._state = TrackingState.INITIALIZING
+                self._map.world.forget_frames(self._motion.give_up())
                 self._begin_submap()
         since = time.perf_counter_ns()
         tracks.refill(sight)
@@ -326,9 +330,8 @@ class Reconstruction:
         if not world.keyframes:
             return None
         since = time.perf_counter_ns()
-        pose = None
-        if self._state is TrackingState.LOST:
-            pose = self._pose(None, min_share=_MIN_SHARE_WHEN_LOST)
+        is_lost = self._state is TrackingState.LOST
+        pose = self._pose(None, min_share=_MIN_SHARE_WHEN_LOST) if is_lost else None
         if pose is None:
             pose = self._recognise(sight)
         self._lap("relocalise", since)
@@ -366,22 +369,20 @@ class Reconstruction:
             self._settings.seed,
         )
         self._motion.reset()
-        for _, t_ns, T_world_cam in backfilled[-2:]:
-            self._motion.observe(t_ns, T_world_cam)
+        for posed in backfilled:
+            self._moves_to(*posed, grown.ids)
+        backfilled = tuple(posed for posed in backfilled if posed[0] in self._map.world.frames)
         self._initialiser.clear()
         self._frames_since_keyframe = 0
         self._lap("two_view", since)
         newest = self._map.world.pose_of_frame(sight.frame.frame_id)
         seen = self._tracks.seen()
         pose = self._pose_from(seen[self._map.world.landmarks.rows(seen.ids) >= 0], newest)
-        if pose is None:
-            self._state = TrackingState.LOST
-            self._frames_lost = 0
-            self._last_posed_id = sight.frame.frame_id
-            return self._result(sight.frame, newest, None, is_keyframe=True, backfilled=backfilled)
-        self._state = TrackingState.TRACKING
+        self._state = TrackingState.LOST if pose is None else TrackingState.TRACKING
+        self._frames_lost = 0
         self._last_posed_id = sight.frame.frame_id
-        self._motion.observe(sight.frame.t_source_ns, pose.T_world_cam)
+        if pose is not None:
+            self._moves_to(sight.frame.frame_id, sight.frame.t_source_ns, pose.T_world_cam, grown.ids)
         return self._result(sight.frame, newest, pose, is_keyframe=True, backfilled=backfilled)
 
     def _try_to_join(self, sight: Sight, T_world_cam: Array) -> float:
@@ -451,8 +452,7 @@ class Reconstruction:
         Returns:
             Number of keyframes that were adjusted.
         """
-        num_adjusted = self._map.adjust_whole()
-        if num_adjusted:
+        if num_adjusted := self._map.adjust_whole():
             self._moved(1.0)
         return num_adjusted
 

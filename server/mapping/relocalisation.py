@@ -18,7 +18,7 @@ from semcast.server.geometry.features import (
 )
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
-from semcast.server.mapping.tracks import Sight
+from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]

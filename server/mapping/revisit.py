@@ -22,7 +22,7 @@ from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.mapper import gather_observations, median_depth
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom
-from semcast.server.mapping.tracks import Sight
+from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]

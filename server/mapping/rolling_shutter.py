@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import to_grey
+from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame
-from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
+from semcast.server.mapping.tracks import TrackTable
 
 Array = NDArray[np.float64]
 #: x and y of each pixel, ``(H, W)`` each.

@@ -12,7 +12,8 @@ from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP, PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.rays import rays_of
-from semcast.server.mapping.tracks import Seen, TrackTable
+from semcast.server.mapping.sight import Seen
+from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]

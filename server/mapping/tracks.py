@@ -1,12 +1,12 @@
 """Keypoint tracks: points followed from image to image, with the confidence of their newest position."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import KLT_WINDOW_PX
-from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.geometry.features import (
     Grey,
     TrackedPoints,
@@ -25,14 +25,12 @@ from semcast.server.geometry.weighting import (
 )
 from semcast.server.geometry.wide_search import search_wide
 from semcast.server.mapping.found import Found
+from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.standing import is_fixed, scene_motion_px, stood
-from semcast.server.mapping.state import DecodedFrame
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Slots at or below this SNR hold nothing of the image (a lost slot is at -20 dB).
-LOST_SLOT_DB = -15.0
 #: A track may be out of sight for so many frames, as long as the image is what is missing.
 MAX_COAST = 3
 #: A point nearer than this to rows that did not arrive counts as hidden. What the decoder makes of such rows
@@ -42,62 +40,6 @@ _LOST_MARGIN_PX = 1
 _NEIGHBOURS, _MIN_NEIGHBOURS = 5, 8
 #: Share of tracks that must be found again; below, the frame counts as damaged and all tracks coast.
 _MIN_FOUND_SHARE = 0.35
-
-
-def usable_rows(frame: DecodedFrame, height: int) -> NDArray[np.bool_]:
-    """Which rows of the image arrived, ``(H,)``; all where nothing is known about slots."""
-    usable = np.ones(height, bool)
-    if frame.slot_snr_db is not None:
-        snr = np.nan_to_num(np.asarray(frame.slot_snr_db, dtype=np.float64), nan=-99.0)
-        lost = np.repeat(snr <= LOST_SLOT_DB, BLOCK_PX)[:height]
-        usable[: len(lost)] = ~lost
-    return usable
-
-
-@dataclass(frozen=True)
-class Sight:
-    """An image as the tracks see it.
-
-    Attributes:
-        frame: As received.
-        grey: ``(H, W)``.
-        usable: ``(H,)`` bool, rows that arrived.
-    """
-
-    frame: DecodedFrame
-    grey: Grey
-    usable: NDArray[np.bool_]
-
-    def near_lost(self, xy: Array, margin_px: int) -> NDArray[np.bool_]:
-        """Which points have a lost row within the margin."""
-        if self.usable.all():
-            return np.zeros(len(xy), bool)
-        reach = np.convolve(~self.usable, np.ones(2 * margin_px + 1, int), mode="same") > 0
-        y = np.clip(np.rint(np.nan_to_num(xy[:, 1])), 0, len(self.usable) - 1).astype(np.intp)
-        return np.asarray(reach[y])
-
-
-@dataclass(frozen=True)
-class Seen:
-    """Tracks as one image shows them.
-
-    Attributes:
-        ids: ``(N,)`` int64.
-        xy: ``(N, 2)`` pixels.
-        confidence: ``(N,)`` of the positions.
-    """
-
-    ids: Ids
-    xy: Array
-    confidence: Array
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "Seen":
-        return Seen(self.ids[rows], self.xy[rows], self.confidence[rows])
-
-
 #: After a jump a point is looked for no further than this from where descriptors put it.
 _MAX_FROM_JUMP_PX = 25.0
 #: What a track has, by attribute of ``TrackTable``.
@@ -133,6 +75,7 @@ class TrackTable:
         self._greys: list[Grey] = []
         self._frame_ids: list[int] = []
         self._before: dict[str, Array] | None = None
+        self._jumped = False
         self.clear()
 
     def clear(self) -> None:
@@ -237,6 +180,7 @@ class TrackTable:
             max_level: KLT pyramid levels.
         """
         self._before = {name: getattr(self, name).copy() for name in _COLUMNS}
+        self._jumped = False
         found = Found.nothing(self.xy)
         guess_xy = np.where(self.fixed[:, None], self.xy, guess_xy)
         for back in range(min(len(self._greys), MAX_COAST + 1)):
@@ -253,7 +197,7 @@ class TrackTable:
         of_scene = ~self.fixed
         if (found.ok & of_scene).sum() < _MIN_FOUND_SHARE * max(1, int((of_scene & ~hidden).sum())):
             jumped = self._jump(sight, found) if len(self._greys) else False
-            self._before = None  # a second look would be the same one
+            self._jumped = True
             coasting = self._hidden(sight, found, guess_xy) & ~found.ok if jumped else ~found.ok
         self._settle(sight, found, coasting)
         self.remember(sight)
@@ -273,6 +217,31 @@ class TrackTable:
         better = guess_xy[missed] + np.median(found.xy[near] - guess_xy[near], axis=1)
         found.take(missed, track_points(grey, sight.grey, self.xy[missed], better, max_level=2))
 
+    def follow_again(self, sight: Sight, guess: Callable[["TrackTable"], Array]) -> bool:
+        """Look again for what ``follow`` just looked for, from another guess.
+
+        Args:
+            sight: The image ``follow`` was given.
+            guess: Expected positions ``(N, 2)`` of tracks as they were before.
+
+        Returns:
+            Whether there was anything to look for.
+        """
+        if self._before is None or len(self._greys) < 2:
+            return False
+        self._take_back()
+        self.follow(sight, guess(self))
+        return True
+
+    def _take_back(self) -> None:
+        """Let the tracks be as they were before the newest image, and forget that."""
+        assert self._before is not None
+        for name, values in self._before.items():
+            setattr(self, name, values)
+        self._before = None
+        self._greys.pop()
+        self._frame_ids.pop()
+
     def follow_jump(self, sight: Sight) -> bool:
         """Look again for what ``follow`` just looked for, by descriptors.
 
@@ -281,17 +250,14 @@ class TrackTable:
         Returns:
             Whether more was found.
         """
-        if self._before is None or len(self._greys) < 2:
+        if self._before is None or self._jumped or len(self._greys) < 2:
             return False
         after = {name: getattr(self, name) for name in _COLUMNS}
-        for name, values in self._before.items():
-            setattr(self, name, values)
-        self._before = None
-        newest = self._greys.pop()
+        self._take_back()
         found = Found.nothing(self.xy)
         jumped = self._jump(sight, found)
         hidden = self._hidden(sight, found, self.xy)
-        self._greys.append(newest)
+        self.remember(sight)
         if not jumped or found.ok.sum() <= (after["missed"] == 0).sum():
             for name, values in after.items():
                 setattr(self, name, values)

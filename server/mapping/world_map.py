@@ -1,6 +1,6 @@
 """The map: landmarks as arrays, keyframes with their observations, bounded in size."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +49,11 @@ class Landmarks:
             return np.full(len(ids), -1, dtype=np.intp)
         row = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
         return np.asarray(np.where(self.ids[row] == ids, row, -1), dtype=np.intp)
+
+    def xyz_of(self, ids: Ids) -> Array:
+        """Positions ``(M, 3)`` of those of the ids that are there."""
+        row = self.rows(ids)
+        return self.xyz[row[row >= 0]]
 
     def add(
         self,
@@ -200,6 +205,10 @@ class WorldMap:
             KeyError: There is no such keyframe.
         """
         self.frames[frame_id] = (keyframe_id, invert_transform(self.poses[keyframe_id]) @ T_world_cam)
+
+    def forget_frames(self, frame_ids: Collection[int]) -> None:
+        """Take the pose from frames; keyframes among them stay for what they see."""
+        self.frames.forget(frame_ids)
 
     def keyframes_of(self, submap: int) -> list[Keyframe]:
         """Keyframes of a submap, in order of time."""

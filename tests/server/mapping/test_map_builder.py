@@ -13,8 +13,8 @@ from semcast.server.mapping.kept_frames import Observed
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import DecodedFrame
-from semcast.server.mapping.tracks import Sight
 from semcast.server.mapping.world_map import Keyframe
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)

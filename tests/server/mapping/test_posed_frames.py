@@ -75,3 +75,15 @@ def test_frames_of_some_keyframes_are_scaled(many):
         np.testing.assert_array_equal(many[k][1][:3, 3], factor * pose(k)[:3, 3])
         np.testing.assert_array_equal(many[k][1][:3, :3], np.eye(3))
     PosedFrames().rescale({1: 2.0})
+
+
+def test_frames_can_be_forgotten_and_set_again():
+    frames = PosedFrames()
+    for k in range(5):
+        frames[k] = (0, make_transform(np.eye(3), (k, 0, 0)))
+    frames.forget([1, 3, 77])
+    assert list(frames.columns()[0]) == [0, 2, 4]
+    assert 1 not in frames
+    assert frames[4][1][0, 3] == 4.0
+    frames[3] = (2, np.eye(4))
+    assert list(frames.columns()[1]) == [0, 0, 2, 0]

@@ -7,8 +7,8 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.rays import rays_of
+from semcast.server.mapping.sight import Seen
 from semcast.server.mapping.tracker import track_pose
-from semcast.server.mapping.tracks import Seen
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=319.5, cy=239.5, width=640, height=480)

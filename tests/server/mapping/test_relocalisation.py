@@ -8,8 +8,8 @@ from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import detect_corners
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.relocalisation import Relocaliser
+from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import DecodedFrame
-from semcast.server.mapping.tracks import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 CAMERA = Intrinsics(fx=300.0, fy=300.0, cx=160.0, cy=120.0, width=320, height=240)

@@ -15,8 +15,9 @@ from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.revisit import NUM_RECENT, find_revisit, place_anew
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame
-from semcast.server.mapping.tracks import Sight, TrackTable, usable_rows
+from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.window import build_problem
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 

@@ -7,9 +7,10 @@ from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
+from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.standing import is_fixed, scene_motion_px, stood
 from semcast.server.mapping.state import DecodedFrame
-from semcast.server.mapping.tracks import Sight, TrackTable
+from semcast.server.mapping.tracks import TrackTable
 
 CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
 WIDTH, HEIGHT = CAMERA.width, CAMERA.height

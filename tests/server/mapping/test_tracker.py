@@ -5,8 +5,8 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.sight import Seen
 from semcast.server.mapping.tracker import track_pose
-from semcast.server.mapping.tracks import Seen
 from semcast.server.mapping.world_map import WorldMap
 
 CAMERA = Intrinsics(fx=300, fy=300, cx=159.5, cy=119.5, width=320, height=240)

@@ -11,9 +11,10 @@ from semcast.common.geometry import make_transform
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
+from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracker import expected_positions
-from semcast.server.mapping.tracks import MAX_COAST, Sight, TrackTable, usable_rows
+from semcast.server.mapping.tracks import MAX_COAST, TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 SHAPE = (192, 256)

@@ -1,0 +1,143 @@
+"""The camera's motion from pose to pose, and images that stay while the camera goes on.
+
+A grabber that hangs and a video that repeats frames give the same image again under a new time. Its pose is
+that of the image, not of the time: on a road, ten such frames are ten metres off. While it lasts, nobody can
+tell such an image from a camera that stopped at once. The next one that differs tells: a camera that stood
+sets off from where it stood, one that went on is where it would have got to by then.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.geometry.motion import MAX_EXTRAPOLATION_S, ConstantVelocity
+
+Array = NDArray[np.float64]
+
+#: A camera stops at once when the image moves by less than this share of what was expected of it ...
+_STILL_SHARE = 0.15
+#: ... and that was at least so many pixels: less is within the error of poses.
+_LEAST_EXPECTED_PX = 2.0
+#: It went on when the image has moved by this share of what it would have moved all the while, or by so many
+#: times what it moved from one frame to the next: nothing sets off three times as fast as it came.
+_GONE_SHARE, _GONE_STEPS = 0.67, 3.0
+#: And in the same direction: least cosine between the two motions in the image.
+_SAME_DIRECTION = 0.5
+#: After so few frames the motion is told from before the stay: a video that repeats every image would seem to
+#: rest and set off twice as fast with each.
+_SHORT_STAY = 2
+#: Points must lie so far in front of the camera, as share of their usual depth.
+_LEAST_DEPTH_SHARE = 0.05
+_S_PER_NS = 1e-9
+
+
+class CameraMotion:
+    """Predicts poses from those before, and finds those whose image was not of their time.
+
+    Args:
+        camera: Pinhole.
+    """
+
+    def __init__(self, camera: Intrinsics) -> None:
+        self._camera = camera
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the motion."""
+        self._motion = ConstantVelocity()
+        self._moving: tuple[int, Array] | None = None
+        self._still: list[int] = []
+        self._still_ns = 0
+
+    @property
+    def speed_map_per_s(self) -> float:
+        """Length of the translation per second, the one before a stop while it lasts."""
+        return self._motion.speed_map_per_s
+
+    def correct(self, T_world_cam: Array, scale: float = 1.0) -> None:
+        """Replace the last pose after the map has moved; the motion in the camera's frame stays."""
+        self._motion.correct(T_world_cam, scale)
+        if self._moving is not None:
+            self._moving = (self._moving[0], T_world_cam.copy())
+
+    def predict(self, t_source_ns: int) -> Array | None:
+        """``T_world_cam`` expected at a time, None without any pose: where the camera stands or got to."""
+        if self._still and self._moving is not None:
+            return self._moving[1].copy()
+        return self._motion.predict(t_source_ns)
+
+    def predict_on(self, t_source_ns: int) -> Array | None:
+        """Where a camera that seems to have stopped would be if it went on, None where it did not stop."""
+        return self._motion.predict(t_source_ns) if self._still else None
+
+    def observe(self, frame_id: int, t_source_ns: int, T_world_cam: Array, xyz: Array) -> list[int]:
+        """Take the pose of a frame.
+
+        Args:
+            frame_id: Of the frame.
+            t_source_ns: Its time.
+            T_world_cam: Its pose.
+            xyz: ``(N, 3)`` points of the map that are in sight.
+
+        Returns:
+            Earlier frames whose poses are of another time: their image was an older one.
+        """
+        T_world_go = self._motion.predict(t_source_ns)
+        if self._moving is None or T_world_go is None:
+            self._go_on(t_source_ns, T_world_cam)
+            return []
+        since_ns, T_world_moving = self._moving
+        moved, expected = self._displacements(T_world_moving, (T_world_cam, T_world_go), xyz)
+        moved_px, expected_px = _median_length(moved), _median_length(expected)
+        if not self._still and expected_px < _LEAST_EXPECTED_PX:
+            self._go_on(t_source_ns, T_world_cam)
+            return []
+        # From here on, motions are counted in those from the frame before to this one.
+        before_ns = self._still_ns if self._still else since_ns
+        known_ns = min(t_source_ns - since_ns, round(MAX_EXTRAPOLATION_S / _S_PER_NS))
+        steps = known_ns / max(1, t_source_ns - before_ns)
+        step_px = expected_px / max(1.0, steps)
+        if moved_px < _STILL_SHARE * step_px:
+            self._still.append(frame_id)
+            self._still_ns = t_source_ns
+            return []
+        withdrawn: list[int] = []
+        if self._still:
+            gone = moved_px >= min(_GONE_SHARE * steps, _GONE_STEPS) * step_px
+            if steps > 1.0 and gone and _cosine(moved, expected) >= _SAME_DIRECTION:
+                withdrawn = self._still
+            elif len(self._still) > _SHORT_STAY:
+                self._motion.observe(self._still_ns, T_world_moving)
+        self._go_on(t_source_ns, T_world_cam)
+        return withdrawn
+
+    def give_up(self) -> list[int]:
+        """Let a camera that seemed to stop have gone on: what it saw is out of sight.
+
+        Returns:
+            Frames whose image was an older one, as ``observe`` does.
+        """
+        withdrawn, self._still = self._still, []
+        return withdrawn
+
+    def _go_on(self, t_source_ns: int, T_world_cam: Array) -> None:
+        self._motion.observe(t_source_ns, T_world_cam)
+        self._moving = (t_source_ns, T_world_cam.copy())
+        self._still = []
+
+    def _displacements(self, T_world_from: Array, to: tuple[Array, Array], xyz: Array) -> list[Array]:
+        """How points move in the image from one pose to others, ``(M, 2)`` each: of those in front in all."""
+        in_cam = [transform_points(invert_transform(T), xyz) for T in (T_world_from, *to)]
+        depth = np.median(in_cam[0][:, 2]) if len(xyz) else 0.0
+        front = np.all([p[:, 2] > _LEAST_DEPTH_SHARE * depth for p in in_cam], axis=0) & (depth > 0.0)
+        pixels = [self._camera.project(p[front]) for p in in_cam]
+        return [p - pixels[0] for p in pixels[1:]]
+
+
+def _median_length(motion: Array) -> float:
+    return float(np.median(np.linalg.norm(motion, axis=1))) if len(motion) else 0.0
+
+
+def _cosine(a: Array, b: Array) -> float:
+    return float((a * b).sum() / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-12))

@@ -1,0 +1,70 @@
+"""What one image shows: the image itself with the rows that arrived, and tracks in it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.phy.slots import BLOCK_PX
+from semcast.server.geometry.features import Grey
+from semcast.server.mapping.state import DecodedFrame
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Slots at or below this SNR hold nothing of the image (a lost slot is at -20 dB).
+LOST_SLOT_DB = -15.0
+
+
+def usable_rows(frame: DecodedFrame, height: int) -> NDArray[np.bool_]:
+    """Which rows of the image arrived, ``(H,)``; all where nothing is known about slots."""
+    usable = np.ones(height, bool)
+    if frame.slot_snr_db is not None:
+        snr = np.nan_to_num(np.asarray(frame.slot_snr_db, dtype=np.float64), nan=-99.0)
+        lost = np.repeat(snr <= LOST_SLOT_DB, BLOCK_PX)[:height]
+        usable[: len(lost)] = ~lost
+    return usable
+
+
+@dataclass(frozen=True)
+class Sight:
+    """An image as the tracks see it.
+
+    Attributes:
+        frame: As received.
+        grey: ``(H, W)``.
+        usable: ``(H,)`` bool, rows that arrived.
+    """
+
+    frame: DecodedFrame
+    grey: Grey
+    usable: NDArray[np.bool_]
+
+    def near_lost(self, xy: Array, margin_px: int) -> NDArray[np.bool_]:
+        """Which points have a lost row within the margin."""
+        if self.usable.all():
+            return np.zeros(len(xy), bool)
+        reach = np.convolve(~self.usable, np.ones(2 * margin_px + 1, int), mode="same") > 0
+        y = np.clip(np.rint(np.nan_to_num(xy[:, 1])), 0, len(self.usable) - 1).astype(np.intp)
+        return np.asarray(reach[y])
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Tracks as one image shows them.
+
+    Attributes:
+        ids: ``(N,)`` int64.
+        xy: ``(N, 2)`` pixels.
+        confidence: ``(N,)`` of the positions.
+    """
+
+    ids: Ids
+    xy: Array
+    confidence: Array
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "Seen":
+        return Seen(self.ids[rows], self.xy[rows], self.confidence[rows])

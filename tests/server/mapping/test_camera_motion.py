@@ -1,0 +1,108 @@
+"""Where the camera goes on to, and images that stayed while it did."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, make_transform
+from semcast.common.sequence import open_sequence
+from semcast.common.trajectory_error import ate
+from semcast.server.export.outputs import trajectory_of
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.camera_motion import CameraMotion
+from semcast.server.mapping.reconstruction import Reconstruction
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.state import DecodedFrame
+
+CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
+FRAME_NS = 100_000_000
+POINTS = np.random.default_rng(0).uniform((-4, -3, 6), (4, 3, 12), (200, 3))
+STREET = Path(__file__).parents[3] / "deploy" / "demo" / "kitti_06"
+
+
+def at(x):
+    return make_transform(exp_so3((0.0, 0.01 * x, 0.0)), (x, 0.0, 0.1 * x))
+
+
+def go(motion, xs, first=0, frame_ns=FRAME_NS):
+    """Frames that withdraw others -> those, for a camera that is at ``xs`` one after the other."""
+    withdrawn = {}
+    for k, x in enumerate(xs, start=first):
+        gone = motion.observe(k, k * frame_ns, at(x), POINTS)
+        if gone:
+            withdrawn[k] = gone
+    return withdrawn
+
+
+@pytest.mark.parametrize("num", [1, 4, 12, 30])
+def test_images_that_stay_while_the_camera_goes_on_are_of_another_time(num):
+    steps = [*range(5), *[4] * num, *range(5 + num, 9 + num)]
+    assert go(CameraMotion(CAMERA), 0.2 * np.array(steps)) == {5 + num: list(range(5, 5 + num))}
+
+
+@pytest.mark.parametrize("num", [1, 4, 12, 30])
+def test_a_camera_that_stood_keeps_its_poses(num):
+    steps = [*range(5), *[4] * num, *range(5, 9)]
+    assert go(CameraMotion(CAMERA), 0.2 * np.array(steps)) == {}
+
+
+def test_a_camera_that_turns_back_did_not_go_on():
+    assert go(CameraMotion(CAMERA), 0.2 * np.array([0, 1, 2, 3, 4, 4, 4, 1.5, 0])) == {}
+
+
+def test_a_shaking_camera_turns_at_its_ends():
+    assert go(CameraMotion(CAMERA), 0.2 * np.sin(np.pi / 4 + np.arange(40) * np.pi / 2)) == {}
+
+
+def test_a_video_with_every_image_twice_has_every_second_pose_withdrawn():
+    withdrawn = go(CameraMotion(CAMERA), 0.2 * np.repeat(np.arange(8), 2))
+    assert [k for gone in withdrawn.values() for k in gone] == [5, 7, 9, 11, 13]
+
+
+def test_frames_that_were_lost_after_the_stay_do_not_make_a_camera_that_stood_go_on():
+    motion = CameraMotion(CAMERA)
+    assert go(motion, 0.2 * np.array([0, 1, 2, 3, 4, 4, 4])) == {}
+    assert go(motion, 0.2 * np.array([7]), first=9) == {}, "three steps in three frames"
+
+
+def test_a_camera_that_seems_to_have_stopped_is_expected_where_it_is_or_where_it_got_to():
+    motion = CameraMotion(CAMERA)
+    go(motion, 0.2 * np.arange(5))
+    assert motion.predict_on(5 * FRAME_NS) is None
+    assert np.allclose(motion.predict(5 * FRAME_NS), at(1.0), atol=1e-3)
+    go(motion, [0.8, 0.8], first=5)
+    assert np.allclose(motion.predict(7 * FRAME_NS), at(0.8))
+    assert np.allclose(motion.predict_on(7 * FRAME_NS), at(1.4), atol=2e-2)
+    assert motion.give_up() == [5, 6]
+    assert motion.predict_on(7 * FRAME_NS) is None
+    assert np.allclose(motion.predict(7 * FRAME_NS), at(1.4), atol=2e-2)
+
+
+def test_a_camera_that_stood_sets_off_from_rest():
+    motion = CameraMotion(CAMERA)
+    go(motion, 0.2 * np.array([0, 1, 2, 3, 4, 4, 4, 4, 5]))
+    assert np.allclose(motion.predict(9 * FRAME_NS), at(1.2), atol=1e-2)
+
+
+def test_less_than_the_error_of_poses_is_no_stop():
+    assert go(CameraMotion(CAMERA), 0.01 * np.array([0, 1, 2, 3, 3, 3, 6, 7])) == {}
+
+
+def test_a_road_is_driven_past_a_grabber_that_hangs():
+    sequence = open_sequence(STREET)
+    times_ns = {}
+    reconstruction = Reconstruction(
+        sequence.intrinsics, ReconstructionSettings(max_features=400), InlineBundle()
+    )
+    hung = range(16, 20)
+    for k in range(28):
+        image = sequence.image(15 if k in hung else k)
+        times_ns[k] = int(sequence.times_ns[k])
+        reconstruction.process(DecodedFrame(k, times_ns[k], image))
+    poses = reconstruction.final_trajectory()
+    reconstruction.close()
+    assert sorted(set(range(28)) - set(poses)) == list(hung)
+    error = ate(trajectory_of(poses, times_ns), sequence.groundtruth())
+    assert error.rmse_m < 0.2
