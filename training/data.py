@@ -49,10 +49,14 @@ def read_images(folder: Path) -> list[NDArray[np.uint8]]:
     """Read all images of a folder as ``(H, W, 3)`` uint8 RGB, by name.
 
     Raises:
-        SourceError: The folder holds no readable image, or one is too small.
+        SourceError: The folder can't be read or holds no readable image, or one is too small.
     """
     images: list[NDArray[np.uint8]] = []
-    for path in sorted(p for p in folder.glob("*") if p.suffix.lower() in SUFFIXES):
+    try:
+        paths = sorted(folder.iterdir())
+    except OSError as err:
+        raise SourceError(f"images can't be read from {folder}: {err.strerror}") from err
+    for path in (p for p in paths if p.suffix.lower() in SUFFIXES):
         bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if bgr is not None:
             height, width = bgr.shape[:2]

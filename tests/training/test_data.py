@@ -91,6 +91,11 @@ def test_a_folder_without_images_is_an_error(tmp_path):
         read_images(tmp_path)
 
 
+def test_a_folder_that_is_not_there_is_named_as_that(tmp_path):
+    with pytest.raises(SourceError, match="images can't be read from .*nowhere: No such file"):
+        read_images(tmp_path / "nowhere")
+
+
 def test_crop_settings_are_checked():
     with pytest.raises(ValueError, match="size_px must be a positive multiple of 16, got 100"):
         CropSettings(size_px=100)
