@@ -22,7 +22,7 @@ class Recorder:
     """Takes messages from any thread and writes them on its own.
 
     When the disk is too slow, newest messages are dropped and counted. When it is full, that is reported
-    once and later messages are counted as dropped.
+    once, and messages that it did not take, and later ones, are counted as dropped.
 
     Args:
         path: File to write. One that is there and not empty is kept under another name: it may be the
@@ -50,8 +50,7 @@ class Recorder:
         self._sequence: Counter[str] = Counter()
         self._condition = threading.Condition()
         self._closed = False
-        self.num_written = 0
-        self.bytes_written = 0
+        self._num_taken = 0
         self.drops: Counter[str] = Counter()
         self.error: str | None = None
         self._former: Path | None = None
@@ -67,6 +66,16 @@ class Recorder:
             raise SourceError(f"{path} can't be written: {err}") from err
         self._thread = threading.Thread(target=self._run, name="semcast-recorder", daemon=True)
         self._thread.start()
+
+    @property
+    def num_written(self) -> int:
+        """Messages the disk has taken."""
+        return self._writer.num_written
+
+    @property
+    def bytes_written(self) -> int:
+        """Their payload."""
+        return self._writer.bytes_written
 
     def put(self, topic: str, kind: str, data: bytes, log_time_ns: int | None = None) -> None:
         """Queue one message; returns at once.
@@ -89,6 +98,7 @@ class Recorder:
                 return
             self._queue.append((topic, kind, now_ns, sequence, data))
             self._queued_bytes += len(data)
+            self._num_taken += 1
             self._condition.notify()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
@@ -106,28 +116,22 @@ class Recorder:
                 self._queued_bytes = 0
                 ending = self._closed
             try:
-                while batch:
-                    self._write(batch[0])
-                    batch.popleft()
+                for item in batch:
+                    if len(item) == 2:
+                        self._writer.add_metadata(*item)
+                    else:
+                        self._writer.add(*item)
                 self._writer.flush_if_due()
                 if ending:
                     self._writer.finish()
             except (OSError, ValueError, struct.error) as err:
                 # struct: of a number that the format has no room for.
-                self._fail(err, batch)
+                self._fail(err)
                 return
             if ending:
                 return
 
-    def _write(self, item: tuple[str, str, int, int, bytes] | tuple[str, Mapping[str, str]]) -> None:
-        if len(item) == 2:
-            self._writer.add_metadata(*item)
-            return
-        self._writer.add(*item)
-        self.num_written += 1
-        self.bytes_written += len(item[4])
-
-    def _fail(self, err: Exception, batch: "deque") -> None:
+    def _fail(self, err: Exception) -> None:
         """Say once that recording ended; what was written up to here stays readable."""
         logger.error(
             "recording into %s ended: %s; the stream goes on, %d messages were recorded",
@@ -137,8 +141,7 @@ class Recorder:
         )
         with self._condition:
             self.error = str(err)
-            lost = sum(len(item) != 2 for item in (*batch, *self._queue))
-            self.drops["disk"] += lost
+            self.drops["disk"] += self._num_taken - self.num_written
             self._queue.clear()
             self._queued_bytes = 0
 

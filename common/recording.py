@@ -3,6 +3,7 @@
 import contextlib
 import datetime
 import platform
+import sys
 import time
 from collections.abc import Mapping
 from importlib import metadata
@@ -55,18 +56,25 @@ class RecordingWriter:
         stream: Opened for writing.
         header: Values of the first metadata record, see ``recording_metadata``.
         chunk_bytes: Size of a chunk; a chunk also ends after ``flush``.
+
+    Attributes:
+        num_written: Messages of whole chunks, which the stream has taken.
+        bytes_written: Their payload.
     """
 
     def __init__(
         self, stream: BinaryIO, header: Mapping[str, str], *, chunk_bytes: int = CHUNK_BYTES
     ) -> None:
         self._stream = stream
-        self._writer = Writer(stream, chunk_size=chunk_bytes, compression=CompressionType.NONE)
+        # The library would end a chunk without a word, and nobody knew what the stream has taken.
+        self._writer = Writer(stream, chunk_size=sys.maxsize, compression=CompressionType.NONE)
+        self._chunk_bytes = chunk_bytes
         self._writer.start(profile="semcast", library=f"semcast {header.get('semcast', '')}".strip())
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._flushed_s = time.monotonic()
-        self._pending = False
+        self._num_pending = self._bytes_pending = 0
+        self.num_written = self.bytes_written = 0
         self.add_metadata(RECORDING_METADATA, header)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
@@ -93,23 +101,29 @@ class RecordingWriter:
             channel = self._writer.register_channel(topic, MESSAGE_ENCODING, schema)
             self._channels[(topic, kind)] = channel
         self._writer.add_message(channel, log_time_ns, data, log_time_ns, sequence)
-        self._pending = True
+        self._num_pending += 1
+        self._bytes_pending += len(data)
+        if self._bytes_pending >= self._chunk_bytes:
+            self.flush()
 
     def flush_if_due(self) -> None:
         """End the chunk when it has been open for half a second, so that a kill loses no more than that."""
-        if self._pending and time.monotonic() - self._flushed_s >= FLUSH_INTERVAL_S:
+        if self._num_pending and time.monotonic() - self._flushed_s >= FLUSH_INTERVAL_S:
             self.flush()
 
     def flush(self) -> None:
         """End the chunk and hand everything to the operating system."""
-        # The library ends a chunk only when it is full and has no public way to ask for it.
+        # The library has no public way to ask for the end of a chunk.
         self._writer._Writer__finalize_chunk()  # type: ignore[attr-defined]
         self._stream.flush()
-        self._pending = False
+        self.num_written += self._num_pending
+        self.bytes_written += self._bytes_pending
+        self._num_pending = self._bytes_pending = 0
         self._flushed_s = time.monotonic()
 
     def finish(self) -> None:
         """Write index and end mark; the stream stays open."""
+        self.flush()
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.flush()
 
