@@ -1,10 +1,14 @@
 """What bundle adjustment is asked and what it answers: plain arrays that travel between processes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.server.geometry.weighting import NoiseModel
 
 Array = NDArray[np.float64]
 
@@ -50,6 +54,80 @@ class BundleProblem:
     map_version: int = 0
     num_anchors: int = 0
     with_covariance: bool = True
+
+
+class Frame(Protocol):
+    """What saw something."""
+
+    @property
+    def frame_id(self) -> int:
+        """Its number in the stream."""
+
+
+class Observations(NamedTuple):
+    """What views saw of some tracks: view, row of the track, pixel and confidence of each observation."""
+
+    view: NDArray[np.intp]
+    point: NDArray[np.intp]
+    xy: Array
+    confidence: Array
+
+    def of_rows(self, kept: NDArray[np.bool_], point: NDArray[np.intp]) -> "Observations":
+        """Return those that are ``kept (M,)``, with the rows their tracks have then."""
+        return Observations(self.view[kept], point, self.xy[kept], self.confidence[kept])
+
+
+def assemble_problem(
+    camera: Intrinsics,
+    views: Sequence[Frame],
+    T_world_cam: Array,
+    landmark_ids: NDArray[np.int64],
+    xyz: Array,
+    seen: Observations,
+    noise: NoiseModel,
+    *,
+    fixed: NDArray[np.bool_],
+    keep_baseline: bool,
+    iterations: int,
+    map_version: int = 0,
+    num_anchors: int = 0,
+    with_covariance: bool = False,
+) -> BundleProblem:
+    """Put a problem together from what views saw; the noise model gives each observation its sigma.
+
+    Args:
+        camera: Pinhole.
+        views: In order of time.
+        T_world_cam: ``(K, 4, 4)`` of the views.
+        landmark_ids: ``(P,)``.
+        xyz: ``(P, 3)`` where they are.
+        seen: Observations, with rows into ``landmark_ids``.
+        noise: Of the observations.
+        fixed: See ``BundleProblem``, as the others.
+        keep_baseline: The same.
+        iterations: The same.
+        map_version: The same.
+        num_anchors: The same.
+        with_covariance: The same.
+    """
+    return BundleProblem(
+        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+        keyframe_ids=np.array([frame.frame_id for frame in views], dtype=np.int64),
+        T_world_cam=T_world_cam,
+        fixed=fixed,
+        keep_baseline=keep_baseline,
+        landmark_ids=landmark_ids,
+        xyz=xyz,
+        view=seen.view,
+        point=seen.point,
+        xy=seen.xy,
+        sigma_px=noise.sigma_px(seen.confidence),
+        confidence=seen.confidence,
+        iterations=iterations,
+        map_version=map_version,
+        num_anchors=num_anchors,
+        with_covariance=with_covariance,
+    )
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from semcast.common.geometry import invert_transform
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.ambiguity import Side
-from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.bundle_problem import BundleProblem, assemble_problem
 from semcast.server.mapping.kept_frames import Observed, pose_of
 from semcast.server.mapping.mapper import gather_observations
 
@@ -111,32 +111,28 @@ def problem_of(
     all_ids, count = np.unique(np.concatenate([o.ids for o in views]), return_counts=True)
     longest = np.lexsort((all_ids, -count))[:_MAX_DECIDING]
     ids = np.sort(all_ids[longest[count[longest] >= 2]])
-    view, point, xy, confidence = gather_observations(views, ids)
-    sigma = noise.sigma_px(confidence)
+    seen = gather_observations(views, ids)
+    sigma = noise.sigma_px(seen.confidence)
     T_cam_world = invert_transform(T_world_cam)
-    points = triangulate(camera, T_cam_world, view, point, xy, sigma, len(ids))
+    points = triangulate(camera, T_cam_world, seen.view, seen.point, seen.xy, sigma, len(ids))
     if not points.in_front.any():
         return None
     # A point that fits nowhere begins at a usual depth: the other structure may have a place for it.
-    _, first = np.unique(point, return_index=True)
-    T_first = T_cam_world[view[first]]
+    _, first = np.unique(seen.point, return_index=True)
+    T_first = T_cam_world[seen.view[first]]
     z = np.einsum("pi,pi->p", T_first[:, 2, :3], points.xyz) + T_first[:, 2, 3]
-    ray = camera.unproject(xy[first]) * float(np.median(z[points.in_front]))
-    T = T_world_cam[view[first]]
+    ray = camera.unproject(seen.xy[first]) * float(np.median(z[points.in_front]))
+    T = T_world_cam[seen.view[first]]
     along = np.einsum("pij,pj->pi", T[:, :3, :3], ray) + T[:, :3, 3]
-    return BundleProblem(
-        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
-        keyframe_ids=np.array([o.frame_id for o in views], dtype=np.int64),
-        T_world_cam=T_world_cam,
+    return assemble_problem(
+        camera,
+        views,
+        T_world_cam,
+        ids,
+        np.where(points.in_front[:, None], points.xyz, along),
+        seen,
+        noise,
         fixed=np.arange(len(views)) == 0,
         keep_baseline=True,
-        landmark_ids=ids,
-        xyz=np.where(points.in_front[:, None], points.xyz, along),
-        view=view,
-        point=point,
-        xy=xy,
-        sigma_px=sigma,
-        confidence=confidence,
         iterations=_DECIDING_ITERATIONS,
-        with_covariance=False,
     )

@@ -16,7 +16,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import optimise
-from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.bundle_problem import assemble_problem
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
 from semcast.server.mapping.mapper import (
@@ -122,30 +122,26 @@ def _with_new_points(
 def _adjusted(camera: Intrinsics, start: Start, noise: NoiseModel) -> Start:
     """Adjust the first keyframes and what they see; the last two of them hold the rest where it is."""
     window = start.keyframes[:_WINDOW]
-    view, point, xy, confidence = gather_observations(window, start.ids)
-    count = np.bincount(point, minlength=len(start.ids))
-    seen, kept, point = within_limit(start.ids, point, -count)
+    seen = gather_observations(window, start.ids)
+    count = np.bincount(seen.point, minlength=len(start.ids))
+    taken, kept, point = within_limit(start.ids, seen.point, -count)
     result = optimise(
-        BundleProblem(
-            intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
-            keyframe_ids=np.array([k.frame_id for k in window], dtype=np.int64),
-            T_world_cam=np.stack([k.T_world_cam for k in window]),
+        assemble_problem(
+            camera,
+            window,
+            np.stack([k.T_world_cam for k in window]),
+            start.ids[taken],
+            start.xyz[taken],
+            seen.of_rows(kept, point),
+            noise,
             fixed=np.arange(len(window)) >= len(window) - 2,
             keep_baseline=False,
-            landmark_ids=start.ids[seen],
-            xyz=start.xyz[seen],
-            view=view[kept],
-            point=point,
-            xy=xy[kept],
-            sigma_px=noise.sigma_px(confidence[kept]),
-            confidence=confidence[kept],
             iterations=_ITERATIONS,
-            with_covariance=False,
         )
     )
     if not result.ok:
         return start
     xyz = start.xyz.copy()
-    xyz[seen] = result.xyz
+    xyz[taken] = result.xyz
     adjusted = [replace(k, T_world_cam=T) for k, T in zip(window, result.T_world_cam, strict=True)]
     return replace(start, keyframes=[*adjusted, *start.keyframes[_WINDOW:]], xyz=xyz)

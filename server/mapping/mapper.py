@@ -11,7 +11,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
-from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
+from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, Observations
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
@@ -231,9 +231,7 @@ class Seen(Protocol):
         """``(M,)``."""
 
 
-def gather_observations(
-    views: Sequence[Seen], ids: Ids
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
+def gather_observations(views: Sequence[Seen], ids: Ids) -> Observations:
     """Find every observation of some tracks in some views.
 
     Args:
@@ -241,8 +239,7 @@ def gather_observations(
         ids: ``(P,)`` tracks, ascending.
 
     Returns:
-        View, row into ``ids``, pixel and confidence of each observation: ``(M,)``, ``(M,)``, ``(M, 2)`` and
-        ``(M,)``, view by view.
+        View ``(M,)``, row into ``ids (M,)``, pixel ``(M, 2)`` and confidence ``(M,)`` of each, view by view.
     """
     view, point, xy, confidence = [], [], [], []
     for k, keyframe in enumerate(views):
@@ -252,7 +249,7 @@ def gather_observations(
         point.append(row[hit].astype(np.intp))
         xy.append(keyframe.xy[hit])
         confidence.append(keyframe.confidence[hit])
-    return np.concatenate(view), np.concatenate(point), np.concatenate(xy), np.concatenate(confidence)
+    return Observations(*(np.concatenate(column) for column in (view, point, xy, confidence)))
 
 
 def median_depth(world: WorldMap, keyframe: Keyframe) -> float:

@@ -14,7 +14,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import optimise
-from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
+from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, assemble_problem
 from semcast.server.mapping.mapper import drop_outliers, gather_observations
 from semcast.server.mapping.window import within_limit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -93,26 +93,22 @@ def _adjust(
     """
     ids = np.unique(np.concatenate([k.ids for k in part]))
     ids = ids[world.landmarks.rows(ids) >= 0]
-    view, point, xy, confidence = gather_observations(part, ids)
+    seen = gather_observations(part, ids)
     limit = max(MAX_OBSERVATIONS, OBSERVATIONS_EACH * len(part))
-    taken, kept, point = within_limit(ids, point, limit=limit)
+    taken, kept, point = within_limit(ids, seen.point, limit=limit)
     landmark_ids = ids[taken]
     result = optimise(
-        BundleProblem(
-            intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
-            keyframe_ids=np.array([k.frame_id for k in part], dtype=np.int64),
-            T_world_cam=np.stack([k.T_world_cam for k in part]),
+        assemble_problem(
+            camera,
+            part,
+            np.stack([k.T_world_cam for k in part]),
+            landmark_ids,
+            world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
+            seen.of_rows(kept, point),
+            noise,
             fixed=np.arange(len(part)) == 0,
             keep_baseline=True,
-            landmark_ids=landmark_ids,
-            xyz=world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
-            view=view[kept],
-            point=point,
-            xy=xy[kept],
-            sigma_px=noise.sigma_px(confidence[kept]),
-            confidence=confidence[kept],
             iterations=_ITERATIONS,
-            with_covariance=False,
         )
     )
     if not result.ok:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.bundle_problem import BundleProblem
+from semcast.server.mapping.bundle_problem import BundleProblem, assemble_problem
 from semcast.server.mapping.mapper import gather_observations, median_depth
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -73,37 +73,35 @@ def build_problem(
     ids = ids[world.landmarks.rows(ids) >= 0]
     anchors = _anchors(world, mine[:-window_size], recent, ids)
     views = [*anchors, *recent]
-    view, point, xy, confidence = gather_observations(views, ids)
-    count = np.bincount(point, minlength=len(ids))
+    seen = gather_observations(views, ids)
+    count = np.bincount(seen.point, minlength=len(ids))
     # What ties the window to older keyframes and what the newest one sees are sure of a part of the room: the
     # longest tracks of a scene that stays in view would take all of it. Then what several keyframes see.
-    is_anchored = np.isin(np.arange(len(ids)), point[view < len(anchors)])
+    is_anchored = np.isin(np.arange(len(ids)), seen.point[seen.view < len(anchors)])
     is_newest = np.isin(ids, recent[-1].ids, assume_unique=True)
     turn = _turns(ids, count, (is_newest, _NEWEST_SHARE), (is_anchored, _ANCHORED_SHARE))
     order = -np.minimum(count, _WELL_SEEN), turn
-    used_points, kept, point = within_limit(ids, point, *order, limit=MAX_OBSERVATIONS)
+    used_points, kept, point = within_limit(ids, seen.point, *order, limit=MAX_OBSERVATIONS)
     if len(used_points) < 8:
         return None
-    held = np.bincount(view[kept], minlength=len(views))[: len(anchors)] >= _MIN_SHARED
+    held = np.bincount(seen.view[kept], minlength=len(views))[: len(anchors)] >= _MIN_SHARED
     fixed = np.zeros(len(views), bool)
     fixed[: len(anchors) + (1 if start or held.sum() >= 2 else 2)] = True
     landmark_ids = ids[used_points]
-    return BundleProblem(
-        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
-        keyframe_ids=np.array([k.frame_id for k in views], dtype=np.int64),
-        T_world_cam=np.stack([k.T_world_cam for k in views]),
+    return assemble_problem(
+        camera,
+        views,
+        np.stack([k.T_world_cam for k in views]),
+        landmark_ids,
+        world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
+        seen.of_rows(kept, point),
+        noise,
         fixed=fixed,
         keep_baseline=start,
-        landmark_ids=landmark_ids,
-        xyz=world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
-        view=view[kept],
-        point=point,
-        xy=xy[kept],
-        sigma_px=noise.sigma_px(confidence[kept]),
-        confidence=confidence[kept],
         iterations=iterations,
         map_version=map_version,
         num_anchors=len(anchors),
+        with_covariance=True,
     )
 
 
