@@ -61,8 +61,10 @@ def adjust_whole_map(world: WorldMap, camera: Intrinsics, noise: NoiseModel) -> 
         for part in _hanging_together(world, mine):
             if len(part) < _MIN_KEYFRAMES:
                 continue
-            results = [_adjust(world, part, settled, camera, noise) for _ in range(_ROUNDS)]
-            if any(results):
+            num_rounds = 0
+            while num_rounds < _ROUNDS and _adjust(world, part, settled, camera, noise):
+                num_rounds += 1
+            if num_rounds:
                 settled += part
         num_adjusted += len(settled)
     return num_adjusted

@@ -1,5 +1,7 @@
 """All keyframes adjusted at once: what drifted is put right, and what hangs on nothing stays."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from semcast.common.geometry import (
 )
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping import whole_map
+from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.whole_map import adjust_whole_map
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -229,3 +232,17 @@ def test_each_keyframe_keeps_observations_enough_where_there_are_many(monkeypatc
     before = steps(world)
     assert adjust_whole_map(world, CAMERA, NOISE) == NUM_KEYFRAMES
     assert steps(world) < before
+
+
+def test_a_part_that_can_not_be_adjusted_is_tried_once(monkeypatch):
+    """Nothing has changed since, so a second try would end as the first."""
+    world, _ = drifted_world()
+    asked = []
+
+    def in_vain(problem):
+        asked.append(problem)
+        return replace(optimise(replace(problem, iterations=1)), ok=False)
+
+    monkeypatch.setattr(whole_map, "optimise", in_vain)
+    assert adjust_whole_map(world, CAMERA, NOISE) == 0
+    assert len(asked) == 1
