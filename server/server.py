@@ -400,6 +400,7 @@ class Server:
 
     def _conclude(self, session: Session) -> None:
         """Adjust the whole map of a stream that has ended, and tell who follows it."""
+        self._save(session)  # the adjustment takes seconds, and the server may be stopped or killed meanwhile
         update = session.conclude()
         if update is not None:
             self._outbox.put_map(session.identity.agent_epoch, update)
@@ -439,8 +440,6 @@ class Server:
         if session is None:
             return {}
         try:
-            if not self._complete:
-                self._save(session)  # who stopped the server may not wait for the adjustment
             self._conclude(session)
             summary = self._end(session, self._settings.out)
         except OSError as err:

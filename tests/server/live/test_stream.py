@@ -48,17 +48,20 @@ def test_a_lossless_stream_leaves_every_promised_file_and_repeats_bit_for_bit(tm
     assert trajectories[0] == trajectories[1]
 
 
+@pytest.mark.parametrize("stop", [True, False], ids=["stopped", "complete"])
 def test_a_stream_is_saved_and_released_where_the_adjustment_at_its_end_is_broken_off(
-    air, tmp_path, monkeypatch
+    air, tmp_path, monkeypatch, stop
 ):
     def break_off(session):
         raise RuntimeError("a second Ctrl-C")
 
     monkeypatch.setattr("semcast.server.session.Session.conclude", break_off)
     running = air.serve(out=tmp_path, save_images="all")
-    air.agent(100).stream(range(12))
+    radio = air.agent(100)
+    radio.stream(range(11))
+    radio.stream([11], final=not stop)
     with pytest.raises(RuntimeError, match="second Ctrl-C"):
-        running.finish(stop=True)
+        running.finish(stop=stop)
     assert len(read_run(tmp_path).frame_ids) >= 8
     names = {thread.name for thread in threading.enumerate()}
     assert names.isdisjoint({"semcast-checkpoint", "semcast-images"})
