@@ -5,6 +5,8 @@ import signal
 import subprocess
 from pathlib import Path
 
+from semcast.parent import bound_to_this
+
 #: How long a role may take to write everything after it was asked to stop.
 STOP_DEADLINE_S = 30.0
 
@@ -18,10 +20,18 @@ class Role:
         self.told = False
 
     def start(self) -> None:
-        """Start the process in a group of its own, so that Ctrl-C reaches it only through us."""
+        """Start the process in a group of its own, so that Ctrl-C reaches it only through us.
+
+        It ends with this one, however that ends; one that is started by hand later on does not.
+        """
         with self.log.open("wb") as log:
             self._process = subprocess.Popen(
-                self.command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+                self.command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                env=bound_to_this(),
             )
 
     @property

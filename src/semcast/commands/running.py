@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from semcast.commands.paths import named_path
 from semcast.common.config_flags import add_flags, given_values, settings_from
+from semcast.parent import stop_with_parent
 
 S = TypeVar("S")
 
@@ -71,8 +72,11 @@ def stop_on_signals(stop: threading.Event) -> Iterator[Interrupted]:
 
 
 def run_until_stopped(work: Callable[[threading.Event], object]) -> int:
-    """Call ``work(stop)`` with signals wired to ``stop``; exit code 130 after Ctrl-C, else 0."""
+    """Call ``work(stop)`` with signals wired to ``stop``; exit code 130 after Ctrl-C, else 0.
+
+    A role of a demo stops with the demo, too.
+    """
     stop = threading.Event()
-    with stop_on_signals(stop) as interrupted:
+    with stop_on_signals(stop) as interrupted, stop_with_parent(stop):
         work(stop)
     return 130 if interrupted.by_user else 0
