@@ -209,7 +209,8 @@ class LoopFinder:
         apart = np.linalg.norm(position[: len(older)] - T_world_cam[:3, 3], axis=1)
         axis = np.stack([k.T_world_cam[:3, 2] for k in older])
         turn = np.arccos(np.clip(axis @ T_world_cam[:3, 2], -1.0, 1.0))
-        reach = 2 * np.arctan(0.5 * np.hypot(self._camera.width, self._camera.height) / self._camera.fx)
+        camera = self._camera
+        reach = 2 * np.arctan(0.5 * np.hypot(camera.width / camera.fx, camera.height / camera.fy))
         depth = median_depth(world, newest)
         near = (apart < _MAX_DRIFT * way + depth) & (apart < _MAX_APART * way) & (turn < 0.5 * reach)
         rows = np.flatnonzero(near)

@@ -188,6 +188,18 @@ def test_far_from_old_keyframes_nothing_is_compared(room):
     assert recogniser.asked == []
 
 
+def test_which_keyframes_are_compared_does_not_depend_on_the_shape_of_pixels(room):
+    asked = []
+    for squeeze in (1.0, 0.1):
+        recogniser = Recogniser()
+        finder = LoopFinder(CAMERA.scaled_to(round(320 * squeeze), 240), recogniser, 0)
+        for _ in range(_LOOK_INTERVAL):
+            look(finder, room)
+        asked.append(recogniser.asked)
+    assert len(asked[0]) == 1
+    assert asked[0] == asked[1]
+
+
 def test_drift_is_shared_out_along_the_way(room, rng):
     world, xyz = room
     loop = look(LoopFinder(CAMERA, Recogniser(), 0), room, old_landmarks(room, HERE, rng))
