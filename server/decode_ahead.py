@@ -22,7 +22,8 @@ class DecodeAhead(Generic[In, Out]):
     superseded) where they arrive, and the tracker never gets one older than its own last frame took.
 
     Args:
-        take: Waits up to the given seconds for a message; None when there was none.
+        take: Waits up to the given seconds for a message; None when there was none. Where it fails, that is
+            logged and the stream goes on.
         decode: Turns a message into what the tracker takes.
         on_failure: Is told the message and ``codec`` (the sender uses another codec or a message makes no
             sense) or ``decode`` (the decoder failed); the stream goes on.
@@ -49,7 +50,12 @@ class DecodeAhead(Generic[In, Out]):
             with self._condition:
                 if not self._condition.wait_for(lambda: self._slot is None, POLL_S):
                     continue
-            message = self._take(POLL_S)
+            try:
+                message = self._take(POLL_S)
+            except Exception:
+                logger.exception("a frame could not be taken and is left out")
+                self._stopping.wait(POLL_S)  # it may fail again at once
+                continue
             if message is None:
                 continue
             try:

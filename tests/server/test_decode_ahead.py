@@ -74,3 +74,18 @@ def test_one_bad_frame_never_stops_the_stream(caplog):
     ahead.close()
     assert failures == [(1, "codec"), (2, "codec"), (3, "decode")]
     assert caplog.text.count("the samples don't fit") == 1
+
+
+def test_a_frame_that_can_not_be_taken_never_stops_the_stream(caplog):
+    inbox = Inbox(3)
+
+    def take(timeout_s):
+        number = inbox.take(timeout_s)
+        if number == 1:
+            raise ZeroDivisionError
+        return number
+
+    ahead = DecodeAhead(take, lambda x: x + 100, lambda m, r: None)
+    assert drain(ahead, 2) == [100, 102]
+    ahead.close()
+    assert "could not be taken" in caplog.text
