@@ -1,7 +1,8 @@
-"""Scenes of points for tests of how a map begins."""
+"""Scenes of points for tests of how a map begins, and the boards that whole maps are made of."""
 
 import numpy as np
 import pytest
+from drawn_boards import render, sideways
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
@@ -99,3 +100,10 @@ def relative():
 @pytest.fixture(scope="session")
 def direction_error_deg():
     return _direction_error_deg
+
+
+@pytest.fixture(scope="session")
+def room():
+    """Poses along the boards, and what a camera sees there."""
+    poses = sideways()
+    return poses, [render(T) for T in poses]

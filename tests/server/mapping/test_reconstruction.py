@@ -1,97 +1,21 @@
 """The whole core on rendered sequences of textured planes, without any data files."""
 
-import cv2
 import numpy as np
 import pytest
+from drawn_boards import CAMERA, ate_percent, frame_of, make, render
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import (
-    align_umeyama,
     exp_so3,
     invert_transform,
     make_transform,
-    rotation_angle_deg,
 )
 from semcast.common.phy.slots import BLOCK_PX
-from semcast.server.mapping import reconstruction
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_process import ProcessBundle
-from semcast.server.mapping.look_back import look_back
-from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.reconstruction import Reconstruction
-from semcast.server.mapping.relocalisation import Place, Relocaliser
 from semcast.server.mapping.settings import ReconstructionSettings
-from semcast.server.mapping.state import DecodedFrame, TrackingState
-
-CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
-FRAME_NS = 100_000_000
-#: Centre, size and depth order of upright boards (far to near).
-BOARDS = (
-    (6.0, 0.0, 9.0, 40.0),
-    (-2.2, 0.6, 6.0, 2.6),
-    (2.0, -0.5, 5.0, 2.2),
-    (0.3, 1.2, 4.0, 1.4),
-    (-1.0, -1.1, 4.5, 1.2),
-)
-
-
-def board_texture(seed, size=512):
-    rng = np.random.default_rng(seed)
-    noise = np.zeros((size, size), np.float32)
-    for sigma in (2.0, 6.0, 16.0):
-        layer = cv2.GaussianBlur(rng.standard_normal((size, size)).astype(np.float32), None, sigma)
-        noise += layer / layer.std()
-    return np.clip(noise * 32 + 128, 0, 255).astype(np.uint8)
-
-
-TEXTURES = [board_texture(k, 1536 if k == 0 else 256) for k in range(len(BOARDS))]
-
-
-def render(T_world_cam):
-    """Draw the boards from far to near by the homography of each."""
-    T = invert_transform(T_world_cam)
-    image = np.zeros(CAMERA.shape_hw, np.uint8)
-    for texture, (x, y, z, size) in zip(TEXTURES, BOARDS, strict=True):
-        scale = size / texture.shape[0]
-        board = np.array([[scale, 0, x - size / 2], [0, scale, y - size / 2], [0, 0, z], [0, 0, 1]])
-        H = CAMERA.K @ (T[:3] @ board)
-        mask = cv2.warpPerspective(np.full_like(texture, 255), H, (CAMERA.width, CAMERA.height))
-        drawn = cv2.warpPerspective(texture, H, (CAMERA.width, CAMERA.height), flags=cv2.INTER_AREA)
-        image = np.where(mask == 255, drawn, image)
-    return np.repeat(image[..., None], 3, axis=2)
-
-
-def sideways(num=24):
-    return [
-        make_transform(exp_so3((0.0, -0.006 * k, 0.002 * k)), (0.08 * k, 0.03 * np.sin(k / 4), 0.03 * k))
-        for k in range(num)
-    ]
-
-
-@pytest.fixture(scope="module")
-def room():
-    poses = sideways()
-    return poses, [render(T) for T in poses]
-
-
-def frame_of(frame_id, image, **maps):
-    return DecodedFrame(frame_id, frame_id * FRAME_NS, image, **maps)
-
-
-def make(bundle=None, **settings):
-    return Reconstruction(
-        CAMERA, ReconstructionSettings(**{"max_features": 250, **settings}), bundle or InlineBundle()
-    )
-
-
-def ate_percent(trajectory, truth):
-    """RMS position error after Sim(3) in percent of the path."""
-    ids = sorted(trajectory)
-    ours = np.array([trajectory[k][:3, 3] for k in ids])
-    theirs = np.array([truth[k][:3, 3] for k in ids])
-    scale, R, t = align_umeyama(ours, theirs)
-    error = np.linalg.norm(scale * ours @ R.T + t - theirs, axis=1)
-    return 100 * np.sqrt((error**2).mean()) / np.linalg.norm(np.diff(theirs, axis=0), axis=1).sum()
+from semcast.server.mapping.state import TrackingState
 
 
 def run(images, reconstruction, ids=None):
@@ -257,186 +181,6 @@ def test_a_covered_lens_is_a_gap(room):
     one, other = with_them.final_trajectory(), without.final_trajectory()
     assert one.keys() == other.keys()
     np.testing.assert_array_equal(np.stack(list(one.values())), np.stack(list(other.values())))
-
-
-def test_another_place_becomes_a_map_of_its_own(room):
-    _, images = room
-    other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
-    reconstruction = make(lost_after_frames=3)
-    sequence = images[:8] + other[:8]
-    results = [reconstruction.process(frame_of(k, image)) for k, image in enumerate(sequence)]
-    assert results[-1].state is TrackingState.TRACKING
-    assert (results[7].submap, results[-1].submap) == (0, 1)
-    assert results[-1].map_epoch == 0
-    assert len(reconstruction.final_trajectory()) >= len(sequence) - 4
-
-
-def test_the_unit_of_a_new_part_is_told_by_its_start_alone(monkeypatch):
-    """Before the start the camera only turned: over that time it was not as fast as before and after."""
-    starts = []
-
-    def noted(camera, start, *rest):
-        starts.append((start, look_back(camera, start, *rest)))
-        return starts[-1][1]
-
-    monkeypatch.setattr(reconstruction, "look_back", noted)
-    truth = [make_transform(np.eye(3), (0.12 * k, 0.05 * np.sin(k), 0.0)) for k in range(8)]
-    truth += [make_transform(exp_so3((0.0, 0.03 * k, 0.0)), (13.0, 0.0, 0.0)) for k in range(30, 0, -1)]
-    truth += [make_transform(np.eye(3), (13.0 - 0.15 * k, 0.05 * np.sin(k), 0.0)) for k in range(1, 26)]
-    core = make(lost_after_frames=2)
-    for k, T in enumerate(truth):
-        result = core.process(frame_of(k, render(T)))
-        if k == 7:
-            speed_map_per_s = core._motion.speed_map_per_s
-        if len(starts) == 2:
-            break
-    start, grown = ([keyframe.frame_id for keyframe in s.keyframes] for s in starts[1])
-    assert result.submap == 1
-    assert grown[0] < start[0], "the part has grown over frames in which the camera turned"
-    trajectory = core.final_trajectory()
-    way = np.linalg.norm(trajectory[start[-1]][:3, 3] - trajectory[start[0]][:3, 3])
-    elapsed_s = (start[-1] - start[0]) * FRAME_NS * 1e-9
-    assert way / elapsed_s == pytest.approx(speed_map_per_s, rel=0.1)
-
-
-def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch):
-    scales, covariances = [], []
-    join, carried_over = MapBuilder.join, MapBuilder.pose_covariance
-    monkeypatch.setattr(MapBuilder, "join", lambda *a: scales.append(join(*a)) or scales[-1])
-    monkeypatch.setattr(
-        MapBuilder, "pose_covariance", lambda *a: covariances.append(a[1]) or carried_over(*a)
-    )
-    # The camera jumps out of view of all it knows, begins a new map, and goes back.
-    x = [0.12 * k for k in range(8)] + [13.0 - 0.3 * k for k in range(42)]
-    truth = [make_transform(np.eye(3), (v, 0.05 * np.sin(v), 0.0)) for v in x]
-    reconstruction = make(lost_after_frames=2)
-    with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
-        for k, T in enumerate(truth):
-            reconstruction.process(frame_of(k, render(T)), lambda _: None)
-            if "submaps are joined" in caplog.text and len(scales) == 1:
-                # Told before the join and after it, the latter in the unit of the older part.
-                before, after = covariances[-2:]
-                assert abs(np.log(scales[0])) > 0.5
-                assert np.allclose(np.diag(after)[:3], np.diag(before)[:3], rtol=0.3)
-                assert np.allclose(np.diag(after)[3:], scales[0] ** 2 * np.diag(before)[3:], rtol=0.3)
-                scales.append(None)
-    assert "a new map is begun" in caplog.text
-    assert "submaps are joined" in caplog.text
-    trajectory = reconstruction.final_trajectory()
-    assert len(trajectory) >= len(x) - 3
-    assert ate_percent(trajectory, truth) < 1.0
-
-
-def test_a_join_leaves_the_older_part_where_it_is(caplog):
-    # Back from a second part the camera is recognised in the first one, and comes into sight of the second.
-    def at(x, k):
-        turn = exp_so3((0.0, 0.004 * np.sin(k / 5), 0.0))
-        return make_transform(turn, (x, 0.05 * np.sin(k / 4), 0.02 * np.sin(k / 7)))
-
-    path = [at(0.08 * k, k) for k in range(25)] + [None] * 3 + [at(13.0 + 0.1 * k, k) for k in range(40)]
-    path += [None] * 2 + [at(1.0 + 0.12 * k, k) for k in range(130)]
-    blank = np.full((*CAMERA.shape_hw, 3), 90, np.uint8)
-    reconstruction = make(lost_after_frames=3)
-    before, submaps = None, []
-    with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
-        for k, T in enumerate(path):
-            result = reconstruction.process(frame_of(k, blank if T is None else render(T)))
-            if "submaps are joined" in caplog.text:
-                break
-            submaps.append(result.submap)
-            before = reconstruction.final_trajectory()
-    assert "submaps are joined" in caplog.text
-    assert 1 in submaps
-    assert submaps[-1] == 0
-    after = reconstruction.final_trajectory()
-    np.testing.assert_allclose(after[0], before[0], atol=1e-9)
-    np.testing.assert_allclose(after[20], before[20], atol=0.02)
-    assert {reconstruction._map.world.submap_of[k.frame_id] for k in reconstruction._map.world.keyframes} == {
-        0
-    }
-
-
-def turning_away():
-    """Sideways, then a turn on the spot until all landmarks are out of view, then sideways again."""
-    poses = [make_transform(np.eye(3), (0.12 * k, 0.02 * np.sin(k), 0.0)) for k in range(10)]
-    position, yaw = poses[-1][:3, 3], 0.0
-    for _ in range(34):
-        yaw -= np.radians(2.0)
-        poses.append(make_transform(exp_so3((0.0, yaw, 0.0)), position))
-    for k in range(18):
-        away = np.array([0.15 * (k + 1), 0.03 * np.sin(k), -0.05 * (k + 1)])
-        poses.append(make_transform(exp_so3((0.0, yaw, 0.0)), position + away))
-    return poses
-
-
-def test_turning_costs_no_rotation_while_landmarks_run_out():
-    truth = turning_away()[:42]
-    reconstruction = make(lost_after_frames=4)
-    results = [reconstruction.process(frame_of(k, render(T))) for k, T in enumerate(truth)]
-    with_pose = [k for k, result in enumerate(results) if result.T_world_cam is not None and k >= 9]
-    assert with_pose == list(range(9, 42))
-    assert results[41].num_inliers < 15, "landmarks did run out on the way"
-    for k in with_pose:
-        turned = results[9].T_world_cam[:3, :3].T @ results[k].T_world_cam[:3, :3]
-        assert rotation_angle_deg(turned.T @ truth[9][:3, :3].T @ truth[k][:3, :3]) < 0.5
-
-
-def test_a_turn_that_leaves_all_landmarks_behind_is_part_of_the_map():
-    truth = turning_away()
-    reconstruction = make(lost_after_frames=4)
-    results = [reconstruction.process(frame_of(k, render(T))) for k, T in enumerate(truth)]
-    assert all(r.state is TrackingState.TRACKING for r in results[3:])
-    assert results[-1].submap == 0
-    assert ate_percent(reconstruction.final_trajectory(), truth) < 4.0
-
-
-def test_a_part_begun_after_a_turn_is_not_taken_for_the_old_one(caplog, monkeypatch):
-    # Many tracks survive the turn, but no landmark does, nor do points under small angles replace them.
-    monkeypatch.setattr("semcast.server.mapping.map_builder._ENOUGH_SHARE", 0.0)
-    truth = turning_away()
-    reconstruction = make(lost_after_frames=4)
-    with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
-        results = [reconstruction.process(frame_of(k, render(T))) for k, T in enumerate(truth)]
-    assert "a new map is begun" in caplog.text
-    assert results[-1].state is TrackingState.TRACKING
-    assert results[-1].submap == 1
-    assert "joined" not in caplog.text
-    world = reconstruction._map.world
-    for keyframe in world.keyframes:
-        row = world.landmarks.rows(keyframe.ids)
-        assert (world.landmarks.submap[row[row >= 0]] == keyframe.submap).all()
-
-
-def test_a_place_without_a_pose_gives_nothing_up(room, monkeypatch):
-    _, images = room
-    reconstruction = make(lost_after_frames=2)
-    other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
-    for k, image in enumerate(images[:8] + other[:2]):
-        result = reconstruction.process(frame_of(k, image))
-    assert result.state is TrackingState.INITIALIZING
-    ids = reconstruction.landmarks()[0]
-    rng = np.random.default_rng(0)
-    nowhere = Place(np.eye(4), 3, ids[:60], rng.uniform(20, 200, (60, 2)), 0)
-    monkeypatch.setattr(Relocaliser, "find", lambda *_, **__: nowhere)
-    results = [reconstruction.process(frame_of(10 + k, other[2 + k])) for k in range(4)]
-    assert results[-1].state is TrackingState.TRACKING
-    assert [r.submap for r in results] == [1] * 4
-
-
-def test_a_part_that_is_lost_as_it_begins_has_its_time_to_be_found_again(room, monkeypatch):
-    _, images = room
-    reconstruction = make(lost_after_frames=4)
-    other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
-    posed = Reconstruction._pose_from
-
-    def no_pose_in_the_second_part(self, *args, **how):
-        return None if self._map.submap == 1 else posed(self, *args, **how)
-
-    monkeypatch.setattr(Reconstruction, "_pose_from", no_pose_in_the_second_part)
-    results = [reconstruction.process(frame_of(k, image)) for k, image in enumerate(images[:8] + other[:14])]
-    begun = next(k for k, r in enumerate(results) if r.is_keyframe and r.submap == 1)
-    assert [r.state for r in results[begun : begun + 4]] == [TrackingState.LOST] * 4
-    assert results[begun + 4].state is TrackingState.INITIALIZING
 
 
 def test_noise_of_every_kind_is_survived(room):

@@ -1,0 +1,75 @@
+"""Upright boards with textures, drawn for a camera that moves before them, and their reconstruction."""
+
+import cv2
+import numpy as np
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import align_umeyama, exp_so3, invert_transform, make_transform
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.reconstruction import Reconstruction
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.state import DecodedFrame
+
+CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
+FRAME_NS = 100_000_000
+#: Centre, size and depth order of upright boards (far to near).
+BOARDS = (
+    (6.0, 0.0, 9.0, 40.0),
+    (-2.2, 0.6, 6.0, 2.6),
+    (2.0, -0.5, 5.0, 2.2),
+    (0.3, 1.2, 4.0, 1.4),
+    (-1.0, -1.1, 4.5, 1.2),
+)
+
+
+def board_texture(seed, size=512):
+    rng = np.random.default_rng(seed)
+    noise = np.zeros((size, size), np.float32)
+    for sigma in (2.0, 6.0, 16.0):
+        layer = cv2.GaussianBlur(rng.standard_normal((size, size)).astype(np.float32), None, sigma)
+        noise += layer / layer.std()
+    return np.clip(noise * 32 + 128, 0, 255).astype(np.uint8)
+
+
+TEXTURES = [board_texture(k, 1536 if k == 0 else 256) for k in range(len(BOARDS))]
+
+
+def render(T_world_cam):
+    """Draw the boards from far to near by the homography of each."""
+    T = invert_transform(T_world_cam)
+    image = np.zeros(CAMERA.shape_hw, np.uint8)
+    for texture, (x, y, z, size) in zip(TEXTURES, BOARDS, strict=True):
+        scale = size / texture.shape[0]
+        board = np.array([[scale, 0, x - size / 2], [0, scale, y - size / 2], [0, 0, z], [0, 0, 1]])
+        H = CAMERA.K @ (T[:3] @ board)
+        mask = cv2.warpPerspective(np.full_like(texture, 255), H, (CAMERA.width, CAMERA.height))
+        drawn = cv2.warpPerspective(texture, H, (CAMERA.width, CAMERA.height), flags=cv2.INTER_AREA)
+        image = np.where(mask == 255, drawn, image)
+    return np.repeat(image[..., None], 3, axis=2)
+
+
+def sideways(num=24):
+    return [
+        make_transform(exp_so3((0.0, -0.006 * k, 0.002 * k)), (0.08 * k, 0.03 * np.sin(k / 4), 0.03 * k))
+        for k in range(num)
+    ]
+
+
+def frame_of(frame_id, image, **maps):
+    return DecodedFrame(frame_id, frame_id * FRAME_NS, image, **maps)
+
+
+def make(bundle=None, **settings):
+    return Reconstruction(
+        CAMERA, ReconstructionSettings(**{"max_features": 250, **settings}), bundle or InlineBundle()
+    )
+
+
+def ate_percent(trajectory, truth):
+    """RMS position error after Sim(3) in percent of the path."""
+    ids = sorted(trajectory)
+    ours = np.array([trajectory[k][:3, 3] for k in ids])
+    theirs = np.array([truth[k][:3, 3] for k in ids])
+    scale, R, t = align_umeyama(ours, theirs)
+    error = np.linalg.norm(scale * ours @ R.T + t - theirs, axis=1)
+    return 100 * np.sqrt((error**2).mean()) / np.linalg.norm(np.diff(theirs, axis=0), axis=1).sum()
