@@ -1,6 +1,7 @@
 """Video files, webcams and network cameras, read by OpenCV."""
 
 import logging
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -27,14 +28,20 @@ _OPEN_TIMEOUT_MS = 5000
 #: Stamps of a constant frame rate are off by the rounding of their container: Matroska's to whole ms,
 #: and that of the first frame comes on top.
 _STAMP_ROUNDING_NS = 1_000_000
+#: What a camera takes as a password in its query or path: ``pwd=``, ``loginpas=``, ``password=``, ``token=``.
+_SECRET = re.compile(r"([?&;/]\w*(?:pas|pwd|token|secret|key)\w*=)[^&;#]*", re.IGNORECASE)
 
 
 def public_name(source: str) -> str:
-    """Return a source's name without the password an address may hold."""
+    """Return a source's name without the password an address may hold, before its host or in its query.
+
+    Names go to the server and into recordings.
+    """
     if "://" not in source:
         return source
     scheme, rest = source.split("://", 1)
-    return f"{scheme}://{rest.rsplit('@', 1)[-1]}"
+    shown = _SECRET.sub(r"\1***", rest.rsplit("@", 1)[-1])
+    return f"{scheme}://{shown}"
 
 
 def _open(source: str, live: bool) -> cv2.VideoCapture:

@@ -379,6 +379,10 @@ def test_what_only_looks_like_a_camera_number_is_a_folder(text):
 def test_an_address_is_shown_without_its_password():
     assert public_name("rtsp://user:secret@10.0.0.7/stream") == "rtsp://10.0.0.7/stream"
     assert public_name("clip@home.mp4") == "clip@home.mp4"
+    in_query = "http://10.0.0.7/video.cgi?usr=me&loginPas=secret&rate=5#1"
+    assert public_name(in_query) == "http://10.0.0.7/video.cgi?usr=me&loginPas=***&rate=5#1"
+    in_path = "rtsp://10.0.0.7:554/user=me&password=secret&channel=1&stream=0.sdp"
+    assert public_name(in_path) == "rtsp://10.0.0.7:554/user=me&password=***&channel=1&stream=0.sdp"
 
 
 @pytest.mark.parametrize(
