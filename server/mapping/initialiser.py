@@ -30,6 +30,7 @@ MAX_HISTORY = 300
 _MAX_IMAGES = 32
 #: Keyframes of a new map at most.
 START_KEYFRAMES = 5
+#: Points of a new map at least.
 MIN_POINTS = 40
 #: Two views of a scene with little perspective can't tell it from its mirror image in depth. They have to do
 #: where tracks don't last for three, as so many attempts have shown.

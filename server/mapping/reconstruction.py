@@ -15,7 +15,7 @@ from semcast.server.mapping import mapper
 from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.camera_motion import CameraMotion
-from semcast.server.mapping.initialiser import Initialiser, Start
+from semcast.server.mapping.initialiser import MIN_POINTS, Initialiser, Start
 from semcast.server.mapping.kept_frames import backfill, observed_of
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
@@ -43,8 +43,6 @@ _MIN_USABLE_SHARE = 0.5
 #: Keyframes between two attempts to recognise an older submap.
 _JOIN_INTERVAL = 3
 _START_LEVELS = 5
-#: Tracks a frame must have to count towards a new map.
-_MIN_TRACKS_TO_GIVE_UP = 50
 #: A pose that rests on fewer landmarks than this share of the tracks asks for more.
 _FEW_INLIERS_SHARE = 0.2
 #: How far from where they are expected lost landmarks are looked for, with a pose and with a prediction.
@@ -295,8 +293,8 @@ class Reconstruction:
             return self._accept(sight, found)
         frame, tracks = sight.frame, self._tracks
         if self._state is TrackingState.LOST:
-            # An empty image is no sign of another place: only frames with something to follow count.
-            self._frames_lost += int(len(tracks) >= _MIN_TRACKS_TO_GIVE_UP)
+            # An empty image is no sign of another place: only frames that a map could begin with count.
+            self._frames_lost += int(len(tracks) >= MIN_POINTS)
             if self._frames_lost >= self._settings.lost_after_frames:
                 logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
                 self._state = TrackingState.INITIALIZING

@@ -1,5 +1,6 @@
 """A camera that loses its map: parts begun anew, joined again, and turns that leave all landmarks behind."""
 
+import cv2
 import numpy as np
 import pytest
 from drawn_boards import CAMERA, FRAME_NS, ate_percent, frame_of, make, render
@@ -10,6 +11,7 @@ from semcast.common.geometry import (
     rotation_angle_deg,
 )
 from semcast.server.mapping import reconstruction
+from semcast.server.mapping.initialiser import MIN_POINTS
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.reconstruction import Reconstruction
@@ -27,6 +29,21 @@ def test_another_place_becomes_a_map_of_its_own(room):
     assert (results[7].submap, results[-1].submap) == (0, 1)
     assert results[-1].map_epoch == 0
     assert len(reconstruction.final_trajectory()) >= len(sequence) - 4
+
+
+def test_a_frame_counts_towards_a_new_map_that_one_could_begin_with(room):
+    """Few dots are as many as a start needs at least."""
+    dots = np.full((*CAMERA.shape_hw, 3), 120, np.uint8)
+    for k in range(41):
+        cv2.circle(dots, (20 + 34 * (k % 9), 24 + 44 * (k // 9)), 3, (230, 230, 230), -1)
+    dots = cv2.GaussianBlur(dots, None, 1.0)
+    reconstruction = make(lost_after_frames=6)
+    for k, image in enumerate(room[1][:8]):
+        reconstruction.process(frame_of(k, image))
+    results = [reconstruction.process(frame_of(8 + k, dots)) for k in range(12)]
+    assert all(MIN_POINTS <= r.num_tracked < 50 for r in results[-5:])
+    assert results[0].state is TrackingState.LOST
+    assert results[-1].state is TrackingState.INITIALIZING
 
 
 def test_the_unit_of_a_new_part_is_told_by_its_start_alone(monkeypatch):
