@@ -82,7 +82,10 @@ class _Captured:
         try:
             first = _read(self._capture)
             if first is None:
-                raise SourceError(f"{name} gives no images")
+                # Of an address FFmpeg reads from front to back, and opens what it then finds no image in.
+                is_on_web = name.startswith(("http://", "https://"))
+                why = ": a video at an address must have its index at its beginning; else download it"
+                raise SourceError(f"{name} gives no images{why if is_on_web else ''}")
             height, width = first.shape[:2]
             camera = settings.camera.resolve(width, height)
             if camera is None and beside is not None:

@@ -1,3 +1,4 @@
+import functools
 import http.server
 import threading
 import time
@@ -126,3 +127,28 @@ def test_a_camera_that_is_not_there_is_said(make_camera):
         open_source(SourceSettings(source=address, camera=PINHOLE))
     assert "can't be opened" in str(caught.value)
     assert "secret" not in str(caught.value)
+
+
+class Folder(http.server.SimpleHTTPRequestHandler):
+    """Files of a folder, from front to back."""
+
+    def log_message(self, *args):
+        pass
+
+
+def test_a_video_whose_index_is_at_its_end_is_no_camera(tmp_path):
+    writer = cv2.VideoWriter(str(tmp_path / "a.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (320, 240))
+    for k in range(30):
+        writer.write(np.random.default_rng(k).integers(0, 256, (240, 320, 3), dtype=np.uint8))
+    writer.release()
+    handler = functools.partial(Folder, directory=tmp_path)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            address = f"http://127.0.0.1:{server.server_port}/a.mp4"
+            with pytest.raises(SourceError, match=r"a.mp4 gives no images: .* its index at its beginning"):
+                open_source(SourceSettings(source=address, camera=PINHOLE))
+        finally:
+            server.shutdown()
+            thread.join()
