@@ -40,6 +40,7 @@ class Capture:
         self._box: Mailbox[SourceFrame] = Mailbox(1, policy)
         self._stopping = threading.Event()
         self._error: SourceError | None = None
+        self._num_unreadable = 0
         self._thread = threading.Thread(target=self._run, name="semcast-capture", daemon=True)
         self._thread.start()
 
@@ -47,6 +48,7 @@ class Capture:
         try:
             for frame in self._source.frames(self._stopping):
                 self._metrics.count("captured")
+                self._count_unreadable()
                 if not (frame.final or self._wants is None or self._wants(frame)):
                     self._metrics.drop("thinned")
                     continue
@@ -61,7 +63,12 @@ class Capture:
             logger.exception("the source failed")
             self._error = SourceError(f"the source failed: {err}")
         finally:
+            self._count_unreadable()
             self._box.close()
+
+    def _count_unreadable(self) -> None:
+        before, self._num_unreadable = self._num_unreadable, self._source.num_unreadable
+        self._metrics.drop("unreadable", self._num_unreadable - before)
 
     @property
     def ended(self) -> bool:

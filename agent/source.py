@@ -69,6 +69,10 @@ class Source(Protocol):
     def rate_hz(self) -> float:
         """Frames per second it aims at; 0 where the receiver sets the pace."""
 
+    @property
+    def num_unreadable(self) -> int:
+        """Frames that were left out so far, as they can't be read or have another size."""
+
     def groundtruth(self) -> Trajectory | None:
         """Return true poses of the frames, where there are any."""
 
@@ -144,6 +148,7 @@ class RecordedSource:
         self._sequence = sequence
         self._settings = settings
         self._intrinsics = sequence.intrinsics
+        self._num_unreadable = 0
         # Repeated, there is always another frame for one that is left out.
         self._length = self._readable_length() if settings.repeat == "once" else len(sequence)
 
@@ -157,9 +162,18 @@ class RecordedSource:
                 refused.append((int(self._sequence.frame_ids[index]), err))
             else:
                 for frame_id, refusal in reversed(refused):
-                    logger.warning("frame %d is left out: %s", frame_id, refusal)
+                    self._leave_out(frame_id, refusal)
                 return index + 1
         return length
+
+    def _leave_out(self, frame_id: int, refusal: SourceError) -> None:
+        self._num_unreadable += 1
+        logger.warning("frame %d is left out: %s", frame_id, refusal)
+
+    @property
+    def num_unreadable(self) -> int:
+        """Images that were left out so far."""
+        return self._num_unreadable
 
     @property
     def name(self) -> str:
@@ -230,7 +244,7 @@ class RecordedSource:
                 bad += 1
                 if bad >= MAX_BAD_IN_A_ROW or (final and once):
                     raise
-                logger.warning("frame %d is left out: %s", frame_id, err)
+                self._leave_out(frame_id, err)
                 continue
             bad = 0
             sent += 1

@@ -117,6 +117,11 @@ class _Captured:
         """Of the images as they come."""
         return self._stored_camera
 
+    @property
+    def num_unreadable(self) -> int:
+        """None: a frame that can't be decoded is one that never came."""
+        return 0
+
     def groundtruth(self) -> Trajectory | None:
         """None: a camera knows no truth."""
         return None

@@ -206,6 +206,7 @@ class Alive:
     roles: set[str]
     changed: threading.Condition
     num_outages: int = 0
+    num_unreadable: int = 0
 
     def on_change(self, role: str, alive: bool) -> None:
         """Take one change."""
@@ -214,9 +215,13 @@ class Alive:
             self.changed.notify_all()
 
     def on_status(self, payload: bytes) -> None:
-        """Take what the server says of itself."""
+        """Take what agent and server say of themselves."""
         with contextlib.suppress(WireError):
-            self.num_outages = unpack(payload, StatusMessage).drops.get("outage", 0)
+            status = unpack(payload, StatusMessage)
+            if status.role == "server":
+                self.num_outages = status.drops.get("outage", 0)
+            else:
+                self.num_unreadable = status.drops.get("unreadable", 0)
 
     def wait_for(self, role: str, child: Role, stop: threading.Event) -> None:
         """Wait until a role is there.
@@ -288,7 +293,8 @@ def run_demo(
             return None, None
         with session:
             session.watch_alive(AGENT_ID, alive.on_change)
-            session.subscribe(status_key(AGENT_ID, "server"), "newest", alive.on_status)
+            for role in ("agent", "server"):
+                session.subscribe(status_key(AGENT_ID, role), "newest", alive.on_status)
             children["channel"].start()
             playback = choose_playback(settings, recorded, stop)
             if playback is None:
@@ -304,7 +310,8 @@ def run_demo(
                 tell(f"{name} is up: {shlex.join(child.command)}")
             error = _watch(settings.out, children, alive, summary_file, stop, tell, progress)
             _keep_settings(settings, sequence, playback, tell)
-            if left_out := children["agent"].images_left_out():
+            children["agent"].stop()  # what it says last counts
+            if left_out := alive.num_unreadable:
                 where = children["agent"].log
                 tell(f"images left out, unreadable or of another size: {left_out}, see {where}")
     finally:

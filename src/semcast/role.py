@@ -44,10 +44,6 @@ class Role:
         lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return lines[-1] if lines else "no output"
 
-    def images_left_out(self) -> int:
-        """Return how many images the log says were left out of the stream."""
-        return len(re.findall(r": frame \d+ is left out: ", self.log.read_text("utf-8", errors="replace")))
-
     def viewer_address(self) -> str | None:
         """Return the address of the viewer's page, once the log names it."""
         log = self.log.read_text(encoding="utf-8", errors="replace")
