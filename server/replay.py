@@ -1,5 +1,6 @@
 """Replays a recording through the same decoder, tracker and outputs as the live server, without a network."""
 
+import contextlib
 import logging
 import math
 import threading
@@ -214,6 +215,8 @@ def _replayed(
             raise SourceError(_none_in_part(reader, stream, settings))
         if not processed:
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
+        with contextlib.suppress(OSError):  # said at the end
+            session.write_results(settings.out)  # who stops the replay may not wait for the adjustment
         update = session.conclude()
         if viewer is not None and update is not None:
             viewer.submit(None, update)

@@ -26,6 +26,7 @@ from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
 from semcast.common.recording import RecordingWriter, recording_metadata, recover_file
 from semcast.common.recording_reader import RecordingReader
+from semcast.common.run_folder import read_run
 from semcast.common.sequence import open_sequence
 from semcast.common.transport import open_hub
 from semcast.common.wire import pack, unpack
@@ -159,6 +160,18 @@ def test_names_with_brackets_are_shown_as_they_are(recording, tmp_path, capsys):
     out = tmp_path / "again [bold]"
     assert main(["replay", str(copied), "--out", str(out), "--end-s", "0.6"]) == 0
     assert f"in {out}: " in capsys.readouterr().out
+
+
+def test_a_replay_that_is_broken_off_in_its_last_adjustment_has_left_results(
+    recording, tmp_path, monkeypatch
+):
+    def break_off(session):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("semcast.server.session.Session.conclude", break_off)
+    with pytest.raises(KeyboardInterrupt):
+        replay(ReplaySettings(file=recording, out=tmp_path))
+    assert len(read_run(tmp_path).frame_ids) > FRAMES / 2
 
 
 def test_a_part_is_measured_by_the_way_that_was_gone(recording):
