@@ -51,7 +51,6 @@ RECORDINGS = {
         path="sequences/phone_150", values={"stride": 6, "gap": (2,), "resize": 0.667, "max_frames": 25}
     ),
 }
-HELD_OUT = ("parking", "phone")
 _SNRS_DB: dict[ChannelName, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "awgn": ((2.0, 4.0, 6.0, 8.0, 10.0, 12.0), (2.0, 6.0)),
     "rayleigh": ((2.0, 6.0, 10.0), (6.0,)),
