@@ -18,13 +18,13 @@ from semcast.common.codec import (
     confidence_from_displacement_px,
 )
 from semcast.common.errors import ConfigError
-from semcast.common.levels import levels_of
 from semcast.common.nets.checkpoint import Manifest, load_transceiver, weights_path
+from semcast.common.nets.coder_input import coder_input
 from semcast.common.nets.inference import inference_net
 from semcast.common.nets.latent import latent_from_symbols, symbols_from_latent
 from semcast.common.nets.modulation import modulate
 from semcast.common.nets.transceiver import Transceiver
-from semcast.common.phy.slots import BLOCK_PX, layout_for
+from semcast.common.phy.slots import layout_for
 from semcast.common.shapes import check_shape
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -150,26 +150,17 @@ class NeuralCodec:
         Raises:
             ValueError: The image is not of that shape and type, or has no pixel.
         """
-        sizes = check_shape(image, "H W 3", "image")
-        if image.dtype != np.uint8:
-            raise ValueError(f"image must be uint8, got {image.dtype}")
-        layout_for((sizes["H"], sizes["W"]))  # refuses images without a pixel
-        low, high = self.manifest.snr_range_db
-        expected = float(np.clip(snr_db, low, high)) if np.isfinite(snr_db) else low
-        levels = levels_of(image)
-        image = levels.stretch(image)
-        bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX
-        if bottom or right:
-            image = np.pad(image, ((0, bottom), (0, right), (0, 0)), mode="edge")
+        given = coder_input(image, snr_db, self.manifest.snr_range_db)
         with torch.inference_mode():
-            pixels = torch.from_numpy(np.ascontiguousarray(image)).to(self._device)
-            latent = self._net.latent(pixels, torch.full((1,), expected, device=self._device), self._is_qam)
+            pixels = torch.from_numpy(given.image).to(self._device)
+            snr = torch.full((1,), given.snr_db, device=self._device)
+            latent = self._net.latent(pixels, snr, self._is_qam)
             symbols = modulate(latent, self._is_qam)[0]
         return EncodedImage(
-            shape_hw=(sizes["H"], sizes["W"]),
+            shape_hw=given.shape_hw,
             symbols=symbols_from_latent(symbols.cpu().numpy()),
             modulation=self._modulation,
-            levels=levels,
+            levels=given.levels,
         )
 
     def decode(self, received: ReceivedImage) -> DecodedImage:

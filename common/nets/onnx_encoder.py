@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import MODULATIONS, DecodedImage, EncodedImage, Modulation, ReceivedImage
 from semcast.common.errors import CheckpointError, ConfigError
-from semcast.common.levels import levels_of
+from semcast.common.nets.coder_input import coder_input
 from semcast.common.nets.latent import symbols_from_latent
 from semcast.common.nets.modulation_numpy import transmit
 from semcast.common.nets.rounding import rounded_snr_db
-from semcast.common.phy.slots import BLOCK_PX, layout_for
-from semcast.common.shapes import check_shape
 
 SUFFIX = ".onnx"
 #: Version of what the graph takes and gives, and of its metadata.
@@ -126,28 +124,16 @@ class OnnxEncoder:
         Raises:
             ValueError: The image is not ``(H, W, 3)`` uint8, or has no pixel.
         """
-        sizes = check_shape(image, "H W 3", "image")
-        if image.dtype != np.uint8:
-            raise ValueError(f"image must be uint8, got {image.dtype}")
-        layout_for((sizes["H"], sizes["W"]))  # refuses images without a pixel
-        low, high = self._snr_range_db
-        expected = float(np.clip(snr_db, low, high)) if np.isfinite(snr_db) else low
-        levels = levels_of(image)
-        image = levels.stretch(image)
-        bottom, right = -sizes["H"] % BLOCK_PX, -sizes["W"] % BLOCK_PX
-        if bottom or right:
-            image = np.pad(image, ((0, bottom), (0, right), (0, 0)), mode="edge")
-        arriving_db = rounded_snr_db(expected) if self._modulation == "16qam" else expected
-        given = {
-            "image": np.ascontiguousarray(image)[None],
-            "snr_db": np.array([arriving_db], dtype=np.float32),
-        }
-        latent = self._session.run([OUTPUT], given)[0][0]
+        given = coder_input(image, snr_db, self._snr_range_db)
+        is_qam = self._modulation == "16qam"
+        arriving_db = rounded_snr_db(given.snr_db) if is_qam else given.snr_db
+        inputs = {"image": given.image[None], "snr_db": np.array([arriving_db], dtype=np.float32)}
+        latent = self._session.run([OUTPUT], inputs)[0][0]
         return EncodedImage(
-            shape_hw=(sizes["H"], sizes["W"]),
+            shape_hw=given.shape_hw,
             symbols=symbols_from_latent(transmit(latent, self._modulation)),
             modulation=self._modulation,
-            levels=levels,
+            levels=given.levels,
         )
 
     def decode(self, received: ReceivedImage) -> DecodedImage:
