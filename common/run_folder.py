@@ -294,6 +294,7 @@ class ImageWriter:
             except (OSError, cv2.error) as err:
                 failed = True
                 self.num_dropped += 1
+                self._remove(item.frame_id)  # a part of it may be there
                 logger.warning("%s can't be written: %s; the run goes on without images", self._images, err)
         while self._settled:
             self._drop_provisional(self._settled.popleft()[1])

@@ -1,6 +1,7 @@
 import dataclasses
 import threading
 import zipfile
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -198,3 +199,20 @@ def test_a_folder_that_vanishes_is_counted_and_does_not_raise(tmp_path):
     writer.close()
     writer.close()
     assert (writer.num_written, writer.num_dropped) == (0, 3)
+
+
+def test_an_image_that_finds_no_room_leaves_no_part_of_itself(tmp_path, monkeypatch):
+    write = Path.write_bytes
+
+    def full(path, data):
+        if path.stem.endswith("1"):
+            write(path, data[: len(data) // 2])
+            raise OSError(28, "No space left on device")
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with ImageWriter(tmp_path, lossless=True) as writer:
+        for k in range(3):
+            writer.put(k, picture(k))
+    assert list(read_image_paths(tmp_path)) == [0]
+    assert (writer.num_written, writer.num_dropped) == (1, 2)
