@@ -1,6 +1,7 @@
-"""A role of the demo ends with the demo, also where that is killed and can ask nobody to end."""
+"""Children of the demo end with it, also where it is killed and can ask nobody to end."""
 
 import logging
+import multiprocessing
 import os
 import threading
 from collections.abc import Iterator, Mapping
@@ -44,3 +45,18 @@ def stop_with_parent(stop: threading.Event) -> Iterator[None]:
     finally:
         done.set()
         thread.join()
+
+
+def end_with_parent() -> None:
+    """Let a ``multiprocessing`` child end at once when its parent is gone; called in the child.
+
+    One that waits for work would wait for ever.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, name="semcast-parent", daemon=True).start()

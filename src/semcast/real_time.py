@@ -16,6 +16,7 @@ from semcast.common.codecs import load_codec
 from semcast.common.cores import usable_cores
 from semcast.common.interrupts import deaf_children
 from semcast.common.rate import NATIVE_RATE, RateChoice, to_coded
+from semcast.parent import end_with_parent
 
 #: Larger images gain little.
 MAX_PIXELS = 250_000
@@ -195,7 +196,7 @@ def plan_for(
     largest = _resize_to(MAX_PIXELS, (height, width))
     size_wh = (max(1, round(width * largest)), max(1, round(height * largest)))
     smaller = np.asarray(cv2.resize(image, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent) as pool:
         with deaf_children():  # Ctrl-C is this process's business
             measured = pool.submit(measure_speed, codec, modulation, smaller, rate, min(cores, _MAX_CORES))
             children = multiprocessing.active_children()

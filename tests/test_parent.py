@@ -1,4 +1,4 @@
-"""Roles of the demo as child processes."""
+"""Children of the demo, when the demo is killed."""
 
 import subprocess
 import sys
@@ -20,6 +20,15 @@ Role("role", [sys.executable, "-c", sys.argv[1]], Path(sys.argv[2])).start()
 time.sleep(60)
 """
 
+MEASURING = """
+import multiprocessing, time
+from concurrent.futures import ProcessPoolExecutor
+from semcast.parent import end_with_parent
+pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent)
+print(pool.submit(abs, -1).result(), flush=True)
+time.sleep(60)
+"""
+
 
 def wait_for(log, words):
     deadline_s = time.monotonic() + DEADLINE_S
@@ -37,3 +46,13 @@ def test_a_role_ends_in_order_when_the_demo_is_killed(tmp_path):
         demo.kill()
         demo.wait()
     wait_for(log, "ended in order")
+
+
+def test_what_the_demo_measures_by_ends_when_the_demo_is_killed():
+    demo = subprocess.Popen([sys.executable, "-c", MEASURING], stdout=subprocess.PIPE)
+    try:
+        assert demo.stdout.readline() == b"1\n"
+    finally:
+        demo.kill()
+    # The end of what all its processes together write.
+    assert demo.communicate(timeout=DEADLINE_S)[0] == b""
