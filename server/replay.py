@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,9 @@ from semcast.server.session import Arrival, Outcome, Session
 from semcast.server.settings import ServerSettings, ViewSettings
 from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.choice import check_viewer, open_viewer
+
+if TYPE_CHECKING:
+    from semcast.server.view.feed import ViewerFeed
 
 logger = logging.getLogger(__name__)
 
@@ -196,21 +199,10 @@ def _replayed(
         for arrival in _paced(_arrivals(reader, stream, settings), settings.pace, stop):
             if stop.is_set():
                 break
-            message = arrival.message
-            session.note_arrival(message.frame_id, message.seq, final=message.final)
-            decoded = decoder.decode(arrival)
-            if decoded.frame is None:
-                reason = "lost_on_air" if arrival.received is None else "outage"
-                drops[reason] = drops.get(reason, 0) + 1
-                if viewer is not None:
-                    viewer.submit(missing_view(decoded, drops))
-                continue
-            outcome = _process(session, decoded, drops)
-            if viewer is not None:
-                viewer.submit(outcome.view, outcome.update)
-            processed += 1
-            if on_frame is not None:
-                on_frame(message.frame_id)
+            if _take(session, decoder, arrival, viewer, drops):
+                processed += 1
+                if on_frame is not None:
+                    on_frame(arrival.message.frame_id)
         if not processed and not drops and not stop.is_set():
             raise SourceError(_none_in_part(reader, stream, settings))
         if not processed:
@@ -231,6 +223,34 @@ def _replayed(
             viewer.close(leave_window=settings.view.leave_open)
         if reference is not None:
             reference.close()
+
+
+def _take(
+    session: Session,
+    decoder: FrameDecoder,
+    arrival: ReceivedFrame,
+    viewer: "ViewerFeed | None",
+    drops: dict[str, int],
+) -> bool:
+    """Decode, track and show one frame, and tell whether it was tracked; one that is not is counted."""
+    message = arrival.message
+    session.note_arrival(message.frame_id, message.seq, final=message.final)
+    try:
+        decoded = decoder.decode(arrival)
+    except SemcastError as err:
+        logger.warning("frame %d is left out: %s", message.frame_id, err)
+        drops["codec"] = drops.get("codec", 0) + 1
+        return False
+    if decoded.frame is None:
+        reason = "lost_on_air" if arrival.received is None else "outage"
+        drops[reason] = drops.get(reason, 0) + 1
+        if viewer is not None:
+            viewer.submit(missing_view(decoded, drops))
+        return False
+    outcome = _process(session, decoded, drops)
+    if viewer is not None:
+        viewer.submit(outcome.view, outcome.update)
+    return True
 
 
 def _process(session: Session, decoded: DecodedArrival, drops: dict[str, int]) -> Outcome:

@@ -1,5 +1,6 @@
 """A recording replays to the same poses every time; through another channel it does not."""
 
+import dataclasses
 import errno
 import json
 import re
@@ -21,7 +22,7 @@ from semcast.cli import main
 from semcast.common.codecs import load_codec
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import ConfigError, SemcastError, SourceError
-from semcast.common.messages import CameraInfo
+from semcast.common.messages import CameraInfo, SymbolFrame
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
 from semcast.common.recording import RecordingWriter, recording_metadata, recover_file
@@ -298,6 +299,22 @@ def test_an_unreadable_message_costs_its_frame_alone(recording, tmp_path, caplog
         replay(ReplaySettings(file=file), None, seen.append)
     assert len(set(frames[0]) - set(frames[1])) == 1
     assert "a message of semcast/agent0/rx/symbols" in caplog.text
+
+
+def test_a_frame_of_another_codec_costs_itself_alone(recording, tmp_path, caplog):
+    path = tmp_path / "mixed.mcap"
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, recording_metadata("", "0"))
+        for m in RecordingReader(recording).messages():
+            data = m.data
+            if m.topic.endswith("rx/symbols") and m.sequence == 2:
+                data = pack(dataclasses.replace(unpack(data, SymbolFrame), digest="0123"))
+            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, data)
+        writer.finish()
+    whole, mixed = (replay(ReplaySettings(file=file)) for file in (recording, path))
+    assert mixed["drops"] == {**whole["drops"], "codec": 1}
+    assert mixed["frames"]["tracked"] == whole["frames"]["tracked"] - 1
+    assert "is left out" in caplog.text
 
 
 def test_a_stream_is_chosen_by_its_number(with_a_later_start):
