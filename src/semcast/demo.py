@@ -262,26 +262,9 @@ def run_demo(
     Raises:
         SemcastError: The sequence or the codec can't be used, or a process could not be started.
     """
-    # What can be wrong is looked at before anything of a former run goes.
     sequence = settings.sequence or default_sequence()
-    recorded = open_sequence(sequence, settings.camera)
-    _ = recorded.intrinsics
-    check_codec(settings.codec)
-    named_weights(settings.codec)
-    check_viewer(ServerSettings(out=settings.out, view=settings.view_settings))
-    for name, file in (("record", settings.record), ("json", settings.json)):
-        if file is not None:
-            check_writable(file, name)
+    recorded, logs = _prepare(settings, sequence)
     summary_file = settings.out / SUMMARY_NAME
-    logs = settings.out / "logs"
-    # The server takes the folder for itself as soon as it starts.
-    with output_folder(settings.out):
-        check_not_foreign(settings.out, SUMMARY_NAME)
-        try:
-            logs.mkdir(exist_ok=True)
-        except OSError as err:
-            raise ConfigError(f"{logs} can't be made a folder for logs: {err}") from err
-        discard(settings.out)
     endpoint = free_endpoint()
     commands = role_commands(settings, sequence, endpoint)
     children = {name: Role(name, command, logs / f"{name}.log") for name, command in commands.items()}
@@ -319,6 +302,32 @@ def run_demo(
             child.stop()
     summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
     return summary, error
+
+
+def _prepare(settings: DemoSettings, sequence: Path) -> tuple[Sequence, Path]:
+    """Look at all that can be wrong before anything of a former run goes; the recording, a folder for logs.
+
+    Raises:
+        SemcastError: Something is wrong.
+    """
+    recorded = open_sequence(sequence, settings.camera)
+    _ = recorded.intrinsics
+    check_codec(settings.codec)
+    named_weights(settings.codec)
+    check_viewer(ServerSettings(out=settings.out, view=settings.view_settings))
+    for name, file in (("record", settings.record), ("json", settings.json)):
+        if file is not None:
+            check_writable(file, name)
+    logs = settings.out / "logs"
+    # The server takes the folder for itself as soon as it starts.
+    with output_folder(settings.out):
+        check_not_foreign(settings.out, SUMMARY_NAME)
+        try:
+            logs.mkdir(exist_ok=True)
+        except OSError as err:
+            raise ConfigError(f"{logs} can't be made a folder for logs: {err}") from err
+        discard(settings.out)
+    return recorded, logs
 
 
 def _keep_settings(
