@@ -119,7 +119,7 @@ class _Captured:
 
     @property
     def num_unreadable(self) -> int:
-        """None: a frame that can't be decoded is one that never came."""
+        """0: a frame that can't be decoded is one that never came."""
         return 0
 
     def groundtruth(self) -> Trajectory | None:

@@ -201,7 +201,7 @@ def _camera_flags(camera: CameraSettings) -> list[str]:
 
 @dataclass
 class Alive:
-    """Which roles are there, as their liveliness tokens say; restarts by hand count like ours."""
+    """Which roles are there, as liveliness tokens say, and what they count; those restarted by hand too."""
 
     roles: set[str]
     changed: threading.Condition
