@@ -19,6 +19,8 @@ Ids = NDArray[np.int64]
 
 #: Root mean square error of a triangulated landmark at most, in standard deviations.
 MAX_ERROR_SIGMA = 1.8
+#: From this on, and seen twice, a track is on something that moves by itself, or slipped.
+_REFUTED_SIGMA = 4.0
 #: Landmarks further than this many median depths are as good as at infinity.
 _MAX_DEPTH_RATIO = 60.0
 #: Noise is judged by residuals that keep at least this share of its variance.
@@ -141,6 +143,7 @@ def add_landmarks(
     views = [k for k in world.keyframes[-num_keyframes:] if k.submap == newest.submap]
     reach = median_depth(world, newest)
     new = new_landmarks(camera, views, newest, wanted, noise, min_parallax_deg, reach)
+    newest.refuted = new.refuted
     row = np.searchsorted(newest.ids, new.ids)
     rgb = sample_colours(image, newest.xy[row])
     world.add_landmarks(new.ids, new.xyz, rgb, new.confidence, newest.submap, newest.frame_id)
@@ -155,11 +158,13 @@ class NewLandmarks:
         ids: ``(P,)`` int64, ascending.
         xyz: ``(P, 3)`` world frame.
         confidence: ``(P,)`` mean over observations.
+        refuted: ``(R,)`` int64, ascending: tracks that are seen where no point at rest can be.
     """
 
     ids: Ids
     xyz: Array
     confidence: Array
+    refuted: Ids
 
 
 def new_landmarks(
@@ -188,7 +193,7 @@ def new_landmarks(
     view, point, xy, confidence = gather_observations(views, wanted)
     seen = np.bincount(point, minlength=len(wanted))
     if not (seen >= 2).any():
-        return NewLandmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0))
+        return NewLandmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
     T_cam_world = invert_transform(np.stack([k.T_world_cam for k in views]))
     sigma = noise.sigma_px(confidence)
     points = triangulate(camera, T_cam_world, view, point, xy, sigma, len(wanted))
@@ -204,7 +209,8 @@ def new_landmarks(
         & (depth < _MAX_DEPTH_RATIO * median_depth_map)
     )
     total = np.bincount(point, weights=confidence, minlength=len(wanted))
-    return NewLandmarks(wanted[good], points.xyz[good], (total / np.maximum(1, seen))[good])
+    refuted = wanted[(seen >= 2) & (points.error_sigma > _REFUTED_SIGMA)]
+    return NewLandmarks(wanted[good], points.xyz[good], (total / np.maximum(1, seen))[good], refuted)
 
 
 def sample_colours(image: NDArray[np.uint8], xy: Array) -> NDArray[np.uint8]:

@@ -4,6 +4,8 @@ While a camera turns, most of what it sees is new, and the few landmarks left li
 where turning and moving look alike. The new tracks are many and everywhere. How far their points are is known
 roughly, as far as others: that much uncertainty moves a projection only along one line, and hardly at all
 while the camera is near the keyframe (inverse depth with its doubt: Civera, Davison and Montiel 2008).
+Something large that moves by itself has such tracks too, many, and for long: keyframes tell them by that no
+point at rest explains where they were seen.
 """
 
 from dataclasses import dataclass
@@ -62,17 +64,21 @@ def rays_of(
         submap: Part of the map whose keyframes count.
 
     Returns:
-        Those of the tracks that a keyframe saw; None where none did or no depth is known.
+        Those of the tracks that a keyframe saw, and that it did not refute; None where there is none or no
+        depth is known.
     """
     mine = (k for k in reversed(world.keyframes) if k.submap == submap and len(k.ids))
     views = list(islice(mine, _NUM_KEYFRAMES))  # newest first; the map may have a thousand
     depth = float("inf")
     T_cam_world = invert_transform(T_world_cam)
     xyz, spread_px, sigma_px = np.zeros((len(ids), 3)), np.zeros((len(ids), 2)), np.zeros(len(ids))
-    found = np.zeros(len(ids), bool)
+    found, refuted = np.zeros(len(ids), bool), np.zeros(len(ids), bool)
     for position, keyframe in enumerate(views):
         row = np.minimum(np.searchsorted(keyframe.ids, ids), len(keyframe.ids) - 1)
-        new = np.flatnonzero(~found & (keyframe.ids[row] == ids))
+        new = np.flatnonzero(~found & ~refuted & (keyframe.ids[row] == ids))
+        if len(keyframe.refuted):
+            refuted[new] = np.isin(ids[new], keyframe.refuted)
+            new = new[~refuted[new]]
         if len(new) == 0:
             continue
         own = _usual_depth(world, views[position:])
@@ -92,7 +98,7 @@ def rays_of(
         xyz[new] = transform_points(keyframe.T_world_cam, point)
         sigma_px[new] = noise.sigma_px(keyframe.confidence[row[new]])
         found[new[front]] = True
-        if found.all():
+        if (found | refuted).all():
             break
     rows = np.flatnonzero(found)
     if len(rows) == 0:

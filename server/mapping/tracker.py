@@ -27,6 +27,10 @@ _MIN_INLIER_SHARE = 0.5
 MIN_BELIEVED_SHARE = 0.25
 #: So many rays, and that share of them, must agree to steady a pose, and that share of its landmarks still.
 _STEADY, _MIN_KEPT_SHARE = (10, 0.5), 0.8
+#: Rays that steady a pose may raise the cost of its landmarks, errors cut off at so many standard deviations,
+#: by so much in all, as noise does with six unknowns, and so much for each. What moves by itself has rays as
+#: well, and takes 0.2 to 8 for each, where at rest it is up to 0.18.
+_MOST_TAKEN, _MOST_TAKEN_EACH, _CUT_SIGMAS = 12.0, 0.2, 3.0
 #: Where fewer landmarks than this are in sight, so many rays, and that share of them, carry the pose on with
 #: the few landmarks that are left: without any, turning and moving are told apart by nothing.
 _RUN_OUT, _CARRY, _MIN_LEFT = 30, (60, 0.6), 4
@@ -179,11 +183,18 @@ def track_pose(
     elif best is not None and len(others):
         T, least = invert_transform(best.T_cam_world), max(enough, _MIN_KEPT_SHARE * best.num_inliers)
         steadied = _steadied(camera, world, noise, marks, others, T, submap, _STEADY, least)
-        best = best if steadied is None else steadied
+        most_taken = _MOST_TAKEN + _MOST_TAKEN_EACH * len(marks)
+        if steadied is not None and _cost(steadied, sigma) < _cost(best, sigma) + most_taken:
+            best = steadied
     if best is None:
         return None
     T_world_cam = invert_transform(best.T_cam_world)
     return TrackedPose(T_world_cam, best.covariance, marks.ids, best.inliers, best.residual_px)
+
+
+def _cost(pose: PoseEstimate, sigma_px: Array) -> float:
+    """Sum of the squared errors of landmarks in standard deviations, each cut off."""
+    return float((np.minimum(pose.residual_px / sigma_px, _CUT_SIGMAS) ** 2).sum())
 
 
 def _steadied(

@@ -1,7 +1,7 @@
 """The map: landmarks as arrays, keyframes with their observations, bounded in size."""
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +110,7 @@ class Keyframe:
         confidence: ``(M,)`` of each observation.
         descriptor_ids: ``(D,)`` int64 tracks that have a descriptor.
         descriptors: ``(D, 32)`` uint8.
+        refuted: ``(R,)`` int64 tracks seen that no point at rest explains, ascending.
     """
 
     frame_id: int
@@ -121,6 +122,7 @@ class Keyframe:
     confidence: Array
     descriptor_ids: Ids
     descriptors: NDArray[np.uint8]
+    refuted: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def drop_observations(self, bad: NDArray[np.bool_]) -> None:
         """Forget the observations in the mask."""

@@ -1,0 +1,145 @@
+"""Something large that moves by itself: its tracks are many and last, and must not carry the camera along."""
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, invert_transform, make_transform
+from semcast.common.trajectory import Trajectory
+from semcast.common.trajectory_error import ate
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.mapper import add_landmarks
+from semcast.server.mapping.rays import rays_of
+from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
+from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.tracker import track_pose
+from semcast.server.mapping.tracks import Seen
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
+WIDTH, HEIGHT = CAMERA.width, CAMERA.height
+NOISE = NoiseModel(0.5, 0.0)
+#: Frames, and that in which the thing comes.
+NUM_FRAMES, CAME = 45, 15
+
+
+def texture(shape_hw, seed):
+    rng = np.random.default_rng(seed)
+    layers = [
+        cv2.GaussianBlur(rng.standard_normal(shape_hw).astype(np.float32), None, sigma) for sigma in (2, 6)
+    ]
+    return np.clip(sum(layer / layer.std() for layer in layers) * 40 + 128, 0, 255).astype(np.uint8)
+
+
+WALL, THING = texture((700, 1800), seed=2), texture((150, 1200), seed=3)
+
+
+def pose_at(k):
+    """A walk along a corridor, looking to the right and to the left."""
+    return make_transform(exp_so3(np.array([0.0, 0.4 * np.sin(k / 8), 0.0])), np.array([0.0, 0.0, 0.1 * k]))
+
+
+def image_at(k, step_px):
+    """What is seen of a corridor that is 4 m wide and ends at 14 m, behind a train from some frame on."""
+    x, y = np.meshgrid(np.arange(WIDTH) - CAMERA.cx, np.arange(HEIGHT) - CAMERA.cy)
+    T_world_cam = pose_at(k)
+    ray = np.stack([x / CAMERA.fx, y / CAMERA.fy, np.ones_like(x)], axis=-1) @ T_world_cam[:3, :3].T
+    z = T_world_cam[2, 3]
+    to_side, to_end = 2.0 / np.maximum(np.abs(ray[..., 0]), 1e-9), (14.0 - z) / np.maximum(ray[..., 2], 1e-9)
+    far = np.minimum(to_side, to_end)
+    along = np.where(to_side < to_end, z + far * ray[..., 2], 16.0 + far * ray[..., 0])
+    rows = 350.0 + 110.0 * far * ray[..., 1]
+    image = cv2.remap(
+        WALL,
+        (110.0 * along).astype(np.float32),
+        rows.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT,
+    )
+    if k >= CAME:
+        image[60:200, 60:260] = THING[:140, step_px * (k - CAME) :][:, :200]
+    return np.repeat(image[..., None], 3, axis=2)
+
+
+@pytest.mark.parametrize("step_px", [2, 4])
+def test_something_large_that_passes_through_does_not_take_the_camera_along(step_px):
+    reconstruction = Reconstruction(CAMERA, ReconstructionSettings(max_features=250), InlineBundle())
+    for k in range(NUM_FRAMES):
+        reconstruction.process(DecodedFrame(k, k * 10**8, image_at(k, step_px)))
+    found = reconstruction.final_trajectory()
+    reconstruction.close()
+    assert len(found) == NUM_FRAMES
+    t_s = 0.1 * np.arange(NUM_FRAMES)
+    truth = Trajectory(t_s, np.stack([pose_at(k) for k in range(NUM_FRAMES)]))
+    absolute = ate(Trajectory(t_s, np.stack([found[k] for k in range(NUM_FRAMES)])), truth)
+    assert absolute is not None
+    assert absolute.percent < 0.5
+
+
+def keyframe(frame_id, T_world_cam, ids, xy):
+    return Keyframe(
+        frame_id=frame_id,
+        t_source_ns=frame_id * 10**8,
+        T_world_cam=T_world_cam,
+        submap=0,
+        ids=ids,
+        xy=xy,
+        confidence=np.ones(len(ids)),
+        descriptor_ids=np.zeros(0, np.int64),
+        descriptors=np.zeros((0, 32), np.uint8),
+    )
+
+
+def project(xyz, T_world_cam):
+    T = invert_transform(T_world_cam)
+    return CAMERA.project(xyz @ T[:3, :3].T + T[:3, 3])
+
+
+NUM_MARKS, NUM_OTHERS = 80, 200
+MOVED = make_transform(exp_so3(np.array([0.01, -0.02, 0.005])), [0.06, 0.01, 0.03])
+
+
+def scene():
+    """Landmarks all over the image of a keyframe at the origin, and tracks that have no depth yet."""
+    rng = np.random.default_rng(0)
+    count = NUM_MARKS + NUM_OTHERS
+    xyz = CAMERA.unproject(rng.uniform((10, 10), (310, 230), (count, 2))) * rng.uniform(2.5, 6, (count, 1))
+    world, ids = WorldMap(), np.arange(count)
+    world.add_keyframe(keyframe(0, np.eye(4), ids, project(xyz, np.eye(4))))
+    marks = slice(0, NUM_MARKS)
+    rgb = np.zeros((NUM_MARKS, 3), np.uint8)
+    world.add_landmarks(ids[marks], xyz[marks], rgb, np.ones(NUM_MARKS), 0, 0)
+    return world, xyz, ids
+
+
+def way_px(xyz, T_world_cam):
+    """How far a pose puts landmarks from where they are seen."""
+    off = project(xyz[:NUM_MARKS], T_world_cam) - project(xyz[:NUM_MARKS], MOVED)
+    return float(np.median(np.linalg.norm(off, axis=1)))
+
+
+def test_many_rays_that_move_alike_do_not_pull_a_pose_away_from_its_landmarks():
+    world, xyz, ids = scene()
+    xy = project(xyz, MOVED)
+    xy[NUM_MARKS:] += (0.0, 1.5)
+    seen = Seen(ids, xy, np.ones(len(ids)))
+    pose = track_pose(CAMERA, world, NOISE, seen, MOVED, submap=0, seed=0)
+    assert pose is not None
+    assert way_px(xyz, pose.T_world_cam) < 0.2
+
+
+def test_tracks_that_no_point_at_rest_explains_are_no_rays():
+    world, xyz, ids = scene()
+    xy = project(xyz, MOVED)
+    moving = np.arange(len(ids)) >= NUM_MARKS + NUM_OTHERS // 2
+    xy[moving] += (0.0, 12.0)
+    world.add_keyframe(keyframe(1, MOVED, ids, xy))
+    add_landmarks(world, CAMERA, NOISE, np.zeros((HEIGHT, WIDTH, 3), np.uint8), 10.0)
+    assert np.array_equal(world.keyframes[-1].refuted, ids[moving])
+    others = ids[NUM_MARKS:]
+    rays = rays_of(CAMERA, world, NOISE, others, MOVED, submap=0)
+    assert rays is not None
+    assert np.array_equal(others[rays.row], ids[NUM_MARKS:][~moving[NUM_MARKS:]])
+    assert rays_of(CAMERA, world, NOISE, ids[moving], MOVED, submap=0) is None
