@@ -84,7 +84,7 @@ class Reconstruction:
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
         self._last_posed_id: int | None = None
-        self._frames_lost = 0
+        self._lost_ns: list[int] = []
         self._frames_since_keyframe = 0
         self._keyframes_since_join = 0
         self._stage_ms: dict[str, float] = {}
@@ -209,7 +209,7 @@ class Reconstruction:
             return self._accept(sight, pose)
         logger.debug("frame %d: tracking is lost", sight.frame.frame_id)
         self._state = TrackingState.LOST
-        self._frames_lost = 0
+        self._lost_ns = []
         self._initialiser.clear()
         return self._find(sight)
 
@@ -245,7 +245,7 @@ class Reconstruction:
         reference = self._map.reference_keyframe()
         assert reference is not None
         self._state = TrackingState.TRACKING
-        self._frames_lost = 0
+        self._lost_ns = []
         self._frames_since_keyframe += 1
         self._last_posed_id = frame.frame_id
         self._moves_to(frame.frame_id, frame.t_source_ns, pose.T_world_cam, pose.ids[pose.inliers])
@@ -294,8 +294,8 @@ class Reconstruction:
         frame, tracks = sight.frame, self._tracks
         if self._state is TrackingState.LOST:
             # An empty image is no sign of another place: only frames that a map could begin with count.
-            self._frames_lost += int(len(tracks) >= MIN_POINTS)
-            if self._frames_lost >= self._settings.lost_after_frames:
+            self._lost_ns += [frame.t_source_ns] if len(tracks) >= MIN_POINTS else []
+            if self._settings.gives_up(self._lost_ns):
                 logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
                 self._state = TrackingState.INITIALIZING
                 self._map.world.forget_frames(self._motion.give_up())
@@ -377,7 +377,7 @@ class Reconstruction:
         seen = self._tracks.seen()
         pose = self._pose_from(seen[self._map.world.landmarks.rows(seen.ids) >= 0], newest)
         self._state = TrackingState.LOST if pose is None else TrackingState.TRACKING
-        self._frames_lost = 0
+        self._lost_ns = []
         self._last_posed_id = sight.frame.frame_id
         if pose is not None:
             self._moves_to(sight.frame.frame_id, sight.frame.t_source_ns, pose.T_world_cam, grown.ids)

@@ -1,10 +1,14 @@
 """Settings of the reconstruction."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import get_args
 
 from semcast.common.camera import Intrinsics, ReadoutFrom, check_readout
 from semcast.server.geometry.weighting import ConfidenceMode
+
+#: A place gets as many chances to be recognised, however far apart frames are.
+_LEAST_LOST_FRAMES = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +60,9 @@ class ReconstructionSettings:
         default=None,
         metadata={"help": "side of the image a rolling shutter begins at; left or right for upright phones"},
     )
-    lost_after_frames: int = field(
-        default=10, metadata={"help": "frames without a pose after which a new map is begun"}
+    lost_after_s: float = field(
+        default=0.4,
+        metadata={"help": "seconds a lost camera is searched for before a new map is begun"},
     )
 
     def __post_init__(self) -> None:
@@ -74,7 +79,7 @@ class ReconstructionSettings:
             ("sigma0_px", 0.05, 20.0),
             ("beta", 0.0, 8.0),
             ("min_parallax_deg", 0.1, 10.0),
-            ("lost_after_frames", 1, 10_000),
+            ("lost_after_s", 0.0, 600.0),
         ):
             value = getattr(self, name)
             if not low <= value <= high:
@@ -83,6 +88,15 @@ class ReconstructionSettings:
             0.0 if self.readout_ms is None else self.readout_ms,
             "top" if self.readout_from is None else self.readout_from,
         )
+
+    def gives_up(self, lost_ns: Sequence[int]) -> bool:
+        """Whether the map is not in sight any more.
+
+        Args:
+            lost_ns: Source times of the frames without a pose that show enough to begin a new one with.
+        """
+        enough = len(lost_ns) >= _LEAST_LOST_FRAMES
+        return enough and (lost_ns[-1] - lost_ns[0]) * 1e-9 >= self.lost_after_s
 
     def with_readout(self, camera: Intrinsics) -> Intrinsics:
         """Return a camera with the readout that is set here, else with its own."""

@@ -203,7 +203,7 @@ def turned(demo, k):
 
 
 def test_every_keyframe_of_a_later_part_has_its_image_too(demo, tmp_path):
-    reconstruction = ReconstructionSettings(lost_after_frames=4)
+    reconstruction = ReconstructionSettings(lost_after_s=0.25)
     run_session(
         demo, tmp_path, range(20), picture=turned, save_images="keyframes", reconstruction=reconstruction
     )
@@ -213,7 +213,7 @@ def test_every_keyframe_of_a_later_part_has_its_image_too(demo, tmp_path):
 
 
 def test_parts_that_never_met_are_told_apart_in_all_that_is_left(demo, tmp_path):
-    reconstruction = ReconstructionSettings(lost_after_frames=4)
+    reconstruction = ReconstructionSettings(lost_after_s=0.25)
     run_session(demo, tmp_path, range(20), picture=turned, reconstruction=reconstruction)
     data = read_run(tmp_path)
     first = data.frame_ids < 8

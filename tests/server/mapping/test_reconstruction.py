@@ -186,7 +186,7 @@ def test_a_covered_lens_is_a_gap(room):
 def test_noise_of_every_kind_is_survived(room):
     _, images = room
     rng = np.random.default_rng(0)
-    reconstruction = make(lost_after_frames=2)
+    reconstruction = make(lost_after_s=0.05)
     shape = CAMERA.shape_hw
     contents = [
         np.zeros((*shape, 3), np.uint8),

@@ -10,7 +10,7 @@ from semcast.common.geometry import (
     make_transform,
     rotation_angle_deg,
 )
-from semcast.server.mapping import reconstruction
+from semcast.server.mapping import reconstruction, settings
 from semcast.server.mapping.initialiser import MIN_POINTS
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
@@ -22,7 +22,7 @@ from semcast.server.mapping.state import TrackingState
 def test_another_place_becomes_a_map_of_its_own(room):
     _, images = room
     other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
-    reconstruction = make(lost_after_frames=3)
+    reconstruction = make(lost_after_s=0.15)
     sequence = images[:8] + other[:8]
     results = [reconstruction.process(frame_of(k, image)) for k, image in enumerate(sequence)]
     assert results[-1].state is TrackingState.TRACKING
@@ -37,7 +37,7 @@ def test_a_frame_counts_towards_a_new_map_that_one_could_begin_with(room):
     for k in range(41):
         cv2.circle(dots, (20 + 34 * (k % 9), 24 + 44 * (k // 9)), 3, (230, 230, 230), -1)
     dots = cv2.GaussianBlur(dots, None, 1.0)
-    reconstruction = make(lost_after_frames=6)
+    reconstruction = make(lost_after_s=0.45)
     for k, image in enumerate(room[1][:8]):
         reconstruction.process(frame_of(k, image))
     results = [reconstruction.process(frame_of(8 + k, dots)) for k in range(12)]
@@ -58,7 +58,7 @@ def test_the_unit_of_a_new_part_is_told_by_its_start_alone(monkeypatch):
     truth = [make_transform(np.eye(3), (0.12 * k, 0.05 * np.sin(k), 0.0)) for k in range(8)]
     truth += [make_transform(exp_so3((0.0, 0.03 * k, 0.0)), (13.0, 0.0, 0.0)) for k in range(30, 0, -1)]
     truth += [make_transform(np.eye(3), (13.0 - 0.15 * k, 0.05 * np.sin(k), 0.0)) for k in range(1, 26)]
-    core = make(lost_after_frames=2)
+    core = make(lost_after_s=0.05)
     for k, T in enumerate(truth):
         result = core.process(frame_of(k, render(T)))
         if k == 7:
@@ -84,7 +84,7 @@ def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch
     # The camera jumps out of view of all it knows, begins a new map, and goes back.
     x = [0.12 * k for k in range(8)] + [13.0 - 0.3 * k for k in range(42)]
     truth = [make_transform(np.eye(3), (v, 0.05 * np.sin(v), 0.0)) for v in x]
-    reconstruction = make(lost_after_frames=2)
+    reconstruction = make(lost_after_s=0.05)
     with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
         for k, T in enumerate(truth):
             reconstruction.process(frame_of(k, render(T)), lambda _: None)
@@ -111,7 +111,7 @@ def test_a_join_leaves_the_older_part_where_it_is(caplog):
     path = [at(0.08 * k, k) for k in range(25)] + [None] * 3 + [at(13.0 + 0.1 * k, k) for k in range(40)]
     path += [None] * 2 + [at(1.0 + 0.12 * k, k) for k in range(130)]
     blank = np.full((*CAMERA.shape_hw, 3), 90, np.uint8)
-    reconstruction = make(lost_after_frames=3)
+    reconstruction = make(lost_after_s=0.15)
     before, submaps = None, []
     with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
         for k, T in enumerate(path):
@@ -146,7 +146,7 @@ def turning_away():
 
 def test_turning_costs_no_rotation_while_landmarks_run_out():
     truth = turning_away()[:42]
-    reconstruction = make(lost_after_frames=4)
+    reconstruction = make(lost_after_s=0.25)
     results = [reconstruction.process(frame_of(k, render(T))) for k, T in enumerate(truth)]
     with_pose = [k for k, result in enumerate(results) if result.T_world_cam is not None and k >= 9]
     assert with_pose == list(range(9, 42))
@@ -158,7 +158,7 @@ def test_turning_costs_no_rotation_while_landmarks_run_out():
 
 def test_a_turn_that_leaves_all_landmarks_behind_is_part_of_the_map():
     truth = turning_away()
-    reconstruction = make(lost_after_frames=4)
+    reconstruction = make(lost_after_s=0.25)
     results = [reconstruction.process(frame_of(k, render(T))) for k, T in enumerate(truth)]
     assert all(r.state is TrackingState.TRACKING for r in results[3:])
     assert results[-1].submap == 0
@@ -169,7 +169,7 @@ def test_a_part_begun_after_a_turn_is_not_taken_for_the_old_one(caplog, monkeypa
     # Many tracks survive the turn, but no landmark does, nor do points under small angles replace them.
     monkeypatch.setattr("semcast.server.mapping.map_builder._ENOUGH_SHARE", 0.0)
     truth = turning_away()
-    reconstruction = make(lost_after_frames=4)
+    reconstruction = make(lost_after_s=0.25)
     with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
         results = [reconstruction.process(frame_of(k, render(T))) for k, T in enumerate(truth)]
     assert "a new map is begun" in caplog.text
@@ -184,7 +184,8 @@ def test_a_part_begun_after_a_turn_is_not_taken_for_the_old_one(caplog, monkeypa
 
 def test_a_place_without_a_pose_gives_nothing_up(room, monkeypatch):
     _, images = room
-    reconstruction = make(lost_after_frames=2)
+    monkeypatch.setattr(settings, "_LEAST_LOST_FRAMES", 2)  # with more, the start follows at once
+    reconstruction = make(lost_after_s=0.05)
     other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
     for k, image in enumerate(images[:8] + other[:2]):
         result = reconstruction.process(frame_of(k, image))
@@ -200,7 +201,7 @@ def test_a_place_without_a_pose_gives_nothing_up(room, monkeypatch):
 
 def test_a_part_that_is_lost_as_it_begins_has_its_time_to_be_found_again(room, monkeypatch):
     _, images = room
-    reconstruction = make(lost_after_frames=4)
+    reconstruction = make(lost_after_s=0.25)
     other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
     posed = Reconstruction._pose_from
 

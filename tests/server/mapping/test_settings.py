@@ -21,3 +21,13 @@ from semcast.server.mapping.settings import ReconstructionSettings
 def test_settings_are_checked(values, message):
     with pytest.raises(ValueError, match=message):
         ReconstructionSettings(**values)
+
+
+def test_a_map_is_given_up_after_a_time_and_not_before_some_frames():
+    settings = ReconstructionSettings(lost_after_s=0.4)
+    at = [k * 10**8 for k in range(6)]
+    assert not settings.gives_up([])
+    assert not settings.gives_up(at[:4])
+    assert settings.gives_up(at[:5])
+    assert not settings.gives_up([0, 10**10]), "two frames are too few chances, however long they took"
+    assert ReconstructionSettings(lost_after_s=0.0).gives_up(at[:3])
