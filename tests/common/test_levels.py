@@ -11,7 +11,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codecs import load_codec
 from semcast.common.image import psnr_db
 from semcast.common.levels import ALL_LEVELS, Levels, levels_of
-from semcast.common.nets import codec as nets_codec
+from semcast.common.nets import coder_input
 
 PHOTO = Path(__file__).resolve().parents[2] / "deploy/demo/kitti_06/images/000000.jpg"
 
@@ -150,7 +150,7 @@ def test_a_night_with_lamps_arrives_better(monkeypatch):
         return psnr_db(decoded, image), psnr_db(decoded[dark][None], image[dark][None])
 
     with_knee = arriving_db()
-    monkeypatch.setattr(nets_codec, "levels_of", lambda _: ALL_LEVELS)
+    monkeypatch.setattr(coder_input, "levels_of", lambda _: ALL_LEVELS)
     without = arriving_db()
     assert with_knee[0] > without[0] + 0.5
     assert with_knee[1] > without[1] + 1.0
@@ -171,7 +171,7 @@ def test_dark_and_hazy_images_arrive_better(monkeypatch, contrast, black):
     levels, stretched_db = arriving()
     assert levels.low >= black // 2
     assert levels.high < black + 60
-    monkeypatch.setattr(nets_codec, "levels_of", lambda _: ALL_LEVELS)
+    monkeypatch.setattr(coder_input, "levels_of", lambda _: ALL_LEVELS)
     levels, plain_db = arriving()
     assert levels == ALL_LEVELS
     assert stretched_db > plain_db + 1.0
