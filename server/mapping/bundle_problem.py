@@ -65,7 +65,14 @@ class Frame(Protocol):
 
 
 class Observations(NamedTuple):
-    """What views saw of some tracks: view, row of the track, pixel and confidence of each observation."""
+    """What views saw of some tracks.
+
+    Attributes:
+        view: ``(M,)`` which view.
+        point: ``(M,)`` row of the track among those asked for.
+        xy: ``(M, 2)`` pixels.
+        confidence: ``(M,)`` in [0, 1].
+    """
 
     view: NDArray[np.intp]
     point: NDArray[np.intp]

@@ -79,11 +79,15 @@ class PosedFrames:
 
     def forget(self, frame_ids: Collection[int]) -> None:
         """Take frames out; those that are not there are no error."""
-        gone = {frame_id for frame_id in frame_ids if frame_id in self._row}
-        if gone:
-            ids, keyframe_ids, T_keyframe_cam = self.columns()
-            kept = ~np.isin(ids, list(gone))
-            self.take(ids[kept], keyframe_ids[kept], T_keyframe_cam[kept])
+        for frame_id in frame_ids:
+            row = self._row.pop(frame_id, None)
+            last = len(self._row)
+            if row is None or row == last:
+                continue
+            # The last one takes its place: a video that repeats frames forgets one with each that is new.
+            self._ids[row], self._keyframe_ids[row] = self._ids[last], self._keyframe_ids[last]
+            self._T_keyframe_cam[row] = self._T_keyframe_cam[last]
+            self._row[int(self._ids[row])] = row
 
     def rescale(self, factor: Mapping[int, float]) -> None:
         """Scale the translations of the frames of some keyframes, by frame id of the keyframe."""

@@ -10,11 +10,15 @@ from semcast.common.geometry import exp_so3, make_transform
 from semcast.common.sequence import open_sequence
 from semcast.common.trajectory_error import ate
 from semcast.server.export.outputs import trajectory_of
+from semcast.server.export.parts import frame_parts
+from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.tracks import TrackTable
 
 CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
 FRAME_NS = 100_000_000
@@ -90,19 +94,55 @@ def test_less_than_the_error_of_poses_is_no_stop():
     assert go(CameraMotion(CAMERA), 0.01 * np.array([0, 1, 2, 3, 3, 3, 6, 7])) == {}
 
 
-def test_a_road_is_driven_past_a_grabber_that_hangs():
+@pytest.mark.parametrize(("num_hung", "parts"), [(4, 1), (10, 2)])
+def test_a_road_is_driven_past_a_grabber_that_hangs(num_hung, parts):
+    """After a second nothing is left in sight, and a new part of the map begins."""
     sequence = open_sequence(STREET)
     times_ns = {}
     reconstruction = Reconstruction(
         sequence.intrinsics, ReconstructionSettings(max_features=400), InlineBundle()
     )
-    hung = range(16, 20)
-    for k in range(28):
+    hung = range(16, 16 + num_hung)
+    num = 28 + num_hung
+    for k in range(num):
         image = sequence.image(15 if k in hung else k)
         times_ns[k] = int(sequence.times_ns[k])
         reconstruction.process(DecodedFrame(k, times_ns[k], image))
     poses = reconstruction.final_trajectory()
+    submaps = set(frame_parts(reconstruction.snapshot()).values())
     reconstruction.close()
-    assert sorted(set(range(28)) - set(poses)) == list(hung)
+    assert len(submaps) == parts
+    assert sorted(set(range(num)) - set(poses)) == list(hung)
     error = ate(trajectory_of(poses, times_ns), sequence.groundtruth())
     assert error.rmse_m < 0.2
+
+
+def test_an_image_is_looked_at_again_from_where_the_camera_would_have_got_to():
+    street = open_sequence(STREET).image(0)
+
+    def sight_of(k, image):
+        frame = DecodedFrame(k, k * FRAME_NS, np.ascontiguousarray(image))
+        return Sight(frame, to_grey(frame.image), np.ones(len(image), bool))
+
+    tracks, first, jumped = (
+        TrackTable("robust", 300, 0),
+        sight_of(0, street[:, :-90]),
+        sight_of(1, street[:, 90:]),
+    )
+    tracks.remember(first)
+    tracks.refill(first)
+    ids, xy = tracks.ids.copy(), tracks.xy.copy()
+    assert not tracks.follow_again(jumped, lambda before: before.xy), "nothing was followed yet"
+    tracks.follow(jumped, tracks.xy + way)
+    asked = []
+
+    def guess(before):
+        asked.append(before.xy.copy())
+        return before.xy - way
+
+    assert tracks.follow_again(jumped, guess)
+    assert np.array_equal(asked[0], xy), "tracks as they were before the image"
+    assert tracks.frame_ids == [1, 0], "the image counts once"
+    was = xy[np.searchsorted(ids, tracks.ids[tracks.visible])]
+    assert len(was) > 150
+    assert np.median(np.abs(tracks.xy[tracks.visible] - (was - way))) < 0.1
