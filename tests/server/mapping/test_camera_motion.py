@@ -124,11 +124,9 @@ def test_an_image_is_looked_at_again_from_where_the_camera_would_have_got_to():
         frame = DecodedFrame(k, k * FRAME_NS, np.ascontiguousarray(image))
         return Sight(frame, to_grey(frame.image), np.ones(len(image), bool))
 
-    tracks, first, jumped = (
-        TrackTable("robust", 300, 0),
-        sight_of(0, street[:, :-90]),
-        sight_of(1, street[:, 90:]),
-    )
+    way = np.array([90.0, 0.0])
+    tracks = TrackTable("robust", 300, 0)
+    first, jumped = sight_of(0, street[:, :-90]), sight_of(1, street[:, 90:])
     tracks.remember(first)
     tracks.refill(first)
     ids, xy = tracks.ids.copy(), tracks.xy.copy()
