@@ -1,0 +1,135 @@
+"""Depth of every pixel of a keyframe from its neighbours, as far as the images tell it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.server.dense.plane_sweep import Neighbour, match_cost
+from semcast.server.dense.semi_global import aggregate
+from semcast.server.dense.view import View
+
+Array = NDArray[np.float64]
+DepthImage = NDArray[np.float32]
+
+#: Depths that are tried: as many as the image moves by pixels between nearest and farthest, within these.
+MIN_DEPTHS, MAX_DEPTHS = 24, 64
+#: A match has to cost less than this, and the second best one this much more in each direction of smoothing.
+_MAX_COST = 0.5
+_MIN_LEAD = 0.04
+#: Depths this many steps away count as another match.
+_APART = 3
+#: Share of the pixels (every 8th each way) whose movement tells how many depths are tried.
+_MOST = 90.0
+_GRID_PX = 8
+
+
+@dataclass(frozen=True)
+class DepthProblem:
+    """What a depth map is made from.
+
+    Attributes:
+        reference: Whose depth is sought.
+        groups: Neighbours: those before and those after it, none of the groups empty.
+        nearest: Least depth that is tried, map units.
+        farthest: Greatest depth that is tried.
+    """
+
+    reference: View
+    groups: Sequence[Sequence[Neighbour]]
+    nearest: float
+    farthest: float
+
+    def __post_init__(self) -> None:
+        """Check ranges.
+
+        Raises:
+            ValueError: There is nothing to compare with, or depths are out of order.
+        """
+        if not self.groups or not all(self.groups):
+            raise ValueError("groups must hold neighbours, got an empty one")
+        if not 0.0 < self.nearest < self.farthest < np.inf:
+            raise ValueError(
+                f"nearest and farthest must be 0 < nearest < farthest, got {self.nearest:g}, {self.farthest:g}"
+            )
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth of one keyframe.
+
+    Attributes:
+        frame_id: Of the keyframe.
+        inverse_depth: ``(H, W)`` float32 per map unit, NaN where it is not known.
+        step: Distance of two depths that were tried, per map unit: what it is good to, about.
+    """
+
+    frame_id: int
+    inverse_depth: DepthImage
+    step: float
+
+
+def estimate_depth(problem: DepthProblem) -> DepthMap:
+    """Estimate the depth of a keyframe's pixels.
+
+    Depths are tried at equal steps of their inverse; the best one after smoothing counts, refined by a parabola,
+    where it explains the images and is clearly better than any other.
+    """
+    reference = problem.reference
+    inverse_depths = np.linspace(1.0 / problem.farthest, 1.0 / problem.nearest, _num_depths(problem))
+    cost = match_cost(reference, problem.groups, inverse_depths)
+    smoothed = aggregate(cost, reference.grey)
+    best = smoothed.argmin(axis=-1)
+    lead = _second(smoothed, best) - _at(smoothed, best)
+    # The nearest and the farthest depth also stand for all that is beyond.
+    known = (best > 0) & (best < len(inverse_depths) - 1)
+    known &= (_at(cost, best) < _MAX_COST) & (lead > 4.0 * _MIN_LEAD)
+    step = float(inverse_depths[1] - inverse_depths[0])
+    inverse_depth = inverse_depths[0] + step * _refined(smoothed, best)
+    inverse_depth[~known] = np.nan
+    return DepthMap(reference.frame_id, inverse_depth.astype(np.float32), step)
+
+
+def _num_depths(problem: DepthProblem) -> int:
+    """As many depths as the image moves by pixels between the nearest and the farthest."""
+    height, width = problem.reference.shape_hw
+    x, y = np.meshgrid(np.arange(0, width, _GRID_PX), np.arange(0, height, _GRID_PX))
+    rays = np.linalg.inv(problem.reference.K) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    moved = 0.0
+    for neighbour in (n for group in problem.groups for n in group):
+        near = _projected(neighbour, rays * problem.nearest)
+        far = _projected(neighbour, rays * problem.farthest)
+        inside = ((near >= 0.0) & (near < np.array([[width], [height]]))).all(axis=0)
+        distance = np.linalg.norm(near - far, axis=0)[inside]
+        if len(distance):
+            moved = max(moved, float(np.percentile(distance, _MOST)))
+    return int(np.clip(np.ceil(moved), MIN_DEPTHS, MAX_DEPTHS))
+
+
+def _projected(neighbour: Neighbour, points: Array) -> Array:
+    """Pixels ``(2, N)`` of points ``(3, N)`` of the reference's frame; far outside where they are behind."""
+    T = neighbour.T_nbr_ref
+    p = neighbour.view.K @ (T[:3, :3] @ points + T[:3, 3:])
+    return np.asarray(np.where(p[2] > 0.0, p[:2] / np.where(p[2] > 0.0, p[2], 1.0), -1e9))
+
+
+def _at(volume: NDArray[np.float32], idx: NDArray[np.intp]) -> NDArray[np.float32]:
+    return np.asarray(np.take_along_axis(volume, idx[..., None], axis=-1)[..., 0])
+
+
+def _second(smoothed: NDArray[np.float32], best: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Cost of the best depth that is not next to the best one."""
+    apart = np.abs(np.arange(smoothed.shape[-1])[None, None] - best[..., None]) >= _APART
+    return np.asarray(np.where(apart, smoothed, np.inf).min(axis=-1), np.float32)
+
+
+def _refined(smoothed: NDArray[np.float32], best: NDArray[np.intp]) -> Array:
+    """Where between the depths the cost is least, in steps: the vertex of a parabola through three."""
+    middle = np.clip(best, 1, smoothed.shape[-1] - 2)
+    before, at, after = (_at(smoothed, middle + k) for k in (-1, 0, 1))
+    curvature = before - 2.0 * at + after
+    offset = np.where(
+        curvature > 0.0, 0.5 * (before - after) / np.where(curvature > 0.0, curvature, 1.0), 0.0
+    )
+    return np.asarray(middle + np.clip(offset, -0.5, 0.5), np.float64)
