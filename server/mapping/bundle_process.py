@@ -1,58 +1,22 @@
 """Bundle adjustment in a process of its own: GTSAM holds the interpreter lock while it works."""
 
-import contextlib
-import logging
-import multiprocessing
-import signal
-import threading
-import time
 from collections.abc import Callable
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 
-from semcast.common.interrupts import deaf_children
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
+from semcast.server.worker import MAX_FAILURES, Worker
 
-logger = logging.getLogger(__name__)
-
-#: Longest wait for one adjustment, the start of the process included.
-DEADLINE_S = 30.0
-_CLOSE_DEADLINE_S = 3.0
-#: Failures in a row, with no result between them, after which the runner gives up for good.
-_MAX_FAILURES = 5
-GIVEN_UP = (
-    f"the bundle adjustment process failed {_MAX_FAILURES} times in a row: the map is no longer adjusted"
-)
+_WHAT = "the bundle adjustment process"
+GIVEN_UP = f"{_WHAT} failed {MAX_FAILURES} times in a row: the map is no longer adjusted"
 
 
-def serve(connection: Connection) -> None:
-    """Answer problems until the other end closes; the body of the child process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows nothing else keeps Ctrl-C away
+def _adjust(problem: BundleProblem) -> BundleResult:
     from semcast.server.mapping.bundle import optimise
 
-    while True:
-        try:
-            problem = connection.recv()
-        except (EOFError, OSError):
-            return
-        if problem is None:
-            return
-        try:
-            connection.send(optimise(problem))
-        except (BrokenPipeError, OSError):
-            return
+    return optimise(problem)
 
 
-def _send(connection: Connection, problem: BundleProblem | None) -> None:
-    with contextlib.suppress(OSError):  # who waits for the result sees that the child is gone
-        connection.send(problem)
-
-
-class ProcessBundle:
-    """Adjusts in a child process that is started again when it dies.
-
-    The child imports the program's main module: a script needs ``if __name__ == "__main__":`` around what it
-    does, or takes ``InlineBundle``.
+class ProcessBundle(Worker[BundleProblem, BundleResult]):
+    """Adjusts in a child process; scripts take ``InlineBundle``, see ``Worker``.
 
     Args:
         lossless: ``take`` always waits for the result, so the same input gives the same map; otherwise it
@@ -61,134 +25,6 @@ class ProcessBundle:
     """
 
     def __init__(self, *, lossless: bool = False, on_give_up: Callable[[str], None] | None = None) -> None:
-        self._lossless = lossless
-        self._on_give_up = on_give_up
-        self._context = multiprocessing.get_context("spawn")
-        self._process: SpawnProcess | None = None
-        self._connection: Connection | None = None
-        self._pending: BundleProblem | None = None
-        self._sender: threading.Thread | None = None
-        self._since_s = 0.0
-        self._closed = False
-        self._failures = 0
-        self.num_restarts = 0
-        self._start()
-
-    @property
-    def busy(self) -> bool:
-        """A problem is under way."""
-        return self._pending is not None
-
-    @property
-    def given_up(self) -> bool:
-        """The child died too often: nothing is adjusted any more."""
-        return self._failures >= _MAX_FAILURES
-
-    @property
-    def pid(self) -> int | None:
-        """Process id of the child, None where there is none any more."""
-        return self._process.pid if self._process is not None else None
-
-    def _start(self) -> None:
-        self._stop()
-        ours, theirs = self._context.Pipe()
-        self._process = self._context.Process(
-            target=serve, args=(theirs,), name="semcast-bundle", daemon=True
+        super().__init__(
+            _adjust, name="bundle", what=_WHAT, given_up=GIVEN_UP, lossless=lossless, on_give_up=on_give_up
         )
-        with deaf_children():  # Ctrl-C is the parent's business
-            self._process.start()
-        theirs.close()
-        self._connection = ours
-
-    def _restart(self) -> None:
-        self._failures += 1
-        if self.given_up:
-            self._give_up()
-            return
-        self.num_restarts += 1
-        logger.warning("the bundle adjustment process ended and is started again")
-        self._start()
-
-    def _give_up(self) -> None:
-        self._stop()
-        logger.error("%s", GIVEN_UP)
-        if self._on_give_up is not None:
-            self._on_give_up(GIVEN_UP)
-
-    def submit(self, problem: BundleProblem) -> bool:
-        """Give a problem to the child; False while it works on another or has failed for good.
-
-        Sending is done by a thread: a child that is still starting, or stuck, does not read what it is sent,
-        and a problem may be larger than what a pipe holds.
-        """
-        if self._closed or self._pending is not None:
-            return False
-        for _ in range(2):
-            if self.given_up:
-                return False
-            if self._process is not None and self._process.is_alive():
-                self._pending, self._since_s = problem, time.monotonic()
-                self._sender = threading.Thread(
-                    target=_send, args=(self._connection, problem), name="semcast-bundle-send", daemon=True
-                )
-                self._sender.start()
-                return True
-            self._restart()
-        return False
-
-    def take(self, wait: bool = False) -> BundleResult | None:
-        """Return the result, or None when it is not there yet or the child died over it.
-
-        A child that has had a problem for longer than ``DEADLINE_S`` is ended. A problem whose child died is
-        sent once more when the result is waited for.
-        """
-        if self._pending is None or self._closed:
-            return None
-        wait = wait or self._lossless
-        retries = 1
-        while True:
-            assert self._connection is not None
-            try:
-                left_s = self._since_s + DEADLINE_S - time.monotonic()
-                if not self._connection.poll(max(0.0, left_s) if wait else 0.0):
-                    if not wait and left_s > 0.0:
-                        return None
-                    if self._process is not None:
-                        self._process.kill()
-                    raise TimeoutError
-                result = self._connection.recv()
-                self._pending, self._failures = None, 0
-                return result  # type: ignore[no-any-return]
-            except (EOFError, OSError):  # TimeoutError is an OSError
-                problem, self._pending = self._pending, None
-                self._restart()
-                if not wait or retries == 0 or problem is None or not self.submit(problem):
-                    self._pending = None
-                    return None
-                retries -= 1
-
-    def _stop(self) -> None:
-        connection, self._connection = self._connection, None
-        process, self._process = self._process, None
-        sender, self._sender = self._sender, None
-        if sender is not None and sender.is_alive() and process is not None:
-            process.kill()  # else it might never be done
-        if sender is not None:
-            sender.join(_CLOSE_DEADLINE_S)
-        if connection is not None:
-            if self._pending is None:
-                _send(connection, None)
-            connection.close()
-        if process is not None:
-            process.join(_CLOSE_DEADLINE_S if self._pending is None else 0.1)
-            if process.is_alive():
-                process.kill()
-                process.join(_CLOSE_DEADLINE_S)
-            process.close()
-
-    def close(self) -> None:
-        """End the child. Idempotent."""
-        if not self._closed:
-            self._closed = True
-            self._stop()
-            self._pending = None

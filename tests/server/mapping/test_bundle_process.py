@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from semcast.server.mapping import bundle_process
+from semcast.server import worker
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.bundle_process import GIVEN_UP, ProcessBundle
 
@@ -71,7 +71,7 @@ def test_a_child_that_hangs_is_ended_and_another_goes_on(wait):
         assert runner.submit(PROBLEM)
         assert runner.take() is None
         assert runner.busy
-        runner._since_s -= 2 * bundle_process.DEADLINE_S
+        runner._since_s -= 2 * worker.DEADLINE_S
         result = runner.take(wait=wait)
         assert (result is not None) == wait, "another child answers one who waits"
         assert not runner.busy

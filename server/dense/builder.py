@@ -1,0 +1,273 @@
+"""Follows the map: chooses whose depth is estimated from which neighbours, and what of it becomes points."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform, rotation_angle_deg
+from semcast.server.dense.cloud import CloudPoints, DenseCloud, DensePatch, landmark_depths
+from semcast.server.dense.consistency import OtherDepth, agrees, back_project, num_agreeing
+from semcast.server.dense.depth_map import DepthMap, DepthProblem
+from semcast.server.dense.plane_sweep import Neighbour
+from semcast.server.dense.view import View, view_of
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+
+#: Keyframes whose images are kept, and those of them whose depth is.
+_NUM_VIEWS, _NUM_MAPS = 12, 6
+#: Neighbours on either side, each so much further away than the one before, in shares of the median depth.
+_NUM_NEIGHBOURS = 2
+_BASELINE = 0.04
+#: Neighbours whose view is turned by more see too little of the same, and that too differently.
+_MAX_TURN_DEG = 40.0
+#: After so many later keyframes those that are there have to do.
+_MAX_LATER = 4
+#: Keyframes that may wait where there is no time for all.
+_MAX_WAITING = 2
+#: A keyframe's depth is sought between these percentiles of its landmarks', and somewhat beyond.
+_NEAR, _FAR = (2.0, 1.0 / 1.3), (98.0, 1.5)
+_MIN_LANDMARKS = 10
+#: Depth of so many keyframes on either side confirms one, two of them where there are three.
+_NUM_CONFIRMING = 2
+#: Keyframes before, whose points are not added once more.
+_NUM_COVERING = 4
+
+
+class DepthRunner(Protocol):
+    """Estimates depth maps, one at a time."""
+
+    @property
+    def busy(self) -> bool:
+        """A problem was submitted and its result not taken yet."""
+
+    def submit(self, problem: DepthProblem) -> bool:
+        """Start on a problem; False (and nothing happens) while another one is under way."""
+
+    def take(self, wait: bool = False) -> DepthMap | None:
+        """Return the result if it is there, or with ``wait`` when it is."""
+
+    def close(self) -> None:
+        """Free everything. Idempotent."""
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A keyframe's image, and the confidence of the view's pixels ``(H, W)``."""
+
+    view: View
+    confidence: NDArray[np.float32]
+
+
+class DenseBuilder:
+    """Makes the dense cloud of a map while that grows.
+
+    Args:
+        camera: Of the images, without distortion.
+        runner: Estimates depth; closed with the builder.
+        lossless: Every keyframe gets its depth, if need be by waiting for it; otherwise those do for which
+            there is time.
+    """
+
+    def __init__(self, camera: Intrinsics, runner: DepthRunner, *, lossless: bool = False) -> None:
+        self._camera = camera
+        self._runner = runner
+        self._lossless = lossless
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the map was begun anew."""
+        self._runner.take(wait=True)
+        self._kept: dict[int, _Kept] = {}
+        self._waiting: list[int] = []
+        self._maps: dict[int, DepthMap] = {}
+        self._unconfirmed: list[int] = []
+        self._confirmed: dict[int, DepthMap] = {}
+        self._cloud = DenseCloud()
+
+    def __len__(self) -> int:
+        return len(self._cloud)
+
+    def add_keyframe(
+        self, frame_id: int, image: NDArray[np.uint8], confidence: NDArray[np.float32] | None
+    ) -> None:
+        """Take the image of a new keyframe.
+
+        Args:
+            frame_id: Of the keyframe, newer than those before.
+            image: ``(H, W, 3)`` uint8 RGB.
+            confidence: ``(H, W)`` in [0, 1], the codec's pixel target; None counts as 1.
+        """
+        view = view_of(frame_id, image, confidence, self._camera)
+        height, width = view.shape_hw
+        small = np.ones((height, width), np.float32)
+        if confidence is not None:
+            small = cv2.resize(confidence, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+        self._kept[frame_id] = _Kept(view, small)
+        self._waiting.append(frame_id)
+        for old in sorted(self._kept)[:-_NUM_VIEWS]:
+            del self._kept[old]
+        self._waiting = [k for k in self._waiting if k in self._kept]
+
+    def advance(self, world: WorldMap) -> None:
+        """Take a depth map that is ready and begin on another; returns at once where nothing may be lost.
+
+        Args:
+            world: The map as it is.
+        """
+        self._take(world, wait=self._lossless)
+        self._begin(world, is_last=False)
+
+    def follow(self, world: WorldMap, frame_ids: Sequence[int]) -> None:
+        """Note keyframes that the map has moved."""
+        self._cloud.follow(world, frame_ids)
+
+    def finish(self, world: WorldMap) -> None:
+        """Estimate what waits with the neighbours there are, and wait for it: the stream has ended."""
+        while True:
+            self._take(world, wait=True)
+            self._begin(world, is_last=True)
+            if not self._runner.busy:
+                break
+        while self._unconfirmed:
+            self._confirm(self._unconfirmed.pop(0), world)
+
+    def take_changes(self) -> tuple[DensePatch, ...]:
+        """Return patches that were added or changed since this was last called."""
+        return self._cloud.take_changes()
+
+    def points(self, world: WorldMap) -> CloudPoints:
+        """Return the cloud as it is."""
+        return self._cloud.points(world)
+
+    def close(self) -> None:
+        """End the runner. Idempotent."""
+        self._runner.close()
+
+    def _take(self, world: WorldMap, *, wait: bool) -> None:
+        found = self._runner.take(wait=wait) if self._runner.busy else None
+        if found is None or found.frame_id not in self._kept:
+            return
+        self._maps[found.frame_id] = found
+        self._unconfirmed.append(found.frame_id)
+        for old in sorted(self._maps)[:-_NUM_MAPS]:
+            del self._maps[old]
+        # The newest waits for one after it.
+        self._unconfirmed = sorted(k for k in self._unconfirmed if k in self._maps)
+        while len(self._unconfirmed) > 1:
+            self._confirm(self._unconfirmed.pop(0), world)
+
+    def _begin(self, world: WorldMap, *, is_last: bool) -> None:
+        """Give the runner the oldest keyframe that has its neighbours."""
+        if self._runner.busy:
+            return
+        if not self._lossless and not is_last:
+            ready = [k for k in self._waiting if self._is_ready(k, world)]
+            self._waiting = [k for k in self._waiting if k not in ready[:-_MAX_WAITING]]
+        for frame_id in list(self._waiting):
+            if not is_last and not self._is_ready(frame_id, world):
+                return
+            self._waiting.remove(frame_id)
+            problem = self._problem(frame_id, world)
+            if problem is not None:
+                self._runner.submit(problem)
+                return
+
+    def _is_ready(self, frame_id: int, world: WorldMap) -> bool:
+        later = [k for k in self._kept if k > frame_id]
+        keyframe = _keyframe(world, frame_id)
+        if len(later) >= _MAX_LATER or keyframe is None:
+            return True
+        return len(self._neighbours(keyframe, sorted(later), world)) >= _NUM_NEIGHBOURS
+
+    def _problem(self, frame_id: int, world: WorldMap) -> DepthProblem | None:
+        """What is asked about a keyframe; None where there is too little to tell its depth from."""
+        keyframe = _keyframe(world, frame_id)
+        if keyframe is None or world.pose_of_frame(frame_id) is None:
+            return None
+        _, depth = landmark_depths(world, keyframe)
+        if len(depth) < _MIN_LANDMARKS:
+            return None
+        before = sorted((k for k in self._kept if k < frame_id), reverse=True)
+        after = sorted(k for k in self._kept if k > frame_id)
+        groups = [self._neighbours(keyframe, side, world) for side in (before, after)]
+        groups = [group for group in groups if group]
+        if not groups:
+            return None
+        near, far = (float(np.percentile(depth, share)) * factor for share, factor in (_NEAR, _FAR))
+        return DepthProblem(_light(self._kept[frame_id].view), groups, near, far)
+
+    def _neighbours(self, keyframe: Keyframe, side: Sequence[int], world: WorldMap) -> list[Neighbour]:
+        """Choose views on one side of a keyframe, from the nearest in time on."""
+        _, depth = landmark_depths(world, keyframe)
+        if len(depth) == 0:
+            return []
+        median = float(np.median(depth))
+        found: list[Neighbour] = []
+        for frame_id in side:
+            T_world_nbr = world.pose_of_frame(frame_id)
+            if T_world_nbr is None or world.submap_of.get(frame_id) != keyframe.submap:
+                continue
+            T_nbr_ref = invert_transform(T_world_nbr) @ keyframe.T_world_cam
+            baseline = float(np.linalg.norm(T_nbr_ref[:3, 3]))
+            if baseline < _BASELINE * median * (len(found) + 1):
+                continue
+            if rotation_angle_deg(T_nbr_ref[:3, :3]) > _MAX_TURN_DEG:
+                break
+            found.append(Neighbour(_light(self._kept[frame_id].view), T_nbr_ref))
+            if len(found) == _NUM_NEIGHBOURS:
+                break
+        return found
+
+    def _confirm(self, frame_id: int, world: WorldMap) -> None:
+        """Make points of what other keyframes see too, and those before have not added yet."""
+        keyframe, kept = _keyframe(world, frame_id), self._kept.get(frame_id)
+        if keyframe is None or kept is None or world.pose_of_frame(frame_id) is None:
+            return
+        found, view = self._maps[frame_id], kept.view
+        before = sorted(k for k in self._maps if k < frame_id)[-_NUM_CONFIRMING:]
+        after = sorted(k for k in self._maps if k > frame_id)[:_NUM_CONFIRMING]
+        others = [
+            other
+            for k in (*before, *after)
+            if (other := self._seen_from(keyframe, self._maps[k], world)) is not None
+        ]
+        wanted = 2 if len(others) > _NUM_CONFIRMING else 1
+        sure = num_agreeing(found.inverse_depth, found.step, view.K, others) >= wanted
+        confirmed = replace(found, inverse_depth=np.where(sure, found.inverse_depth, np.nan))
+        points = back_project(confirmed.inverse_depth, view.K)[sure]
+        new = np.ones(len(points), bool)
+        for covering in self._confirmed.values():
+            other = self._seen_from(keyframe, covering, world)
+            if other is not None:
+                new &= ~agrees(points, found.step, other)
+        self._confirmed[frame_id] = confirmed
+        for old in sorted(self._confirmed)[:-_NUM_COVERING]:
+            del self._confirmed[old]
+        patch = DensePatch(
+            frame_id, points[new].astype(np.float32), view.rgb[sure][new], kept.confidence[sure][new]
+        )
+        if len(patch.xyz):
+            self._cloud.add(patch, *landmark_depths(world, keyframe))
+
+    def _seen_from(self, keyframe: Keyframe, found: DepthMap, world: WorldMap) -> OtherDepth | None:
+        """Another keyframe's depth as ``consistency`` takes it; None where it is not of the same part."""
+        T_world_other, kept = world.pose_of_frame(found.frame_id), self._kept.get(found.frame_id)
+        if T_world_other is None or kept is None or world.submap_of.get(found.frame_id) != keyframe.submap:
+            return None
+        T_other_ref = invert_transform(T_world_other) @ keyframe.T_world_cam
+        return OtherDepth(found.inverse_depth, found.step, kept.view.K, T_other_ref)
+
+
+def _keyframe(world: WorldMap, frame_id: int) -> Keyframe | None:
+    return next((k for k in reversed(world.keyframes) if k.frame_id == frame_id), None)
+
+
+def _light(view: View) -> View:
+    """Return a view as it travels to the runner: without colours, which only points need."""
+    return replace(view, rgb=view.rgb[:0])

@@ -1,0 +1,142 @@
+"""The points of all keyframes' depth: each hangs on its keyframe and goes with it when the map moves."""
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.geometry import invert_transform
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+#: Points at most; beyond it the older half of the patches keeps every second of its points.
+MAX_POINTS = 1_000_000
+#: A patch is handed out again where its scale has changed by more than this share.
+_SCALE_CHANGE = 1e-3
+#: So many landmarks of a keyframe have to be left to tell its scale.
+_MIN_LANDMARKS = 5
+
+
+@dataclass(frozen=True)
+class DensePatch:
+    """What one keyframe adds to the cloud.
+
+    A point is at ``T_world_cam @ (scale * xyz)`` with the keyframe's present pose.
+
+    Attributes:
+        frame_id: Of the keyframe.
+        xyz: ``(N, 3)`` float32 in its camera frame, in map units of when they were made.
+        rgb: ``(N, 3)`` uint8.
+        confidence: ``(N,)`` float32 in [0, 1], of the pixels they are from.
+        scale: Present map units in one of then.
+    """
+
+    frame_id: int
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    scale: float = 1.0
+
+    def thinned(self) -> "DensePatch":
+        """Return it with every second point."""
+        return replace(self, xyz=self.xyz[::2], rgb=self.rgb[::2], confidence=self.confidence[::2])
+
+
+@dataclass(frozen=True)
+class CloudPoints:
+    """Points in the world frame.
+
+    Attributes:
+        xyz: ``(N, 3)`` float64, map units.
+        rgb: ``(N, 3)`` uint8.
+        confidence: ``(N,)`` float32 in [0, 1].
+    """
+
+    xyz: Array
+    rgb: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+
+
+def landmark_depths(world: WorldMap, keyframe: Keyframe) -> tuple[Ids, Array]:
+    """Return the landmarks ``(N,)`` in front of a keyframe that sees them, and their depths ``(N,)``."""
+    row = world.landmarks.rows(keyframe.ids)
+    ids, xyz = keyframe.ids[row >= 0], world.landmarks.xyz[row[row >= 0]]
+    T_cam_world = invert_transform(keyframe.T_world_cam)
+    depth = xyz @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    return ids[depth > 0.0], depth[depth > 0.0]
+
+
+class DenseCloud:
+    """Collects patches, keeps their scale that of the map, and bounds their number.
+
+    Args:
+        max_points: Points at most.
+    """
+
+    def __init__(self, max_points: int = MAX_POINTS) -> None:
+        self._max_points = max_points
+        self._patches: dict[int, DensePatch] = {}
+        self._landmarks: dict[int, tuple[Ids, Array]] = {}
+        self._changed: set[int] = set()
+
+    def __len__(self) -> int:
+        return sum(len(patch.xyz) for patch in self._patches.values())
+
+    def add(self, patch: DensePatch, ids: Ids, depth: Array) -> None:
+        """Add a keyframe's points.
+
+        Args:
+            patch: The points.
+            ids: ``(L,)`` landmarks that the keyframe sees.
+            depth: ``(L,)`` how far they are from it, in the units of the points.
+        """
+        self._patches[patch.frame_id] = patch
+        self._landmarks[patch.frame_id] = (ids, depth)
+        self._changed.add(patch.frame_id)
+        if len(self) > self._max_points:
+            for frame_id in sorted(self._patches)[: (len(self._patches) + 1) // 2]:
+                self._patches[frame_id] = self._patches[frame_id].thinned()
+                self._changed.add(frame_id)
+
+    def follow(self, world: WorldMap, frame_ids: Collection[int]) -> None:
+        """Take the scale of keyframes that moved from their landmarks: joined parts and loops change it."""
+        for frame_id in frame_ids:
+            patch, T_world_cam = self._patches.get(frame_id), world.pose_of_frame(frame_id)
+            if patch is None or T_world_cam is None:
+                continue
+            ids, before = self._landmarks[frame_id]
+            row = world.landmarks.rows(ids)
+            there = row >= 0
+            T_cam_world = invert_transform(T_world_cam)
+            depth = world.landmarks.xyz[row[there]] @ T_cam_world[2, :3] + T_cam_world[2, 3]
+            sound = depth > 0.0
+            if sound.sum() < _MIN_LANDMARKS:
+                continue
+            scale = float(np.median(depth[sound] / before[there][sound]))
+            if abs(scale / patch.scale - 1.0) > _SCALE_CHANGE:
+                self._patches[frame_id] = replace(patch, scale=scale)
+                self._changed.add(frame_id)
+
+    def take_changes(self) -> tuple[DensePatch, ...]:
+        """Return patches that were added or changed since this was last called, by frame id."""
+        changed, self._changed = sorted(self._changed), set()
+        return tuple(self._patches[frame_id] for frame_id in changed)
+
+    def points(self, world: WorldMap) -> CloudPoints:
+        """Return all points with the present poses; those of keyframes without a pose are left out."""
+        return placed(self._patches.values(), world)
+
+
+def placed(patches: Iterable[DensePatch], world: WorldMap) -> CloudPoints:
+    """Return the points of patches in the world frame."""
+    xyz, rgb, confidence = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0, np.float32)]
+    for patch in patches:
+        T_world_cam = world.pose_of_frame(patch.frame_id)
+        if T_world_cam is not None:
+            xyz.append(patch.scale * patch.xyz @ T_world_cam[:3, :3].T + T_world_cam[:3, 3])
+            rgb.append(patch.rgb)
+            confidence.append(patch.confidence)
+    return CloudPoints(np.concatenate(xyz), np.concatenate(rgb), np.concatenate(confidence))

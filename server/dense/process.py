@@ -1,0 +1,38 @@
+"""Depth maps in a process of its own, which stands back behind tracking, mapping and decoding."""
+
+from collections.abc import Callable
+
+import cv2
+
+from semcast.server.dense.depth_map import DepthMap, DepthProblem, estimate_depth
+from semcast.server.worker import MAX_FAILURES, Worker
+
+_WHAT = "the process that estimates dense depth"
+GIVEN_UP = f"{_WHAT} failed {MAX_FAILURES} times in a row: the dense cloud no longer grows"
+#: Poses come first: depth has what time they leave.
+_NICENESS = 10
+
+
+def _estimate(problem: DepthProblem) -> DepthMap:
+    cv2.setNumThreads(1)
+    return estimate_depth(problem)
+
+
+class ProcessDepth(Worker[DepthProblem, DepthMap]):
+    """Estimates depth maps in a child process, see ``Worker``.
+
+    Args:
+        lossless: ``take`` always waits for the result, so the same input gives the same cloud.
+        on_give_up: Is told why, once, when the child dies so often that it is not started again.
+    """
+
+    def __init__(self, *, lossless: bool = False, on_give_up: Callable[[str], None] | None = None) -> None:
+        super().__init__(
+            _estimate,
+            name="depth",
+            what=_WHAT,
+            given_up=GIVEN_UP,
+            lossless=lossless,
+            on_give_up=on_give_up,
+            niceness=_NICENESS,
+        )
