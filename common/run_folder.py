@@ -3,6 +3,7 @@
 ===================== =================================================================================
 ``trajectory.tum``    poses of all frames, ``t tx ty tz qx qy qz qw``, camera to world
 ``map.ply``           landmarks with colour and confidence
+``dense.ply``         the dense cloud, likewise
 ``summary.json``      figures of the run
 ``settings.toml``     resolved settings of the server or the replay
 ``demo.toml``         resolved settings of a demo, its link among them
@@ -43,6 +44,7 @@ logger = logging.getLogger(__name__)
 
 TRAJECTORY_NAME = "trajectory.tum"
 MAP_NAME = "map.ply"
+DENSE_NAME = "dense.ply"
 SUMMARY_NAME = "summary.json"
 SETTINGS_NAME = "settings.toml"
 DEMO_SETTINGS_NAME = "demo.toml"

@@ -166,7 +166,7 @@ def _row(
         "frame_ms_p50": float(np.percentile(times_ms, 50)),
         "frame_ms_p95": float(np.percentile(times_ms, 95)),
         "landmarks": len(reconstruction.landmarks()[0]),
-        "keyframes": len(np.unique(reconstruction.observations()[1])),
+        "keyframes": len(np.unique(reconstruction.world.observations()[1])),
         "memory_mb": resident_mb(),
     }
     if truth is not None and len(posed) >= 3:

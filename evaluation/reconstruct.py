@@ -124,7 +124,7 @@ def reconstruct(
         poses = reconstruction.final_trajectory()
         num_landmarks = len(reconstruction.landmarks()[0])
         part_of = frame_parts(reconstruction.snapshot())
-        num_keyframes = len(np.unique(reconstruction.observations()[1]))
+        num_keyframes = len(np.unique(reconstruction.world.observations()[1]))
     finally:
         reconstruction.close()
     trajectory = trajectory_of(poses, frame_times_ns)

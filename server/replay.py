@@ -77,6 +77,10 @@ class ReplaySettings:
     save_images: Literal["none", "keyframes", "all"] = field(
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
+    dense_cloud: bool = field(
+        default=True,
+        metadata={"help": "estimate the depth of keyframes too, for dense.ply and a cloud in the viewer"},
+    )
     reference: Path | None = field(
         default=None,
         metadata={
@@ -156,6 +160,7 @@ def replay(
         mode="replay",
         out=settings.out,
         save_images=settings.save_images,
+        dense_cloud=settings.dense_cloud,
         threads=settings.threads,
         reference=settings.reference,
         bundle="inline",
@@ -209,9 +214,9 @@ def _replayed(
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
         with contextlib.suppress(OSError):  # said at the end
             session.write_results(settings.out)  # who stops the replay may not wait for the adjustment
-        update = session.conclude()
-        if viewer is not None and update is not None:
-            viewer.submit(None, update)
+        update, patches = session.conclude()
+        if viewer is not None:
+            viewer.submit(None, update, patches)
         try:
             whole = settings.start_s == 0.0 and settings.end_s is None and not stop.is_set()
             return session.write_outputs(settings.out, drops, complete=whole)
@@ -249,7 +254,7 @@ def _take(
         return False
     outcome = _process(session, decoded, drops)
     if viewer is not None:
-        viewer.submit(outcome.view, outcome.update)
+        viewer.submit(outcome.view, outcome.update, outcome.patches)
     return True
 
 

@@ -342,7 +342,7 @@ class Server:
             self._metrics.observe(stage, duration_ms)
         if self._views.is_shown:
             started_ns = time.perf_counter_ns()
-            self._views.submit(outcome.view, outcome.update, new_map=self._new_map)
+            self._views.submit(outcome.view, outcome.update, outcome.patches, new_map=self._new_map)
             self._metrics.observe("view", (time.perf_counter_ns() - started_ns) * 1e-6)
         self._new_map = False
 
@@ -401,10 +401,10 @@ class Server:
     def _conclude(self, session: Session) -> None:
         """Adjust the whole map of a stream that has ended, and tell who follows it."""
         self._save(session)  # the adjustment takes seconds, and the server may be stopped or killed meanwhile
-        update = session.conclude()
+        update, patches = session.conclude()
         if update is not None:
             self._outbox.put_map(session.identity.agent_epoch, update)
-            self._views.submit(None, update)
+        self._views.submit(None, update, patches)
 
     def _drops(self) -> dict[str, int]:
         """Drops since the present stream began."""

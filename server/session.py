@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.config import settings_to_dict, to_toml
-from semcast.common.errors import CheckpointError, SemcastError
+from semcast.common.errors import CheckpointError
 from semcast.common.run_folder import (
     CHECKPOINT_NAME,
+    DENSE_NAME,
     FRAMES_NAME,
     IMAGES_NAME,
     MAP_NAME,
@@ -26,10 +27,7 @@ from semcast.common.run_folder import (
     TRAJECTORY_NAME,
     VIEWER_NAME,
     ImageWriter,
-    RunData,
-    write_run,
 )
-from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.whole_file import write_whole
 from semcast.server.checkpoint import (
     Checkpoint,
@@ -38,8 +36,10 @@ from semcast.server.checkpoint import (
     load_checkpoint,
     mismatch,
 )
-from semcast.server.export.outputs import EachFile, trajectory_of, versions, write_json, write_ply
-from semcast.server.export.parts import frame_parts, landmark_parts
+from semcast.server.dense.builder import DenseBuilder
+from semcast.server.dense.cloud import DensePatch
+from semcast.server.dense.process import ProcessDepth
+from semcast.server.export.outputs import EachFile, versions, write_json, write_ply
 from semcast.server.former_run import set_aside
 from semcast.server.frame_views import frame_view
 from semcast.server.mapping.bundle import InlineBundle
@@ -49,6 +49,7 @@ from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.reference import Reference
 from semcast.server.run_record import FrameRow, RunRecord, run_line, summarise
+from semcast.server.run_results import Results, results_of, write_results
 from semcast.server.sent_frames import stretches
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
@@ -59,7 +60,7 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 
 #: What is written at the end of a run, and when it is asked for.
-_RESULTS = (TRAJECTORY_NAME, MAP_NAME, RECONSTRUCTION_NAME, SETTINGS_NAME, SUMMARY_NAME)
+_RESULTS = (TRAJECTORY_NAME, MAP_NAME, DENSE_NAME, RECONSTRUCTION_NAME, SETTINGS_NAME, SUMMARY_NAME)
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
 
@@ -87,28 +88,12 @@ class Arrival:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one frame led to."""
+    """What one frame led to: its result, changes of map and dense cloud, and what is shown of it."""
 
     result: FrameResult
     update: MapUpdate | None
     view: FrameView
-
-
-@dataclass(frozen=True)
-class Results:
-    """What there is of a map.
-
-    Attributes:
-        trajectory: All posed frames.
-        part_of: Frame id of each -> the part of the map it is in now.
-        num_landmarks: Of the map.
-        num_keyframes: Keyframes the map rests on.
-    """
-
-    trajectory: Trajectory
-    part_of: Mapping[int, int]
-    num_landmarks: int
-    num_keyframes: int
+    patches: tuple[DensePatch, ...] = ()
 
 
 class Session:
@@ -143,6 +128,7 @@ class Session:
         self._reference = reference
         bundle = bundle if bundle is not None else new_bundle(settings)
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
+        self._dense = _new_dense(settings, identity) if settings.dense_cloud else None
         self._t_source_ns: dict[int, int] = {}
         self._numbers: dict[int, int | None] = {}
         self._num_frames = identity.num_frames
@@ -245,6 +231,7 @@ class Session:
             tell(result)
         self._log_state(result)
         update = self._reconstruction.take_map_update()
+        patches = self._grow_cloud(frame, result, update)
         self._last_frame_id = frame.frame_id
         self._t_source_ns[frame.frame_id] = frame.t_source_ns
         for frame_id, t_source_ns, _ in result.backfilled:
@@ -275,7 +262,23 @@ class Session:
             restored = [(k, self._t_source_ns.get(k, 0), T) for k, T in sorted(self._restored.items())]
             view = replace(view, backfilled=(*restored, *view.backfilled))
             self._restored = {}
-        return Outcome(result, update, view)
+        return Outcome(result, update, view, patches)
+
+    def _grow_cloud(
+        self, frame: DecodedFrame, result: FrameResult, update: MapUpdate | None
+    ) -> tuple[DensePatch, ...]:
+        """Let the dense cloud follow the map; what is new in it."""
+        if self._dense is None:
+            return ()
+        world = self._reconstruction.world
+        if update is not None:
+            self._dense.follow(world, update.keyframe_ids.tolist())
+        if result.is_keyframe:
+            image = self._reconstruction.put_right(frame.image)
+            self._dense.add_keyframe(frame.frame_id, image, frame.confidence)
+        if result.is_keyframe or self._settings.mode == "live":  # a replay repeats itself at any speed
+            self._dense.advance(world)
+        return self._dense.take_changes()
 
     def _log_state(self, result: FrameResult) -> None:
         """Say where a map begins and where the camera is lost."""
@@ -338,16 +341,28 @@ class Session:
         """Forget the map, as the control request ``reset`` asks."""
         self._reconstruction.reset()
         self._restored = {}
+        if self._dense is not None:
+            self._dense.reset()
 
-    def conclude(self) -> MapUpdate | None:
-        """Adjust the whole map, as the settings want it, now that the stream has ended; what that changed."""
+    def conclude(self) -> tuple[MapUpdate | None, tuple[DensePatch, ...]]:
+        """Adjust the whole map, as the settings want it, and complete the dense cloud: the stream has ended.
+
+        Returns:
+            What that changed in the map and in the cloud.
+        """
         since = time.monotonic()
         try:
             num_adjusted = self._reconstruction.conclude()
             logger.debug("%d keyframes are adjusted, in %.1f s", num_adjusted, time.monotonic() - since)
         except Exception:
             logger.exception("the map could not be adjusted as a whole and stays as it was")
-        return self._reconstruction.take_map_update()
+        update = self._reconstruction.take_map_update()
+        if self._dense is None:
+            return update, ()
+        if update is not None:
+            self._dense.follow(self._reconstruction.world, update.keyframe_ids.tolist())
+        self._dense.finish(self._reconstruction.world)
+        return update, self._dense.take_changes()
 
     def write_outputs(
         self, folder: Path | None, drops: Mapping[str, int], *, complete: bool
@@ -391,6 +406,7 @@ class Session:
             results.num_keyframes,
         )
         summary["num_landmarks"] = results.num_landmarks
+        summary["num_dense_points"] = None if self._dense is None else len(self._dense)
         summary["stream"] = {
             "agent_id": self.identity.agent_id,
             "codec": self.identity.codec,
@@ -412,47 +428,16 @@ class Session:
             return self._write_results(folder, each)
 
     def _write_results(self, folder: Path | None, each: EachFile) -> Results:
-        poses = self._reconstruction.final_trajectory()
-        snapshot = self._reconstruction.snapshot()
-        part_of = frame_parts(snapshot)
-        trajectory = trajectory_of(poses, self._t_source_ns)
-        ids, xyz, rgb, confidence = self._reconstruction.landmarks()
-        landmark_ids, keyframe_ids, xy = self._reconstruction.observations()
-        results = Results(trajectory, part_of, len(ids), len(np.unique(keyframe_ids)))
-        if folder is None:
-            return results
-        folder.mkdir(parents=True, exist_ok=True)
-        with each.attempt(folder / SETTINGS_NAME) as path:
-            write_whole(path, to_toml(self._program))
-        with each.attempt(folder / TRAJECTORY_NAME) as path:
-            write_tum(path, trajectory)
-        with each.attempt(folder / MAP_NAME) as path:
-            write_ply(path, xyz, rgb, confidence)
-        timed = sorted(frame_id for frame_id in poses if frame_id in self._t_source_ns)
-        used = np.isin(landmark_ids, ids) & np.isin(keyframe_ids, timed)
-        try:
-            # What exports to other tools are made from.
-            write_run(
-                folder,
-                RunData(
-                    intrinsics=self.identity.camera,
-                    frame_ids=np.array(timed, dtype=np.int64),
-                    t_source_ns=np.array([self._t_source_ns[k] for k in timed], dtype=np.int64),
-                    T_world_cam=np.array([poses[k] for k in timed]).reshape(-1, 4, 4),
-                    frame_submap=np.array([part_of[k] for k in timed], dtype=np.int64),
-                    keyframe_ids=np.unique(keyframe_ids[used]),
-                    landmark_ids=ids,
-                    xyz=xyz,
-                    rgb=rgb,
-                    confidence=confidence,
-                    landmark_submap=landmark_parts(snapshot),
-                    observed_landmark_ids=landmark_ids[used],
-                    observed_keyframe_ids=keyframe_ids[used],
-                    observed_xy=xy[used].astype(np.float32),
-                ),
-            )
-        except (SemcastError, ValueError) as err:
-            logger.warning("the reconstruction can't be written for export: %s", err)
+        results = results_of(self._reconstruction, self._t_source_ns)
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            with each.attempt(folder / SETTINGS_NAME) as path:
+                write_whole(path, to_toml(self._program))
+            write_results(folder, self._reconstruction, results, self.identity.camera, self._t_source_ns, each)
+            if self._dense is not None:
+                cloud = self._dense.points(self._reconstruction.world)
+                with each.attempt(folder / DENSE_NAME) as path:
+                    write_ply(path, cloud.xyz, cloud.rgb, cloud.confidence)
         return results
 
     def move_records(self, folder: Path) -> None:
@@ -477,6 +462,8 @@ class Session:
             self._images.close()
         self._record.close()
         self._reconstruction.close()
+        if self._dense is not None:
+            self._dense.close()
 
 
 def new_bundle(settings: ServerSettings, on_give_up: Callable[[str], None] | None = None) -> BundleRunner:
@@ -489,3 +476,9 @@ def new_bundle(settings: ServerSettings, on_give_up: Callable[[str], None] | Non
     if settings.bundle == "inline":
         return InlineBundle()
     return ProcessBundle(lossless=settings.mode == "replay", on_give_up=on_give_up)
+
+
+def _new_dense(settings: ServerSettings, identity: StreamIdentity) -> DenseBuilder:
+    """Return what makes the dense cloud of a stream; a replay leaves out nothing."""
+    lossless = settings.mode == "replay"
+    return DenseBuilder(identity.camera, ProcessDepth(lossless=lossless), lossless=lossless)

@@ -101,6 +101,7 @@ class ServerSettings:
         resume: Go on with the map in ``out`` when it belongs to the same stream.
         record: Recording to write of everything that is sent, or None.
         save_images: Which decoded images to keep in ``out``, for exports.
+        dense_cloud: Estimate the depth of keyframes too, in the time that tracking and mapping leave.
         keep_running: Go on after the source's last frame and wait for the next agent.
         idle_timeout_s: End when nothing arrives for so long after the first frame.
         duration_s: End after so long.
@@ -148,6 +149,10 @@ class ServerSettings:
     )
     save_images: Literal["none", "keyframes", "all"] = field(
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
+    )
+    dense_cloud: bool = field(
+        default=True,
+        metadata={"help": "estimate the depth of keyframes too, for dense.ply and a cloud in the viewer"},
     )
     keep_running: bool = field(
         default=False, metadata={"help": "wait for the next agent after the source's last frame"}

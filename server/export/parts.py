@@ -31,11 +31,6 @@ def frame_parts(snapshot: Mapping[str, NDArray[Any]]) -> dict[int, int]:
     }
 
 
-def landmark_parts(snapshot: Mapping[str, NDArray[Any]]) -> NDArray[np.int64]:
-    """Return ``(N,)`` the number of each landmark's part, in the order of ``Reconstruction.landmarks()``."""
-    return np.asarray(snapshot["landmarks.submap"], dtype=np.int64)
-
-
 def count_parts(parts: Iterable[int]) -> list[dict[str, int]]:
     """Return number and posed frames of each part, by number.
 

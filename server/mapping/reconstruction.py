@@ -32,6 +32,7 @@ from semcast.server.mapping.tracker import (
     track_pose,
 )
 from semcast.server.mapping.tracks import TrackTable
+from semcast.server.mapping.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
 
@@ -465,9 +466,10 @@ class Reconstruction:
         marks = self._map.world.landmarks
         return marks.ids.copy(), marks.xyz.copy(), marks.rgb.copy(), marks.confidence.copy()
 
-    def observations(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-        """All observations: landmark ids ``(M,)``, frame ids of keyframes ``(M,)``, pixels ``(M, 2)``."""
-        return self._map.world.observations()
+    @property
+    def world(self) -> WorldMap:
+        """The map itself, to be looked at between two frames and not to be changed."""
+        return self._map.world
 
     def snapshot(self) -> dict[str, NDArray]:
         """The map and what is needed to go on with it, as plain arrays."""

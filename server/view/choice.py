@@ -1,11 +1,13 @@
 """Whether a run is shown, where, and under which name; Rerun is imported only when something is shown."""
 
 import logging
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from semcast.common.errors import ConfigError
 from semcast.common.former_file import keep_former
 from semcast.common.run_folder import VIEWER_NAME
+from semcast.server.dense.cloud import DensePatch
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.reference import Reference
 from semcast.server.settings import ServerSettings
@@ -119,11 +121,16 @@ class SuccessiveViews:
         self._process = None
 
     def submit(
-        self, view: FrameView | None, update: MapUpdate | None = None, *, new_map: bool = False
+        self,
+        view: FrameView | None,
+        update: MapUpdate | None = None,
+        patches: Sequence[DensePatch] = (),
+        *,
+        new_map: bool = False,
     ) -> None:
         """Show a frame or what changed in the map, as ``ViewerFeed.submit`` does, where anything is shown."""
         if self._feed is not None:
-            self._feed.submit(view, update, new_map=new_map)
+            self._feed.submit(view, update, patches, new_map=new_map)
 
     def end_stream(self) -> None:
         """Finish recording and file of the present stream; the viewer waits for the next one."""

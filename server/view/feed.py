@@ -8,8 +8,9 @@ import logging
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError
 from semcast.common.trajectory import Trajectory
+from semcast.server.dense.cloud import DensePatch
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.settings import ViewSettings
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary, window_display
@@ -59,6 +61,28 @@ def check_view(settings: ViewSettings, *, has_folder: bool) -> None:
         raise ConfigError("no display: use --view web or --view file")
 
 
+class _Pending(NamedTuple):
+    """What was submitted at once."""
+
+    view: FrameView | None
+    update: MapUpdate | None
+    patches: tuple[DensePatch, ...]
+    new_map: bool
+
+
+def _apply(scene: Scene, item: _Pending) -> None:
+    """Bring what was submitted into the scene."""
+    if item.new_map:
+        scene.start_new_map()
+    if (update := item.update) is not None:
+        scene.set_keyframes(update.keyframe_ids, update.keyframe_poses)
+        scene.move_frames(update.frame_ids, update.frame_poses)
+        scene.add_landmarks(update.ids, update.xyz, update.rgb, update.confidence, update.removed)
+    scene.set_patches(item.patches)
+    if item.view is not None:
+        scene.add_frame(item.view)
+
+
 class ViewerFeed:
     """Shows a run in Rerun: live, as a file, or both.
 
@@ -98,7 +122,7 @@ class ViewerFeed:
         self._footer = footer
         self._scene = Scene(truth, truth_times_ns)
         self._scene_lock = threading.Lock()
-        self._pending: deque[tuple[FrameView | None, MapUpdate | None, bool]] = deque(maxlen=MAX_PENDING)
+        self._pending: deque[_Pending] = deque(maxlen=MAX_PENDING)
         self._newest: FrameView | None = None
         self._queue_lock = threading.Lock()
         self._work = threading.Event()
@@ -130,7 +154,12 @@ class ViewerFeed:
         return self._process.url if self._process is not None else None
 
     def submit(
-        self, view: FrameView | None, update: MapUpdate | None = None, *, new_map: bool = False
+        self,
+        view: FrameView | None,
+        update: MapUpdate | None = None,
+        patches: Sequence[DensePatch] = (),
+        *,
+        new_map: bool = False,
     ) -> None:
         """Show a frame and what changed in the map before it. Returns at once.
 
@@ -139,10 +168,12 @@ class ViewerFeed:
         Args:
             view: The processed frame; None when the map alone has changed.
             update: Map changes up to and including this frame.
+            patches: The same of the dense cloud.
             new_map: The map was started anew just before this frame.
         """
         with self._queue_lock:
-            self._pending.append((None if view is None else view.without_image(), update, new_map))
+            light = None if view is None else view.without_image()
+            self._pending.append(_Pending(light, update, tuple(patches), new_map))
             if view is not None and view.image is not None:
                 self._newest = view
         self._work.set()
@@ -204,17 +235,8 @@ class ViewerFeed:
             self._last_picture_s = now
             picture = compress_picture(newest, self._settings.jpeg_quality)
         with self._scene_lock:
-            for view, update, new_map in items:
-                if new_map:
-                    self._scene.start_new_map()
-                if update is not None:
-                    self._scene.set_keyframes(update.keyframe_ids, update.keyframe_poses)
-                    self._scene.move_frames(update.frame_ids, update.frame_poses)
-                    self._scene.add_landmarks(
-                        update.ids, update.xyz, update.rgb, update.confidence, update.removed
-                    )
-                if view is not None:
-                    self._scene.add_frame(view)
+            for item in items:
+                _apply(self._scene, item)
             if picture is not None:
                 self._scene.set_picture(picture)
             if self._has_truth and items and (force or now - self._last_align_s > ALIGN_INTERVAL_S):

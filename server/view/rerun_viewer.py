@@ -11,6 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from semcast.common.camera import Intrinsics
+from semcast.server.view.patch_table import PlacedPatch
 from semcast.server.view.scene import Changes, Picture, PointChunk, Row, confidence_colours
 
 logger = logging.getLogger(__name__)
@@ -22,6 +23,10 @@ PATH_COLOUR = (255, 170, 40)
 TRUTH_COLOUR = (150, 160, 180)
 INLIER_COLOUR = (80, 230, 120)
 OTHER_COLOUR = (240, 120, 70)
+
+#: Entity of the dense cloud, one below it for each keyframe.
+DENSE = "world/dense"
+DENSE_POINT_SIZE = 1.3
 
 #: Plot path to (name in the legend, colour); other paths get a colour of Rerun's choice.
 SERIES = {
@@ -172,7 +177,7 @@ class RerunStream:
         """Log what changed; returns before it has arrived."""
         stream = self._open()
         if changes.cleared:
-            for path in ("world/trajectory", "world/map_confidence", "world/map_colour", "world/truth"):
+            for path in ("world/trajectory", "world/map_confidence", "world/map_colour", DENSE, "world/truth"):
                 stream.log(path, rr.Clear(recursive=True))
         if changes.frustum_size is not None and changes.frustum_size > 0:
             self._log_pinhole(changes.frustum_size)
@@ -193,6 +198,8 @@ class RerunStream:
             )
         for chunk in changes.chunks:
             self._write_points(chunk)
+        for patch in changes.patches:
+            self._write_patch(patch)
         if changes.picture is not None:
             self._write_picture(changes.picture)
 
@@ -228,6 +235,16 @@ class RerunStream:
             self._open().log(
                 f"world/{path}/{chunk.idx:04d}", rr.Points3D(chunk.xyz, colors=colours, radii=radius)
             )
+
+    def _write_patch(self, patch: PlacedPatch) -> None:
+        """Send dense points once, in their keyframe's axes; where they are goes with that."""
+        path, T = f"{DENSE}/{patch.frame_id:06d}", patch.T_world_points
+        if patch.points is not None:
+            points = rr.Points3D(
+                patch.points.xyz, colors=patch.points.rgb, radii=rr.Radius.ui_points(DENSE_POINT_SIZE)
+            )
+            self._open().log(path, points)
+        self._open().log(path, rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
 
     def _write_picture(self, picture: Picture) -> None:
         stream = self._open()

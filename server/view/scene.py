@@ -17,7 +17,9 @@ from semcast.common.geometry import invert_transform, project_to_so3
 from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import match_times
+from semcast.server.dense.cloud import DensePatch
 from semcast.server.view.landmark_table import LandmarkTable
+from semcast.server.view.patch_table import PatchTable, PlacedPatch
 from semcast.server.view.spectator import Spectator
 
 Array = NDArray[np.float64]
@@ -122,6 +124,7 @@ class Changes:
         rows: Frames since the last call, in order.
         segments: Index to line strips, each ``(n, 3)``.
         chunks: Landmarks that were added, moved or removed.
+        patches: Dense points that were added or moved.
         truth: ``(N, 3)`` aligned true path, or None when unchanged.
         picture: The newest image, or None when unchanged.
         frustum_size: Distance of the drawn image plane in map units, or None when unchanged.
@@ -131,6 +134,7 @@ class Changes:
     rows: list[Row]
     segments: dict[int, list[NDArray[np.float32]]]
     chunks: list[PointChunk]
+    patches: list[PlacedPatch]
     truth: NDArray[np.float32] | None
     picture: Picture | None
     frustum_size: float | None
@@ -143,6 +147,7 @@ class Changes:
             or self.rows
             or self.segments
             or self.chunks
+            or self.patches
             or self.truth is not None
             or self.picture is not None
             or self.frustum_size is not None
@@ -157,6 +162,7 @@ class Cursor:
     num_rows: int = 0
     segments: dict[int, int] = field(default_factory=dict)
     chunks: dict[int, int] = field(default_factory=dict)
+    patches: dict[int, tuple[int, int]] = field(default_factory=dict)
     truth_version: int = 0
     picture_id: int = -1
     frustum_size: float = 0.0
@@ -193,6 +199,7 @@ class Scene:
         self._lost_since_pose = False
         self._segment_versions: list[int] = []
         self._table = LandmarkTable()
+        self._patches = PatchTable()
         self._truth_version = 0
         self._aligned: NDArray[np.float32] | None = None
         self._frustum_size = 0.0
@@ -278,9 +285,16 @@ class Scene:
                 insort(self._keyframe_ids, keyframe_id)
             self._keyframes[keyframe_id] = T
             self._newest_keyframe = max(self._newest_keyframe, keyframe_id)
+        self._patches.place(self._keyframes, ids.tolist())
         if moved:
             touched = {k // SEGMENT_POSES for k, ref in enumerate(self._references) if ref in moved}
             self._touch_segments(sorted(touched))
+
+    def set_patches(self, patches: Sequence[DensePatch]) -> None:
+        """Add or replace the dense points of keyframes."""
+        for patch in patches:
+            self._patches.add(patch)
+        self._patches.place(self._keyframes, [patch.frame_id for patch in patches])
 
     def set_picture(self, picture: Picture) -> None:
         """Replace the newest image."""
@@ -330,6 +344,7 @@ class Scene:
         if cleared:
             cursor.segments.clear()
             cursor.chunks.clear()
+            cursor.patches.clear()
             cursor.truth_version = 0
             cursor.frustum_size = 0.0
             cursor.generation = self._generation
@@ -346,6 +361,7 @@ class Scene:
             if cursor.chunks.get(k) != version:
                 cursor.chunks[k] = version
                 chunks.append(PointChunk(k, *self._table.chunk(k)))
+        patches = self._patches.changes_since(cursor.patches)
         truth = self._aligned if cursor.truth_version != self._truth_version else None
         cursor.truth_version = self._truth_version
         picture = self._picture
@@ -355,7 +371,7 @@ class Scene:
             cursor.picture_id = picture.frame_id
         size = self._frustum_size if self._frustum_size != cursor.frustum_size else None
         cursor.frustum_size = self._frustum_size
-        return Changes(cleared, rows, segments, chunks, truth, picture, size)
+        return Changes(cleared, rows, segments, chunks, patches, truth, picture, size)
 
     def _strips(self, segment: int) -> list[NDArray[np.float32]]:
         """Line strips of one segment; it starts at the last pose of the one before."""

@@ -43,7 +43,7 @@ def test_a_clean_sequence_is_followed_within_one_percent(room, mode):
     } == set(trajectory)
     ids, xyz, rgb, confidence = reconstruction.landmarks()
     assert len(ids) == len(xyz) == len(rgb) == len(confidence) > 150
-    seen, frames, xy = reconstruction.observations()
+    seen, frames, xy = reconstruction.world.observations()
     assert set(seen.tolist()) <= set(ids.tolist())
     error = reprojection(trajectory, xyz[np.searchsorted(ids, seen)], frames, xy)
     assert np.median(error) < 0.7
@@ -62,7 +62,7 @@ def test_a_pose_is_told_before_the_map_is_extended_with_its_frame(room):
 
     def tell(found):
         early[found.frame_id] = found
-        seen = reconstruction.observations()[1]
+        seen = reconstruction.world.observations()[1]
         keyframes_known[found.frame_id] = found.frame_id in seen
 
     results = [reconstruction.process(frame_of(k, image), tell) for k, image in enumerate(images)]
@@ -276,7 +276,7 @@ def test_the_map_stays_bounded_and_the_cost_flat(room):
     for frame_id, k in enumerate(order):
         reconstruction.process(frame_of(frame_id, images[k]))
     assert len(reconstruction.landmarks()[0]) <= 500
-    assert len(set(reconstruction.observations()[1].tolist())) <= 20
+    assert len(set(reconstruction.world.observations()[1].tolist())) <= 20
     assert len(reconstruction.final_trajectory()) == len(order)
 
 
