@@ -12,6 +12,7 @@ from semcast.common.errors import ConfigError
 from semcast.common.run_folder import (
     CHECKPOINT_NAME,
     DEMO_SETTINGS_NAME,
+    DENSE_NAME,
     FRAMES_NAME,
     IMAGES_NAME,
     MAP_NAME,
@@ -33,6 +34,7 @@ logger = logging.getLogger(__name__)
 _FILES = (
     TRAJECTORY_NAME,
     MAP_NAME,
+    DENSE_NAME,
     SUMMARY_NAME,
     SETTINGS_NAME,
     DEMO_SETTINGS_NAME,

@@ -380,13 +380,14 @@ class Server:
         """Return the session of a stream; a server that ``goes_on`` keeps it in memory if need be."""
         out = self._settings.out
         bundle, self._spare_bundle = self._spare_bundle or self._new_bundle(), None
+        new = functools.partial(Session, self._settings, identity, on_give_up=self._metrics.error)
         try:
-            return Session(self._settings, identity, out, self._reference, bundle)
+            return new(out, self._reference, bundle)
         except (OSError, SemcastError) as err:
             if not goes_on:
                 raise
             self._tell_not_written(out, err)
-        return Session(self._settings, identity, None, self._reference, self._new_bundle())
+        return new(None, self._reference, self._new_bundle())
 
     def _show(self, identity: StreamIdentity, resumed: bool, *, goes_on: bool) -> None:
         """Show the stream; a server that ``goes_on`` tracks it unseen if need be."""

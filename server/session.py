@@ -106,6 +106,7 @@ class Session:
         reference: Originals and truth, or None.
         bundle: A runner made ahead by ``new_bundle``, which the session closes; None makes one.
         program: Settings of the program for the run's records; None takes ``settings``.
+        on_give_up: Is told why, when the dense cloud will not grow any more.
 
     Raises:
         OSError: The folder can't be made.
@@ -120,6 +121,7 @@ class Session:
         reference: Reference | None,
         bundle: BundleRunner | None = None,
         program: Any = None,
+        on_give_up: Callable[[str], None] | None = None,
     ) -> None:
         self._settings = settings
         self._program = program if program is not None else settings
@@ -128,7 +130,7 @@ class Session:
         self._reference = reference
         bundle = bundle if bundle is not None else new_bundle(settings)
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
-        self._dense = _new_dense(settings, identity) if settings.dense_cloud else None
+        self._dense = _new_dense(settings, identity, on_give_up) if settings.dense_cloud else None
         self._t_source_ns: dict[int, int] = {}
         self._numbers: dict[int, int | None] = {}
         self._num_frames = identity.num_frames
@@ -433,7 +435,9 @@ class Session:
             folder.mkdir(parents=True, exist_ok=True)
             with each.attempt(folder / SETTINGS_NAME) as path:
                 write_whole(path, to_toml(self._program))
-            write_results(folder, self._reconstruction, results, self.identity.camera, self._t_source_ns, each)
+            write_results(
+                folder, self._reconstruction, results, self.identity.camera, self._t_source_ns, each
+            )
             if self._dense is not None:
                 cloud = self._dense.points(self._reconstruction.world)
                 with each.attempt(folder / DENSE_NAME) as path:
@@ -478,7 +482,10 @@ def new_bundle(settings: ServerSettings, on_give_up: Callable[[str], None] | Non
     return ProcessBundle(lossless=settings.mode == "replay", on_give_up=on_give_up)
 
 
-def _new_dense(settings: ServerSettings, identity: StreamIdentity) -> DenseBuilder:
+def _new_dense(
+    settings: ServerSettings, identity: StreamIdentity, on_give_up: Callable[[str], None] | None
+) -> DenseBuilder:
     """Return what makes the dense cloud of a stream; a replay leaves out nothing."""
     lossless = settings.mode == "replay"
-    return DenseBuilder(identity.camera, ProcessDepth(lossless=lossless), lossless=lossless)
+    runner = ProcessDepth(lossless=lossless, on_give_up=on_give_up)
+    return DenseBuilder(identity.camera, runner, lossless=lossless)

@@ -64,6 +64,7 @@ class Worker(Generic[Problem, Result]):
             it returns at once.
         on_give_up: Is told ``given_up``, once.
         niceness: How far the child stands back behind other processes, 0 to 19; 0 where the system has none.
+        start_early: Start the child now; otherwise with the first problem.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class Worker(Generic[Problem, Result]):
         lossless: bool = False,
         on_give_up: Callable[[str], None] | None = None,
         niceness: int = 0,
+        start_early: bool = True,
     ) -> None:
         self._work = work
         self._name = name
@@ -93,7 +95,9 @@ class Worker(Generic[Problem, Result]):
         self._closed = False
         self._failures = 0
         self.num_restarts = 0
-        self._start()
+        self._is_due = not start_early
+        if start_early:
+            self._start()
 
     @property
     def busy(self) -> bool:
@@ -111,6 +115,7 @@ class Worker(Generic[Problem, Result]):
         return self._process.pid if self._process is not None else None
 
     def _start(self) -> None:
+        self._is_due = False
         self._stop()
         ours, theirs = self._context.Pipe()
         self._process = self._context.Process(
@@ -147,6 +152,8 @@ class Worker(Generic[Problem, Result]):
         """
         if self._closed or self._pending is not None:
             return False
+        if self._is_due:
+            self._start()
         for _ in range(2):
             if self.given_up:
                 return False

@@ -35,4 +35,5 @@ class ProcessDepth(Worker[DepthProblem, DepthMap]):
             lossless=lossless,
             on_give_up=on_give_up,
             niceness=_NICENESS,
+            start_early=False,
         )

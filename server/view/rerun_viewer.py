@@ -177,7 +177,13 @@ class RerunStream:
         """Log what changed; returns before it has arrived."""
         stream = self._open()
         if changes.cleared:
-            for path in ("world/trajectory", "world/map_confidence", "world/map_colour", DENSE, "world/truth"):
+            for path in (
+                "world/trajectory",
+                "world/map_confidence",
+                "world/map_colour",
+                DENSE,
+                "world/truth",
+            ):
                 stream.log(path, rr.Clear(recursive=True))
         if changes.frustum_size is not None and changes.frustum_size > 0:
             self._log_pinhole(changes.frustum_size)

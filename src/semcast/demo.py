@@ -97,6 +97,10 @@ class DemoSettings:
     save_images: Literal["none", "keyframes", "all"] = field(
         default="keyframes", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
+    dense_cloud: bool = field(
+        default=True,
+        metadata={"help": "estimate the depth of keyframes too, for dense.ply and a cloud in the viewer"},
+    )
     record: Path | None = field(
         default=None, metadata={"help": "also keep everything that is sent in this recording (MCAP)"}
     )
@@ -169,6 +173,7 @@ def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict
     server += ["--viewer-port", str(settings.viewer_port), "--web-port", str(settings.web_port)]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
     server += ["--save-images", settings.save_images]
+    server += [] if settings.dense_cloud else ["--no-dense-cloud"]
     if settings.record is not None:
         server += ["--record", str(settings.record)]
     channel = [*_PROGRAM, "channel", "--agent-id", AGENT_ID, "--connect", endpoint]

@@ -33,6 +33,7 @@ _FIGURES: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
     ("rpe_rot_deg", "step error, rotation", _measure("deg")),
     ("psnr_db", "image quality (PSNR)", "{:.2f} dB".format),
     ("num_landmarks", "landmarks", str),
+    ("num_dense_points", "points of the dense cloud", str),
 )
 
 
@@ -106,7 +107,15 @@ def run(arguments: argparse.Namespace) -> int:
         return code or 1
     shown = talk if json_to_stdout else plain_console()
     shown.print(summary_table(result))
-    files = ("trajectory.tum", "map.ply", "run.rrd", "summary.json", "settings.toml", "demo.toml")
+    files = (
+        "trajectory.tum",
+        "map.ply",
+        "dense.ply",
+        "run.rrd",
+        "summary.json",
+        "settings.toml",
+        "demo.toml",
+    )
     there = ", ".join(name for name in files if (settings.out / name).exists())
     show_again = shlex.join(("rerun", str(settings.out / "run.rrd")))
     again = f"; look again with: {show_again}" if (settings.out / "run.rrd").exists() else ""
