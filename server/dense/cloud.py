@@ -41,8 +41,8 @@ class DensePatch:
     scale: float = 1.0
 
     def thinned(self) -> "DensePatch":
-        """Return it with every second point."""
-        return replace(self, xyz=self.xyz[::2], rgb=self.rgb[::2], confidence=self.confidence[::2])
+        """Return it with every second point, rather one less than one more."""
+        return replace(self, xyz=self.xyz[1::2], rgb=self.rgb[1::2], confidence=self.confidence[1::2])
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,9 @@ class DenseCloud:
         self._patches[patch.frame_id] = patch
         self._landmarks[patch.frame_id] = (ids, depth)
         self._changed.add(patch.frame_id)
-        if len(self) > self._max_points:
-            for frame_id in sorted(self._patches)[: (len(self._patches) + 1) // 2]:
+        while len(self) > self._max_points:
+            holding = [k for k in sorted(self._patches) if len(self._patches[k].xyz)]
+            for frame_id in holding[: (len(holding) + 1) // 2]:
                 self._patches[frame_id] = self._patches[frame_id].thinned()
                 self._changed.add(frame_id)
 

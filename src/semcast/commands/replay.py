@@ -11,6 +11,7 @@ from semcast.commands.console import plain_console
 from semcast.commands.demo import summary_table
 from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
 from semcast.common.run_folder import (
+    DENSE_NAME,
     MAP_NAME,
     RECONSTRUCTION_NAME,
     SETTINGS_NAME,
@@ -23,7 +24,15 @@ from semcast.server.replay import ReplaySettings, replay
 #: A recording is replayed in order and at once; the seed is that of channel and estimation alike.
 _UNUSED = frozenset({"link.delay_ms", "link.jitter_ms", "reconstruction.seed"})
 #: Files of the output folder that are named at the end, where they are there.
-_FILES = (TRAJECTORY_NAME, MAP_NAME, RECONSTRUCTION_NAME, VIEWER_NAME, SUMMARY_NAME, SETTINGS_NAME)
+_FILES = (
+    TRAJECTORY_NAME,
+    MAP_NAME,
+    DENSE_NAME,
+    RECONSTRUCTION_NAME,
+    VIEWER_NAME,
+    SUMMARY_NAME,
+    SETTINGS_NAME,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

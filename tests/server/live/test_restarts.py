@@ -153,7 +153,7 @@ def test_a_former_start_that_cannot_be_written_does_not_stop_the_new_one(tmp_pat
             raise OSError(28, "No space left on device")
         write_ply(path, *rest)
 
-    monkeypatch.setattr("semcast.server.session.write_ply", full)
+    monkeypatch.setattr("semcast.server.run_results.write_ply", full)
     running = air.serve(out=tmp_path)
     for epoch, num_frames in ((100, 6), (200, 4)):
         radio = air.agent(epoch)

@@ -1,0 +1,184 @@
+"""Whose depth is estimated from which neighbours, and what of it becomes points."""
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, make_transform, transform_points
+from semcast.server.dense.builder import DenseBuilder
+from semcast.server.dense.depth_map import DepthMap
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+CAMERA = Intrinsics(fx=60.0, fy=60.0, cx=39.5, cy=29.5, width=80, height=60)
+#: Everything is a wall at this distance from the line the camera moves along.
+WALL = 5.0
+STEP_M = 0.3
+
+
+class Wall:
+    """Says at once that all is a wall, or, as told, nothing; holds results back while it is ``slow``."""
+
+    def __init__(self, depth_of=lambda frame_id: WALL):
+        self.asked = []
+        self.slow = False
+        self.closed = False
+        self._depth_of = depth_of
+        self._result = None
+
+    @property
+    def busy(self):
+        return self._result is not None
+
+    def submit(self, problem):
+        assert not self.busy
+        self.asked.append(problem)
+        frame_id = problem.reference.frame_id
+        inverse = np.full(problem.reference.shape_hw, 1.0 / self._depth_of(frame_id), np.float32)
+        self._result = DepthMap(frame_id, inverse, 0.002)
+        return True
+
+    def take(self, wait=False):
+        if self.slow and not wait:
+            return None
+        result, self._result = self._result, None
+        return result
+
+    def close(self):
+        self.closed = True
+
+    @property
+    def asked_ids(self):
+        return [problem.reference.frame_id for problem in self.asked]
+
+
+def add_keyframe(world, builder, k, *, x_m=None, turn_deg=0.0, submap=0, num_landmarks=30):
+    """A keyframe ``k`` steps along the wall, 255 * its number bright, and landmarks on the wall before it."""
+    x_m = k * STEP_M if x_m is None else x_m
+    T_world_cam = make_transform(exp_so3((0.0, np.radians(turn_deg), 0.0)), (x_m, 0.0, 0.0))
+    ids = np.arange(num_landmarks) + 1000 * k
+    xy = np.random.default_rng(k).uniform((2, 2), (78, 58), (num_landmarks, 2))
+    rays = np.column_stack([(xy - (CAMERA.cx, CAMERA.cy)) / CAMERA.fx, np.ones(num_landmarks)])
+    none, colours = np.zeros(0, np.int64), np.zeros((num_landmarks, 3), np.uint8)
+    ones = np.ones(num_landmarks)
+    world.add_keyframe(Keyframe(k, k, T_world_cam, submap, ids, xy, ones, none, np.zeros((0, 32), np.uint8)))
+    world.add_landmarks(ids, transform_points(T_world_cam, WALL * rays), colours, ones, submap, k)
+    image = np.full((60, 80, 3), 10 + k, np.uint8)
+    builder.add_keyframe(k, image, np.full((60, 80), 0.25, np.float32))
+
+
+def run(num=8, runner=None, lossless=True, **how):
+    runner = Wall() if runner is None else runner
+    world, builder = WorldMap(), DenseBuilder(CAMERA, runner, lossless=lossless)
+    for k in range(num):
+        add_keyframe(world, builder, k, **how)
+        builder.advance(world)
+    return world, builder, runner
+
+
+def neighbours(problem):
+    return [[n.view.frame_id for n in group] for group in problem.groups]
+
+
+def test_every_keyframe_gets_its_depth_from_both_sides():
+    world, builder, runner = run(6)
+    assert runner.asked_ids == [0, 1, 2, 3]
+    assert [neighbours(p) for p in runner.asked] == [
+        [[1, 2]],
+        [[0], [2, 3]],
+        [[1, 0], [3, 4]],
+        [[2, 1], [4, 5]],
+    ]
+    builder.finish(world)
+    assert runner.asked_ids == [0, 1, 2, 3, 4, 5]
+    assert neighbours(runner.asked[-1]) == [[4, 3]]
+
+
+def test_depth_is_sought_around_that_of_the_landmarks():
+    _, _, runner = run(3)
+    assert 0.5 * WALL < runner.asked[0].nearest < WALL < runner.asked[0].farthest < 2.0 * WALL
+
+
+def test_poses_of_neighbours_are_relative_to_the_keyframe():
+    _, _, runner = run(4)
+    T_nbr_ref = runner.asked[1].groups[0][0].T_nbr_ref
+    np.testing.assert_allclose(T_nbr_ref, make_transform(np.eye(3), (STEP_M, 0.0, 0.0)))
+
+
+def test_neighbours_that_hardly_moved_are_passed_over():
+    world, runner = WorldMap(), Wall()
+    builder = DenseBuilder(CAMERA, runner, lossless=True)
+    for k, x_m in enumerate((0.0, 0.01, 0.02, 0.3, 0.6)):
+        add_keyframe(world, builder, k, x_m=x_m)
+    builder.advance(world)
+    assert neighbours(runner.asked[0]) == [[3, 4]]
+
+
+def test_views_turned_far_away_and_of_other_parts_are_no_neighbours():
+    world, runner = WorldMap(), Wall()
+    builder = DenseBuilder(CAMERA, runner, lossless=True)
+    for k, (turn_deg, submap) in enumerate(((0.0, 0), (60.0, 0), (0.0, 1), (0.0, 1), (0.0, 1))):
+        add_keyframe(world, builder, k, turn_deg=turn_deg, submap=submap)
+    builder.finish(world)
+    assert runner.asked_ids == [2, 3, 4], "the first two see nothing that another one sees"
+    assert all(k > 1 for p in runner.asked for group in neighbours(p) for k in group)
+
+
+def test_keyframes_with_too_few_landmarks_are_left_out():
+    world, builder, runner = run(5, num_landmarks=5)
+    builder.finish(world)
+    assert runner.asked == []
+
+
+def test_the_cloud_is_the_wall_and_each_part_of_it_once():
+    world, builder, _ = run(8)
+    builder.finish(world)
+    points = builder.points(world)
+    np.testing.assert_allclose(points.xyz[:, 2], WALL, rtol=1e-5)
+    width_m = 80 / 60 * WALL + 7 * STEP_M - 2 * STEP_M  # what only the first or the last one sees is not sure
+    assert np.ptp(points.xyz[:, 0]) == pytest.approx(width_m, rel=0.03)
+    in_all = len(points.xyz) / (80 * 60)
+    assert 1.1 < in_all < 1.0 + 7 * STEP_M / (80 / 60 * WALL) + 0.15, "what was seen before adds nothing"
+    assert len(builder) == len(points.xyz)
+    assert np.all(points.confidence == np.float32(0.25))
+    assert set(points.rgb[:, 0].tolist()) <= set(range(10, 18))
+
+
+def test_depth_that_nobody_confirms_makes_no_points():
+    world, builder, _ = run(8, Wall(lambda frame_id: WALL if frame_id != 3 else 0.5 * WALL))
+    builder.finish(world)
+    assert {p.frame_id for p in builder.take_changes()}.isdisjoint({3})
+    np.testing.assert_allclose(builder.points(world).xyz[:, 2], WALL, rtol=1e-5)
+
+
+def test_a_live_cloud_waits_for_nobody_and_leaves_out_what_is_too_much():
+    runner = Wall()
+    runner.slow = True
+    world, builder, _ = run(9, runner, lossless=False)
+    assert runner.asked_ids == [0], "it is still at work on it"
+    runner.slow = False
+    builder.advance(world)
+    assert runner.asked_ids == [0, 5], "of those that wait the newest two stay"
+    builder.finish(world)
+    assert runner.asked_ids == [0, 5, 6, 7, 8]
+
+
+def test_a_keyframe_that_lost_its_pose_is_left_out():
+    world, runner = WorldMap(), Wall()
+    builder = DenseBuilder(CAMERA, runner, lossless=True)
+    for k in range(6):
+        add_keyframe(world, builder, k)
+    world.forget_frames([2])
+    builder.finish(world)
+    assert 2 not in runner.asked_ids
+    assert all(2 not in group for p in runner.asked for group in neighbours(p))
+
+
+def test_a_new_map_has_a_new_cloud():
+    world, builder, runner = run(6)
+    builder.reset()
+    assert len(builder) == 0
+    assert not runner.busy
+    builder.finish(world)
+    assert runner.asked_ids == [0, 1, 2, 3]
+    builder.close()
+    assert runner.closed
