@@ -63,7 +63,13 @@ def num_agreeing(
 
 
 def agrees(points: Array, step: float, other: OtherDepth) -> NDArray[np.bool_]:
-    """Tell which points ``(N, 3)``, whose inverse depth is good to ``step``, lie on what another keyframe sees."""
+    """Tell which points lie on what another keyframe sees.
+
+    Args:
+        points: ``(N, 3)`` in the camera frame of ``other.T_other_ref``.
+        step: What their inverse depth is good to.
+        other: The depth of the other keyframe.
+    """
     T = other.T_other_ref
     moved = points @ T[:3, :3].T + T[:3, 3]
     height, width = other.inverse_depth.shape

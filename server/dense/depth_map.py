@@ -51,7 +51,8 @@ class DepthProblem:
             raise ValueError("groups must hold neighbours, got an empty one")
         if not 0.0 < self.nearest < self.farthest < np.inf:
             raise ValueError(
-                f"nearest and farthest must be 0 < nearest < farthest, got {self.nearest:g}, {self.farthest:g}"
+                "nearest and farthest must be 0 < nearest < farthest, "
+                f"got {self.nearest:g}, {self.farthest:g}"
             )
 
 
@@ -73,8 +74,8 @@ class DepthMap:
 def estimate_depth(problem: DepthProblem) -> DepthMap:
     """Estimate the depth of a keyframe's pixels.
 
-    Depths are tried at equal steps of their inverse; the best one after smoothing counts, refined by a parabola,
-    where it explains the images and is clearly better than any other.
+    Depths are tried at equal steps of their inverse; the best one after smoothing counts, refined by a
+    parabola, where it explains the images and is clearly better than any other.
     """
     reference = problem.reference
     inverse_depths = np.linspace(1.0 / problem.farthest, 1.0 / problem.nearest, _num_depths(problem))

@@ -1,4 +1,4 @@
-"""Smoothing of a cost volume along lines of pixels: semi-global matching (Hirschmueller, PAMI 2008, Eq. 13)."""
+"""Smoothing of a cost volume along lines of pixels: semi-global matching (Hirschmueller, PAMI 2008)."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 MAX_PIXELS = 60_000
 #: Noise of an image without confidence, grey levels: that of a camera.
 CLEAN_SIGMA = 3.0
-#: The pixel target is ``1 - tanh(30 |error|)``, error in shares of white (paper Eq. 9, ``training/losses.py``).
+#: The pixel target is ``1 - tanh(30 |error|)``, error in shares of white (paper, ``training/losses.py``).
 _GREY_LEVELS_PER_ATANH = 255.0 / 30.0
 #: Standard deviation over mean absolute value, of a Gaussian.
 _SD_PER_MEAN = 1.2533
@@ -82,6 +82,6 @@ def view_of(
 
 
 def error_sd(confidence: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Standard deviation of a pixel's error in grey levels that a confidence of the paper's target stands for."""
+    """Standard deviation of a pixel's error in grey levels that a confidence stands for."""
     doubt = 1.0 - np.clip(confidence, _LEAST_CONFIDENCE, 1.0)
     return (_SD_PER_MEAN * _GREY_LEVELS_PER_ATANH * np.arctanh(doubt)).astype(np.float32)
