@@ -1,6 +1,6 @@
 """Textured rectangles and the picture a pinhole camera has of them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 
 #: Nothing nearer than this is drawn, in metres.
 NEAR_M = 0.05
+#: Nothing farther than one over this is drawn, per metre.
+_LEAST_INVERSE_DEPTH = np.float32(1e-4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +89,38 @@ def draw(
         ``(H, W, 3)`` in grey levels 0..255.
     """
     image = background.copy()
-    nearest = np.full((camera.height, camera.width), 1e-4, np.float32)
+    nearest = np.full((camera.height, camera.width), _LEAST_INVERSE_DEPTH, np.float32)
+    for surface, G, window in _seen(surfaces, camera, T_world_cam):
+        _paint(image, nearest, surface, G, window)
+    return image
+
+
+def exact_depth(surfaces: Sequence[Surface], camera: Intrinsics, T_world_cam: Array) -> NDArray[np.float32]:
+    """Return how far along its view the camera sees the nearest surface at the centre of each pixel.
+
+    Args:
+        surfaces: What is in the scene.
+        camera: Pinhole, distortion ignored.
+        T_world_cam: ``(4, 4)`` pose, camera axes x right, y down, z forward.
+
+    Returns:
+        ``(H, W)`` camera z in metres, infinite where no surface is.
+    """
+    nearest = np.full((camera.height, camera.width), _LEAST_INVERSE_DEPTH, np.float32)
+    for _, G, window in _seen(surfaces, camera, T_world_cam):
+        hit = _hit(nearest, G, window)
+        nearest[window][hit.visible] = hit.inverse_depth[hit.visible]
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / np.where(nearest > _LEAST_INVERSE_DEPTH, nearest, 0.0), np.float32)
+
+
+def _seen(
+    surfaces: Sequence[Surface], camera: Intrinsics, T_world_cam: Array
+) -> Iterator[tuple[Surface, Array, tuple[slice, slice]]]:
+    """Yield the rectangles that may be seen, the nearest first.
+
+    Each comes with the map from pixels to ``(u, v, 1)`` over depth, and rows and columns it may cover.
+    """
     R_cam_world, centre = T_world_cam[:3, :3].T, T_world_cam[:3, 3]
     # Columns span each plane in the camera's frame, so that A (u, v, 1) is a point of it.
     spans = [np.column_stack([s.edge_u_m, s.edge_v_m, s.corner_m - centre]) for s in surfaces]
@@ -95,9 +128,7 @@ def draw(
     for index in _in_view(As, camera):
         window = _window(As[index], camera)
         if window is not None and abs(np.linalg.det(As[index])) > 1e-9:
-            G = np.linalg.inv(As[index]) @ np.linalg.inv(camera.K)
-            _paint(image, nearest, surfaces[index], G, window)
-    return image
+            yield surfaces[index], np.linalg.inv(As[index]) @ np.linalg.inv(camera.K), window
 
 
 def _in_view(As: Array, camera: Intrinsics) -> list[int]:
@@ -132,14 +163,18 @@ def _window(A: Array, camera: Intrinsics) -> tuple[slice, slice] | None:
     return slice(low[1], high[1]), slice(low[0], high[0])
 
 
-def _paint(
-    image: NDArray[np.float32],
-    nearest: NDArray[np.float32],
-    surface: Surface,
-    G: Array,
-    window: tuple[slice, slice],
-) -> None:
-    """Draw one rectangle where it is the nearest; ``G`` maps pixels to ``(u, v, 1)`` over depth."""
+@dataclass(frozen=True, eq=False)
+class _Hit:
+    """Where rays through pixels of a window meet a rectangle's plane; all ``(H, W)``."""
+
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    inverse_depth: NDArray[np.float32]
+    visible: NDArray[np.bool_]
+
+
+def _hit(nearest: NDArray[np.float32], G: Array, window: tuple[slice, slice]) -> _Hit:
+    """Tell where a rectangle is nearer than what is there; ``G`` maps pixels to ``(u, v, 1)`` over depth."""
     rows, columns = window
     ys, xs = np.mgrid[rows, columns].astype(np.float32)
     G32 = G.astype(np.float32)
@@ -149,6 +184,19 @@ def _paint(
         v = (G32[1, 0] * xs + G32[1, 1] * ys + G32[1, 2]) / inverse_depth
         inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
         visible = inside & (inverse_depth > nearest[window]) & (inverse_depth < 1 / NEAR_M)
+    return _Hit(u, v, inverse_depth, visible)
+
+
+def _paint(
+    image: NDArray[np.float32],
+    nearest: NDArray[np.float32],
+    surface: Surface,
+    G: Array,
+    window: tuple[slice, slice],
+) -> None:
+    """Draw one rectangle where it is the nearest; ``G`` maps pixels to ``(u, v, 1)`` over depth."""
+    hit = _hit(nearest, G, window)
+    u, v, inverse_depth, visible = hit.u, hit.v, hit.inverse_depth, hit.visible
     if not visible.any():
         return
     tall, wide = surface.texture[0].shape[:2]

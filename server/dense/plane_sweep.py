@@ -38,9 +38,9 @@ class Neighbour:
 def match_cost(reference: View, groups: Sequence[Sequence[Neighbour]], inverse_depths: Array) -> Volume:
     """Cost of each depth at each pixel: one less the normalised cross-correlation of windows.
 
-    The noise of both images counts as a variance that nothing explains, so that windows whose texture does not
-    stand out of it say little. Of a group the mean counts, and of the groups (those before and those after the
-    reference) the better one: what is hidden on one side is mostly seen from the other.
+    The noise of both images counts as a variance that nothing explains, so that windows whose texture does
+    not stand out of it say little. Of a group the mean counts, and of the groups (those before and those
+    after the reference) the better one: what is hidden on one side is mostly seen from the other.
 
     Args:
         reference: The view whose depth is sought.

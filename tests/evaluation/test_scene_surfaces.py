@@ -5,7 +5,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.evaluation.scenes.motion import look
-from semcast.evaluation.scenes.surfaces import Surface, box, draw
+from semcast.evaluation.scenes.surfaces import Surface, box, draw, exact_depth
 from semcast.evaluation.scenes.textures import Pyramid, pyramid
 
 CAMERA = Intrinsics(fx=100.0, fy=100.0, cx=49.5, cy=39.5, width=100, height=80)
@@ -87,3 +87,30 @@ def test_look_has_camera_axes() -> None:
     rolled = look(np.zeros(3), 0.4, 0.3, 0.2)[:3, :3]
     np.testing.assert_allclose(rolled.T @ rolled, np.eye(3), atol=1e-12)
     assert np.linalg.det(rolled) == pytest.approx(1)
+
+
+def test_depth_is_along_the_view_and_infinite_beside_what_there_is() -> None:
+    depth = exact_depth([wall(2.0, 0.5, plain(200))], CAMERA, AHEAD)
+    assert depth[15:65, 25:75] == pytest.approx(2.0, rel=1e-5)
+    assert np.isinf(depth).sum() == depth.size - 50 * 50
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_depth_is_that_of_the_nearer_wall(order: tuple[int, int]) -> None:
+    walls = [wall(2.0, 0.2, plain(200)), wall(4.0, 2.0, plain(80))]
+    depth = exact_depth([walls[i] for i in order], CAMERA, AHEAD)
+    assert depth[40, 50] == pytest.approx(2.0, rel=1e-5)
+    assert depth[10, 10] == pytest.approx(4.0, rel=1e-5)
+
+
+def test_points_at_the_depth_of_a_slanted_floor_lie_on_it() -> None:
+    floor = Surface(
+        np.array([-5.0, -5.0, -1.0]), np.array([60.0, 0, 0]), np.array([0, 10.0, 0]), plain(120), (6.0, 1.0)
+    )
+    camera_pose = look(np.array([0.3, -0.2, 0.5]), 0.2, -0.3, 0.1)
+    depth = exact_depth([floor], CAMERA, camera_pose)
+    ys, xs = np.nonzero(np.isfinite(depth))
+    rays = np.linalg.inv(CAMERA.K) @ np.stack([xs, ys, np.ones(len(xs))])
+    world = camera_pose[:3, :3] @ (rays * depth[ys, xs]) + camera_pose[:3, 3:]
+    assert len(ys) > 3000
+    np.testing.assert_allclose(world[2], -1.0, atol=1e-3)
