@@ -134,6 +134,9 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
     assert len(seen) == 2 * len(set(seen)) >= FRAMES
     first, second = ((tmp_path / name / "trajectory.tum").read_bytes() for name in ("a", "b"))
     assert first == second
+    clouds = [(tmp_path / name / "dense.ply").read_bytes() for name in ("a", "b")]
+    assert clouds[0] == clouds[1]
+    assert len(clouds[0]) > 10_000
     lossy = ReplaySettings(
         file=recording,
         out=tmp_path / "c",

@@ -243,6 +243,22 @@ def test_the_summary_counts_the_keyframes_of_the_map_also_those_it_began_with(de
     assert json.loads((tmp_path / "summary.json").read_text())["frames"]["keyframes"] == num_keyframes
 
 
+def test_the_dense_cloud_lies_around_the_landmarks_where_it_is_wanted(demo, tmp_path):
+    run_session(demo, tmp_path / "dense", range(14), mode="replay")
+    run_session(demo, tmp_path / "sparse", range(14), mode="replay", dense_cloud=False)
+    assert not (tmp_path / "sparse" / "dense.ply").exists()
+    assert json.loads((tmp_path / "sparse" / "summary.json").read_text())["num_dense_points"] is None
+    cloud, marks = (read_ply(tmp_path / "dense" / name) for name in ("dense.ply", "map.ply"))
+    assert len(cloud) == json.loads((tmp_path / "dense" / "summary.json").read_text())["num_dense_points"]
+    assert len(cloud) > 4 * len(marks)
+    for axis in "xyz":
+        low, high = np.percentile(marks[axis], (2, 98))
+        beyond = 0.5 * (high - low)
+        assert ((cloud[axis] > low - beyond) & (cloud[axis] < high + beyond)).mean() > 0.9
+    alike = [(tmp_path / name / "trajectory.tum").read_bytes() for name in ("dense", "sparse")]
+    assert alike[0] == alike[1], "no pose depends on it"
+
+
 def test_a_resumed_session_goes_on_with_what_is_there_and_a_new_one_sets_it_aside(demo, tmp_path):
     run_session(demo, tmp_path, range(8), save_images="keyframes", killed=True)
     before = list(read_image_paths(tmp_path))

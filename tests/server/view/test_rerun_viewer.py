@@ -17,6 +17,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError
 from semcast.common.geometry import make_transform
+from semcast.server.dense.cloud import DensePatch
 from semcast.server.settings import ServerSettings, ViewSettings
 from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.scene import FrameView
@@ -106,7 +107,10 @@ def test_the_file_can_be_read_back_and_holds_everything(tmp_path):
     file = tmp_path / "run.rrd"
     feed = ViewerFeed(ViewSettings(view="file", image_rate_hz=60), CAMERA, "test-file", file=file)
     for k in range(5):
-        feed.submit(frame(k), Update(k))
+        points = DensePatch(
+            k, np.ones((2, 3), np.float32), np.full((2, 3), 9, np.uint8), np.ones(2, np.float32)
+        )
+        feed.submit(frame(k), Update(k), [points] if k < 2 else [])
     feed.close()
     rerun_output("rrd", "verify", str(file))
     text = rerun_output("rrd", "print", "-vv", str(file))
@@ -116,6 +120,8 @@ def test_the_file_can_be_read_back_and_holds_everything(tmp_path):
         "/world/trajectory/0000",
         "/world/map_confidence/0000",
         "/world/map_colour/0000",
+        "/world/dense/000000",
+        "/world/dense/000001",
         "/confidence",
         "/plots/link/psnr_db",
         "/plots/drops/stale",
