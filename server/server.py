@@ -352,7 +352,7 @@ class Server:
         former, self._session = self._session, None
         if former is not None:
             logger.info("the agent was started again: a new map is begun")
-            self._conclude(former)
+            self._conclude(former, hurry=True)
             self._views.end_stream()
             self._end_former(former)
         self._former_epochs.discard(identity.agent_epoch)
@@ -399,10 +399,10 @@ class Server:
             logger.error("the new stream is not shown: %s", err)
             self._metrics.error(str(err))
 
-    def _conclude(self, session: Session) -> None:
+    def _conclude(self, session: Session, *, hurry: bool = False) -> None:
         """Adjust the whole map of a stream that has ended, and tell who follows it."""
         self._save(session)  # the adjustment takes seconds, and the server may be stopped or killed meanwhile
-        update, patches = session.conclude()
+        update, patches = session.conclude(hurry=hurry)
         if update is not None:
             self._outbox.put_map(session.identity.agent_epoch, update)
         self._views.submit(None, update, patches)

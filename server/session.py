@@ -346,8 +346,11 @@ class Session:
         if self._dense is not None:
             self._dense.reset()
 
-    def conclude(self) -> tuple[MapUpdate | None, tuple[DensePatch, ...]]:
+    def conclude(self, *, hurry: bool = False) -> tuple[MapUpdate | None, tuple[DensePatch, ...]]:
         """Adjust the whole map, as the settings want it, and complete the dense cloud: the stream has ended.
+
+        Args:
+            hurry: Another stream waits: the cloud is left as it is.
 
         Returns:
             What that changed in the map and in the cloud.
@@ -363,7 +366,7 @@ class Session:
             return update, ()
         if update is not None:
             self._dense.follow(self._reconstruction.world, update.keyframe_ids.tolist())
-        self._dense.finish(self._reconstruction.world)
+        self._dense.finish(self._reconstruction.world, hurry=hurry)
         return update, self._dense.take_changes()
 
     def write_outputs(

@@ -127,9 +127,14 @@ class DenseBuilder:
         """Note keyframes that the map has moved."""
         self._cloud.follow(world, frame_ids)
 
-    def finish(self, world: WorldMap) -> None:
-        """Estimate what waits with the neighbours there are, and wait for it: the stream has ended."""
-        while True:
+    def finish(self, world: WorldMap, *, hurry: bool = False) -> None:
+        """Make points of what is there, for the stream has ended.
+
+        Args:
+            world: The map as it is.
+            hurry: Leave out what is not estimated yet instead of waiting for it.
+        """
+        while not hurry:
             self._take(world, wait=True)
             self._begin(world, is_last=True)
             if not self._runner.busy:

@@ -158,6 +158,9 @@ def test_a_live_cloud_waits_for_nobody_and_leaves_out_what_is_too_much():
     runner.slow = False
     builder.advance(world)
     assert runner.asked_ids == [0, 5], "of those that wait the newest two stay"
+    builder.finish(world, hurry=True)
+    assert runner.asked_ids == [0, 5], "another stream waits"
+    assert {p.frame_id for p in builder.take_changes()} <= {0, 5}
     builder.finish(world)
     assert runner.asked_ids == [0, 5, 6, 7, 8]
 
