@@ -115,8 +115,8 @@ def test_a_camera_is_slowed_down_and_nothing_is_made_up_for(make_camera):
     assert source.rate_hz == 20.0
     gaps_s = np.diff(times_s)
     assert gaps_s[3] > 0.3
-    assert gaps_s.min() > 0.03
-    assert np.median(np.delete(gaps_s, 3)) == pytest.approx(0.05, abs=0.02)
+    assert gaps_s.min() > 0.015, "images that had waited would come 0.005 apart"
+    assert np.median(np.delete(gaps_s, 3)) == pytest.approx(0.05, abs=0.03)
 
 
 def test_a_camera_that_is_not_there_is_said(make_camera):
