@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.server.dense.plane_sweep import Neighbour, match_cost
-from semcast.server.dense.semi_global import aggregate
+from semcast.server.dense.plane_sweep import UNKNOWN_COST, Neighbour, match_cost
+from semcast.server.dense.semi_global import NUM_DIRECTIONS, Smoothed, aggregate
 from semcast.server.dense.view import View
 
 Array = NDArray[np.float64]
@@ -15,11 +15,10 @@ DepthImage = NDArray[np.float32]
 
 #: Depths that are tried: as many as the image moves by pixels between nearest and farthest, within these.
 MIN_DEPTHS, MAX_DEPTHS = 24, 64
-#: A match has to cost less than this, and the second best one this much more in each direction of smoothing.
-_MAX_COST = 0.5
-_MIN_LEAD = 0.04
-#: Depths this many steps away count as another match.
-_APART = 3
+#: The second best match has to cost this share of the greatest cost more, the mean of all directions.
+_MIN_LEAD = 0.15
+#: Depths up to this many steps away belong to the same match.
+_BESIDE = 2
 #: Share of the pixels (every 8th each way) whose movement tells how many depths are tried.
 _MOST = 90.0
 _GRID_PX = 8
@@ -75,21 +74,19 @@ def estimate_depth(problem: DepthProblem) -> DepthMap:
     """Estimate the depth of a keyframe's pixels.
 
     Depths are tried at equal steps of their inverse; the best one after smoothing counts, refined by a
-    parabola, where it explains the images and is clearly better than any other.
+    parabola, where it is clearly better than any other.
     """
     reference = problem.reference
     inverse_depths = np.linspace(1.0 / problem.farthest, 1.0 / problem.nearest, _num_depths(problem))
-    cost = match_cost(reference, problem.groups, inverse_depths)
-    smoothed = aggregate(cost, reference.grey)
+    smoothed = aggregate(match_cost(reference, problem.groups, inverse_depths), reference.grey)
     best = smoothed.argmin(axis=-1)
-    lead = _second(smoothed, best) - _at(smoothed, best)
-    # The nearest and the farthest depth also stand for all that is beyond.
-    known = (best > 0) & (best < len(inverse_depths) - 1)
-    known &= (_at(cost, best) < _MAX_COST) & (lead > 4.0 * _MIN_LEAD)
     step = float(inverse_depths[1] - inverse_depths[0])
     inverse_depth = inverse_depths[0] + step * _refined(smoothed, best)
+    # The nearest and the farthest depth also stand for all that is beyond.
+    known = (best > 0) & (best < len(inverse_depths) - 1)
+    known &= _lead(smoothed, best) > _MIN_LEAD * UNKNOWN_COST * NUM_DIRECTIONS
     inverse_depth[~known] = np.nan
-    return DepthMap(reference.frame_id, inverse_depth.astype(np.float32), step)
+    return DepthMap(reference.frame_id, np.asarray(inverse_depth, np.float32), step)
 
 
 def _num_depths(problem: DepthProblem) -> int:
@@ -115,22 +112,22 @@ def _projected(neighbour: Neighbour, points: Array) -> Array:
     return np.asarray(np.where(p[2] > 0.0, p[:2] / np.where(p[2] > 0.0, p[2], 1.0), -1e9))
 
 
-def _at(volume: NDArray[np.float32], idx: NDArray[np.intp]) -> NDArray[np.float32]:
-    return np.asarray(np.take_along_axis(volume, idx[..., None], axis=-1)[..., 0])
+def _at(smoothed: Smoothed, idx: NDArray[np.intp]) -> NDArray[np.float32]:
+    return np.asarray(np.take_along_axis(smoothed, idx[..., None], axis=-1)[..., 0], np.float32)
 
 
-def _second(smoothed: NDArray[np.float32], best: NDArray[np.intp]) -> NDArray[np.float32]:
-    """Cost of the best depth that is not next to the best one."""
-    apart = np.abs(np.arange(smoothed.shape[-1])[None, None] - best[..., None]) >= _APART
-    return np.asarray(np.where(apart, smoothed, np.inf).min(axis=-1), np.float32)
+def _lead(smoothed: Smoothed, best: NDArray[np.intp]) -> NDArray[np.float32]:
+    """By how much the best match is cheaper than any other; writes over the costs of the best one."""
+    cost = _at(smoothed, best)
+    for k in range(-_BESIDE, _BESIDE + 1):
+        beside = np.clip(best + k, 0, smoothed.shape[-1] - 1)
+        np.put_along_axis(smoothed, beside[..., None], np.iinfo(np.uint16).max, axis=-1)
+    return np.asarray(smoothed.min(axis=-1) - cost)
 
 
-def _refined(smoothed: NDArray[np.float32], best: NDArray[np.intp]) -> Array:
+def _refined(smoothed: Smoothed, best: NDArray[np.intp]) -> NDArray[np.float32]:
     """Where between the depths the cost is least, in steps: the vertex of a parabola through three."""
     middle = np.clip(best, 1, smoothed.shape[-1] - 2)
     before, at, after = (_at(smoothed, middle + k) for k in (-1, 0, 1))
-    curvature = before - 2.0 * at + after
-    offset = np.where(
-        curvature > 0.0, 0.5 * (before - after) / np.where(curvature > 0.0, curvature, 1.0), 0.0
-    )
-    return np.asarray(middle + np.clip(offset, -0.5, 0.5), np.float64)
+    curvature = np.maximum(before - 2.0 * at + after, 1e-6)
+    return np.asarray(middle + np.clip(0.5 * (before - after) / curvature, -0.5, 0.5), np.float32)

@@ -10,16 +10,18 @@ from numpy.typing import NDArray
 from semcast.server.dense.view import View
 
 Array = NDArray[np.float64]
-Volume = NDArray[np.float32]
+Volume = NDArray[np.uint8]
+Image = NDArray[np.float32]
 
 #: Side of the window that is compared.
 WINDOW = 5
-#: Cost where nothing is known: as of windows without anything in common.
-UNKNOWN_COST = 1.0
-#: No pixel has this value: what lies outside of a warped image.
-_OUTSIDE = -1e4
-#: Variance of what lies outside, which does not count: only to divide by.
-_LEAST_NOISE = 1.0
+#: Cost of windows that have nothing in common, and of what no neighbour sees; no cost is larger.
+UNKNOWN_COST = 100
+#: Contrast of a window, grey levels, that half of its correlation is left of: below it there is noise.
+_FAINT_LEVELS = 1.5
+#: No pixel has this value, nor one near it: what lies beside a warped image.
+_BESIDE = -1e4
+_WHITE = 255.0
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,8 @@ class Neighbour:
 def match_cost(reference: View, groups: Sequence[Sequence[Neighbour]], inverse_depths: Array) -> Volume:
     """Cost of each depth at each pixel: one less the normalised cross-correlation of windows.
 
-    The noise of both images counts as a variance that nothing explains, so that windows whose texture does
-    not stand out of it say little. Of a group the mean counts, and of the groups (those before and those
-    after the reference) the better one: what is hidden on one side is mostly seen from the other.
+    Of a group the mean counts, and of the groups (those before and those after the reference) the better one:
+    what is hidden on one side is mostly seen from the other.
 
     Args:
         reference: The view whose depth is sought.
@@ -48,27 +49,62 @@ def match_cost(reference: View, groups: Sequence[Sequence[Neighbour]], inverse_d
         inverse_depths: ``(D,)`` inverse depths in the reference's camera frame, ascending.
 
     Returns:
-        ``(H, W, D)`` in [0, 2], ``UNKNOWN_COST`` where no neighbour of any group sees the pixel.
+        ``(D, H, W)`` of 0 for alike to ``UNKNOWN_COST`` for nothing in common or not seen by any neighbour.
     """
-    height, width = reference.shape_hw
-    ref = reference.grey
-    mean_ref = _box(ref)
-    var_ref = np.maximum(_box(ref * ref) - mean_ref * mean_ref, 0.0) + _box(reference.sigma**2)
+    ref = _Reference(reference)
+    centred = [[(n, _centred(n.view)) for n in group] for group in groups]
     K_inv = np.linalg.inv(reference.K)
-    cost = np.full((len(inverse_depths), height, width), np.inf, np.float32)
+    cost = np.empty((len(inverse_depths), *reference.shape_hw), np.uint8)
     for d, inverse_depth in enumerate(inverse_depths.tolist()):
-        for group in groups:
-            total = np.zeros((height, width), np.float32)
-            weight = np.zeros((height, width), np.float32)
-            for neighbour in group:
-                H = _homography(neighbour, K_inv, inverse_depth)
-                correlation, seen = _correlation(ref, mean_ref, var_ref, neighbour.view, H)
-                total += correlation * seen
+        best = np.zeros(reference.shape_hw, np.float32)
+        for group in centred:
+            total, weight = np.zeros_like(best), np.zeros_like(best)
+            for neighbour, grey in group:
+                correlation, seen = ref.correlation(grey, _homography(neighbour, K_inv, inverse_depth))
+                total += correlation
                 weight += seen
-            group_cost = 1.0 - total / np.maximum(weight, 1.0)
-            np.minimum(cost[d], np.where(weight > 0.0, group_cost, np.inf), out=cost[d])
-    cost[~np.isfinite(cost)] = UNKNOWN_COST
-    return np.ascontiguousarray(cost.transpose(1, 2, 0))
+            total /= np.maximum(weight, 1e-6)
+            np.maximum(best, total, out=best)
+        cost[d] = np.rint(UNKNOWN_COST * np.maximum(1.0 - best, 0.0))
+    return cost
+
+
+class _Reference:
+    """What correlations of a reference with other views have in common."""
+
+    def __init__(self, view: View) -> None:
+        self._grey = _centred(view)
+        self._mean = _box(self._grey)
+        variance = np.maximum(_box(self._grey * self._grey) - self._mean * self._mean, 0.0)
+        self._per_sd = 1.0 / np.sqrt(variance + _FAINT_LEVELS**2)
+
+    def correlation(self, other: Image, H: Array) -> tuple[Image, NDArray[np.bool_]]:
+        """Return the normalised cross-correlation with an image warped by ``H``, and where that is seen."""
+        height, width = self._grey.shape
+        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        grey = cv2.warpPerspective(
+            other, H, (width, height), flags=how, borderMode=cv2.BORDER_CONSTANT, borderValue=_BESIDE
+        )
+        seen = grey > -_WHITE
+        grey *= seen
+        mean = _box(grey)
+        variance = _box(grey * grey)
+        variance -= mean * mean
+        np.maximum(variance, 0.0, out=variance)
+        variance += _FAINT_LEVELS**2
+        grey *= self._grey
+        correlation = _box(grey)
+        mean *= self._mean
+        correlation -= mean
+        correlation *= self._per_sd
+        correlation /= np.sqrt(variance, out=variance)
+        correlation *= seen
+        return correlation, seen
+
+
+def _centred(view: View) -> Image:
+    """Return grey levels about 0, whose squares lose less of float32."""
+    return view.grey - np.float32(0.5 * _WHITE)
 
 
 def _homography(neighbour: Neighbour, K_inv: Array, inverse_depth: float) -> Array:
@@ -79,39 +115,7 @@ def _homography(neighbour: Neighbour, K_inv: Array, inverse_depth: float) -> Arr
     return np.asarray(neighbour.view.K @ plane @ K_inv)
 
 
-def _correlation(
-    ref: NDArray[np.float32],
-    mean_ref: NDArray[np.float32],
-    var_ref: NDArray[np.float32],
-    view: View,
-    H: Array,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Normalised cross-correlation with a warped view, and where that is seen (0 or 1)."""
-    warped = _warp(np.dstack([view.grey, view.sigma**2]), H, ref.shape)
-    grey, noise = warped[..., 0], warped[..., 1]
-    seen = grey >= 0.0
-    grey, noise = np.where(seen, grey, mean_ref), np.where(seen, noise, _LEAST_NOISE)
-    mean = _box(grey)
-    var = np.maximum(_box(grey * grey) - mean * mean, 0.0) + np.maximum(_box(noise), _LEAST_NOISE)
-    covariance = _box(grey * ref) - mean * mean_ref
-    return covariance / np.sqrt(var_ref * var), seen.astype(np.float32)
-
-
-def _warp(image: NDArray[np.float32], H: Array, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    return np.asarray(
-        cv2.warpPerspective(
-            image,
-            H,
-            (shape[1], shape[0]),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=(_OUTSIDE, 0.0, 0.0, 0.0),
-        ),
-        np.float32,
-    )
-
-
-def _box(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _box(values: Image) -> Image:
     return np.asarray(
         cv2.boxFilter(values, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE), np.float32
     )

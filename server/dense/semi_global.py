@@ -3,43 +3,50 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Volume = NDArray[np.float32]
+from semcast.server.dense.plane_sweep import UNKNOWN_COST
 
-#: Cost of a step to the next depth, and of a jump to any other, for costs in [0, 2].
-STEP_COST = 0.08
-JUMP_COST = 0.5
+Volume = NDArray[np.uint8]
+Smoothed = NDArray[np.uint16]
+
+#: Lines of pixels that the costs of a pixel are summed over.
+NUM_DIRECTIONS = 4
+#: Cost of a step to the next depth, and of a jump to any other. The dearest way fits in a byte.
+STEP_COST = 8
+JUMP_COST = 140
+assert np.iinfo(np.uint8).max >= UNKNOWN_COST + JUMP_COST + STEP_COST
 #: Difference of two pixels in grey levels that halves the cost of a jump between them: depth ends at edges.
 _EDGE_LEVELS = 8.0
 
 
-def aggregate(cost: Volume, grey: NDArray[np.float32]) -> Volume:
+def aggregate(cost: Volume, grey: NDArray[np.float32]) -> Smoothed:
     """Sum the cheapest ways to each depth along lines from the left, the right, above and below.
 
     Args:
-        cost: ``(H, W, D)``.
+        cost: ``(D, H, W)``, at most ``UNKNOWN_COST``.
         grey: ``(H, W)`` grey levels of the reference.
 
     Returns:
         ``(H, W, D)``, the sum over the four directions.
     """
-    total = np.zeros_like(cost)
+    rows = np.ascontiguousarray(cost.transpose(1, 2, 0))
+    total = np.zeros(rows.shape, np.uint16)
     down = _jump_cost(np.abs(np.diff(grey, axis=0)))
-    _along(cost, down, total)
-    _along(cost[::-1], down[::-1], total[::-1])
-    across = np.ascontiguousarray(cost.transpose(1, 0, 2))
-    total_across = np.zeros_like(across)
+    _along(rows, down, total)
+    _along(rows[::-1], down[::-1], total[::-1])
+    columns = np.ascontiguousarray(cost.transpose(2, 1, 0))
+    total_across = np.zeros(columns.shape, np.uint16)
     right = _jump_cost(np.abs(np.diff(grey, axis=1))).T
-    _along(across, right, total_across)
-    _along(across[::-1], right[::-1], total_across[::-1])
+    _along(columns, right, total_across)
+    _along(columns[::-1], right[::-1], total_across[::-1])
     total += total_across.transpose(1, 0, 2)
     return total
 
 
-def _jump_cost(difference: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.maximum(1.5 * STEP_COST, JUMP_COST / (1.0 + difference / _EDGE_LEVELS)).astype(np.float32)
+def _jump_cost(difference: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.maximum(1.5 * STEP_COST, JUMP_COST / (1.0 + difference / _EDGE_LEVELS)).astype(np.uint8)
 
 
-def _along(cost: Volume, jump: NDArray[np.float32], total: Volume) -> None:
+def _along(cost: Volume, jump: NDArray[np.uint8], total: Smoothed) -> None:
     """Add the cheapest ways from the first line on to ``total``.
 
     Args:
@@ -49,10 +56,13 @@ def _along(cost: Volume, jump: NDArray[np.float32], total: Volume) -> None:
     """
     way = cost[0].copy()
     total[0] += way
+    step = np.uint8(STEP_COST)
     for k in range(1, len(cost)):
-        least = way.min(axis=-1, keepdims=True)
-        best = np.minimum(way, least + jump[k - 1][:, None])
-        np.minimum(best[:, 1:], way[:, :-1] + STEP_COST, out=best[:, 1:])
-        np.minimum(best[:, :-1], way[:, 1:] + STEP_COST, out=best[:, :-1])
-        way = cost[k] + (best - least)
+        way -= way.min(axis=-1, keepdims=True)
+        best = np.minimum(way, jump[k - 1][:, None])
+        way += step
+        np.minimum(best[:, 1:], way[:, :-1], out=best[:, 1:])
+        np.minimum(best[:, :-1], way[:, 1:], out=best[:, :-1])
+        best += cost[k]
+        way = best
         total[k] += way
