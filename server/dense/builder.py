@@ -254,9 +254,7 @@ class DenseBuilder:
         self._confirmed[frame_id] = confirmed
         for old in sorted(self._confirmed)[:-_NUM_COVERING]:
             del self._confirmed[old]
-        patch = DensePatch(
-            frame_id, points[new].astype(np.float32), view.rgb[sure][new], kept.confidence[sure][new]
-        )
+        patch = DensePatch(frame_id, points[new], view.rgb[sure][new], kept.confidence[sure][new])
         if len(patch.xyz):
             self._cloud.add(patch, *landmark_depths(world, keyframe))
 

@@ -32,12 +32,13 @@ class OtherDepth:
     T_other_ref: Array
 
 
-def back_project(inverse_depth: DepthImage, K: Array) -> Array:
+def back_project(inverse_depth: DepthImage, K: Array) -> NDArray[np.float32]:
     """Points ``(H, W, 3)`` in the camera frame; NaN where the depth is not known."""
     height, width = inverse_depth.shape
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones((height, width))], axis=-1)
-    return np.asarray(rays / inverse_depth[..., None].astype(np.float64))
+    z = 1.0 / inverse_depth
+    x = (np.arange(width, dtype=np.float32) - np.float32(K[0, 2])) / np.float32(K[0, 0])
+    y = (np.arange(height, dtype=np.float32) - np.float32(K[1, 2])) / np.float32(K[1, 1])
+    return np.stack([x * z, y[:, None] * z, z], axis=-1)
 
 
 def num_agreeing(
@@ -57,12 +58,11 @@ def num_agreeing(
     count = np.zeros(inverse_depth.shape, np.intp)
     known = np.isfinite(inverse_depth)
     points = back_project(inverse_depth, K)[known]
-    for other in others:
-        count[known] += agrees(points, step, other)
+    count[known] = sum((agrees(points, step, other) for other in others), np.zeros(len(points), np.intp))
     return count
 
 
-def agrees(points: Array, step: float, other: OtherDepth) -> NDArray[np.bool_]:
+def agrees(points: NDArray[np.floating], step: float, other: OtherDepth) -> NDArray[np.bool_]:
     """Tell which points lie on what another keyframe sees.
 
     Args:
@@ -70,19 +70,15 @@ def agrees(points: Array, step: float, other: OtherDepth) -> NDArray[np.bool_]:
         step: What their inverse depth is good to.
         other: The depth of the other keyframe.
     """
-    T = other.T_other_ref
-    moved = points @ T[:3, :3].T + T[:3, 3]
     height, width = other.inverse_depth.shape
-    z = moved[:, 2]
+    T = other.T_other_ref
+    A, b = (other.K @ T[:3, :3]).astype(np.float32), (other.K @ T[:3, 3]).astype(np.float32)
+    x, y, z = A @ np.asarray(points, np.float32).T + b[:, None]
     ahead = z > 0.0
-    pixel = np.full((len(points), 2), -1, np.intp)
-    projected = moved[ahead] @ other.K.T
-    xy = projected[:, :2] / projected[:, 2:]
-    near = (np.abs(xy) < 1e6).all(axis=1)
-    pixel[np.flatnonzero(ahead)[near]] = np.rint(xy[near]).astype(np.intp)
-    inside = ((pixel >= 0) & (pixel < [width, height])).all(axis=1)
-    there = np.full(len(points), np.nan)
-    there[inside] = other.inverse_depth[pixel[inside, 1], pixel[inside, 0]]
-    within = np.maximum(_STEPS * max(step, other.step), _SHARE / np.where(ahead, z, 1.0))
+    per_z = 1.0 / np.where(ahead, z, 1.0)
+    column, row = np.rint(x * per_z), np.rint(y * per_z)
+    inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    at = np.where(inside, row * width + column, 0.0).astype(np.intp)
+    within = np.maximum(_STEPS * max(step, other.step), _SHARE * per_z)
     with np.errstate(invalid="ignore"):
-        return np.asarray(inside & (np.abs(there - 1.0 / np.where(ahead, z, 1.0)) < within))
+        return np.asarray(inside & (np.abs(other.inverse_depth.ravel()[at] - per_z) < within))
