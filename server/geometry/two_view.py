@@ -210,6 +210,22 @@ def _behind(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: 
     return np.asarray(sure & ((depth0 <= 0) | (depth1 <= 0)))
 
 
+def follows(
+    camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array, threshold_px: float
+) -> NDArray[np.bool_]:
+    """Which matches a relative pose explains, ``(N,)``: inliers, and points too far away to be behind.
+
+    Args:
+        camera: Of both images.
+        T_cam1_cam0: ``(4, 4)`` relative pose.
+        xy0: ``(N, 2)`` pixels.
+        xy1: ``(N, 2)`` pixels, matched row by row.
+        threshold_px: Inlier threshold of the search.
+    """
+    near = np.abs(sampson_px(fundamental_matrix(camera, T_cam1_cam0), xy0, xy1)) < 2.0 * threshold_px
+    return np.asarray(near & ~_behind(camera, T_cam1_cam0, xy0, xy1, threshold_px))
+
+
 def _search(
     camera: Intrinsics,
     xy0: Array,

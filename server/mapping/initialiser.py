@@ -18,6 +18,7 @@ from semcast.server.mapping.ambiguity import Side, decide
 from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
 from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
 from semcast.server.mapping.mapper import gather_observations
+from semcast.server.mapping.scene_motion import ITERATIONS, SceneMotion, motion_of_scene
 from semcast.server.mapping.start_alignment import aligned_views
 from semcast.server.mapping.world_map import Keyframe
 
@@ -37,6 +38,8 @@ MIN_POINTS = 40
 _MIN_VIEWS, _MAX_TOO_SHORT = 3, 2
 #: After so many starts that could have been one or the other, or so many frames, the better one is taken.
 _MAX_UNDECIDED, _MAX_UNDECIDED_FRAMES = 12, 60
+#: After so many attempts in which another motion explained almost as much of the image, that does not hinder.
+_MAX_CONTESTED = 12
 #: What decides grows with the way of the tracks: it is looked at again when that is so many times as long.
 _RETRY_GROWTH = 1.15
 #: So many structures go on to the next attempt, none that is so much more doubtful than the best one.
@@ -90,6 +93,7 @@ class Initialiser:
         self.history: list[Observed] = []
         self._reference = 0
         self._num_too_short = 0
+        self._num_contested = 0
         self._num_undecided = 0
         self._num_since_undecided = 0
         self._undecided_flow_px = 0.0
@@ -154,13 +158,25 @@ class Initialiser:
             mode=self._mode,
             threshold_px=threshold_px,
             seed=self._seed,
-            min_iterations=130,
-            max_iterations=1300,
+            min_iterations=ITERATIONS[0],
+            max_iterations=ITERATIONS[1],
             choose_model=True,
         )
-        if found is None or not self._is_good(found, len(shared)):
+        if found is None:
             return None
-        start = self._build(found, shared[found.inliers], noise)
+        scene = motion_of_scene(
+            self._camera,
+            found,
+            xy0,
+            xy1,
+            confidence,
+            mode=self._mode,
+            threshold_px=threshold_px,
+            seed=self._seed,
+        )
+        if not self._is_good(scene) or (scene.is_contested and self._may_wait_for_the_other()):
+            return None
+        start = self._build(scene.motion, shared[scene.motion.inliers], shared[scene.alone], noise)
         if self._num_undecided:
             self._undecided_flow_px = flow_px
         return start
@@ -187,9 +203,20 @@ class Initialiser:
         """A start from a few points of a damaged image costs the whole map; waiting costs a few frames."""
         return MIN_POINTS if len(self.history) >= _PATIENCE_FRAMES else _PLENTY_OF_POINTS
 
-    def _is_good(self, found: TwoViewResult, num_shared: int) -> bool:
-        enough = int(found.inliers.sum()) >= max(self._min_points(), 0.5 * num_shared)
-        return enough and found.model != "rotation" and found.parallax_deg > _MIN_MEDIAN_PARALLAX_DEG
+    def _is_good(self, scene: SceneMotion) -> bool:
+        """Whether a map could begin with a motion: of half of the tracks, but for what moves by itself."""
+        found = scene.motion
+        enough = max(self._min_points(), 0.5 * int((~scene.alone).sum()))
+        return (
+            int(found.inliers.sum()) >= enough
+            and found.model != "rotation"
+            and found.parallax_deg > _MIN_MEDIAN_PARALLAX_DEG
+        )
+
+    def _may_wait_for_the_other(self) -> bool:
+        """Whether to wait until it is clear which motion is the scene's; asked, and counted, each time."""
+        self._num_contested += 1
+        return self._num_contested <= _MAX_CONTESTED
 
     def _move_reference(self) -> None:
         """Let the reference be the oldest frame that still shares enough tracks with the newest."""
@@ -212,9 +239,9 @@ class Initialiser:
             if self.history[k].grey is not None:
                 self.history[k] = replace(self.history[k], grey=None)
 
-    def _build(self, found: TwoViewResult, ids: Ids, noise: NoiseModel) -> Start | None:
-        """Triangulate, place the frames between, and triangulate again from all."""
-        span = self.history[self._reference :]
+    def _build(self, found: TwoViewResult, ids: Ids, alone: Ids, noise: NoiseModel) -> Start | None:
+        """Triangulate, place the frames between, and triangulate again from all but what moves by itself."""
+        span = [o.without(alone) if len(alone) else o for o in self.history[self._reference :]]
         first, last = span[0], span[-1]
         T_world_cam = {0: np.eye(4), len(span) - 1: invert_transform(found.T_cam1_cam0)}
         points = self._triangulate([first, last], np.stack([np.eye(4), found.T_cam1_cam0]), ids, noise)

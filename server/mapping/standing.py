@@ -22,6 +22,13 @@ _COLUMNS = 12
 _LEAST_MOTION_PX = 0.5
 
 
+def cells_of(xy: Array, width: int) -> NDArray[np.intp]:
+    """Which cell of the image each of ``(N, 2)`` pixels is in, ``(N,)``; cells with none have no number."""
+    cell = np.floor(xy * (_COLUMNS / width)).astype(np.int64)
+    _, group = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_inverse=True)
+    return np.asarray(group, dtype=np.intp)
+
+
 def scene_motion_px(xy: Array, motion_px: Array, width: int) -> float:
     """How far the scene moved in the image from one frame to the next: the median over its area.
 
@@ -32,8 +39,7 @@ def scene_motion_px(xy: Array, motion_px: Array, width: int) -> float:
     """
     if len(xy) == 0:
         return 0.0
-    cell = np.floor(xy * (_COLUMNS / width)).astype(np.int64)
-    _, group = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_inverse=True)
+    group = cells_of(xy, width)
     order = np.lexsort((motion_px, group))
     begins = np.searchsorted(group[order], np.arange(group.max() + 1))
     middle = begins + (np.bincount(group) - 1) // 2
