@@ -26,11 +26,11 @@ _CLOSE_DEADLINE_S = 3.0
 MAX_FAILURES = 5
 
 
-def serve(connection: Connection, work: Callable[[Problem], Result], niceness: int) -> None:
+def serve(connection: Connection, work: Callable[[Problem], Result], stands_back: bool) -> None:
     """Answer problems until the other end closes; the body of the child process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows nothing else keeps Ctrl-C away
-    if niceness and hasattr(os, "nice"):
-        os.nice(niceness)
+    if stands_back:
+        _stand_back()
     while True:
         try:
             problem = connection.recv()
@@ -42,6 +42,15 @@ def serve(connection: Connection, work: Callable[[Problem], Result], niceness: i
             connection.send(work(problem))
         except (BrokenPipeError, OSError):
             return
+
+
+def _stand_back() -> None:
+    """Let every other process go first, as far as the system knows how."""
+    with contextlib.suppress(OSError):  # some containers don't allow it
+        if hasattr(os, "SCHED_IDLE"):
+            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+        elif hasattr(os, "nice"):
+            os.nice(19)
 
 
 def _send(connection: Connection, problem: object) -> None:
@@ -63,7 +72,7 @@ class Worker(Generic[Problem, Result]):
         lossless: ``take`` always waits for the result, so the same input gives the same outcome; otherwise
             it returns at once.
         on_give_up: Is told ``given_up``, once.
-        niceness: How far the child stands back behind other processes, 0 to 19; 0 where the system has none.
+        stands_back: The child lets every other process go first.
         start_early: Start the child now; otherwise with the first problem.
     """
 
@@ -76,14 +85,14 @@ class Worker(Generic[Problem, Result]):
         given_up: str,
         lossless: bool = False,
         on_give_up: Callable[[str], None] | None = None,
-        niceness: int = 0,
+        stands_back: bool = False,
         start_early: bool = True,
     ) -> None:
         self._work = work
         self._name = name
         self._what = what
         self._given_up = given_up
-        self._niceness = niceness
+        self._stands_back = stands_back
         self._lossless = lossless
         self._on_give_up = on_give_up
         self._context = multiprocessing.get_context("spawn")
@@ -120,7 +129,7 @@ class Worker(Generic[Problem, Result]):
         ours, theirs = self._context.Pipe()
         self._process = self._context.Process(
             target=serve,
-            args=(theirs, self._work, self._niceness),
+            args=(theirs, self._work, self._stands_back),
             name=f"semcast-{self._name}",
             daemon=True,
         )

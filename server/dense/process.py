@@ -9,8 +9,6 @@ from semcast.server.worker import MAX_FAILURES, Worker
 
 _WHAT = "the process that estimates dense depth"
 GIVEN_UP = f"{_WHAT} failed {MAX_FAILURES} times in a row: the dense cloud no longer grows"
-#: Poses come first: depth has what time they leave.
-_NICENESS = 10
 
 
 def _estimate(problem: DepthProblem) -> DepthMap:
@@ -34,6 +32,6 @@ class ProcessDepth(Worker[DepthProblem, DepthMap]):
             given_up=GIVEN_UP,
             lossless=lossless,
             on_give_up=on_give_up,
-            niceness=_NICENESS,
+            stands_back=True,  # poses come first: depth has what time they leave
             start_early=False,
         )
