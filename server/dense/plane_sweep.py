@@ -13,12 +13,17 @@ Array = NDArray[np.float64]
 Volume = NDArray[np.uint8]
 Image = NDArray[np.float32]
 
-#: Side of the window that is compared.
-WINDOW = 5
+#: Side of the window that is compared, and where the median noise of the reference is above so many grey
+#: levels: noise asks for more pixels, which blur the outlines of things.
+WINDOW, WINDOW_OF_NOISY = 5, 7
+_NOISY_LEVELS = 3.75
 #: Cost of windows that have nothing in common, and of what no neighbour sees; no cost is larger.
 UNKNOWN_COST = 100
 #: Contrast of a window, grey levels, that half of its correlation is left of: below it there is noise.
-_FAINT_LEVELS = 1.5
+_FAINT_LEVELS = 1.0
+#: Correlation that windows of noise have now and then: below it there is nothing in common. Otherwise depths
+#: at which more neighbours see a pixel would cost less, having more chances.
+_CHANCE = 0.2
 #: No pixel has this value, nor one near it: what lies beside a warped image.
 _BESIDE = -1e4
 _WHITE = 255.0
@@ -54,6 +59,7 @@ def match_cost(reference: View, groups: Sequence[Sequence[Neighbour]], inverse_d
     ref = _Reference(reference)
     centred = [[(n, _centred(n.view)) for n in group] for group in groups]
     K_inv = np.linalg.inv(reference.K)
+    per_correlation = UNKNOWN_COST / (1.0 - _CHANCE)
     cost = np.empty((len(inverse_depths), *reference.shape_hw), np.uint8)
     for d, inverse_depth in enumerate(inverse_depths.tolist()):
         best = np.zeros(reference.shape_hw, np.float32)
@@ -65,7 +71,7 @@ def match_cost(reference: View, groups: Sequence[Sequence[Neighbour]], inverse_d
                 weight += seen
             total /= np.maximum(weight, 1e-6)
             np.maximum(best, total, out=best)
-        cost[d] = np.rint(UNKNOWN_COST * np.maximum(1.0 - best, 0.0))
+        cost[d] = np.rint(per_correlation * (1.0 - np.clip(best, _CHANCE, 1.0)))
     return cost
 
 
@@ -74,8 +80,9 @@ class _Reference:
 
     def __init__(self, view: View) -> None:
         self._grey = _centred(view)
-        self._mean = _box(self._grey)
-        variance = np.maximum(_box(self._grey * self._grey) - self._mean * self._mean, 0.0)
+        self._window = WINDOW_OF_NOISY if np.median(view.sigma) > _NOISY_LEVELS else WINDOW
+        self._mean = self._box(self._grey)
+        variance = np.maximum(self._box(self._grey * self._grey) - self._mean * self._mean, 0.0)
         self._per_sd = 1.0 / np.sqrt(variance + _FAINT_LEVELS**2)
 
     def correlation(self, other: Image, H: Array) -> tuple[Image, NDArray[np.bool_]]:
@@ -87,19 +94,23 @@ class _Reference:
         )
         seen = grey > -_WHITE
         grey *= seen
-        mean = _box(grey)
-        variance = _box(grey * grey)
+        mean = self._box(grey)
+        variance = self._box(grey * grey)
         variance -= mean * mean
         np.maximum(variance, 0.0, out=variance)
         variance += _FAINT_LEVELS**2
         grey *= self._grey
-        correlation = _box(grey)
+        correlation = self._box(grey)
         mean *= self._mean
         correlation -= mean
         correlation *= self._per_sd
         correlation /= np.sqrt(variance, out=variance)
         correlation *= seen
         return correlation, seen
+
+    def _box(self, values: Image) -> Image:
+        size = (self._window, self._window)
+        return np.asarray(cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def _centred(view: View) -> Image:
@@ -113,9 +124,3 @@ def _homography(neighbour: Neighbour, K_inv: Array, inverse_depth: float) -> Arr
     plane = R.copy()
     plane[:, 2] += inverse_depth * t
     return np.asarray(neighbour.view.K @ plane @ K_inv)
-
-
-def _box(values: Image) -> Image:
-    return np.asarray(
-        cv2.boxFilter(values, -1, (WINDOW, WINDOW), borderType=cv2.BORDER_REPLICATE), np.float32
-    )

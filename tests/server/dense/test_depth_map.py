@@ -1,0 +1,69 @@
+"""Depth is right where the images tell it, and not known where they don't."""
+
+import numpy as np
+import pytest
+
+from semcast.server.dense.depth_map import MAX_DEPTHS, DepthProblem, estimate_depth
+
+XS = (-0.3, 0.0, 0.3)
+
+
+def problem(row, nearest=1.5, farthest=8.0, k=1):
+    return DepthProblem(
+        row.views[k], [[row.neighbour(k - 1, k)], [row.neighbour(k + 1, k)]], nearest, farthest
+    )
+
+
+def relative_error(found, truth):
+    return np.abs(1 / found - truth) / truth
+
+
+def test_a_slanted_wall_is_found_to_a_hundredth(stand, slant) -> None:
+    row = stand([slant], XS)
+    found = estimate_depth(problem(row))
+    assert found.frame_id == 1
+    error = relative_error(found.inverse_depth, row.depths[1])
+    assert np.isfinite(error).mean() > 0.9
+    assert np.nanmedian(error) < 0.01
+    assert np.nanmean(error > 0.05) < 0.02
+
+
+def test_what_stands_before_a_wall_has_its_own_depth(stand, wall, plate) -> None:
+    row = stand([wall, plate], XS)
+    found = estimate_depth(problem(row)).inverse_depth
+    truth = row.depths[1]
+    for depth in (2.0, 4.0):
+        error = relative_error(found, truth)[truth == depth]
+        assert np.isfinite(error).mean() > 0.85
+        # Windows across the outline have the depth of the plate.
+        assert np.nanmean(error < 0.02) > 0.93
+
+
+def test_a_wall_without_texture_has_no_depth(stand, plain_wall) -> None:
+    found = estimate_depth(problem(stand([plain_wall], XS, noise_sd=0.7)))
+    assert np.isfinite(found.inverse_depth).mean() < 0.03
+
+
+def test_what_is_nearer_than_all_depths_tried_is_not_known(stand, wall) -> None:
+    found = estimate_depth(problem(stand([wall], XS), nearest=6.0, farthest=20.0))
+    assert np.isfinite(found.inverse_depth).mean() < 0.3
+
+
+def test_depths_are_as_many_as_the_image_moves_by_pixels(stand, wall) -> None:
+    def steps(xs):
+        found = estimate_depth(problem(stand([wall], xs), nearest=2.0, farthest=8.0))
+        return round((1 / 2.0 - 1 / 8.0) / found.step) + 1
+
+    # 140 px focal length: 0.8 units move the image by 0.8 * 140 * (1/2 - 1/8) = 42 px.
+    assert steps((-0.8, 0.0, 0.1)) == pytest.approx(42, abs=1)
+    assert steps((-1.6, 0.0, 0.1)) == MAX_DEPTHS
+
+
+def test_a_problem_without_neighbours_or_with_depths_out_of_order_is_refused(stand, wall) -> None:
+    row = stand([wall], XS)
+    for groups in ([], [[row.neighbour(0, 1)], []]):
+        with pytest.raises(ValueError, match="groups must hold neighbours"):
+            DepthProblem(row.views[1], groups, 1.0, 2.0)
+    for nearest, farthest in ((0.0, 2.0), (2.0, 1.0), (1.0, np.inf)):
+        with pytest.raises(ValueError, match="0 < nearest < farthest"):
+            DepthProblem(row.views[1], [[row.neighbour(0, 1)]], nearest, farthest)
