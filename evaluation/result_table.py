@@ -130,6 +130,23 @@ LAYOUTS: dict[str, _Layout] = {
             "corners moved; 1 is best."
         ],
     ),
+    "depth": _Layout(
+        lambda report: report["results"],
+        {
+            "codec": ("codec", ""),
+            "SNR dB": ("snr_db", "g"),
+            "confidence": ("confidence", ""),
+            "coverage": ("coverage", ".1%"),
+            "median": ("median_error", ".2%"),
+            "off by 5 %": ("outlier_share", ".1%"),
+            "PSNR dB": ("psnr_db", ".2f"),
+            "lost": ("lost", ".0%"),
+        },
+        lambda report: [
+            f"Depth that other keyframes confirm, over {report['num_keyframes']} keyframes. Coverage: share "
+            f"of the pixels with {report['reference']} depth. Errors are relative to it."
+        ],
+    ),
     "latency": _Layout(
         lambda report: _named(report["stages"]),
         {

@@ -93,7 +93,9 @@ def _num_depths(problem: DepthProblem) -> int:
     """As many depths as the image moves by pixels between the nearest and the farthest."""
     height, width = problem.reference.shape_hw
     x, y = np.meshgrid(np.arange(0, width, _GRID_PX), np.arange(0, height, _GRID_PX))
-    rays = np.linalg.inv(problem.reference.K) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    rays = np.linalg.inv(problem.reference.K).astype(np.float64) @ np.stack(
+        [x.ravel(), y.ravel(), np.ones(x.size)]
+    )
     moved = 0.0
     for neighbour in (n for group in problem.groups for n in group):
         near = _projected(neighbour, rays * problem.nearest)

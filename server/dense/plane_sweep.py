@@ -58,7 +58,7 @@ def match_cost(reference: View, groups: Sequence[Sequence[Neighbour]], inverse_d
     """
     ref = _Reference(reference)
     centred = [[(n, _centred(n.view)) for n in group] for group in groups]
-    K_inv = np.linalg.inv(reference.K)
+    K_inv = np.linalg.inv(reference.K).astype(np.float64)
     per_correlation = UNKNOWN_COST / (1.0 - _CHANCE)
     cost = np.empty((len(inverse_depths), *reference.shape_hw), np.uint8)
     for d, inverse_depth in enumerate(inverse_depths.tolist()):
@@ -89,8 +89,11 @@ class _Reference:
         """Return the normalised cross-correlation with an image warped by ``H``, and where that is seen."""
         height, width = self._grey.shape
         how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        grey = cv2.warpPerspective(
-            other, H, (width, height), flags=how, borderMode=cv2.BORDER_CONSTANT, borderValue=_BESIDE
+        grey = np.asarray(
+            cv2.warpPerspective(
+                other, H, (width, height), flags=how, borderMode=cv2.BORDER_CONSTANT, borderValue=_BESIDE
+            ),
+            np.float32,
         )
         seen = grey > -_WHITE
         grey *= seen

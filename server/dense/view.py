@@ -68,7 +68,7 @@ def view_of(
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
     sigma = np.full(grey.shape, CLEAN_SIGMA, np.float32)
     if confidence is not None:
-        small = cv2.resize(confidence, size_wh, interpolation=cv2.INTER_AREA)
+        small = np.asarray(cv2.resize(confidence, size_wh, interpolation=cv2.INTER_AREA), np.float32)
         sigma = np.hypot(sigma, error_sd(small)).astype(np.float32)
     x_share, y_share = size_wh[0] / width, size_wh[1] / height
     K = np.array(
@@ -84,4 +84,4 @@ def view_of(
 def error_sd(confidence: NDArray[np.float32]) -> NDArray[np.float32]:
     """Standard deviation of a pixel's error in grey levels that a confidence stands for."""
     doubt = 1.0 - np.clip(confidence, _LEAST_CONFIDENCE, 1.0)
-    return (_SD_PER_MEAN * _GREY_LEVELS_PER_ATANH * np.arctanh(doubt)).astype(np.float32)
+    return np.asarray(_SD_PER_MEAN * _GREY_LEVELS_PER_ATANH * np.arctanh(doubt), np.float32)

@@ -15,7 +15,17 @@ from rich.text import Text
 from semcast.channel.emulator import warn_of_idle
 from semcast.commands.console import plain_console
 from semcast.commands.running import add_settings, read_settings
-from semcast.evaluation import codec, confidence, endurance, latency, pairs, recording, runtime, trajectory
+from semcast.evaluation import (
+    codec,
+    confidence,
+    depth,
+    endurance,
+    latency,
+    pairs,
+    recording,
+    runtime,
+    trajectory,
+)
 from semcast.evaluation.report import RESULT_NAME, STDOUT, check_outputs
 from semcast.evaluation.result_table import ResultTable, result_table
 
@@ -45,6 +55,12 @@ EVALUATIONS: dict[str, _Evaluation] = {
         confidence.evaluate_confidence,
         confidence.UNUSED_FIELDS,
         "grade the confidence maps of a codec",
+    ),
+    "depth": (
+        depth.DepthSettings,
+        depth.evaluate_depth,
+        depth.UNUSED_FIELDS,
+        "depth maps from decoded images, beside exact ones or those of the originals",
     ),
     "latency": (
         latency.LatencySettings,

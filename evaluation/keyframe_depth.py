@@ -1,0 +1,156 @@
+"""Depth maps of a recording's keyframes, from whatever images of them arrived."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.evaluation.pipeline import LinkedFrame
+from semcast.evaluation.reconstruct import as_received
+from semcast.server.dense.consistency import OtherDepth, num_agreeing
+from semcast.server.dense.depth_map import DepthImage, DepthMap, DepthProblem, estimate_depth
+from semcast.server.dense.plane_sweep import Neighbour
+from semcast.server.dense.view import View
+from semcast.server.export.parts import frame_parts
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.reconstruction import Reconstruction
+from semcast.server.mapping.settings import ReconstructionSettings
+
+Array = NDArray[np.float64]
+
+#: Neighbours on either side, each so much further away than the one before, in shares of the median depth.
+_NUM_NEIGHBOURS = 2
+_BASELINE = 0.04
+#: Depth is sought between these percentiles of a keyframe's landmarks, and somewhat beyond.
+_NEAR, _FAR = (2.0, 1.0 / 1.3), (98.0, 1.5)
+#: Keyframes with fewer landmarks tell no range of depths.
+_MIN_LANDMARKS = 10
+#: Depths of so many keyframes on either side confirm one, and so many of them have to.
+_NUM_CONFIRMING = 2
+_WANTED = 2
+
+
+@dataclass(frozen=True)
+class DepthKeyframe:
+    """Where a keyframe was and between which depths there is something.
+
+    Attributes:
+        T_world_cam: ``(4, 4)`` pose.
+        nearest: Least depth that is tried, units of the poses.
+        median: Of its landmarks.
+        farthest: Greatest depth that is tried.
+    """
+
+    T_world_cam: Array
+    nearest: float
+    median: float
+    farthest: float
+
+    def with_poses_of(self, T_world_cam: Array, scale: float) -> "DepthKeyframe":
+        """Return it at another pose, in whose units one of its own is ``scale``."""
+        return DepthKeyframe(T_world_cam, scale * self.nearest, scale * self.median, scale * self.farthest)
+
+
+def reconstructed(
+    frames: Iterable[LinkedFrame], camera: Intrinsics, settings: ReconstructionSettings
+) -> tuple[dict[int, Array], dict[int, DepthKeyframe]]:
+    """Reconstruct frames; return poses, and those keyframes whose landmarks tell a range of depths.
+
+    Args:
+        frames: In order.
+        camera: Of their images.
+        settings: How to reconstruct.
+
+    Returns:
+        Frame id to ``T_world_cam``, and keyframe id to where it was, of the largest part of the map.
+    """
+    reconstruction = Reconstruction(camera, settings, InlineBundle())
+    try:
+        for frame in frames:
+            if frame.decoded is not None:
+                reconstruction.process(as_received(frame))
+        reconstruction.conclude()
+        poses = reconstruction.final_trajectory()
+        ids, xyz, _, _ = reconstruction.landmarks()
+        seen_ids, seen_by, _ = reconstruction.observations()
+        part_of = frame_parts(reconstruction.snapshot())
+    finally:
+        reconstruction.close()
+    largest, _ = Counter(part_of.values()).most_common(1)[0] if part_of else (0, 0)
+    poses = {k: T_world_cam for k, T_world_cam in poses.items() if part_of.get(k) == largest}
+    place = dict(zip(ids.tolist(), xyz, strict=True))
+    keyframes = {}
+    for k in sorted({*seen_by.tolist()} & {*poses}):
+        points = np.array([place[i] for i in seen_ids[seen_by == k].tolist() if i in place]).reshape(-1, 3)
+        T_cam_world = invert_transform(poses[k])
+        depth = points @ T_cam_world[2, :3] + T_cam_world[2, 3]
+        depth = depth[depth > 0.0]
+        if len(depth) >= _MIN_LANDMARKS:
+            near, far = (float(np.percentile(depth, share)) * factor for share, factor in (_NEAR, _FAR))
+            keyframes[k] = DepthKeyframe(poses[k], near, float(np.median(depth)), far)
+    return poses, keyframes
+
+
+def confirmed_depths(
+    keyframes: Mapping[int, DepthKeyframe], views: Mapping[int, View]
+) -> dict[int, DepthImage]:
+    """Estimate the depth of keyframes from their views and keep what others confirm.
+
+    Args:
+        keyframes: By frame id.
+        views: Of those that arrived.
+
+    Returns:
+        ``(H, W)`` inverse depth in units of the poses, NaN where it is not confirmed, of every keyframe that
+        has a view and a neighbour.
+    """
+    problems = {k: _problem(k, keyframes, views) for k in sorted(views)}
+    maps = {k: estimate_depth(problem) for k, problem in problems.items() if problem is not None}
+    return {k: _confirmed(k, maps, keyframes, views) for k in maps}
+
+
+def _problem(
+    k: int, keyframes: Mapping[int, DepthKeyframe], views: Mapping[int, View]
+) -> DepthProblem | None:
+    sides = (sorted((j for j in views if j < k), reverse=True), sorted(j for j in views if j > k))
+    groups = []
+    for side in sides:
+        group: list[Neighbour] = []
+        for j in side:
+            T_nbr_ref = invert_transform(keyframes[j].T_world_cam) @ keyframes[k].T_world_cam
+            least = _BASELINE * keyframes[k].median * (len(group) + 1)
+            if np.linalg.norm(T_nbr_ref[:3, 3]) >= least:
+                group.append(Neighbour(views[j], T_nbr_ref))
+            if len(group) == _NUM_NEIGHBOURS:
+                break
+        groups.append(group)
+    if not any(groups):
+        return None
+    sought = keyframes[k]
+    return DepthProblem(views[k], [group for group in groups if group], sought.nearest, sought.farthest)
+
+
+def _confirmed(
+    k: int,
+    maps: Mapping[int, DepthMap],
+    keyframes: Mapping[int, DepthKeyframe],
+    views: Mapping[int, View],
+) -> DepthImage:
+    found, order = maps[k], sorted(maps)
+    place = order.index(k)
+    others = [
+        OtherDepth(
+            maps[j].inverse_depth,
+            maps[j].step,
+            views[j].K,
+            invert_transform(keyframes[j].T_world_cam) @ keyframes[k].T_world_cam,
+        )
+        for j in order[max(0, place - _NUM_CONFIRMING) : place + _NUM_CONFIRMING + 1]
+        if j != k
+    ]
+    sure = num_agreeing(found.inverse_depth, found.step, views[k].K, others) >= _WANTED
+    return np.where(sure, found.inverse_depth, np.float32(np.nan))
