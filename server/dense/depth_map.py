@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +20,12 @@ MIN_DEPTHS, MAX_DEPTHS = 24, 64
 _MIN_LEAD = 0.15
 #: Depths up to this many steps away belong to the same match.
 _BESIDE = 2
+#: Patches of fewer pixels are chance; pixels side by side are of one patch where their depths are at most so
+#: many steps apart.
+_MIN_PATCH_PX = 40
+_MAX_APART = 1.5
+#: Parts of a step that patches are told apart by.
+_PARTS = 16
 #: Share of the pixels (every 8th each way) whose movement tells how many depths are tried.
 _MOST = 90.0
 _GRID_PX = 8
@@ -81,12 +88,20 @@ def estimate_depth(problem: DepthProblem) -> DepthMap:
     smoothed = aggregate(match_cost(reference, problem.groups, inverse_depths), reference.grey)
     best = smoothed.argmin(axis=-1)
     step = float(inverse_depths[1] - inverse_depths[0])
-    inverse_depth = inverse_depths[0] + step * _refined(smoothed, best)
+    steps = _refined(smoothed, best)
     # The nearest and the farthest depth also stand for all that is beyond.
     known = (best > 0) & (best < len(inverse_depths) - 1)
     known &= _lead(smoothed, best) > _MIN_LEAD * UNKNOWN_COST * NUM_DIRECTIONS
-    inverse_depth[~known] = np.nan
-    return DepthMap(reference.frame_id, np.asarray(inverse_depth, np.float32), step)
+    steps[~_without_specks(steps, known)] = np.nan
+    inverse_depth = np.asarray(inverse_depths[0] + step * steps, np.float32)
+    return DepthMap(reference.frame_id, inverse_depth, step)
+
+
+def _without_specks(steps: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return what is known but for small patches; ``(H, W)`` each, depths in steps."""
+    parts = np.where(known, _PARTS * steps, -1).astype(np.int16)
+    cv2.filterSpeckles(parts, -1, _MIN_PATCH_PX, _PARTS * _MAX_APART)
+    return np.asarray(parts >= 0)
 
 
 def _num_depths(problem: DepthProblem) -> int:

@@ -1,5 +1,6 @@
 """Depth is right where the images tell it, and not known where they don't."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -42,6 +43,14 @@ def test_what_stands_before_a_wall_has_its_own_depth(stand, wall, plate) -> None
 def test_a_wall_without_texture_has_no_depth(stand, plain_wall) -> None:
     found = estimate_depth(problem(stand([plain_wall], XS, noise_sd=0.7)))
     assert np.isfinite(found.inverse_depth).mean() < 0.03
+
+
+def test_specks_of_chance_are_left_out(stand, plain_wall) -> None:
+    found = estimate_depth(problem(stand([plain_wall], XS, noise_sd=1.5)))
+    known = np.isfinite(found.inverse_depth).astype(np.uint8)
+    num, _, facts, _ = cv2.connectedComponentsWithStats(known, connectivity=4)
+    assert num > 1, "there is more noise than can be told from a wall"
+    assert facts[1:, cv2.CC_STAT_AREA].min() >= 40
 
 
 def test_what_is_nearer_than_all_depths_tried_is_not_known(stand, wall) -> None:
