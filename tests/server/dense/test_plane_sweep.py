@@ -59,3 +59,15 @@ def test_what_is_hidden_on_one_side_is_matched_on_the_other(stand, wall, plate) 
     }
     assert cost["left"] > 50
     assert cost["both"] <= cost["right"] < 15
+
+
+def test_images_known_to_be_noisy_are_matched_in_larger_windows(stand, wall) -> None:
+    row = stand([wall], (0.0, 0.3), noise_sd=40.0)
+    doubted = replace(row.views[0], sigma=np.full_like(row.views[0].sigma, 40.0))
+    right = [
+        (
+            match_cost(view, [[row.neighbour(1, 0)]], INVERSE_DEPTHS)[(slice(None), *MIDDLE)].argmin(0) == 2
+        ).mean()
+        for view in (row.views[0], doubted)
+    ]
+    assert right[1] > right[0] + 0.05
