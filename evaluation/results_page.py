@@ -226,6 +226,29 @@ def _endurance(report: Report) -> Iterator[str]:
     yield from table(head, _sampled(body, 5))
 
 
+def _depth(report: Report) -> Iterator[str]:
+    against = "the exact depth" if report["reference"] == "exact" else "that from the original images"
+    poses = "true" if report["settings"]["poses"] == "true" else "those estimated from the original images"
+    yield f"{report['num_keyframes']} keyframes, measured against {against}; poses are {poses}.\n"
+    head = ["codec", "SNR dB", "confidence", "coverage", "median error", "off by 5 %", "PSNR dB", "lost"]
+    yield from table(
+        head,
+        [
+            [
+                row["codec"],
+                "-" if row["snr_db"] is None else f"{row['snr_db']:g}",
+                row["confidence"],
+                "-" if row["coverage"] is None else f"{row['coverage']:.1%}",
+                "-" if row["median_error"] is None else f"{row['median_error']:.2%}",
+                "-" if row["outlier_share"] is None else f"{row['outlier_share']:.1%}",
+                number(row["psnr_db"]),
+                f"{row['lost']:.0%}",
+            ]
+            for row in report["results"]
+        ],
+    )
+
+
 def _training(report: Report) -> Iterator[str]:
     curve = report["curve"]
     rows = [[r["step"], r["elapsed_s"], number(r["train_psnr_db"])] for r in _sampled(curve, 8)]
@@ -282,6 +305,7 @@ SECTIONS: dict[str, tuple[str, Tables]] = {
     "pairs": ("Relative pose of frame pairs", _pairs),
     "depth": ("Depth maps", _depth),
     "confidence": ("What the confidence maps are worth", _confidence),
+    "depth": ("Depth from decoded images", _depth),
     "latency": ("Where the time goes", _latency),
     "runtime": ("How fast encoder and decoder are", _runtime),
     "recording": ("What recording costs", _recording),

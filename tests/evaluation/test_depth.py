@@ -12,6 +12,7 @@ from semcast.evaluation.depth import DepthSettings, evaluate_depth
 from semcast.evaluation.keyframe_depth import DepthKeyframe, confirmed_depths, reconstructed
 from semcast.evaluation.pipeline import run_frames
 from semcast.evaluation.result_table import result_table
+from semcast.evaluation.results_page import results_page
 from semcast.server.dense.view import view_of
 from semcast.server.mapping.settings import ReconstructionSettings
 
@@ -23,10 +24,10 @@ def test_a_recording_is_measured_against_its_originals(room, phase_codec, tmp_pa
         snr_db=(20.0, -5.0),
         max_frames=18,
         out=tmp_path,
-        json=tmp_path / "depth.json",
+        json=tmp_path / "depth_room.json",
     )
     report = evaluate_depth(settings, [phase_codec])
-    assert report == json.loads((tmp_path / "depth.json").read_text())
+    assert report == json.loads((tmp_path / "depth_room.json").read_text())
     assert report["command"].startswith("semcast eval depth --sequence room --codec phase")
     assert (report["reference"], report["num_keyframes"] >= 4) == ("original", True)
     rows = {(row["snr_db"], row["confidence"]): row for row in report["results"]}
@@ -39,6 +40,7 @@ def test_a_recording_is_measured_against_its_originals(room, phase_codec, tmp_pa
     strip = cv2.imread(str(tmp_path / "depth.png"))
     assert strip.shape[1] > 2 * 384, "the original and its depth are side by side"
     assert len(result_table("depth", report).rows) == 4
+    assert f"| phase | 20 | off | {good['coverage']:.1%} |" in results_page(tmp_path)
 
 
 def test_a_drawn_scene_is_measured_against_its_exact_depth(phase_codec):
