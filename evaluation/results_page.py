@@ -146,30 +146,6 @@ def _latency(report: Report) -> Iterator[str]:
     )
 
 
-def _depth(report: Report) -> Iterator[str]:
-    against = {"exact": "the exact depth", "original": "depth from the original images"}[report["reference"]]
-    yield (
-        f"Depth that other keyframes confirm, of {report['num_keyframes']} keyframes, against {against}: share of "
-        "its pixels that have one, median error, share that is off by more than 5 %.\n"
-    )
-    rows = [
-        [
-            row["codec"],
-            "no link" if row["snr_db"] is None else f"{row['snr_db']:g}",
-            row["confidence"],
-            *(number(None if row[k] is None else 100.0 * row[k], digits) for k, digits in _DEPTH_FIGURES),
-            number(row["psnr_db"]),
-            f"{row['lost']:.0%}",
-        ]
-        for row in report["results"]
-    ]
-    head = ["codec", "SNR dB", "confidence", "pixels %", "error %", "off %", "PSNR dB", "frames lost"]
-    yield from table(head, rows)
-
-
-_DEPTH_FIGURES = (("coverage", 1), ("median_error", 2), ("outlier_share", 1))
-
-
 def _demo(report: Report) -> Iterator[str]:
     width, height = report["stream"]["image_wh"]
     codec = report["stream"]["codec"]
@@ -303,7 +279,6 @@ SECTIONS: dict[str, tuple[str, Tables]] = {
     "shutter": ("Rolling shutters, put right and not", _trajectory),
     "readout": ("Readout times found", _readout),
     "pairs": ("Relative pose of frame pairs", _pairs),
-    "depth": ("Depth maps", _depth),
     "confidence": ("What the confidence maps are worth", _confidence),
     "depth": ("Depth from decoded images", _depth),
     "latency": ("Where the time goes", _latency),
