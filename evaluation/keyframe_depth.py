@@ -76,7 +76,7 @@ def reconstructed(
         reconstruction.conclude()
         poses = reconstruction.final_trajectory()
         ids, xyz, _, _ = reconstruction.landmarks()
-        seen_ids, seen_by, _ = reconstruction.observations()
+        seen_ids, seen_by, _ = reconstruction.world.observations()
         part_of = frame_parts(reconstruction.snapshot())
     finally:
         reconstruction.close()

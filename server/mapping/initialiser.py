@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import interpolate_pose, invert_transform
+from semcast.server.geometry.epipolar import fit_rotation, rotation_residual_px
 from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import TwoViewResult, estimate_two_view
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
@@ -25,6 +26,7 @@ from semcast.server.mapping.world_map import Keyframe
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
+_NONE: Ids = np.zeros(0, np.int64)
 #: Frames kept for poses in retrospect.
 MAX_HISTORY = 300
 #: Of them, those whose images are kept too: 10 MB of 640x480.
@@ -40,7 +42,8 @@ _MIN_VIEWS, _MAX_TOO_SHORT = 3, 2
 _MAX_UNDECIDED, _MAX_UNDECIDED_FRAMES = 12, 60
 #: After so many attempts in which another motion explained almost as much of the image, that does not hinder.
 _MAX_CONTESTED = 12
-#: What decides grows with the way of the tracks: it is looked at again when that is so many times as long.
+#: What decides grows with the way of the tracks, and with what turning leaves of it: it is looked at again
+#: when one of them is so many times as long.
 _RETRY_GROWTH = 1.15
 #: So many structures go on to the next attempt, none that is so much more doubtful than the best one.
 _MAX_HYPOTHESES, _HOPELESS = 3, 1.0
@@ -48,6 +51,8 @@ _MAX_HYPOTHESES, _HOPELESS = 3, 1.0
 _PLENTY_OF_POINTS, _PATIENCE_FRAMES = 60, 12
 #: Share of the reference's tracks that must still be there; else the reference moves on.
 _MIN_SHARED = 0.12
+#: Share of the tracks two views share that must agree with a relative pose.
+_LEAST_AGREEING = 0.5
 #: Median way of the tracks, as share of the image width, below which no start is tried.
 _MIN_FLOW_SHARE = 0.012
 #: Median angle between the rays of the two views.
@@ -96,8 +101,9 @@ class Initialiser:
         self._num_contested = 0
         self._num_undecided = 0
         self._num_since_undecided = 0
-        self._undecided_flow_px = 0.0
+        self._undecided_px = np.zeros(2)
         self._hypotheses: list[Hypothesis] = []
+        self._agreeing = 1.0
 
     @property
     def ids(self) -> Ids:
@@ -114,13 +120,20 @@ class Initialiser:
         """Forget tracks that turned out to be of no scene, in the frames that saw them too."""
         if self.history and np.isin(self.history[-1].ids, ids).any():
             self.history = [o.without(ids) for o in self.history]
+            # What they took part in says nothing any more.
+            self._hypotheses = []
+            self._undecided_px = np.zeros(2)
 
-    def add(self, observed: Observed, noise: NoiseModel, *, is_damaged: bool = False) -> Start | None:
+    def add(
+        self, observed: Observed, noise: NoiseModel, suspect: Ids = _NONE, *, is_damaged: bool = False
+    ) -> Start | None:
         """Take a frame and try to start a map with it.
 
         Args:
             observed: Its tracks.
             noise: Of the observations.
+            suspect: Tracks that stand in the image and may be of no scene. No start rests on them: it would
+                take what moves with the camera for what is far away, and the camera for not turning.
             is_damaged: Much of the image is missing: keep the frame, but do not start from it.
 
         Returns:
@@ -140,11 +153,16 @@ class Initialiser:
         shared, row0, row1 = np.intersect1d(
             reference.ids, observed.ids, assume_unique=True, return_indices=True
         )
+        doubtful = np.isin(shared, suspect)
+        left_out, shared, row0, row1 = shared[doubtful], shared[~doubtful], row0[~doubtful], row1[~doubtful]
         if len(shared) < self._min_points():
             return None
         xy0, xy1 = reference.xy[row0], observed.xy[row1]
         flow_px = float(np.median(np.linalg.norm(xy1 - xy0, axis=1)))
-        if flow_px < _MIN_FLOW_SHARE * self._camera.width or not self._is_new_evidence(flow_px):
+        if flow_px < _MIN_FLOW_SHARE * self._camera.width:
+            return None
+        evidence_px = np.array([flow_px, self._relief_px(xy0, xy1)])
+        if not self._is_new_evidence(evidence_px):
             return None
         if self._reference + 1 == len(self.history) - 1 and self._is_too_short():
             return None
@@ -162,31 +180,48 @@ class Initialiser:
             max_iterations=ITERATIONS[1],
             choose_model=True,
         )
-        if found is None:
+        scene = None
+        if found is not None:
+            scene = motion_of_scene(
+                self._camera,
+                found,
+                xy0,
+                xy1,
+                confidence,
+                mode=self._mode,
+                threshold_px=threshold_px,
+                seed=self._seed,
+            )
+        agreeing = 0.0 if scene is None else float(scene.motion.inliers.mean())
+        self._agreeing = max(_LEAST_AGREEING, agreeing)
+        if scene is None or not self._is_good(scene):
             return None
-        scene = motion_of_scene(
-            self._camera,
-            found,
-            xy0,
-            xy1,
-            confidence,
-            mode=self._mode,
-            threshold_px=threshold_px,
-            seed=self._seed,
-        )
-        if not self._is_good(scene) or (scene.is_contested and self._may_wait_for_the_other()):
+        if scene.is_contested and self._may_wait_for_the_other():
             return None
-        start = self._build(scene.motion, shared[scene.motion.inliers], shared[scene.alone], noise)
-        if self._num_undecided:
-            self._undecided_flow_px = flow_px
+        history = [o.without(left_out) for o in self.history]
+        span = [o.without(shared[scene.alone]) for o in history[self._reference :]]
+        start = self._build(span, scene.motion, shared[scene.motion.inliers], noise)
+        if start is not None:
+            self.history = history
+        elif self._num_undecided:
+            self._undecided_px = evidence_px
         return start
 
-    def _is_new_evidence(self, flow_px: float) -> bool:
-        """Whether a start that could not be decided is worth another look, with tracks of this length."""
+    def _relief_px(self, xy0: Array, xy1: Array) -> float:
+        """Median way of tracks that turning alone does not explain: a hand turns more than it goes."""
+        R_cam1_cam0 = fit_rotation(self._camera, xy0, xy1, iterations=1)
+        return float(np.median(rotation_residual_px(self._camera, R_cam1_cam0, xy0, xy1)))
+
+    def _is_new_evidence(self, evidence_px: Array) -> bool:
+        """Whether a start that could not be decided is worth another look.
+
+        Args:
+            evidence_px: ``(2,)`` median way of the tracks, and what turning leaves of it.
+        """
         if not self._num_undecided:
             return True
         self._num_since_undecided += 1
-        return self._is_overdue() or flow_px >= _RETRY_GROWTH * self._undecided_flow_px
+        return self._is_overdue() or bool((evidence_px >= _RETRY_GROWTH * self._undecided_px).any())
 
     def _is_too_short(self) -> bool:
         """Whether to wait for a third view; asked, and counted, each time there are only two.
@@ -206,7 +241,7 @@ class Initialiser:
     def _is_good(self, scene: SceneMotion) -> bool:
         """Whether a map could begin with a motion: of half of the tracks, but for what moves by itself."""
         found = scene.motion
-        enough = max(self._min_points(), 0.5 * int((~scene.alone).sum()))
+        enough = max(self._min_points(), _LEAST_AGREEING * int((~scene.alone).sum()))
         return (
             int(found.inliers.sum()) >= enough
             and found.model != "rotation"
@@ -219,16 +254,20 @@ class Initialiser:
         return self._num_contested <= _MAX_CONTESTED
 
     def _move_reference(self) -> None:
-        """Let the reference be the oldest frame that still shares enough tracks with the newest."""
+        """Let the reference be the oldest frame that still shares enough tracks with the newest.
+
+        Enough are so many that those of them that agree, by their share in the last search, make a start.
+        With fewer the reference would stay for as long as the last few tracks last, and no start come of it.
+        """
         newest = self.history[-1]
         while self._reference < len(self.history) - 1:
             reference = self.history[self._reference]
             shared = int(np.isin(reference.ids, newest.ids, assume_unique=True).sum())
-            if shared >= max(MIN_POINTS, _MIN_SHARED * len(reference.ids)):
+            if shared >= max(MIN_POINTS / self._agreeing, _MIN_SHARED * len(reference.ids)):
                 return
             self._reference += 1
             # Its tracks begin anew. Attempts are counted on: a fast camera would never use them up.
-            self._undecided_flow_px = 0.0
+            self._undecided_px = np.zeros(2)
 
     def _forget_images(self) -> None:
         """Keep the images of a few frames among those that may become keyframes of the start."""
@@ -239,9 +278,8 @@ class Initialiser:
             if self.history[k].grey is not None:
                 self.history[k] = replace(self.history[k], grey=None)
 
-    def _build(self, found: TwoViewResult, ids: Ids, alone: Ids, noise: NoiseModel) -> Start | None:
-        """Triangulate, place the frames between, and triangulate again from all but what moves by itself."""
-        span = [o.without(alone) if len(alone) else o for o in self.history[self._reference :]]
+    def _build(self, span: list[Observed], found: TwoViewResult, ids: Ids, noise: NoiseModel) -> Start | None:
+        """Triangulate, place the frames between, and triangulate again from all."""
         first, last = span[0], span[-1]
         T_world_cam = {0: np.eye(4), len(span) - 1: invert_transform(found.T_cam1_cam0)}
         points = self._triangulate([first, last], np.stack([np.eye(4), found.T_cam1_cam0]), ids, noise)

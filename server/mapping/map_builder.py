@@ -254,7 +254,7 @@ class MapBuilder:
     def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
         """Turn the newest frame into a keyframe, triangulate, and ask for an adjustment."""
         frame, world = sight.frame, self.world
-        visible = tracks.visible
+        visible = tracks.visible & ~tracks.suspect
         ids, xy = tracks.ids[visible], tracks.xy[visible]
         self.images.append(SeenFrom(frame.frame_id, sight.grey))
         descriptor_ids, descriptors = self.relocaliser.describe(sight.grey, ids, xy)

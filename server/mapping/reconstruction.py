@@ -308,7 +308,8 @@ class Reconstruction:
         observed = observed_of(sight, tracks, visible)
         self._initialiser.leave_out(tracks.ids[tracks.fixed])
         waits = self._state is TrackingState.LOST or float(sight.usable.mean()) < _MIN_USABLE_SHARE
-        start = self._initialiser.add(observed, self._map.noise.model, is_damaged=waits)
+        suspect = tracks.ids[tracks.suspect]
+        start = self._initialiser.add(observed, self._map.noise.model, suspect, is_damaged=waits)
         self._lap("two_view", since)
         if start is None:
             return self._result(frame, None, None)
@@ -446,11 +447,7 @@ class Reconstruction:
         return self._map.whole(self._map_epoch)
 
     def conclude(self) -> int:
-        """Adjust the whole map, if the settings want that: the stream has ended, and no pose waits.
-
-        Returns:
-            Number of keyframes that were adjusted.
-        """
+        """Adjust the whole map of a stream that has ended, if settings want it; the number of keyframes."""
         if num_adjusted := self._map.adjust_whole():
             self._moved(1.0)
         return num_adjusted

@@ -13,9 +13,14 @@ Array = NDArray[np.float64]
 
 #: A track stands as long as it is no further from where it began to: share of the width, at least pixels.
 _STANDING_SHARE, _STANDING_PX = 0.0015, 1.0
+#: And as long as its noise, so many standard deviations, explains what it moved.
+_NOISE_SIGMAS = 2.0
 #: The scene must go so many image widths while a track stands. A point so far away that it does the same is
 #: in the direction the camera moves, and few are.
 _SCENE_WIDTHS = 0.1
+#: From so many on a track may belong to the camera, where more than this share of all do: of what is at
+#: rest, a twentieth stands in images of a car that goes straight on, and less elsewhere.
+_SUSPECT_WIDTHS, _MANY_SHARE = 0.006, 0.1
 #: Cells along the width by which the area counts.
 _COLUMNS = 12
 #: Less than this from one frame to the next is no motion, but noise.
@@ -48,7 +53,12 @@ def scene_motion_px(xy: Array, motion_px: Array, width: int) -> float:
 
 
 def stood(
-    xy: Array, anchor_xy: Array, widths: Array, scene_px: Array | float, width: int
+    xy: Array,
+    anchor_xy: Array,
+    widths: Array,
+    scene_px: Array | float,
+    width: int,
+    sd_px: Array | float = 0.0,
 ) -> tuple[Array, Array]:
     """Count on how far the scene went while tracks stood.
 
@@ -58,14 +68,23 @@ def stood(
         widths: ``(N,)`` image widths the scene went since.
         scene_px: How far it went with this frame, for all tracks or ``(N,)``.
         width: Of the image.
+        sd_px: Standard deviation of a position per coordinate, for all tracks or ``(N,)``.
 
     Returns:
         The new ``anchor_xy`` and ``widths``: a track that moved begins anew where it is.
     """
-    stands = np.linalg.norm(xy - anchor_xy, axis=1) <= max(_STANDING_PX, _STANDING_SHARE * width)
+    # Both ends of what it moved are noisy.
+    least_px = np.maximum(max(_STANDING_PX, _STANDING_SHARE * width), _NOISE_SIGMAS * np.sqrt(2.0) * sd_px)
+    stands = np.linalg.norm(xy - anchor_xy, axis=1) <= least_px
     return np.where(stands[:, None], anchor_xy, xy), np.where(stands, widths + scene_px / width, 0.0)
 
 
 def is_fixed(widths: Array) -> NDArray[np.bool_]:
     """Which tracks belong to the camera: the scene went ``(N,)`` image widths while they stood."""
     return np.asarray(widths >= _SCENE_WIDTHS)
+
+
+def may_be_fixed(widths: Array) -> NDArray[np.bool_]:
+    """Which tracks may belong to the camera: too many stand to be far away, too shortly to be sure."""
+    may = (widths >= _SUSPECT_WIDTHS) & ~is_fixed(widths)
+    return np.asarray(may & (may.sum() > _MANY_SHARE * len(may)))

@@ -26,7 +26,7 @@ from semcast.server.geometry.weighting import (
 from semcast.server.geometry.wide_search import search_wide
 from semcast.server.mapping.found import Found
 from semcast.server.mapping.sight import Seen, Sight
-from semcast.server.mapping.standing import is_fixed, scene_motion_px, stood
+from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -112,6 +112,11 @@ class TrackTable:
     def fixed(self) -> NDArray[np.bool_]:
         """Tracks on something that moves with the camera: followed, lest it is taken for the scene again."""
         return is_fixed(self.stood_widths)
+
+    @property
+    def suspect(self) -> NDArray[np.bool_]:
+        """Tracks that may be on something that moves with the camera; nothing should rest on them yet."""
+        return may_be_fixed(self.stood_widths)
 
     def vouch(self, ids: Ids) -> None:
         """Tracks that agree with the pose are of the scene, however still they stand."""
@@ -296,7 +301,9 @@ class TrackTable:
         width = sight.grey.shape[1]
         scene_px = scene_motion_px(self.xy[ok], np.linalg.norm(self.velocity[ok], axis=1), width)
         passed = np.where(ok, scene_px, 0.0)  # where a track that coasts is, nobody knows
-        self.anchor_xy, self.stood_widths = stood(self.xy, self.anchor_xy, self.stood_widths, passed, width)
+        self.anchor_xy, self.stood_widths = stood(
+            self.xy, self.anchor_xy, self.stood_widths, passed, width, np.sqrt(self.variance_px2)
+        )
         self.missed = np.where(ok, 0, self.missed + 1)
         cues = replace(
             self._cues(

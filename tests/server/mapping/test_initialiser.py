@@ -16,13 +16,14 @@ CAMERA = Intrinsics(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=48
 NOISE = NoiseModel(1.0, 0.0)
 
 
-def ride(num_frames, num_points=150, step_m=0.12, noise_px=0.3, seed=0, turn_rad=0.01):
-    """Frames of a camera that moves sideways, and their true poses."""
+def ride(num_frames, num_points=150, step_m=0.12, noise_px=0.3, seed=0, turn_rad=0.01, shake_rad=()):
+    """Frames of a camera that moves sideways and may shake at first, and their true poses."""
     rng = np.random.default_rng(seed)
     xyz = rng.uniform([-3.0, -2.0, 3.0], [3.0, 2.0, 7.0], (num_points, 3))
     frames, poses = [], []
     for k in range(num_frames):
-        T_world_cam = make_transform(exp_so3(np.array([0.0, turn_rad * k, 0.0])), [step_m * k, 0.0, 0.0])
+        yaw_rad = turn_rad * k + (shake_rad[k] if k < len(shake_rad) else 0.0)
+        T_world_cam = make_transform(exp_so3(np.array([0.0, yaw_rad, 0.0])), [step_m * k, 0.0, 0.0])
         T = invert_transform(T_world_cam)
         xy = CAMERA.project(xyz @ T[:3, :3].T + T[:3, 3])
         seen = ((xy > 0) & (xy < [640, 480])).all(axis=1)
@@ -145,6 +146,27 @@ def test_a_start_is_looked_at_again_when_the_tracks_have_become_longer(monkeypat
     assert len(asked) == so_far
 
 
+def test_a_hand_that_turned_away_and_back_holds_no_second_look_up(monkeypatch):
+    asked = never_decided(monkeypatch)
+    shaken, _ = ride(10, step_m=0.05, turn_rad=0.0, shake_rad=(0.0, 0.08, 0.12, 0.08))
+    begin(shaken)
+    assert len(asked) > 3
+
+
+def test_a_few_tracks_that_last_long_do_not_tie_the_start_to_an_old_frame():
+    """A third of them goes its own way: those left are too few to begin with."""
+    frames, _ = ride(20, step_m=0.05, turn_rad=0.0)
+    last = frames[0].ids[:44]
+    own_way = np.random.default_rng(3).uniform(-8.0, 8.0, (150, 2)) * (np.arange(150) < last[14])[:, None]
+    later = [
+        replace(f, ids=np.where(np.isin(f.ids, last), f.ids, 1000 + f.ids), xy=f.xy + k * own_way[f.ids])
+        for k, f in enumerate(frames[3:], start=3)
+    ]
+    k, start = begin([*frames[:3], *later], is_damaged=lambda k: k < 3)
+    assert start.keyframes[0].frame_id >= 3
+    assert k < 16
+
+
 def test_a_camera_that_stops_too_early_gets_the_better_start_in_the_end(monkeypatch):
     asked = never_decided(monkeypatch)
     moving, _ = ride(6, step_m=0.05)
@@ -232,3 +254,38 @@ def test_tracks_that_stand_hold_no_start_up_once_they_are_left_out():
     start = initialiser.add(frames[6].without(ids), NOISE)
     assert start is not None
     assert not np.isin(start.ids, ids).any()
+
+
+def test_a_start_is_looked_at_anew_without_tracks_that_were_left_out(monkeypatch):
+    asked = never_decided(monkeypatch)
+    initialiser = Initialiser(CAMERA, "off", 1.0, 0)
+    frames, _ = ride(8, step_m=0.05)
+    for frame in frames:
+        initialiser.add(frame, NOISE)
+    so_far = len(asked)
+    initialiser.add(same_view(frames[-1], 1, 8)[0], NOISE)
+    assert len(asked) == so_far
+    left_out = frames[-1].ids[:20]
+    initialiser.leave_out(left_out)
+    initialiser.add(same_view(frames[-1], 1, 9)[0].without(left_out), NOISE)
+    assert len(asked) == so_far + 1
+
+
+def test_no_start_rests_on_suspect_tracks():
+    rng = np.random.default_rng(7)
+    ids = 1000 + np.arange(100)
+    standing = np.column_stack((rng.uniform(0, 640, 100), rng.uniform(400, 480, 100)))
+    frames = [
+        replace(
+            f,
+            ids=np.concatenate([f.ids, ids]),
+            xy=np.concatenate([f.xy, standing]),
+            confidence=np.ones(len(f.ids) + 100),
+        )
+        for f in ride(6)[0]
+    ]
+    initialiser = Initialiser(CAMERA, "off", 1.0, 0)
+    found = [initialiser.add(frame, NOISE, ids) for frame in frames]
+    start = next(start for start in found if start is not None)
+    assert not np.isin(ids, start.ids).any()
+    assert not any(np.isin(ids, keyframe.ids).any() for keyframe in start.keyframes)

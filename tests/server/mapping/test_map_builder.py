@@ -48,6 +48,7 @@ class NewestFrame:
     def __init__(self, ids, xy):
         self.ids, self.xy = ids, xy.copy()
         self.visible = np.ones(len(ids), bool)
+        self.suspect = np.zeros(len(ids), bool)
         self.confidence = np.full(len(ids), 0.8)
 
     def settle_at(self, rows, xy, scatter_px2):
@@ -221,6 +222,15 @@ def test_an_update_after_a_join_has_the_poses_of_all_frames(builder):
         np.testing.assert_allclose(T_world_cam, builder.world.pose_of_frame(frame_id), atol=1e-12)
     for known in builder.world.keyframes:
         assert known.T_world_cam is builder.world.poses[known.frame_id]
+
+
+def test_a_keyframe_keeps_no_track_that_may_stand_with_the_camera(builder):
+    ids, xyz = add_part(builder, 0, 4, 0)
+    sight = Sight(DecodedFrame(9, 9, IMAGE), IMAGE[..., 0], np.ones(480, bool))
+    newest = NewestFrame(ids, seen(xyz, pose(0.4)))
+    newest.suspect[:20] = True
+    builder.make_keyframe(sight, newest, pose(0.4))
+    assert np.array_equal(builder.world.keyframes[-1].ids, ids[20:])
 
 
 def test_a_camera_found_back_far_in_the_past_is_held_by_the_keyframes_there(builder):

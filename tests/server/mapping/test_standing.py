@@ -2,13 +2,15 @@
 
 import cv2
 import numpy as np
+from drawn_boards import ate_percent, frame_of, make, render
 
 from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, make_transform
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
 from semcast.server.mapping.sight import Sight
-from semcast.server.mapping.standing import is_fixed, scene_motion_px, stood
+from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable
 
@@ -70,6 +72,24 @@ def test_a_track_that_moves_begins_anew():
     assert np.array_equal(anchor, [(0.0, 0.0), (4.0, 0.0)])
     assert np.allclose(widths, (0.6, 0.0))
     assert is_fixed(widths).tolist() == [True, False]
+
+
+def test_a_track_stands_as_long_as_its_noise_explains_what_it_moved():
+    xy = np.array([(2.5, 0.0), (2.5, 0.0), (6.0, 0.0)])
+    sd_px = np.array([0.2, 1.0, 1.0])
+    _, widths = stood(xy, np.zeros((3, 2)), np.zeros(3), 32.0, 320, sd_px)
+    assert np.allclose(widths, (0.0, 0.1, 0.0))
+
+
+def test_many_tracks_that_stand_are_suspect_until_they_are_known_to_be_fixed():
+    widths = np.zeros(100)
+    widths[:30] = 0.02
+    assert np.array_equal(np.flatnonzero(may_be_fixed(widths)), np.arange(30))
+    widths[:10] = 0.2
+    assert np.array_equal(np.flatnonzero(may_be_fixed(widths)), np.arange(10, 30))
+    widths[:25] = 0.0
+    assert not may_be_fixed(widths).any(), "a few are far away, or ahead"
+    assert not may_be_fixed(np.zeros(0)).any()
 
 
 def test_tracks_on_a_bonnet_take_no_room_from_those_of_the_scene():
@@ -156,3 +176,20 @@ def test_a_drive_behind_a_bonnet_is_followed_as_one_without():
     assert steps.std() < 0.1 * steps.mean(), "it drove at one speed"
     way = t[-1] - t[0]
     assert np.abs(np.cross(t - t[0], way / np.linalg.norm(way))).max() < 0.02 * np.linalg.norm(way)
+
+
+def test_a_map_that_begins_behind_a_bonnet_does_not_rest_on_it():
+    """A hand that turns: taken for what is far away, a bonnet would let the camera seem not to turn."""
+    path = [
+        make_transform(exp_so3((0.0, 0.05 * np.sin(k / 5), 0.0)), (0.02 * k, 0.006 * k, 0.0))
+        for k in range(30)
+    ]
+    reconstruction = make()
+    for k, T_world_cam in enumerate(path):
+        image = render(T_world_cam)
+        image[BONNET_Y:] = BONNET[BONNET_Y:, :, None]
+        reconstruction.process(frame_of(k, image))
+    trajectory = reconstruction.final_trajectory()
+    reconstruction.close()
+    assert len(trajectory) == 30
+    assert ate_percent(trajectory, path) < 1.0
