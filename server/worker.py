@@ -19,7 +19,7 @@ logger = logging.getLogger(__name__)
 Problem = TypeVar("Problem")
 Result = TypeVar("Result")
 
-#: Longest wait for one result, the start of the process included.
+#: Longest wait for a result where nothing else is said.
 DEADLINE_S = 30.0
 _CLOSE_DEADLINE_S = 3.0
 #: Failures in a row, with no result between them, after which the worker gives up for good.
@@ -46,16 +46,30 @@ def serve(connection: Connection, work: Callable[[Problem], Result], stands_back
 
 def _stand_back() -> None:
     """Let every other process go first, as far as the system knows how."""
-    with contextlib.suppress(OSError):  # some containers don't allow it
-        if hasattr(os, "SCHED_IDLE"):
-            os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-        elif hasattr(os, "nice"):
-            os.nice(19)
+    if hasattr(os, "nice"):  # not the class of idle processes: on a busy machine that has no time at all
+        os.nice(19)
 
 
-def _send(connection: Connection, problem: object) -> None:
-    with contextlib.suppress(OSError):  # who waits for the result sees that the child is gone
-        connection.send(problem)
+class _Exchange(threading.Thread, Generic[Problem, Result]):
+    """Hands a problem to the child and waits for the result, so that nobody else has to.
+
+    A child that is still starting, stuck, or behind all other processes does not read what it is sent, and is
+    slow to write what it has found; both may be larger than what a pipe holds.
+    """
+
+    def __init__(self, connection: Connection, problem: Problem, name: str) -> None:
+        super().__init__(name=name, daemon=True)
+        self.problem = problem
+        self.result: Result | None = None
+        self.since_s = time.monotonic()
+        self._connection = connection
+        self.start()
+
+    def run(self) -> None:
+        """Send and receive; without a result the child is gone."""
+        with contextlib.suppress(EOFError, OSError):
+            self._connection.send(self.problem)
+            self.result = self._connection.recv()
 
 
 class Worker(Generic[Problem, Result]):
@@ -74,6 +88,7 @@ class Worker(Generic[Problem, Result]):
         on_give_up: Is told ``given_up``, once.
         stands_back: The child lets every other process go first.
         start_early: Start the child now; otherwise with the first problem.
+        deadline_s: Longest wait for one result, the start of the process included.
     """
 
     def __init__(
@@ -87,6 +102,7 @@ class Worker(Generic[Problem, Result]):
         on_give_up: Callable[[str], None] | None = None,
         stands_back: bool = False,
         start_early: bool = True,
+        deadline_s: float = DEADLINE_S,
     ) -> None:
         self._work = work
         self._name = name
@@ -94,13 +110,12 @@ class Worker(Generic[Problem, Result]):
         self._given_up = given_up
         self._stands_back = stands_back
         self._lossless = lossless
+        self._deadline_s = deadline_s
         self._on_give_up = on_give_up
         self._context = multiprocessing.get_context("spawn")
         self._process: SpawnProcess | None = None
         self._connection: Connection | None = None
-        self._pending: Problem | None = None
-        self._sender: threading.Thread | None = None
-        self._since_s = 0.0
+        self._exchange: _Exchange[Problem, Result] | None = None
         self._closed = False
         self._failures = 0
         self.num_restarts = 0
@@ -111,7 +126,7 @@ class Worker(Generic[Problem, Result]):
     @property
     def busy(self) -> bool:
         """A problem is under way."""
-        return self._pending is not None
+        return self._exchange is not None
 
     @property
     def given_up(self) -> bool:
@@ -154,12 +169,8 @@ class Worker(Generic[Problem, Result]):
             self._on_give_up(self._given_up)
 
     def submit(self, problem: Problem) -> bool:
-        """Give a problem to the child; False while it works on another or has failed for good.
-
-        Sending is done by a thread: a child that is still starting, or stuck, does not read what it is sent,
-        and a problem may be larger than what a pipe holds.
-        """
-        if self._closed or self._pending is not None:
+        """Give a problem to the child; False while it works on another or has failed for good."""
+        if self._closed or self._exchange is not None:
             return False
         if self._is_due:
             self._start()
@@ -167,14 +178,9 @@ class Worker(Generic[Problem, Result]):
             if self.given_up:
                 return False
             if self._process is not None and self._process.is_alive():
-                self._pending, self._since_s = problem, time.monotonic()
-                self._sender = threading.Thread(
-                    target=_send,
-                    args=(self._connection, problem),
-                    name=f"semcast-{self._name}-send",
-                    daemon=True,
-                )
-                self._sender.start()
+                assert self._connection is not None
+                name = f"semcast-{self._name}-exchange"
+                self._exchange = _Exchange(self._connection, problem, name)
                 return True
             self._restart()
         return False
@@ -182,48 +188,46 @@ class Worker(Generic[Problem, Result]):
     def take(self, wait: bool = False) -> Result | None:
         """Return the result, or None when it is not there yet or the child died over it.
 
-        A child that has had a problem for longer than ``DEADLINE_S`` is ended. A problem whose child died is
+        A child that has had a problem for longer than its deadline is ended. A problem whose child died is
         sent once more when the result is waited for.
         """
-        if self._pending is None or self._closed:
-            return None
         wait = wait or self._lossless
-        retries = 1
-        while True:
-            assert self._connection is not None
-            try:
-                left_s = self._since_s + DEADLINE_S - time.monotonic()
-                if not self._connection.poll(max(0.0, left_s) if wait else 0.0):
-                    if not wait and left_s > 0.0:
-                        return None
-                    if self._process is not None:
-                        self._process.kill()
-                    raise TimeoutError
-                result = self._connection.recv()
-                self._pending, self._failures = None, 0
-                return result  # type: ignore[no-any-return]
-            except (EOFError, OSError):  # TimeoutError is an OSError
-                problem, self._pending = self._pending, None
-                self._restart()
-                if not wait or retries == 0 or problem is None or not self.submit(problem):
-                    self._pending = None
+        for is_last in (False, True):
+            exchange = self._exchange
+            if exchange is None or self._closed:
+                return None
+            left_s = exchange.since_s + self._deadline_s - time.monotonic()
+            exchange.join(max(0.0, left_s) if wait else 0.0)
+            if exchange.is_alive():
+                if not wait and left_s > 0.0:
                     return None
-                retries -= 1
+                self._end_exchange()
+            self._exchange = None
+            if exchange.result is not None:
+                self._failures = 0
+                return exchange.result
+            self._restart()
+            if not wait or is_last or not self.submit(exchange.problem):
+                return None
+        return None
+
+    def _end_exchange(self) -> None:
+        """End what the child is at, and with it the child."""
+        if self._exchange is not None and self._exchange.is_alive():
+            if self._process is not None:
+                self._process.kill()
+            self._exchange.join(_CLOSE_DEADLINE_S)
 
     def _stop(self) -> None:
+        self._end_exchange()
         connection, self._connection = self._connection, None
         process, self._process = self._process, None
-        sender, self._sender = self._sender, None
-        if sender is not None and sender.is_alive() and process is not None:
-            process.kill()  # else it might never be done
-        if sender is not None:
-            sender.join(_CLOSE_DEADLINE_S)
         if connection is not None:
-            if self._pending is None:
-                _send(connection, None)
+            with contextlib.suppress(OSError):
+                connection.send(None)
             connection.close()
         if process is not None:
-            process.join(_CLOSE_DEADLINE_S if self._pending is None else 0.1)
+            process.join(_CLOSE_DEADLINE_S)
             if process.is_alive():
                 process.kill()
                 process.join(_CLOSE_DEADLINE_S)
@@ -234,4 +238,4 @@ class Worker(Generic[Problem, Result]):
         if not self._closed:
             self._closed = True
             self._stop()
-            self._pending = None
+            self._exchange = None

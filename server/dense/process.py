@@ -7,6 +7,8 @@ import cv2
 from semcast.server.dense.depth_map import DepthMap, DepthProblem, estimate_depth
 from semcast.server.worker import MAX_FAILURES, Worker
 
+#: A busy machine leaves a hundredth of its time.
+_DEADLINE_S = 120.0
 _WHAT = "the process that estimates dense depth"
 GIVEN_UP = f"{_WHAT} failed {MAX_FAILURES} times in a row: the dense cloud no longer grows"
 
@@ -34,4 +36,5 @@ class ProcessDepth(Worker[DepthProblem, DepthMap]):
             on_give_up=on_give_up,
             stands_back=True,  # poses come first: depth has what time they leave
             start_early=False,
+            deadline_s=_DEADLINE_S,
         )

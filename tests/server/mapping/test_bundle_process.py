@@ -71,7 +71,7 @@ def test_a_child_that_hangs_is_ended_and_another_goes_on(wait):
         assert runner.submit(PROBLEM)
         assert runner.take() is None
         assert runner.busy
-        runner._since_s -= 2 * worker.DEADLINE_S
+        runner._exchange.since_s -= 2 * worker.DEADLINE_S
         result = runner.take(wait=wait)
         assert (result is not None) == wait, "another child answers one who waits"
         assert not runner.busy
@@ -103,7 +103,7 @@ def test_a_child_that_does_not_read_holds_nobody_up(goes_on):
         since_s = time.monotonic()
         runner.close()
     assert time.monotonic() - since_s < DEADLINE_S
-    assert not any(thread.name == "semcast-bundle-send" for thread in threading.enumerate())
+    assert not any(thread.name == "semcast-bundle-exchange" for thread in threading.enumerate())
 
 
 def test_ctrl_c_does_not_reach_a_child_that_still_starts():
