@@ -1,10 +1,9 @@
 """Follows the map: chooses whose depth is estimated from which neighbours, and what of it becomes points."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,14 +55,6 @@ class DepthRunner(Protocol):
         """Free everything. Idempotent."""
 
 
-@dataclass(frozen=True)
-class _Kept:
-    """A keyframe's image, and the confidence of the view's pixels ``(H, W)``."""
-
-    view: View
-    confidence: NDArray[np.float32]
-
-
 class DenseBuilder:
     """Makes the dense cloud of a map while that grows.
 
@@ -83,7 +74,7 @@ class DenseBuilder:
     def reset(self) -> None:
         """Forget everything: the map was begun anew."""
         self._runner.take(wait=True)
-        self._kept: dict[int, _Kept] = {}
+        self._kept: dict[int, View] = {}
         self._waiting: list[int] = []
         self._maps: dict[int, DepthMap] = {}
         self._unconfirmed: list[int] = []
@@ -103,12 +94,7 @@ class DenseBuilder:
             image: ``(H, W, 3)`` uint8 RGB.
             confidence: ``(H, W)`` in [0, 1], the codec's pixel target; None counts as 1.
         """
-        view = view_of(frame_id, image, confidence, self._camera)
-        height, width = view.shape_hw
-        small = np.ones((height, width), np.float32)
-        if confidence is not None:
-            small = cv2.resize(confidence, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
-        self._kept[frame_id] = _Kept(view, small)
+        self._kept[frame_id] = view_of(frame_id, image, confidence, self._camera)
         self._waiting.append(frame_id)
         for old in sorted(self._kept)[:-_NUM_VIEWS]:
             del self._kept[old]
@@ -205,7 +191,7 @@ class DenseBuilder:
         if not groups:
             return None
         near, far = (float(np.percentile(depth, share)) * factor for share, factor in (_NEAR, _FAR))
-        return DepthProblem(_light(self._kept[frame_id].view), groups, near, far)
+        return DepthProblem(self._kept[frame_id].to_compare(), groups, near, far)
 
     def _neighbours(self, keyframe: Keyframe, side: Sequence[int], world: WorldMap) -> list[Neighbour]:
         """Choose views on one side of a keyframe, from the nearest in time on."""
@@ -224,17 +210,17 @@ class DenseBuilder:
                 continue
             if rotation_angle_deg(T_nbr_ref[:3, :3]) > _MAX_TURN_DEG:
                 break
-            found.append(Neighbour(_light(self._kept[frame_id].view), T_nbr_ref))
+            found.append(Neighbour(self._kept[frame_id].to_compare(), T_nbr_ref))
             if len(found) == _NUM_NEIGHBOURS:
                 break
         return found
 
     def _confirm(self, frame_id: int, world: WorldMap) -> None:
         """Make points of what other keyframes see too, and those before have not added yet."""
-        keyframe, kept = _keyframe(world, frame_id), self._kept.get(frame_id)
-        if keyframe is None or kept is None or world.pose_of_frame(frame_id) is None:
+        keyframe, view = _keyframe(world, frame_id), self._kept.get(frame_id)
+        if keyframe is None or view is None or world.pose_of_frame(frame_id) is None:
             return
-        found, view = self._maps[frame_id], kept.view
+        found = self._maps[frame_id]
         before = sorted(k for k in self._maps if k < frame_id)[-_NUM_CONFIRMING:]
         after = sorted(k for k in self._maps if k > frame_id)[:_NUM_CONFIRMING]
         others = [
@@ -254,23 +240,18 @@ class DenseBuilder:
         self._confirmed[frame_id] = confirmed
         for old in sorted(self._confirmed)[:-_NUM_COVERING]:
             del self._confirmed[old]
-        patch = DensePatch(frame_id, points[new], view.rgb[sure][new], kept.confidence[sure][new])
+        patch = DensePatch(frame_id, points[new], view.rgb[sure][new], view.confidence[sure][new])
         if len(patch.xyz):
             self._cloud.add(patch, *landmark_depths(world, keyframe))
 
     def _seen_from(self, keyframe: Keyframe, found: DepthMap, world: WorldMap) -> OtherDepth | None:
         """Another keyframe's depth as ``consistency`` takes it; None where it is not of the same part."""
-        T_world_other, kept = world.pose_of_frame(found.frame_id), self._kept.get(found.frame_id)
-        if T_world_other is None or kept is None or world.submap_of.get(found.frame_id) != keyframe.submap:
+        T_world_other, view = world.pose_of_frame(found.frame_id), self._kept.get(found.frame_id)
+        if T_world_other is None or view is None or world.submap_of.get(found.frame_id) != keyframe.submap:
             return None
         T_other_ref = invert_transform(T_world_other) @ keyframe.T_world_cam
-        return OtherDepth(found.inverse_depth, found.step, kept.view.K, T_other_ref)
+        return OtherDepth(found.inverse_depth, found.step, view.K, T_other_ref)
 
 
 def _keyframe(world: WorldMap, frame_id: int) -> Keyframe | None:
     return next((k for k in reversed(world.keyframes) if k.frame_id == frame_id), None)
-
-
-def _light(view: View) -> View:
-    """Return a view as it travels to the runner: without colours, which only points need."""
-    return replace(view, rgb=view.rgb[:0])

@@ -85,7 +85,9 @@ def estimate_depth(problem: DepthProblem) -> DepthMap:
     """
     reference = problem.reference
     inverse_depths = np.linspace(1.0 / problem.farthest, 1.0 / problem.nearest, _num_depths(problem))
-    smoothed = aggregate(match_cost(reference, problem.groups, inverse_depths), reference.grey)
+    smoothed = aggregate(
+        match_cost(reference, problem.groups, inverse_depths), reference.grey.astype(np.float32)
+    )
     best = smoothed.argmin(axis=-1)
     step = float(inverse_depths[1] - inverse_depths[0])
     steps = _refined(smoothed, best)

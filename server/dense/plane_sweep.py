@@ -80,7 +80,7 @@ class _Reference:
 
     def __init__(self, view: View) -> None:
         self._grey = _centred(view)
-        self._window = WINDOW_OF_NOISY if np.median(view.sigma) > _NOISY_LEVELS else WINDOW
+        self._window = WINDOW_OF_NOISY if view.noise > _NOISY_LEVELS else WINDOW
         self._mean = self._box(self._grey)
         variance = np.maximum(self._box(self._grey * self._grey) - self._mean * self._mean, 0.0)
         self._per_sd = 1.0 / np.sqrt(variance + _FAINT_LEVELS**2)

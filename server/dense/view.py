@@ -1,6 +1,7 @@
 """An image as dense depth is sought in it: small, grey, and with the noise its confidence stands for."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -27,22 +28,28 @@ class View:
 
     Attributes:
         frame_id: Of the keyframe.
-        grey: ``(H, W)`` float32 grey levels.
-        sigma: ``(H, W)`` float32, standard deviation of its error in grey levels.
-        rgb: ``(H, W, 3)`` uint8.
+        grey: ``(H, W)`` uint8.
+        noise: Median standard deviation of its pixels' errors, grey levels.
         K: ``(3, 3)`` pixels of the small image.
+        rgb: ``(H, W, 3)`` uint8.
+        confidence: ``(H, W)`` float32 in [0, 1].
     """
 
     frame_id: int
-    grey: NDArray[np.float32]
-    sigma: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
+    grey: NDArray[np.uint8]
+    noise: float
     K: Array
+    rgb: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
 
     @property
     def shape_hw(self) -> tuple[int, int]:
         """Height and width."""
         return self.grey.shape[0], self.grey.shape[1]
+
+    def to_compare(self) -> "View":
+        """Return what depth is estimated from: without colours and confidence, which only points need."""
+        return replace(self, rgb=self.rgb[:0], confidence=self.confidence[:0])
 
 
 def view_of(
@@ -65,11 +72,11 @@ def view_of(
     share = min(1.0, float(np.sqrt(max_pixels / (height * width))))
     size_wh = (max(1, round(width * share)), max(1, round(height * share)))
     rgb = np.asarray(cv2.resize(image, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
-    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    sigma = np.full(grey.shape, CLEAN_SIGMA, np.float32)
+    grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+    small, noise = np.ones(grey.shape, np.float32), CLEAN_SIGMA
     if confidence is not None:
         small = np.asarray(cv2.resize(confidence, size_wh, interpolation=cv2.INTER_AREA), np.float32)
-        sigma = np.hypot(sigma, error_sd(small)).astype(np.float32)
+        noise = float(np.hypot(noise, error_sd(float(np.median(small)))))
     x_share, y_share = size_wh[0] / width, size_wh[1] / height
     K = np.array(
         [
@@ -78,10 +85,10 @@ def view_of(
             [0.0, 0.0, 1.0],
         ]
     )
-    return View(frame_id, grey, sigma, rgb, K)
+    return View(frame_id, grey, noise, K, rgb, small)
 
 
-def error_sd(confidence: NDArray[np.float32]) -> NDArray[np.float32]:
+def error_sd(confidence: float) -> float:
     """Standard deviation of a pixel's error in grey levels that a confidence stands for."""
-    doubt = 1.0 - np.clip(confidence, _LEAST_CONFIDENCE, 1.0)
-    return np.asarray(_SD_PER_MEAN * _GREY_LEVELS_PER_ATANH * np.arctanh(doubt), np.float32)
+    doubt = 1.0 - min(max(confidence, _LEAST_CONFIDENCE), 1.0)
+    return _SD_PER_MEAN * _GREY_LEVELS_PER_ATANH * math.atanh(doubt)

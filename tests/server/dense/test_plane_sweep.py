@@ -28,7 +28,7 @@ def test_the_true_depth_costs_least(pair) -> None:
 
 def test_other_brightness_and_contrast_make_no_difference(pair) -> None:
     view = pair.views[1]
-    neighbour = Neighbour(replace(view, grey=0.5 * view.grey + 70), pair.T(1, 0))
+    neighbour = Neighbour(replace(view, grey=(0.5 * view.grey + 70).astype(np.uint8)), pair.T(1, 0))
     inner = match_cost(pair.views[0], [[neighbour]], INVERSE_DEPTHS)[(slice(None), *MIDDLE)]
     assert (inner.argmin(axis=0) == 2).mean() > 0.95
 
@@ -63,7 +63,7 @@ def test_what_is_hidden_on_one_side_is_matched_on_the_other(stand, wall, plate) 
 
 def test_images_known_to_be_noisy_are_matched_in_larger_windows(stand, wall) -> None:
     row = stand([wall], (0.0, 0.3), noise_sd=40.0)
-    doubted = replace(row.views[0], sigma=np.full_like(row.views[0].sigma, 40.0))
+    doubted = replace(row.views[0], noise=40.0)
     right = [
         (
             match_cost(view, [[row.neighbour(1, 0)]], INVERSE_DEPTHS)[(slice(None), *MIDDLE)].argmin(0) == 2

@@ -36,18 +36,24 @@ def test_a_small_image_stays_as_it_is() -> None:
 
 def test_noise_is_that_of_the_error_which_the_confidence_stands_for() -> None:
     error = 0.05
-    confidence = np.full((48, 64), 1 - np.tanh(30 * error), np.float32)
-    assert error_sd(confidence) == pytest.approx(np.sqrt(np.pi / 2) * error * 255, rel=1e-3)
-    assert error_sd(np.ones((2, 2), np.float32)) == pytest.approx(0.0)
-    assert np.isfinite(error_sd(np.zeros((2, 2), np.float32))).all()
+    assert error_sd(1.0 - float(np.tanh(30 * error))) == pytest.approx(
+        np.sqrt(np.pi / 2) * error * 255, rel=1e-3
+    )
+    assert error_sd(1.0) == pytest.approx(0.0)
+    assert np.isfinite(error_sd(0.0))
 
 
-def test_noise_is_never_less_than_that_of_a_clean_image() -> None:
+def test_noise_is_that_of_most_pixels_and_never_less_than_that_of_a_clean_image() -> None:
     camera = Intrinsics(fx=50, fy=50, cx=31.5, cy=23.5, width=64, height=48)
     image = np.zeros((48, 64, 3), np.uint8)
-    assert (view_of(0, image, None, camera).sigma == CLEAN_SIGMA).all()
-    half = np.ones((48, 64), np.float32)
-    half[:, 32:] = 0.2
-    sigma = view_of(0, image, half, camera).sigma
-    assert sigma[:, :32] == pytest.approx(CLEAN_SIGMA)
-    assert (sigma[:, 32:] > CLEAN_SIGMA + 2).all()
+    clean = view_of(0, image, None, camera)
+    assert clean.noise == CLEAN_SIGMA
+    assert (clean.confidence == 1.0).all()
+    few, most = np.ones((48, 64), np.float32), np.ones((48, 64), np.float32)
+    few[:, 48:] = 0.2
+    most[:, 16:] = 0.2
+    assert view_of(0, image, few, camera).noise == pytest.approx(CLEAN_SIGMA)
+    view = view_of(0, image, most, camera)
+    assert view.noise > CLEAN_SIGMA + 2
+    assert view.confidence.tolist() == most.tolist()
+    assert view.to_compare().confidence.size == view.to_compare().rgb.size == 0
