@@ -36,7 +36,7 @@ from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_streams import RecordedStream, choose_stream
 from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Arrival, Outcome, Session
-from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.settings import DenseCloud, ServerSettings, ViewSettings
 from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.choice import check_viewer, open_viewer
 
@@ -77,9 +77,12 @@ class ReplaySettings:
     save_images: Literal["none", "keyframes", "all"] = field(
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
-    dense_cloud: bool = field(
-        default=True,
-        metadata={"help": "estimate the depth of keyframes too, for dense.ply and a cloud in the viewer"},
+    dense_cloud: DenseCloud = field(
+        default="auto",
+        metadata={
+            "help": "depth of keyframes, for dense.ply and the viewer: live, at the end of the stream, auto "
+            "(live on four cores or more) or none"
+        },
     )
     reference: Path | None = field(
         default=None,
@@ -214,9 +217,12 @@ def _replayed(
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
         with contextlib.suppress(OSError):  # said at the end
             session.write_results(settings.out)  # who stops the replay may not wait for the adjustment
-        update, patches = session.conclude()
+        update = session.conclude()
         if viewer is not None:
-            viewer.submit(None, update, patches)
+            viewer.submit(None, update)
+        for patches in session.complete_cloud():
+            if viewer is not None:
+                viewer.submit(None, None, patches)
         try:
             whole = settings.start_s == 0.0 and settings.end_s is None and not stop.is_set()
             return session.write_outputs(settings.out, drops, complete=whole)

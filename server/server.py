@@ -241,9 +241,7 @@ class Server:
         return ""
 
     def _whole_map(self, session: Session | None) -> bytes | None:
-        if session is None:
-            return None
-        return pack(map_message(session.identity.agent_epoch, session.whole_map()))
+        return pack(map_message(session.identity.agent_epoch, session.whole_map())) if session else None
 
     def _tell_not_written(self, folder: Path | None, err: Exception) -> str:
         """Report outputs that the stream goes on without."""
@@ -402,10 +400,11 @@ class Server:
     def _conclude(self, session: Session, *, hurry: bool = False) -> None:
         """Adjust the whole map of a stream that has ended, and tell who follows it."""
         self._save(session)  # the adjustment takes seconds, and the server may be stopped or killed meanwhile
-        update, patches = session.conclude(hurry=hurry)
-        if update is not None:
+        if (update := session.conclude()) is not None:
             self._outbox.put_map(session.identity.agent_epoch, update)
-        self._views.submit(None, update, patches)
+            self._views.submit(None, update)
+        for patches in session.complete_cloud(hurry=hurry):
+            self._views.submit(None, None, patches)
 
     def _drops(self) -> dict[str, int]:
         """Drops since the present stream began."""

@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
 from dataclasses import dataclass, replace
@@ -61,6 +61,8 @@ Array = NDArray[np.float64]
 
 #: What is written at the end of a run, and when it is asked for.
 _RESULTS = (TRAJECTORY_NAME, MAP_NAME, DENSE_NAME, RECONSTRUCTION_NAME, SETTINGS_NAME, SUMMARY_NAME)
+#: Keyframes whose depth takes so long that it is said what is going on.
+_MANY_WAITING = 10
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
 
@@ -130,7 +132,7 @@ class Session:
         self._reference = reference
         bundle = bundle if bundle is not None else new_bundle(settings)
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
-        self._dense = _new_dense(settings, identity, on_give_up) if settings.dense_cloud else None
+        self._dense = _new_dense(settings, identity, on_give_up) if settings.dense_cloud != "none" else None
         self._t_source_ns: dict[int, int] = {}
         self._numbers: dict[int, int | None] = {}
         self._num_frames = identity.num_frames
@@ -346,15 +348,8 @@ class Session:
         if self._dense is not None:
             self._dense.reset()
 
-    def conclude(self, *, hurry: bool = False) -> tuple[MapUpdate | None, tuple[DensePatch, ...]]:
-        """Adjust the whole map, as the settings want it, and complete the dense cloud: the stream has ended.
-
-        Args:
-            hurry: Another stream waits: the cloud is left as it is.
-
-        Returns:
-            What that changed in the map and in the cloud.
-        """
+    def conclude(self) -> MapUpdate | None:
+        """Adjust the whole map, as the settings want it, now that the stream has ended; what that changed."""
         since = time.monotonic()
         try:
             num_adjusted = self._reconstruction.conclude()
@@ -362,12 +357,20 @@ class Session:
         except Exception:
             logger.exception("the map could not be adjusted as a whole and stays as it was")
         update = self._reconstruction.take_map_update()
-        if self._dense is None:
-            return update, ()
-        if update is not None:
+        if self._dense is not None and update is not None:
             self._dense.follow(self._reconstruction.world, update.keyframe_ids.tolist())
-        self._dense.finish(self._reconstruction.world, hurry=hurry)
-        return update, self._dense.take_changes()
+        return update
+
+    def complete_cloud(self, *, hurry: bool = False) -> Iterator[tuple[DensePatch, ...]]:
+        """Estimate the depth that is still missing, after ``conclude``, and yield what is new in the cloud.
+
+        Args:
+            hurry: Another stream waits: what is missing is left out.
+        """
+        if self._dense is not None:
+            if not hurry and self._dense.num_waiting > _MANY_WAITING:
+                logger.info("the depth of %d keyframes is estimated now", self._dense.num_waiting)
+            yield from self._dense.finish(self._reconstruction.world, hurry=hurry)
 
     def write_outputs(
         self, folder: Path | None, drops: Mapping[str, int], *, complete: bool
@@ -491,4 +494,4 @@ def _new_dense(
     """Return what makes the dense cloud of a stream; a replay leaves out nothing."""
     lossless = settings.mode == "replay"
     runner = ProcessDepth(lossless=lossless, on_give_up=on_give_up)
-    return DenseBuilder(identity.camera, runner, lossless=lossless)
+    return DenseBuilder(identity.camera, runner, lossless=lossless, at_end=settings.dense_at_end)

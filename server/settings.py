@@ -7,13 +7,18 @@ from typing import Literal
 
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import Modulation
-from semcast.common.cores import check_threads
+from semcast.common.cores import check_threads, usable_cores
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import HubSettings
 from semcast.server.mapping.settings import ReconstructionSettings
 
 #: Sizes the viewer understands.
 _MEMORY = re.compile(r"\d+(\.\d+)? ?(B|[kMGT]B|[KMGT]iB)|(100|\d{1,2}(\.\d+)?)%")
+
+#: When the depth of keyframes is estimated.
+DenseCloud = Literal["auto", "live", "end", "none"]
+#: With fewer cores the estimation of depth would keep frames waiting.
+_CORES_FOR_LIVE_DEPTH = 4
 
 View = Literal["auto", "native", "web", "file", "none"]
 
@@ -101,7 +106,8 @@ class ServerSettings:
         resume: Go on with the map in ``out`` when it belongs to the same stream.
         record: Recording to write of everything that is sent, or None.
         save_images: Which decoded images to keep in ``out``, for exports.
-        dense_cloud: Estimate the depth of keyframes too, in the time that tracking and mapping leave.
+        dense_cloud: Whether and when the depth of keyframes is estimated too: ``live`` in the time that
+            tracking and mapping leave, at the ``end`` of the stream, ``auto``: live on four cores or more.
         keep_running: Go on after the source's last frame and wait for the next agent.
         idle_timeout_s: End when nothing arrives for so long after the first frame.
         duration_s: End after so long.
@@ -150,9 +156,12 @@ class ServerSettings:
     save_images: Literal["none", "keyframes", "all"] = field(
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
-    dense_cloud: bool = field(
-        default=True,
-        metadata={"help": "estimate the depth of keyframes too, for dense.ply and a cloud in the viewer"},
+    dense_cloud: DenseCloud = field(
+        default="auto",
+        metadata={
+            "help": "depth of keyframes, for dense.ply and the viewer: live, at the end of the stream, auto "
+            "(live on four cores or more) or none"
+        },
     )
     keep_running: bool = field(
         default=False, metadata={"help": "wait for the next agent after the source's last frame"}
@@ -165,6 +174,12 @@ class ServerSettings:
         default=ReconstructionSettings(), metadata={"help": "tracking and mapping"}
     )
     view: ViewSettings = field(default=ViewSettings(), metadata={"help": "viewer"})
+
+    @property
+    def dense_at_end(self) -> bool:
+        """Whether depth waits for the end of the stream; a replay has nothing to show before."""
+        too_few = self.mode == "replay" or usable_cores() < _CORES_FOR_LIVE_DEPTH
+        return self.dense_cloud == "end" or (self.dense_cloud == "auto" and too_few)
 
     def __post_init__(self) -> None:
         """Check ranges.

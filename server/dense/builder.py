@@ -1,6 +1,6 @@
 """Follows the map: chooses whose depth is estimated from which neighbours, and what of it becomes points."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 #: Keyframes whose images are kept, and those of them whose depth is.
 _NUM_VIEWS, _NUM_MAPS = 12, 6
+#: The same where depth is estimated at the end: half a megabyte each. Beyond it every second one goes.
+_NUM_STORED = 240
 #: Neighbours on either side, each so much further away than the one before, in shares of the median depth.
 _NUM_NEIGHBOURS = 2
 _BASELINE = 0.04
@@ -63,12 +65,16 @@ class DenseBuilder:
         runner: Estimates depth; closed with the builder.
         lossless: Every keyframe gets its depth, if need be by waiting for it; otherwise those do for which
             there is time.
+        at_end: Depth is not estimated before the stream has ended.
     """
 
-    def __init__(self, camera: Intrinsics, runner: DepthRunner, *, lossless: bool = False) -> None:
+    def __init__(
+        self, camera: Intrinsics, runner: DepthRunner, *, lossless: bool = False, at_end: bool = False
+    ) -> None:
         self._camera = camera
         self._runner = runner
         self._lossless = lossless
+        self._at_end = at_end
         self.reset()
 
     def reset(self) -> None:
@@ -96,7 +102,11 @@ class DenseBuilder:
         """
         self._kept[frame_id] = view_of(frame_id, image, confidence, self._camera)
         self._waiting.append(frame_id)
-        for old in sorted(self._kept)[:-_NUM_VIEWS]:
+        by_age = sorted(self._kept)
+        gone = by_age[:-_NUM_VIEWS]
+        if self._at_end:
+            gone = by_age[1:-1:2] if len(by_age) > _NUM_STORED else []
+        for old in gone:
             del self._kept[old]
         self._waiting = [k for k in self._waiting if k in self._kept]
 
@@ -106,15 +116,16 @@ class DenseBuilder:
         Args:
             world: The map as it is.
         """
-        self._take(world, wait=self._lossless)
-        self._begin(world, is_last=False)
+        if not self._at_end:
+            self._take(world, wait=self._lossless)
+            self._begin(world, is_last=False)
 
     def follow(self, world: WorldMap, frame_ids: Sequence[int]) -> None:
         """Note keyframes that the map has moved."""
         self._cloud.follow(world, frame_ids)
 
-    def finish(self, world: WorldMap, *, hurry: bool = False) -> None:
-        """Make points of what is there, for the stream has ended.
+    def finish(self, world: WorldMap, *, hurry: bool = False) -> Iterator[tuple[DensePatch, ...]]:
+        """Make points of what is there, for the stream has ended, and yield them as they come.
 
         Args:
             world: The map as it is.
@@ -125,8 +136,15 @@ class DenseBuilder:
             self._begin(world, is_last=True)
             if not self._runner.busy:
                 break
+            yield self.take_changes()
         while self._unconfirmed:
             self._confirm(self._unconfirmed.pop(0), world)
+        yield self.take_changes()
+
+    @property
+    def num_waiting(self) -> int:
+        """Keyframes whose depth may still be estimated."""
+        return len(self._waiting)
 
     def take_changes(self) -> tuple[DensePatch, ...]:
         """Return patches that were added or changed since this was last called."""

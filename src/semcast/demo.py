@@ -34,7 +34,7 @@ from semcast.real_time import plan_for
 from semcast.role import Role
 from semcast.server.former_run import check_not_foreign, discard, output_folder
 from semcast.server.mapping.settings import ReconstructionSettings
-from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.settings import DenseCloud, ServerSettings, ViewSettings
 from semcast.server.view.choice import check_viewer
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
@@ -97,9 +97,12 @@ class DemoSettings:
     save_images: Literal["none", "keyframes", "all"] = field(
         default="keyframes", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
-    dense_cloud: bool = field(
-        default=True,
-        metadata={"help": "estimate the depth of keyframes too, for dense.ply and a cloud in the viewer"},
+    dense_cloud: DenseCloud = field(
+        default="auto",
+        metadata={
+            "help": "depth of keyframes, for dense.ply and the viewer: live, at the end of the stream, auto "
+            "(live on four cores or more) or none"
+        },
     )
     record: Path | None = field(
         default=None, metadata={"help": "also keep everything that is sent in this recording (MCAP)"}
@@ -173,7 +176,7 @@ def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict
     server += ["--viewer-port", str(settings.viewer_port), "--web-port", str(settings.web_port)]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
     server += ["--save-images", settings.save_images]
-    server += [] if settings.dense_cloud else ["--no-dense-cloud"]
+    server += ["--dense-cloud", settings.dense_cloud]
     if settings.record is not None:
         server += ["--record", str(settings.record)]
     channel = [*_PROGRAM, "channel", "--agent-id", AGENT_ID, "--connect", endpoint]

@@ -147,3 +147,18 @@ def test_a_viewer_that_would_refuse_its_memory_is_not_begun(limit):
 def test_a_limit_that_is_no_number_is_refused(name):
     with pytest.raises(ValueError, match=f"{name} must be positive, got nan"):
         ServerSettings(**{name: float("nan")})
+
+
+@pytest.mark.parametrize(
+    ("when", "mode", "cores", "at_end"),
+    [
+        ("auto", "live", 2, True),
+        ("auto", "live", 4, False),
+        ("auto", "replay", 16, True),
+        ("live", "live", 2, False),
+        ("end", "live", 16, True),
+    ],
+)
+def test_depth_is_estimated_live_where_there_are_cores_for_it(monkeypatch, when, mode, cores, at_end):
+    monkeypatch.setattr("semcast.server.settings.usable_cores", lambda: cores)
+    assert ServerSettings(dense_cloud=when, mode=mode).dense_at_end == at_end

@@ -66,13 +66,18 @@ def add_keyframe(world, builder, k, *, x_m=None, turn_deg=0.0, submap=0, num_lan
     builder.add_keyframe(k, image, np.full((60, 80), 0.25, np.float32))
 
 
-def run(num=8, runner=None, lossless=True, **how):
+def run(num=8, runner=None, lossless=True, at_end=False, **how):
     runner = Wall() if runner is None else runner
-    world, builder = WorldMap(), DenseBuilder(CAMERA, runner, lossless=lossless)
+    world, builder = WorldMap(), DenseBuilder(CAMERA, runner, lossless=lossless, at_end=at_end)
     for k in range(num):
         add_keyframe(world, builder, k, **how)
         builder.advance(world)
     return world, builder, runner
+
+
+def finish(builder, world, **how):
+    """What the end of a stream adds."""
+    return [patch for patches in builder.finish(world, **how) for patch in patches]
 
 
 def neighbours(problem):
@@ -88,7 +93,7 @@ def test_every_keyframe_gets_its_depth_from_both_sides():
         [[1, 0], [3, 4]],
         [[2, 1], [4, 5]],
     ]
-    builder.finish(world)
+    finish(builder, world)
     assert runner.asked_ids == [0, 1, 2, 3, 4, 5]
     assert neighbours(runner.asked[-1]) == [[4, 3]]
 
@@ -118,20 +123,20 @@ def test_views_turned_far_away_and_of_other_parts_are_no_neighbours():
     builder = DenseBuilder(CAMERA, runner, lossless=True)
     for k, (turn_deg, submap) in enumerate(((0.0, 0), (60.0, 0), (0.0, 1), (0.0, 1), (0.0, 1))):
         add_keyframe(world, builder, k, turn_deg=turn_deg, submap=submap)
-    builder.finish(world)
+    finish(builder, world)
     assert runner.asked_ids == [2, 3, 4], "the first two see nothing that another one sees"
     assert all(k > 1 for p in runner.asked for group in neighbours(p) for k in group)
 
 
 def test_keyframes_with_too_few_landmarks_are_left_out():
     world, builder, runner = run(5, num_landmarks=5)
-    builder.finish(world)
+    finish(builder, world)
     assert runner.asked == []
 
 
 def test_the_cloud_is_the_wall_and_each_part_of_it_once():
     world, builder, _ = run(8)
-    builder.finish(world)
+    finish(builder, world)
     points = builder.points(world)
     np.testing.assert_allclose(points.xyz[:, 2], WALL, rtol=1e-5)
     width_m = 80 / 60 * WALL + 7 * STEP_M - 2 * STEP_M  # what only the first or the last one sees is not sure
@@ -145,8 +150,7 @@ def test_the_cloud_is_the_wall_and_each_part_of_it_once():
 
 def test_depth_that_nobody_confirms_makes_no_points():
     world, builder, _ = run(8, Wall(lambda frame_id: WALL if frame_id != 3 else 0.5 * WALL))
-    builder.finish(world)
-    assert {p.frame_id for p in builder.take_changes()}.isdisjoint({3})
+    assert {p.frame_id for p in finish(builder, world)}.isdisjoint({3})
     np.testing.assert_allclose(builder.points(world).xyz[:, 2], WALL, rtol=1e-5)
 
 
@@ -158,11 +162,30 @@ def test_a_live_cloud_waits_for_nobody_and_leaves_out_what_is_too_much():
     runner.slow = False
     builder.advance(world)
     assert runner.asked_ids == [0, 5], "of those that wait the newest two stay"
-    builder.finish(world, hurry=True)
+    assert {p.frame_id for p in finish(builder, world, hurry=True)} <= {0, 5}
     assert runner.asked_ids == [0, 5], "another stream waits"
-    assert {p.frame_id for p in builder.take_changes()} <= {0, 5}
-    builder.finish(world)
+    finish(builder, world)
     assert runner.asked_ids == [0, 5, 6, 7, 8]
+
+
+def test_a_cloud_at_the_end_waits_for_it_and_is_the_same():
+    world, builder, runner = run(8)
+    finish(builder, world)
+    late = Wall()
+    late_world, late_builder, _ = run(8, late, at_end=True)
+    assert late.asked == []
+    assert late_builder.num_waiting == 8
+    assert {p.frame_id for p in finish(late_builder, late_world)} <= set(range(8))
+    assert late.asked_ids == runner.asked_ids
+    assert late_builder.points(late_world).xyz.tolist() == builder.points(world).xyz.tolist()
+
+
+def test_images_for_the_end_are_bounded_and_spread_over_the_stream(monkeypatch):
+    monkeypatch.setattr("semcast.server.dense.builder._NUM_STORED", 10)
+    world, builder, runner = run(40, at_end=True)
+    finish(builder, world)
+    assert 5 <= len(runner.asked) <= 10
+    assert np.ptp(runner.asked_ids) > 30
 
 
 def test_a_keyframe_that_lost_its_pose_is_left_out():
@@ -171,7 +194,7 @@ def test_a_keyframe_that_lost_its_pose_is_left_out():
     for k in range(6):
         add_keyframe(world, builder, k)
     world.forget_frames([2])
-    builder.finish(world)
+    finish(builder, world)
     assert 2 not in runner.asked_ids
     assert all(2 not in group for p in runner.asked for group in neighbours(p))
 
@@ -181,7 +204,7 @@ def test_a_new_map_has_a_new_cloud():
     builder.reset()
     assert len(builder) == 0
     assert not runner.busy
-    builder.finish(world)
+    finish(builder, world)
     assert runner.asked_ids == [0, 1, 2, 3]
     builder.close()
     assert runner.closed
