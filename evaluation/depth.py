@@ -245,7 +245,7 @@ class _Reference:
     def __init__(self, scene: _Scene, views: Mapping[int, View], clean: Mapping[int, DepthImage]) -> None:
         self._metres = scene.metres
         self._clean = clean
-        self._limits = {k: (1 / f.farthest, 1 / f.nearest) for k, f in scene.keyframes.items()}
+        self._limits = {k: (1 / f.sought.farthest, 1 / f.sought.nearest) for k, f in scene.keyframes.items()}
         self.is_exact = scene.truth is not None
         if scene.truth is not None:
             self._depth = {k: _at_centres(scene.truth[k], views[k].shape_hw) for k in views}

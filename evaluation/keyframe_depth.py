@@ -13,7 +13,13 @@ from semcast.evaluation.pipeline import LinkedFrame
 from semcast.evaluation.reconstruct import as_received
 from semcast.server.dense.consistency import OtherDepth, num_agreeing
 from semcast.server.dense.depth_map import DepthImage, DepthMap, DepthProblem, estimate_depth
-from semcast.server.dense.plane_sweep import Neighbour
+from semcast.server.dense.neighbours import (
+    NUM_CONFIRMING,
+    DepthRange,
+    choose_neighbours,
+    depth_range,
+    num_to_confirm,
+)
 from semcast.server.dense.view import View
 from semcast.server.export.parts import frame_parts
 from semcast.server.mapping.bundle import InlineBundle
@@ -22,17 +28,6 @@ from semcast.server.mapping.settings import ReconstructionSettings
 
 Array = NDArray[np.float64]
 
-#: Neighbours on either side, each so much further away than the one before, in shares of the median depth.
-_NUM_NEIGHBOURS = 2
-_BASELINE = 0.04
-#: Depth is sought between these percentiles of a keyframe's landmarks, and somewhat beyond.
-_NEAR, _FAR = (2.0, 1.0 / 1.3), (98.0, 1.5)
-#: Keyframes with fewer landmarks tell no range of depths.
-_MIN_LANDMARKS = 10
-#: Depths of so many keyframes on either side confirm one, and so many of them have to.
-_NUM_CONFIRMING = 2
-_WANTED = 2
-
 
 @dataclass(frozen=True)
 class DepthKeyframe:
@@ -40,19 +35,15 @@ class DepthKeyframe:
 
     Attributes:
         T_world_cam: ``(4, 4)`` pose.
-        nearest: Least depth that is tried, units of the poses.
-        median: Of its landmarks.
-        farthest: Greatest depth that is tried.
+        sought: Depths, units of the poses.
     """
 
     T_world_cam: Array
-    nearest: float
-    median: float
-    farthest: float
+    sought: DepthRange
 
     def with_poses_of(self, T_world_cam: Array, scale: float) -> "DepthKeyframe":
         """Return it at another pose, in whose units one of its own is ``scale``."""
-        return DepthKeyframe(T_world_cam, scale * self.nearest, scale * self.median, scale * self.farthest)
+        return DepthKeyframe(T_world_cam, DepthRange(*(scale * depth for depth in self.sought)))
 
 
 def reconstructed(
@@ -88,10 +79,9 @@ def reconstructed(
         points = np.array([place[i] for i in seen_ids[seen_by == k].tolist() if i in place]).reshape(-1, 3)
         T_cam_world = invert_transform(poses[k])
         depth = points @ T_cam_world[2, :3] + T_cam_world[2, 3]
-        depth = depth[depth > 0.0]
-        if len(depth) >= _MIN_LANDMARKS:
-            near, far = (float(np.percentile(depth, share)) * factor for share, factor in (_NEAR, _FAR))
-            keyframes[k] = DepthKeyframe(poses[k], near, float(np.median(depth)), far)
+        sought = depth_range(depth[depth > 0.0])
+        if sought is not None:
+            keyframes[k] = DepthKeyframe(poses[k], sought)
     return poses, keyframes
 
 
@@ -117,20 +107,13 @@ def _problem(
     k: int, keyframes: Mapping[int, DepthKeyframe], views: Mapping[int, View]
 ) -> DepthProblem | None:
     sides = (sorted((j for j in views if j < k), reverse=True), sorted(j for j in views if j > k))
-    groups = []
-    for side in sides:
-        group: list[Neighbour] = []
-        for j in side:
-            T_nbr_ref = invert_transform(keyframes[j].T_world_cam) @ keyframes[k].T_world_cam
-            least = _BASELINE * keyframes[k].median * (len(group) + 1)
-            if np.linalg.norm(T_nbr_ref[:3, 3]) >= least:
-                group.append(Neighbour(views[j], T_nbr_ref))
-            if len(group) == _NUM_NEIGHBOURS:
-                break
-        groups.append(group)
+    of, sought = keyframes[k].T_world_cam, keyframes[k].sought
+    groups = [
+        choose_neighbours(of, sought.median, ((views[j], keyframes[j].T_world_cam) for j in side))
+        for side in sides
+    ]
     if not any(groups):
         return None
-    sought = keyframes[k]
     return DepthProblem(views[k], [group for group in groups if group], sought.nearest, sought.farthest)
 
 
@@ -149,8 +132,9 @@ def _confirmed(
             views[j].K,
             invert_transform(keyframes[j].T_world_cam) @ keyframes[k].T_world_cam,
         )
-        for j in order[max(0, place - _NUM_CONFIRMING) : place + _NUM_CONFIRMING + 1]
+        for j in order[max(0, place - NUM_CONFIRMING) : place + NUM_CONFIRMING + 1]
         if j != k
     ]
-    sure = num_agreeing(found.inverse_depth, found.step, views[k].K, others) >= _WANTED
+    agreeing = num_agreeing(found.inverse_depth, found.step, views[k].K, others)
+    sure = agreeing >= num_to_confirm(len(others))
     return np.where(sure, found.inverse_depth, np.float32(np.nan))

@@ -8,10 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform, rotation_angle_deg
+from semcast.common.geometry import invert_transform
 from semcast.server.dense.cloud import CloudPoints, DenseCloud, DensePatch, landmark_depths
 from semcast.server.dense.consistency import OtherDepth, agrees, back_project, num_agreeing
 from semcast.server.dense.depth_map import DepthMap, DepthProblem
+from semcast.server.dense.neighbours import (
+    NUM_CONFIRMING,
+    NUM_NEIGHBOURS,
+    choose_neighbours,
+    depth_range,
+    num_to_confirm,
+)
 from semcast.server.dense.plane_sweep import Neighbour
 from semcast.server.dense.view import View, view_of
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -22,20 +29,10 @@ Array = NDArray[np.float64]
 _NUM_VIEWS, _NUM_MAPS = 12, 6
 #: The same where depth is estimated at the end: half a megabyte each. Beyond it every second one goes.
 _NUM_STORED = 240
-#: Neighbours on either side, each so much further away than the one before, in shares of the median depth.
-_NUM_NEIGHBOURS = 2
-_BASELINE = 0.04
-#: Neighbours whose view is turned by more see too little of the same, and that too differently.
-_MAX_TURN_DEG = 40.0
 #: After so many later keyframes those that are there have to do.
 _MAX_LATER = 4
 #: Keyframes that may wait where there is no time for all.
 _MAX_WAITING = 2
-#: A keyframe's depth is sought between these percentiles of its landmarks', and somewhat beyond.
-_NEAR, _FAR = (2.0, 1.0 / 1.3), (98.0, 1.5)
-_MIN_LANDMARKS = 10
-#: Depth of so many keyframes on either side confirms one, two of them where there are three.
-_NUM_CONFIRMING = 2
 #: Keyframes before, whose points are not added once more.
 _NUM_COVERING = 4
 
@@ -192,15 +189,15 @@ class DenseBuilder:
         keyframe = _keyframe(world, frame_id)
         if len(later) >= _MAX_LATER or keyframe is None:
             return True
-        return len(self._neighbours(keyframe, sorted(later), world)) >= _NUM_NEIGHBOURS
+        return len(self._neighbours(keyframe, sorted(later), world)) >= NUM_NEIGHBOURS
 
     def _problem(self, frame_id: int, world: WorldMap) -> DepthProblem | None:
         """What is asked about a keyframe; None where there is too little to tell its depth from."""
         keyframe = _keyframe(world, frame_id)
         if keyframe is None or world.pose_of_frame(frame_id) is None:
             return None
-        _, depth = landmark_depths(world, keyframe)
-        if len(depth) < _MIN_LANDMARKS:
+        sought = depth_range(landmark_depths(world, keyframe)[1])
+        if sought is None:
             return None
         before = sorted((k for k in self._kept if k < frame_id), reverse=True)
         after = sorted(k for k in self._kept if k > frame_id)
@@ -208,30 +205,21 @@ class DenseBuilder:
         groups = [group for group in groups if group]
         if not groups:
             return None
-        near, far = (float(np.percentile(depth, share)) * factor for share, factor in (_NEAR, _FAR))
-        return DepthProblem(self._kept[frame_id].to_compare(), groups, near, far)
+        reference = self._kept[frame_id].to_compare()
+        return DepthProblem(reference, groups, sought.nearest, sought.farthest)
 
     def _neighbours(self, keyframe: Keyframe, side: Sequence[int], world: WorldMap) -> list[Neighbour]:
-        """Choose views on one side of a keyframe, from the nearest in time on."""
-        _, depth = landmark_depths(world, keyframe)
-        if len(depth) == 0:
+        """Choose views of a keyframe's part on one side of it, from the nearest in time on."""
+        sought = depth_range(landmark_depths(world, keyframe)[1])
+        if sought is None:
             return []
-        median = float(np.median(depth))
-        found: list[Neighbour] = []
-        for frame_id in side:
-            T_world_nbr = world.pose_of_frame(frame_id)
-            if T_world_nbr is None or world.submap_of.get(frame_id) != keyframe.submap:
-                continue
-            T_nbr_ref = invert_transform(T_world_nbr) @ keyframe.T_world_cam
-            baseline = float(np.linalg.norm(T_nbr_ref[:3, 3]))
-            if baseline < _BASELINE * median * (len(found) + 1):
-                continue
-            if rotation_angle_deg(T_nbr_ref[:3, :3]) > _MAX_TURN_DEG:
-                break
-            found.append(Neighbour(self._kept[frame_id].to_compare(), T_nbr_ref))
-            if len(found) == _NUM_NEIGHBOURS:
-                break
-        return found
+        posed = (
+            (self._kept[k].to_compare(), T_world_nbr)
+            for k in side
+            if world.submap_of.get(k) == keyframe.submap
+            and (T_world_nbr := world.pose_of_frame(k)) is not None
+        )
+        return choose_neighbours(keyframe.T_world_cam, sought.median, posed)
 
     def _confirm(self, frame_id: int, world: WorldMap) -> None:
         """Make points of what other keyframes see too, and those before have not added yet."""
@@ -239,15 +227,15 @@ class DenseBuilder:
         if keyframe is None or view is None or world.pose_of_frame(frame_id) is None:
             return
         found = self._maps[frame_id]
-        before = sorted(k for k in self._maps if k < frame_id)[-_NUM_CONFIRMING:]
-        after = sorted(k for k in self._maps if k > frame_id)[:_NUM_CONFIRMING]
+        before = sorted(k for k in self._maps if k < frame_id)[-NUM_CONFIRMING:]
+        after = sorted(k for k in self._maps if k > frame_id)[:NUM_CONFIRMING]
         others = [
             other
             for k in (*before, *after)
             if (other := self._seen_from(keyframe, self._maps[k], world)) is not None
         ]
-        wanted = 2 if len(others) > _NUM_CONFIRMING else 1
-        sure = num_agreeing(found.inverse_depth, found.step, view.K, others) >= wanted
+        agreeing = num_agreeing(found.inverse_depth, found.step, view.K, others)
+        sure = agreeing >= num_to_confirm(len(others))
         confirmed = replace(found, inverse_depth=np.where(sure, found.inverse_depth, np.nan))
         points = back_project(confirmed.inverse_depth, view.K)[sure]
         new = np.ones(len(points), bool)

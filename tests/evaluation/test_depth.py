@@ -13,6 +13,7 @@ from semcast.evaluation.keyframe_depth import DepthKeyframe, confirmed_depths, r
 from semcast.evaluation.pipeline import run_frames
 from semcast.evaluation.result_table import result_table
 from semcast.evaluation.results_page import results_page
+from semcast.server.dense.neighbours import DepthRange
 from semcast.server.dense.view import view_of
 from semcast.server.mapping.settings import ReconstructionSettings
 
@@ -62,7 +63,7 @@ def test_wrong_poses_confirm_next_to_nothing(room):
     images = {k: sequence.image(k) for k in ids}
     views = {k: view_of(k, image, None, sequence.intrinsics, 8_000) for k, image in images.items()}
     truth = sequence.groundtruth()
-    place = {k: DepthKeyframe(truth.T_world_cam[k], 2.0, 5.0, 9.0) for k in ids}
+    place = {k: DepthKeyframe(truth.T_world_cam[k], DepthRange(2.0, 5.0, 9.0)) for k in ids}
     swapped = {k: place[(7 * k + 4) % 24] for k in ids}
     right, wrong = (
         np.mean([np.isfinite(depth).mean() for depth in confirmed_depths(frames, views).values()])
@@ -78,10 +79,10 @@ def test_keyframes_know_between_which_depths_their_landmarks_are(room):
     poses, keyframes = reconstructed(frames, sequence.intrinsics, ReconstructionSettings())
     assert set(keyframes) <= set(poses)
     for frame in keyframes.values():
-        assert 0 < frame.nearest < frame.median < frame.farthest
+        assert 0 < frame.sought.nearest < frame.sought.median < frame.sought.farthest
     k, frame = next(iter(keyframes.items()))
     moved = frame.with_poses_of(np.eye(4), 2.0)
-    assert moved.median == pytest.approx(2 * frame.median)
+    assert moved.sought == pytest.approx([2 * depth for depth in frame.sought])
     np.testing.assert_array_equal(frame.T_world_cam, poses[k])
 
 
