@@ -36,7 +36,7 @@ from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_streams import RecordedStream, choose_stream
 from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Arrival, Outcome, Session
-from semcast.server.settings import DenseCloud, ServerSettings, ViewSettings
+from semcast.server.settings import DenseWhen, ServerSettings, ViewSettings
 from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.choice import check_viewer, open_viewer
 
@@ -77,11 +77,10 @@ class ReplaySettings:
     save_images: Literal["none", "keyframes", "all"] = field(
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
-    dense_cloud: DenseCloud = field(
+    dense_cloud: DenseWhen = field(
         default="auto",
         metadata={
-            "help": "depth of keyframes, for dense.ply and the viewer: live, at the end of the stream, auto "
-            "(live on four cores or more) or none"
+            "help": "depth of keyframes, for dense.ply and the viewer: live, end, auto (which is end) or none"
         },
     )
     reference: Path | None = field(
@@ -220,7 +219,7 @@ def _replayed(
         update = session.conclude()
         if viewer is not None:
             viewer.submit(None, update)
-        for patches in session.complete_cloud():
+        for patches in session.complete_cloud(0.0 if stop.is_set() else None):
             if viewer is not None:
                 viewer.submit(None, None, patches)
         try:

@@ -49,6 +49,8 @@ NEARLY_FINAL_FRAMES = 10
 AGENT_GONE_S = 2.0
 #: How long after a restart of the agent its former start's frames may still come: above any channel's delay.
 STRAGGLER_NS = 20_000_000_000
+#: Time for depth that is still missing where another stream waits, and where the server was stopped.
+_IN_A_HURRY_S, _STOPPED_S = 2.0, 12.0
 #: How long a control request waits to be served; a busy server answers that it will be.
 SERVE_WAIT_S = 2.0
 
@@ -120,14 +122,11 @@ class Server:
         settings = self._settings
         if settings.reference is not None:
             open_sequence(settings.reference, settings.camera)
-        self._spare_bundle = self._new_bundle()
+        self._spare_bundle = new_bundle(self._settings, self._metrics.error)
         check_viewer(settings)
         if self._codec is not None:
             codec = self._decoder.load(self._codec, settings.modulation)
             self._decoder.warm_up(codec.name, settings.modulation, codec.digest, WARM_UP_SHAPE_HW)
-
-    def _new_bundle(self) -> BundleRunner:
-        return new_bundle(self._settings, self._metrics.error)
 
     def _close_spare(self) -> None:
         bundle, self._spare_bundle = self._spare_bundle, None
@@ -350,7 +349,7 @@ class Server:
         former, self._session = self._session, None
         if former is not None:
             logger.info("the agent was started again: a new map is begun")
-            self._conclude(former, hurry=True)
+            self._conclude(former, _IN_A_HURRY_S)
             self._views.end_stream()
             self._end_former(former)
         self._former_epochs.discard(identity.agent_epoch)
@@ -367,17 +366,19 @@ class Server:
         self._begun_ns = time.perf_counter_ns()
         self._drops_before = self._metrics.drops if former is not None else {}
         self._show(identity, self._session.resumed, goes_on=former is not None)
-        width, height = camera.image_wh
         logger.info(
             "stream of %s (%s): %dx%d, codec %s, %s mode",
-            *(self._agent_id, camera.source_name, width, height, camera.codec, self._settings.mode),
+            *(self._agent_id, camera.source_name, *camera.image_wh, camera.codec, self._settings.mode),
         )
         return self._session
 
     def _new_session(self, identity: StreamIdentity, *, goes_on: bool) -> Session:
         """Return the session of a stream; a server that ``goes_on`` keeps it in memory if need be."""
         out = self._settings.out
-        bundle, self._spare_bundle = self._spare_bundle or self._new_bundle(), None
+        bundle, self._spare_bundle = (
+            self._spare_bundle or new_bundle(self._settings, self._metrics.error),
+            None,
+        )
         new = functools.partial(Session, self._settings, identity, on_give_up=self._metrics.error)
         try:
             return new(out, self._reference, bundle)
@@ -385,7 +386,7 @@ class Server:
             if not goes_on:
                 raise
             self._tell_not_written(out, err)
-        return new(None, self._reference, self._new_bundle())
+        return new(None, self._reference, new_bundle(self._settings, self._metrics.error))
 
     def _show(self, identity: StreamIdentity, resumed: bool, *, goes_on: bool) -> None:
         """Show the stream; a server that ``goes_on`` tracks it unseen if need be."""
@@ -397,13 +398,13 @@ class Server:
             logger.error("the new stream is not shown: %s", err)
             self._metrics.error(str(err))
 
-    def _conclude(self, session: Session, *, hurry: bool = False) -> None:
+    def _conclude(self, session: Session, depth_budget_s: float | None) -> None:
         """Adjust the whole map of a stream that has ended, and tell who follows it."""
         self._save(session)  # the adjustment takes seconds, and the server may be stopped or killed meanwhile
         if (update := session.conclude()) is not None:
             self._outbox.put_map(session.identity.agent_epoch, update)
             self._views.submit(None, update)
-        for patches in session.complete_cloud(hurry=hurry):
+        for patches in session.complete_cloud(depth_budget_s):
             self._views.submit(None, None, patches)
 
     def _drops(self) -> dict[str, int]:
@@ -440,7 +441,7 @@ class Server:
         if session is None:
             return {}
         try:
-            self._conclude(session)
+            self._conclude(session, None if self._complete else _STOPPED_S)
             summary = self._end(session, self._settings.out)
         except OSError as err:
             raise SemcastError(_not_written(self._settings.out, err)) from err

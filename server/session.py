@@ -36,9 +36,7 @@ from semcast.server.checkpoint import (
     load_checkpoint,
     mismatch,
 )
-from semcast.server.dense.builder import DenseBuilder
 from semcast.server.dense.cloud import DensePatch
-from semcast.server.dense.process import ProcessDepth
 from semcast.server.export.outputs import EachFile, versions, write_json, write_ply
 from semcast.server.former_run import set_aside
 from semcast.server.frame_views import frame_view
@@ -51,6 +49,7 @@ from semcast.server.reference import Reference
 from semcast.server.run_record import FrameRow, RunRecord, run_line, summarise
 from semcast.server.run_results import Results, results_of, write_results
 from semcast.server.sent_frames import stretches
+from semcast.server.session_cloud import SessionCloud
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.scene import FrameView
@@ -61,8 +60,6 @@ Array = NDArray[np.float64]
 
 #: What is written at the end of a run, and when it is asked for.
 _RESULTS = (TRAJECTORY_NAME, MAP_NAME, DENSE_NAME, RECONSTRUCTION_NAME, SETTINGS_NAME, SUMMARY_NAME)
-#: Keyframes whose depth takes so long that it is said what is going on.
-_MANY_WAITING = 10
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
 
@@ -132,7 +129,7 @@ class Session:
         self._reference = reference
         bundle = bundle if bundle is not None else new_bundle(settings)
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
-        self._dense = _new_dense(settings, identity, on_give_up) if settings.dense_cloud != "none" else None
+        self._cloud = SessionCloud(settings, identity.camera, self._reconstruction, on_give_up)
         self._t_source_ns: dict[int, int] = {}
         self._numbers: dict[int, int | None] = {}
         self._num_frames = identity.num_frames
@@ -235,7 +232,7 @@ class Session:
             tell(result)
         self._log_state(result)
         update = self._reconstruction.take_map_update()
-        patches = self._grow_cloud(frame, result, update)
+        patches = self._cloud.grow(frame, result, update)
         self._last_frame_id = frame.frame_id
         self._t_source_ns[frame.frame_id] = frame.t_source_ns
         for frame_id, t_source_ns, _ in result.backfilled:
@@ -267,22 +264,6 @@ class Session:
             view = replace(view, backfilled=(*restored, *view.backfilled))
             self._restored = {}
         return Outcome(result, update, view, patches)
-
-    def _grow_cloud(
-        self, frame: DecodedFrame, result: FrameResult, update: MapUpdate | None
-    ) -> tuple[DensePatch, ...]:
-        """Let the dense cloud follow the map; what is new in it."""
-        if self._dense is None:
-            return ()
-        world = self._reconstruction.world
-        if update is not None:
-            self._dense.follow(world, update.keyframe_ids.tolist())
-        if result.is_keyframe:
-            image = self._reconstruction.put_right(frame.image)
-            self._dense.add_keyframe(frame.frame_id, image, frame.confidence)
-        if result.is_keyframe or self._settings.mode == "live":  # a replay repeats itself at any speed
-            self._dense.advance(world)
-        return self._dense.take_changes()
 
     def _log_state(self, result: FrameResult) -> None:
         """Say where a map begins and where the camera is lost."""
@@ -345,8 +326,7 @@ class Session:
         """Forget the map, as the control request ``reset`` asks."""
         self._reconstruction.reset()
         self._restored = {}
-        if self._dense is not None:
-            self._dense.reset()
+        self._cloud.reset()
 
     def conclude(self) -> MapUpdate | None:
         """Adjust the whole map, as the settings want it, now that the stream has ended; what that changed."""
@@ -357,20 +337,16 @@ class Session:
         except Exception:
             logger.exception("the map could not be adjusted as a whole and stays as it was")
         update = self._reconstruction.take_map_update()
-        if self._dense is not None and update is not None:
-            self._dense.follow(self._reconstruction.world, update.keyframe_ids.tolist())
+        self._cloud.follow(update)
         return update
 
-    def complete_cloud(self, *, hurry: bool = False) -> Iterator[tuple[DensePatch, ...]]:
+    def complete_cloud(self, budget_s: float | None = None) -> Iterator[tuple[DensePatch, ...]]:
         """Estimate the depth that is still missing, after ``conclude``, and yield what is new in the cloud.
 
         Args:
-            hurry: Another stream waits: what is missing is left out.
+            budget_s: What is still missing by then is left out; None waits for all.
         """
-        if self._dense is not None:
-            if not hurry and self._dense.num_waiting > _MANY_WAITING:
-                logger.info("the depth of %d keyframes is estimated now", self._dense.num_waiting)
-            yield from self._dense.finish(self._reconstruction.world, hurry=hurry)
+        return self._cloud.complete(budget_s)
 
     def write_outputs(
         self, folder: Path | None, drops: Mapping[str, int], *, complete: bool
@@ -414,7 +390,8 @@ class Session:
             results.num_keyframes,
         )
         summary["num_landmarks"] = results.num_landmarks
-        summary["num_dense_points"] = None if self._dense is None else len(self._dense)
+        points = self._cloud.points()
+        summary["num_dense_points"] = None if points is None else len(points.xyz)
         summary["stream"] = {
             "agent_id": self.identity.agent_id,
             "codec": self.identity.codec,
@@ -444,8 +421,8 @@ class Session:
             write_results(
                 folder, self._reconstruction, results, self.identity.camera, self._t_source_ns, each
             )
-            if self._dense is not None:
-                cloud = self._dense.points(self._reconstruction.world)
+            cloud = self._cloud.points()
+            if cloud is not None and len(cloud.xyz):
                 with each.attempt(folder / DENSE_NAME) as path:
                     write_ply(path, cloud.xyz, cloud.rgb, cloud.confidence)
         return results
@@ -472,8 +449,7 @@ class Session:
             self._images.close()
         self._record.close()
         self._reconstruction.close()
-        if self._dense is not None:
-            self._dense.close()
+        self._cloud.close()
 
 
 def new_bundle(settings: ServerSettings, on_give_up: Callable[[str], None] | None = None) -> BundleRunner:
@@ -486,12 +462,3 @@ def new_bundle(settings: ServerSettings, on_give_up: Callable[[str], None] | Non
     if settings.bundle == "inline":
         return InlineBundle()
     return ProcessBundle(lossless=settings.mode == "replay", on_give_up=on_give_up)
-
-
-def _new_dense(
-    settings: ServerSettings, identity: StreamIdentity, on_give_up: Callable[[str], None] | None
-) -> DenseBuilder:
-    """Return what makes the dense cloud of a stream; a replay leaves out nothing."""
-    lossless = settings.mode == "replay"
-    runner = ProcessDepth(lossless=lossless, on_give_up=on_give_up)
-    return DenseBuilder(identity.camera, runner, lossless=lossless, at_end=settings.dense_at_end)

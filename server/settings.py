@@ -16,7 +16,7 @@ from semcast.server.mapping.settings import ReconstructionSettings
 _MEMORY = re.compile(r"\d+(\.\d+)? ?(B|[kMGT]B|[KMGT]iB)|(100|\d{1,2}(\.\d+)?)%")
 
 #: When the depth of keyframes is estimated.
-DenseCloud = Literal["auto", "live", "end", "none"]
+DenseWhen = Literal["auto", "live", "end", "none"]
 #: With fewer cores the estimation of depth would keep frames waiting.
 _CORES_FOR_LIVE_DEPTH = 4
 
@@ -156,7 +156,7 @@ class ServerSettings:
     save_images: Literal["none", "keyframes", "all"] = field(
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
-    dense_cloud: DenseCloud = field(
+    dense_cloud: DenseWhen = field(
         default="auto",
         metadata={
             "help": "depth of keyframes, for dense.ply and the viewer: live, at the end of the stream, auto "

@@ -1,5 +1,6 @@
 """Follows the map: chooses whose depth is estimated from which neighbours, and what of it becomes points."""
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
-from semcast.server.dense.cloud import CloudPoints, DenseCloud, DensePatch, landmark_depths
+from semcast.server.dense.cloud import CloudPoints, DenseCloud, DensePatch, landmark_depths, scale_since
 from semcast.server.dense.consistency import OtherDepth, agrees, back_project, num_agreeing
 from semcast.server.dense.depth_map import DepthMap, DepthProblem
 from semcast.server.dense.neighbours import (
@@ -24,11 +25,15 @@ from semcast.server.dense.view import View, view_of
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
 
 #: Keyframes whose images are kept, and those of them whose depth is.
 _NUM_VIEWS, _NUM_MAPS = 12, 6
 #: The same where depth is estimated at the end: half a megabyte each. Beyond it every second one goes.
-_NUM_STORED = 240
+_NUM_STORED = 300
+#: Depths that are off by a larger share than this, since the unit has changed, are left out.
+_SCALE_CHANGE = 0.01
+_POLL_S = 0.01
 #: After so many later keyframes those that are there have to do.
 _MAX_LATER = 4
 #: Keyframes that may wait where there is no time for all.
@@ -76,12 +81,13 @@ class DenseBuilder:
 
     def reset(self) -> None:
         """Forget everything: the map was begun anew."""
-        self._runner.take(wait=True)
         self._kept: dict[int, View] = {}
         self._waiting: list[int] = []
         self._maps: dict[int, DepthMap] = {}
         self._unconfirmed: list[int] = []
         self._confirmed: dict[int, DepthMap] = {}
+        #: What landmarks said when depth was asked for, to notice another scale since.
+        self._landmarks: dict[int, tuple[Ids, Array]] = {}
         self._cloud = DenseCloud()
 
     def __len__(self) -> int:
@@ -99,13 +105,8 @@ class DenseBuilder:
         """
         self._kept[frame_id] = view_of(frame_id, image, confidence, self._camera)
         self._waiting.append(frame_id)
-        by_age = sorted(self._kept)
-        gone = by_age[:-_NUM_VIEWS]
-        if self._at_end:
-            gone = by_age[1:-1:2] if len(by_age) > _NUM_STORED else []
-        for old in gone:
-            del self._kept[old]
-        self._waiting = [k for k in self._waiting if k in self._kept]
+        if not self._at_end:
+            self._keep(sorted(self._kept)[-_NUM_VIEWS:])
 
     def advance(self, world: WorldMap) -> None:
         """Take a depth map that is ready and begin on another; returns at once where nothing may be lost.
@@ -113,27 +114,46 @@ class DenseBuilder:
         Args:
             world: The map as it is.
         """
-        if not self._at_end:
-            self._take(world, wait=self._lossless)
-            self._begin(world, is_last=False)
+        if self._at_end:
+            there = {k.frame_id for k in world.keyframes}
+            kept = [k for k in sorted(self._kept) if k in there]
+            self._keep([*kept[:-1:2], kept[-1]] if len(kept) > _NUM_STORED else kept)
+            return
+        self._take(world, wait=self._lossless)
+        self._begin(world, is_last=False)
+
+    def _keep(self, frame_ids: list[int]) -> None:
+        """Forget the images of all other keyframes."""
+        self._kept = {k: self._kept[k] for k in frame_ids}
+        self._waiting = [k for k in self._waiting if k in self._kept]
 
     def follow(self, world: WorldMap, frame_ids: Sequence[int]) -> None:
-        """Note keyframes that the map has moved."""
+        """Note keyframes that the map has moved; depths in units of before are of no use any more."""
         self._cloud.follow(world, frame_ids)
+        if any(self._has_other_scale(k, world) for k in frame_ids if k in self._maps):
+            self._maps, self._confirmed, self._unconfirmed = {}, {}, []
 
-    def finish(self, world: WorldMap, *, hurry: bool = False) -> Iterator[tuple[DensePatch, ...]]:
+    def _has_other_scale(self, frame_id: int, world: WorldMap) -> bool:
+        scale = scale_since(world, frame_id, *self._landmarks[frame_id])
+        return scale is not None and abs(scale - 1.0) > _SCALE_CHANGE
+
+    def finish(self, world: WorldMap, budget_s: float | None = None) -> Iterator[tuple[DensePatch, ...]]:
         """Make points of what is there, for the stream has ended, and yield them as they come.
 
         Args:
             world: The map as it is.
-            hurry: Leave out what is not estimated yet instead of waiting for it.
+            budget_s: What is not estimated by then is left out; None waits for all.
         """
-        while not hurry:
-            self._take(world, wait=True)
+        end_s = None if budget_s is None else time.monotonic() + budget_s
+        while end_s is None or time.monotonic() < end_s:
+            self._take(world, wait=end_s is None)
             self._begin(world, is_last=True)
             if not self._runner.busy:
                 break
-            yield self.take_changes()
+            if changes := self.take_changes():
+                yield changes
+            elif end_s is not None:
+                time.sleep(_POLL_S)
         while self._unconfirmed:
             self._confirm(self._unconfirmed.pop(0), world)
         yield self.take_changes()
@@ -157,15 +177,15 @@ class DenseBuilder:
 
     def _take(self, world: WorldMap, *, wait: bool) -> None:
         found = self._runner.take(wait=wait) if self._runner.busy else None
-        if found is None or found.frame_id not in self._kept:
+        if found is None or found.frame_id not in self._kept or self._has_other_scale(found.frame_id, world):
             return
         self._maps[found.frame_id] = found
         self._unconfirmed.append(found.frame_id)
         for old in sorted(self._maps)[:-_NUM_MAPS]:
             del self._maps[old]
-        # The newest waits for one after it.
+        # The newest wait for those after them.
         self._unconfirmed = sorted(k for k in self._unconfirmed if k in self._maps)
-        while len(self._unconfirmed) > 1:
+        while len(self._unconfirmed) > NUM_CONFIRMING:
             self._confirm(self._unconfirmed.pop(0), world)
 
     def _begin(self, world: WorldMap, *, is_last: bool) -> None:
@@ -180,7 +200,10 @@ class DenseBuilder:
                 return
             self._waiting.remove(frame_id)
             problem = self._problem(frame_id, world)
-            if problem is not None:
+            keyframe = _keyframe(world, frame_id)
+            if problem is not None and keyframe is not None:
+                self._landmarks = {k: v for k, v in self._landmarks.items() if k in self._maps}
+                self._landmarks[frame_id] = landmark_depths(world, keyframe)
                 self._runner.submit(problem)
                 return
 

@@ -69,6 +69,28 @@ def landmark_depths(world: WorldMap, keyframe: Keyframe) -> tuple[Ids, Array]:
     return ids[depth > 0.0], depth[depth > 0.0]
 
 
+def scale_since(world: WorldMap, frame_id: int, ids: Ids, before: Array) -> float | None:
+    """Tell how many present map units one of earlier is, around a frame; None with too few landmarks.
+
+    Args:
+        world: The map as it is.
+        frame_id: Of the frame.
+        ids: ``(L,)`` landmarks it saw.
+        before: ``(L,)`` how far they were from it.
+    """
+    T_world_cam = world.pose_of_frame(frame_id)
+    if T_world_cam is None:
+        return None
+    row = world.landmarks.rows(ids)
+    there = row >= 0
+    T_cam_world = invert_transform(T_world_cam)
+    depth = world.landmarks.xyz[row[there]] @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    sound = depth > 0.0
+    if sound.sum() < _MIN_LANDMARKS:
+        return None
+    return float(np.median(depth[sound] / before[there][sound]))
+
+
 class DenseCloud:
     """Collects patches, keeps their scale that of the map, and bounds their number.
 
@@ -105,19 +127,9 @@ class DenseCloud:
     def follow(self, world: WorldMap, frame_ids: Collection[int]) -> None:
         """Take the scale of keyframes that moved from their landmarks: joined parts and loops change it."""
         for frame_id in frame_ids:
-            patch, T_world_cam = self._patches.get(frame_id), world.pose_of_frame(frame_id)
-            if patch is None or T_world_cam is None:
-                continue
-            ids, before = self._landmarks[frame_id]
-            row = world.landmarks.rows(ids)
-            there = row >= 0
-            T_cam_world = invert_transform(T_world_cam)
-            depth = world.landmarks.xyz[row[there]] @ T_cam_world[2, :3] + T_cam_world[2, 3]
-            sound = depth > 0.0
-            if sound.sum() < _MIN_LANDMARKS:
-                continue
-            scale = float(np.median(depth[sound] / before[there][sound]))
-            if abs(scale / patch.scale - 1.0) > _SCALE_CHANGE:
+            patch = self._patches.get(frame_id)
+            scale = None if patch is None else scale_since(world, frame_id, *self._landmarks[frame_id])
+            if patch is not None and scale is not None and abs(scale / patch.scale - 1.0) > _SCALE_CHANGE:
                 self._patches[frame_id] = replace(patch, scale=scale)
                 self._changed.add(frame_id)
 
@@ -128,10 +140,10 @@ class DenseCloud:
 
     def points(self, world: WorldMap) -> CloudPoints:
         """Return all points with the present poses; those of keyframes without a pose are left out."""
-        return placed(self._patches.values(), world)
+        return _placed(self._patches.values(), world)
 
 
-def placed(patches: Iterable[DensePatch], world: WorldMap) -> CloudPoints:
+def _placed(patches: Iterable[DensePatch], world: WorldMap) -> CloudPoints:
     """Return the points of patches in the world frame."""
     xyz, rgb, confidence = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0, np.float32)]
     for patch in patches:

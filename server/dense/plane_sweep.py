@@ -96,6 +96,10 @@ class _Reference:
             np.float32,
         )
         seen = grey > -_WHITE
+        corners = np.array([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)])
+        if (corners @ H[2] <= 0.0).any():  # what is behind the other camera has a place in its image, too
+            x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+            seen &= np.float32(H[2, 0]) * x + np.float32(H[2, 1]) * y + np.float32(H[2, 2]) > 0.0
         grey *= seen
         mean = self._box(grey)
         variance = self._box(grey * grey)

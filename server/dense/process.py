@@ -1,4 +1,4 @@
-"""Depth maps in a process of its own, which stands back behind tracking, mapping and decoding."""
+"""Where depth maps are estimated: in a process behind all others, or in the caller's thread."""
 
 from collections.abc import Callable
 
@@ -16,6 +16,34 @@ GIVEN_UP = f"{_WHAT} failed {MAX_FAILURES} times in a row: the dense cloud no lo
 def _estimate(problem: DepthProblem) -> DepthMap:
     cv2.setNumThreads(1)
     return estimate_depth(problem)
+
+
+class InlineDepth:
+    """Estimates depth maps in the caller's thread."""
+
+    def __init__(self) -> None:
+        self._result: DepthMap | None = None
+
+    @property
+    def busy(self) -> bool:
+        """A result waits to be taken."""
+        return self._result is not None
+
+    def submit(self, problem: DepthProblem) -> bool:
+        """Estimate now; the result waits for ``take``."""
+        if self._result is not None:
+            return False
+        self._result = estimate_depth(problem)
+        return True
+
+    def take(self, wait: bool = False) -> DepthMap | None:
+        """Return the result of the last ``submit``, once."""
+        result, self._result = self._result, None
+        return result
+
+    def close(self) -> None:
+        """Forget a result that was not taken."""
+        self._result = None
 
 
 class ProcessDepth(Worker[DepthProblem, DepthMap]):

@@ -35,9 +35,6 @@ class PatchTable:
         #: Of points and of place.
         self._versions: dict[int, tuple[int, int]] = {}
 
-    def __len__(self) -> int:
-        return len(self._patches)
-
     def add(self, patch: DensePatch) -> None:
         """Add a patch, or replace the one of the same keyframe; ``place`` says where it is."""
         known = self._patches.get(patch.frame_id)

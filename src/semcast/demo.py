@@ -34,7 +34,7 @@ from semcast.real_time import plan_for
 from semcast.role import Role
 from semcast.server.former_run import check_not_foreign, discard, output_folder
 from semcast.server.mapping.settings import ReconstructionSettings
-from semcast.server.settings import DenseCloud, ServerSettings, ViewSettings
+from semcast.server.settings import DenseWhen, ServerSettings, ViewSettings
 from semcast.server.view.choice import check_viewer
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
@@ -97,7 +97,7 @@ class DemoSettings:
     save_images: Literal["none", "keyframes", "all"] = field(
         default="keyframes", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
-    dense_cloud: DenseCloud = field(
+    dense_cloud: DenseWhen = field(
         default="auto",
         metadata={
             "help": "depth of keyframes, for dense.ply and the viewer: live, at the end of the stream, auto "

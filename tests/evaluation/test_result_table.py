@@ -16,6 +16,7 @@ SHIPPED = {
     "codec": "codec_awgn_kodak",
     "confidence": "confidence_awgn_kitti_06",
     "latency": "latency_kitti_06",
+    "depth": "depth_room",
     "endurance": "endurance_parking_synth_60",
     "runtime": "runtime_3dcsc",
     "recording": "recording_cost",
@@ -42,7 +43,9 @@ def test_no_name_of_a_column_is_cut_and_every_row_takes_one_line(what):
     _, head, _, *body = lines_at_80_columns(what, table)
     assert [name.strip() for name in head.split("  ") if name.strip()] == table.head
     assert [line.split() for line in body] == [row for row in table.rows if row]
-    assert all(cell != "-" for row in table.rows for cell in row), "every figure is found in the result"
+    # Where nothing arrives there is nothing to measure, nor is there an SNR without a link.
+    measured = [row for row in table.rows if not {"100%", "none"} & set(row)]
+    assert all(cell != "-" for row in measured for cell in row), "every figure is found in the result"
 
 
 def test_a_long_name_takes_several_lines_and_cuts_no_other_column():

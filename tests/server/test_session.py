@@ -109,8 +109,7 @@ def run_session(demo, folder, frame_ids, epoch=5, program=None, **settings):
             session.save_checkpoint()
         else:
             session.conclude()
-            for _ in session.complete_cloud():
-                pass
+            list(session.complete_cloud())
             session.write_outputs(folder, {}, complete=True)
     finally:
         session.close()
@@ -259,6 +258,18 @@ def test_the_dense_cloud_lies_around_the_landmarks_where_it_is_wanted(demo, tmp_
         assert ((cloud[axis] > low - beyond) & (cloud[axis] < high + beyond)).mean() > 0.9
     alike = [(tmp_path / name / "trajectory.tum").read_bytes() for name in ("dense", "sparse")]
     assert alike[0] == alike[1], "no pose depends on it"
+
+
+def test_a_cloud_that_fails_ends_alone(demo, tmp_path, monkeypatch, caplog):
+    def broken(*_):
+        raise RuntimeError("no depth today")
+
+    monkeypatch.setattr("semcast.server.dense.builder.DenseBuilder.add_keyframe", broken)
+    run_session(demo, tmp_path, range(6))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["frames"]["posed"] == 6
+    assert summary["num_dense_points"] is None
+    assert caplog.text.count("the dense cloud no longer grows") == 1
 
 
 def test_a_resumed_session_goes_on_with_what_is_there_and_a_new_one_sets_it_aside(demo, tmp_path):

@@ -1,5 +1,7 @@
 """Whose depth is estimated from which neighbours, and what of it becomes points."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -21,6 +23,7 @@ class Wall:
     def __init__(self, depth_of=lambda frame_id: WALL):
         self.asked = []
         self.slow = False
+        self.unit = 1.0
         self.closed = False
         self._depth_of = depth_of
         self._result = None
@@ -33,7 +36,9 @@ class Wall:
         assert not self.busy
         self.asked.append(problem)
         frame_id = problem.reference.frame_id
-        inverse = np.full(problem.reference.shape_hw, 1.0 / self._depth_of(frame_id), np.float32)
+        inverse = np.full(
+            problem.reference.shape_hw, 1.0 / (self.unit * self._depth_of(frame_id)), np.float32
+        )
         self._result = DepthMap(frame_id, inverse, 0.002)
         return True
 
@@ -162,7 +167,7 @@ def test_a_live_cloud_waits_for_nobody_and_leaves_out_what_is_too_much():
     runner.slow = False
     builder.advance(world)
     assert runner.asked_ids == [0, 5], "of those that wait the newest two stay"
-    assert {p.frame_id for p in finish(builder, world, hurry=True)} <= {0, 5}
+    assert {p.frame_id for p in finish(builder, world, budget_s=0.0)} <= {0, 5}
     assert runner.asked_ids == [0, 5], "another stream waits"
     finish(builder, world)
     assert runner.asked_ids == [0, 5, 6, 7, 8]
@@ -175,12 +180,24 @@ def test_a_cloud_at_the_end_waits_for_it_and_is_the_same():
     late_world, late_builder, _ = run(8, late, at_end=True)
     assert late.asked == []
     assert late_builder.num_waiting == 8
-    assert {p.frame_id for p in finish(late_builder, late_world)} <= set(range(8))
+    assert {p.frame_id for p in finish(late_builder, late_world)} == {0, 1, 2, 3, 4, 5, 7}
     assert late.asked_ids == runner.asked_ids
     assert late_builder.points(late_world).xyz.tolist() == builder.points(world).xyz.tolist()
 
 
-def test_images_for_the_end_are_bounded_and_spread_over_the_stream(monkeypatch):
+def test_images_for_the_end_are_those_of_keyframes_that_the_map_keeps():
+    runner = Wall()
+    world, builder = WorldMap(), DenseBuilder(CAMERA, runner, at_end=True)
+    for k in range(60):
+        add_keyframe(world, builder, k)
+        world.bound(10_000, max_keyframes=20, recent=5)
+        builder.advance(world)
+    finish(builder, world)
+    assert runner.asked_ids == [keyframe.frame_id for keyframe in world.keyframes]
+    assert len(runner.asked_ids) > 10
+
+
+def test_images_for_the_end_are_bounded(monkeypatch):
     monkeypatch.setattr("semcast.server.dense.builder._NUM_STORED", 10)
     world, builder, runner = run(40, at_end=True)
     finish(builder, world)
@@ -199,12 +216,39 @@ def test_a_keyframe_that_lost_its_pose_is_left_out():
     assert all(2 not in group for p in runner.asked for group in neighbours(p))
 
 
-def test_a_new_map_has_a_new_cloud():
-    world, builder, runner = run(6)
+def test_a_new_map_has_a_new_cloud_and_does_not_wait_for_the_old_one():
+    runner = Wall()
+    runner.slow = True
+    world, builder, _ = run(6, runner, lossless=False)
     builder.reset()
+    assert runner.busy
     assert len(builder) == 0
-    assert not runner.busy
-    finish(builder, world)
-    assert runner.asked_ids == [0, 1, 2, 3]
+    runner.slow = False
+    assert finish(builder, world) == []
+    assert runner.asked_ids == [0], "what was under way is of a map that is gone"
     builder.close()
     assert runner.closed
+
+
+def test_depth_in_units_of_before_a_join_makes_no_points_after_it():
+    """What is left over from before, or under way, is half as far away as the wall is now."""
+    world, builder, runner = run(8, submap=1)
+    finish(builder, world)
+    for k in range(8, 12):
+        add_keyframe(world, builder, k, submap=1)
+        builder.advance(world)
+    world.transform_submap(1, 0, 2.0, np.eye(4))
+    runner.unit = 2.0
+    builder.follow(world, list(range(12)))
+    finish(builder, world)
+    np.testing.assert_allclose(builder.points(world).xyz[:, 2], 2.0 * WALL, rtol=1e-4)
+
+
+def test_the_end_of_a_stream_waits_no_longer_than_it_may():
+    runner = Wall()
+    runner.slow = True
+    world, builder, _ = run(8, runner, at_end=True)
+    since_s = time.monotonic()
+    finish(builder, world, budget_s=0.1)
+    assert 0.1 <= time.monotonic() - since_s < 5.0
+    assert runner.asked_ids == [0]

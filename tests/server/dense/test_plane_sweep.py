@@ -71,3 +71,12 @@ def test_images_known_to_be_noisy_are_matched_in_larger_windows(stand, wall) -> 
         for view in (row.views[0], doubted)
     ]
     assert right[1] > right[0] + 0.05
+
+
+def test_what_is_behind_a_neighbour_is_not_seen_by_it(pair) -> None:
+    """It has a place in the image of one that has driven past it: the mirror image of its own."""
+    ahead = Neighbour(pair.views[1], make_transform(np.eye(3), (0.0, 0.0, -9.0)))
+    near = pair.neighbour(1, 0)
+    alone, beside = (match_cost(pair.views[0], [group], INVERSE_DEPTHS) for group in ([near], [near, ahead]))
+    np.testing.assert_array_equal(beside, alone)
+    assert (match_cost(pair.views[0], [[ahead]], INVERSE_DEPTHS) == UNKNOWN_COST).all()
