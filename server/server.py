@@ -375,10 +375,8 @@ class Server:
     def _new_session(self, identity: StreamIdentity, *, goes_on: bool) -> Session:
         """Return the session of a stream; a server that ``goes_on`` keeps it in memory if need be."""
         out = self._settings.out
-        bundle, self._spare_bundle = (
-            self._spare_bundle or new_bundle(self._settings, self._metrics.error),
-            None,
-        )
+        bundle = self._spare_bundle or new_bundle(self._settings, self._metrics.error)
+        self._spare_bundle = None
         new = functools.partial(Session, self._settings, identity, on_give_up=self._metrics.error)
         try:
             return new(out, self._reference, bundle)

@@ -16,6 +16,7 @@ from semcast.server.dense.depth_map import DepthMap, DepthProblem
 from semcast.server.dense.neighbours import (
     NUM_CONFIRMING,
     NUM_NEIGHBOURS,
+    DepthRange,
     choose_neighbours,
     depth_range,
     num_to_confirm,
@@ -90,9 +91,6 @@ class DenseBuilder:
         self._landmarks: dict[int, tuple[Ids, Array]] = {}
         self._cloud = DenseCloud()
 
-    def __len__(self) -> int:
-        return len(self._cloud)
-
     def add_keyframe(
         self, frame_id: int, image: NDArray[np.uint8], confidence: NDArray[np.float32] | None
     ) -> None:
@@ -114,13 +112,13 @@ class DenseBuilder:
         Args:
             world: The map as it is.
         """
-        if self._at_end:
+        if not self._at_end:
+            self._take(world, wait=self._lossless)
+            self._begin(world, is_last=False)
+        elif len(self._kept) > _NUM_STORED:
             there = {k.frame_id for k in world.keyframes}
             kept = [k for k in sorted(self._kept) if k in there]
             self._keep([*kept[:-1:2], kept[-1]] if len(kept) > _NUM_STORED else kept)
-            return
-        self._take(world, wait=self._lossless)
-        self._begin(world, is_last=False)
 
     def _keep(self, frame_ids: list[int]) -> None:
         """Forget the images of all other keyframes."""
@@ -199,11 +197,14 @@ class DenseBuilder:
             if not is_last and not self._is_ready(frame_id, world):
                 return
             self._waiting.remove(frame_id)
-            problem = self._problem(frame_id, world)
             keyframe = _keyframe(world, frame_id)
-            if problem is not None and keyframe is not None:
+            if keyframe is None or world.pose_of_frame(frame_id) is None:
+                continue
+            seen = landmark_depths(world, keyframe)
+            problem = self._problem(keyframe, depth_range(seen[1]), world)
+            if problem is not None:
                 self._landmarks = {k: v for k, v in self._landmarks.items() if k in self._maps}
-                self._landmarks[frame_id] = landmark_depths(world, keyframe)
+                self._landmarks[frame_id] = seen
                 self._runner.submit(problem)
                 return
 
@@ -212,28 +213,27 @@ class DenseBuilder:
         keyframe = _keyframe(world, frame_id)
         if len(later) >= _MAX_LATER or keyframe is None:
             return True
-        return len(self._neighbours(keyframe, sorted(later), world)) >= NUM_NEIGHBOURS
-
-    def _problem(self, frame_id: int, world: WorldMap) -> DepthProblem | None:
-        """What is asked about a keyframe; None where there is too little to tell its depth from."""
-        keyframe = _keyframe(world, frame_id)
-        if keyframe is None or world.pose_of_frame(frame_id) is None:
-            return None
         sought = depth_range(landmark_depths(world, keyframe)[1])
+        return len(self._neighbours(keyframe, sought, sorted(later), world)) >= NUM_NEIGHBOURS
+
+    def _problem(self, keyframe: Keyframe, sought: DepthRange | None, world: WorldMap) -> DepthProblem | None:
+        """What is asked about a keyframe; None where there is too little to tell its depth from."""
         if sought is None:
             return None
+        frame_id = keyframe.frame_id
         before = sorted((k for k in self._kept if k < frame_id), reverse=True)
         after = sorted(k for k in self._kept if k > frame_id)
-        groups = [self._neighbours(keyframe, side, world) for side in (before, after)]
+        groups = [self._neighbours(keyframe, sought, side, world) for side in (before, after)]
         groups = [group for group in groups if group]
         if not groups:
             return None
         reference = self._kept[frame_id].to_compare()
         return DepthProblem(reference, groups, sought.nearest, sought.farthest)
 
-    def _neighbours(self, keyframe: Keyframe, side: Sequence[int], world: WorldMap) -> list[Neighbour]:
+    def _neighbours(
+        self, keyframe: Keyframe, sought: DepthRange | None, side: Sequence[int], world: WorldMap
+    ) -> list[Neighbour]:
         """Choose views of a keyframe's part on one side of it, from the nearest in time on."""
-        sought = depth_range(landmark_depths(world, keyframe)[1])
         if sought is None:
             return []
         posed = (
