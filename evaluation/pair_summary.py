@@ -5,7 +5,7 @@ geometrically, so that no hard cell outweighs all others.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,6 @@ import numpy as np
 
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import number, table
-from semcast.evaluation.plots import variant_name
 
 #: The best confidence-free estimator of others on these matches.
 RIVAL = "poselib"
@@ -40,10 +39,16 @@ class Cell:
     values: Mapping[str, Any]
 
     @property
-    def title(self) -> str:
-        """Recording, codec where it is not the default, and matches, as a row is named."""
+    def link(self) -> str:
+        """Channel, and codec where it is not the default."""
         codec = "" if self.codec == DEFAULT_CODEC else f", {self.codec}"
-        return f"{self.recording}, {self.channel}{codec}"
+        return f"{self.channel}{codec}"
+
+    @property
+    def matches(self) -> str:
+        """How many matches the estimators got."""
+        most = self.values["max_matches"]
+        return f"{most} matches" if most else "all matches"
 
     def mean(self, method: str, figure: str = "tdir_deg_mean") -> float | None:
         """Return a figure of one method, None where it was not run."""
@@ -104,10 +109,11 @@ def _left_out(num_silent: int) -> Iterator[str]:
 
 
 def _against_rival(cells: Sequence[Cell]) -> Iterator[str]:
-    yield "**Mean translation-direction error in degrees**, mean over the cells of a row. `better` and"
-    yield f"`worse` count cells in which the 95 % interval of `robust` minus `{RIVAL}` excludes zero.\n"
+    yield "**Mean translation-direction error in degrees**, mean over the cells of a row, each in four rows."
+    yield "`better` and `worse` count those in which the 95 % interval of `robust` minus"
+    yield f"`{RIVAL}` excludes zero.\n"
     rows = []
-    for title, group in _grouped(cells, lambda c: f"{c.title}; {variant_name(c.values)}").items():
+    for title, group in _groups(cells):
         figures = [number(_mean(c.mean(m) for c in group), 1) for m in _METHODS]
         paired = [p for c in group if (p := c.interval("robust", RIVAL)) is not None]
         paired = [p for p in paired if p["low"] is not None]
@@ -115,7 +121,7 @@ def _against_rival(cells: Sequence[Cell]) -> Iterator[str]:
         worse = sum(p["low"] > 0 for p in paired)
         ratio = number(_ratio(group, "robust", RIVAL))
         rows.append([title, str(len(group)), *figures, ratio, str(better), str(worse)])
-    head = ["recording, channel; matches", "cells", *_METHODS, f"robust / {RIVAL}", "better", "worse"]
+    head = ["cells of", "number", *_METHODS, f"robust / {RIVAL}", "better", "worse"]
     yield from table(head, rows)
     yield ""
     yield (
@@ -148,8 +154,8 @@ def _against_plain(cells: Sequence[Cell]) -> Iterator[str]:
     yield f"**Gain over plain RANSAC (OpenCV's) at {BAD_LINK_DB:g} dB and below**, in degrees of the mean"
     yield "error; the paper claims 1-2 of rotation and 8-10 of translation direction.\n"
     rows = []
-    for title, group in _grouped(bad, lambda c: f"{c.title}; {variant_name(c.values)}").items():
-        row = [title]
+    for title, group in _groups(bad):
+        row = [title, str(len(group))]
         for figure in ("rot_deg_mean", "tdir_deg_mean"):
             plain = _mean(c.mean(PLAIN, figure) for c in group)
             row.append(number(plain, 1))
@@ -159,7 +165,7 @@ def _against_plain(cells: Sequence[Cell]) -> Iterator[str]:
         rows.append(row)
     names = ("plain", *_AGAINST_PLAIN)
     figures = (f"{figure}, {name}" for figure in ("rotation", "direction") for name in names)
-    head = ["recording, channel; matches", *figures]
+    head = ["cells of", "number", *figures]
     yield from table(head, rows)
     yield ""
     for method in ("paper", "robust"):
@@ -226,11 +232,19 @@ def _time(cells: Sequence[Cell]) -> Iterator[str]:
     yield from table(names, [[number(float(np.median(m)), 1) if m else "-" for m in medians]])
 
 
-def _grouped(cells: Iterable[Cell], key: Any) -> dict[str, list[Cell]]:
-    groups: dict[str, list[Cell]] = {}
-    for cell in cells:
-        groups.setdefault(key(cell), []).append(cell)
-    return groups
+def _groups(cells: Sequence[Cell]) -> Iterator[tuple[str, list[Cell]]]:
+    """Yield the rows of a table: by recording and features, then by link, by number of matches, and all."""
+    keys: tuple[Callable[[Cell], str], ...] = (
+        lambda c: f"{c.recording}; {c.values['features']}",
+        lambda c: c.link,
+        lambda c: c.matches,
+        lambda c: "all",
+    )
+    for key in keys:
+        groups: dict[str, list[Cell]] = defaultdict(list)
+        for cell in cells:
+            groups[key(cell)].append(cell)
+        yield from groups.items()
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
