@@ -41,7 +41,7 @@ class AgentSettings:
         default=10.0,
         metadata={
             "flag": "expect_snr_db",
-            "help": "SNR in dB to encode for in replay, and in live until the server reports the link's",
+            "help": "SNR in dB to encode for: in replay always, in live until the server reports the link's",
         },
     )
     rate: RateChoice = field(
@@ -52,7 +52,7 @@ class AgentSettings:
         },
     )
     feedback_max_age_s: float = field(
-        default=2.0, metadata={"help": "a report about the link counts for so many seconds"}
+        default=2.0, metadata={"help": "seconds for which a report about the link counts"}
     )
     share_source: Literal["off", "jpeg", "png"] = field(
         default="off",
@@ -68,9 +68,7 @@ class AgentSettings:
             "begins at about 12 a second"
         },
     )
-    wait: bool = field(
-        default=True, metadata={"help": "send nothing until channel and server are there for the first time"}
-    )
+    wait: bool = field(default=True, metadata={"help": "wait for channel and server before the first frame"})
     network: NetworkSettings = field(default=NetworkSettings(), metadata={"help": "where the hub is"})
 
     def __post_init__(self) -> None:

@@ -31,19 +31,19 @@ class SourceSettings:
     camera: CameraSettings = field(default=CameraSettings(), metadata={"help": "intrinsics"})
     resize: float = field(default=1.0, metadata={"help": "factor on the image size; intrinsics follow"})
     stride: int = field(default=1, metadata={"help": "send every n-th frame"})
-    max_frames: int | None = field(default=None, metadata={"help": "send at most so many frames"})
+    max_frames: int | None = field(default=None, metadata={"help": "frames sent at most"})
     pace: Pace = field(
         default="recorded",
         metadata={
-            "help": "recorded: at recorded times, or as the camera gives them; rate: at --rate-hz; "
+            "help": "recorded: at recorded times, or as the camera delivers; rate: at --rate-hz; "
             "receiver: as fast as the receiver takes them (replay mode)"
         },
     )
     rate_hz: float | None = field(
         default=None,
         metadata={
-            "help": "frames per second for --pace rate; with another pace those at which a folder that "
-            "records no times was taken (10 where nothing is said)"
+            "help": "frames per second for --pace rate; with another pace, those at which a folder without "
+            "times was taken (default 10)"
         },
     )
     repeat: Repeat = field(

@@ -64,22 +64,25 @@ class ChannelSettings:
     frame_loss: float = field(default=0.0, metadata={"help": "share of whole frames lost, on any channel"})
     burst_slots: float = field(
         default=4.0,
-        metadata={"help": "mean length of a burst in slots, but for those that the end of a frame cuts"},
+        metadata={"help": "mean length of a burst in slots; the end of a frame cuts bursts short"},
     )
-    burst_noise_db: float = field(default=20.0, metadata={"help": "how far a burst raises the noise, in dB"})
+    burst_noise_db: float = field(
+        default=20.0, metadata={"help": "by how much a burst raises the noise, in dB"}
+    )
     rician_k_db: float = field(
-        default=6.0, metadata={"help": "line of sight over scattered power in dB (rician)"}
+        default=6.0, metadata={"help": "power of the line of sight over scattered power, in dB (rician)"}
     )
     doppler_hz: float = field(
         default=0.0,
-        metadata={"help": "Doppler shift of rayleigh and rician; 0 draws each slot independently"},
+        metadata={"help": "largest Doppler shift in Hz (rayleigh, rician); 0 draws each slot on its own"},
     )
     slot_ms: float = field(default=1.0, metadata={"help": "duration of a slot in ms, for Doppler"})
     trace: TraceName = field(default="ramp", metadata={"help": "shape of the SNR over time (trace)"})
     trace_end_db: float = field(default=2.0, metadata={"help": "SNR at the end of the ramp in dB"})
     trace_s: float = field(default=5.0, metadata={"help": "duration of the ramp in seconds"})
     trace_step_db: float = field(
-        default=1.0, metadata={"help": "standard deviation of a random walk's step each half second, in dB"}
+        default=1.0,
+        metadata={"help": "standard deviation in dB of a random walk's steps, one each half second"},
     )
     trace_file: Path | None = field(
         default=None, metadata={"help": "CSV file with the columns t_s,snr_db (trace file)"}
@@ -87,10 +90,7 @@ class ChannelSettings:
     delay_ms: float = field(default=0.0, metadata={"help": "delay of every frame in ms"})
     jitter_ms: float = field(
         default=0.0,
-        metadata={
-            "help": "mean of a random extra delay of each frame in ms; none overtakes another, so that those "
-            "behind it wait too"
-        },
+        metadata={"help": "mean of a random extra delay of each frame in ms; no frame overtakes another"},
     )
 
     def __post_init__(self) -> None:

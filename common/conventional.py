@@ -1,4 +1,4 @@
-"""Separate source and channel coding, the classical rival: an image file over LDPC-coded QAM.
+"""Separate source and channel coding, the classical baseline: an image file over LDPC-coded QAM.
 
 The bits fill exactly the data symbols every other codec has, pilots inside the same channel uses. ``*-ldpc``
 is the paper's fixed scheme, rate 1/2 and 16-QAM; ``*-amc`` picks modulation and rate by the SNR the

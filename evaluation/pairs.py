@@ -104,7 +104,7 @@ class PairSettings(StreamSettings):
             if not values or len(set(values)) != len(values):
                 raise ValueError(f"{name} must be one or more different values, got {values}")
         if min(self.gap) < 1:
-            raise ValueError(f"gap must be at least 1, got {self.gap}")
+            raise ValueError(f"gap must be at least 1, got {min(self.gap)}")
         if any(count != 0 and count < 5 for count in self.max_matches):
             raise ValueError(f"max_matches must be 0 or at least 5, got {self.max_matches}")
         for name in ("threshold_px", "inlier_px"):

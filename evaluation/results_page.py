@@ -312,7 +312,10 @@ def results_page(folder: Path = RESULTS) -> str:
 
 
 def readme_table(folder: Path = RESULTS) -> str:
-    """Return the README's short table: path errors in the default mode, recordings by links."""
+    """Return the README's short table: path errors in the default mode, recordings by links.
+
+    Recordings that were sent over most links come first.
+    """
     errors: dict[str, dict[str, str]] = {}
     for file in sorted(folder.glob("trajectory_*.json")):
         report = json.loads(file.read_text(encoding="utf-8"))
@@ -326,7 +329,8 @@ def readme_table(folder: Path = RESULTS) -> str:
                     number(cell["ate_percent"]) + share
                 )
     links = list(README_LINKS.values())
-    rows = [[name, *(of.get(link, "-") for link in links)] for name, of in sorted(errors.items())]
+    ordered = sorted(errors.items(), key=lambda entry: (-len(entry[1]), entry[0]))
+    rows = [[name, *(of.get(link, "-") for link in links)] for name, of in ordered]
     return "\n".join(table(("recording", *links), rows))
 
 

@@ -19,7 +19,7 @@ class DecodeAhead(Generic[In, Out]):
     """One slot between decoder and tracker.
 
     The next message is taken only when the slot is free: while the tracker is busy, frames wait (or are
-    superseded) where they arrive, and the tracker never gets one older than its own last frame took.
+    superseded) where they arrive, and a decoded one never waits longer than the tracker's last frame took.
 
     Args:
         take: Waits up to the given seconds for a message; None when there was none. Where it fails, that is

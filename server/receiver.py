@@ -25,6 +25,7 @@ from semcast.common.symbol_payload import lost_slots_of, slots_of
 from semcast.common.transport import Session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.server.arrival import Arrivals
+from semcast.server.backlog import Backlog
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +78,8 @@ class ReceivedFrame:
 class Receiver:
     """Takes the frames of one agent from the network. ``next`` belongs to one thread.
 
-    In ``live`` mode the newest frame wins; in ``replay`` every frame is delivered once and in order, and the
+    In ``live`` mode frames wait while a busy moment is worked off, and of a consumer that is too slow the
+    newest one wins, see ``Backlog``; in ``replay`` every frame is delivered once and in order, and the
     agent is told how many it may send, and which it may forget: those that are ``done``. Frames of the other
     kind are dropped as ``mode``. What does not get to ``next`` is counted in ``metrics`` by reason, see
     ``Arrivals``; further reasons are ``camera`` (nobody says what the camera is), ``too_old`` and
@@ -111,11 +113,13 @@ class Receiver:
         self._max_age_ms = max_age_ms
         self._lock = threading.Lock()
         self._arrivals = Arrivals(lossless=mode == "replay", drop=metrics.drop)
-        self._box: Mailbox[tuple[SymbolFrame, int]] = Mailbox(1 if mode == "live" else 4 * WINDOW, "newest")
+        self._box: Backlog[tuple[SymbolFrame, int]] | Mailbox[tuple[SymbolFrame, int]] = (
+            Backlog() if mode == "live" else Mailbox(4 * WINDOW, "newest")
+        )
         self._held: tuple[SymbolFrame, int] | None = None
         self._cameras: dict[int, CameraInfo] = {}
         self._snr_set: OrderedDict[tuple[int, int], float] = OrderedDict()
-        self._num_superseded = 0
+        self._num_superseded = self._num_given_way = 0
         self._reporter: tuple[tuple[int, str], LinkReporter] | None = None
         self._roles: set[str] = set()
         self._told: set[str] = set()
@@ -220,13 +224,17 @@ class Receiver:
                 self._metrics.drop("epoch", dropped)
                 self._num_superseded = 0
             if taken:
-                before = self._box.dropped
                 self._box.put((frame, arrival_ns))
-                superseded = self._box.dropped - before
-                self._num_superseded += superseded
-                self._metrics.drop("superseded", superseded)
+                self._count_superseded()
         if self._mode == "replay":
             self._send_flow()
+
+    def _count_superseded(self) -> None:
+        """Count what gave way to newer frames since the last time; the lock is held."""
+        superseded = self._box.dropped - self._num_given_way
+        self._num_given_way += superseded
+        self._num_superseded += superseded
+        self._metrics.drop("superseded", superseded)
 
     def _beat(self) -> None:
         while not self._stopping.wait(FLOW_INTERVAL_S):
@@ -258,6 +266,8 @@ class Receiver:
         deadline_s = time.monotonic() + timeout_s
         while not self._stopping.is_set():
             entry = self._take_held() or self._box.get(max(0.0, deadline_s - time.monotonic()))
+            with self._lock:
+                self._count_superseded()
             if entry is None:
                 return None
             frame = self._prepare(*entry)

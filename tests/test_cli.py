@@ -64,6 +64,17 @@ def test_an_unknown_option_is_wrong_usage(capsys):
     assert exit_info.value.code == 2
 
 
+@pytest.mark.parametrize("words", [["channel", "--snr-db", "much"], ["eval", "codec", "--snr-db", "much"]])
+def test_wrong_usage_is_one_line_that_names_the_help(words, capsys):
+    with pytest.raises(SystemExit):
+        main(words)
+    verb = " ".join(w for w in words[:-2])
+    assert capsys.readouterr().err == (
+        f"semcast {verb}: argument --snr-db: invalid float value: 'much' "
+        f"('semcast {verb} --help' lists the options)\n"
+    )
+
+
 def test_an_error_is_one_line_and_exit_code_1(tmp_path, capsys):
     missing = tmp_path / "none.toml"
     assert main(["channel", "run", "--config", str(missing)]) == 1

@@ -117,6 +117,11 @@ def test_a_run_is_described(run_folder):
     assert "tracked by time of arrival: 3.9 frames a second" in text
 
 
+def test_all_files_that_exports_and_viewers_read_are_listed(run_folder):
+    (run_folder / "dense.ply").write_bytes(bytes(2048))
+    assert "dense.ply: 2.0 KiB" in text_of(run_folder)
+
+
 def test_a_run_of_one_part_says_nothing_of_parts_and_one_of_two_says_so(run_folder):
     values = {
         "intrinsics": Intrinsics(fx=50, fy=50, cx=31.5, cy=23.5, width=64, height=48),

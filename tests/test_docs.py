@@ -66,6 +66,12 @@ def test_links_between_pages_lead_somewhere(page):
             assert (page.parent / target).exists(), f"{page.name} links to {target}"
 
 
+def test_the_files_that_the_page_on_the_paper_names_are_there():
+    named = re.findall(r"`([\w/]+\.py)`", (ROOT / "docs/paper.md").read_text(encoding="utf-8"))
+    assert len(named) > 20
+    assert not [file for file in named if not (ROOT / file).is_file()]
+
+
 def test_the_figures_in_the_docs_are_those_of_the_result_files(monkeypatch):
     monkeypatch.chdir(ROOT)
     assert (ROOT / "docs/results.md").read_text(encoding="utf-8") == results_page(), "run make results-page"

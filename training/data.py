@@ -29,8 +29,10 @@ class CropSettings:
     """
 
     size_px: int = field(default=128, metadata={"help": "side of a crop, a multiple of 16"})
-    scale_min: float = field(default=0.5, metadata={"help": "smallest factor a photo is resized by before"})
-    scale_max: float = field(default=0.9, metadata={"help": "largest"})
+    scale_min: float = field(
+        default=0.5, metadata={"help": "smallest factor by which a photo is resized first"}
+    )
+    scale_max: float = field(default=0.9, metadata={"help": "largest such factor"})
     share_grey: float = field(default=0.18, metadata={"help": "share of crops turned grey"})
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Dense SIFT-like descriptors in torch, for the paper's descriptor consistency (Eq. 7)."""
+"""Dense SIFT-like descriptors in torch, for the paper's descriptor consistency (Eq. 9)."""
 
 import math
 

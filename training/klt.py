@@ -117,7 +117,7 @@ def start_from_klt(model: Transceiver, images: list[NDArray[np.uint8]], generato
     encoder, decoder = model.encoder, model.decoder
     with torch.no_grad():
         if isinstance(encoder, Encoder) and isinstance(decoder, Decoder):
-            _start_heart(encoder.linear, decoder.linear, linear_link(images, LATENT_CHANNELS, generator))
+            _start_linear(encoder.linear, decoder.linear, linear_link(images, LATENT_CHANNELS, generator))
         elif isinstance(encoder, VitEncoder) and isinstance(decoder, VitDecoder):
             _start_vit(encoder, decoder, linear_link(images, LATENT_CHANNELS, generator))
         elif isinstance(encoder, MaeEncoder) and isinstance(decoder, MaeDecoder):
@@ -139,15 +139,15 @@ def _bias(layer: nn.Conv2d | nn.ConvTranspose2d) -> torch.Tensor:
     return layer.bias
 
 
-def _start_heart(heart_in: BlockAnalysis, heart_out: BlockSynthesis, link: LinearLink) -> None:
-    _set(heart_in.transform.weight, link.analysis)
-    _set(heart_in.transform.bias, -link.analysis @ link.mean)
-    _set(heart_in.mix.weight, link.mix)
-    _set(heart_out.unmix.weight, link.unmix)
-    _set(heart_out.unmix.bias, np.zeros(LATENT_CHANNELS))
-    _set(heart_out.log_power, np.log(link.power))
-    _set(heart_out.transform.weight, link.synthesis)
-    _set(heart_out.transform.bias, link.mean)
+def _start_linear(analysis: BlockAnalysis, synthesis: BlockSynthesis, link: LinearLink) -> None:
+    _set(analysis.transform.weight, link.analysis)
+    _set(analysis.transform.bias, -link.analysis @ link.mean)
+    _set(analysis.mix.weight, link.mix)
+    _set(synthesis.unmix.weight, link.unmix)
+    _set(synthesis.unmix.bias, np.zeros(LATENT_CHANNELS))
+    _set(synthesis.log_power, np.log(link.power))
+    _set(synthesis.transform.weight, link.synthesis)
+    _set(synthesis.transform.bias, link.mean)
 
 
 def _start_vit(encoder: VitEncoder, decoder: VitDecoder, link: LinearLink) -> None:

@@ -59,7 +59,7 @@ def reconstruction_loss(x_hat: Tensor, x: Tensor, knee: float) -> tuple[Tensor, 
 
 
 def confidence_label(x_hat: Tensor, x: Tensor, sharpness: float) -> Tensor:
-    """Return the paper's pseudo-label (Eq. 9), ``(B, 1, H, W)``, from the mean error over colour."""
+    """Return the paper's pseudo-label (Eq. 11), ``(B, 1, H, W)``, from the mean error over colour."""
     error = (x_hat.detach().clamp(0.0, 1.0) - x).abs().mean(dim=1, keepdim=True)
     return 1.0 - torch.tanh(sharpness * error)
 

@@ -1,7 +1,7 @@
 """Eight-bit convolutions for an exported encoder: about twice as fast where bfloat16 is not in hardware.
 
 Weights and activations of the network's convolutions become integers, their ranges learned from images. The
-linear heart, which carries most of the picture and takes a fiftieth of the work, stays in floating point.
+linear transform, which carries most of the picture and takes a fiftieth of the work, stays in floating point.
 """
 
 import logging

@@ -21,7 +21,7 @@ def rate_factor(progress: float, step: int, settings: TrainSettings) -> float:
 
 
 def build_optimisers(model: Transceiver, settings: TrainSettings) -> list[torch.optim.Optimizer]:
-    """Give kernels and a transformer's matrices to Muon (or AdamW), the linear heart and the rest to AdamW.
+    """Give kernels and a transformer's matrices to Muon (or AdamW), the rest to AdamW.
 
     First and last layers of the image path are AdamW's: their rows are pixels, not features. Weights that
     need no gradient are left out.

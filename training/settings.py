@@ -19,29 +19,34 @@ class TrainSettings:
 
     architecture: str = field(default="3dcsc-lite", metadata={"help": "architecture from the registry"})
     data: Path = field(default=Path("data/train"), metadata={"help": "folder of training images"})
-    valid: Path | None = field(default=None, metadata={"help": "folder of images to choose by"})
+    valid: Path | None = field(default=None, metadata={"help": "folder of images to validate on"})
     out: Path = field(
         default=Path("checkpoints/3dcsc-lite"), metadata={"help": "folder of checkpoint and log"}
     )
     steps: int = field(default=100_000, metadata={"help": "optimiser steps"})
     minutes: float = field(
-        default=0.0, metadata={"help": "end after this much training time if steps are not done; 0: no limit"}
+        default=0.0, metadata={"help": "end after so many minutes even if steps are left; 0: no limit"}
     )
     warmup_steps: int = field(default=300, metadata={"help": "steps of linear warm-up"})
     decay_share: float = field(
-        default=0.25, metadata={"help": "last share of the run: learning rate falls to 0"}
+        default=0.25, metadata={"help": "last share of the run, over which the learning rate falls to 0"}
     )
-    batch: int = field(default=16, metadata={"help": "crops in a step, for each process"})
-    optimiser: Literal["muon", "adamw"] = field(default="muon", metadata={"help": "for convolution kernels"})
+    batch: int = field(default=16, metadata={"help": "crops per step and process"})
+    optimiser: Literal["muon", "adamw"] = field(
+        default="muon", metadata={"help": "optimiser of convolution kernels"}
+    )
     lr: float = field(default=1e-3, metadata={"help": "learning rate of AdamW"})
     lr_muon: float = field(default=0.006, metadata={"help": "learning rate of Muon"})
-    lr_linear: float = field(default=2e-4, metadata={"help": "learning rate of the linear heart"})
+    lr_linear: float = field(default=2e-4, metadata={"help": "learning rate of the linear transform"})
     weight_decay: float = field(
         default=1.0, metadata={"help": "decay of Muon's kernels: holds their largest gain near 1 / decay"}
     )
-    clip: float = field(default=0.01, metadata={"help": "largest norm of the gradient"})
+    clip: float = field(default=0.01, metadata={"help": "norm to which gradients are clipped"})
     ema: float = field(default=0.999, metadata={"help": "decay of the averaged weights that are shipped"})
-    start: Literal["klt", "random"] = field(default="klt", metadata={"help": "linear layers at the start"})
+    start: Literal["klt", "random"] = field(
+        default="klt",
+        metadata={"help": "first weights of linear layers; klt: the Karhunen-Loeve transform of the images"},
+    )
     grow_from: Path | None = field(
         default=None,
         metadata={
@@ -49,7 +54,8 @@ class TrainSettings:
         },
     )
     pretrain_share: float = field(
-        default=0.0, metadata={"help": "first share of the run: fill in hidden patches, without a link (mae)"}
+        default=0.0,
+        metadata={"help": "first share of the run, spent on filling in hidden patches without a link (mae)"},
     )
     analog_share: float = field(
         default=0.0,
@@ -62,7 +68,7 @@ class TrainSettings:
     head_every: int = field(
         default=4,
         metadata={
-            "help": "train the confidence heads every N steps, and always in the last quarter of the decay"
+            "help": "train the confidence heads every N steps, in every step of the decay's last quarter"
         },
     )
     only_heads: bool = field(
@@ -73,17 +79,19 @@ class TrainSettings:
         },
     )
     seed: int = field(default=0, metadata={"help": "seed of weights, data order and links"})
-    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where to train"})
+    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "device to train on"})
     bf16: bool = field(default=True, metadata={"help": "bfloat16 autocast"})
     compile: bool = field(default=False, metadata={"help": "torch.compile the networks"})
-    threads: int = field(default=0, metadata={"help": "CPU threads; 0: as torch decides"})
+    threads: int = field(default=0, metadata={"help": "CPU threads; 0: torch decides"})
     data_workers: int = field(
         default=1, metadata={"help": "threads that cut crops; about 8 keep one GPU busy"}
     )
     log_every: int = field(default=50, metadata={"help": "steps between log lines"})
     valid_every: int = field(default=2000, metadata={"help": "steps between validations"})
     save_every: int = field(default=1000, metadata={"help": "steps between checkpoints"})
-    resume: bool = field(default=True, metadata={"help": "go on from the checkpoint in out, if there is one"})
+    resume: bool = field(
+        default=True, metadata={"help": "continue from the checkpoint in --out, if there is one"}
+    )
     crop: CropSettings = field(default_factory=CropSettings)
     channel: ChannelSettings = field(default_factory=ChannelSettings)
     loss: LossSettings = field(default_factory=LossSettings)

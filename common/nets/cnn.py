@@ -1,4 +1,4 @@
-"""The plain convolutional rival: stride-2 convolutions with PReLU, no attention, no linear heart."""
+"""The plain convolutional baseline: stride-2 convolutions with PReLU, no attention, no linear transform."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""The confidence branch (paper Sec. III-B): received features, fused with every decoder stage."""
+"""The confidence branch (paper Sec. IV-B): received features, fused with every decoder stage."""
 
 import torch
 from torch import Tensor, nn

@@ -1,4 +1,4 @@
-"""The linear heart of the transceiver: a block transform, mixing, and a Wiener filter at the receiver.
+"""The linear part of the transceiver: a block transform, mixing, and a Wiener filter at the receiver.
 
 Optimal linear analog transmission gives coefficient i of a Karhunen-Loeve transform a power proportional to
 the square root of its variance; an orthogonal mixing then spreads the coefficients so that every channel use

@@ -1,4 +1,4 @@
-"""The masked-autoencoder rival: few large patches, first trained to fill in hidden ones, then over the link.
+"""The masked-autoencoder baseline: few large patches, trained to fill in hidden ones, then over the link.
 
 The paper cuts 800x800 images into 16 x 16 patches of 50 x 50 pixels. Slots cover blocks of 16 pixels, so the
 patch here is the nearest whole number of blocks, 48 pixels. A patch's pixels pass a narrow layer shared by

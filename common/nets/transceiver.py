@@ -31,7 +31,7 @@ class Transceiver(nn.Module):
     """Encoder and decoder with the modulation between them.
 
     Any encoder ``(x, snr_db) -> latent`` and decoder ``(y, snr_db, shrink, scale) -> (x_hat,
-    DecoderFeatures)`` fit; the rivals use the same shell.
+    DecoderFeatures)`` fit; the baselines use the same shell.
     """
 
     def __init__(self, encoder: nn.Module, decoder: nn.Module, confidence: nn.Module) -> None:

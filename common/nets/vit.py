@@ -1,4 +1,4 @@
-"""The transformer rival: 16x16 patches, transformer encoder and decoder, linear maps to latent and pixels."""
+"""The transformer baseline: 16x16 patches, transformer encoder and decoder, linear maps at both ends."""
 
 import math
 from dataclasses import dataclass

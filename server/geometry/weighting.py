@@ -1,6 +1,6 @@
 """From confidence to weight: the only place where one becomes the other.
 
-One noise model everywhere: ``sigma^2(c) = sigma0^2 exp(beta (1 - c))`` (Eq. 22 of the paper). It sets the
+One noise model everywhere: ``sigma^2(c) = sigma0^2 exp(beta (1 - c))`` (Eq. 23 of the paper). It sets the
 thresholds of the two-view search, the weights of PnP and the factor noise of bundle adjustment.
 
 ``paper`` takes the codec's pixel confidence for ``c`` and given ``sigma0`` and ``beta``. ``robust`` first
@@ -31,7 +31,7 @@ SIGMA0_RANGE_PX = (0.25, 6.0)
 #: A gate is never narrower than that of this sigma: landmarks have errors of their own, and a gate that
 #: follows the residuals it lets through would close by itself.
 _MIN_GATE_SIGMA_PX = 0.6
-#: The pixel confidence is trained on ``1 - tanh(30 |x_hat - x|)`` (paper Sec. III-B) with images in [0, 1].
+#: The pixel confidence is trained on ``1 - tanh(30 |x_hat - x|)`` (paper Sec. IV-B) with images in [0, 1].
 _LABEL_SHARPNESS = 30.0
 #: What tracking errs by without a link, and the expected error from which a position is worth nothing.
 _TRACKING_PX, _MOST_PX = 0.3, 5.0
@@ -73,7 +73,7 @@ class NoiseModel:
         return np.asarray(self.sigma0_px * np.exp(0.5 * self.beta * (1.0 - c)))
 
     def weight(self, confidence: NDArray) -> Array:
-        """``w = sigma^-2`` (Eq. 22), per square pixel."""
+        """``w = sigma^-2`` (Eq. 23), per square pixel."""
         return self.sigma_px(confidence) ** -2
 
     def threshold_px(self, confidence: NDArray) -> Array:

@@ -13,7 +13,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from semcast import SemcastError, __version__
 from semcast.common.argument_order import arguments_last
@@ -51,7 +51,13 @@ EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose help fails where standard output can't be written; argparse keeps that to itself."""
+    """A parser that says what is wrong in a line, without the usage of dozens of options before it.
+
+    Its help fails where standard output can't be written; argparse keeps that to itself.
+    """
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(EXIT_USAGE, f"{self.prog}: {message} ('{self.prog} --help' lists the options)\n")
 
     def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
         if sys.stdout is not None and file is sys.stdout:

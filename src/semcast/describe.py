@@ -11,6 +11,7 @@ from semcast.common.camera_settings import HOW_TO_GIVE
 from semcast.common.errors import CheckpointError, SourceError
 from semcast.common.recording_reader import RECORDING_METADATA, RecordingReader
 from semcast.common.run_folder import (
+    DENSE_NAME,
     FRAMES_NAME,
     MAP_NAME,
     RECONSTRUCTION_NAME,
@@ -140,7 +141,15 @@ def describe_run(path: Path) -> list[Section]:
         )
     if line := parts_line(parts):
         facts.append(("parts", line))
-    names = (TRAJECTORY_NAME, MAP_NAME, VIEWER_NAME, RECONSTRUCTION_NAME, FRAMES_NAME, SUMMARY_NAME)
+    names = (
+        TRAJECTORY_NAME,
+        MAP_NAME,
+        DENSE_NAME,
+        VIEWER_NAME,
+        RECONSTRUCTION_NAME,
+        FRAMES_NAME,
+        SUMMARY_NAME,
+    )
     files = [(name, _bytes((path / name).stat().st_size)) for name in names if (path / name).is_file()]
     images = read_image_paths(path)
     if images:

@@ -1,0 +1,110 @@
+"""Frames that wait for the decoder: a busy moment is worked off, a lasting overload gets the newest frame."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, NamedTuple, TypeVar
+
+T = TypeVar("T")
+
+#: Longest wait: of those that wait for more, the oldest gives way to a newer one.
+MAX_WAIT_S = 0.5
+#: A consumer that has not caught up after so long will not: from then on only the newest waits,
+CATCH_UP_S = 1.0
+#: until nothing had to give way for so long.
+RECOVERY_S = 2.0
+#: Whatever their rate, no more are kept.
+MAX_WAITING = 64
+
+
+class _Waiting(NamedTuple, Generic[T]):
+    item: T
+    since_s: float
+
+
+class Backlog(Generic[T]):
+    """A queue bounded in time, in which newer items win; those that gave way are counted.
+
+    Beginning a map, or another process, keeps a consumer for some tenths of a second, and then it is faster
+    than what comes: nothing has to be lost for that. One that is too slow for good would only be late with
+    all it does, so its queue ends after ``CATCH_UP_S``.
+
+    Args:
+        clock: Returns seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._waiting: deque[_Waiting[T]] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._dropped = 0
+        self._behind_since_s: float | None = None
+        self._newest_only = False
+        self._last_drop_s = 0.0
+
+    @property
+    def dropped(self) -> int:
+        """Items that gave way to newer ones."""
+        with self._changed:
+            return self._dropped
+
+    def __len__(self) -> int:
+        with self._changed:
+            return len(self._waiting)
+
+    def put(self, item: T) -> bool:
+        """Add an item; False when the queue is closed."""
+        with self._changed:
+            if self._closed:
+                return False
+            now_s = self._clock()
+            self._waiting.append(_Waiting(item, now_s))
+            self._thin_out(now_s)
+            self._changed.notify_all()
+            return True
+
+    def get(self, timeout_s: float | None = None) -> T | None:
+        """Take the oldest item; None when there was none in time, or the queue is closed and empty."""
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._waiting) or self._closed, timeout_s)
+            if not self._waiting:
+                return None
+            now_s = self._clock()
+            self._thin_out(now_s)
+            item = self._waiting.popleft().item
+            if not self._waiting:
+                self._behind_since_s = None
+            elif self._behind_since_s is None:
+                self._behind_since_s = now_s
+            return item
+
+    def _thin_out(self, now_s: float) -> None:
+        """Let older items give way, as it is time; the newest stays."""
+        if self._behind_since_s is not None and now_s - self._behind_since_s > CATCH_UP_S:
+            self._newest_only, self._last_drop_s = True, now_s
+        elif self._newest_only and now_s - self._last_drop_s > RECOVERY_S:
+            self._newest_only = False
+        while len(self._waiting) > 1 and (
+            self._newest_only
+            or now_s - self._waiting[0].since_s > MAX_WAIT_S
+            or len(self._waiting) > MAX_WAITING
+        ):
+            self._waiting.popleft()
+            self._dropped += 1
+            self._last_drop_s = now_s
+
+    def clear(self) -> int:
+        """Throw everything away and return how many items that were; they don't count as ``dropped``."""
+        with self._changed:
+            count = len(self._waiting)
+            self._waiting.clear()
+            self._behind_since_s = None
+            return count
+
+    def close(self) -> None:
+        """Refuse further items and wake all who wait; what is inside can still be taken. Idempotent."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
