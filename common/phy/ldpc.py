@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from semcast.common.phy.ldpc_graph import CORE_ROWS, BaseGraph, BlockPlan
 from semcast.common.shapes import check_shape
 
-#: Scale of the min-sum messages; plain min-sum (1.0) loses about half a dB.
-MIN_SUM_SCALE = 0.7
-_SIGN = np.uint32(0x80000000)
+#: Bounds of ``|tanh(LLR / 2)|``: a product can be divided by each of its factors, and no message is infinite.
+_SMALLEST, _LARGEST = np.float32(1e-6), np.float32(1.0 - 2.0**-23)
 #: LLR of a filler bit, which is known to be zero.
 _KNOWN_ZERO = np.float32(1e4)
 
@@ -127,35 +126,24 @@ def _scatter(target: NDArray[np.float32], source: NDArray[np.float32], shift: in
 def _update_row(
     belief: NDArray[np.float32], messages: NDArray[np.float32], row: tuple[tuple[int, int], ...]
 ) -> None:
-    """Process one base row in place: the layer of a layered normalised min-sum decoder.
+    """Process one base row in place: the layer of a layered sum-product decoder.
+
+    ``tanh(out_e / 2)`` is the product of ``tanh(in_d / 2)`` over the other edges ``d`` of the check.
 
     Args:
         belief: ``(num_columns, Z, B)`` a-posteriori LLRs.
         messages: ``(degree, Z, B)`` what the row told each of its columns last time.
         row: Its edges.
     """
-    degree = len(row)
     inputs = np.empty_like(messages)
     for edge, (column, shift) in enumerate(row):
         _gather(inputs[edge], belief[column], shift)
     inputs -= messages
-    magnitude = np.abs(inputs)
-    signs = inputs.view(np.uint32) & _SIGN
-    smallest = np.minimum(magnitude[0], magnitude[1])
-    second = np.maximum(magnitude[0], magnitude[1])
-    spare = np.empty_like(smallest)
-    for edge in range(2, degree):
-        np.maximum(magnitude[edge], smallest, out=spare)
-        np.minimum(second, spare, out=second)
-        np.minimum(smallest, magnitude[edge], out=smallest)
-    signs ^= np.bitwise_xor.reduce(signs, axis=0)
-    is_smallest = magnitude == smallest
-    smallest *= np.float32(MIN_SUM_SCALE)
-    second *= np.float32(MIN_SUM_SCALE)
-    np.copyto(messages, smallest)
-    np.copyto(messages, np.broadcast_to(second, messages.shape), where=is_smallest)
-    bits = messages.view(np.uint32)
-    bits |= signs
+    half = np.tanh(np.float32(0.5) * inputs)
+    np.copyto(half, _SMALLEST, where=np.abs(half) < _SMALLEST)
+    np.divide(np.multiply.reduce(half, axis=0), half, out=half)
+    np.clip(half, -_LARGEST, _LARGEST, out=half)
+    np.log((np.float32(1.0) + half) / (np.float32(1.0) - half), out=messages)
     inputs += messages
     for edge, (column, shift) in enumerate(row):
         _scatter(belief[column], inputs[edge], shift)
@@ -175,7 +163,7 @@ def _failed(belief: NDArray[np.float32], rows: tuple[tuple[tuple[int, int], ...]
 
 
 def decode(plan: BlockPlan, llr: NDArray[np.float32], max_iterations: int = 30) -> DecodedBlocks:
-    """Decode by layered normalised min-sum, each block until its parity checks hold.
+    """Decode by layered sum-product, each block until its parity checks hold.
 
     Args:
         plan: The code.
