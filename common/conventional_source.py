@@ -10,8 +10,8 @@ from semcast.common.image import psnr_db
 
 ImageFormat = Literal["jpeg", "webp", "avif"]
 #: Below this quality a smaller image at higher quality may look better, so both are tried.
-_POOR_QUALITY = 10
-_SCALES = (1.0, 0.5, 0.25, 0.125)
+_POOR_QUALITY = 40
+_SCALES = (1.0, 0.75, 0.5, 0.35, 0.25, 0.125)
 #: Range of the quality setting: AVIF at 0 is still an image, WebP above 100 would be lossless.
 _MAX_QUALITY = 100
 

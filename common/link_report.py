@@ -100,8 +100,10 @@ def reachable_snr_db(frames: Sequence[SlotSnrs]) -> float:
         frames: The newest ones, of equally many slots.
     """
     reachable = LOST_SLOT_SNR_DB
+    constellations = {mode.bits_per_symbol for mode in ADAPTIVE_MODES}
+    steady = {bits_per_symbol: steady_snr_db(frames, bits_per_symbol) for bits_per_symbol in constellations}
     for mode, above in zip(ADAPTIVE_MODES, (*ADAPTIVE_MODES[1:], None), strict=True):
-        steady_db = steady_snr_db(frames, mode.bits_per_symbol)
+        steady_db = steady[mode.bits_per_symbol]
         if steady_db >= mode.min_snr_db:
             # Not so far that the next mode, which was not asked yet, would be taken.
             most_db = np.inf if above is None else np.nextafter(above.min_snr_db, -np.inf)

@@ -185,6 +185,16 @@ def test_under_a_tight_budget_a_smaller_image_is_sent(picture):
     assert decompress(b"", (160, 240)) is None
 
 
+def test_a_smaller_image_is_sent_where_it_comes_closer_to_the_original(picture):
+    blurred = cv2.GaussianBlur(picture, (0, 0), 3)
+    bgr = cv2.cvtColor(blurred, cv2.COLOR_RGB2BGR)
+    whole = compress(bgr, "jpeg", 25)
+    _, data = compress_to_fit(blurred, "jpeg", len(whole))
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape[0] < 160
+    gain_db = psnr_db(decompress(data, (160, 240)), blurred) - psnr_db(decompress(whole, (160, 240)), blurred)
+    assert gain_db > 1.0
+
+
 def test_jpeg_is_always_there():
     assert supported("jpeg")
 
