@@ -62,10 +62,13 @@ class NoiseModel:
     Attributes:
         sigma0_px: Standard deviation per pixel coordinate of a fully trusted keypoint.
         beta: How fast the variance grows as confidence falls; 0 ignores confidence.
+        huber_px: Residual in pixels at which Huber's loss turns linear, whatever the weight (Eq. 22: weights
+            outside of the loss). None: ``HUBER_K`` of each observation's own sigmas.
     """
 
     sigma0_px: float
     beta: float
+    huber_px: float | None = None
 
     def sigma_px(self, confidence: NDArray) -> Array:
         """Standard deviation per coordinate, ``(N,)`` for ``(N,)`` confidences."""
@@ -157,7 +160,7 @@ class OnlineNoise:
         self._mode = mode
         self._fit = fit and mode != "paper"
         start_beta = beta if mode == "paper" or (not fit and mode != "off") else 0.0
-        self.model = NoiseModel(sigma0_px, start_beta)
+        self.model = NoiseModel(sigma0_px, start_beta, HUBER_K * sigma0_px if mode == "paper" else None)
         self._recent: deque[tuple[Array, Array]] = deque(maxlen=8)
 
     def add(self, confidence: Array, residual_px: Array) -> None:

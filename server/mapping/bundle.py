@@ -52,6 +52,17 @@ def residuals_px(problem: BundleProblem, T_world_cam: Array, xyz: Array) -> tupl
     return np.where(front[:, None], problem.xy - projected, np.nan), front
 
 
+def _noise_model(sigma_px: float, huber_px: float | None) -> gtsam.noiseModel.Robust:
+    """Return Huber's loss of the residual over sigma.
+
+    GTSAM puts the weight inside the loss. With a limit of ``huber_px / sigma`` that is ``sigma^-2`` times the
+    loss of the residual in pixels, as in Eq. 22.
+    """
+    limit = HUBER_K if huber_px is None else huber_px / sigma_px
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(limit)
+    return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, sigma_px))
+
+
 def _build(
     problem: BundleProblem, used: NDArray[np.bool_]
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -72,10 +83,7 @@ def _build(
     for p in np.unique(problem.point[used]).tolist():
         values.insert(L(p), problem.xyz[p])
     sigmas, step = quantised_sigma(problem.sigma_px)
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K)
-    models = [
-        gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, float(s))) for s in sigmas
-    ]
+    models = [_noise_model(float(sigma), problem.huber_px) for sigma in sigmas]
     fx, fy, cx, cy = problem.intrinsics
     calibration = gtsam.Cal3_S2(fx, fy, 0.0, cx, cy)
     factor = gtsam.GenericProjectionFactorCal3_S2

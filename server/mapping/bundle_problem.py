@@ -36,6 +36,7 @@ class BundleProblem:
         num_anchors: So many of the first keyframes are of long ago; they are held, and only what the others
             see is adjusted.
         with_covariance: Whether the covariance of the last pose is wanted.
+        huber_px: See ``NoiseModel``.
     """
 
     intrinsics: tuple[float, float, float, float]
@@ -54,6 +55,7 @@ class BundleProblem:
     map_version: int = 0
     num_anchors: int = 0
     with_covariance: bool = True
+    huber_px: float | None = None
 
 
 class Frame(Protocol):
@@ -134,6 +136,7 @@ def assemble_problem(
         map_version=map_version,
         num_anchors=num_anchors,
         with_covariance=with_covariance,
+        huber_px=noise.huber_px,
     )
 
 

@@ -131,10 +131,15 @@ def test_what_is_not_fitted_is_as_set_after_a_restart_too():
     for mode, fit in (("paper", True), ("robust", False)):
         noise = OnlineNoise(mode, 2.0, 3.0, fit)
         noise.restore(state)
-        assert noise.model == NoiseModel(2.0, 3.0)
+        assert replace(noise.model, huber_px=None) == NoiseModel(2.0, 3.0)
     noise = OnlineNoise("off", 2.0, 3.0, True)
     noise.restore(state)
     assert noise.model == NoiseModel(0.3, 0.0)
+
+
+def test_the_papers_loss_does_not_know_the_weights():
+    assert OnlineNoise("paper", 0.5, 2.0, True).model.huber_px == pytest.approx(0.5 * 1.345)
+    assert OnlineNoise("robust", 0.5, 2.0, True).model.huber_px is None
 
 
 def test_fit_can_be_switched_off():

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
+from semcast.server.mapping import bundle
 from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.bundle_process import ProcessBundle
@@ -170,6 +171,29 @@ def test_residuals_by_hand():
     residual, front = residuals_px(one, np.eye(4)[None], np.array([[0.0, 0.0, 2.0]]))
     assert residual.tolist() == [[10.0, -5.0]]
     assert front.tolist() == [True]
+
+
+def test_the_weight_is_outside_of_the_loss_in_the_papers_objective_and_inside_in_our_own():
+    sigmas, _ = quantised_sigma(np.ones(1))
+    sigma, residual_px, limit_px = sigmas[8], 5.0, 1.0
+    one = {
+        "fixed": np.array([False]),
+        "T_world_cam": np.eye(4)[None],
+        "xyz": np.array([[0.0, 0.0, 2.0]]),
+        "xy": np.array([[CX + residual_px, CY]]),
+        "view": np.array([0]),
+        "point": np.array([0]),
+        "sigma_px": np.array([sigma]),
+    }
+    problem = BundleProblem(**{**vars(make_problem()[0]), **one})
+    paper = BundleProblem(**{**vars(problem), "huber_px": limit_px})
+    used = np.array([True])
+    # Eq. 22: w rho(r), with rho linear beyond the limit: sigma^-2 (1 * 5 - 1 / 2).
+    graph, values = bundle._build(paper, used)
+    assert graph.error(values) == pytest.approx(4.5 / sigma**2)
+    # Ours: rho(r / sigma), linear beyond 1.345 sigma.
+    graph, values = bundle._build(problem, used)
+    assert graph.error(values) == pytest.approx(1.345 * (residual_px / sigma - 1.345 / 2))
 
 
 def test_inline_gives_the_same_bits_again():
