@@ -21,7 +21,7 @@ class ReconstructionSettings:
 
     confidence: ConfidenceMode = field(
         default="robust",
-        metadata={"help": "use of confidence: robust, paper (equations to the letter), off, or an ablation"},
+        metadata={"help": "use of confidence: robust, paper (the paper's equations), off, or an ablation"},
     )
     seed: int = field(default=0, metadata={"help": "seed of every random search"})
     max_features: int = field(default=500, metadata={"help": "keypoints followed at most"})
