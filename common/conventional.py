@@ -56,8 +56,9 @@ class Mode(NamedTuple):
 
 MODE_MARGIN_DB = 0.5
 FIXED_MODE = Mode(bits_per_symbol=4, rate=0.5, min_snr_db=6.7)
-#: Modulations and rates of 5G NR (3GPP TS 38.214, table 5.1.3.1-1) without the two that another one of about
-#: as many bits outdoes. Ascending in bits per channel use; the receiver learns the position in this table.
+#: Modulations and rates of 5G NR (3GPP TS 38.214, table 5.1.3.1-1), but where two have about as many bits the
+#: one that needs less SNR: QPSK to rate .66, and 16-QAM to rate .84, where 5G turns to 64-QAM at .64.
+#: Ascending in bits per channel use; the receiver learns the position in this table.
 ADAPTIVE_MODES = (
     Mode(2, 120 / 1024, -20.0),
     Mode(2, 157 / 1024, -4.3),
@@ -75,9 +76,11 @@ ADAPTIVE_MODES = (
     Mode(4, 553 / 1024, 7.3),
     Mode(4, 616 / 1024, 8.6),
     Mode(4, 658 / 1024, 9.1),
-    Mode(6, 466 / 1024, 10.3),
-    Mode(6, 517 / 1024, 11.2),
-    Mode(6, 567 / 1024, 12.1),
+    Mode(4, 700 / 1024, 9.8),
+    Mode(4, 740 / 1024, 10.3),
+    Mode(4, 790 / 1024, 11.1),
+    Mode(4, 822 / 1024, 11.5),
+    Mode(4, 860 / 1024, 12.1),
     Mode(6, 616 / 1024, 13.2),
     Mode(6, 666 / 1024, 14.1),
     Mode(6, 719 / 1024, 15.2),
