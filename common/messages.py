@@ -384,6 +384,7 @@ class StatusMessage:
         drops: Frames dropped since the start, by reason.
         stages_ms: Stage to (p50, p95, max) over the last frames.
         last_error: One line, empty when there was none.
+        activity: What it is at besides frames, in a few words; empty when it is at nothing else.
     """
 
     version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
@@ -396,6 +397,7 @@ class StatusMessage:
     drops: dict[str, int] = field(metadata=rule(Named(WholeNumber())))
     stages_ms: dict[str, tuple[float, ...]] = field(metadata=rule(Named(Many(Number(0.0), count=3))))
     last_error: str = field(metadata=rule(Text(1000)))
+    activity: str = field(default="", metadata=rule(Text(200)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,6 +36,7 @@ class Metrics:
         self._events_ns: dict[str, deque[int]] = {}
         self._stages_ms: dict[str, deque[float]] = {}
         self._last_error = ""
+        self._activity = ""
 
     def count(self, event: str, by: int = 1) -> None:
         """Count an event; its rate is reported too."""
@@ -71,6 +72,11 @@ class Metrics:
         with self._lock:
             self._last_error = sendable(text, 1000)
             self._counts["errors"] = self._counts.get("errors", 0) + 1
+
+    def be_at(self, activity: str) -> None:
+        """Note what the process is at besides frames, in a few words; empty when it is done with that."""
+        with self._lock:
+            self._activity = sendable(activity, 200)
 
     @property
     def drops(self) -> dict[str, int]:
@@ -116,7 +122,7 @@ class Metrics:
     def status(self, agent_epoch: int) -> StatusMessage:
         """Return the message that is sent once a second."""
         with self._lock:
-            last_error = self._last_error
+            last_error, activity = self._last_error, self._activity
         return StatusMessage(
             role=self._role,
             agent_epoch=agent_epoch,
@@ -126,6 +132,7 @@ class Metrics:
             drops=self.drops,
             stages_ms={stage: tuple(values) for stage, values in self.stages_ms().items()},
             last_error=last_error,
+            activity=activity,
         )
 
     def summary(self) -> dict[str, Any]:

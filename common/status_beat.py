@@ -36,9 +36,10 @@ class StatusBeat:
 
     def _run(self) -> None:
         while not self._stopping.wait(STATUS_INTERVAL_S):
-            self._send()
+            self.send()
 
-    def _send(self) -> None:
+    def send(self) -> None:
+        """Send the status now, before work that does not let go of the interpreter for seconds."""
         try:
             self._publisher.put(pack(self._metrics.status(self._agent_epoch())))
         except SemcastError as err:
@@ -49,4 +50,4 @@ class StatusBeat:
         if not self._stopping.is_set():
             self._stopping.set()
             self._thread.join(2.0)
-            self._send()
+            self.send()

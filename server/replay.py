@@ -28,6 +28,7 @@ from semcast.common.rate import belongs_to
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.symbol_payload import data_symbols, lost_slots_of, slots_of
 from semcast.common.wire import WireError, unpack
+from semcast.server.conclusion import conclude
 from semcast.server.decoder import DecodedArrival, FrameDecoder
 from semcast.server.former_run import output_folder
 from semcast.server.frame_views import missing_view
@@ -138,6 +139,7 @@ def replay(
     settings: ReplaySettings,
     stop: threading.Event | None = None,
     on_frame: Callable[[int], None] | None = None,
+    on_activity: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
     """Replay one stream of a recording: the one asked for, else the last that has frames.
 
@@ -145,6 +147,7 @@ def replay(
         settings: What and how.
         stop: Ends early; outputs are still written.
         on_frame: Is told the id of each frame that was processed.
+        on_activity: Is told what is going on after the last one.
 
     Returns:
         The summary, which is also in ``summary.json`` of ``settings.out``.
@@ -172,7 +175,7 @@ def replay(
     )
     check_viewer(server)
     with output_folder(settings.out):
-        return _replayed(settings, server, reader, stream, stop or threading.Event(), on_frame)
+        return _replayed(settings, server, reader, stream, stop or threading.Event(), on_frame, on_activity)
 
 
 def _replayed(
@@ -182,6 +185,7 @@ def _replayed(
     stream: RecordedStream,
     stop: threading.Event,
     on_frame: Callable[[int], None] | None,
+    on_activity: Callable[[str], None] | None,
 ) -> dict[str, Any]:
     """Decode and reconstruct the frames of a stream; return the summary."""
     agent_id, camera = stream.agent_id, stream.camera
@@ -216,12 +220,12 @@ def _replayed(
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
         with contextlib.suppress(OSError):  # said at the end
             session.write_results(settings.out)  # who stops the replay may not wait for the adjustment
-        update = session.conclude()
-        if viewer is not None:
-            viewer.submit(None, update)
-        for patches in session.complete_cloud(0.0 if stop.is_set() else None):
-            if viewer is not None:
-                viewer.submit(None, None, patches)
+        conclude(
+            session,
+            lambda update, patches: viewer.submit(None, update, patches) if viewer is not None else None,
+            on_activity or (lambda text: None),
+            0.0 if stop.is_set() else None,
+        )
         try:
             whole = settings.start_s == 0.0 and settings.end_s is None and not stop.is_set()
             return session.write_outputs(settings.out, drops, complete=whole)

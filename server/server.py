@@ -5,7 +5,7 @@ import functools
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,14 @@ from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
 from semcast.common.transport import open_session
 from semcast.common.wire import WireError, pack, unpack
+from semcast.server.conclusion import conclude
 from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import DecodedArrival, FrameDecoder, codec_loader
+from semcast.server.dense.cloud import DensePatch
 from semcast.server.former_run import free_folder, output_folder
 from semcast.server.frame_views import missing_view
 from semcast.server.mapping.bundle_problem import BundleRunner
+from semcast.server.mapping.state import MapUpdate
 from semcast.server.outbox import Outbox, map_message
 from semcast.server.receiver import ReceivedFrame, Receiver
 from semcast.server.record import recording
@@ -33,7 +36,7 @@ from semcast.server.reference import Reference, sequence_reference
 from semcast.server.requests import RequestDesk
 from semcast.server.session import Arrival, Outcome, Session, new_bundle
 from semcast.server.settings import ServerSettings
-from semcast.server.stream_identity import StreamIdentity
+from semcast.server.stream_identity import StreamIdentity, is_nearly_final
 from semcast.server.view.choice import SuccessiveViews, check_viewer
 
 logger = logging.getLogger(__name__)
@@ -43,9 +46,7 @@ CAMERA_TIMEOUT_S = 0.5
 WARM_UP_SHAPE_HW = (256, 384)
 #: How long stragglers are waited for after the source's last frame.
 FINAL_IDLE_S = 0.5
-#: The last frame may be lost on the air: the last so many, or the last fifth where that is fewer, count as
-#: the end once the agent is gone.
-NEARLY_FINAL_FRAMES = 10
+#: The last frame may be lost on the air: one of the last ones is the end once the agent is gone so long.
 AGENT_GONE_S = 2.0
 #: How long after a restart of the agent its former start's frames may still come: above any channel's delay.
 STRAGGLER_NS = 20_000_000_000
@@ -102,10 +103,10 @@ class Server:
             )
             self._outbox = Outbox(session, self._agent_id, self._metrics)
             stack.callback(self._outbox.close)
-            beat = StatusBeat(
+            self._beat = StatusBeat(
                 session, self._agent_id, "server", self._metrics, lambda: self._receiver.agent_epoch
             )
-            stack.callback(beat.close)
+            stack.callback(self._beat.close)
             session.answer(control_key(self._agent_id, "server"), self._answer)
             session.answer(map_key(self._agent_id), self._answer_map)
             stack.callback(self._close_spare)
@@ -281,7 +282,7 @@ class Server:
             session = self._begin(decoded.arrival.camera)
         session.note_arrival(message.frame_id, message.seq, final=message.final)
         self._complete = message.final
-        self._nearly_final = _is_nearly_final(message.frame_id, decoded.arrival.camera)
+        self._nearly_final = is_nearly_final(message.frame_id, decoded.arrival.camera)
         if decoded.frame is None:
             self._metrics.drop("lost_on_air" if decoded.arrival.received is None else "outage")
             self._views.submit(missing_view(decoded, self._metrics.drops))
@@ -352,6 +353,7 @@ class Server:
             self._conclude(former, _IN_A_HURRY_S)
             self._views.end_stream()
             self._end_former(former)
+            self._be_at("")
         self._former_epochs.discard(identity.agent_epoch)
         self._complete = self._nearly_final = False
         other_camera = former is not None and former.identity.camera != identity.camera
@@ -399,11 +401,18 @@ class Server:
     def _conclude(self, session: Session, depth_budget_s: float | None) -> None:
         """Adjust the whole map of a stream that has ended, and tell who follows it."""
         self._save(session)  # the adjustment takes seconds, and the server may be stopped or killed meanwhile
-        if (update := session.conclude()) is not None:
-            self._outbox.put_map(session.identity.agent_epoch, update)
-            self._views.submit(None, update)
-        for patches in session.complete_cloud(depth_budget_s):
-            self._views.submit(None, None, patches)
+
+        def show(update: MapUpdate | None, patches: Sequence[DensePatch]) -> None:
+            if update is not None:
+                self._outbox.put_map(session.identity.agent_epoch, update)
+            self._views.submit(None, update, patches)
+
+        conclude(session, show, self._be_at, depth_budget_s)
+
+    def _be_at(self, activity: str) -> None:
+        """Let the status say at once what the server is at; see ``Metrics.be_at``."""
+        self._metrics.be_at(activity)
+        self._beat.send()
 
     def _drops(self) -> dict[str, int]:
         """Drops since the present stream began."""
@@ -459,15 +468,6 @@ class Server:
         reference, self._reference = self._reference, None
         if reference is not None:
             reference.close()
-
-
-def _is_nearly_final(frame_id: int, camera: CameraInfo) -> bool:
-    """Whether a frame is among the last of a finite source, whose ids may count in steps."""
-    last_id = camera.last_frame_id
-    if camera.num_frames is None or last_id is None:
-        return False
-    nearly = min(NEARLY_FINAL_FRAMES, max(1, camera.num_frames // 5))
-    return frame_id > last_id - nearly * camera.frame_step
 
 
 def _not_written(folder: Path | None, err: Exception) -> str:

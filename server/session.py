@@ -340,6 +340,17 @@ class Session:
         self._cloud.follow(update)
         return update
 
+    @property
+    def num_to_adjust(self) -> int:
+        """Keyframes that ``conclude`` will adjust."""
+        wanted = self._settings.reconstruction.final_adjustment
+        return len(self._reconstruction.world.keyframes) if wanted else 0
+
+    @property
+    def num_without_depth(self) -> int:
+        """Keyframes whose depth ``complete_cloud`` has still to estimate."""
+        return self._cloud.num_waiting
+
     def complete_cloud(self, budget_s: float | None = None) -> Iterator[tuple[DensePatch, ...]]:
         """Estimate the depth that is still missing, after ``conclude``, and yield what is new in the cloud.
 

@@ -16,9 +16,6 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-#: Keyframes whose depth takes so long that it is said what is going on.
-_MANY_WAITING = 10
-
 
 class SessionCloud:
     """Grows beside a map, where the settings want it; an error ends it and not the stream.
@@ -74,6 +71,11 @@ class SessionCloud:
             ids = update.keyframe_ids.tolist()
             self._guarded(lambda builder: builder.follow(self._reconstruction.world, ids), None)
 
+    @property
+    def num_waiting(self) -> int:
+        """Keyframes whose depth may still be estimated."""
+        return self._guarded(lambda builder: builder.num_waiting, 0)
+
     def complete(self, budget_s: float | None = None) -> Iterator[tuple[DensePatch, ...]]:
         """Estimate the depth that is still missing and yield what is new.
 
@@ -82,8 +84,6 @@ class SessionCloud:
         """
         if self._builder is None:
             return
-        if self._builder.num_waiting > _MANY_WAITING:
-            logger.info("the depth of %d keyframes is estimated now", self._builder.num_waiting)
         try:
             yield from self._builder.finish(self._reconstruction.world, budget_s)
         except Exception as err:

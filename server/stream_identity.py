@@ -6,6 +6,9 @@ from typing import Self
 from semcast.common.camera import Intrinsics
 from semcast.common.messages import CameraInfo
 
+#: Nearly the last are so many frames, or the last fifth where that is fewer.
+NEARLY_FINAL_FRAMES = 10
+
 
 @dataclass(frozen=True)
 class StreamIdentity:
@@ -50,3 +53,12 @@ class StreamIdentity:
         if self.num_frames is None or self.last_frame_id in (None, final_id):
             return self.num_frames
         return final_id // self.frame_step + 1
+
+
+def is_nearly_final(frame_id: int, camera: CameraInfo) -> bool:
+    """Tell whether a frame is among the last of a finite source, whose ids may count in steps."""
+    last_id = camera.last_frame_id
+    if camera.num_frames is None or last_id is None:
+        return False
+    nearly = min(NEARLY_FINAL_FRAMES, max(1, camera.num_frames // 5))
+    return frame_id > last_id - nearly * camera.frame_step

@@ -7,9 +7,12 @@ import os
 import signal
 import threading
 import time
+import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
+from multiprocessing.reduction import ForkingPickler
 from typing import Generic, TypeVar
 
 from semcast.common.interrupts import deaf_children
@@ -26,21 +29,50 @@ _CLOSE_DEADLINE_S = 3.0
 MAX_FAILURES = 5
 
 
+@dataclass(frozen=True)
+class Answer(Generic[Result]):
+    """What came of one problem.
+
+    Attributes:
+        result: Of the work, where it was done.
+        failure: Why it was not, in a line.
+        trace: Where it was not, for who looks for the cause.
+    """
+
+    result: Result | None = None
+    failure: str | None = None
+    trace: str = ""
+
+    @classmethod
+    def failed(cls, err: Exception) -> "Answer[Result]":
+        """Return the answer of work that raised."""
+        said = f"{type(err).__name__}: {' '.join(str(err).split())}".removesuffix(": ")
+        return cls(failure=said, trace=traceback.format_exc())
+
+
 def serve(connection: Connection, work: Callable[[Problem], Result], stands_back: bool) -> None:
-    """Answer problems until the other end closes; the body of the child process."""
+    """Answer problems until the other end closes; the body of the child process.
+
+    Work that raises, or whose result can't be sent, is answered with why; the next one is another matter.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows nothing else keeps Ctrl-C away
     if stands_back:
         _stand_back()
     while True:
         try:
-            problem = connection.recv()
+            received = connection.recv_bytes()
         except (EOFError, OSError):
             return
-        if problem is None:
-            return
         try:
-            connection.send(work(problem))
-        except (BrokenPipeError, OSError):
+            problem = ForkingPickler.loads(received)
+            if problem is None:
+                return
+            answer = ForkingPickler.dumps(Answer(work(problem)))
+        except Exception as err:
+            answer = ForkingPickler.dumps(Answer.failed(err))
+        try:
+            connection.send_bytes(answer)
+        except OSError:
             return
 
 
@@ -60,20 +92,27 @@ class _Exchange(threading.Thread, Generic[Problem, Result]):
     def __init__(self, connection: Connection, problem: Problem, name: str) -> None:
         super().__init__(name=name, daemon=True)
         self.problem = problem
-        self.result: Result | None = None
+        #: None where the child has gone.
+        self.answer: Answer[Result] | None = None
         self.since_s = time.monotonic()
         self._connection = connection
         self.start()
 
     def run(self) -> None:
-        """Send and receive; without a result the child is gone."""
-        with contextlib.suppress(EOFError, OSError):
+        """Send and receive; without an answer the child is gone."""
+        try:
             self._connection.send(self.problem)
-            self.result = self._connection.recv()
+            self.answer = self._connection.recv()
+        except (EOFError, OSError):
+            return
+        except Exception as err:  # it can't be packed or unpacked: nothing is left in the pipe
+            self.answer = Answer.failed(err)
 
 
 class Worker(Generic[Problem, Result]):
     """Works in a child process that is started again when it dies.
+
+    Work that raises is told in a line of the log and has no result; the child goes on with the next.
 
     The child imports the program's main module: a script needs ``if __name__ == "__main__":`` around what it
     does.
@@ -135,23 +174,25 @@ class Worker(Generic[Problem, Result]):
 
     @property
     def pid(self) -> int | None:
-        """Process id of the child, None where there is none any more."""
+        """Process id of the child, None where there is none."""
         return self._process.pid if self._process is not None else None
 
     def _start(self) -> None:
         self._is_due = False
         self._stop()
         ours, theirs = self._context.Pipe()
-        self._process = self._context.Process(
+        process = self._context.Process(
             target=serve,
             args=(theirs, self._work, self._stands_back),
             name=f"semcast-{self._name}",
             daemon=True,
         )
-        with deaf_children():  # Ctrl-C is the parent's business
-            self._process.start()
-        theirs.close()
-        self._connection = ours
+        with contextlib.ExitStack() as on_failure:
+            on_failure.callback(ours.close)
+            with theirs, deaf_children():  # Ctrl-C is the parent's business
+                process.start()
+            on_failure.pop_all()
+        self._process, self._connection = process, ours
 
     def _restart(self) -> None:
         self._failures += 1
@@ -160,7 +201,14 @@ class Worker(Generic[Problem, Result]):
             return
         self.num_restarts += 1
         logger.warning("%s ended and is started again", self._what)
-        self._start()
+        self._start_if_possible()
+
+    def _start_if_possible(self) -> None:
+        """Start the child; where the system has no room for it, the next problem is another occasion."""
+        try:
+            self._start()
+        except OSError as err:
+            logger.warning("%s can't be started: %s", self._what, err)
 
     def _give_up(self) -> None:
         self._stop()
@@ -173,7 +221,7 @@ class Worker(Generic[Problem, Result]):
         if self._closed or self._exchange is not None:
             return False
         if self._is_due:
-            self._start()
+            self._start_if_possible()
         for _ in range(2):
             if self.given_up:
                 return False
@@ -186,7 +234,7 @@ class Worker(Generic[Problem, Result]):
         return False
 
     def take(self, wait: bool = False) -> Result | None:
-        """Return the result, or None when it is not there yet or the child died over it.
+        """Return the result, or None when it is not there yet, the work raised or the child died over it.
 
         A child that has had a problem for longer than its deadline is ended. A problem whose child died is
         sent once more when the result is waited for.
@@ -203,13 +251,19 @@ class Worker(Generic[Problem, Result]):
                     return None
                 self._end_exchange()
             self._exchange = None
-            if exchange.result is not None:
+            if exchange.answer is not None:
                 self._failures = 0
-                return exchange.result
+                return self._result_of(exchange.answer)
             self._restart()
             if not wait or is_last or not self.submit(exchange.problem):
                 return None
         return None
+
+    def _result_of(self, answer: Answer[Result]) -> Result | None:
+        if answer.failure is not None:
+            logger.error("%s could not do a piece of its work: %s", self._what, answer.failure)
+            logger.debug("%s", answer.trace)
+        return answer.result
 
     def _end_exchange(self) -> None:
         """End what the child is at, and with it the child."""
@@ -231,7 +285,8 @@ class Worker(Generic[Problem, Result]):
             if process.is_alive():
                 process.kill()
                 process.join(_CLOSE_DEADLINE_S)
-            process.close()
+            with contextlib.suppress(ValueError):  # the system does not let go of it
+                process.close()
 
     def close(self) -> None:
         """End the child. Idempotent."""

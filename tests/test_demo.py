@@ -16,9 +16,11 @@ from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import ConfigError, SemcastError
+from semcast.common.metrics import Metrics
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
 from semcast.common.transport import free_endpoint
+from semcast.common.wire import pack
 from semcast.demo import (
     Alive,
     DemoSettings,
@@ -190,6 +192,32 @@ def test_a_role_that_gives_up_ends_the_demo_and_one_that_is_stopped_does_not(tmp
     assert ["start it again with" in line for line in told] == ([] if ends else [True])
 
 
+def test_the_status_line_says_what_the_server_is_at_after_the_last_frame(tmp_path):
+    rows, stop = [], threading.Event()
+    line = {"frame_id": 49, "state": "tracking", "num_inliers": 120, "psnr_db": None}
+    (tmp_path / "frames.jsonl").write_text(json.dumps(line) + "\n")
+    alive = Alive(set(), threading.Condition())
+    metrics = Metrics("server")
+    notes = ["last adjustment of 9 keyframes", "depth 3 of 9 keyframes"]
+
+    def progress(done, text):
+        rows.append((done, text))
+        if not notes:
+            stop.set()
+            return
+        metrics.be_at(notes.pop(0))
+        alive.on_status(pack(metrics.status(1)))
+
+    child = Role("server", [], tmp_path / "log")
+    child.log.touch()
+    demo._watch(tmp_path, {"server": child}, alive, tmp_path / "none", stop, lambda line: None, progress)
+    assert rows == [
+        (50, "tracking      120 inliers"),
+        (50, "last adjustment of 9 keyframes"),
+        (50, "depth 3 of 9 keyframes"),
+    ]
+
+
 def test_a_folder_with_images_no_run_wrote_is_no_place_for_outputs(tmp_path):
     sequence = tmp_path / "sequence"
     shutil.copytree(SEQUENCE, sequence)
@@ -210,7 +238,9 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
     assert summary is not None
     assert {line.split()[0] for line in told} >= {"server", "channel", "agent"}
     assert rows[-1][0] == 51
-    assert rows[-1][1].startswith("tracking ")
+    frames = [text for _, text in rows if "inliers" in text]
+    assert frames[-1].startswith("tracking ")
+    assert rows[-1][1].startswith(("last adjustment of ", "depth ", "writing results"))
     for name in ("trajectory.tum", "map.ply", "summary.json", "settings.toml"):
         assert (tmp_path / name).stat().st_size > 0
     in_force = build_settings(DemoSettings, read_toml(tmp_path / "demo.toml"))
@@ -222,12 +252,12 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
     assert info.complete
     assert not info.missed
     # What the server itself sends is recorded with the rest.
-    assert info.counts["semcast/demo/tx/symbols"] >= len(rows)
-    assert info.counts["semcast/demo/rx/symbols"] >= len(rows)
-    assert info.counts["semcast/demo/pose"] >= len(rows)
+    assert info.counts["semcast/demo/tx/symbols"] >= len(frames)
+    assert info.counts["semcast/demo/rx/symbols"] >= len(frames)
+    assert info.counts["semcast/demo/pose"] >= len(frames)
     assert info.counts["semcast/demo/camera"] >= 1
     again = replay(ReplaySettings(file=recording, reference=SEQUENCE))
-    assert again["frames"]["tracked"] >= len(rows)  # none is too old or overtaken in a replay
+    assert again["frames"]["tracked"] >= len(frames)  # none is too old or overtaken in a replay
 
 
 @pytest.mark.slow

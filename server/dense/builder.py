@@ -136,7 +136,7 @@ class DenseBuilder:
         return scale is not None and abs(scale - 1.0) > _SCALE_CHANGE
 
     def finish(self, world: WorldMap, budget_s: float | None = None) -> Iterator[tuple[DensePatch, ...]]:
-        """Make points of what is there, for the stream has ended, and yield them as they come.
+        """Make points of what is there, for the stream has ended, and yield after each depth map what is new.
 
         Args:
             world: The map as it is.
@@ -148,9 +148,10 @@ class DenseBuilder:
             self._begin(world, is_last=True)
             if not self._runner.busy:
                 break
-            if changes := self.take_changes():
+            changes = self.take_changes()
+            if changes or end_s is None:
                 yield changes
-            elif end_s is not None:
+            else:
                 time.sleep(_POLL_S)
         while self._unconfirmed:
             self._confirm(self._unconfirmed.pop(0), world)
@@ -158,8 +159,8 @@ class DenseBuilder:
 
     @property
     def num_waiting(self) -> int:
-        """Keyframes whose depth may still be estimated."""
-        return len(self._waiting)
+        """Keyframes whose depth may still be estimated, the one at work among them."""
+        return len(self._waiting) + self._runner.busy
 
     def take_changes(self) -> tuple[DensePatch, ...]:
         """Return patches that were added or changed since this was last called."""

@@ -215,6 +215,7 @@ class Alive:
     changed: threading.Condition
     num_outages: int = 0
     num_unreadable: int = 0
+    activity: str = ""
 
     def on_change(self, role: str, alive: bool) -> None:
         """Take one change."""
@@ -228,6 +229,7 @@ class Alive:
             status = unpack(payload, StatusMessage)
             if status.role == "server":
                 self.num_outages = status.drops.get("outage", 0)
+                self.activity = status.activity
             else:
                 self.num_unreadable = status.drops.get("unreadable", 0)
 
@@ -444,7 +446,8 @@ def _watch(
     """Follow the rows the server writes until its summary is there; tell which process gave up, and why."""
     rows = out / "frames.jsonl"
     read_bytes = 0
-    num_outages = 0
+    num_done = num_outages = 0
+    activity = ""
     page: str | None = None
     while not stop.is_set() and not summary_file.exists():
         if page is None and (page := children["server"].viewer_address()) is not None:
@@ -471,10 +474,14 @@ def _watch(
             read_bytes += len(complete) + bool(complete)
             for line in complete.splitlines():
                 row = json.loads(line)
-                progress(row["frame_id"] + 1, _standing(row))
+                num_done = row["frame_id"] + 1
+                progress(num_done, _standing(row))
         if not read_bytes and alive.num_outages > num_outages:
-            num_outages = alive.num_outages
-            progress(num_outages, f"no image could be decoded, {num_outages} outages")
+            num_done = num_outages = alive.num_outages
+            progress(num_done, f"no image could be decoded, {num_outages} outages")
+        if alive.activity != activity:
+            activity = alive.activity
+            progress(num_done, activity)
         with alive.changed:
             alive.changed.wait(0.1)
     return None

@@ -83,6 +83,14 @@ def test_the_status_travels(metrics, clock):
     assert metrics.summary()["stage_ms"]["encode"] == {"p50": 4.0, "p95": 4.0, "max": 4.0}
 
 
+def test_what_a_process_is_at_travels_until_it_is_done(metrics):
+    assert metrics.status(7).activity == ""
+    metrics.be_at("depth 3 of 9 keyframes")
+    assert unpack(pack(metrics.status(7)), StatusMessage).activity == "depth 3 of 9 keyframes"
+    metrics.be_at("")
+    assert metrics.status(7).activity == ""
+
+
 def test_an_error_about_a_file_whose_name_is_no_text_does_not_end_the_status(metrics):
     metrics.error("room\udcff can't be written to")
     assert unpack(pack(metrics.status(1)), StatusMessage).last_error == "room? can't be written to"

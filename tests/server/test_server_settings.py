@@ -17,8 +17,9 @@ from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import HubSettings
 from semcast.common.sequence import open_sequence
 from semcast.common.transport import open_hub
-from semcast.server.server import Server, _is_nearly_final
+from semcast.server.server import Server
 from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.stream_identity import is_nearly_final
 
 AGENT = "cam0"
 DEMO = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
@@ -112,7 +113,7 @@ def test_the_last_frames_are_known_by_their_ids(num_frames, last_id, frame_id, i
         last_frame_id=last_id,
         lossless=False,
     )
-    assert _is_nearly_final(frame_id, camera) is is_near
+    assert is_nearly_final(frame_id, camera) is is_near
 
 
 def test_the_reference_follows_the_camera_of_a_restarted_agent(session):

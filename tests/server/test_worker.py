@@ -1,10 +1,17 @@
-"""Children that work: begun when they are needed, and behind all others where they may wait."""
+"""Children that work: begun when needed, behind all others where they may wait, and not easily upset."""
 
+import logging
 import os
+import signal
+import threading
+from pathlib import Path
 
 import pytest
 
 from semcast.server.worker import Worker
+
+WHAT = "the test's child"
+DEADLINE_S = 30.0
 
 
 @pytest.fixture
@@ -12,12 +19,35 @@ def make():
     made = []
 
     def one(work, **how):
-        made.append(Worker(work, name="test", what="the test's child", given_up="it is no more", **how))
+        made.append(Worker(work, name="test", what=WHAT, given_up="it is no more", **how))
         return made[-1]
 
     yield one
     for worker in made:
         worker.close()
+
+
+def answer(worker, problem):
+    assert worker.submit(problem)
+    return worker.take(wait=True)
+
+
+def raise_on_odd(problem):
+    """Keep a note of each time it is asked; what it is asked is a number and the file for the notes."""
+    number, notes = problem
+    with Path(notes).open("a") as file:
+        file.write(f"{number} ")
+    if number % 2:
+        raise ArithmeticError(f"{number} is odd,\nas it happens")
+    return os.getpid()
+
+
+def return_what_cannot_be_sent(problem):
+    return threading.Lock() if problem else "sent"
+
+
+def end_at_once(problem):
+    os._exit(3)
 
 
 def test_a_child_begins_with_its_first_problem_where_that_is_wanted(make):
@@ -39,3 +69,80 @@ def test_a_child_that_stands_back_lets_others_go_first(make):
         worker.submit(0)
         order.append(worker.take(wait=True))
     assert order == [os.nice(0), 19]
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_work_that_raises_is_told_once_and_the_same_child_does_the_next(make, tmp_path, caplog, lossless):
+    worker, notes = make(raise_on_odd, lossless=lossless), str(tmp_path / "notes")
+    asked = [answer(worker, (number, notes)) for number in (2, 3, 5, 4)]
+    assert asked == [worker.pid, None, None, worker.pid]
+    assert Path(notes).read_text() == "2 3 5 4 ", "nothing is asked twice"
+    assert worker.num_restarts == 0
+    told = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    assert told == [
+        f"{WHAT} could not do a piece of its work: ArithmeticError: {n} is odd, as it happens" for n in (3, 5)
+    ]
+
+
+def test_work_that_always_raises_is_no_dying_child(make, tmp_path):
+    worker = make(raise_on_odd)
+    for _ in range(8):
+        assert answer(worker, (1, str(tmp_path / "notes"))) is None
+    assert not worker.given_up
+    assert worker.num_restarts == 0
+
+
+def test_what_cannot_be_sent_either_way_is_told(make, caplog):
+    worker = make(return_what_cannot_be_sent)
+    assert answer(worker, 1) is None
+    assert answer(worker, threading.Lock()) is None
+    assert answer(worker, 0) == "sent"
+    assert worker.num_restarts == 0
+    assert caplog.text.count("cannot pickle '_thread.lock' object") == 2
+
+
+def test_a_child_that_ends_over_its_work_is_started_again_and_given_up_in_the_end(make, caplog):
+    worker = make(end_at_once)
+    for _ in range(3):
+        if worker.submit(0):
+            assert worker.take(wait=True) is None
+    assert worker.given_up
+    assert caplog.text.count("is started again") == 4
+    assert caplog.text.count("it is no more") == 1
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="the system does not list open files")
+def test_nothing_is_left_of_children_that_were_killed_stopped_or_could_not_start(make, monkeypatch):
+    def num_open():
+        return len(os.listdir("/proc/self/fd"))
+
+    first = make(abs)
+    assert answer(first, -1) == 1
+    first.close()  # what multiprocessing itself keeps is there now
+    before = num_open()
+
+    worker = make(abs)
+    pids = []
+    for number in (signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM):
+        assert answer(worker, -1) == 1
+        pids.append(worker.pid)
+        os.kill(worker.pid, number)
+        assert worker.submit(-1)
+        if number == signal.SIGSTOP:
+            worker._exchange.since_s -= 2 * DEADLINE_S
+        assert worker.take(wait=True) == 1
+    pids.append(worker.pid)
+    worker.close()
+
+    def fail(self):
+        raise OSError("no more processes")
+
+    monkeypatch.setattr(worker._context.Process, "start", fail)
+    with pytest.raises(OSError, match="no more processes"):
+        make(abs)
+    assert not make(abs, start_early=False).submit(-1)
+    assert num_open() == before
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+    assert not any("exchange" in thread.name for thread in threading.enumerate())

@@ -50,9 +50,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     def work(stop: threading.Event) -> None:
         with talk.status(Text(f"replaying {settings.file}")) as status:
-            summary.update(
-                replay(settings, stop, lambda k: status.update(Text(f"replaying {settings.file}: frame {k}")))
-            )
+
+            def show(text: str) -> None:
+                status.update(Text(f"replaying {settings.file}: {text}"))
+
+            summary.update(replay(settings, stop, lambda k: show(f"frame {k}"), show))
 
     code = run_until_stopped(work)
     plain_console().print(summary_table(summary))

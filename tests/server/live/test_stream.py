@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import re
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +12,15 @@ import pytest
 
 from semcast.common.codecs import load_codec
 from semcast.common.errors import SemcastError
+from semcast.common.keys import status_key
+from semcast.common.messages import StatusMessage
+from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.slots import layout_for
 from semcast.common.run_folder import read_run
 from semcast.common.symbol_payload import pack_lost
 from semcast.common.trajectory import read_tum
-from semcast.common.transport import open_hub
+from semcast.common.transport import open_client, open_hub
+from semcast.common.wire import unpack
 from semcast.server.export.outputs import read_ply
 from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server
@@ -22,6 +28,7 @@ from semcast.server.settings import ServerSettings, ViewSettings
 
 DEMO = Path(__file__).resolve().parents[3] / "deploy" / "demo" / "kitti_06"
 AGENT = "cam0"
+DEADLINE_S = 60.0
 
 
 def test_a_lossless_stream_leaves_every_promised_file_and_repeats_bit_for_bit(tmp_path, open_air):
@@ -65,6 +72,40 @@ def test_a_stream_is_saved_and_released_where_the_adjustment_at_its_end_is_broke
     assert len(read_run(tmp_path).frame_ids) >= 8
     names = {thread.name for thread in threading.enumerate()}
     assert names.isdisjoint({"semcast-checkpoint", "semcast-images"})
+
+
+def test_the_status_says_at_once_what_the_end_of_a_stream_waits_for(air, monkeypatch, caplog):
+    monkeypatch.setattr("semcast.common.status_beat.STATUS_INTERVAL_S", 1000.0)
+    monkeypatch.setattr("semcast.server.conclusion._MANY", 2)
+    monkeypatch.setattr("semcast.server.conclusion._LOG_INTERVAL_S", 0.0)
+    caplog.set_level("INFO")
+    told = []
+
+    def hear(payload):
+        if (activity := unpack(payload, StatusMessage).activity) not in told[-1:]:
+            told.append(activity)
+
+    with open_client(NetworkSettings(connect=(air.endpoint,)), DEADLINE_S) as client:
+        client.subscribe(status_key(AGENT, "server"), "every", hear)
+        running = air.serve(dense_cloud="end")
+        radio = air.agent(100)
+        radio.stream(range(14))
+        running.finish(stop=True)
+        end_s = time.monotonic() + DEADLINE_S
+        while "writing results" not in told:
+            assert time.monotonic() < end_s, told
+            time.sleep(0.01)
+    first, *depths, last = told
+    assert re.fullmatch(r"last adjustment of \d+ keyframes", first)
+    done, in_all = zip(*(map(int, re.findall(r"\d+", text)) for text in depths), strict=True)
+    assert depths == [f"depth {k} of {num} keyframes" for k, num in zip(done, in_all, strict=True)]
+    assert done[0] == 0
+    assert list(done) == sorted(set(done)), "those without neighbours are passed over"
+    assert len(done) > 3
+    assert set(in_all) == {done[-1]}
+    assert last == "writing results"
+    assert first in caplog.text
+    assert depths[-1] in caplog.text
 
 
 def test_bad_frames_are_counted_and_never_stop_the_stream(air):
