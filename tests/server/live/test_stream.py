@@ -78,7 +78,7 @@ def test_the_status_says_at_once_what_the_end_of_a_stream_waits_for(air, monkeyp
     monkeypatch.setattr("semcast.common.status_beat.STATUS_INTERVAL_S", 1000.0)
     monkeypatch.setattr("semcast.server.conclusion._MANY", 2)
     monkeypatch.setattr("semcast.server.conclusion._LOG_INTERVAL_S", 0.0)
-    caplog.set_level("INFO")
+    caplog.set_level("INFO", logger="semcast.server.conclusion")
     told = []
 
     def hear(payload):
