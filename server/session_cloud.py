@@ -10,6 +10,7 @@ from semcast.server.dense.cloud import CloudPoints, DensePatch
 from semcast.server.dense.process import InlineDepth, ProcessDepth
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
+from semcast.server.mapping.world_map import WorldMap
 from semcast.server.settings import ServerSettings
 
 logger = logging.getLogger(__name__)
@@ -54,7 +55,7 @@ class SessionCloud:
         def follow(builder: DenseBuilder) -> tuple[DensePatch, ...]:
             world = self._reconstruction.world
             if update is not None:
-                builder.follow(world, update.keyframe_ids.tolist())
+                _follow(builder, world, update)
             if result.is_keyframe:
                 builder.add_keyframe(
                     frame.frame_id, self._reconstruction.put_right(frame.image), frame.confidence
@@ -68,8 +69,7 @@ class SessionCloud:
     def follow(self, update: MapUpdate | None) -> None:
         """Note what the adjustment at the end of a stream has moved."""
         if update is not None:
-            ids = update.keyframe_ids.tolist()
-            self._guarded(lambda builder: builder.follow(self._reconstruction.world, ids), None)
+            self._guarded(lambda builder: _follow(builder, self._reconstruction.world, update), None)
 
     @property
     def num_waiting(self) -> int:
@@ -117,3 +117,8 @@ class SessionCloud:
         if self._on_give_up is not None:
             self._on_give_up(f"the dense cloud no longer grows: {err}")
         self.close()
+
+
+def _follow(builder: DenseBuilder, world: WorldMap, update: MapUpdate) -> None:
+    builder.follow(world, update.keyframe_ids.tolist())
+    builder.withdraw(update.withdrawn.tolist())

@@ -131,6 +131,10 @@ class DenseBuilder:
         if any(self._has_other_scale(k, world) for k in frame_ids if k in self._maps):
             self._maps, self._confirmed, self._unconfirmed = {}, {}, []
 
+    def withdraw(self, frame_ids: Sequence[int]) -> None:
+        """Take away the points of keyframes whose pose was taken back."""
+        self._cloud.withdraw(frame_ids)
+
     def _has_other_scale(self, frame_id: int, world: WorldMap) -> bool:
         scale = scale_since(world, frame_id, *self._landmarks[frame_id])
         return scale is not None and abs(scale - 1.0) > _SCALE_CHANGE

@@ -44,6 +44,10 @@ class DensePatch:
         """Return it with every second point, rather one less than one more."""
         return replace(self, xyz=self.xyz[1::2], rgb=self.rgb[1::2], confidence=self.confidence[1::2])
 
+    def emptied(self) -> "DensePatch":
+        """Return it without points, for who has to take away what it had."""
+        return replace(self, xyz=self.xyz[:0], rgb=self.rgb[:0], confidence=self.confidence[:0])
+
 
 @dataclass(frozen=True)
 class CloudPoints:
@@ -131,6 +135,13 @@ class DenseCloud:
             scale = None if patch is None else scale_since(world, frame_id, *self._landmarks[frame_id])
             if patch is not None and scale is not None and abs(scale / patch.scale - 1.0) > _SCALE_CHANGE:
                 self._patches[frame_id] = replace(patch, scale=scale)
+                self._changed.add(frame_id)
+
+    def withdraw(self, frame_ids: Collection[int]) -> None:
+        """Empty the patches of keyframes whose pose was taken back."""
+        for frame_id in frame_ids:
+            if (patch := self._patches.get(frame_id)) is not None and len(patch.xyz):
+                self._patches[frame_id] = patch.emptied()
                 self._changed.add(frame_id)
 
     def take_changes(self) -> tuple[DensePatch, ...]:

@@ -25,7 +25,7 @@ from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.whole_map import adjust_whole_map
 from semcast.server.mapping.window import build_problem
-from semcast.server.mapping.world_map import Keyframe, WorldMap
+from semcast.server.mapping.world_map import Keyframe, MapChanges, WorldMap
 
 logger = logging.getLogger(__name__)
 
@@ -416,19 +416,19 @@ class MapBuilder:
 
     def take_update(self, map_epoch: int) -> MapUpdate | None:
         """What changed in the map since this was last called, None when nothing did."""
-        changed, removed, keyframes, frames = self.world.take_changes()
-        if len(changed) + len(removed) + len(keyframes) == 0:
-            return None
-        return self._update(map_epoch, changed, removed, keyframes, frames)
+        changes = self.world.take_changes()
+        return self._update(map_epoch, changes) if any(map(len, changes)) else None
 
     def whole(self, map_epoch: int) -> MapUpdate:
         """All landmarks and keyframes, whether they changed or not."""
         keyframes = np.array(sorted(self.world.poses), dtype=np.int64)
         none = np.zeros(0, np.int64)
-        return self._update(map_epoch, self.world.landmarks.ids.copy(), none, keyframes, none)
+        changes = MapChanges(self.world.landmarks.ids.copy(), none, keyframes, frames=none, withdrawn=none)
+        return self._update(map_epoch, changes)
 
-    def _update(self, map_epoch: int, ids: Ids, removed: Ids, keyframes: Ids, frames: Ids) -> MapUpdate:
+    def _update(self, map_epoch: int, changes: MapChanges) -> MapUpdate:
         world = self.world
+        ids, removed, keyframes, frames, withdrawn = changes
         row = world.landmarks.rows(ids)
         frame_poses = np.zeros((0, 4, 4))
         if len(frames):  # a run of hours has a hundred thousand
@@ -445,6 +445,7 @@ class MapBuilder:
             keyframe_poses=np.array([world.poses[k] for k in keyframes.tolist()]).reshape(-1, 4, 4),
             frame_ids=frames,
             frame_poses=frame_poses,
+            withdrawn=withdrawn,
         )
 
     def pose_covariance(self, covariance_in_map: Array | None, T_world_cam: Array) -> Array | None:

@@ -118,6 +118,7 @@ class MapUpdate:
         keyframe_poses: ``(K, 4, 4)`` their ``T_world_cam``.
         frame_ids: ``(F,)`` int64, frames that moved otherwise than with their keyframe: when submaps joined.
         frame_poses: ``(F, 4, 4)`` their ``T_world_cam``.
+        withdrawn: ``(W,)`` int64, frames whose pose was taken back.
     """
 
     map_epoch: int
@@ -130,3 +131,4 @@ class MapUpdate:
     keyframe_poses: Array
     frame_ids: NDArray[np.int64]
     frame_poses: Array
+    withdrawn: NDArray[np.int64]

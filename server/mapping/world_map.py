@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,6 +133,24 @@ class Keyframe:
 _KEYFRAME_PARTS = ("ids", "xy", "confidence", "descriptor_ids", "descriptors")
 
 
+class MapChanges(NamedTuple):
+    """Ids of what has changed in a map, each ascending.
+
+    Attributes:
+        landmarks: Those added or moved.
+        removed: Landmarks that are gone.
+        keyframes: Frame ids of those added or moved; frames move with their keyframe without being named.
+        frames: Frames that moved otherwise.
+        withdrawn: Frames whose pose was taken back.
+    """
+
+    landmarks: Ids
+    removed: Ids
+    keyframes: Ids
+    frames: Ids
+    withdrawn: Ids
+
+
 class WorldMap:
     """Landmarks, keyframes and the poses of all frames relative to keyframes.
 
@@ -155,6 +174,7 @@ class WorldMap:
         self._moved_keyframes: set[int] = set()
         self._frames_moved = False
         self._removed: set[int] = set()
+        self._withdrawn: set[int] = set()
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Append a keyframe."""
@@ -210,6 +230,7 @@ class WorldMap:
 
     def forget_frames(self, frame_ids: Collection[int]) -> None:
         """Take the pose from frames; keyframes among them stay for what they see."""
+        self._withdrawn.update(frame_ids)
         self.frames.forget(frame_ids)
 
     def keyframes_of(self, submap: int) -> list[Keyframe]:
@@ -346,20 +367,18 @@ class WorldMap:
             xy.append(keyframe.xy[seen])
         return np.concatenate(ids), np.concatenate(frames), np.concatenate(xy)
 
-    def take_changes(self) -> tuple[Ids, Ids, Ids, Ids]:
-        """Ids of landmarks added or moved, of removed ones, of keyframes added or moved, and of frames moved.
-
-        Frames move with their keyframe without being named; they are named when they moved otherwise.
-        """
+    def take_changes(self) -> MapChanges:
+        """Return what has changed since this was last called."""
         removed = np.array(sorted(self._removed), dtype=np.int64)
         removed = removed[self.landmarks.rows(removed) < 0]
         changed = np.array(sorted(self._changed), dtype=np.int64)
         changed = changed[self.landmarks.rows(changed) >= 0]
         moved = np.array(sorted(self._moved_keyframes), dtype=np.int64)
         frames = np.array(sorted(self.frames) if self._frames_moved else [], dtype=np.int64)
+        withdrawn = np.array(sorted(k for k in self._withdrawn if k not in self.frames), dtype=np.int64)
         self._changed, self._removed, self._moved_keyframes = set(), set(), set()
-        self._frames_moved = False
-        return changed, removed, moved, frames
+        self._frames_moved, self._withdrawn = False, set()
+        return MapChanges(changed, removed, moved, frames, withdrawn)
 
     def arrays(self) -> dict[str, NDArray]:
         """Everything as plain arrays, for a checkpoint."""

@@ -77,6 +77,7 @@ def _apply(scene: Scene, item: _Pending) -> None:
     if (update := item.update) is not None:
         scene.set_keyframes(update.keyframe_ids, update.keyframe_poses)
         scene.move_frames(update.frame_ids, update.frame_poses)
+        scene.withdraw_frames(update.withdrawn)
         scene.add_landmarks(update.ids, update.xyz, update.rgb, update.confidence, update.removed)
     scene.set_patches(item.patches)
     if item.view is not None:

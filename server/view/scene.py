@@ -8,6 +8,7 @@ from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -195,6 +196,14 @@ class Scene:
         self._T_ref_cam: list[Array] = []
         self._keyframes: dict[int, Array] = {}
         self._keyframe_ids: list[int] = []
+        #: What is known of each posed frame, in the order of the path.
+        self._columns: tuple[list[Any], ...] = (
+            self._frame_ids,
+            self._times_ns,
+            self._references,
+            self._breaks,
+            self._T_ref_cam,
+        )
         self._newest_keyframe = -1
         self._lost_since_pose = False
         self._segment_versions: list[int] = []
@@ -254,6 +263,18 @@ class Scene:
                 self._T_ref_cam[place] = self._in_keyframe(self._references[place], T)
         if len(ids):
             self._touch_segments(range((len(self._frame_ids) - 1) // SEGMENT_POSES + 1))
+
+    def withdraw_frames(self, ids: NDArray[np.int64]) -> None:
+        """Take frames out of the path whose pose was taken back; unknown ones are no error."""
+        places = np.flatnonzero(np.isin(np.array(self._frame_ids, dtype=np.int64), ids)).tolist()
+        for place in reversed(places):
+            is_break = self._breaks[place]
+            for column in self._columns:
+                del column[place]
+            if is_break and place < len(self._breaks):
+                self._breaks[place] = True
+        if places:
+            self._touch_segments(range(places[0] // SEGMENT_POSES, len(self._segment_versions)))
 
     def _touch_segments(self, indices: Sequence[int]) -> None:
         for k in indices:
@@ -376,7 +397,7 @@ class Scene:
     def _strips(self, segment: int) -> list[NDArray[np.float32]]:
         """Line strips of one segment; it starts at the last pose of the one before."""
         start = max(segment * SEGMENT_POSES - 1, 0)
-        stop = min((segment + 1) * SEGMENT_POSES, len(self._frame_ids))
+        stop = max(min((segment + 1) * SEGMENT_POSES, len(self._frame_ids)), start)
         positions = self.poses(start, stop)[:, :3, 3].astype(np.float32)
         cuts = [k for k in range(1, stop - start) if self._breaks[start + k]]
         return [strip for strip in np.split(positions, cuts) if len(strip) > 1]

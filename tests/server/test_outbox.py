@@ -46,6 +46,7 @@ def some_change(rng, map_epoch):
         keyframe_poses=rng.normal(size=(len(keyframe_ids), 4, 4)),
         frame_ids=np.zeros(0, np.int64),
         frame_poses=np.zeros((0, 4, 4)),
+        withdrawn=np.zeros(0, np.int64),
     )
 
 

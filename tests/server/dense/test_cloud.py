@@ -99,3 +99,16 @@ def test_points_of_a_frame_without_a_pose_are_left_out():
     cloud = cloud_of(world)
     world.forget_frames([0])
     assert len(cloud.points(world).xyz) == 10
+
+
+def test_points_go_with_the_pose_of_their_keyframe():
+    world = make_world()
+    cloud = cloud_of(world)
+    cloud.take_changes()
+    world.forget_frames([10])
+    cloud.withdraw([10, 99])
+    (change,) = cloud.take_changes()
+    assert (change.frame_id, len(change.xyz)) == (10, 0)
+    assert len(cloud.points(world).xyz) == len(cloud) == 10
+    cloud.withdraw([10])
+    assert cloud.take_changes() == (), "it is empty already"

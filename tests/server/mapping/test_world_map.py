@@ -68,17 +68,21 @@ def test_frames_follow_their_keyframe():
 
 def test_changes_are_reported_once():
     world = make_world()
-    changed, removed, keyframes, frames = world.take_changes()
+    changed, removed, keyframes, frames, withdrawn = world.take_changes()
     assert changed.tolist() == [1, 2, 3, 5, 6]
     assert removed.tolist() == []
     assert keyframes.tolist() == [0, 10, 20, 30]
-    assert frames.tolist() == []
+    assert frames.tolist() == withdrawn.tolist() == []
     assert sum(len(part) for part in world.take_changes()) == 0
     world.move_landmarks(np.array([2, 77]), np.ones((2, 3)))
     world.remove_landmarks(world.landmarks.ids == 3)
-    changed, removed, _, _ = world.take_changes()
+    world.forget_frames([13, 20, 77])
+    world.forget_frames([23])
+    world.add_frame(23, 20, world.poses[20])
+    changed, removed, _, _, withdrawn = world.take_changes()
     assert changed.tolist() == [2]
     assert removed.tolist() == [3]
+    assert withdrawn.tolist() == [13, 20, 77], "23 has a pose again"
 
 
 def test_a_landmark_that_comes_back_is_not_reported_as_removed():
@@ -86,7 +90,7 @@ def test_a_landmark_that_comes_back_is_not_reported_as_removed():
     world.take_changes()
     world.remove_landmarks(world.landmarks.ids == 3)
     add_world(world, [3], 0, 40)
-    changed, removed, _, _ = world.take_changes()
+    changed, removed, *_ = world.take_changes()
     assert changed.tolist() == [3]
     assert removed.tolist() == []
 
@@ -99,7 +103,7 @@ def test_a_similarity_moves_everything_of_a_submap_alike():
     others = {k: world.pose_of_frame(k) for k in (0, 3, 13)}
     world.take_changes()
     world.transform_submap(1, 0, scale, T)
-    assert world.take_changes()[3].tolist() == sorted(world.frames)
+    assert world.take_changes().frames.tolist() == sorted(world.frames)
     seen_after = transform_points(invert_transform(world.pose_of_frame(33)), world.landmarks.xyz[row])
     assert np.allclose(seen_after, scale * seen_before)
     assert np.allclose(world.pose_of_frame(33)[:3, :3] @ world.pose_of_frame(33)[:3, :3].T, np.eye(3))
@@ -149,7 +153,7 @@ def test_bending_moves_what_each_keyframe_made_with_it_and_in_its_scale():
         np.testing.assert_allclose(T[:3, 3], factor * frames[frame_id][1][:3, 3])
         np.testing.assert_array_equal(T[:3, :3], frames[frame_id][1][:3, :3])
         assert keyframe_id == frames[frame_id][0]
-    changed, _, keyframes, moved = world.take_changes()
+    changed, _, keyframes, moved, _ = world.take_changes()
     assert set(world.landmarks.ids[mine].tolist()) <= set(changed.tolist())
     assert {0, 10, 20} <= set(keyframes.tolist())
     assert moved.tolist() == sorted(world.frames)

@@ -76,6 +76,7 @@ class Update:
         self.keyframe_poses = make_transform(np.eye(3), (0.0, 0.0, 0.1 * k))[None]
         self.frame_ids = np.zeros(0, np.int64)
         self.frame_poses = np.zeros((0, 4, 4))
+        self.withdrawn = np.zeros(0, np.int64)
 
 
 def rerun_output(*arguments):

@@ -260,3 +260,28 @@ def test_pictures_are_jpeg_and_bad_confidence_is_shown_as_none():
     assert colours[1].tolist() == [[40, 200, 220], [165, 30, 75]]
     with pytest.raises(ValueError, match="must have an image"):
         compress_picture(view(0).without_image(), 80)
+
+
+def test_frames_whose_pose_is_taken_back_leave_the_path():
+    scene, cursor = Scene(), Cursor()
+    scene.set_keyframes(np.array([0]), at(0)[None])
+    num = SEGMENT_POSES + 4
+    for k in range(num):
+        scene.add_frame(view(k, at(k)))
+    scene.changes_since(cursor)
+    scene.withdraw_frames(np.array([3, num - 1, 500]))
+    np.testing.assert_array_equal(scene.poses()[:, 0, 3], np.delete(np.arange(num), [3, num - 1]))
+    segments = scene.changes_since(cursor).segments
+    assert 3.0 not in np.concatenate(segments[0])[:, 0]
+    assert segments[1][0][-1, 0] == num - 2
+    scene.withdraw_frames(np.arange(SEGMENT_POSES, num))
+    assert scene.changes_since(cursor).segments[1] == [], "a viewer has to be told that nothing is left"
+
+
+def test_a_gap_stays_when_the_frame_after_it_is_taken_back():
+    scene = Scene()
+    for k, T in enumerate((at(0), at(1), None, at(9), at(10), at(11))):
+        scene.add_frame(view(k, T))
+    scene.withdraw_frames(np.array([3]))
+    (strips,) = scene.changes_since(Cursor()).segments.values()
+    assert [strip[:, 0].tolist() for strip in strips] == [[0.0, 1.0], [10.0, 11.0]]
