@@ -132,6 +132,8 @@ def reconstruct(
     drops = {"lost": num_lost} if num_lost else {}
     sent = stretches({frame_id: k for k, frame_id in enumerate(frame_times_ns)})
     summary = summarise(rows, trajectory, part_of, truth, sent, len(sent), drops, num_keyframes)
+    summary["readout_ms"] = reconstruction.camera.readout_ms
+    summary["readout_from"] = reconstruction.camera.readout_from
     return ReconstructedRun(summary, _plain_rows(rows, trajectory, truth), trajectory, num_landmarks, truth)
 
 

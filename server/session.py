@@ -409,6 +409,8 @@ class Session:
             "digest": self.identity.digest,
             "image_wh": [self.identity.camera.width, self.identity.camera.height],
         }
+        summary["readout_ms"] = self._reconstruction.camera.readout_ms
+        summary["readout_from"] = self._reconstruction.camera.readout_from
         summary["resumed"] = self.resumed
         summary["versions"] = versions()
         summary["settings"] = settings_to_dict(self._program)

@@ -14,6 +14,20 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class ViewMotion:
+    """How views moved while their images were read.
+
+    Attributes:
+        size_wh: Of the images, pixels.
+        velocity: ``(K, 6)`` of each view in its own frame, rotation (rad/s) before translation (map units/s);
+            NaN where unknown.
+    """
+
+    size_wh: tuple[int, int]
+    velocity: Array
+
+
+@dataclass(frozen=True)
 class BundleProblem:
     """A window of keyframes and the landmarks they see.
 
@@ -37,6 +51,7 @@ class BundleProblem:
             see is adjusted.
         with_covariance: Whether the covariance of the last pose is wanted.
         huber_px: See ``NoiseModel``.
+        motion: Of the views, where it is wanted what the residuals say about a rolling shutter.
     """
 
     intrinsics: tuple[float, float, float, float]
@@ -56,6 +71,7 @@ class BundleProblem:
     num_anchors: int = 0
     with_covariance: bool = True
     huber_px: float | None = None
+    motion: ViewMotion | None = None
 
 
 class Frame(Protocol):
@@ -153,6 +169,7 @@ class BundleResult:
         covariance: ``(6, 6)`` marginal covariance of the last keyframe's pose in its own frame, rotation
             before translation, or None.
         elapsed_ms: Time it took.
+        readout: ``(K, 3, 3)``, see ``readout.information``; None where it was not asked for.
     """
 
     problem: BundleProblem
@@ -162,6 +179,7 @@ class BundleResult:
     residual_px: Array
     covariance: Array | None
     elapsed_ms: float
+    readout: Array | None = None
 
 
 class BundleRunner(Protocol):

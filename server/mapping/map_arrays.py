@@ -1,11 +1,13 @@
 """What the arrays of a checkpoint have to be like for a map to be made of them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.shapes import check_shape
+from semcast.server.mapping.readout import AXES, Readout
 
 #: Shapes by name; a word stands for the same size wherever it occurs.
 _SHAPES = {
@@ -32,7 +34,7 @@ _SHAPES = {
     "frames.keyframe_id": "F",
     "frames.T_keyframe_cam": "F 4 4",
 }
-#: Arrays that older checkpoints lack.
+#: Arrays that older checkpoints lack; so they do ``readout``.
 _ADDED = {"revisits": "R 2"}
 #: Keyframes and frames refer to poses by frame id.
 _OF_POSES = {"keyframes.frame_id": "keyframes", "frames.keyframe_id": "frames"}
@@ -68,3 +70,45 @@ def check_map_arrays(arrays: Mapping[str, NDArray], parts: tuple[str, ...]) -> N
         unknown = np.setdiff1d(arrays[name], arrays["poses.frame_id"])
         if len(unknown):
             raise ValueError(f"{what} refer to keyframe {unknown[0]}, which is not there")
+
+
+@dataclass(frozen=True)
+class RunState:
+    """What a run needs to go on, besides its map.
+
+    Attributes:
+        counters: Map epoch, submap, next track's id, newest frame's id.
+        noise: ``(2,)`` of ``OnlineNoise``.
+        readout: That images are put right for; None where a checkpoint does not tell.
+    """
+
+    counters: list[int]
+    noise: NDArray[np.float64]
+    readout: Readout | None
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Return it as plain arrays."""
+        readout = self.readout or Readout("rows", 0.0)
+        return {
+            "counters": np.array(self.counters, dtype=np.int64),
+            "noise": self.noise,
+            "readout": np.array([AXES.index(readout.axis), readout.signed_ms]),
+        }
+
+    @staticmethod
+    def of(arrays: Mapping[str, NDArray]) -> "RunState":
+        """Take what ``arrays`` gave.
+
+        Raises:
+            KeyError: An array is missing.
+            ValueError: An array is not one of a run.
+        """
+        counters, noise = np.asarray(arrays["counters"]), np.asarray(arrays["noise"], dtype=np.float64)
+        if counters.shape != (4,) or noise.shape != (2,) or not np.isfinite(noise).all():
+            raise ValueError("counters and noise of a snapshot must have 4 and 2 finite values")
+        if "readout" not in arrays:
+            return RunState(counters.tolist(), noise, None)
+        readout = np.asarray(arrays["readout"], dtype=np.float64)
+        if readout.shape != (2,) or readout[0] not in (0.0, 1.0) or not np.isfinite(readout).all():
+            raise ValueError(f"readout of a snapshot must be an axis and a time, got {readout}")
+        return RunState(counters.tolist(), noise, Readout(AXES[int(readout[0])], float(readout[1])))

@@ -1,7 +1,8 @@
 """The map as it grows: keyframes, their landmarks, adjustments, and submaps that are joined."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +15,14 @@ from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, colours_of
+from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, View, share_out
+from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, place_anew
+from semcast.server.mapping.rolling_shutter import ImageFlow
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import MapUpdate
@@ -56,6 +60,7 @@ class MapBuilder:
         self._settings = settings
         self._bundle = bundle
         self._version = 0
+        self.watch = ReadoutWatch(camera, is_wanted=settings.watches_readout(camera))
         self.clear()
 
     def clear(self) -> None:
@@ -64,6 +69,7 @@ class MapBuilder:
         if self._bundle.busy:
             self._bundle.take(wait=True)
         self._version += 1
+        self.watch.forget_frames()
         self.world = WorldMap()
         self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
         self.relocaliser = Relocaliser(self._camera, s.seed, s.max_features)
@@ -315,7 +321,7 @@ class MapBuilder:
             map_version=self._version,
         )
         if problem is not None:
-            self._bundle.submit(problem)
+            self._bundle.submit(replace(problem, motion=self.watch.motion(self.world, problem)))
 
     def collect(self, *, wait: bool = False) -> BundleResult | None:
         """Bring a finished adjustment into the map; the result, or None where there is none."""
@@ -326,7 +332,17 @@ class MapBuilder:
         place_left_out(self.world, self._camera, self.noise.model, result)
         if result.covariance is not None:
             self._adjusted = (int(result.problem.keyframe_ids[-1]), result.covariance)
+        self.watch.take(result)
         return result
+
+    def put_right(self, camera: Intrinsics, flows: Mapping[int, ImageFlow]) -> None:
+        """Make up for a rolling shutter that was not known of, see ``put_map_right``, and adjust the map."""
+        if self._bundle.busy:
+            self._bundle.take(wait=True)
+        self._version += 1
+        put_map_right(self.world, self.images, camera, flows)
+        self._submit(start=True)
+        self.collect(wait=True)
 
     def adjust_whole(self) -> int:
         """Adjust all keyframes with all they see, and say how many. Takes seconds where there are many."""

@@ -63,6 +63,10 @@ class KeyframeImages:
             ids = np.array([image.frame_id for image in self._images[: len(self._images) // 2 + 1]])
             del self._images[1 + int(np.argmin(ids[2:] - ids[:-2]))]
 
+    def replace(self, image: SeenFrom) -> None:
+        """Take another version of a keyframe's image, if it is kept."""
+        self._images = [image if kept.frame_id == image.frame_id else kept for kept in self._images]
+
     def keep(self, keyframe_ids: set[int]) -> None:
         """Forget images of other keyframes."""
         self._images = [image for image in self._images if image.frame_id in keyframe_ids]

@@ -18,7 +18,9 @@ from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import MIN_POINTS, Initialiser, Start
 from semcast.server.mapping.kept_frames import backfill, observed_of
 from semcast.server.mapping.look_back import look_back
+from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -69,19 +71,19 @@ class Reconstruction:
     def __init__(self, camera: Intrinsics, settings: ReconstructionSettings, bundle: BundleRunner) -> None:
         if any(camera.distortion):
             raise ValueError(f"camera must be without distortion, got {camera.distortion}")
-        self._camera = settings.with_readout(camera)
+        self._camera = camera
         self._settings = settings
         self._bundle = bundle
         self._map = MapBuilder(camera, settings, bundle)
         self._map_epoch = 0
-        self._begin()
+        self._begin(settings.with_readout(camera))
 
-    def _begin(self) -> None:
+    def _begin(self, camera: Intrinsics) -> None:
         s = self._settings
         self._tracks = TrackTable(s.confidence, s.max_features, s.seed)
         self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
         self._motion = CameraMotion(self._camera)
-        self._shutter = RollingShutter(self._camera)
+        self._shutter = RollingShutter(camera, keeps_flows=self._map.watch.is_on)
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
         self._last_posed_id: int | None = None
@@ -95,7 +97,12 @@ class Reconstruction:
         """Forget the map; the next one has another epoch."""
         self._map_epoch += 1
         self._map.clear()
-        self._begin()
+        self._begin(self.camera)
+
+    @property
+    def camera(self) -> Intrinsics:
+        """Pinhole, with the readout that images are put right for: given, or found."""
+        return self._shutter.camera
 
     def close(self) -> None:
         """End the bundle runner. Idempotent."""
@@ -150,6 +157,8 @@ class Reconstruction:
         if result is None:
             return
         self._stage_ms["bundle"] = result.elapsed_ms
+        if (more := self._map.watch.take_found()) is not None:
+            self._map.put_right(self._shutter.add(more), self._shutter.flows)
         self._moved(1.0)
         self._lap("apply", since)
 
@@ -162,6 +171,7 @@ class Reconstruction:
     def _moves_to(self, frame_id: int, t_source_ns: int, T_world_cam: Array, ids: Ids) -> None:
         """Let the motion go on; frames that now turn out to have shown an older image have no pose."""
         xyz = self._map.world.landmarks.xyz_of(ids)
+        self._map.watch.note(frame_id, t_source_ns)
         self._map.world.forget_frames(self._motion.observe(frame_id, t_source_ns, T_world_cam, xyz))
 
     def _follow(self, sight: Sight, T_world_guess: Array | None) -> None:
@@ -183,12 +193,10 @@ class Reconstruction:
     def _last_pose(self) -> Array | None:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
 
-    def _pose(self, T_world_guess: Array | None, **how: Unpack[Believing]) -> TrackedPose | None:
-        return self._pose_from(self._tracks.seen(), T_world_guess, **how)
-
-    def _pose_from(
-        self, seen: Seen, T_world_guess: Array | None, **how: Unpack[Believing]
+    def _pose(
+        self, T_world_guess: Array | None, seen: Seen | None = None, **how: Unpack[Believing]
     ) -> TrackedPose | None:
+        seen = self._tracks.seen() if seen is None else seen
         known = {"submap": self._map.submap, "seed": self._settings.seed}
         noise = self._map.noise.model
         return track_pose(self._camera, self._map.world, noise, seen, T_world_guess, **known, **how)
@@ -343,7 +351,7 @@ class Reconstruction:
             return None
         # Nothing is given up for a place before there is a pose in it.
         seen = Seen(place.ids, place.xy, np.full(len(place.ids), _RECOGNISED_CONFIDENCE))
-        pose = self._pose_from(seen, place.T_world_cam)
+        pose = self._pose(place.T_world_cam, seen)
         if pose is not None:
             self._map.go_on_from(place)
             self._tracks.adopt(place.ids, place.xy, _RECOGNISED_CONFIDENCE)
@@ -377,7 +385,7 @@ class Reconstruction:
         self._lap("two_view", since)
         newest = self._map.world.pose_of_frame(sight.frame.frame_id)
         seen = self._tracks.seen()
-        pose = self._pose_from(seen[self._map.world.landmarks.rows(seen.ids) >= 0], newest)
+        pose = self._pose(newest, seen[self._map.world.landmarks.rows(seen.ids) >= 0])
         self._state = TrackingState.LOST if pose is None else TrackingState.TRACKING
         self._lost_ns = []
         self._last_posed_id = sight.frame.frame_id
@@ -470,13 +478,9 @@ class Reconstruction:
 
     def snapshot(self) -> dict[str, NDArray]:
         """The map and what is needed to go on with it, as plain arrays."""
-        return {
-            **self._map.world.arrays(),
-            "noise": self._map.noise.state(),
-            "counters": np.array(
-                [self._map_epoch, self._map.submap, self._tracks.next_id, self._last_frame_id], dtype=np.int64
-            ),
-        }
+        counters = [self._map_epoch, self._map.submap, self._tracks.next_id, self._last_frame_id]
+        state = RunState(counters, self._map.noise.state(), Readout.of(self.camera))
+        return {**self._map.world.arrays(), **state.arrays()}
 
     def restore(self, arrays: Mapping[str, NDArray]) -> None:
         """Go on with the map of a snapshot: the next frame is located in it as after a loss of tracking.
@@ -485,13 +489,12 @@ class Reconstruction:
             KeyError: An array is missing.
             ValueError: Arrays contradict each other.
         """
-        counters, noise = np.asarray(arrays["counters"]), np.asarray(arrays["noise"], dtype=np.float64)
-        if counters.shape != (4,) or noise.shape != (2,) or not np.isfinite(noise).all():
-            raise ValueError("counters and noise of a snapshot must have 4 and 2 finite values")
+        state = RunState.of(arrays)
         self._map.clear()
-        self._begin()
+        found = state.readout if self._map.watch.is_on else None
+        self._begin(self.camera if found is None else found.put_on(self.camera))
         self._map.world.restore(dict(arrays))
-        self._map.noise.restore(noise)
-        self._map_epoch, self._map.submap, self._tracks.next_id, self._last_frame_id = counters.tolist()
+        self._map.noise.restore(state.noise)
+        self._map_epoch, self._map.submap, self._tracks.next_id, self._last_frame_id = state.counters
         if self._map.world.keyframes:
             self._state = TrackingState.LOST

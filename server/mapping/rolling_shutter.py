@@ -6,6 +6,9 @@ how far each row has moved by its time. The image is put right by that, and all 
 adjustments, has one pose an image.
 """
 
+import logging
+from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -14,9 +17,12 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import to_grey
+from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 #: x and y of each pixel, ``(H, W)`` each.
@@ -30,6 +36,8 @@ _MAX_STEP_S = 0.5
 _MAX_TREND_STEP_S = 0.06
 #: Nothing is moved by more than this share of the image's height.
 _MAX_SHARE = 0.2
+#: Images whose movement is kept: a minute and more of video.
+_MAX_FLOWS = 2000
 #: How far the image is moved is computed at every so many pixels.
 _GRID_PX = 16
 
@@ -81,27 +89,73 @@ class ImageFlow:
         return ImageFlow(camera, coefficients)
 
 
-class RollingShutter:
-    """Puts images and the tracks in them right, one after the other.
+class RowTimes:
+    """When each pixel of an image is read, and where that puts it.
 
     Args:
-        camera: Pinhole and the shutter's readout; with a global shutter nothing is done.
+        camera: Pinhole and the shutter's readout.
     """
 
     def __init__(self, camera: Intrinsics) -> None:
-        self._camera = camera
         self._axis = int(camera.readout_from in ("top", "bottom"))
         last = max(1, (camera.width, camera.height)[self._axis] - 1)
         self._middle = 0.5 * last
         self._s_per_px = (
             1e-3 * camera.readout_ms / last * (1 if camera.readout_from in ("top", "left") else -1)
         )
+        self._reach_px = _MAX_SHARE * camera.height
         # Middles of cells, one cell more on each side: a resize puts samples there.
         x, y = (
             _GRID_PX * (np.arange(-1, -(-side // _GRID_PX) + 1) + 0.5) - 0.5
             for side in (camera.width, camera.height)
         )
         self._grid = np.stack(np.meshgrid(x, y), axis=-1)
+
+    def as_received(self, flow: ImageFlow, xy: Array) -> Array:
+        """Return where points ``(..., 2)`` of an image that was put right are in it as received."""
+        moved = flow.at(xy)
+        # A point moves while the shutter runs towards it: the row it was met in is another one.
+        closing = np.maximum(1.0 - self._s_per_px * moved[..., self._axis], 0.2)
+        offset_s = self._s_per_px * (xy[..., self._axis] - self._middle) / closing
+        return xy + self._bounded(moved * offset_s[..., None])
+
+    def put_right(self, flow: ImageFlow, xy: Array) -> Array:
+        """Return where points ``(..., 2)`` of an image as received go."""
+        offset_s = self._s_per_px * (xy[..., self._axis] - self._middle)
+        there = xy
+        for _ in range(2):
+            there = xy - self._bounded(flow.at(there) * offset_s[..., None])
+        return there
+
+    def _bounded(self, away: Array) -> Array:
+        return np.clip(away, -self._reach_px, self._reach_px)
+
+    def places(self, flow: ImageFlow, shape_hw: tuple[int, int]) -> Places:
+        """Return where each pixel of an image that is put right is as received."""
+        height, width = shape_hw
+        away = (self.as_received(flow, self._grid) - self._grid).astype(np.float32)
+        fine = cv2.resize(away, None, fx=_GRID_PX, fy=_GRID_PX, interpolation=cv2.INTER_LINEAR)
+        fine = fine[_GRID_PX : _GRID_PX + height, _GRID_PX : _GRID_PX + width]
+        x = np.arange(width, dtype=np.float32) + fine[..., 0]
+        y = np.arange(height, dtype=np.float32)[:, None] + fine[..., 1]
+        return x, y
+
+
+class RollingShutter:
+    """Puts images and the tracks in them right, one after the other.
+
+    Args:
+        camera: Pinhole and the shutter's readout; with a global shutter nothing is done.
+        keeps_flows: Whether the movement of every image is wanted, with a global shutter too: it may turn out
+            to be none.
+
+    Attributes:
+        camera: With the readout that is made up for.
+    """
+
+    def __init__(self, camera: Intrinsics, *, keeps_flows: bool = False) -> None:
+        self._take(camera)
+        self._flows: OrderedDict[int, ImageFlow] | None = OrderedDict() if keeps_flows else None
         #: The movement at the newest image, that the image was put right by, and the mean towards the image.
         self._flow: ImageFlow | None = None
         self._applied: ImageFlow | None = None
@@ -110,10 +164,25 @@ class RollingShutter:
         self._step_s = 0.0
         self._has_begun = False
 
+    def _take(self, camera: Intrinsics) -> None:
+        self.camera, self._rows = camera, RowTimes(camera)
+
+    def add(self, more: Readout) -> Intrinsics:
+        """From the next image on, make up for a readout that is longer.
+
+        Returns:
+            The camera with what is new of its readout: what images so far still have to be put right for.
+        """
+        camera = self.camera
+        readout = Readout.of(camera).with_more(more)
+        logger.info("rolling shutter: %s, as adjustments have found; images are put right", readout)
+        self._take(readout.put_on(camera))
+        return more.put_on(camera)
+
     @property
     def is_global(self) -> bool:
         """Whether all rows are exposed at once: there is nothing to do."""
-        return self._s_per_px == 0.0
+        return self.camera.readout_ms == 0.0
 
     def see(self, frame: DecodedFrame) -> Sight:
         """Return an image put right by the movement before it, for tracks to be followed in."""
@@ -134,16 +203,22 @@ class RollingShutter:
             compared with those of later ones. That is said once: where points are so few that the movement is
             unknown now and then, a start from what there is comes before none.
         """
-        if self.is_global:
-            return sight, False
         step_s = self._since_s(frame)
         self._t_ns = frame.t_source_ns
+        if self.is_global and self._flows is None:
+            return sight, False
         self._flow = self._measured(tracks, step_s)
         self._step_s = step_s
         if self._flow is None:
             return sight, False
+        if self._flows is not None:
+            self._flows[frame.frame_id] = self._flow
+            if len(self._flows) > _MAX_FLOWS:
+                self._flows.popitem(last=False)
+        if self.is_global:
+            return sight, False
         visible = tracks.visible
-        tracks.move(visible, self._put_right(self.in_image(tracks.xy[visible])))
+        tracks.move(visible, self._rows.put_right(self._flow, self.in_image(tracks.xy[visible])))
         sight = self._sight(frame, with_colours=True)
         tracks.replace_newest(sight)
         is_first, self._has_begun = not self._has_begun, True
@@ -151,26 +226,12 @@ class RollingShutter:
 
     def in_image(self, xy: Array) -> Array:
         """Return where points ``(..., 2)`` of the newest image, as put right, are in it as received."""
-        if self._applied is None:
-            return xy
-        flow = self._applied.at(xy)
-        # A point moves while the shutter runs towards it: the row it was met in is another one.
-        closing = np.maximum(1.0 - self._s_per_px * flow[..., self._axis], 0.2)
-        offset_s = self._s_per_px * (xy[..., self._axis] - self._middle) / closing
-        return xy + self._bounded(flow * offset_s[..., None])
+        return xy if self._applied is None else self._rows.as_received(self._applied, xy)
 
-    def _put_right(self, xy: Array) -> Array:
-        """Return where points ``(..., 2)`` of the received image go, by the newest movement."""
-        assert self._flow is not None
-        offset_s = self._s_per_px * (xy[..., self._axis] - self._middle)
-        there = xy
-        for _ in range(2):
-            there = xy - self._bounded(self._flow.at(there) * offset_s[..., None])
-        return there
-
-    def _bounded(self, away: Array) -> Array:
-        reach = _MAX_SHARE * self._camera.height
-        return np.clip(away, -reach, reach)
+    @property
+    def flows(self) -> Mapping[int, ImageFlow]:
+        """How the newest images moved, by frame id, where that is kept."""
+        return self._flows or {}
 
     def _since_s(self, frame: DecodedFrame) -> float:
         return 0.0 if self._t_ns is None else (frame.t_source_ns - self._t_ns) * 1e-9
@@ -182,12 +243,12 @@ class RollingShutter:
             return None
         rows = tracks.visible & (tracks.age > 1)
         way = tracks.velocity[rows]
-        self._mean = ImageFlow.fitted(self._camera, tracks.xy[rows] - 0.5 * way, way / step_s)
+        self._mean = ImageFlow.fitted(self.camera, tracks.xy[rows] - 0.5 * way, way / step_s)
         if self._mean is None or mean_before is None or step_s > _MAX_TREND_STEP_S:
             return self._mean
         # The mean is that of half a step ago.
         trend = (self._mean.coefficients - mean_before.coefficients) / (0.5 * (step_s + self._step_s))
-        return ImageFlow(self._camera, self._mean.coefficients + 0.5 * step_s * trend)
+        return ImageFlow(self.camera, self._mean.coefficients + 0.5 * step_s * trend)
 
     def _sight(self, frame: DecodedFrame, *, with_colours: bool) -> Sight:
         """Return an image put right by the newest movement that is known."""
@@ -198,16 +259,17 @@ class RollingShutter:
         if places is None:
             return Sight(frame, to_grey(frame.image), usable)
 
-        def map_taken(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
-            return None if values is None else np.asarray(_taken(values, places), np.float32)
+        def map_right(values: NDArray[np.float32] | None) -> NDArray[np.float32] | None:
+            return None if values is None else np.asarray(taken_from(values, places), np.float32)
 
-        image = np.asarray(_taken(frame.image, places), np.uint8) if with_colours else frame.image
-        grey = to_grey(image) if with_colours else np.asarray(_taken(to_grey(frame.image), places), np.uint8)
+        image = np.asarray(taken_from(frame.image, places), np.uint8) if with_colours else frame.image
+        grey = to_grey(image) if with_colours else to_grey(frame.image)
+        grey = grey if with_colours else np.asarray(taken_from(grey, places), np.uint8)
         right = replace(
             frame,
             image=image,
-            confidence=map_taken(frame.confidence),
-            keypoint_confidence=map_taken(frame.keypoint_confidence),
+            confidence=map_right(frame.confidence),
+            keypoint_confidence=map_right(frame.keypoint_confidence),
         )
         if not usable.all():
             rows = np.clip(np.rint(places[1][:, [0, width // 2, width - 1]]), 0, height - 1).astype(np.intp)
@@ -217,20 +279,15 @@ class RollingShutter:
     def put_right(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the newest image ``(H, W, 3)``, given as received, as its tracks have it."""
         places = self._places((image.shape[0], image.shape[1]))
-        return image if places is None else np.asarray(_taken(image, places), np.uint8)
+        return image if places is None else np.asarray(taken_from(image, places), np.uint8)
 
     def _places(self, shape_hw: tuple[int, int]) -> Places | None:
         """Return where each pixel of the image as put right is as received; None where that is the same."""
         if self._applied is None or self.is_global:
             return None
-        height, width = shape_hw
-        away = (self.in_image(self._grid) - self._grid).astype(np.float32)
-        fine = cv2.resize(away, None, fx=_GRID_PX, fy=_GRID_PX, interpolation=cv2.INTER_LINEAR)
-        fine = fine[_GRID_PX : _GRID_PX + height, _GRID_PX : _GRID_PX + width]
-        x = np.arange(width, dtype=np.float32) + fine[..., 0]
-        y = np.arange(height, dtype=np.float32)[:, None] + fine[..., 1]
-        return x, y
+        return self._rows.places(self._applied, shape_hw)
 
 
-def _taken(values: NDArray, places: Places) -> NDArray:
+def taken_from(values: NDArray, places: Places) -> NDArray:
+    """Return an image of other places of an image."""
     return cv2.remap(values, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -53,7 +53,7 @@ class ReconstructionSettings:
         default=None,
         metadata={
             "help": "time a rolling shutter takes from the first row to the last, 0 for a global shutter; "
-            "default: what the camera's calibration says"
+            "default: what the camera's calibration says, else it is found while the camera moves"
         },
     )
     readout_from: ReadoutFrom | None = field(
@@ -97,6 +97,10 @@ class ReconstructionSettings:
         """
         enough = len(lost_ns) >= _LEAST_LOST_FRAMES
         return enough and (lost_ns[-1] - lost_ns[0]) * 1e-9 >= self.lost_after_s
+
+    def watches_readout(self, camera: Intrinsics) -> bool:
+        """Whether nobody says what readout the camera has."""
+        return self.readout_ms is None and camera.readout_ms == 0.0
 
     def with_readout(self, camera: Intrinsics) -> Intrinsics:
         """Return a camera with the readout that is set here, else with its own."""

@@ -203,12 +203,12 @@ def test_a_part_that_is_lost_as_it_begins_has_its_time_to_be_found_again(room, m
     _, images = room
     reconstruction = make(lost_after_s=0.25)
     other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
-    posed = Reconstruction._pose_from
+    posed = Reconstruction._pose
 
     def no_pose_in_the_second_part(self, *args, **how):
         return None if self._map.submap == 1 else posed(self, *args, **how)
 
-    monkeypatch.setattr(Reconstruction, "_pose_from", no_pose_in_the_second_part)
+    monkeypatch.setattr(Reconstruction, "_pose", no_pose_in_the_second_part)
     results = [reconstruction.process(frame_of(k, image)) for k, image in enumerate(images[:8] + other[:14])]
     begun = next(k for k, r in enumerate(results) if r.is_keyframe and r.submap == 1)
     assert [r.state for r in results[begun : begun + 4]] == [TrackingState.LOST] * 4

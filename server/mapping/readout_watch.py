@@ -1,0 +1,127 @@
+"""Watches a growing map for signs of a rolling shutter that nobody told of."""
+
+import logging
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
+from semcast.server.mapping.readout import Axis, Readout, body_velocity, fit_readout
+from semcast.server.mapping.world_map import WorldMap
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+#: Frames whose times are remembered: a minute and more of video.
+_MAX_FRAMES = 2000
+#: Frames further apart than this don't tell how the camera moved in between.
+_MAX_STEP_S = 0.25
+#: New keyframes from one look to the next, that each counts about once.
+_INTERVAL = 8
+#: A shutter is believed to be rolling from so many milliseconds on: below, an image that is put right gains
+#: less than it loses by being sampled anew. And what was found is changed by so much at least.
+_LEAST_MS, _LEAST_CHANGE_MS = 4.0, 1.0
+#: An estimate counts when it is so many standard deviations from 0 and explains such a share of the squared
+#: residuals: those of global shutters explained up to .015, behind bad links. A change of what was found is
+#: no question of whether the shutter rolls.
+_LEAST_SIGMAS, _LEAST_EXPLAINED, _LEAST_EXPLAINED_MORE = 6.0, 0.03, 0.002
+#: From so many views on, an estimate is the last one if it is that sure. After many more there is none: a camera
+#: that hardly turns does not tell, and it matters little.
+_ENOUGH_VIEWS, _SURE_MS, _MOST_VIEWS = 40, 0.7, 600
+
+
+class ReadoutWatch:
+    """Collects what adjustments say about the readout, until it is known.
+
+    Args:
+        camera: Pinhole, with the readout it is said to have.
+        is_wanted: Whether to watch at all.
+    """
+
+    def __init__(self, camera: Intrinsics, is_wanted: bool) -> None:
+        self._camera = camera
+        self._is_done = not is_wanted
+        self._axis: Axis | None = None
+        self._views: list[Array] = []
+        self._found: Readout | None = None
+        self.forget_frames()
+
+    @property
+    def is_on(self) -> bool:
+        """Whether the readout may still change."""
+        return not self._is_done
+
+    def forget_frames(self) -> None:
+        """Frames to come are of another map."""
+        self._frames: deque[tuple[int, int]] = deque(maxlen=_MAX_FRAMES)
+        self._newest_id = -1
+
+    def note(self, frame_id: int, t_source_ns: int) -> None:
+        """A frame has got a pose."""
+        self._frames.append((frame_id, t_source_ns))
+
+    def _velocities(self, world: WorldMap, frame_ids: Sequence[int]) -> Array:
+        """Return ``(N, 6)`` velocities of the camera at frames, see ``ViewMotion``; NaN where unknown."""
+        row = {frame_id: k for k, (frame_id, _) in enumerate(self._frames)}
+        velocity = np.full((len(frame_ids), 6), np.nan)
+        for k, frame_id in enumerate(frame_ids):
+            if (at := row.get(frame_id)) is not None:
+                before, after = (self._velocity(world, at, at + way, at) for way in (-1, 1))
+                if before is not None and after is not None:
+                    velocity[k] = 0.5 * (before + after)
+        return velocity
+
+    def _velocity(self, world: WorldMap, one: int, other: int, seen_from: int) -> Array | None:
+        """Return the velocity between two frames by row, in a third one's frame; None where unknown."""
+        first, last = sorted((one, other))
+        if first < 0 or last >= len(self._frames):
+            return None
+        (before, before_ns), (after, after_ns) = self._frames[first], self._frames[last]
+        step_s = (after_ns - before_ns) * 1e-9
+        poses = [world.pose_of_frame(k) for k in (before, self._frames[seen_from][0], after)]
+        T_before, T_world_cam, T_after = poses
+        if T_before is None or T_world_cam is None or T_after is None or not 0.0 < step_s <= _MAX_STEP_S:
+            return None
+        return body_velocity(T_before, T_world_cam, T_after, step_s)
+
+    def motion(self, world: WorldMap, problem: BundleProblem) -> ViewMotion | None:
+        """Return how a window's views move, when it is time for another look; else None."""
+        if self._is_done or int((problem.keyframe_ids > self._newest_id).sum()) < _INTERVAL:
+            return None
+        self._newest_id = int(problem.keyframe_ids[-1])
+        velocity = self._velocities(world, problem.keyframe_ids.tolist())
+        return ViewMotion((self._camera.width, self._camera.height), velocity)
+
+    def take(self, result: BundleResult) -> None:
+        """Take what an adjustment has told."""
+        if result.readout is None or self._is_done or self._found is not None:
+            return
+        self._views += list(result.readout)
+        fit = fit_readout(self._views, self._axis)
+        if fit is None:
+            return
+        logger.debug(
+            "readout by %d views: %s, sigma %.2f ms, explains %.4f",
+            len(self._views),
+            fit.readout,
+            fit.sigma_ms,
+            fit.explained,
+        )
+        is_first = self._axis is None
+        least_ms = _LEAST_MS if is_first else _LEAST_CHANGE_MS
+        least_explained = _LEAST_EXPLAINED if is_first else _LEAST_EXPLAINED_MORE
+        is_sure = fit.readout.ms >= _LEAST_SIGMAS * fit.sigma_ms and fit.explained >= least_explained
+        if is_sure and fit.readout.ms >= least_ms:
+            self._found, self._axis, self._views = fit.readout, fit.readout.axis, []
+        else:
+            is_known = len(self._views) >= _ENOUGH_VIEWS and fit.sigma_ms <= _SURE_MS
+            self._is_done = is_known or len(self._views) >= _MOST_VIEWS
+
+    def take_found(self) -> Readout | None:
+        """Return, once, the readout to be added to what images are put right for; views to come have it."""
+        found, self._found = self._found, None
+        return found

@@ -1,0 +1,85 @@
+"""A rolling shutter that nobody told of is found while the map grows, and made up for."""
+
+import logging
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from drawn_boards import CAMERA, ate_percent, make, render
+
+from semcast.common.geometry import exp_so3, make_transform
+from semcast.server.mapping.state import DecodedFrame
+
+NUM_FRAMES, STEP_S, READOUT_S, NUM_BANDS = 50, 1 / 30, 0.025, 12
+
+
+def pose_at(t_s):
+    """A hand that goes sideways and shakes."""
+    turn = (0.03 * np.sin(9.0 * t_s), -0.1 * t_s + 0.03 * np.sin(12.0 * t_s), 0.03 * np.sin(7.0 * t_s))
+    return make_transform(exp_so3(turn), (0.9 * t_s, 0.04 * np.sin(8.0 * t_s), 0.3 * t_s))
+
+
+def rolled(t_s, readout_s, axis):
+    """An image whose rows (axis 0) or columns (1) are read one after the other."""
+    size = CAMERA.shape_hw[axis]
+    image = np.zeros((*CAMERA.shape_hw, 3), np.uint8)
+    edges = np.linspace(0, size, NUM_BANDS + 1 if readout_s else 2, dtype=int)
+    for low, high in pairwise(edges):
+        late_s = readout_s * (0.5 * (low + high) / size - 0.5)
+        band = (slice(None),) * axis + (slice(low, high),)
+        image[band] = render(pose_at(t_s + late_s))[band]
+    return image
+
+
+def run(readout_s, axis=0, **settings):
+    reconstruction = make(**settings)
+    results = [
+        reconstruction.process(DecodedFrame(k, round(k * STEP_S * 1e9), rolled(k * STEP_S, readout_s, axis)))
+        for k in range(NUM_FRAMES)
+    ]
+    reconstruction.conclude()
+    trajectory = reconstruction.final_trajectory()
+    assert results[-1].T_world_cam is not None
+    truth = [pose_at(k * STEP_S) for k in range(NUM_FRAMES)]
+    return reconstruction, trajectory, ate_percent(trajectory, truth)
+
+
+@pytest.mark.parametrize(("readout_s", "axis", "side"), [(READOUT_S, 0, "top"), (-READOUT_S, 1, "right")])
+def test_the_readout_is_found_and_the_path_is_put_right(readout_s, axis, side, caplog):
+    with caplog.at_level(logging.INFO, "semcast.server.mapping"):
+        reconstruction, trajectory, ate = run(readout_s, axis)
+    assert reconstruction.camera.readout_from == side
+    assert reconstruction.camera.readout_ms == pytest.approx(25.0, abs=3.0)
+    assert "rolling shutter: " in caplog.text
+    assert sorted(trajectory) == list(range(NUM_FRAMES)), "frames before it was found have poses too"
+    as_global, _, ate_as_global = run(readout_s, axis, readout_ms=0.0)
+    assert as_global.camera.readout_ms == 0.0
+    assert ate < 0.65 * ate_as_global
+
+
+def test_what_was_found_outlives_a_restart_and_a_reset():
+    reconstruction, _, _ = run(READOUT_S)
+    found = reconstruction.camera
+    arrays = reconstruction.snapshot()
+    again = make()
+    again.restore(arrays)
+    assert again.camera == found
+    told = make(readout_ms=0.0)
+    told.restore(arrays)
+    assert told.camera.readout_ms == 0.0, "settings win over what was found"
+    older = {name: array for name, array in arrays.items() if name != "readout"}
+    again = make()
+    again.restore(older)
+    assert again.camera == CAMERA
+    with pytest.raises(ValueError, match="readout of a snapshot"):
+        make().restore({**arrays, "readout": np.array([2.0, 20.0])})
+    reconstruction.reset()
+    assert reconstruction.camera == found
+
+
+def test_a_global_shutter_is_taken_for_one():
+    reconstruction, trajectory, ate = run(0.0)
+    assert reconstruction.camera == CAMERA
+    _, told, _ = run(0.0, readout_ms=0.0)
+    assert all(np.array_equal(trajectory[k], T) for k, T in told.items()), "watching changes nothing"
+    assert ate < 0.5
