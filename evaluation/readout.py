@@ -1,53 +1,59 @@
 """A rolling shutter's readout time, from images of the camera alone.
 
-The images are reconstructed over and over, each time put right for another readout time. The right one leaves
-the smallest reprojection error: rows that are given a wrong time lean against the others.
+The images are reconstructed as if all rows were exposed at once. What adjustments leave over tells the
+readout time (``server/mapping/readout.py``); with images put right for it, the next reconstruction tells what
+is left of it, until that is nothing.
 """
 
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.agent.source import Source, open_source
 from semcast.agent.source_settings import SourceSettings
-from semcast.common.camera import MAX_READOUT_MS, Intrinsics, ReadoutFrom
+from semcast.common.camera import MAX_READOUT_MS, Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.sequence import resized
 from semcast.common.sequence_layouts import Layout
 from semcast.evaluation.report import provenance, write_json
-from semcast.evaluation.statistics import MIN_SAMPLES, small_sample_factor
+from semcast.evaluation.statistics import small_sample_factor
 from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
+from semcast.server.mapping.readout import NUM_GROUPS, Readout, ReadoutFit, fit_readout
+from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
-#: Rows are read from top or bottom, columns (of an upright phone) from left or right.
-Axis = Literal["rows", "columns"]
 
-_SIDES: dict[Axis, tuple[ReadoutFrom, ReadoutFrom]] = {
-    "rows": ("top", "bottom"),
-    "columns": ("left", "right"),
-}
-#: The search walks in these steps, each as far as the error falls.
-_STEPS_MS = (10.0, 5.0, 2.5)
-#: Trials that far from the best one are fitted.
-_FIT_REACH_MS = 10.0
+#: Reconstructions at most. Each leaves about a tenth of what the one before was wrong by.
+_MAX_TRIALS = 4
+#: What is left of the readout then counts as nothing.
+_NOTHING_MS = 0.3
 #: Larger images tell no more and take longer.
 _MAX_PIXELS = 640 * 480
-#: Frames with a pose in every trial from which there is an answer, and those that are resampled together.
-_MIN_FRAMES, _BLOCK_FRAMES = 30, 10
-_NUM_RESAMPLES = 1000
+#: Frames with a pose from which there is an answer.
+_MIN_FRAMES = 30
 #: An interval wider than this is no answer.
 _MAX_INTERVAL_MS = 10.0
+#: Standard deviations either side of 95 %.
+_SIGMAS_95 = 1.96
 #: Below it a shutter is as good as global: turning by 100 degrees a second leans an image by .1 degree.
 _AS_GOOD_AS_GLOBAL_MS = 1.0
+_NOT_TOLD = (
+    "these images don't tell the readout time, and it matters little for images like them: take some while "
+    "the camera turns from side to side and up and down, about 60 degrees a second"
+)
+#: Images must be further apart than this, for a readout to fit in between.
+_LEAST_PERIOD_MS = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,48 +87,21 @@ class ReadoutSettings:
             raise ValueError(f"frames must be in [{_MIN_FRAMES + 1}, 1000], got {self.frames}")
 
 
-@dataclass(frozen=True, order=True)
-class Readout:
-    """A readout time with its direction.
-
-    Attributes:
-        axis: What is read one after the other.
-        signed_ms: From the first to the last; below 0 from the last to the first.
-    """
-
-    axis: Axis
-    signed_ms: float
-
-    @property
-    def ms(self) -> float:
-        """Time from the first row or column that is read to the last."""
-        return abs(self.signed_ms)
-
-    @property
-    def side(self) -> ReadoutFrom:
-        """Where it begins."""
-        return _SIDES[self.axis][self.signed_ms < 0]
-
-    def __str__(self) -> str:
-        return f"{self.ms:.1f} ms from {self.side}"
-
-
 @dataclass(frozen=True)
 class Trial:
     """What the reconstruction with one readout time left.
 
     Attributes:
         readout: The readout time.
-        error_px: Median reprojection error of each frame that got a pose, by frame id.
+        error_px: Mean over frames of their median reprojection error, None without any.
+        num_frames: Frames that got a pose.
+        more: By how much more readout residuals would be less, None where they don't say.
     """
 
     readout: Readout
-    error_px: dict[int, float]
-
-    @property
-    def mean_px(self) -> float:
-        """Mean over the frames, infinite without any."""
-        return float(np.mean(list(self.error_px.values()))) if self.error_px else np.inf
+    error_px: float | None
+    num_frames: int
+    more: ReadoutFit | None
 
 
 @dataclass(frozen=True)
@@ -130,8 +109,8 @@ class ReadoutEstimate:
     """A readout time and how far to trust it.
 
     Attributes:
-        readout: Where the error is least.
-        low_ms: Lower bound of ``signed_ms``, 95 %, frames resampled in blocks, widened for how few those are.
+        readout: That residuals say nothing against.
+        low_ms: Lower bound of ``signed_ms``, 95 %, by leaving out a part of the keyframes at a time.
         high_ms: Upper bound.
         camera: As it was given, of the images as stored, with the readout found.
         trials: All that were made, in order.
@@ -180,31 +159,34 @@ def find_readout(
     if len(frames) <= _MIN_FRAMES:
         raise SourceError(f"{source.name} must have more than {_MIN_FRAMES} images, got {len(frames)}")
     period_ms = float(np.median(np.diff([frame.t_source_ns for frame in frames]))) * 1e-6
-    if period_ms < _STEPS_MS[1]:
-        most_hz = 1e3 / _STEPS_MS[1]
+    if period_ms < _LEAST_PERIOD_MS:
+        most_hz = 1e3 / _LEAST_PERIOD_MS
         raise SourceError(
             f"{source.name} must have at most {most_hz:g} images a second, got {1e3 / period_ms:.0f}"
         )
-    trials: dict[Readout, Trial] = {}
-
-    def error_px(readout: Readout) -> float:
-        if readout not in trials:
-            trials[readout] = trial = _tried(frames, camera, readout)
-            if on_trial is not None:
-                on_trial(trial)
-        # Where the camera was mostly lost, the few frames with a pose are the easy ones.
-        is_lost = 2 * len(trials[readout].error_px) < len(frames)
-        return np.inf if is_lost else trials[readout].mean_px
-
-    best = search(error_px, min(period_ms, MAX_READOUT_MS))
-    readout, low_ms, high_ms = fitted(best, tuple(trials.values()))
+    trials: list[Trial] = []
+    readout, sigma_ms = Readout("rows", 0.0), np.inf
+    for _ in range(_MAX_TRIALS):
+        trials.append(trial := _tried(frames, camera, readout))
+        if on_trial is not None:
+            on_trial(trial)
+        more = _checked(trial)
+        readout, sigma_ms = readout.with_more(more.readout), more.sigma_ms
+        readout = replace(readout, signed_ms=_bounded(readout.signed_ms, min(period_ms, MAX_READOUT_MS)))
+        if more.readout.ms < max(_NOTHING_MS, sigma_ms):
+            break
+    # So many groups of keyframes tell how sure it is.
+    reach_ms = _SIGMAS_95 * small_sample_factor(NUM_GROUPS) * sigma_ms
+    low_ms, high_ms = readout.signed_ms - reach_ms, readout.signed_ms + reach_ms
+    if high_ms - low_ms > _MAX_INTERVAL_MS:
+        raise SemcastError(_NOT_TOLD)
     is_global = bool(low_ms <= 0.0 <= high_ms or readout.ms < _AS_GOOD_AS_GLOBAL_MS)
     found = replace(
         stored,
         readout_ms=0.0 if is_global else round(readout.ms, 1),
         readout_from="top" if is_global else readout.side,
     )
-    estimate = ReadoutEstimate(readout, low_ms, high_ms, found, tuple(trials.values()))
+    estimate = ReadoutEstimate(readout, low_ms, high_ms, found, tuple(trials))
     if settings.json is not None:
         write_json(settings.json, _report(settings, source.name, estimate))
     return estimate
@@ -224,92 +206,36 @@ def _report(settings: ReadoutSettings, name: str, estimate: ReadoutEstimate) -> 
             {
                 "axis": trial.readout.axis,
                 "signed_ms": trial.readout.signed_ms,
-                "error_px": trial.mean_px if trial.error_px else None,
-                "num_frames": len(trial.error_px),
+                "error_px": trial.error_px,
+                "num_frames": trial.num_frames,
+                "more_axis": None if trial.more is None else trial.more.readout.axis,
+                "more_ms": None if trial.more is None else trial.more.readout.signed_ms,
+                "sigma_ms": None if trial.more is None else trial.more.sigma_ms,
+                "explained": None if trial.more is None else trial.more.explained,
             }
             for trial in estimate.trials
         ],
     }
 
 
-def search(error_px: Callable[[Readout], float], limit_ms: float) -> Readout:
-    """Return the readout time with the least error, to the last step of the search.
-
-    Args:
-        error_px: Error of a readout time.
-        limit_ms: No readout takes longer; the time between two frames at most.
-    """
-    best = Readout("rows", 0.0)
-    for step_ms in _STEPS_MS:
-        while True:
-            axes: Sequence[Axis] = (best.axis,) if best.signed_ms else ("rows", "columns")
-            beside = [
-                Readout(axis if best.signed_ms + way else "rows", best.signed_ms + way)
-                for axis in axes
-                for way in (-step_ms, step_ms)
-                if abs(best.signed_ms + way) <= limit_ms
-            ]
-            nearest = min(beside, key=error_px, default=best)
-            if error_px(nearest) >= error_px(best):
-                break
-            best = nearest
-    return best
-
-
-def fitted(best: Readout, trials: Sequence[Trial]) -> tuple[Readout, float, float]:
-    """Return the readout time with the least error between the trials, and the bounds of ``signed_ms``.
-
-    Noise and lean add up as squares, and the lean grows in proportion to how wrong the time is: the square of
-    the error is a parabola. No trial of 0 is fitted: images that are left as they are keep the sharpness that
-    putting them right costs. The longer the readout, the more the movement's own errors cost: the least is
-    some percent short of the true time, and the better one to put images right by.
-
-    Args:
-        best: As found by ``search``.
-        trials: All of them.
+def _checked(trial: Trial) -> ReadoutFit:
+    """Return what a trial says.
 
     Raises:
-        SemcastError: Too few frames have poses, or the least is no clear one.
+        SemcastError: Too few frames got a pose, or they say nothing.
     """
-    if not best.signed_ms:
-        best = min((t for t in trials if t.readout.ms), key=lambda t: t.mean_px).readout
-        best = Readout(best.axis, 0.0)
-    used = [
-        trial
-        for trial in trials
-        if trial.readout.ms
-        and trial.readout.axis == best.axis
-        and abs(trial.readout.signed_ms - best.signed_ms) <= _FIT_REACH_MS
-    ]
-    ids = sorted(set[int].intersection(*(set(trial.error_px) for trial in used))) if used else []
-    if len(ids) < _MIN_FRAMES:
+    if trial.num_frames < _MIN_FRAMES:
         raise SemcastError(
-            f"only {len(ids)} frames got a pose in every trial, {_MIN_FRAMES} are needed: take images of a "
-            "place with much to see, while the camera moves sideways and turns"
+            f"only {trial.num_frames} frames got a pose, {_MIN_FRAMES} are needed: take images of a place "
+            "with much to see, while the camera moves sideways and turns"
         )
-    at_ms = np.array([trial.readout.signed_ms for trial in used])
-    errors_px = np.array([[trial.error_px[k] for k in ids] for trial in used])
-    rng = np.random.default_rng(0)
-    starts = rng.integers(len(ids), size=(_NUM_RESAMPLES, -(-len(ids) // _BLOCK_FRAMES), 1))
-    blocks = ((starts + np.arange(_BLOCK_FRAMES)) % len(ids)).reshape(_NUM_RESAMPLES, -1)[:, : len(ids)]
-    resampled = errors_px[:, blocks].mean(axis=2)
-    bend, least_ms = _parabolas(at_ms, np.column_stack([errors_px.mean(axis=1), resampled]) ** 2)
-    # Fewer than five blocks count as five: with them the interval is still a little too narrow.
-    widen = small_sample_factor(max(MIN_SAMPLES, len(ids) // _BLOCK_FRAMES))
-    low_ms, high_ms = least_ms[0] + widen * (np.percentile(least_ms[1:], (2.5, 97.5)) - least_ms[0])
-    if np.mean(bend <= 0) > 0.025 or bend[0] <= 0 or high_ms - low_ms > _MAX_INTERVAL_MS:
-        raise SemcastError(
-            "these images don't tell the readout time, and it matters little for images like them: take some "
-            "while the camera turns from side to side and up and down, about 60 degrees a second"
-        )
-    return Readout(best.axis, float(least_ms[0])), float(low_ms), float(high_ms)
+    if trial.more is None:
+        raise SemcastError(_NOT_TOLD)
+    return trial.more
 
 
-def _parabolas(x: Array, y: Array) -> tuple[Array, Array]:
-    """Fit a parabola to each column of ``(N, M)`` over ``(N,)``; bend and place of the least of each."""
-    middle = x.mean()
-    _, slope, bend = np.linalg.lstsq(np.vander(x - middle, 3, increasing=True), y, rcond=None)[0]
-    return bend, middle - 0.5 * slope / np.where(bend == 0, np.nan, bend)
+def _bounded(value: float, limit: float) -> float:
+    return float(np.clip(value, -limit, limit))
 
 
 def _small_frames(source: Source) -> tuple[list[DecodedFrame], Intrinsics]:
@@ -324,13 +250,45 @@ def _small_frames(source: Source) -> tuple[list[DecodedFrame], Intrinsics]:
     return frames, camera
 
 
+class _Listening(InlineBundle):
+    """Asks every few adjustments what their residuals say."""
+
+    def __init__(self, camera: Intrinsics) -> None:
+        super().__init__()
+        self.watch = ReadoutWatch(camera, is_wanted=True)
+        self.world: WorldMap | None = None
+        self.views: list[Array] = []
+
+    def submit(self, problem: BundleProblem) -> bool:
+        """Adjust now."""
+        assert self.world is not None
+        return super().submit(replace(problem, motion=self.watch.motion(self.world, problem)))
+
+    def take(self, wait: bool = False) -> BundleResult | None:
+        """Return the result of the last ``submit``, once."""
+        result = super().take(wait)
+        if result is not None and result.readout is not None:
+            self.views += list(result.readout)
+        return result
+
+
 def _tried(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout) -> Trial:
     """Reconstruct with one readout time."""
     settings = ReconstructionSettings(confidence="off", readout_ms=readout.ms, readout_from=readout.side)
-    reconstruction = Reconstruction(camera, settings, InlineBundle())
+    bundle = _Listening(camera)
+    reconstruction = Reconstruction(camera, settings, bundle)
+    errors_px = []
     try:
-        results = [reconstruction.process(frame) for frame in frames]
+        for frame in frames:
+            bundle.world = reconstruction.world
+            result = reconstruction.process(frame)
+            for frame_id, t_source_ns, _ in result.backfilled:
+                bundle.watch.note(frame_id, t_source_ns)
+            if result.T_world_cam is not None:
+                bundle.watch.note(frame.frame_id, frame.t_source_ns)
+            if result.reprojection_error_px is not None:
+                errors_px.append(result.reprojection_error_px)
     finally:
         reconstruction.close()
-    errors_px = {r.frame_id: r.reprojection_error_px for r in results}
-    return Trial(readout, {k: error for k, error in errors_px.items() if error is not None})
+    more = fit_readout(bundle.views, readout.axis if readout.ms else None)
+    return Trial(readout, float(np.mean(errors_px)) if errors_px else None, len(errors_px), more)

@@ -260,14 +260,20 @@ def _recording(report: Report) -> Iterator[str]:
 
 def _readout(report: Report) -> Iterator[str]:
     low_ms, high_ms = report["interval_ms"]
-    least = f"{report['least_ms']:.1f} ms along {report['axis']} ({low_ms:.1f} to {high_ms:.1f})"
-    yield f"Least at {least}. Below 0: from bottom or right.\n"
-    rows = sorted(report["trials"], key=lambda row: (row["axis"], row["signed_ms"]))
+    found = f"{report['least_ms']:.1f} ms along {report['axis']} ({low_ms:.1f} to {high_ms:.1f})"
+    yield f"Found: {found}. Below 0: from bottom or right.\n"
     yield from table(
-        ["along", "readout ms", "reprojection error px", "frames"],
+        ["put right for ms", "along", "reprojection error px", "frames", "left over ms", "along"],
         [
-            [row["axis"], f"{row['signed_ms']:g}", number(row["error_px"], 3), str(row["num_frames"])]
-            for row in rows
+            [
+                f"{row['signed_ms']:.1f}",
+                row["axis"],
+                number(row["error_px"], 3),
+                str(row["num_frames"]),
+                f"{row['more_ms']:.1f} +- {row['sigma_ms']:.1f}",
+                row["more_axis"],
+            ]
+            for row in report["trials"]
         ],
     )
 

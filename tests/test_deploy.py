@@ -31,3 +31,5 @@ def test_a_service_is_tried_again_for_ever_and_has_time_to_write_its_results():
     # By default five starts in ten seconds, a second apart, are the last ones.
     assert unit["Unit"]["StartLimitIntervalSec"] == "0"
     assert float(unit["Service"]["TimeoutStopSec"]) >= STOP_DEADLINE_S
+    # A signal to every process of the service would end those that adjust and write.
+    assert unit["Service"]["KillMode"] == "mixed"

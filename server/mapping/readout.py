@@ -33,7 +33,7 @@ _HUBER_MEDIANS = 1.5
 #: Holds what nothing else does, as share of the mean of the diagonal: the gauge.
 _DAMPING = 1e-6
 #: Groups of keyframes, one left out at a time, that say how sure an estimate is.
-_NUM_GROUPS = 10
+NUM_GROUPS = 10
 
 
 @dataclass(frozen=True, order=True)
@@ -252,7 +252,7 @@ def fit_readout(views: Sequence[Array] | Array, axis: Axis | None = None) -> Rea
         return None
     gain = np.where(told, total[0, 1:] ** 2 / np.where(told, np.diag(total)[1:], 1.0), 0.0)
     best = int(gain.argmax())
-    num_groups = min(_NUM_GROUPS, len(each))
+    num_groups = min(NUM_GROUPS, len(each))
     group = np.arange(len(each)) * num_groups // len(each)
     without = total - np.stack([each[group == k].sum(axis=0) for k in range(num_groups)])
     slopes = without[:, 0, 1 + best] / np.maximum(without[:, 1 + best, 1 + best], 1e-12)

@@ -29,8 +29,8 @@ _LEAST_MS, _LEAST_CHANGE_MS = 4.0, 1.0
 #: residuals: those of global shutters explained up to .015, behind bad links. A change of what was found is
 #: no question of whether the shutter rolls.
 _LEAST_SIGMAS, _LEAST_EXPLAINED, _LEAST_EXPLAINED_MORE = 6.0, 0.03, 0.002
-#: From so many views on, an estimate is the last one if it is that sure. After many more there is none: a camera
-#: that hardly turns does not tell, and it matters little.
+#: From so many views on, an estimate is the last one if it is that sure. After many more there is none: a
+#: camera that hardly turns does not tell, and it matters little.
 _ENOUGH_VIEWS, _SURE_MS, _MOST_VIEWS = 40, 0.7, 600
 
 

@@ -33,7 +33,8 @@ def _check_file(path: Path | None, name: str) -> None:
 
 
 def _show(trial: Trial) -> None:
-    what = f"{trial.readout!s:>20}: reprojection error {trial.mean_px:.3f} px in {len(trial.error_px)} frames"
+    error = "" if trial.error_px is None else f", reprojection error {trial.error_px:.3f} px"
+    what = f"{trial.readout!s:>20}: {trial.num_frames} frames with a pose{error}"
     print(what, file=sys.stderr, flush=True)
 
 
