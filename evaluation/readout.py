@@ -34,8 +34,9 @@ from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
 
-#: Reconstructions at most. Each leaves about a tenth of what the one before was wrong by.
-_MAX_TRIALS = 4
+#: Reconstructions at most, and the factor by which each has to make errors smaller for its readout to be
+#: believed.
+_MAX_TRIALS, _BETTER = 4, 0.995
 #: What is left of the readout then counts as nothing.
 _NOTHING_MS = 0.3
 #: Larger images tell no more and take longer.
@@ -93,13 +94,13 @@ class Trial:
 
     Attributes:
         readout: The readout time.
-        error_px: Mean over frames of their median reprojection error, None without any.
+        mean_px: Mean over frames of their median reprojection error, infinite without any.
         num_frames: Frames that got a pose.
         more: By how much more readout residuals would be less, None where they don't say.
     """
 
     readout: Readout
-    error_px: float | None
+    mean_px: float
     num_frames: int
     more: ReadoutFit | None
 
@@ -109,7 +110,7 @@ class ReadoutEstimate:
     """A readout time and how far to trust it.
 
     Attributes:
-        readout: That residuals say nothing against.
+        readout: That images are best put right for.
         low_ms: Lower bound of ``signed_ms``, 95 %, by leaving out a part of the keyframes at a time.
         high_ms: Upper bound.
         camera: As it was given, of the images as stored, with the readout found.
@@ -164,17 +165,20 @@ def find_readout(
         raise SourceError(
             f"{source.name} must have at most {most_hz:g} images a second, got {1e3 / period_ms:.0f}"
         )
-    trials: list[Trial] = []
-    readout, sigma_ms = Readout("rows", 0.0), np.inf
-    for _ in range(_MAX_TRIALS):
-        trials.append(trial := _tried(frames, camera, readout))
-        if on_trial is not None:
-            on_trial(trial)
-        more = _checked(trial)
-        readout, sigma_ms = readout.with_more(more.readout), more.sigma_ms
-        readout = replace(readout, signed_ms=_bounded(readout.signed_ms, min(period_ms, MAX_READOUT_MS)))
-        if more.readout.ms < max(_NOTHING_MS, sigma_ms):
+    trials = [_seen(_tried(frames, camera, Readout("rows", 0.0)), on_trial)]
+    more = _checked(trials[0])
+    readout, sigma_ms = Readout("rows", 0.0), more.sigma_ms
+    while more.readout.ms >= max(_NOTHING_MS, more.sigma_ms) and len(trials) < _MAX_TRIALS:
+        longer = readout.with_more(more.readout)
+        longer = replace(longer, signed_ms=_bounded(longer.signed_ms, min(period_ms, MAX_READOUT_MS)))
+        trial = _seen(_tried(frames, camera, longer), on_trial)
+        # Putting images right has errors of its own, which speak for a readout too.
+        is_better = trial.num_frames >= _MIN_FRAMES and trial.mean_px < _BETTER * trials[-1].mean_px
+        trials.append(trial)
+        if not is_better:
             break
+        readout, sigma_ms = longer, more.sigma_ms
+        more = _checked(trial)
     # So many groups of keyframes tell how sure it is.
     reach_ms = _SIGMAS_95 * small_sample_factor(NUM_GROUPS) * sigma_ms
     low_ms, high_ms = readout.signed_ms - reach_ms, readout.signed_ms + reach_ms
@@ -206,7 +210,7 @@ def _report(settings: ReadoutSettings, name: str, estimate: ReadoutEstimate) -> 
             {
                 "axis": trial.readout.axis,
                 "signed_ms": trial.readout.signed_ms,
-                "error_px": trial.error_px,
+                "error_px": trial.mean_px if trial.num_frames else None,
                 "num_frames": trial.num_frames,
                 "more_axis": None if trial.more is None else trial.more.readout.axis,
                 "more_ms": None if trial.more is None else trial.more.readout.signed_ms,
@@ -216,6 +220,12 @@ def _report(settings: ReadoutSettings, name: str, estimate: ReadoutEstimate) -> 
             for trial in estimate.trials
         ],
     }
+
+
+def _seen(trial: Trial, on_trial: Callable[[Trial], None] | None) -> Trial:
+    if on_trial is not None:
+        on_trial(trial)
+    return trial
 
 
 def _checked(trial: Trial) -> ReadoutFit:
@@ -291,4 +301,4 @@ def _tried(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout)
     finally:
         reconstruction.close()
     more = fit_readout(bundle.views, readout.axis if readout.ms else None)
-    return Trial(readout, float(np.mean(errors_px)) if errors_px else None, len(errors_px), more)
+    return Trial(readout, float(np.mean(errors_px)) if errors_px else np.inf, len(errors_px), more)

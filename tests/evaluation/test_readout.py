@@ -1,6 +1,7 @@
 """The readout time of a rolling shutter is found from its images."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -15,12 +16,12 @@ from semcast.server.mapping.readout import Readout, ReadoutFit
 
 
 def says(true: Readout, share: float = 0.9, sigma_ms: float = 0.2, num_frames: int = 60):
-    """A reconstruction that sees a share of what is missing of the readout."""
+    """A reconstruction that sees a share of what is missing of the readout, and whose error grows with it."""
 
     def tried(frames, camera, at: Readout) -> Trial:
         missing = true.signed_ms - (at.signed_ms if at.axis == true.axis else 0.0)
         more = ReadoutFit(Readout(true.axis, share * missing), sigma_ms, 0.1)
-        return Trial(at, 0.3, num_frames, more)
+        return Trial(at, 0.3 + 0.01 * abs(missing), num_frames, more)
 
     return tried
 
@@ -38,6 +39,16 @@ def test_what_is_left_of_the_readout_is_added_until_it_is_nothing(rolling, axis,
     assert found.is_global == (true_ms == 0.0)
     if true_ms:
         assert found.camera.readout_from == Readout(axis, true_ms).side
+
+
+def test_a_readout_that_makes_nothing_better_is_not_believed(rolling, monkeypatch):
+    def tried(frames, camera, at: Readout) -> Trial:
+        return Trial(at, 0.3 + 0.01 * at.ms, 60, ReadoutFit(Readout("rows", 2.0), 0.3, 0.01))
+
+    monkeypatch.setattr(readout, "_tried", tried)
+    found = readout.find_readout(ReadoutSettings(source=str(rolling)))
+    assert [trial.readout.signed_ms for trial in found.trials] == [0.0, 2.0]
+    assert found.is_global
 
 
 def test_no_readout_is_longer_than_a_frame(rolling, monkeypatch):
@@ -85,7 +96,7 @@ def test_the_readout_of_a_drawn_shutter_is_found_and_written(rolling, tmp_path, 
     assert 16.0 < found.readout_ms < 22.0
     assert (found.fx, found.width) == (before.fx, before.width)
     assert f"--readout-ms {found.readout_ms:g} --readout-from top" in said.out
-    assert "0.0 ms from top: 4" in said.err  # frames
+    assert re.search(r" 0\.0 ms from top: 3\d frames with a pose, reprojection error 0\.\d+ px\n", said.err)
     report = json.loads(result.read_text())
     assert report["command"].startswith("semcast shutter ")
     assert report["readout_ms"] == found.readout_ms

@@ -33,7 +33,7 @@ def _check_file(path: Path | None, name: str) -> None:
 
 
 def _show(trial: Trial) -> None:
-    error = "" if trial.error_px is None else f", reprojection error {trial.error_px:.3f} px"
+    error = f", reprojection error {trial.mean_px:.3f} px" if trial.num_frames else ""
     what = f"{trial.readout!s:>20}: {trial.num_frames} frames with a pose{error}"
     print(what, file=sys.stderr, flush=True)
 
