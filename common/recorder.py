@@ -1,5 +1,6 @@
 """Records messages beside a running system: a bounded queue and a thread, so the live path never waits."""
 
+import contextlib
 import logging
 import struct
 import threading
@@ -26,7 +27,8 @@ class Recorder:
 
     Args:
         path: File to write. One that is there and not empty is kept under another name: it may be the
-            recording of a process that was killed, whose restart this is. Without a message no file is left.
+            recording of a process that was killed, whose restart this is. Without a message no file is left,
+            and no folder made for it.
         header: See ``recording_metadata``.
         queue_bytes: Payload that may wait for the disk.
         stream: Written instead of ``path``, for tests.
@@ -55,6 +57,7 @@ class Recorder:
         self.error: str | None = None
         self._former: Path | None = None
         self._is_own = stream is None
+        self._new_folders = [folder for folder in path.parents if not folder.exists()]
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if stream is None:
@@ -165,6 +168,9 @@ class Recorder:
                 self._path.unlink()
             if self._former is not None:
                 self._former.rename(self._path)
+            for folder in self._new_folders:  # the innermost first
+                with contextlib.suppress(OSError):  # somebody else put something in
+                    folder.rmdir()
 
     def __enter__(self) -> "Recorder":
         return self

@@ -267,6 +267,17 @@ def test_a_recorder_that_heard_nothing_leaves_all_as_it_was(tmp_path):
     assert [m.data for m in RecordingReader(path).messages()] == [b"x"]
 
 
+def test_folders_made_for_nothing_go_again(tmp_path):
+    (tmp_path / "mine").mkdir()
+    with Recorder(tmp_path / "mine" / "new" / "newer" / "a.mcap", HEADER):
+        assert (tmp_path / "mine" / "new" / "newer").is_dir()
+    assert list(tmp_path.iterdir()) == [tmp_path / "mine"]
+    assert list((tmp_path / "mine").iterdir()) == []
+    with Recorder(tmp_path / "mine" / "new" / "newer" / "a.mcap", HEADER):
+        (tmp_path / "mine" / "new" / "notes.txt").write_text("somebody else's")
+    assert (tmp_path / "mine" / "new" / "notes.txt").exists()
+
+
 def test_a_link_to_a_device_stays_where_nothing_came(tmp_path):
     link = tmp_path / "run.mcap"
     link.symlink_to(os.devnull)
