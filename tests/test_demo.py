@@ -306,6 +306,12 @@ def test_errors_are_shown_with_three_digits(value, told):
     assert len(names) == 2
 
 
+@pytest.mark.parametrize(("readout_ms", "told"), [(19.62, ["19.6 ms from top"]), (0.0, [])])
+def test_a_rolling_shutter_that_images_were_put_right_for_is_shown(readout_ms, told):
+    table = summary_table({"readout_ms": readout_ms, "readout_from": "top"})
+    assert [str(cell) for cell in table.columns[1].cells] == told
+
+
 def test_a_camera_given_by_hand_takes_the_place_of_one_that_does_not_fit_the_images(tmp_path, monkeypatch):
     sequence = tmp_path / "halved"
     write_images(sequence, 3)

@@ -51,6 +51,8 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
             value = value.get("p50", value.get("mean"))
         if value is not None:
             table.add_row(name, written(value))
+    if summary.get("readout_ms"):
+        table.add_row("rolling shutter", f"{summary['readout_ms']:.1f} ms from {summary['readout_from']}")
     if line := parts_line(summary.get("parts") or []):
         table.add_row("parts of the map", line)
     for reason, count in (summary.get("drops") or {}).items():
