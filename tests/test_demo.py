@@ -306,9 +306,9 @@ def test_errors_are_shown_with_three_digits(value, told):
     assert len(names) == 2
 
 
-@pytest.mark.parametrize(("readout_ms", "told"), [(19.62, ["19.6 ms from top"]), (0.0, [])])
+@pytest.mark.parametrize(("readout_ms", "told"), [(19.62, ["100.0%", "19.6 ms from top"]), (0.0, ["100.0%"])])
 def test_a_rolling_shutter_that_images_were_put_right_for_is_shown(readout_ms, told):
-    table = summary_table({"readout_ms": readout_ms, "readout_from": "top"})
+    table = summary_table({"completeness": 1.0, "readout_ms": readout_ms, "readout_from": "top"})
     assert [str(cell) for cell in table.columns[1].cells] == told
 
 
