@@ -11,7 +11,8 @@ from semcast.common.errors import SourceError
 HOW_TO_GIVE = (
     "put intrinsics.json (fx fy cx cy width height) beside the images, or give --intrinsics FILE "
     "(.json, or .yaml of OpenCV, ROS or EuRoC), or --fx --fy --cx --cy in pixels. 'semcast calibrate' finds "
-    "them from pictures of a chessboard; --focal-35mm 26 (a phone's main camera) is a rough start without"
+    "them from pictures of a chessboard; --focal-35mm 26 (a phone's main camera) is a rough start without, "
+    "and 'semcast lens' makes it better from images alone"
 )
 #: Diagonal of a 35 mm film frame, 36 x 24 mm.
 _FILM_DIAGONAL_MM = 43.27

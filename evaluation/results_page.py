@@ -278,12 +278,33 @@ def _readout(report: Report) -> Iterator[str]:
     )
 
 
+def _lens(report: Report) -> Iterator[str]:
+    before, found = report["before"], report["found"]
+    reach = report["focal_reach"] * found["fx"]
+    yield f"Focal length {before['fx']:.1f} px before, {found['fx']:.1f} +- {reach:.1f} px found.\n"
+    yield from table(
+        ["focal length x", "k1 +", "reprojection error px", "frames", "left over, focal length %"],
+        [
+            [
+                f"{row['focal']:.4f}",
+                f"{row['radial']:.4f}",
+                number(row["error_px"], 3),
+                str(row["num_frames"]),
+                f"{100 * row['more_focal']:+.2f}",
+            ]
+            for row in report["trials"]
+        ],
+    )
+
+
 SECTIONS: dict[str, tuple[str, Tables]] = {
     "demo": ("The live demo", _demo),
     "codec": ("Image quality per channel use", _codec),
     "trajectory": ("Trajectories", _trajectory),
     "shutter": ("Rolling shutters, put right and not", _trajectory),
     "readout": ("Readout times found", _readout),
+    "lens": ("Focal lengths found", _lens),
+    "focal": ("Paths with a focal length that was guessed, and found", _trajectory),
     "pairs": ("Relative pose of frame pairs", _pairs),
     "confidence": ("What the confidence maps are worth", _confidence),
     "depth": ("Depth from decoded images", _depth),

@@ -15,7 +15,7 @@ from semcast.common.geometry import invert_transform, project_to_so3
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 from semcast.server.geometry.weighting import HUBER_K
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
-from semcast.server.mapping.readout import information
+from semcast.server.mapping.left_over import information
 
 Array = NDArray[np.float64]
 
@@ -138,11 +138,11 @@ def optimise(problem: BundleProblem) -> BundleResult:
             T_world_cam, xyz = problem.T_world_cam.copy(), problem.xyz.copy()
     residual, _ = residuals_px(problem, T_world_cam, xyz)
     residual[~used] = np.nan
-    readout = None
+    left_over = None
     if ok and problem.motion is not None:
-        readout = information(problem, problem.motion, T_world_cam, xyz, residual)
+        left_over = information(problem, problem.motion, T_world_cam, xyz, residual)
     elapsed_ms = (time.perf_counter_ns() - started) * 1e-6
-    return BundleResult(problem, ok, T_world_cam, xyz, residual, covariance, elapsed_ms, readout)
+    return BundleResult(problem, ok, T_world_cam, xyz, residual, covariance, elapsed_ms, left_over)
 
 
 def _covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int) -> Array | None:

@@ -51,7 +51,7 @@ class BundleProblem:
             see is adjusted.
         with_covariance: Whether the covariance of the last pose is wanted.
         huber_px: See ``NoiseModel``.
-        motion: Of the views, where it is wanted what the residuals say about a rolling shutter.
+        motion: Of the views, where it is wanted what the residuals say about shutter and lens.
     """
 
     intrinsics: tuple[float, float, float, float]
@@ -169,7 +169,7 @@ class BundleResult:
         covariance: ``(6, 6)`` marginal covariance of the last keyframe's pose in its own frame, rotation
             before translation, or None.
         elapsed_ms: Time it took.
-        readout: ``(K, 3, 3)``, see ``readout.information``; None where it was not asked for.
+        left_over: ``(K, 5, 5)``, see ``left_over.information``; None where it was not asked for.
     """
 
     problem: BundleProblem
@@ -179,7 +179,7 @@ class BundleResult:
     residual_px: Array
     covariance: Array | None
     elapsed_ms: float
-    readout: Array | None = None
+    left_over: Array | None = None
 
 
 class BundleRunner(Protocol):

@@ -1,4 +1,4 @@
-"""Watches a growing map for signs of a rolling shutter that nobody told of."""
+"""Watches a growing map for signs of a rolling shutter that nobody told of, and of a wrong focal length."""
 
 import logging
 from collections import deque
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
+from semcast.server.mapping.lens import fit_lens
 from semcast.server.mapping.readout import Axis, Readout, body_velocity, fit_readout
 from semcast.server.mapping.world_map import WorldMap
 
@@ -32,6 +33,8 @@ _LEAST_SIGMAS, _LEAST_EXPLAINED, _LEAST_EXPLAINED_MORE = 6.0, 0.03, 0.002
 #: From so many views on, an estimate is the last one if it is that sure. After many more there is none: a
 #: camera that hardly turns does not tell, and it matters little.
 _ENOUGH_VIEWS, _SURE_MS, _MOST_VIEWS = 40, 0.7, 600
+#: From so many views on, a focal length is called wrong that is so by this share.
+_LENS_VIEWS, _LEAST_FOCAL = 24, 0.02
 
 
 class ReadoutWatch:
@@ -48,6 +51,7 @@ class ReadoutWatch:
         self._axis: Axis | None = None
         self._views: list[Array] = []
         self._found: Readout | None = None
+        self._lens_is_told = False
         self.forget_frames()
 
     @property
@@ -98,9 +102,10 @@ class ReadoutWatch:
 
     def take(self, result: BundleResult) -> None:
         """Take what an adjustment has told."""
-        if result.readout is None or self._is_done or self._found is not None:
+        if result.left_over is None or self._is_done or self._found is not None:
             return
-        self._views += list(result.readout)
+        self._views += list(result.left_over)
+        self._look_at_lens()
         fit = fit_readout(self._views, self._axis)
         if fit is None:
             return
@@ -120,6 +125,20 @@ class ReadoutWatch:
         else:
             is_known = len(self._views) >= _ENOUGH_VIEWS and fit.sigma_ms <= _SURE_MS
             self._is_done = is_known or len(self._views) >= _MOST_VIEWS
+
+    def _look_at_lens(self) -> None:
+        """Say once if the focal length is clearly wrong."""
+        fit = fit_lens(self._views, with_radial=False)
+        if fit is None or self._lens_is_told or len(self._views) < _LENS_VIEWS:
+            return
+        is_sure = abs(fit.focal) >= _LEAST_SIGMAS * fit.sigma_focal and fit.explained >= _LEAST_EXPLAINED
+        if is_sure and abs(fit.focal) >= _LEAST_FOCAL:
+            self._lens_is_told = True
+            logger.warning(
+                "the focal length seems %.1f %% too %s for what is seen: semcast lens measures it",
+                100.0 * abs(fit.focal),
+                "short" if fit.focal > 0.0 else "long",
+            )
 
     def take_found(self) -> Readout | None:
         """Return, once, the readout to be added to what images are put right for; views to come have it."""

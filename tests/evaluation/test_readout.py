@@ -9,19 +9,22 @@ import pytest
 from semcast.cli import main
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError
-from semcast.evaluation import readout
-from semcast.evaluation.readout import ReadoutSettings, Trial
+from semcast.evaluation import moving_images, readout
+from semcast.evaluation.moving_images import Heard, ImagesSettings
+from semcast.evaluation.readout import Trial
 from semcast.evaluation.scenes.render import RenderSettings, render_scene
 from semcast.server.mapping.readout import Readout, ReadoutFit
+
+HEARD = Heard([], 0.3, 60)
 
 
 def says(true: Readout, share: float = 0.9, sigma_ms: float = 0.2, num_frames: int = 60):
     """A reconstruction that sees a share of what is missing of the readout, and whose error grows with it."""
 
-    def tried(frames, camera, at: Readout) -> Trial:
+    def tried(images, at: Readout) -> Trial:
         missing = true.signed_ms - (at.signed_ms if at.axis == true.axis else 0.0)
         more = ReadoutFit(Readout(true.axis, share * missing), sigma_ms, 0.1)
-        return Trial(at, 0.3 + 0.01 * abs(missing), num_frames, more)
+        return Trial(at, Heard([], 0.3 + 0.01 * abs(missing), num_frames), more)
 
     return tried
 
@@ -31,7 +34,7 @@ def says(true: Readout, share: float = 0.9, sigma_ms: float = 0.2, num_frames: i
 def test_what_is_left_of_the_readout_is_added_until_it_is_nothing(rolling, axis, true_ms, monkeypatch):
     monkeypatch.setattr(readout, "_tried", says(Readout(axis, true_ms)))
     seen: list[Trial] = []
-    found = readout.find_readout(ReadoutSettings(source=str(rolling)), seen.append)
+    found = readout.find_readout(ImagesSettings(source=str(rolling)), seen.append)
     assert found.trials == tuple(seen)
     assert len(seen) <= 3
     assert found.readout.signed_ms == pytest.approx(true_ms, abs=0.3)
@@ -42,27 +45,27 @@ def test_what_is_left_of_the_readout_is_added_until_it_is_nothing(rolling, axis,
 
 
 def test_a_readout_that_makes_nothing_better_is_not_believed(rolling, monkeypatch):
-    def tried(frames, camera, at: Readout) -> Trial:
-        return Trial(at, 0.3 + 0.01 * at.ms, 60, ReadoutFit(Readout("rows", 2.0), 0.3, 0.01))
+    def tried(images, at: Readout) -> Trial:
+        return Trial(at, Heard([], 0.3 + 0.01 * at.ms, 60), ReadoutFit(Readout("rows", 2.0), 0.3, 0.01))
 
     monkeypatch.setattr(readout, "_tried", tried)
-    found = readout.find_readout(ReadoutSettings(source=str(rolling)))
+    found = readout.find_readout(ImagesSettings(source=str(rolling)))
     assert [trial.readout.signed_ms for trial in found.trials] == [0.0, 2.0]
     assert found.is_global
 
 
 def test_no_readout_is_longer_than_a_frame(rolling, monkeypatch):
     monkeypatch.setattr(readout, "_tried", says(Readout("rows", 48.0)))
-    found = readout.find_readout(ReadoutSettings(source=str(rolling)))
+    found = readout.find_readout(ImagesSettings(source=str(rolling)))
     assert found.camera.readout_ms == pytest.approx(1e3 / 30, abs=0.1)
 
 
 def test_images_that_do_not_tell_are_refused(rolling, monkeypatch):
-    settings = ReadoutSettings(source=str(rolling))
+    settings = ImagesSettings(source=str(rolling))
     monkeypatch.setattr(readout, "_tried", says(Readout("rows", 10.0), sigma_ms=3.0))
     with pytest.raises(SemcastError, match="these images don't tell the readout time"):
         readout.find_readout(settings)
-    monkeypatch.setattr(readout, "_tried", lambda frames, camera, at: Trial(at, 0.3, 60, None))
+    monkeypatch.setattr(readout, "_tried", lambda images, at: Trial(at, HEARD, None))
     with pytest.raises(SemcastError, match="these images don't tell the readout time"):
         readout.find_readout(settings)
     monkeypatch.setattr(readout, "_tried", says(Readout("rows", 10.0), num_frames=29))
@@ -72,7 +75,7 @@ def test_images_that_do_not_tell_are_refused(rolling, monkeypatch):
 
 def test_too_few_frames_are_refused_by_settings():
     with pytest.raises(ValueError, match=r"frames must be in \[31, 1000\], got 30"):
-        ReadoutSettings(source="0", frames=30)
+        ImagesSettings(source="0", frames=30)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +89,7 @@ def rolling(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_readout_of_a_drawn_shutter_is_found_and_written(rolling, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(readout, "_MAX_PIXELS", 240 * 180)
+    monkeypatch.setattr(moving_images, "_MAX_PIXELS", 240 * 180)
     out = tmp_path / "intrinsics.json"
     result = tmp_path / "result.json"
     assert main(["shutter", str(rolling), "--out", str(out), "--json", str(result)]) == 0

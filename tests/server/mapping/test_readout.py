@@ -4,77 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from shaken_views import CAMERA, NUM_VIEWS, SIZE_WH, adjusted, pose_at, rolling_xy
 
-from semcast.common.camera import Intrinsics
-from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
-from semcast.server.mapping.bundle import optimise
-from semcast.server.mapping.bundle_problem import BundleProblem, ViewMotion
-from semcast.server.mapping.readout import Readout, body_velocity, fit_readout, information, lean
-
-CAMERA = Intrinsics(fx=400.0, fy=400.0, cx=319.5, cy=239.5, width=640, height=480)
-NUM_VIEWS, STEP_S = 12, 0.1
-SIZE_WH = (CAMERA.width, CAMERA.height)
-
-
-def pose_at(t_s):
-    """A hand that goes sideways and shakes."""
-    turn = 0.05 * np.array([np.sin(9.0 * t_s), np.cos(7.0 * t_s), np.sin(11.0 * t_s + 1.0)])
-    return make_transform(exp_so3(turn), np.array([0.5 * t_s, 0.04 * np.sin(8.0 * t_s), 0.1 * t_s]))
-
-
-def rolling_xy(xyz, t_s, camera):
-    """Where points are seen when each row, or column, has its own pose."""
-    axis = int(camera.readout_from in ("top", "bottom"))
-    readout_s = 1e-3 * Readout.of(camera).signed_ms
-    xy = camera.project(transform_points(invert_transform(pose_at(t_s)), xyz))
-    for _ in range(4):
-        late_s = readout_s * (xy[:, axis] / (SIZE_WH[axis] - 1) - 0.5)
-        in_cam = [
-            transform_points(invert_transform(pose_at(t_s + s)), p[None])[0]
-            for s, p in zip(late_s, xyz, strict=True)
-        ]
-        xy = camera.project(np.array(in_cam))
-    return xy
-
-
-def adjusted(camera, noise_px=0.2, seed=0, velocities=True):
-    """An adjustment that takes every image for one of a moment, and what it says."""
-    rng = np.random.default_rng(seed)
-    xyz = np.column_stack(
-        [rng.uniform(-2.0, 2.5, 150), rng.uniform(-1.5, 1.5, 150), rng.uniform(3.0, 6.0, 150)]
-    )
-    times_s = STEP_S * np.arange(NUM_VIEWS)
-    poses = np.stack([pose_at(t) for t in times_s])
-    xy = np.concatenate([rolling_xy(xyz, t, camera) for t in times_s])
-    view, point = np.divmod(np.arange(len(xy)), len(xyz))
-    ms = 1e-3
-    velocity = np.stack(
-        [body_velocity(pose_at(t - ms), pose_at(t), pose_at(t + ms), 2 * ms) for t in times_s]
-    )
-    problem = BundleProblem(
-        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
-        keyframe_ids=np.arange(NUM_VIEWS),
-        T_world_cam=poses,
-        fixed=np.arange(NUM_VIEWS) == 0,
-        keep_baseline=True,
-        landmark_ids=np.arange(len(xyz)),
-        xyz=xyz,
-        view=view,
-        point=point,
-        xy=xy + noise_px * rng.standard_normal(xy.shape),
-        sigma_px=np.full(len(xy), 0.5),
-        confidence=np.ones(len(xy)),
-        iterations=20,
-        motion=ViewMotion(SIZE_WH, velocity) if velocities else None,
-    )
-    return optimise(problem)
+from semcast.common.geometry import exp_se3, invert_transform, transform_points
+from semcast.server.mapping.bundle_problem import ViewMotion
+from semcast.server.mapping.left_over import information
+from semcast.server.mapping.readout import Readout, body_velocity, fit_readout, lean
 
 
 @pytest.mark.parametrize("readout_from", ["top", "bottom", "left", "right"])
 def test_the_readout_and_its_side_are_found_in_what_an_adjustment_leaves(readout_from):
     result = adjusted(replace(CAMERA, readout_ms=20.0, readout_from=readout_from))
-    assert result.readout.shape == (NUM_VIEWS, 3, 3)
-    fit = fit_readout(result.readout)
+    assert result.left_over.shape == (NUM_VIEWS, 5, 5)
+    fit = fit_readout(result.left_over)
     assert fit.readout.side == readout_from
     assert fit.readout.ms == pytest.approx(20.0, abs=1.5)
     assert fit.sigma_ms < 1.5
@@ -82,14 +24,14 @@ def test_the_readout_and_its_side_are_found_in_what_an_adjustment_leaves(readout
 
 
 def test_noise_alone_looks_like_no_rolling_shutter():
-    fit = fit_readout(adjusted(CAMERA).readout)
+    fit = fit_readout(adjusted(CAMERA).left_over)
     assert fit.readout.ms < 4 * max(fit.sigma_ms, 0.05)
     assert fit.readout.ms < 1.0
     assert fit.explained < 0.01
 
 
 def test_an_axis_that_is_known_is_kept():
-    views = adjusted(replace(CAMERA, readout_ms=20.0, readout_from="bottom")).readout
+    views = adjusted(replace(CAMERA, readout_ms=20.0, readout_from="bottom")).left_over
     assert fit_readout(views, "rows") == fit_readout(views)
     across = fit_readout(views, "columns")
     assert across.readout.axis == "columns"
@@ -97,13 +39,13 @@ def test_an_axis_that_is_known_is_kept():
 
 
 def test_without_movement_nothing_is_said():
-    assert adjusted(CAMERA, velocities=False).readout is None
+    assert adjusted(CAMERA, velocities=False).left_over is None
     result = adjusted(CAMERA)
     motion = ViewMotion(SIZE_WH, np.full((NUM_VIEWS, 6), np.nan))
     told = information(result.problem, motion, result.T_world_cam, result.xyz, result.residual_px)
     assert not told.any()
     assert fit_readout(told) is None
-    assert fit_readout(np.zeros((0, 3, 3))) is None
+    assert fit_readout(np.zeros((0, 5, 5))) is None
     still = replace(motion, velocity=np.zeros((NUM_VIEWS, 6)))
     told = information(result.problem, still, result.T_world_cam, result.xyz, result.residual_px)
     assert fit_readout(told) is None

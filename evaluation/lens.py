@@ -1,0 +1,192 @@
+"""A camera's focal length and radial distortion, from images of the camera alone: self-calibration.
+
+The images are reconstructed with the lens as it is believed to be. What adjustments leave over tells by how
+much the focal length and the first radial coefficient are wrong; with images of the better lens it is done
+again.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import SemcastError
+from semcast.common.sequence import ImageRectifier
+from semcast.evaluation.moving_images import Heard, Images, ImagesSettings, listen, load_images, reach_95
+from semcast.evaluation.report import provenance, write_json
+from semcast.server.mapping.lens import LensFit, fit_lens
+from semcast.server.mapping.readout import Readout
+
+#: Steps at most, and where to begin again if the first one leads nowhere.
+_MAX_STEPS, _FAR_FACTORS = 6, (0.83, 1.2)
+#: A change by less than this share, or than so many standard deviations, ends the search.
+_NOTHING, _NOTHING_SIGMAS = 0.002, 0.5
+#: One step changes the focal length by this share at most: adjustments are straight lines only nearby.
+_MAX_STEP = 0.2
+#: Distortion is believed that is surer than so many standard deviations, and that explains this much more of
+#: what is left.
+_RADIAL_SIGMAS, _RADIAL_EXPLAINED = 4.0, 0.01
+#: Distortion is looked for where the focal length is right to this share.
+_NEAR = 0.01
+#: An interval of the focal length that reaches further than this share to either side is no answer.
+_MAX_REACH = 0.05
+_NOT_TOLD = (
+    "these images don't tell the focal length, and it matters little for images like them: take some "
+    "while the camera moves sideways and turns, near things at different distances"
+)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens, relative to what it was believed to be.
+
+    Attributes:
+        focal: Factor on the focal length.
+        radial: What is added to the first radial coefficient.
+    """
+
+    focal: float
+    radial: float
+
+    def put_on(self, camera: Intrinsics) -> Intrinsics:
+        """Return a camera with this lens."""
+        distortion = camera.distortion
+        if self.radial:
+            k1, *others = distortion or (0.0, 0.0, 0.0, 0.0)
+            distortion = (k1 + self.radial, *others)
+        return replace(camera, fx=camera.fx * self.focal, fy=camera.fy * self.focal, distortion=distortion)
+
+
+@dataclass(frozen=True)
+class LensTrial:
+    """What the reconstruction with one lens left.
+
+    Attributes:
+        lens: The lens.
+        heard: What it left.
+        change: Of the lens, by which residuals would be less; None where they don't say.
+    """
+
+    lens: Lens
+    heard: Heard
+    change: LensFit | None
+
+
+@dataclass(frozen=True)
+class LensEstimate:
+    """A lens and how far to trust it.
+
+    Attributes:
+        camera: As it was given, of the images as stored, with the lens found.
+        focal_reach: Bounds of 95 % of the focal length, as share of it to either side.
+        radial_reach: The same of the first radial coefficient, absolute; None where distortion is as it was.
+        trials: All that were made, in order.
+    """
+
+    camera: Intrinsics
+    focal_reach: float
+    radial_reach: float | None
+    trials: tuple[LensTrial, ...]
+
+
+def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | None = None) -> LensEstimate:
+    """Find the focal length and the radial distortion of the camera that took some images.
+
+    The principal point stays. A distortion that is known is kept, and the first coefficient is added to.
+
+    Args:
+        settings: Which images, and the camera to begin with; a quarter of its focal length is far away.
+        on_trial: Sees each trial as soon as it is made.
+
+    Raises:
+        SourceError: Images or intrinsics can't be read.
+        SemcastError: The images don't tell, or the result can't be written.
+    """
+    images = load_images(settings)
+    readout = Readout.of(images.stored)
+    trials: list[LensTrial] = []
+
+    def tried(lens: Lens) -> LensTrial:
+        trials.append(_tried(images, lens, readout))
+        if on_trial is not None:
+            on_trial(trials[-1])
+        return trials[-1]
+
+    best, num_steps = tried(Lens(1.0, 0.0)), 0
+    while True:
+        best.heard.check()
+        if (change := best.change) is None:
+            raise SemcastError(_NOT_TOLD)
+        reach = reach_95(change.sigma_focal)
+        if _is_nothing(change) or num_steps == _MAX_STEPS:
+            break
+        trial = tried(_changed(best.lens, change))
+        if trial.heard.mean_px > best.heard.mean_px:
+            # Residuals and the reconstruction contradict each other by so much.
+            if num_steps or abs(change.focal) <= reach:
+                reach = max(reach, abs(change.focal))
+                break
+            # From too far away they do altogether.
+            others = [tried(Lens(factor, 0.0)) for factor in _FAR_FACTORS]
+            trial = min(others, key=lambda t: t.heard.mean_px)
+            if trial.heard.mean_px > best.heard.mean_px:
+                raise SemcastError(_NOT_TOLD)
+        best, num_steps = trial, num_steps + 1
+    if reach > _MAX_REACH:
+        raise SemcastError(_NOT_TOLD)
+    radial_reach = reach_95(change.sigma_radial) if best.lens.radial else None
+    found = LensEstimate(best.lens.put_on(images.stored), reach, radial_reach, tuple(trials))
+    if settings.json is not None:
+        write_json(settings.json, _report(settings, images, found))
+    return found
+
+
+def _is_nothing(change: LensFit) -> bool:
+    return not change.radial and abs(change.focal) < max(_NOTHING, _NOTHING_SIGMAS * change.sigma_focal)
+
+
+def _changed(lens: Lens, change: LensFit) -> Lens:
+    step = float(np.clip(change.focal, -_MAX_STEP, _MAX_STEP))
+    return Lens(lens.focal * (1.0 + step), lens.radial + change.radial)
+
+
+def _tried(images: Images, lens: Lens, readout: Readout) -> LensTrial:
+    """Reconstruct with one lens."""
+    camera = lens.put_on(images.camera)
+    rectify = ImageRectifier(camera, (camera.width, camera.height))
+    frames = [replace(frame, image=rectify(frame.image)) for frame in images.frames]
+    heard = listen(frames, camera.undistorted(), readout)
+    plain = fit_lens(heard.views, with_radial=False)
+    bent = fit_lens(heard.views, with_radial=True)
+    # Far from the right focal length the one is taken for the other.
+    if plain is None or bent is None or abs(plain.focal) > _NEAR:
+        return LensTrial(lens, heard, plain)
+    is_bent = abs(bent.radial) >= _RADIAL_SIGMAS * bent.sigma_radial
+    is_bent &= bent.explained >= plain.explained + _RADIAL_EXPLAINED
+    return LensTrial(lens, heard, bent if is_bent else plain)
+
+
+def _report(settings: ImagesSettings, images: Images, found: LensEstimate) -> dict[str, Any]:
+    """Return the result with its provenance."""
+    return {
+        **provenance("lens", settings),
+        "sequence": images.name,
+        "before": images.stored.to_dict(),
+        "found": found.camera.to_dict(),
+        "focal_reach": found.focal_reach,
+        "radial_reach": found.radial_reach,
+        "trials": [
+            {
+                "focal": trial.lens.focal,
+                "radial": trial.lens.radial,
+                "error_px": trial.heard.mean_px,
+                "num_frames": trial.heard.num_frames,
+                "more_focal": None if trial.change is None else trial.change.focal,
+                "more_radial": None if trial.change is None else trial.change.radial,
+                "explained": None if trial.change is None else trial.change.explained,
+            }
+            for trial in found.trials
+        ],
+    }

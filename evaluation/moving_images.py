@@ -1,0 +1,204 @@
+"""What images of a moving camera say about the camera itself: they are reconstructed, and asked what is left.
+
+All of it is one process, each adjustment done before the next frame, so that the same images give the same
+answer.
+"""
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.agent.source import Source, open_source
+from semcast.agent.source_settings import SourceSettings
+from semcast.common.camera import Intrinsics
+from semcast.common.camera_settings import CameraSettings
+from semcast.common.errors import SemcastError, SourceError
+from semcast.common.sequence import resized
+from semcast.common.sequence_layouts import Layout
+from semcast.evaluation.statistics import small_sample_factor
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
+from semcast.server.mapping.left_over import NUM_GROUPS
+from semcast.server.mapping.readout import Readout
+from semcast.server.mapping.readout_watch import ReadoutWatch
+from semcast.server.mapping.reconstruction import Reconstruction
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.world_map import WorldMap
+
+Array = NDArray[np.float64]
+
+#: Frames with a pose from which there is an answer.
+MIN_FRAMES = 30
+#: Larger images tell no more and take longer.
+_MAX_PIXELS = 640 * 480
+#: Standard deviations either side of 95 %.
+_SIGMAS_95 = 1.96
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagesSettings:
+    """Which images a camera is to be found by.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    source: str = field(
+        metadata={
+            "positional": True,
+            "help": "video, folder of a recorded sequence or of images, or number of a camera, which is then "
+            "to be moved and turned",
+        }
+    )
+    layout: Layout = field(
+        default="auto",
+        metadata={"help": "layout of the folder: native, tum, kitti, euroc, transforms, folder"},
+    )
+    camera: CameraSettings = field(default=CameraSettings(), metadata={"help": "intrinsics"})
+    rate_hz: float | None = field(
+        default=None, metadata={"help": "frames per second of folders that record no times"}
+    )
+    frames: int = field(default=150, metadata={"help": "frames used at most, from the first one on"})
+    json: Path | None = field(default=None, metadata={"help": "file for the result"})
+
+    def __post_init__(self) -> None:
+        if not MIN_FRAMES < self.frames <= 1000:
+            raise ValueError(f"frames must be in [{MIN_FRAMES + 1}, 1000], got {self.frames}")
+
+
+@dataclass(frozen=True)
+class Images:
+    """Images of a moving camera.
+
+    Attributes:
+        name: Of their source.
+        frames: Small, and without the distortion that is known.
+        camera: Of the small images.
+        stored: Of the images as stored.
+        period_ms: Median time from one to the next.
+    """
+
+    name: str
+    frames: Sequence[DecodedFrame]
+    camera: Intrinsics
+    stored: Intrinsics
+    period_ms: float
+
+
+def load_images(settings: ImagesSettings) -> Images:
+    """Read images and make them small.
+
+    Raises:
+        SourceError: Images or intrinsics can't be read, or the images are too few.
+    """
+    source = open_source(
+        SourceSettings(
+            source=settings.source,
+            layout=settings.layout,
+            camera=settings.camera,
+            rate_hz=settings.rate_hz,
+            max_frames=settings.frames,
+            pace="receiver",
+        )
+    )
+    try:
+        frames, camera = _small_frames(source)
+        stored = source.stored_camera
+    finally:
+        source.close()
+    if len(frames) <= MIN_FRAMES:
+        raise SourceError(f"{source.name} must have more than {MIN_FRAMES} images, got {len(frames)}")
+    period_ms = float(np.median(np.diff([frame.t_source_ns for frame in frames]))) * 1e-6
+    return Images(source.name, frames, camera, stored, period_ms)
+
+
+def _small_frames(source: Source) -> tuple[list[DecodedFrame], Intrinsics]:
+    """Return the frames of a source, made small, and their camera."""
+    camera = source.intrinsics
+    share = min(1.0, float(np.sqrt(_MAX_PIXELS / (camera.width * camera.height))))
+    camera = camera.scaled_to(round(camera.width * share), round(camera.height * share))
+    frames = [
+        DecodedFrame(frame.frame_id, frame.t_source_ns, resized(frame.image, (camera.width, camera.height)))
+        for frame in source.frames(threading.Event())
+    ]
+    return frames, camera
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What a reconstruction left.
+
+    Attributes:
+        views: ``(5, 5)`` of each view, see ``left_over.information``.
+        mean_px: Mean over frames of their median reprojection error, infinite without any.
+        num_frames: Frames that got a pose from a map that was there.
+    """
+
+    views: Sequence[Array]
+    mean_px: float
+    num_frames: int
+
+    def check(self) -> None:
+        """Make sure that it is worth listening to.
+
+        Raises:
+            SemcastError: Too few frames got a pose.
+        """
+        if self.num_frames < MIN_FRAMES:
+            raise SemcastError(
+                f"only {self.num_frames} frames got a pose, {MIN_FRAMES} are needed: take images of a place "
+                "with much to see, while the camera moves sideways and turns"
+            )
+
+
+def reach_95(sigma: float) -> float:
+    """Return how far the bounds of 95 % are from an estimate whose ``sigma`` comes from groups of views."""
+    return _SIGMAS_95 * small_sample_factor(NUM_GROUPS) * sigma
+
+
+class _Listening(InlineBundle):
+    """Asks every few adjustments what their residuals say."""
+
+    def __init__(self, camera: Intrinsics) -> None:
+        super().__init__()
+        self.watch = ReadoutWatch(camera, is_wanted=True)
+        self.world: WorldMap | None = None
+        self.views: list[Array] = []
+
+    def submit(self, problem: BundleProblem) -> bool:
+        """Adjust now."""
+        assert self.world is not None
+        return super().submit(replace(problem, motion=self.watch.motion(self.world, problem)))
+
+    def take(self, wait: bool = False) -> BundleResult | None:
+        """Return the result of the last ``submit``, once."""
+        result = super().take(wait)
+        if result is not None and result.left_over is not None:
+            self.views += list(result.left_over)
+        return result
+
+
+def listen(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout) -> Heard:
+    """Reconstruct images, put right for a readout time, and hear what adjustments leave over."""
+    settings = ReconstructionSettings(confidence="off", readout_ms=readout.ms, readout_from=readout.side)
+    bundle = _Listening(camera)
+    reconstruction = Reconstruction(camera, settings, bundle)
+    errors_px = []
+    try:
+        for frame in frames:
+            bundle.world = reconstruction.world
+            result = reconstruction.process(frame)
+            for frame_id, t_source_ns, _ in result.backfilled:
+                bundle.watch.note(frame_id, t_source_ns)
+            if result.T_world_cam is not None:
+                bundle.watch.note(frame.frame_id, frame.t_source_ns)
+            if result.reprojection_error_px is not None:
+                errors_px.append(result.reprojection_error_px)
+    finally:
+        reconstruction.close()
+    return Heard(bundle.views, float(np.mean(errors_px)) if errors_px else np.inf, len(errors_px))

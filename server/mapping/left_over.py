@@ -1,0 +1,174 @@
+"""What the residuals of an adjustment say about what it took for given: the shutter and the lens.
+
+An adjustment gives all rows of an image one pose, and believes in a focal length. Where that is wrong, points
+are off by a pattern that is known but for its size. Poses and points take some of it over; the rest stays in
+the residuals, in proportion. Its size is then one unknown in a linear least squares problem: the residuals
+are compared with the pattern, after poses and points had a chance to explain either.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.geometry import invert_transform
+from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.mapping.bundle_problem import BundleProblem, ViewMotion
+
+Array = NDArray[np.float64]
+
+#: The patterns in their order: the residuals themselves; a second of readout along rows, along columns; a
+#: focal length twice as long; a first radial coefficient of 1.
+RESIDUAL, ROWS, COLUMNS, FOCAL, RADIAL = range(5)
+#: Residuals beyond so many medians count less (Huber).
+_HUBER_MEDIANS = 1.5
+#: Holds what nothing else does, as share of the mean of the diagonal: the gauge.
+_DAMPING = 1e-6
+#: Groups of views, one left out at a time, that say how sure an estimate is.
+NUM_GROUPS = 10
+
+
+def information(
+    problem: BundleProblem, motion: ViewMotion, T_world_cam: Array, xyz: Array, residual_px: Array
+) -> Array:
+    """Return what each view's residuals say: sums of the products of all patterns with each other.
+
+    Each pattern is without what a change of poses and points explains of it.
+
+    Args:
+        problem: That was adjusted; dense algebra, for a window's number of views.
+        motion: Of its views.
+        T_world_cam: ``(K, 4, 4)`` after the adjustment.
+        xyz: ``(P, 3)`` after the adjustment.
+        residual_px: ``(M, 2)``, NaN where not used.
+
+    Returns:
+        ``(K, 5, 5)``, in the order of ``RESIDUAL``, ``ROWS`` ...; zero for views of unknown velocity.
+    """
+    num_views, num_points = len(T_world_cam), len(xyz)
+    T_cam_world = invert_transform(T_world_cam)[problem.view]
+    points = np.einsum("mij,mj->mi", T_cam_world[:, :3, :3], xyz[problem.point]) + T_cam_world[:, :3, 3]
+    used = np.isfinite(residual_px).all(axis=1) & (points[:, 2] > MIN_DEPTH_MAP)
+    used &= np.isfinite(motion.velocity[problem.view]).all(axis=1)
+    told = np.zeros((num_views, 5, 5))
+    if not used.any():
+        return told
+    view, point, points = problem.view[used], problem.point[used], points[used]
+    by_point = by_points(problem.intrinsics, points)
+    by_pose = by_poses(by_point, points)
+    by_xyz = by_point @ T_cam_world[used, :3, :3]
+    flow = np.einsum("mij,mj->mi", by_pose, motion.velocity[view])
+    share = shares_of_readout(motion.size_wh, problem.xy[used])
+    ray = points[:, :2] / points[:, 2:]
+    off_centre = ray * problem.intrinsics[:2]
+    patterns = np.stack(
+        [
+            residual_px[used],
+            share[:, 1:] * flow,
+            share[:, :1] * flow,
+            off_centre,
+            off_centre * (ray**2).sum(axis=1, keepdims=True),
+        ],
+        axis=2,
+    )
+    weight = _weights(residual_px[used], problem.sigma_px[used])[:, None, None]
+    left = _unexplained(
+        weight * by_pose, weight * by_xyz, weight * patterns, view, point, (num_views, num_points)
+    )
+    np.add.at(told, view, np.einsum("mkg,mkh->mgh", left, left))
+    return told
+
+
+def shares_of_readout(size_wh: tuple[int, int], xy: Array) -> Array:
+    """Return which share of the readout after the middle each pixel is read, ``(M, 2)`` by column and row."""
+    last = np.maximum(np.array(size_wh, dtype=np.float64) - 1.0, 1.0)
+    return np.asarray(xy / last - 0.5)
+
+
+def by_poses(by_point: Array, points_cam: Array) -> Array:
+    """Return the change of pixels with the camera's pose in its own frame, ``(M, 2, 6)``."""
+    return np.concatenate([by_point @ _skews(points_cam), -by_point], axis=2)
+
+
+def by_points(intrinsics: tuple[float, float, float, float], points_cam: Array) -> Array:
+    """Return the change of pixels with points in the camera's frame, ``(M, 2, 3)``."""
+    fx, fy, _, _ = intrinsics
+    x, y, z = points_cam.T
+    jacobian = np.zeros((len(points_cam), 2, 3))
+    jacobian[:, 0, 0], jacobian[:, 0, 2] = fx / z, -fx * x / z**2
+    jacobian[:, 1, 1], jacobian[:, 1, 2] = fy / z, -fy * y / z**2
+    return jacobian
+
+
+def _skews(points: Array) -> Array:
+    """Return the cross product matrices of vectors ``(M, 3)``."""
+    x, y, z = points.T
+    none = np.zeros_like(x)
+    return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
+
+
+def _weights(residual_px: Array, sigma_px: Array) -> Array:
+    """Return the square root of each observation's weight, ``(M,)``."""
+    error = np.linalg.norm(residual_px, axis=1) / sigma_px
+    usual = _HUBER_MEDIANS * np.median(error) + 1e-9
+    return np.asarray(np.sqrt(usual / np.maximum(error, usual)) / sigma_px)
+
+
+def _unexplained(
+    by_pose: Array,
+    by_xyz: Array,
+    patterns: Array,
+    view: NDArray[np.intp],
+    point: NDArray[np.intp],
+    counts: tuple[int, int],
+) -> Array:
+    """Return patterns ``(M, 2, G)`` without what poses and points explain of them, by least squares.
+
+    Points are eliminated first (Schur complement).
+    """
+    num_views, num_points = counts
+    poses = np.zeros((num_views, 6, 6))
+    np.add.at(poses, view, by_pose.transpose(0, 2, 1) @ by_pose)
+    own = np.zeros((num_points, 3, 3))
+    np.add.at(own, point, by_xyz.transpose(0, 2, 1) @ by_xyz)
+    own += (_DAMPING * np.trace(own, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
+    both = np.zeros((num_points, 3, num_views, 6))
+    both[point, :, view] = by_xyz.transpose(0, 2, 1) @ by_pose  # a view sees a point once
+    each = both.reshape(num_points, 3, 6 * num_views)
+    of_points = np.zeros((num_points, 3, patterns.shape[2]))
+    np.add.at(of_points, point, by_xyz.transpose(0, 2, 1) @ patterns)
+    of_poses = np.zeros((num_views, 6, patterns.shape[2]))
+    np.add.at(of_poses, view, by_pose.transpose(0, 2, 1) @ patterns)
+    inverse = np.linalg.inv(own)
+    solved = (inverse @ each).reshape(3 * num_points, -1)
+    flat = each.reshape(3 * num_points, -1)
+    system = -flat.T @ solved
+    for k in range(num_views):
+        system[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += poses[k]
+    system += (_DAMPING * np.trace(poses, axis1=1, axis2=2).mean() / 6 + 1e-12) * np.eye(len(system))
+    right = of_poses.reshape(6 * num_views, -1) - solved.T @ of_points.reshape(3 * num_points, -1)
+    moved = np.linalg.solve(system, right)
+    shifted = inverse @ (of_points - each @ moved)
+    left = patterns - by_xyz @ shifted[point]
+    return np.asarray(left - by_pose @ moved.reshape(num_views, 6, -1)[view])
+
+
+def grouped(views: Sequence[Array] | Array) -> Array | None:
+    """Return sums over groups of views after each other, ``(G, 5, 5)``; None where too few say something.
+
+    Args:
+        views: ``(5, 5)`` of each, as ``information`` gives them.
+    """
+    each = np.asarray(views, dtype=np.float64).reshape(-1, 5, 5)
+    each = each[each[:, RESIDUAL, RESIDUAL] > 0.0]
+    if len(each) < 3:
+        return None
+    num_groups = min(NUM_GROUPS, len(each))
+    group = np.arange(len(each)) * num_groups // len(each)
+    return np.stack([each[group == k].sum(axis=0) for k in range(num_groups)])
+
+
+def spread(estimates: Array) -> float:
+    """Return the standard deviation of an estimate from those that each leave out a group (jackknife)."""
+    count = len(estimates)
+    return float(np.sqrt((count - 1) / count * ((estimates - estimates.mean()) ** 2).sum()))

@@ -1,0 +1,40 @@
+"""``semcast lens``: focal length and radial distortion, from images of the camera alone."""
+
+import argparse
+import sys
+
+from semcast.commands.camera_out import add_images, images_of, write_camera
+from semcast.evaluation.lens import LensEstimate, LensTrial, find_lens
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_images(parser, "the lens found")
+
+
+def _show(trial: LensTrial) -> None:
+    bent = f", k1 {trial.lens.radial:+.4f}" if trial.lens.radial else ""
+    error = f", reprojection error {trial.heard.mean_px:.3f} px" if trial.heard.num_frames else ""
+    what = f"focal length x {trial.lens.focal:.4f}{bent}: {trial.heard.num_frames} frames with a pose{error}"
+    print(what, file=sys.stderr, flush=True)
+
+
+def _answer(found: LensEstimate) -> str:
+    """Return the result in words."""
+    camera = found.camera
+    low, high = (camera.fx * (1.0 + way * found.focal_reach) for way in (-1, 1))
+    words = [f"focal length: {camera.fx:.1f} px ({low:.1f} to {high:.1f})"]
+    flags = f"--fx {camera.fx:.2f} --fy {camera.fy:.2f} --cx {camera.cx:.2f} --cy {camera.cy:.2f}"
+    if found.radial_reach is not None:
+        words.append(f"radial distortion: k1 {camera.distortion[0]:.4f} (+- {found.radial_reach:.4f})")
+    if camera.distortion:
+        flags += " --distortion " + " ".join(f"{value:.6g}" for value in camera.distortion)
+    return "\n".join([*words, flags])
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Reconstruct with one lens after another, one line on stderr each; then print the one that fits."""
+    found = find_lens(images_of(arguments), _show)
+    print(_answer(found))
+    write_camera(found.camera, arguments.out)
+    return 0
