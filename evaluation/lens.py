@@ -21,8 +21,9 @@ from semcast.server.mapping.readout import Readout
 
 #: Steps at most, and where to begin again if the first one leads nowhere.
 _MAX_STEPS, _FAR_FACTORS = 6, (0.83, 1.2)
-#: A change by less than this share, or than so many standard deviations, ends the search.
-_NOTHING, _NOTHING_SIGMAS = 0.002, 0.5
+#: A change by less than this share, or than so many standard deviations, ends the search. No bounds are closer
+#: than that: each step leaves some of the change to the next.
+_NOTHING, _NOTHING_SIGMAS = 0.001, 0.5
 #: One step changes the focal length by this share at most: adjustments are straight lines only nearby.
 _MAX_STEP = 0.2
 #: Distortion is believed that is surer than so many standard deviations, and that explains this much more of
@@ -119,7 +120,7 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
         best.heard.check()
         if (change := best.change) is None:
             raise SemcastError(_NOT_TOLD)
-        reach = reach_95(change.sigma_focal)
+        reach = max(reach_95(change.sigma_focal), 2.0 * _NOTHING)
         if _is_nothing(change) or num_steps == _MAX_STEPS:
             break
         trial = tried(_changed(best.lens, change))
