@@ -21,8 +21,8 @@ from semcast.server.mapping.readout import Readout
 
 #: Steps at most, and where to begin again if the first one leads nowhere.
 _MAX_STEPS, _FAR_FACTORS = 6, (0.83, 1.2)
-#: A change by less than this share, or than so many standard deviations, ends the search. No bounds are closer
-#: than that: each step leaves some of the change to the next.
+#: A change by less than this share, or than so many standard deviations, ends the search. No bounds are
+#: closer than that: each step leaves some of the change to the next.
 _NOTHING, _NOTHING_SIGMAS = 0.001, 0.5
 #: One step changes the focal length by this share at most: adjustments are straight lines only nearby.
 _MAX_STEP = 0.2
