@@ -1,6 +1,7 @@
 """Focal length and distortion are found from images of a moving camera."""
 
 import json
+import logging
 from pathlib import Path
 
 import pytest
@@ -127,6 +128,7 @@ def test_the_focal_length_of_a_drawn_room_is_found_and_written(room, tmp_path, c
     assert f"focal length: {found.fx:.1f} px (" in said.out
     assert f"--fx {found.fx:.2f} --fy " in said.out
     assert "focal length x 1.0000: " in said.err
+    assert logging.getLogger("semcast.server").level == logging.NOTSET, "others are heard again"
     report = json.loads(result.read_text())
     assert report["command"].startswith("semcast lens ")
     assert report["found"]["fx"] == found.fx

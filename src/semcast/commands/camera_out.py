@@ -3,6 +3,8 @@
 import argparse
 import logging
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from semcast.agent.source import is_camera_number
@@ -26,7 +28,7 @@ def add_images(parser: argparse.ArgumentParser, found: str) -> None:
 
 
 def images_of(arguments: argparse.Namespace) -> ImagesSettings:
-    """Return which images, after checks; what reconstruction says of itself is kept quiet.
+    """Return which images, after checks.
 
     Raises:
         ConfigError: A file is to be written that can't be.
@@ -36,9 +38,20 @@ def images_of(arguments: argparse.Namespace) -> ImagesSettings:
     _check_file(settings.json, "json")
     if "://" in settings.source or is_camera_number(settings.source):
         print(f"taking {settings.frames} images: move the camera, and turn it to and fro", file=sys.stderr)
-    if not arguments.debug:
-        logging.getLogger("semcast.server").setLevel(logging.ERROR)
     return settings
+
+
+@contextmanager
+def quiet_reconstruction(debug: bool) -> Iterator[None]:
+    """Keep to itself what reconstructions say while a camera is looked for, unless for debugging."""
+    server = logging.getLogger("semcast.server")
+    before = server.level
+    if not debug:
+        server.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        server.setLevel(before)
 
 
 def _check_file(path: Path | None, name: str) -> None:

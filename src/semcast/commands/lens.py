@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from semcast.commands.camera_out import add_images, images_of, write_camera
+from semcast.commands.camera_out import add_images, images_of, quiet_reconstruction, write_camera
 from semcast.evaluation.lens import LensEstimate, LensTrial, find_lens
 
 
@@ -34,7 +34,9 @@ def _answer(found: LensEstimate) -> str:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct with one lens after another, one line on stderr each; then print the one that fits."""
-    found = find_lens(images_of(arguments), _show)
+    settings = images_of(arguments)
+    with quiet_reconstruction(arguments.debug):
+        found = find_lens(settings, _show)
     print(_answer(found))
     write_camera(found.camera, arguments.out)
     return 0

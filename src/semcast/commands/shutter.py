@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from semcast.commands.camera_out import add_images, images_of, write_camera
+from semcast.commands.camera_out import add_images, images_of, quiet_reconstruction, write_camera
 from semcast.evaluation.readout import ReadoutEstimate, Trial, find_readout
 
 
@@ -31,7 +31,9 @@ def _answer(found: ReadoutEstimate) -> str:
 
 def run(arguments: argparse.Namespace) -> int:
     """Reconstruct with one readout time after another, a line on stderr each; print the one that fits."""
-    found = find_readout(images_of(arguments), _show)
+    settings = images_of(arguments)
+    with quiet_reconstruction(arguments.debug):
+        found = find_readout(settings, _show)
     print(_answer(found))
     write_camera(found.camera, arguments.out)
     return 0
