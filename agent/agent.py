@@ -190,7 +190,14 @@ def _send_lossless(
 
     session.subscribe(flow_key(agent_id), "newest", on_flow)
     encoded: SymbolFrame | None = None
+    expected_s = time.monotonic() + _READY_S
+    is_told = False
     while not stop.is_set():
+        if not is_told and not window.is_wanted and time.monotonic() > expected_s:
+            is_told = True
+            logger.warning(
+                "no server asks for frames: one in live mode takes none of an agent in replay mode (--mode)"
+            )
         if encoded is None and not capture.ended:
             # While the receiver is busy, one frame is encoded ahead.
             frame = capture.get(_FLOW_POLL_S if window.all_taken else _BUSY_POLL_S)

@@ -48,6 +48,11 @@ class ReplayWindow:
         return self._next_seq < self._base_seq + self._window
 
     @property
+    def is_wanted(self) -> bool:
+        """Whether a receiver has asked for frames yet."""
+        return self._window > 0
+
+    @property
     def all_taken(self) -> bool:
         """Whether the receiver's consumer is done with every frame."""
         return not self._kept

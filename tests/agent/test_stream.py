@@ -202,7 +202,7 @@ def test_a_finite_live_source_ends_when_its_last_frame_was_seen(bench):
     assert taken + not_sent == 12
 
 
-def test_replay_delivers_every_frame_to_a_slow_consumer(bench):
+def test_replay_delivers_every_frame_to_a_slow_consumer(bench, caplog):
     bench.channel(channel="erasure", frame_loss=0.3)
     receiver = bench.receiver("replay")
     agent = bench.agent("replay")
@@ -213,6 +213,18 @@ def test_replay_delivers_every_frame_to_a_slow_consumer(bench):
     assert (agent.result["complete"], agent.result["counts"]["sent"]) == (True, 12)
     assert bench.metrics.drops == {}
     assert bench.codec.snrs_db == [10.0] * 12, "what the encoder is told does not depend on timing"
+    assert "no server asks for frames" not in caplog.text
+
+
+def test_a_live_server_that_takes_no_replay_is_told_of(bench, until, caplog, monkeypatch):
+    monkeypatch.setattr("semcast.agent.agent._READY_S", 0.3)
+    bench.channel()
+    bench.receiver("live")
+    agent = bench.agent("replay")
+    until(lambda: "no server asks for frames: one in live mode takes none" in caplog.text)
+    agent.end()
+    assert caplog.text.count("no server asks for frames") == 1
+    assert agent.result["complete"] is False
 
 
 def test_replay_is_the_same_every_time(bench):

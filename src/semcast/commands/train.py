@@ -24,14 +24,18 @@ def run(arguments: argparse.Namespace) -> int:
 
     def work(stop: threading.Event) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-        with Progress(*columns, TimeRemainingColumn(), console=talk) as bar:
-            task = bar.add_task(settings.architecture, total=settings.steps)
+        bar = Progress(*columns, TimeRemainingColumn(), console=talk)
+        task = bar.add_task(settings.architecture, total=settings.steps)
 
-            def show(step: Step) -> None:
-                figures = " ".join(f"{name} {value:.4g}" for name, value in step.values.items())
-                bar.update(task, completed=step.step, description=figures)
+        def show(step: Step) -> None:
+            figures = " ".join(f"{name} {value:.4g}" for name, value in step.values.items())
+            bar.update(task, completed=step.step, description=figures)
+            bar.start()  # nothing is shown of a run that can't begin
 
+        try:
             result = train(settings, show, stop.is_set)
+        finally:
+            bar.stop()
         print(f"{result.weights}: {result.steps} steps in {result.elapsed_s / 60:.0f} min")
 
     return run_until_stopped(work)
