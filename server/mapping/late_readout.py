@@ -33,7 +33,6 @@ def put_map_right(
         camera: Pinhole, with the readout that is not made up for yet.
         flows: How images moved, by frame id; frames without are left as they are.
     """
-    flows = _with_first(flows, list(world.frames))
     poses = _upright(world, camera, flows)
     hang_on = {frame_id: world.frames[frame_id][0] for frame_id in poses}
     rows = RowTimes(camera)
@@ -50,16 +49,6 @@ def put_map_right(
             world.move_keyframe(frame_id, poses[frame_id])
     for frame_id, keyframe_id in hang_on.items():
         world.add_frame(frame_id, keyframe_id, poses[frame_id])
-
-
-def _with_first(flows: Mapping[int, ImageFlow], frame_ids: list[int]) -> Mapping[int, ImageFlow]:
-    """Add the image before the first one, whose movement is known by the trend of the two after it."""
-    first = sorted(flows)[:2]
-    before = [k for k in frame_ids if len(first) == 2 and k < first[0]]
-    if not before:
-        return flows
-    one, two = (flows[k] for k in first)
-    return {max(before): ImageFlow(one.camera, 2.0 * one.coefficients - two.coefficients), **flows}
 
 
 def _upright(world: WorldMap, camera: Intrinsics, flows: Mapping[int, ImageFlow]) -> dict[int, Array]:

@@ -128,8 +128,9 @@ class ReadoutWatch:
 
     def _look_at_lens(self) -> None:
         """Say once if the focal length is clearly wrong."""
-        fit = fit_lens(self._views, with_radial=False)
-        if fit is None or self._lens_is_told or len(self._views) < _LENS_VIEWS:
+        if self._lens_is_told or len(self._views) < _LENS_VIEWS:
+            return
+        if (fit := fit_lens(self._views, with_radial=False)) is None:
             return
         is_sure = abs(fit.focal) >= _LEAST_SIGMAS * fit.sigma_focal and fit.explained >= _LEAST_EXPLAINED
         if is_sure and abs(fit.focal) >= _LEAST_FOCAL:

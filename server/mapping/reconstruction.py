@@ -83,7 +83,7 @@ class Reconstruction:
         self._tracks = TrackTable(s.confidence, s.max_features, s.seed)
         self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
         self._motion = CameraMotion(self._camera)
-        self._shutter = RollingShutter(camera, keeps_flows=self._map.watch.is_on)
+        self._shutter = RollingShutter(camera, lambda: self._map.watch.is_on)
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
         self._last_posed_id: int | None = None

@@ -8,7 +8,7 @@ adjustments, has one pose an image.
 
 import logging
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -146,16 +146,18 @@ class RollingShutter:
 
     Args:
         camera: Pinhole and the shutter's readout; with a global shutter nothing is done.
-        keeps_flows: Whether the movement of every image is wanted, with a global shutter too: it may turn out
-            to be none.
+        wants_flows: Asked with every image whether its movement is to be kept, with a global shutter too: it
+            may turn out to be none.
 
     Attributes:
         camera: With the readout that is made up for.
     """
 
-    def __init__(self, camera: Intrinsics, *, keeps_flows: bool = False) -> None:
+    def __init__(self, camera: Intrinsics, wants_flows: Callable[[], bool] = lambda: False) -> None:
         self._take(camera)
-        self._flows: OrderedDict[int, ImageFlow] | None = OrderedDict() if keeps_flows else None
+        self._wants_flows = wants_flows
+        self._flows: OrderedDict[int, ImageFlow] = OrderedDict()
+        self._first_id: int | None = None
         #: The movement at the newest image, that the image was put right by, and the mean towards the image.
         self._flow: ImageFlow | None = None
         self._applied: ImageFlow | None = None
@@ -204,17 +206,17 @@ class RollingShutter:
             unknown now and then, a start from what there is comes before none.
         """
         step_s = self._since_s(frame)
+        self._first_id = frame.frame_id if self._t_ns is None else self._first_id
         self._t_ns = frame.t_source_ns
-        if self.is_global and self._flows is None:
+        wants_flow = self._wants_flows()
+        if self.is_global and not wants_flow:
             return sight, False
         self._flow = self._measured(tracks, step_s)
         self._step_s = step_s
         if self._flow is None:
             return sight, False
-        if self._flows is not None:
-            self._flows[frame.frame_id] = self._flow
-            if len(self._flows) > _MAX_FLOWS:
-                self._flows.popitem(last=False)
+        if wants_flow:
+            self._keep(frame.frame_id, self._flow)
         if self.is_global:
             return sight, False
         visible = tracks.visible
@@ -230,8 +232,17 @@ class RollingShutter:
 
     @property
     def flows(self) -> Mapping[int, ImageFlow]:
-        """How the newest images moved, by frame id, where that is kept."""
-        return self._flows or {}
+        """How the newest images moved, by frame id, as far as that was wanted."""
+        return self._flows
+
+    def _keep(self, frame_id: int, flow: ImageFlow) -> None:
+        """Keep a movement; with the second, that of the first image too, by the trend of both."""
+        if len(self._flows) == 1 and self._first_id is not None:
+            after = next(iter(self._flows.values()))
+            self._flows[self._first_id] = ImageFlow(flow.camera, 2.0 * after.coefficients - flow.coefficients)
+        self._flows[frame_id] = flow
+        if len(self._flows) > _MAX_FLOWS:
+            self._flows.popitem(last=False)
 
     def _since_s(self, frame: DecodedFrame) -> float:
         return 0.0 if self._t_ns is None else (frame.t_source_ns - self._t_ns) * 1e-9

@@ -1,14 +1,19 @@
 """A rolling shutter that nobody told of is found while the map grows, and made up for."""
 
 import logging
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+import shaken_views
 from drawn_boards import CAMERA, ate_percent, make, render
 
 from semcast.common.geometry import exp_so3, make_transform
+from semcast.server.mapping.readout_watch import ReadoutWatch
+from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.tracks import TrackTable
 
 NUM_FRAMES, STEP_S, READOUT_S, NUM_BANDS = 50, 1 / 30, 0.025, 12
 
@@ -83,3 +88,36 @@ def test_a_global_shutter_is_taken_for_one():
     _, told, _ = run(0.0, readout_ms=0.0)
     assert all(np.array_equal(trajectory[k], T) for k, T in told.items()), "watching changes nothing"
     assert ate < 0.5
+
+
+def test_a_focal_length_that_is_clearly_wrong_is_told_once(caplog):
+    def told(factor):
+        caplog.clear()
+        camera = replace(shaken_views.CAMERA, fx=factor * 400.0, fy=factor * 400.0)
+        watch = ReadoutWatch(shaken_views.CAMERA, is_wanted=True)
+        for seed in range(3):  # twelve views each
+            watch.take(shaken_views.adjusted(camera, seed=seed))
+            if seed == 0:
+                assert "the focal length seems" not in caplog.text, "too few views"
+        return caplog.text
+
+    assert "the focal length seems" not in told(1.0)
+    text = told(1.06)
+    assert text.count("the focal length seems") == 1
+    assert "% too short for what is seen: semcast lens measures it" in text
+
+
+def test_movements_are_measured_only_while_they_are_wanted():
+    wanted = [True] * 6 + [False] * 4
+    answers = iter(wanted)
+    shutter, tracks = RollingShutter(CAMERA, lambda: next(answers)), TrackTable("robust", 200, 0)
+    for k in range(len(wanted)):
+        frame = DecodedFrame(k, round(k * STEP_S * 1e9), rolled(k * STEP_S, 0.0, 0))
+        sight = shutter.see(frame)
+        tracks.follow(sight, tracks.xy + tracks.velocity) if len(tracks) else tracks.remember(sight)
+        shutter.settle(frame, sight, tracks)
+        tracks.refill(sight)
+    assert sorted(shutter.flows) == [0, 1, 2, 3, 4, 5], "the first one by those after it"
+    middle = np.array([[160.0, 120.0]])
+    speeds = [shutter.flows[k].at(middle)[0, 0] for k in range(3)]
+    assert speeds[0] == pytest.approx(2 * speeds[1] - speeds[2])
