@@ -13,7 +13,7 @@ demo: $(VENV)/.ready-run  ## stream the demo sequence over a noisy link and reco
 	$(BIN)/semcast demo --out runs/demo $(ARGS)
 
 test: $(VENV)/.ready-dev  ## run all tests
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadgroup $(ARGS)
 
 check: $(VENV)/.ready-dev  ## formatting, lint and types
 	$(BIN)/ruff format --check .

@@ -1,6 +1,11 @@
-"""Shared fixtures."""
+"""How the tests run side by side, and shared fixtures."""
 
+import os
 import signal
+from collections.abc import Generator
+
+# Threads of several processes that wait for each other by spinning cost a factor of three on two cores.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import pytest
@@ -10,6 +15,24 @@ def pytest_configure() -> None:
     """Hear Ctrl-C, which a shell lets everything ignore that it starts in the background, tests included."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep a file's tests in one process, for its fixtures, and those marked "real time" in one: in turn."""
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Escape what is no text in captured output, which processes of the tests send each other as UTF-8."""
+    report = yield
+    report.sections = [
+        (name, text.encode(errors="backslashreplace").decode()) for name, text in report.sections
+    ]
+    return report
 
 
 @pytest.fixture

@@ -30,6 +30,8 @@ from semcast.common.transport import free_endpoint, open_hub, open_session
 from semcast.common.wire import pack, unpack
 from semcast.server.receiver import Receiver
 
+pytestmark = pytest.mark.xdist_group("real time")
+
 PROGRAM = """
 import dataclasses, signal, sys, threading
 stop = threading.Event()

@@ -22,6 +22,8 @@ from semcast.common.transport import (
     zenoh_config,
 )
 
+pytestmark = pytest.mark.xdist_group("real time")
+
 HUB_PROGRAM = """
 import sys, threading
 from semcast.common.network_settings import NetworkSettings

@@ -5,6 +5,8 @@ import pytest
 from semcast.common.errors import ConfigError
 from semcast.evaluation.latency import LatencySettings, evaluate_latency, stage_profile
 
+pytestmark = pytest.mark.xdist_group("real time")
+
 
 def test_profile_by_hand():
     rows = [{"stage_ms": {"encode": 4.0}}, {"stage_ms": {"encode": 2.0, "bundle": 10.0}}]

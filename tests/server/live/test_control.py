@@ -7,6 +7,8 @@ import pytest
 
 from semcast.common.errors import SemcastError
 
+pytestmark = pytest.mark.xdist_group("real time")
+
 DEADLINE_S = 60.0
 
 

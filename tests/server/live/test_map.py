@@ -3,6 +3,7 @@
 import time
 
 import numpy as np
+import pytest
 
 from semcast.common.map_mirror import MapMirror
 from semcast.common.network_settings import NetworkSettings
@@ -10,6 +11,8 @@ from semcast.common.run_folder import read_run
 from semcast.common.transport import open_client
 from semcast.server.export.outputs import read_ply
 from semcast.server.mapping.settings import ReconstructionSettings
+
+pytestmark = pytest.mark.xdist_group("real time")
 
 AGENT = "cam0"
 DEADLINE_S = 60.0

@@ -13,6 +13,8 @@ from semcast.server.recorded_streams import recorded_streams
 from semcast.server.settings import ViewSettings
 from semcast.server.view.rerun_viewer import RerunStream
 
+pytestmark = pytest.mark.xdist_group("real time")
+
 
 def centre(pose):
     return np.array(pose.T_world_cam)[[3, 7, 11]]

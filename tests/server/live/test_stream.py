@@ -26,6 +26,8 @@ from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server
 from semcast.server.settings import ServerSettings, ViewSettings
 
+pytestmark = pytest.mark.xdist_group("real time")
+
 DEMO = Path(__file__).resolve().parents[3] / "deploy" / "demo" / "kitti_06"
 AGENT = "cam0"
 DEADLINE_S = 60.0
