@@ -16,21 +16,21 @@ from semcast.common.errors import SemcastError
 from semcast.common.sequence import ImageRectifier
 from semcast.evaluation.moving_images import Heard, Images, ImagesSettings, listen, load_images, reach_95
 from semcast.evaluation.report import provenance, write_json
-from semcast.server.mapping.lens import LensFit, fit_lens
+from semcast.server.mapping.lens import LensFit, believed_lens, fit_lens
 from semcast.server.mapping.readout import Readout
 
 #: Steps at most, and where to begin again if the first one leads nowhere.
 _MAX_STEPS, _FAR_FACTORS = 6, (0.83, 1.2)
-#: A change by less than this share, or than so many standard deviations, ends the search. No bounds are
-#: closer than that: each step leaves some of the change to the next.
+#: A change by less than this share, or than so many standard deviations, ends the search.
 _NOTHING, _NOTHING_SIGMAS = 0.001, 0.5
-#: One step changes the focal length by this share at most: adjustments are straight lines only nearby.
+#: No bounds are closer than this share: reconstructions with nearly the same lens speak for changes that
+#: differ by as much.
+_MIN_REACH = 0.004
+#: Near the right focal length, within this share of it, what a reconstruction's error grows by may be chance
+#: up to this factor.
+_NEAR, _WORSE = 0.01, 1.02
+#: One step changes the focal length by this share at most.
 _MAX_STEP = 0.2
-#: Distortion is believed that is surer than so many standard deviations, and that explains this much more of
-#: what is left.
-_RADIAL_SIGMAS, _RADIAL_EXPLAINED = 4.0, 0.01
-#: Distortion is looked for where the focal length is right to this share.
-_NEAR = 0.01
 #: An interval of the focal length that reaches further than this share to either side is no answer.
 _MAX_REACH = 0.05
 _NOT_TOLD = (
@@ -120,37 +120,49 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
         best.heard.check()
         if (change := best.change) is None:
             raise SemcastError(_NOT_TOLD)
-        reach = max(reach_95(change.sigma_focal), 2.0 * _NOTHING)
+        reach = max(reach_95(change.sigma_focal), _MIN_REACH)
+        radial_reach = reach_95(change.sigma_radial)
         if _is_nothing(change) or num_steps == _MAX_STEPS:
             break
+        is_near = abs(change.focal) <= _NEAR
+        most_px = (_WORSE if is_near else 1.0) * best.heard.mean_px
         trial = tried(_changed(best.lens, change))
-        if trial.heard.mean_px > best.heard.mean_px:
+        if trial.heard.mean_px > most_px and not is_near:
+            # Adjustments are straight lines only nearby.
+            trial = tried(_changed(best.lens, _half(change)))
+        if trial.heard.mean_px > most_px:
             # Residuals and the reconstruction contradict each other by so much.
             if num_steps or abs(change.focal) <= reach:
                 reach = max(reach, abs(change.focal))
+                radial_reach = max(radial_reach, abs(change.radial))
                 break
             # From too far away they do altogether.
-            others = [tried(Lens(factor, 0.0)) for factor in _FAR_FACTORS]
-            trial = min(others, key=lambda t: t.heard.mean_px)
-            if trial.heard.mean_px > best.heard.mean_px:
+            trial = min((tried(Lens(f, 0.0)) for f in _FAR_FACTORS), key=lambda t: t.heard.mean_px)
+            if trial.heard.mean_px > most_px:
                 raise SemcastError(_NOT_TOLD)
         best, num_steps = trial, num_steps + 1
     if reach > _MAX_REACH:
         raise SemcastError(_NOT_TOLD)
-    radial_reach = reach_95(change.sigma_radial) if best.lens.radial else None
-    found = LensEstimate(best.lens.put_on(images.stored), reach, radial_reach, tuple(trials))
+    camera = best.lens.put_on(images.stored)
+    found = LensEstimate(camera, reach, radial_reach if best.lens.radial else None, tuple(trials))
     if settings.json is not None:
         write_json(settings.json, _report(settings, images, found))
     return found
 
 
 def _is_nothing(change: LensFit) -> bool:
-    return not change.radial and abs(change.focal) < max(_NOTHING, _NOTHING_SIGMAS * change.sigma_focal)
+    is_nothing = abs(change.focal) < max(_NOTHING, _NOTHING_SIGMAS * change.sigma_focal)
+    return is_nothing and abs(change.radial) <= _NOTHING_SIGMAS * change.sigma_radial
+
+
+def _half(change: LensFit) -> LensFit:
+    return replace(change, focal=0.5 * change.focal, radial=0.5 * change.radial)
 
 
 def _changed(lens: Lens, change: LensFit) -> Lens:
-    step = float(np.clip(change.focal, -_MAX_STEP, _MAX_STEP))
-    return Lens(lens.focal * (1.0 + step), lens.radial + change.radial)
+    factor = 1.0 + float(np.clip(change.focal, -_MAX_STEP, _MAX_STEP))
+    # In pixels distortion stays what it is, whatever the focal length.
+    return Lens(lens.focal * factor, (lens.radial + change.radial) * factor**2)
 
 
 def _tried(images: Images, lens: Lens, readout: Readout) -> LensTrial:
@@ -159,14 +171,9 @@ def _tried(images: Images, lens: Lens, readout: Readout) -> LensTrial:
     rectify = ImageRectifier(camera, (camera.width, camera.height))
     frames = [replace(frame, image=rectify(frame.image)) for frame in images.frames]
     heard = listen(frames, camera.undistorted(), readout)
-    plain = fit_lens(heard.views, with_radial=False)
-    bent = fit_lens(heard.views, with_radial=True)
-    # Far from the right focal length the one is taken for the other.
-    if plain is None or bent is None or abs(plain.focal) > _NEAR:
-        return LensTrial(lens, heard, plain)
-    is_bent = abs(bent.radial) >= _RADIAL_SIGMAS * bent.sigma_radial
-    is_bent &= bent.explained >= plain.explained + _RADIAL_EXPLAINED
-    return LensTrial(lens, heard, bent if is_bent else plain)
+    # Once it is believed that there is distortion, it is asked for to the end.
+    change = fit_lens(heard.views, with_radial=True) if lens.radial else believed_lens(heard.views)
+    return LensTrial(lens, heard, change)
 
 
 def _report(settings: ImagesSettings, images: Images, found: LensEstimate) -> dict[str, Any]:

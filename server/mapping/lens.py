@@ -12,6 +12,9 @@ Array = NDArray[np.float64]
 
 #: Keeps the two apart where images say nothing about one of them, as share of its square.
 _DAMPING = 1e-9
+#: Distortion is believed that is surer than so many standard deviations, and that explains this much more of
+#: what is left than the focal length alone.
+_RADIAL_SIGMAS, _RADIAL_EXPLAINED = 3.0, 0.01
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,27 @@ def fit_lens(views: Sequence[Array] | Array, *, with_radial: bool) -> LensFit | 
     focal, radial = (*change.tolist(), 0.0)[:2]
     sigma_focal, sigma_radial = (*sigma, 0.0)[:2]
     return LensFit(focal, radial, sigma_focal, sigma_radial, float(explained))
+
+
+def believed_lens(views: Sequence[Array] | Array) -> LensFit | None:
+    """Return the change of the lens that views speak for, with distortion where that is worth believing.
+
+    A wrong focal length and a wrong distortion look alike, and the one alone takes the other's place: so both
+    are asked for together.
+
+    Args:
+        views: ``(5, 5)`` of each, as ``left_over.information`` gives them.
+
+    Returns:
+        ``radial`` and ``sigma_radial`` are zero where it is not; None where views say nothing.
+    """
+    plain = fit_lens(views, with_radial=False)
+    bent = fit_lens(views, with_radial=True)
+    if plain is None or bent is None:
+        return plain
+    is_bent = abs(bent.radial) >= _RADIAL_SIGMAS * bent.sigma_radial
+    is_bent &= bent.explained >= plain.explained + _RADIAL_EXPLAINED
+    return bent if is_bent else plain
 
 
 def _solved(total: Array, columns: list[int]) -> Array:

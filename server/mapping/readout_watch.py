@@ -1,4 +1,4 @@
-"""Watches a growing map for signs of a rolling shutter that nobody told of, and of a wrong focal length."""
+"""Watches a growing map for signs of a rolling shutter that nobody told of, and of a wrong lens."""
 
 import logging
 from collections import deque
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
-from semcast.server.mapping.lens import fit_lens
+from semcast.server.mapping.lens import believed_lens
 from semcast.server.mapping.readout import Axis, Readout, body_velocity, fit_readout
 from semcast.server.mapping.world_map import WorldMap
 
@@ -33,8 +33,9 @@ _LEAST_SIGMAS, _LEAST_EXPLAINED, _LEAST_EXPLAINED_MORE = 6.0, 0.03, 0.002
 #: From so many views on, an estimate is the last one if it is that sure. After many more there is none: a
 #: camera that hardly turns does not tell, and it matters little.
 _ENOUGH_VIEWS, _SURE_MS, _MOST_VIEWS = 40, 0.7, 600
-#: From so many views on, a focal length is called wrong that is so by this share.
-_LENS_VIEWS, _LEAST_FOCAL = 24, 0.02
+#: From so many views on, a focal length is called wrong that is so by this share, and a distortion that is so
+#: by this coefficient.
+_LENS_VIEWS, _LEAST_FOCAL, _LEAST_RADIAL = 24, 0.02, 0.02
 
 
 class ReadoutWatch:
@@ -127,19 +128,20 @@ class ReadoutWatch:
             self._is_done = is_known or len(self._views) >= _MOST_VIEWS
 
     def _look_at_lens(self) -> None:
-        """Say once if the focal length is clearly wrong."""
+        """Say once if the lens is clearly another one."""
         if self._lens_is_told or len(self._views) < _LENS_VIEWS:
             return
-        if (fit := fit_lens(self._views, with_radial=False)) is None:
+        if (fit := believed_lens(self._views)) is None or fit.explained < _LEAST_EXPLAINED:
             return
-        is_sure = abs(fit.focal) >= _LEAST_SIGMAS * fit.sigma_focal and fit.explained >= _LEAST_EXPLAINED
-        if is_sure and abs(fit.focal) >= _LEAST_FOCAL:
+        wrong = []
+        if abs(fit.focal) >= max(_LEAST_FOCAL, _LEAST_SIGMAS * fit.sigma_focal):
+            way = "short" if fit.focal > 0.0 else "long"
+            wrong.append(f"the focal length seems {100.0 * abs(fit.focal):.1f} % too {way}")
+        if abs(fit.radial) >= max(_LEAST_RADIAL, _LEAST_SIGMAS * fit.sigma_radial):
+            wrong.append(f"the distortion seems off by k1 = {fit.radial:+.3f}")
+        if wrong:
             self._lens_is_told = True
-            logger.warning(
-                "the focal length seems %.1f %% too %s for what is seen: semcast lens measures it",
-                100.0 * abs(fit.focal),
-                "short" if fit.focal > 0.0 else "long",
-            )
+            logger.warning("%s for what is seen: semcast lens measures it", " and ".join(wrong))
 
     def take_found(self) -> Readout | None:
         """Return, once, the readout to be added to what images are put right for; views to come have it."""

@@ -90,21 +90,24 @@ def test_a_global_shutter_is_taken_for_one():
     assert ate < 0.5
 
 
-def test_a_focal_length_that_is_clearly_wrong_is_told_once(caplog):
-    def told(factor):
+def test_a_lens_that_is_clearly_another_one_is_told_once(caplog):
+    def told(factor, radial=0.0):
         caplog.clear()
         camera = replace(shaken_views.CAMERA, fx=factor * 400.0, fy=factor * 400.0)
         watch = ReadoutWatch(shaken_views.CAMERA, is_wanted=True)
         for seed in range(3):  # twelve views each
-            watch.take(shaken_views.adjusted(camera, seed=seed))
+            watch.take(shaken_views.adjusted(camera, seed=seed, radial=radial))
             if seed == 0:
-                assert "the focal length seems" not in caplog.text, "too few views"
+                assert "semcast lens" not in caplog.text, "too few views"
         return caplog.text
 
-    assert "the focal length seems" not in told(1.0)
+    assert "semcast lens" not in told(1.0)
     text = told(1.06)
     assert text.count("the focal length seems") == 1
     assert "% too short for what is seen: semcast lens measures it" in text
+    text = told(1.0, radial=-0.1)
+    assert text.count("the distortion seems off by k1 = -0.") == 1
+    assert "focal length" not in text
 
 
 def test_movements_are_measured_only_while_they_are_wanted():

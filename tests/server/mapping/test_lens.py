@@ -7,7 +7,7 @@ import pytest
 from shaken_views import CAMERA, adjusted
 
 from semcast.server.mapping.left_over import FOCAL, RESIDUAL, grouped, spread
-from semcast.server.mapping.lens import fit_lens
+from semcast.server.mapping.lens import believed_lens, fit_lens
 
 
 @pytest.mark.parametrize("factor", [0.97, 1.02])
@@ -33,6 +33,18 @@ def test_a_lens_that_is_right_is_left_alone():
     assert abs(fit.focal) < 4 * fit.sigma_focal < 0.012
     assert abs(fit.radial) < 4 * fit.sigma_radial < 0.02
     assert fit.explained < 0.01
+
+
+def test_distortion_is_believed_where_it_explains_more():
+    far = replace(CAMERA, fx=1.06 * CAMERA.fx, fy=1.06 * CAMERA.fy)
+    straight, bent = adjusted(far).left_over, adjusted(far, radial=-0.1).left_over
+    assert believed_lens(straight) == fit_lens(straight, with_radial=False)
+    fit = believed_lens(bent)
+    assert fit == fit_lens(bent, with_radial=True)
+    # In the units of the focal length that was believed in.
+    assert fit.radial == pytest.approx(-0.1 / 1.06**2, abs=0.02)
+    assert fit.focal == pytest.approx(0.06, abs=0.01)
+    assert believed_lens(np.zeros((9, 5, 5))) is None
 
 
 def test_by_hand_the_change_is_the_slope_and_its_spread_that_of_what_is_left():
