@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
+from semcast.common.lens import DISTORTION_COUNTS
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.whole_file import write_whole
 from semcast.evaluation.scenes.block import Block
 from semcast.evaluation.scenes.motion import Pace
+from semcast.evaluation.scenes.optics import Optics
 from semcast.evaluation.scenes.orbit import Orbit
 from semcast.evaluation.scenes.room import Room
 from semcast.evaluation.scenes.street import Street
@@ -73,21 +75,25 @@ def frame_of(
         brightness: Factor on the grey levels, before the noise.
     """
     height = scene.camera.height
+    optics = Optics.of(scene.camera)
     edges = np.linspace(0, height, 2 if readout_s == 0 else _NUM_BANDS + 1, dtype=int)
     total = np.zeros((height, scene.camera.width, 3), np.float32)
-    background = scene.background()
+    around = (optics.margin, optics.margin)
+    background = np.pad(scene.background(), (around, around, (0, 0)), mode="edge")
     for top, bottom in pairwise(edges.tolist()):
+        first, end = optics.rows(top, bottom)
         late_s = readout_s * (0.5 * (top + bottom) / height - 0.5)
         for index, (dx, dy) in enumerate(_SAMPLES):
             moment_s = t_s + late_s + scene.exposure_s * ((index + 0.5) / len(_SAMPLES) - 0.5)
             band = replace(
-                scene.camera,
-                cx=scene.camera.cx - dx,
-                cy=scene.camera.cy - dy - top,
-                height=bottom - top,
+                optics.pinhole,
+                cx=optics.pinhole.cx - dx,
+                cy=optics.pinhole.cy - dy - first,
+                height=end - first,
             )
             T_world_cam = scene.T_world_cam(moment_s)
-            total[top:bottom] += draw(scene.surfaces(moment_s), band, T_world_cam, background[top:bottom])
+            drawn = draw(scene.surfaces(moment_s), band, T_world_cam, background[first:end])
+            total[top:bottom] += optics.bend(drawn, top, bottom)
     noisy = total * (brightness / len(_SAMPLES)) + rng.normal(0, noise_sd, total.shape[:2])[..., None]
     return np.asarray(np.clip(np.rint(noisy), 0, 255), np.uint8)
 
@@ -118,6 +124,9 @@ class RenderSettings:
         default=0.0,
         metadata={"help": "time a rolling shutter takes from the top row to the bottom, 0 for none"},
     )
+    distortion: tuple[float, ...] = field(
+        default=(), metadata={"help": "of the lens: OpenCV coefficients k1 k2 p1 p2 [k3 [k4 k5 k6]]"}
+    )
     out: Path = field(metadata={"help": "folder to write; it must not exist or be empty"})
 
     def __post_init__(self) -> None:
@@ -132,6 +141,8 @@ class RenderSettings:
             raise ValueError(f"brightness must be in (0, 1], got {self.brightness:g}")
         if not 0 <= self.readout_ms <= 100:
             raise ValueError(f"readout_ms must be in [0, 100], got {self.readout_ms:g}")
+        if len(self.distortion) not in DISTORTION_COUNTS:
+            raise ValueError(f"distortion must be 4, 5 or 8 numbers, got {len(self.distortion)}")
 
 
 def render_scene(settings: RenderSettings) -> int:
@@ -143,30 +154,31 @@ def render_scene(settings: RenderSettings) -> int:
         Number of frames.
 
     Raises:
-        SourceError: The folder has files in it or can't be written.
+        SourceError: The folder has files in it or can't be written, or no lens has such a distortion.
     """
     folder = settings.out
+    scene = SCENES[settings.scene](settings.seed, settings.pace)
+    scene.camera = replace(scene.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
+    Optics.of(scene.camera)
     try:
         if folder.exists() and any(folder.iterdir()):
             raise SourceError(f"out must be a new or an empty folder, {folder} has files in it")
         (folder / "images").mkdir(parents=True, exist_ok=True)
-        return _draw_into(folder, settings)
+        return _draw_into(folder, settings, scene)
     except OSError as err:
         raise SourceError(f"can't write to {folder}: {err.strerror}") from err
 
 
-def _draw_into(folder: Path, settings: RenderSettings) -> int:
-    scene = SCENES[settings.scene](settings.seed, settings.pace)
+def _draw_into(folder: Path, settings: RenderSettings, scene: Scene) -> int:
     times_s = np.arange(max(1, round(settings.seconds * scene.rate_hz))) / scene.rate_hz
     T_world_cams = np.stack([scene.T_world_cam(float(t_s)) for t_s in times_s])
     for index, t_s in enumerate(times_s):
         rng = np.random.default_rng([settings.seed, index, 4])
-        image = frame_of(
-            scene, float(t_s), settings.noise_sd, rng, 1e-3 * settings.readout_ms, settings.brightness
-        )
+        readout_s = 1e-3 * settings.readout_ms
+        image = frame_of(scene, float(t_s), settings.noise_sd, rng, readout_s, settings.brightness)
         _, png = cv2.imencode(".png", image[..., ::-1])
         write_whole(folder / "images" / f"{index:06d}.png", png.tobytes())
     write_whole(folder / "times.txt", "".join(f"{t_s:.6f}\n" for t_s in times_s))
-    replace(scene.camera, readout_ms=settings.readout_ms).save(folder / "intrinsics.json")
+    scene.camera.save(folder / "intrinsics.json")
     write_tum(folder / "groundtruth.txt", Trajectory(times_s, T_world_cams))
     return len(times_s)
