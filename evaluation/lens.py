@@ -1,7 +1,7 @@
 """A camera's focal length and radial distortion, from images of the camera alone: self-calibration.
 
 The images are reconstructed with the lens as it is believed to be. What adjustments leave over tells by how
-much the focal length and the first radial coefficient are wrong; with images of the better lens it is done
+much the focal length and the first radial coefficients are wrong; with images of the better lens it is done
 again.
 """
 
@@ -16,11 +16,11 @@ from semcast.common.errors import SemcastError
 from semcast.common.sequence import ImageRectifier
 from semcast.evaluation.moving_images import Heard, Images, ImagesSettings, listen, load_images, reach_95
 from semcast.evaluation.report import provenance, write_json
-from semcast.server.mapping.lens import LensFit, believed_lens, fit_lens
+from semcast.server.mapping.lens import LensFit, believed_lens
 from semcast.server.mapping.readout import Readout
 
 #: Steps at most, and where to begin again if the first one leads nowhere.
-_MAX_STEPS, _FAR_FACTORS = 6, (0.83, 1.2)
+_MAX_STEPS, _FAR_FACTORS = 8, (0.83, 1.2)
 #: A change by less than this share, or than so many standard deviations, ends the search.
 _NOTHING, _NOTHING_SIGMAS = 0.001, 0.5
 #: No bounds are closer than this share: reconstructions with nearly the same lens speak for changes that
@@ -45,18 +45,23 @@ class Lens:
 
     Attributes:
         focal: Factor on the focal length.
-        radial: What is added to the first radial coefficient.
+        radial: ``(k1, k2)``, what is added to the radial coefficients.
     """
 
-    focal: float
-    radial: float
+    focal: float = 1.0
+    radial: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def num_radial(self) -> int:
+        """How many radial coefficients, the first ones, are changed."""
+        return 2 if self.radial[1] else 1 if self.radial[0] else 0
 
     def put_on(self, camera: Intrinsics) -> Intrinsics:
         """Return a camera with this lens."""
         distortion = camera.distortion
-        if self.radial:
-            k1, *others = distortion or (0.0, 0.0, 0.0, 0.0)
-            distortion = (k1 + self.radial, *others)
+        if self.num_radial:
+            k1, k2, *others = distortion or (0.0, 0.0, 0.0, 0.0)
+            distortion = (k1 + self.radial[0], k2 + self.radial[1], *others)
         return replace(camera, fx=camera.fx * self.focal, fy=camera.fy * self.focal, distortion=distortion)
 
 
@@ -82,20 +87,20 @@ class LensEstimate:
     Attributes:
         camera: As it was given, of the images as stored, with the lens found.
         focal_reach: Bounds of 95 % of the focal length, as share of it to either side.
-        radial_reach: The same of the first radial coefficient, absolute; None where distortion is as it was.
+        radial_reach: The same of the radial coefficients that were changed, the first ones, absolute.
         trials: All that were made, in order.
     """
 
     camera: Intrinsics
     focal_reach: float
-    radial_reach: float | None
+    radial_reach: tuple[float, ...]
     trials: tuple[LensTrial, ...]
 
 
 def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | None = None) -> LensEstimate:
     """Find the focal length and the radial distortion of the camera that took some images.
 
-    The principal point stays. A distortion that is known is kept, and the first coefficient is added to.
+    The principal point stays. A distortion that is known is kept, and its radial coefficients are added to.
 
     Args:
         settings: Which images, and the camera to begin with; a quarter of its focal length is far away.
@@ -115,13 +120,13 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
             on_trial(trials[-1])
         return trials[-1]
 
-    best, num_steps = tried(Lens(1.0, 0.0)), 0
+    best, num_steps = tried(Lens()), 0
     while True:
         best.heard.check()
         if (change := best.change) is None:
             raise SemcastError(_NOT_TOLD)
         reach = max(reach_95(change.sigma_focal), _MIN_REACH)
-        radial_reach = reach_95(change.sigma_radial)
+        radial_reach = [reach_95(sigma) for sigma in change.sigma_radial]
         if _is_nothing(change) or num_steps == _MAX_STEPS:
             break
         is_near = abs(change.focal) <= _NEAR
@@ -134,17 +139,17 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
             # Residuals and the reconstruction contradict each other by so much.
             if num_steps or abs(change.focal) <= reach:
                 reach = max(reach, abs(change.focal))
-                radial_reach = max(radial_reach, abs(change.radial))
+                radial_reach = [max(r, abs(k)) for r, k in zip(radial_reach, change.radial, strict=True)]
                 break
             # From too far away they do altogether.
-            trial = min((tried(Lens(f, 0.0)) for f in _FAR_FACTORS), key=lambda t: t.heard.mean_px)
+            trial = min((tried(Lens(f)) for f in _FAR_FACTORS), key=lambda t: t.heard.mean_px)
             if trial.heard.mean_px > most_px:
                 raise SemcastError(_NOT_TOLD)
         best, num_steps = trial, num_steps + 1
     if reach > _MAX_REACH:
         raise SemcastError(_NOT_TOLD)
     camera = best.lens.put_on(images.stored)
-    found = LensEstimate(camera, reach, radial_reach if best.lens.radial else None, tuple(trials))
+    found = LensEstimate(camera, reach, tuple(radial_reach[: best.lens.num_radial]), tuple(trials))
     if settings.json is not None:
         write_json(settings.json, _report(settings, images, found))
     return found
@@ -152,17 +157,21 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
 
 def _is_nothing(change: LensFit) -> bool:
     is_nothing = abs(change.focal) < max(_NOTHING, _NOTHING_SIGMAS * change.sigma_focal)
-    return is_nothing and abs(change.radial) <= _NOTHING_SIGMAS * change.sigma_radial
+    return is_nothing and all(
+        abs(k) <= _NOTHING_SIGMAS * sigma for k, sigma in zip(change.radial, change.sigma_radial, strict=True)
+    )
 
 
 def _half(change: LensFit) -> LensFit:
-    return replace(change, focal=0.5 * change.focal, radial=0.5 * change.radial)
+    k1, k2 = change.radial
+    return replace(change, focal=0.5 * change.focal, radial=(0.5 * k1, 0.5 * k2))
 
 
 def _changed(lens: Lens, change: LensFit) -> Lens:
     factor = 1.0 + float(np.clip(change.focal, -_MAX_STEP, _MAX_STEP))
     # In pixels distortion stays what it is, whatever the focal length.
-    return Lens(lens.focal * factor, (lens.radial + change.radial) * factor**2)
+    (k1, k2), (more_k1, more_k2) = lens.radial, change.radial
+    return Lens(lens.focal * factor, ((k1 + more_k1) * factor**2, (k2 + more_k2) * factor**4))
 
 
 def _tried(images: Images, lens: Lens, readout: Readout) -> LensTrial:
@@ -171,9 +180,8 @@ def _tried(images: Images, lens: Lens, readout: Readout) -> LensTrial:
     rectify = ImageRectifier(camera, (camera.width, camera.height))
     frames = [replace(frame, image=rectify(frame.image)) for frame in images.frames]
     heard = listen(frames, camera.undistorted(), readout)
-    # Once it is believed that there is distortion, it is asked for to the end.
-    change = fit_lens(heard.views, with_radial=True) if lens.radial else believed_lens(heard.views)
-    return LensTrial(lens, heard, change)
+    # What is once believed to be there is asked for to the end.
+    return LensTrial(lens, heard, believed_lens(heard.views, lens.num_radial))
 
 
 def _report(settings: ImagesSettings, images: Images, found: LensEstimate) -> dict[str, Any]:

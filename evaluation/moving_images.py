@@ -134,7 +134,7 @@ class Heard:
     """What a reconstruction left.
 
     Attributes:
-        views: ``(5, 5)`` of each view, see ``left_over.information``.
+        views: ``(6, 6)`` of each view, see ``left_over.information``.
         mean_px: Mean over frames of their median reprojection error, infinite without any.
         num_frames: Frames that got a pose from a map that was there.
     """

@@ -281,13 +281,19 @@ def _readout(report: Report) -> Iterator[str]:
 def _lens(report: Report) -> Iterator[str]:
     before, found = report["before"], report["found"]
     reach = report["focal_reach"] * found["fx"]
-    yield f"Focal length {before['fx']:.1f} px before, {found['fx']:.1f} +- {reach:.1f} px found.\n"
+    bent = "".join(
+        f" k{number} {k:.4f} +- {reach_k:.4f}."
+        for number, (k, reach_k) in enumerate(
+            zip(found["distortion"], report["radial_reach"], strict=False), 1
+        )
+    )
+    yield f"Focal length {before['fx']:.1f} px before, {found['fx']:.1f} +- {reach:.1f} px found.{bent}\n"
     yield from table(
-        ["focal length x", "k1 +", "reprojection error px", "frames", "left over, focal length %"],
+        ["focal length x", "k1 +", "k2 +", "reprojection error px", "frames", "left over, focal length %"],
         [
             [
                 f"{row['focal']:.4f}",
-                f"{row['radial']:.4f}",
+                *(f"{k:.4f}" for k in row["radial"]),
                 number(row["error_px"], 3),
                 str(row["num_frames"]),
                 f"{100 * row['more_focal']:+.2f}",

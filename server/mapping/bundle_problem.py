@@ -169,7 +169,7 @@ class BundleResult:
         covariance: ``(6, 6)`` marginal covariance of the last keyframe's pose in its own frame, rotation
             before translation, or None.
         elapsed_ms: Time it took.
-        left_over: ``(K, 5, 5)``, see ``left_over.information``; None where it was not asked for.
+        left_over: ``(K, 6, 6)``, see ``left_over.information``; None where it was not asked for.
     """
 
     problem: BundleProblem

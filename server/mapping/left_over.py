@@ -18,8 +18,9 @@ from semcast.server.mapping.bundle_problem import BundleProblem, ViewMotion
 Array = NDArray[np.float64]
 
 #: The patterns in their order: the residuals themselves; a second of readout along rows, along columns; a
-#: focal length twice as long; a first radial coefficient of 1.
-RESIDUAL, ROWS, COLUMNS, FOCAL, RADIAL = range(5)
+#: focal length twice as long; a first and a second radial coefficient of 1.
+RESIDUAL, ROWS, COLUMNS, FOCAL, RADIAL, RADIAL_2 = range(6)
+NUM_PATTERNS = 6
 #: Residuals beyond so many medians count less (Huber).
 _HUBER_MEDIANS = 1.5
 #: Holds what nothing else does, as share of the mean of the diagonal: the gauge.
@@ -43,14 +44,14 @@ def information(
         residual_px: ``(M, 2)``, NaN where not used.
 
     Returns:
-        ``(K, 5, 5)``, in the order of ``RESIDUAL``, ``ROWS`` ...; zero for views of unknown velocity.
+        ``(K, 6, 6)``, in the order of ``RESIDUAL``, ``ROWS`` ...; zero for views of unknown velocity.
     """
     num_views, num_points = len(T_world_cam), len(xyz)
     T_cam_world = invert_transform(T_world_cam)[problem.view]
     points = np.einsum("mij,mj->mi", T_cam_world[:, :3, :3], xyz[problem.point]) + T_cam_world[:, :3, 3]
     used = np.isfinite(residual_px).all(axis=1) & (points[:, 2] > MIN_DEPTH_MAP)
     used &= np.isfinite(motion.velocity[problem.view]).all(axis=1)
-    told = np.zeros((num_views, 5, 5))
+    told = np.zeros((num_views, NUM_PATTERNS, NUM_PATTERNS))
     if not used.any():
         return told
     view, point, points = problem.view[used], problem.point[used], points[used]
@@ -60,14 +61,15 @@ def information(
     flow = np.einsum("mij,mj->mi", by_pose, motion.velocity[view])
     share = shares_of_readout(motion.size_wh, problem.xy[used])
     ray = points[:, :2] / points[:, 2:]
-    off_centre = ray * problem.intrinsics[:2]
+    off_centre, r2 = ray * problem.intrinsics[:2], (ray**2).sum(axis=1, keepdims=True)
     patterns = np.stack(
         [
             residual_px[used],
             share[:, 1:] * flow,
             share[:, :1] * flow,
             off_centre,
-            off_centre * (ray**2).sum(axis=1, keepdims=True),
+            off_centre * r2,
+            off_centre * r2**2,
         ],
         axis=2,
     )
@@ -154,12 +156,12 @@ def _unexplained(
 
 
 def grouped(views: Sequence[Array] | Array) -> Array | None:
-    """Return sums over groups of views after each other, ``(G, 5, 5)``; None where too few say something.
+    """Return sums over groups of views after each other, ``(G, 6, 6)``; None where too few say something.
 
     Args:
-        views: ``(5, 5)`` of each, as ``information`` gives them.
+        views: ``(6, 6)`` of each, as ``information`` gives them.
     """
-    each = np.asarray(views, dtype=np.float64).reshape(-1, 5, 5)
+    each = np.asarray(views, dtype=np.float64).reshape(-1, NUM_PATTERNS, NUM_PATTERNS)
     each = each[each[:, RESIDUAL, RESIDUAL] > 0.0]
     if len(each) < 3:
         return None

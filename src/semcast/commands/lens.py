@@ -13,7 +13,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _show(trial: LensTrial) -> None:
-    bent = f", k1 {trial.lens.radial:+.4f}" if trial.lens.radial else ""
+    changed = trial.lens.radial[: trial.lens.num_radial]
+    bent = "".join(f", k{number} {change:+.4f}" for number, change in enumerate(changed, 1))
     error = f", reprojection error {trial.heard.mean_px:.3f} px" if trial.heard.num_frames else ""
     what = f"focal length x {trial.lens.focal:.4f}{bent}: {trial.heard.num_frames} frames with a pose{error}"
     print(what, file=sys.stderr, flush=True)
@@ -25,8 +26,10 @@ def _answer(found: LensEstimate) -> str:
     low, high = (camera.fx * (1.0 + way * found.focal_reach) for way in (-1, 1))
     words = [f"focal length: {camera.fx:.1f} px ({low:.1f} to {high:.1f})"]
     flags = f"--fx {camera.fx:.2f} --fy {camera.fy:.2f} --cx {camera.cx:.2f} --cy {camera.cy:.2f}"
-    if found.radial_reach is not None:
-        words.append(f"radial distortion: k1 {camera.distortion[0]:.4f} (+- {found.radial_reach:.4f})")
+    if found.radial_reach:
+        radial = zip(camera.distortion, found.radial_reach, strict=False)
+        told = (f"k{number} {k:.4f} (+- {reach:.4f})" for number, (k, reach) in enumerate(radial, 1))
+        words.append("radial distortion: " + ", ".join(told))
     if camera.distortion:
         flags += " --distortion " + " ".join(f"{value:.6g}" for value in camera.distortion)
     return "\n".join([*words, flags])

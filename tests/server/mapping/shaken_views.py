@@ -34,7 +34,7 @@ def rolling_xy(xyz, t_s, camera):
     return xy
 
 
-def adjusted(camera, noise_px=0.2, seed=0, velocities=True, radial=0.0):
+def adjusted(camera, noise_px=0.2, seed=0, velocities=True, radial=0.0, radial_2=0.0):
     """An adjustment that takes every image for one of a moment and of ``CAMERA``, and what it says."""
     rng = np.random.default_rng(seed)
     xyz = np.column_stack(
@@ -44,7 +44,8 @@ def adjusted(camera, noise_px=0.2, seed=0, velocities=True, radial=0.0):
     poses = np.stack([pose_at(t) for t in times_s])
     xy = np.concatenate([rolling_xy(xyz, t, camera) for t in times_s])
     ray = (xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    xy += radial * (xy - (camera.cx, camera.cy)) * (ray**2).sum(axis=1, keepdims=True)
+    r2 = (ray**2).sum(axis=1, keepdims=True)
+    xy += (radial * r2 + radial_2 * r2**2) * (xy - (camera.cx, camera.cy))
     view, point = np.divmod(np.arange(len(xy)), len(xyz))
     ms = 1e-3
     velocity = np.stack(
