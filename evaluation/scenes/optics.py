@@ -79,5 +79,5 @@ class Optics:
         if self.sources is None:
             return drawn
         first, _ = self.rows(top, bottom)
-        sources = self.sources[top:bottom] - np.float32((0, first))
+        sources = self.sources[top:bottom] - np.array([0, first], np.float32)
         return np.asarray(cv2.remap(drawn, sources, None, cv2.INTER_CUBIC), np.float32)
