@@ -80,4 +80,5 @@ class Optics:
             return drawn
         first, _ = self.rows(top, bottom)
         sources = self.sources[top:bottom] - np.array([0, first], np.float32)
-        return np.asarray(cv2.remap(drawn, sources, None, cv2.INTER_CUBIC), np.float32)
+        x, y = sources[..., 0], sources[..., 1]
+        return np.asarray(cv2.remap(drawn, x, y, cv2.INTER_CUBIC), np.float32)
