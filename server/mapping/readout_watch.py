@@ -137,9 +137,9 @@ class ReadoutWatch:
         if abs(fit.focal) >= max(_LEAST_FOCAL, _LEAST_SIGMAS * fit.sigma_focal):
             way = "short" if fit.focal > 0.0 else "long"
             wrong.append(f"the focal length seems {100.0 * abs(fit.focal):.1f} % too {way}")
-        k1, sigma_k1 = fit.radial[0], fit.sigma_radial[0]
-        if abs(k1) >= max(_LEAST_RADIAL, _LEAST_SIGMAS * sigma_k1):
-            wrong.append(f"the distortion seems off by k1 = {k1:+.3f}")
+        if abs(fit.radial[0]) >= max(_LEAST_RADIAL, _LEAST_SIGMAS * fit.sigma_radial[0]):
+            off = (f"k{number} {k:+.3f}" for number, k in enumerate(fit.radial, 1) if k)
+            wrong.append(f"the distortion seems off ({', '.join(off)})")
         if wrong:
             self._lens_is_told = True
             logger.warning("%s for what is seen: semcast lens measures it", " and ".join(wrong))
