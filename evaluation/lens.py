@@ -1,8 +1,8 @@
-"""A camera's focal length and radial distortion, from images of the camera alone: self-calibration.
+"""A camera's focal length, distortion and principal point, from its images alone: self-calibration.
 
 The images are reconstructed with the lens as it is believed to be. What adjustments leave over tells by how
-much the focal length and the first radial coefficients are wrong; with images of the better lens it is done
-again.
+much the focal length, the first radial coefficients and the principal point are wrong; with images of the
+better lens it is done again.
 """
 
 from collections.abc import Callable
@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError
@@ -19,9 +20,12 @@ from semcast.evaluation.report import provenance, write_json
 from semcast.server.mapping.lens import LensFit, believed_lens
 from semcast.server.mapping.readout import Readout
 
+Array = NDArray[np.float64]
+
 #: Steps at most, and where to begin again if the first one leads nowhere.
 _MAX_STEPS, _FAR_FACTORS = 8, (0.83, 1.2)
-#: A change by less than this share, or than so many standard deviations, ends the search.
+#: A change by less than this (of the focal length, a coefficient, in focal lengths), or than so many standard
+#: deviations, ends the search.
 _NOTHING, _NOTHING_SIGMAS = 0.001, 0.5
 #: No bounds are closer than this share: reconstructions with nearly the same lens speak for changes that
 #: differ by as much.
@@ -46,10 +50,12 @@ class Lens:
     Attributes:
         focal: Factor on the focal length.
         radial: ``(k1, k2)``, what is added to the radial coefficients.
+        centre: ``(x, y)``, what is added to the principal point, in focal lengths as believed before.
     """
 
     focal: float = 1.0
     radial: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float, float] = (0.0, 0.0)
 
     @property
     def num_radial(self) -> int:
@@ -62,7 +68,14 @@ class Lens:
         if self.num_radial:
             k1, k2, *others = distortion or (0.0, 0.0, 0.0, 0.0)
             distortion = (k1 + self.radial[0], k2 + self.radial[1], *others)
-        return replace(camera, fx=camera.fx * self.focal, fy=camera.fy * self.focal, distortion=distortion)
+        return replace(
+            camera,
+            fx=camera.fx * self.focal,
+            fy=camera.fy * self.focal,
+            cx=camera.cx + self.centre[0] * camera.fx,
+            cy=camera.cy + self.centre[1] * camera.fy,
+            distortion=distortion,
+        )
 
 
 @dataclass(frozen=True)
@@ -88,19 +101,21 @@ class LensEstimate:
         camera: As it was given, of the images as stored, with the lens found.
         focal_reach: Bounds of 95 % of the focal length, as share of it to either side.
         radial_reach: The same of the radial coefficients that were changed, the first ones, absolute.
+        centre_reach_px: The same of the principal point, x and y, if it was moved.
         trials: All that were made, in order.
     """
 
     camera: Intrinsics
     focal_reach: float
     radial_reach: tuple[float, ...]
+    centre_reach_px: tuple[float, ...]
     trials: tuple[LensTrial, ...]
 
 
 def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | None = None) -> LensEstimate:
-    """Find the focal length and the radial distortion of the camera that took some images.
+    """Find focal length, radial distortion and principal point of the camera that took some images.
 
-    The principal point stays. A distortion that is known is kept, and its radial coefficients are added to.
+    A distortion that is known is kept, and its radial coefficients are added to.
 
     Args:
         settings: Which images, and the camera to begin with; a quarter of its focal length is far away.
@@ -125,8 +140,7 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
         best.heard.check()
         if (change := best.change) is None:
             raise SemcastError(_NOT_TOLD)
-        reach = max(reach_95(change.sigma_focal), _MIN_REACH)
-        radial_reach = [reach_95(sigma) for sigma in change.sigma_radial]
+        reaches = _reaches(change)
         if _is_nothing(change) or num_steps == _MAX_STEPS:
             break
         is_near = abs(change.focal) <= _NEAR
@@ -137,41 +151,64 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
             trial = tried(_changed(best.lens, _half(change)))
         if trial.heard.mean_px > most_px:
             # Residuals and the reconstruction contradict each other by so much.
-            if num_steps or abs(change.focal) <= reach:
-                reach = max(reach, abs(change.focal))
-                radial_reach = [max(r, abs(k)) for r, k in zip(radial_reach, change.radial, strict=True)]
+            if num_steps or abs(change.focal) <= reaches[0]:
+                reaches = np.maximum(reaches, np.abs(_values(change)))
                 break
             # From too far away they do altogether.
             trial = min((tried(Lens(f)) for f in _FAR_FACTORS), key=lambda t: t.heard.mean_px)
             if trial.heard.mean_px > most_px:
                 raise SemcastError(_NOT_TOLD)
         best, num_steps = trial, num_steps + 1
-    if reach > _MAX_REACH:
+    if reaches[0] > _MAX_REACH:
         raise SemcastError(_NOT_TOLD)
     camera = best.lens.put_on(images.stored)
-    found = LensEstimate(camera, reach, tuple(radial_reach[: best.lens.num_radial]), tuple(trials))
+    found = LensEstimate(
+        camera,
+        float(reaches[0]),
+        tuple(reaches[1 : 1 + best.lens.num_radial].tolist()),
+        tuple((reaches[3:] * (camera.fx, camera.fy)).tolist()) if any(best.lens.centre) else (),
+        tuple(trials),
+    )
     if settings.json is not None:
         write_json(settings.json, _report(settings, images, found))
     return found
 
 
+def _values(change: LensFit) -> Array:
+    """Return ``(5,)``: focal length, radial coefficients, principal point."""
+    return np.array([change.focal, *change.radial, *change.centre])
+
+
+def _sigmas(change: LensFit) -> Array:
+    return np.array([change.sigma_focal, *change.sigma_radial, *change.sigma_centre])
+
+
+def _reaches(change: LensFit) -> Array:
+    """Return the bounds of 95 %, ``(5,)``, to either side."""
+    reaches = np.array([reach_95(sigma) for sigma in _sigmas(change)])
+    reaches[0] = max(reaches[0], _MIN_REACH)
+    return reaches
+
+
 def _is_nothing(change: LensFit) -> bool:
-    is_nothing = abs(change.focal) < max(_NOTHING, _NOTHING_SIGMAS * change.sigma_focal)
-    return is_nothing and all(
-        abs(k) <= _NOTHING_SIGMAS * sigma for k, sigma in zip(change.radial, change.sigma_radial, strict=True)
-    )
+    return bool((np.abs(_values(change)) < np.maximum(_NOTHING, _NOTHING_SIGMAS * _sigmas(change))).all())
 
 
 def _half(change: LensFit) -> LensFit:
-    k1, k2 = change.radial
-    return replace(change, focal=0.5 * change.focal, radial=(0.5 * k1, 0.5 * k2))
+    (k1, k2), (x, y) = change.radial, change.centre
+    return replace(change, focal=0.5 * change.focal, radial=(0.5 * k1, 0.5 * k2), centre=(0.5 * x, 0.5 * y))
 
 
 def _changed(lens: Lens, change: LensFit) -> Lens:
     factor = 1.0 + float(np.clip(change.focal, -_MAX_STEP, _MAX_STEP))
-    # In pixels distortion stays what it is, whatever the focal length.
+    # In pixels distortion and principal point stay what they are, whatever the focal length.
     (k1, k2), (more_k1, more_k2) = lens.radial, change.radial
-    return Lens(lens.focal * factor, ((k1 + more_k1) * factor**2, (k2 + more_k2) * factor**4))
+    (x, y), (more_x, more_y) = lens.centre, change.centre
+    return Lens(
+        lens.focal * factor,
+        ((k1 + more_k1) * factor**2, (k2 + more_k2) * factor**4),
+        (x + more_x * lens.focal, y + more_y * lens.focal),
+    )
 
 
 def _tried(images: Images, lens: Lens, readout: Readout) -> LensTrial:
@@ -179,9 +216,9 @@ def _tried(images: Images, lens: Lens, readout: Readout) -> LensTrial:
     camera = lens.put_on(images.camera)
     rectify = ImageRectifier(camera, (camera.width, camera.height))
     frames = [replace(frame, image=rectify(frame.image)) for frame in images.frames]
-    heard = listen(frames, camera.undistorted(), readout)
+    heard = listen(frames, camera, readout)
     # What is once believed to be there is asked for to the end.
-    return LensTrial(lens, heard, believed_lens(heard.views, lens.num_radial))
+    return LensTrial(lens, heard, believed_lens(heard.views, lens.num_radial, any(lens.centre)))
 
 
 def _report(settings: ImagesSettings, images: Images, found: LensEstimate) -> dict[str, Any]:
@@ -193,14 +230,17 @@ def _report(settings: ImagesSettings, images: Images, found: LensEstimate) -> di
         "found": found.camera.to_dict(),
         "focal_reach": found.focal_reach,
         "radial_reach": found.radial_reach,
+        "centre_reach_px": found.centre_reach_px,
         "trials": [
             {
                 "focal": trial.lens.focal,
                 "radial": trial.lens.radial,
+                "centre": trial.lens.centre,
                 "error_px": trial.heard.mean_px,
                 "num_frames": trial.heard.num_frames,
                 "more_focal": None if trial.change is None else trial.change.focal,
                 "more_radial": None if trial.change is None else trial.change.radial,
+                "more_centre": None if trial.change is None else trial.change.centre,
                 "explained": None if trial.change is None else trial.change.explained,
             }
             for trial in found.trials

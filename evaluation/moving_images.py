@@ -134,7 +134,7 @@ class Heard:
     """What a reconstruction left.
 
     Attributes:
-        views: ``(6, 6)`` of each view, see ``left_over.information``.
+        views: ``(8, 8)`` of each view, see ``left_over.information``.
         mean_px: Mean over frames of their median reprojection error, infinite without any.
         num_frames: Frames that got a pose from a map that was there.
     """
@@ -184,10 +184,16 @@ class _Listening(InlineBundle):
 
 
 def listen(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout) -> Heard:
-    """Reconstruct images, put right for a readout time, and hear what adjustments leave over."""
+    """Reconstruct images, put right for a readout time, and hear what adjustments leave over.
+
+    Args:
+        frames: Images without distortion.
+        camera: With the distortion that they were freed of.
+        readout: Of the camera.
+    """
     settings = ReconstructionSettings(confidence="off", readout_ms=readout.ms, readout_from=readout.side)
     bundle = _Listening(camera)
-    reconstruction = Reconstruction(camera, settings, bundle)
+    reconstruction = Reconstruction(camera.undistorted(), settings, bundle)
     errors_px = []
     try:
         for frame in frames:

@@ -287,13 +287,25 @@ def _lens(report: Report) -> Iterator[str]:
             zip(found["distortion"], report["radial_reach"], strict=False), 1
         )
     )
+    if report["centre_reach_px"]:
+        x, y = report["centre_reach_px"]
+        bent += f" Principal point {found['cx']:.1f} +- {x:.1f}, {found['cy']:.1f} +- {y:.1f} px."
     yield f"Focal length {before['fx']:.1f} px before, {found['fx']:.1f} +- {reach:.1f} px found.{bent}\n"
     yield from table(
-        ["focal length x", "k1 +", "k2 +", "reprojection error px", "frames", "left over, focal length %"],
+        [
+            "focal length x",
+            "k1 +",
+            "k2 +",
+            "centre + x",
+            "centre + y",
+            "reprojection error px",
+            "frames",
+            "left over, focal length %",
+        ],
         [
             [
                 f"{row['focal']:.4f}",
-                *(f"{k:.4f}" for k in row["radial"]),
+                *(f"{value:.4f}" for value in (*row["radial"], *row["centre"])),
                 number(row["error_px"], 3),
                 str(row["num_frames"]),
                 f"{100 * row['more_focal']:+.2f}",

@@ -21,10 +21,12 @@ class ViewMotion:
         size_wh: Of the images, pixels.
         velocity: ``(K, 6)`` of each view in its own frame, rotation (rad/s) before translation (map units/s);
             NaN where unknown.
+        distortion: OpenCV coefficients of the lens that the images were put right for.
     """
 
     size_wh: tuple[int, int]
     velocity: Array
+    distortion: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -166,10 +168,10 @@ class BundleResult:
         T_world_cam: ``(K, 4, 4)``.
         xyz: ``(P, 3)``.
         residual_px: ``(M, 2)`` observed minus projected, NaN behind the camera or not used.
-        covariance: ``(6, 6)`` marginal covariance of the last keyframe's pose in its own frame, rotation
+        covariance: ``(8, 8)`` marginal covariance of the last keyframe's pose in its own frame, rotation
             before translation, or None.
         elapsed_ms: Time it took.
-        left_over: ``(K, 6, 6)``, see ``left_over.information``; None where it was not asked for.
+        left_over: ``(K, 8, 8)``, see ``left_over.information``; None where it was not asked for.
     """
 
     problem: BundleProblem

@@ -8,6 +8,7 @@ are compared with the pattern, after poses and points had a chance to explain ei
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,13 +19,16 @@ from semcast.server.mapping.bundle_problem import BundleProblem, ViewMotion
 Array = NDArray[np.float64]
 
 #: The patterns in their order: the residuals themselves; a second of readout along rows, along columns; a
-#: focal length twice as long; a first and a second radial coefficient of 1.
-RESIDUAL, ROWS, COLUMNS, FOCAL, RADIAL, RADIAL_2 = range(6)
-NUM_PATTERNS = 6
+#: focal length twice as long; a first and a second radial coefficient of 1; a principal point further to the
+#: right and down, by a focal length.
+RESIDUAL, ROWS, COLUMNS, FOCAL, RADIAL, RADIAL_2, CENTRE_X, CENTRE_Y = range(8)
+NUM_PATTERNS = 8
 #: Residuals beyond so many medians count less (Huber).
 _HUBER_MEDIANS = 1.5
 #: Holds what nothing else does, as share of the mean of the diagonal: the gauge.
 _DAMPING = 1e-6
+#: Of the numerical slope of a distortion, in rays.
+_STEP = 1e-5
 #: Groups of views, one left out at a time, that say how sure an estimate is.
 NUM_GROUPS = 10
 
@@ -44,7 +48,7 @@ def information(
         residual_px: ``(M, 2)``, NaN where not used.
 
     Returns:
-        ``(K, 6, 6)``, in the order of ``RESIDUAL``, ``ROWS`` ...; zero for views of unknown velocity.
+        ``(K, 8, 8)``, in the order of ``RESIDUAL``, ``ROWS`` ...; zero for views of unknown velocity.
     """
     num_views, num_points = len(T_world_cam), len(xyz)
     T_cam_world = invert_transform(T_world_cam)[problem.view]
@@ -60,16 +64,12 @@ def information(
     by_xyz = by_point @ T_cam_world[used, :3, :3]
     flow = np.einsum("mij,mj->mi", by_pose, motion.velocity[view])
     share = shares_of_readout(motion.size_wh, problem.xy[used])
-    ray = points[:, :2] / points[:, 2:]
-    off_centre, r2 = ray * problem.intrinsics[:2], (ray**2).sum(axis=1, keepdims=True)
     patterns = np.stack(
         [
             residual_px[used],
             share[:, 1:] * flow,
             share[:, :1] * flow,
-            off_centre,
-            off_centre * r2,
-            off_centre * r2**2,
+            *_lens_patterns(problem.intrinsics[:2], motion.distortion, points[:, :2] / points[:, 2:]),
         ],
         axis=2,
     )
@@ -79,6 +79,41 @@ def information(
     )
     np.add.at(told, view, np.einsum("mkg,mkh->mgh", left, left))
     return told
+
+
+def _lens_patterns(focal_px: tuple[float, float], distortion: tuple[float, ...], ray: Array) -> list[Array]:
+    """Return the change of pixels with the lens, ``(M, 2)`` each: from ``FOCAL`` to ``CENTRE_Y``.
+
+    Images were freed of the distortion as it is believed to be: where the lens is another one, they were
+    freed of it in the wrong places, which the slope of the distortion makes up for.
+
+    Args:
+        focal_px: fx, fy.
+        distortion: OpenCV coefficients.
+        ray: ``(M, 2)`` with unit depth.
+    """
+    r2 = (ray**2).sum(axis=1, keepdims=True)
+    across, down = np.zeros((2, len(ray), 2))
+    across[:, 0], down[:, 1] = 1.0, 1.0
+    changes = [ray, ray * r2, ray * r2**2, across, down]
+    if any(distortion):
+        changes[0], slope = _bent(ray, distortion)
+        changes = [np.linalg.solve(slope, change[..., None])[..., 0] for change in changes]
+    return [change * focal_px for change in changes]
+
+
+def _bent(ray: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
+    """Return where a lens sees rays, ``(M, 2)`` with unit depth, and its slope there, ``(M, 2, 2)``."""
+    lens, still = np.array(distortion), np.zeros(3)
+
+    def seen(at: Array) -> Array:
+        points = np.column_stack([at, np.ones(len(at))])
+        pixels = cv2.projectPoints(points, still, still, np.eye(3), lens)[0]
+        return np.asarray(pixels, np.float64).reshape(-1, 2)
+
+    steps = _STEP * np.eye(2)
+    slope = np.stack([(seen(ray + step) - seen(ray - step)) / (2 * _STEP) for step in steps], axis=2)
+    return seen(ray), slope
 
 
 def shares_of_readout(size_wh: tuple[int, int], xy: Array) -> Array:
@@ -156,10 +191,10 @@ def _unexplained(
 
 
 def grouped(views: Sequence[Array] | Array) -> Array | None:
-    """Return sums over groups of views after each other, ``(G, 6, 6)``; None where too few say something.
+    """Return sums over groups of views after each other, ``(G, 8, 8)``; None where too few say something.
 
     Args:
-        views: ``(6, 6)`` of each, as ``information`` gives them.
+        views: ``(8, 8)`` of each, as ``information`` gives them.
     """
     each = np.asarray(views, dtype=np.float64).reshape(-1, NUM_PATTERNS, NUM_PATTERNS)
     each = each[each[:, RESIDUAL, RESIDUAL] > 0.0]

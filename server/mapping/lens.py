@@ -1,4 +1,4 @@
-"""A camera's focal length and radial distortion, from what adjustments leave over."""
+"""A camera's focal length, radial distortion and principal point, from what adjustments leave over."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,79 +6,117 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.server.mapping.left_over import FOCAL, RADIAL, RADIAL_2, RESIDUAL, grouped, spread
+from semcast.server.mapping.left_over import (
+    CENTRE_X,
+    CENTRE_Y,
+    FOCAL,
+    NUM_PATTERNS,
+    RADIAL,
+    RADIAL_2,
+    RESIDUAL,
+    grouped,
+    spread,
+)
 
 Array = NDArray[np.float64]
 
-#: Keeps the three apart where images say nothing about one of them, as share of its square.
+_ALL = [FOCAL, RADIAL, RADIAL_2, CENTRE_X, CENTRE_Y]
+#: Keeps them apart where images say nothing about one of them, as share of its square.
 _DAMPING = 1e-9
-#: A coefficient is believed that is surer than so many standard deviations, and that explains this much more
-#: of what is left than those before it.
-_RADIAL_SIGMAS, _RADIAL_EXPLAINED = 3.0, 0.01
+#: What is more than a wrong focal length is believed where it is surer than so many standard deviations, and
+#: explains this much more of what is left.
+_MORE_SIGMAS, _MORE_EXPLAINED = 3.0, 0.01
+#: The principal point is looked for once the others change by no more than this: far from the right lens it
+#: takes their place.
+_NEAR_FOCAL, _NEAR_RADIAL = 0.03, 0.05
 
 
 @dataclass(frozen=True)
 class LensFit:
-    """The change of a lens that residuals speak for.
+    """The change of a lens that residuals speak for; zero, and surely so, of what was taken for right.
 
     Attributes:
         focal: By which share the focal length is longer.
         radial: ``(k1, k2)``, by how much the radial coefficients (Brown) are larger.
+        centre: ``(x, y)``, how far the principal point is to the right and down, in focal lengths.
         sigma_focal: Standard deviation, by leaving out a part of the keyframes at a time.
-        sigma_radial: The same; zero of coefficients that were taken for right.
+        sigma_radial: The same.
+        sigma_centre: The same.
         explained: Share of the squared residuals that the change explains.
     """
 
-    focal: float
-    radial: tuple[float, float]
-    sigma_focal: float
-    sigma_radial: tuple[float, float]
-    explained: float
+    focal: float = 0.0
+    radial: tuple[float, float] = (0.0, 0.0)
+    centre: tuple[float, float] = (0.0, 0.0)
+    sigma_focal: float = 0.0
+    sigma_radial: tuple[float, float] = (0.0, 0.0)
+    sigma_centre: tuple[float, float] = (0.0, 0.0)
+    explained: float = 0.0
 
 
-def fit_lens(views: Sequence[Array] | Array, num_radial: int) -> LensFit | None:
+def fit_lens(views: Sequence[Array] | Array, num_radial: int, with_centre: bool = False) -> LensFit | None:
     """Return the change of the lens that views speak for, None where they say nothing.
 
     Args:
-        views: ``(6, 6)`` of each, as ``left_over.information`` gives them.
+        views: ``(8, 8)`` of each, as ``left_over.information`` gives them.
         num_radial: Radial coefficients that may change, the first ones, 0 to 2.
+        with_centre: Whether the principal point may move.
     """
     parts = grouped(views)
     if parts is None:
         return None
-    columns = [FOCAL, RADIAL, RADIAL_2][: 1 + num_radial]
+    columns = [FOCAL, *(RADIAL, RADIAL_2)[:num_radial], *((CENTRE_X, CENTRE_Y) if with_centre else ())]
     total = parts.sum(axis=0)
     if not (np.diag(total)[columns] > 0.0).all():
         return None
-    change = _solved(total, columns)
-    sigma = [spread(s) for s in np.stack([_solved(total - part, columns) for part in parts], axis=1)]
-    explained = change @ total[columns, RESIDUAL] / total[RESIDUAL, RESIDUAL]
-    focal, k1, k2 = (*change.tolist(), 0.0, 0.0)[:3]
-    sigma_focal, sigma_k1, sigma_k2 = (*sigma, 0.0, 0.0)[:3]
-    return LensFit(focal, (k1, k2), sigma_focal, (sigma_k1, sigma_k2), float(explained))
+    change, sigma = np.zeros((2, NUM_PATTERNS))
+    change[columns] = _solved(total, columns)
+    without = np.stack([_solved(total - part, columns) for part in parts], axis=1)
+    sigma[columns] = [spread(each) for each in without]
+    focal, k1, k2, x, y = change[_ALL].tolist()
+    sigma_focal, sigma_k1, sigma_k2, sigma_x, sigma_y = sigma[_ALL].tolist()
+    explained = float(change @ total[:, RESIDUAL] / total[RESIDUAL, RESIDUAL])
+    return LensFit(focal, (k1, k2), (x, y), sigma_focal, (sigma_k1, sigma_k2), (sigma_x, sigma_y), explained)
 
 
-def believed_lens(views: Sequence[Array] | Array, num_radial: int = 0) -> LensFit | None:
-    """Return the change of the lens that views speak for, with distortion where that is worth believing.
+def believed_lens(
+    views: Sequence[Array] | Array, num_radial: int = 0, with_centre: bool = False
+) -> LensFit | None:
+    """Return the change of the lens that views speak for, of more than its focal length where that is sure.
 
     A wrong focal length and a wrong distortion look alike, and the one alone takes the other's place: so both
     are asked for together.
 
     Args:
-        views: ``(6, 6)`` of each, as ``left_over.information`` gives them.
+        views: ``(8, 8)`` of each, as ``left_over.information`` gives them.
         num_radial: Coefficients, the first ones, that are believed in anyway.
+        with_centre: Whether another principal point is.
 
     Returns:
-        ``radial`` and ``sigma_radial`` are zero where it is not; None where views say nothing.
+        None where views say nothing.
     """
-    best = fit_lens(views, num_radial)
+    best = fit_lens(views, num_radial, with_centre)
     for num in range(num_radial + 1, 3):
-        if best is None or (fit := fit_lens(views, num)) is None:
-            break
-        is_sure = abs(fit.radial[num - 1]) >= _RADIAL_SIGMAS * fit.sigma_radial[num - 1]
-        if is_sure and fit.explained >= best.explained + _RADIAL_EXPLAINED:
+        fit = fit_lens(views, num, with_centre)
+        if fit is not None and _is_more(fit, best, fit.radial[num - 1 :], fit.sigma_radial[num - 1 :]):
+            best, num_radial = fit, num
+    if not with_centre and best is not None and _is_near(best):
+        fit = fit_lens(views, num_radial, with_centre=True)
+        if fit is not None and _is_more(fit, best, fit.centre, fit.sigma_centre):
             best = fit
     return best
+
+
+def _is_near(fit: LensFit) -> bool:
+    return abs(fit.focal) <= _NEAR_FOCAL and max(map(abs, fit.radial)) <= _NEAR_RADIAL
+
+
+def _is_more(
+    fit: LensFit, best: LensFit | None, values: tuple[float, ...], sigmas: tuple[float, ...]
+) -> bool:
+    """Whether a fit is worth believing over a simpler one, for values that only it has."""
+    is_sure = any(abs(v) >= _MORE_SIGMAS * sigma > 0.0 for v, sigma in zip(values, sigmas, strict=True))
+    return best is not None and is_sure and fit.explained >= best.explained + _MORE_EXPLAINED
 
 
 def _solved(total: Array, columns: list[int]) -> Array:

@@ -125,7 +125,7 @@ def fit_readout(views: Sequence[Array] | Array, axis: Axis | None = None) -> Rea
     """Return the readout time that views speak for, None where they say nothing.
 
     Args:
-        views: ``(6, 6)`` of each, as ``left_over.information`` gives them.
+        views: ``(8, 8)`` of each, as ``left_over.information`` gives them.
         axis: What is read one after the other, None for what explains more.
     """
     parts = grouped(views)

@@ -33,16 +33,16 @@ _LEAST_SIGMAS, _LEAST_EXPLAINED, _LEAST_EXPLAINED_MORE = 6.0, 0.03, 0.002
 #: From so many views on, an estimate is the last one if it is that sure. After many more there is none: a
 #: camera that hardly turns does not tell, and it matters little.
 _ENOUGH_VIEWS, _SURE_MS, _MOST_VIEWS = 40, 0.7, 600
-#: From so many views on, a focal length is called wrong that is so by this share, and a distortion that is so
-#: by this coefficient.
-_LENS_VIEWS, _LEAST_FOCAL, _LEAST_RADIAL = 24, 0.02, 0.02
+#: From so many views on, a focal length is called wrong that is so by this share, a distortion that is so by
+#: this coefficient, a principal point that is so by this share of the focal length.
+_LENS_VIEWS, _LEAST_FOCAL, _LEAST_RADIAL, _LEAST_CENTRE = 24, 0.02, 0.02, 0.01
 
 
 class ReadoutWatch:
     """Collects what adjustments say about the readout, until it is known.
 
     Args:
-        camera: Pinhole, with the readout it is said to have.
+        camera: With the readout it is said to have; its distortion, if any, is what images were freed of.
         is_wanted: Whether to watch at all.
     """
 
@@ -99,7 +99,7 @@ class ReadoutWatch:
             return None
         self._newest_id = int(problem.keyframe_ids[-1])
         velocity = self._velocities(world, problem.keyframe_ids.tolist())
-        return ViewMotion((self._camera.width, self._camera.height), velocity)
+        return ViewMotion((self._camera.width, self._camera.height), velocity, self._camera.distortion)
 
     def take(self, result: BundleResult) -> None:
         """Take what an adjustment has told."""
@@ -140,6 +140,10 @@ class ReadoutWatch:
         if abs(fit.radial[0]) >= max(_LEAST_RADIAL, _LEAST_SIGMAS * fit.sigma_radial[0]):
             off = (f"k{number} {k:+.3f}" for number, k in enumerate(fit.radial, 1) if k)
             wrong.append(f"the distortion seems off ({', '.join(off)})")
+        centre = zip(fit.centre, fit.sigma_centre, strict=True)
+        if any(abs(c) >= max(_LEAST_CENTRE, _LEAST_SIGMAS * sigma) for c, sigma in centre):
+            x_px, y_px = fit.centre[0] * self._camera.fx, fit.centre[1] * self._camera.fy
+            wrong.append(f"the principal point seems off (x {x_px:+.0f}, y {y_px:+.0f} pixels)")
         if wrong:
             self._lens_is_told = True
             logger.warning("%s for what is seen: semcast lens measures it", " and ".join(wrong))

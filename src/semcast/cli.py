@@ -36,7 +36,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "plot": ("plot", "draw a run: its path against the truth, and what happened over time"),
     "info": ("info", "say what a recording, run, sequence or weights file is, in a screenful"),
     "calibrate": ("calibrate", "find a camera's intrinsics from pictures of a chessboard or live"),
-    "lens": ("lens", "find a camera's focal length and distortion, from a video or live"),
+    "lens": ("lens", "find a camera's intrinsics from a video or live, without a chessboard"),
     "shutter": ("shutter", "find how long a camera's rolling shutter takes, from a video or live"),
     "render": ("render", "draw a sequence with an exact path: a room, a street, a block, an orbit"),
     "eval": ("evaluate", "measure trajectories, frame pairs, codecs and confidence offline"),

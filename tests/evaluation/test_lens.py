@@ -46,7 +46,9 @@ def world_of(
         heard = Heard([], 0.2 + abs(off) + abs(bent), num_frames)
         is_seen = at.num_radial or abs(bent) > 0.005
         told = (share * bent, 0.001) if is_seen else (0.0, 0.0)
-        return LensTrial(at, heard, LensFit(share * off, (told[0], 0.0), sigma, (told[1], 0.0), 0.1))
+        return LensTrial(
+            at, heard, LensFit(share * off, (told[0], 0.0), sigma_focal=sigma, sigma_radial=(told[1], 0.0))
+        )
 
     return tried
 
@@ -74,7 +76,7 @@ def test_from_far_away_it_begins_again_nearer(images, monkeypatch):
             return near(_, at, readout)
         # Lost in a valley of its own.
         return LensTrial(
-            at, Heard([], 0.6 - 0.1 * at.focal, 60), LensFit(-0.05, (0.0, 0.0), 0.001, (0.0, 0.0), 0.1)
+            at, Heard([], 0.6 - 0.1 * at.focal, 60), LensFit(-0.05, (0.0, 0.0), sigma_focal=0.001)
         )
 
     monkeypatch.setattr(lens, "_tried", tried)
@@ -89,7 +91,9 @@ def test_half_a_step_is_tried_where_a_whole_one_leads_too_far(images, monkeypatc
     def tried(_, at: Lens, readout) -> LensTrial:
         trial = near(_, at, readout)
         if at == Lens():
-            return replace(trial, change=LensFit(0.12, (-0.4, 0.0), 0.001, (0.001, 0.0), 0.1))
+            return replace(
+                trial, change=LensFit(0.12, (-0.4, 0.0), sigma_focal=0.001, sigma_radial=(0.001, 0.0))
+            )
         return trial
 
     monkeypatch.setattr(lens, "_tried", tried)
@@ -107,7 +111,7 @@ def test_images_that_do_not_tell_are_refused(images, monkeypatch):
 
     def contradicts(images, at: Lens, readout) -> LensTrial:
         error_px = 0.2 + abs(at.focal - 1.0)
-        return LensTrial(at, Heard([], error_px, 60), LensFit(0.05, (0.0, 0.0), 0.001, (0.0, 0.0), 0.1))
+        return LensTrial(at, Heard([], error_px, 60), LensFit(0.05, (0.0, 0.0), sigma_focal=0.001))
 
     monkeypatch.setattr(lens, "_tried", contradicts)
     with pytest.raises(SemcastError, match="these images don't tell the focal length"):
@@ -123,7 +127,7 @@ def test_images_that_do_not_tell_are_refused(images, monkeypatch):
 def test_a_last_step_that_makes_it_worse_widens_the_bounds(images, monkeypatch):
     def tried(_, at: Lens, readout) -> LensTrial:
         error_px = 0.2 + abs(at.focal - 1.1)
-        return LensTrial(at, Heard([], error_px, 60), LensFit(0.08, (0.0, 0.0), 0.001, (0.0, 0.0), 0.1))
+        return LensTrial(at, Heard([], error_px, 60), LensFit(0.08, (0.0, 0.0), sigma_focal=0.001))
 
     monkeypatch.setattr(lens, "_tried", tried)
     with pytest.raises(SemcastError, match="these images don't tell the focal length"):
@@ -139,7 +143,7 @@ def test_a_small_change_may_make_it_a_little_worse_by_chance(images, monkeypatch
     def world(growth):
         def tried(_, at: Lens, readout) -> LensTrial:
             steps = round((at.focal - 1.0) / 0.008)
-            change = LensFit(0.008 if steps < 3 else 0.0, (0.0, 0.0), 0.004, (0.0, 0.0), 0.1)
+            change = LensFit(0.008 if steps < 3 else 0.0, (0.0, 0.0), sigma_focal=0.004)
             return LensTrial(at, Heard([], 0.2 * growth**steps, 60), change)
 
         return tried
@@ -160,6 +164,8 @@ def test_a_lens_changes_what_is_known_of_a_camera():
     assert (changed.fx, changed.fy) == pytest.approx((550.0, 561.0))
     assert changed.distortion == (-0.05, 0.0, 0.0, 0.0)
     bent = Intrinsics(**{**vars(camera), "distortion": (0.1, 0.2, 0.001, 0.002, 0.3)})
+    moved = Lens(1.1, centre=(0.02, -0.01)).put_on(camera)
+    assert (moved.cx, moved.cy) == pytest.approx((330.0, 234.9))
     assert Lens(1.0, (-0.05, 0.0)).put_on(bent).distortion == pytest.approx((0.05, 0.2, 0.001, 0.002, 0.3))
 
 
@@ -185,6 +191,33 @@ def test_the_lens_of_a_drawn_room_is_found_and_written(tmp_path, capsys, monkeyp
     assert report["found"]["fx"] == found.fx
     assert [0.0 < reach < 0.02 for reach in report["radial_reach"]] == [True, True]
     assert len(report["trials"]) == said.err.count(" frames with a pose")
+
+
+def test_a_principal_point_that_was_moved_is_told(images, tmp_path, capsys, monkeypatch):
+    def tried(_, at: Lens, readout) -> LensTrial:
+        left = (0.04 - at.centre[0], -0.02 - at.centre[1])
+        error_px = 0.2 + abs(left[0]) + abs(1.1 - at.focal)
+        change = LensFit(1.1 / at.focal - 1.0, centre=left, sigma_focal=0.001, sigma_centre=(0.002, 0.001))
+        return LensTrial(at, Heard([], error_px, 60), change)
+
+    monkeypatch.setattr(lens, "_tried", tried)
+    out, result = tmp_path / "camera.json", tmp_path / "result.json"
+    assert main(["lens", str(images), "--out", str(out), "--json", str(result)]) == 0
+    said, found = capsys.readouterr(), Intrinsics.load(out)
+    assert found.fx == pytest.approx(1.1 * 26.5)
+    assert (found.cx, found.cy) == pytest.approx((15.5 + 0.04 * 26.5, 11.5 - 0.02 * 26.5))
+    assert found.distortion == ()
+    assert "principal point: 16.6 (+- 0.1), 11.0 (+- 0.1) px" in said.out
+    assert "focal length x 1.1000, centre +0.0400 -0.0200: 60 frames with a pose" in said.err
+    assert json.loads(result.read_text())["centre_reach_px"] == pytest.approx([0.13, 0.07], abs=0.02)
+
+
+def test_in_pixels_everything_else_stays_when_the_focal_length_changes():
+    lens_before = Lens(1.2, (0.1, 0.02), (0.03, -0.01))
+    after = lens._changed(lens_before, LensFit(0.1, (0.05, 0.0), (0.01, 0.0)))
+    assert after.focal == pytest.approx(1.32)
+    assert after.radial == pytest.approx((0.15 * 1.21, 0.02 * 1.21**2))
+    assert after.centre == pytest.approx((0.03 + 0.01 * 1.2, -0.01))
 
 
 def test_a_file_that_can_not_be_written_is_told_before_the_work(images, capsys):

@@ -1,4 +1,4 @@
-"""``semcast lens``: focal length and radial distortion, from images of the camera alone."""
+"""``semcast lens``: focal length, distortion and principal point, from images of the camera alone."""
 
 import argparse
 import sys
@@ -15,6 +15,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _show(trial: LensTrial) -> None:
     changed = trial.lens.radial[: trial.lens.num_radial]
     bent = "".join(f", k{number} {change:+.4f}" for number, change in enumerate(changed, 1))
+    if any(trial.lens.centre):
+        x, y = trial.lens.centre
+        bent += f", centre {x:+.4f} {y:+.4f}"
     error = f", reprojection error {trial.heard.mean_px:.3f} px" if trial.heard.num_frames else ""
     what = f"focal length x {trial.lens.focal:.4f}{bent}: {trial.heard.num_frames} frames with a pose{error}"
     print(what, file=sys.stderr, flush=True)
@@ -30,6 +33,9 @@ def _answer(found: LensEstimate) -> str:
         radial = zip(camera.distortion, found.radial_reach, strict=False)
         told = (f"k{number} {k:.4f} (+- {reach:.4f})" for number, (k, reach) in enumerate(radial, 1))
         words.append("radial distortion: " + ", ".join(told))
+    if found.centre_reach_px:
+        x, y = found.centre_reach_px
+        words.append(f"principal point: {camera.cx:.1f} (+- {x:.1f}), {camera.cy:.1f} (+- {y:.1f}) px")
     if camera.distortion:
         flags += " --distortion " + " ".join(f"{value:.6g}" for value in camera.distortion)
     return "\n".join([*words, flags])

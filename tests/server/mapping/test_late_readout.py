@@ -91,9 +91,10 @@ def test_a_global_shutter_is_taken_for_one():
 
 
 def test_a_lens_that_is_clearly_another_one_is_told_once(caplog):
-    def told(factor, radial=0.0):
+    def told(factor, radial=0.0, cx_off=0.0):
         caplog.clear()
-        camera = replace(shaken_views.CAMERA, fx=factor * 400.0, fy=factor * 400.0)
+        cx = shaken_views.CAMERA.cx + cx_off
+        camera = replace(shaken_views.CAMERA, fx=factor * 400.0, fy=factor * 400.0, cx=cx)
         watch = ReadoutWatch(shaken_views.CAMERA, is_wanted=True)
         for seed in range(3):  # twelve views each
             watch.take(shaken_views.adjusted(camera, seed=seed, radial=radial))
@@ -108,6 +109,9 @@ def test_a_lens_that_is_clearly_another_one_is_told_once(caplog):
     text = told(1.0, radial=-0.1)
     assert text.count("the distortion seems off (k1 -0.1") == 1
     assert "focal length" not in text
+    text = told(1.0, cx_off=12.0)
+    assert text.count("the principal point seems off (x +1") == 1
+    assert "distortion" not in text
 
 
 def test_movements_are_measured_only_while_they_are_wanted():

@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from shaken_views import CAMERA, adjusted
 
-from semcast.server.mapping.left_over import FOCAL, RESIDUAL, grouped, spread
+from semcast.server.mapping.left_over import FOCAL, RESIDUAL, _lens_patterns, grouped, spread
 from semcast.server.mapping.lens import believed_lens, fit_lens
 
 
@@ -41,6 +42,48 @@ def test_the_second_coefficient_is_told_from_the_first():
     assert believed_lens(right, 2) == fit_lens(right, num_radial=2)
 
 
+def test_the_principal_point_is_found_once_the_rest_is_near():
+    moved = replace(CAMERA, cx=CAMERA.cx + 8.0, cy=CAMERA.cy - 4.0)
+    views = adjusted(moved).left_over
+    fit = believed_lens(views)
+    assert fit == fit_lens(views, num_radial=0, with_centre=True)
+    assert fit.centre == pytest.approx((8.0 / CAMERA.fx, -4.0 / CAMERA.fy), abs=0.004)
+    assert max(fit.sigma_centre) < 0.004
+    far = adjusted(replace(moved, fx=1.06 * CAMERA.fx, fy=1.06 * CAMERA.fy)).left_over
+    assert believed_lens(far).centre == (0.0, 0.0)
+    assert believed_lens(far, with_centre=True).centre != (0.0, 0.0)
+
+
+@pytest.mark.parametrize("distortion", [(), (-0.28, 0.07, 0.001, -0.002)])
+def test_patterns_are_how_pixels_change_with_the_lens(distortion):
+    """By differences: a pixel stays, and is seen through a slightly other lens."""
+    camera = replace(CAMERA, fy=1.1 * CAMERA.fx, distortion=distortion)
+    ray = np.array([[0.4, 0.3], [-0.35, 0.2], [0.1, -0.3], [0.0, 0.0]])
+
+    distorted = np.array(distortion or np.zeros(4))
+
+    def lens_of(change):
+        focal, k1, k2, x, y = change
+        fx, fy = camera.fx * (1.0 + focal), camera.fy * (1.0 + focal)
+        cx, cy = camera.cx + x * camera.fx, camera.cy + y * camera.fy
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), distorted + np.array([k1, k2, 0, 0])
+
+    K, k = lens_of(np.zeros(5))
+    points, still = np.column_stack([ray, np.ones(4)]), np.zeros(3)
+    pixels = cv2.projectPoints(points, still, still, K, k)[0]
+
+    def residual(change):
+        K, k = lens_of(change)
+        done = (cv2.TERM_CRITERIA_COUNT, 200, 0.0)
+        straight = cv2.undistortPoints(pixels, K, k, P=K, criteria=done).reshape(-1, 2)
+        return ray @ K[:2, :2].T + K[:2, 2] - straight
+
+    patterns = _lens_patterns((camera.fx, camera.fy), distortion, ray)
+    for pattern, step in zip(patterns, 1e-5 * np.eye(5), strict=True):
+        by_differences = (residual(step) - residual(-step)) / 2e-5
+        np.testing.assert_allclose(pattern, by_differences, rtol=1e-3, atol=1e-2)
+
+
 def test_a_lens_that_is_right_is_left_alone():
     fit = fit_lens(adjusted(CAMERA).left_over, num_radial=1)
     assert abs(fit.focal) < 4 * fit.sigma_focal < 0.012
@@ -57,13 +100,13 @@ def test_distortion_is_believed_where_it_explains_more():
     # In the units of the focal length that was believed in.
     assert fit.radial[0] == pytest.approx(-0.1 / 1.06**2, abs=0.02)
     assert fit.focal == pytest.approx(0.06, abs=0.01)
-    assert believed_lens(np.zeros((9, 6, 6))) is None
+    assert believed_lens(np.zeros((9, 8, 8))) is None
 
 
 def test_by_hand_the_change_is_the_slope_and_its_spread_that_of_what_is_left():
     # A doubled focal length would move the points of a view by 10 in all; they are off by .012 of that.
     def view(slope):
-        told = np.zeros((6, 6))
+        told = np.zeros((8, 8))
         told[RESIDUAL, RESIDUAL], told[FOCAL, FOCAL] = 4.0, 100.0
         told[RESIDUAL, FOCAL] = told[FOCAL, RESIDUAL] = 100.0 * slope
         return told
@@ -79,9 +122,9 @@ def test_by_hand_the_change_is_the_slope_and_its_spread_that_of_what_is_left():
 
 
 def test_views_that_say_nothing_are_no_lens():
-    assert fit_lens(np.zeros((0, 6, 6)), num_radial=1) is None
-    assert fit_lens(np.zeros((9, 6, 6)), num_radial=1) is None
-    flat = np.zeros((4, 6, 6))
+    assert fit_lens(np.zeros((0, 8, 8)), num_radial=1) is None
+    assert fit_lens(np.zeros((9, 8, 8)), num_radial=1) is None
+    flat = np.zeros((4, 8, 8))
     flat[:, RESIDUAL, RESIDUAL] = 1.0
     assert fit_lens(flat, num_radial=0) is None
-    assert grouped(flat).shape == (4, 6, 6)
+    assert grouped(flat).shape == (4, 8, 8)

@@ -15,7 +15,7 @@ from semcast.server.mapping.readout import Readout, body_velocity, fit_readout, 
 @pytest.mark.parametrize("readout_from", ["top", "bottom", "left", "right"])
 def test_the_readout_and_its_side_are_found_in_what_an_adjustment_leaves(readout_from):
     result = adjusted(replace(CAMERA, readout_ms=20.0, readout_from=readout_from))
-    assert result.left_over.shape == (NUM_VIEWS, 6, 6)
+    assert result.left_over.shape == (NUM_VIEWS, 8, 8)
     fit = fit_readout(result.left_over)
     assert fit.readout.side == readout_from
     assert fit.readout.ms == pytest.approx(20.0, abs=1.5)
@@ -45,7 +45,7 @@ def test_without_movement_nothing_is_said():
     told = information(result.problem, motion, result.T_world_cam, result.xyz, result.residual_px)
     assert not told.any()
     assert fit_readout(told) is None
-    assert fit_readout(np.zeros((0, 6, 6))) is None
+    assert fit_readout(np.zeros((0, 8, 8))) is None
     still = replace(motion, velocity=np.zeros((NUM_VIEWS, 6)))
     told = information(result.problem, still, result.T_world_cam, result.xyz, result.residual_px)
     assert fit_readout(told) is None
