@@ -85,7 +85,8 @@ def _lens_patterns(focal_px: tuple[float, float], distortion: tuple[float, ...],
     """Return the change of pixels with the lens, ``(M, 2)`` each: from ``FOCAL`` to ``CENTRE_Y``.
 
     Images were freed of the distortion as it is believed to be: where the lens is another one, they were
-    freed of it in the wrong places, which the slope of the distortion makes up for.
+    freed of it in the wrong places, which the slope of the distortion makes up for. With another focal length
+    distortion stays what it is in pixels.
 
     Args:
         focal_px: fx, fy.
@@ -95,15 +96,15 @@ def _lens_patterns(focal_px: tuple[float, float], distortion: tuple[float, ...],
     r2 = (ray**2).sum(axis=1, keepdims=True)
     across, down = np.zeros((2, len(ray), 2))
     across[:, 0], down[:, 1] = 1.0, 1.0
-    changes = [ray, ray * r2, ray * r2**2, across, down]
+    changes = [ray * r2, ray * r2**2, across, down]
     if any(distortion):
-        changes[0], slope = _bent(ray, distortion)
+        slope = _slope(ray, distortion)
         changes = [np.linalg.solve(slope, change[..., None])[..., 0] for change in changes]
-    return [change * focal_px for change in changes]
+    return [change * focal_px for change in (ray, *changes)]
 
 
-def _bent(ray: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
-    """Return where a lens sees rays, ``(M, 2)`` with unit depth, and its slope there, ``(M, 2, 2)``."""
+def _slope(ray: Array, distortion: tuple[float, ...]) -> Array:
+    """Return how where a lens sees rays, ``(M, 2)`` with unit depth, changes with them, ``(M, 2, 2)``."""
     lens, still = np.array(distortion), np.zeros(3)
 
     def seen(at: Array) -> Array:
@@ -112,8 +113,7 @@ def _bent(ray: Array, distortion: tuple[float, ...]) -> tuple[Array, Array]:
         return np.asarray(pixels, np.float64).reshape(-1, 2)
 
     steps = _STEP * np.eye(2)
-    slope = np.stack([(seen(ray + step) - seen(ray - step)) / (2 * _STEP) for step in steps], axis=2)
-    return seen(ray), slope
+    return np.stack([(seen(ray + step) - seen(ray - step)) / (2 * _STEP) for step in steps], axis=2)
 
 
 def shares_of_readout(size_wh: tuple[int, int], xy: Array) -> Array:

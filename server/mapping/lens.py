@@ -28,7 +28,7 @@ _DAMPING = 1e-9
 _MORE_SIGMAS, _MORE_EXPLAINED = 3.0, 0.01
 #: The principal point is looked for once the others change by no more than this: far from the right lens it
 #: takes their place.
-_NEAR_FOCAL, _NEAR_RADIAL = 0.03, 0.05
+_NEAR_FOCAL, _NEAR_RADIAL = 0.08, 0.1
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,7 @@ def test_the_lens_of_a_drawn_room_is_found_and_written(tmp_path, capsys, monkeyp
     guess = ["--fx", f"{0.96 * true.fx}", "--fy", f"{0.96 * true.fy}", "--cx", "319.5", "--cy", "239.5"]
     assert main(["lens", str(bent), *guess, "--out", str(out), "--json", str(result)]) == 0
     said, found = capsys.readouterr(), Intrinsics.load(out)
-    assert found.fx == pytest.approx(true.fx, rel=0.01)
+    assert found.fx == pytest.approx(true.fx, rel=0.015)
     assert found.distortion[:2] == pytest.approx((-0.28, 0.07), abs=0.015)
     assert found.shape_hw == true.shape_hw
     assert f"focal length: {found.fx:.1f} px (" in said.out
