@@ -33,8 +33,9 @@ _LEAST_SIGMAS, _LEAST_EXPLAINED, _LEAST_EXPLAINED_MORE = 6.0, 0.03, 0.002
 #: From so many views on, an estimate is the last one if it is that sure. After many more there is none: a
 #: camera that hardly turns does not tell, and it matters little.
 _ENOUGH_VIEWS, _SURE_MS, _MOST_VIEWS = 40, 0.7, 600
-#: From so many views on, a focal length is called wrong that is so by this share, a distortion that is so by
-#: this coefficient, a principal point that is so by this share of the focal length.
+#: From so many views on, a focal length is called wrong that is so by this share, a distortion that displaces
+#: a pixel by this share of its distance to the centre, a principal point that is so by this share of the focal
+#: length.
 _LENS_VIEWS, _LEAST_FOCAL, _LEAST_RADIAL, _LEAST_CENTRE = 24, 0.02, 0.02, 0.01
 
 
@@ -137,7 +138,10 @@ class ReadoutWatch:
         if abs(fit.focal) >= max(_LEAST_FOCAL, _LEAST_SIGMAS * fit.sigma_focal):
             way = "short" if fit.focal > 0.0 else "long"
             wrong.append(f"the focal length seems {100.0 * abs(fit.focal):.1f} % too {way}")
-        if abs(fit.radial[0]) >= max(_LEAST_RADIAL, _LEAST_SIGMAS * fit.sigma_radial[0]):
+        is_sure = any(
+            abs(k) >= _LEAST_SIGMAS * s > 0.0 for k, s in zip(fit.radial, fit.sigma_radial, strict=True)
+        )
+        if is_sure and self._most_bent(fit.radial) >= _LEAST_RADIAL:
             off = (f"k{number} {k:+.3f}" for number, k in enumerate(fit.radial, 1) if k)
             wrong.append(f"the distortion seems off ({', '.join(off)})")
         centre = zip(fit.centre, fit.sigma_centre, strict=True)
@@ -147,6 +151,14 @@ class ReadoutWatch:
         if wrong:
             self._lens_is_told = True
             logger.warning("%s for what is seen: semcast lens measures it", " and ".join(wrong))
+
+    def _most_bent(self, radial: tuple[float, float]) -> float:
+        """Return by which share of its distance to the centre a pixel is displaced at most."""
+        camera = self._camera
+        corner = (max(camera.cx, camera.width - camera.cx) / camera.fx) ** 2
+        corner += (max(camera.cy, camera.height - camera.cy) / camera.fy) ** 2
+        r2 = corner * np.linspace(0.0, 1.0, 11)
+        return float(np.abs(radial[0] * r2 + radial[1] * r2**2).max())
 
     def take_found(self) -> Readout | None:
         """Return, once, the readout to be added to what images are put right for; views to come have it."""
