@@ -34,7 +34,7 @@ _LEAST_SIGMAS, _LEAST_EXPLAINED, _LEAST_EXPLAINED_MORE = 6.0, 0.03, 0.002
 #: camera that hardly turns does not tell, and it matters little.
 _ENOUGH_VIEWS, _SURE_MS, _MOST_VIEWS = 40, 0.7, 600
 #: From so many views on, a focal length is called wrong that is so by this share, a distortion that displaces
-#: a pixel by this share of its distance to the centre, a principal point that is so by this share of the focal
+#: a pixel by this share of its distance to the centre, a principal point that is so by this share of a focal
 #: length.
 _LENS_VIEWS, _LEAST_FOCAL, _LEAST_RADIAL, _LEAST_CENTRE = 24, 0.02, 0.02, 0.01
 
