@@ -35,6 +35,8 @@ _MIN_REACH = 0.004
 _NEAR, _WORSE = 0.01, 1.02
 #: One step changes the focal length by this share at most.
 _MAX_STEP = 0.2
+#: Powers of the focal length by which k1, k2, p1, p2, k3 ... k6 grow where the distortion in pixels stays.
+_POWERS = (2, 4, 1, 1, 6, 2, 4, 6)
 #: An interval of the focal length that reaches further than this share to either side is no answer.
 _MAX_REACH = 0.05
 _NOT_TOLD = (
@@ -64,17 +66,16 @@ class Lens:
 
     def put_on(self, camera: Intrinsics) -> Intrinsics:
         """Return a camera with this lens."""
-        distortion = camera.distortion
-        if self.num_radial:
-            k1, k2, *others = distortion or (0.0, 0.0, 0.0, 0.0)
-            distortion = (k1 + self.radial[0], k2 + self.radial[1], *others)
+        known = zip(camera.distortion or (0.0, 0.0, 0.0, 0.0), _POWERS, strict=False)
+        k1, k2, *others = (k * self.focal**power for k, power in known)
+        distortion = (k1 + self.radial[0], k2 + self.radial[1], *others)
         return replace(
             camera,
             fx=camera.fx * self.focal,
             fy=camera.fy * self.focal,
             cx=camera.cx + self.centre[0] * camera.fx,
             cy=camera.cy + self.centre[1] * camera.fy,
-            distortion=distortion,
+            distortion=distortion if any(distortion) else (),
         )
 
 
@@ -115,7 +116,7 @@ class LensEstimate:
 def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | None = None) -> LensEstimate:
     """Find focal length, radial distortion and principal point of the camera that took some images.
 
-    A distortion that is known is kept, and its radial coefficients are added to.
+    A distortion that is known is kept, in pixels, and its radial coefficients are added to.
 
     Args:
         settings: Which images, and the camera to begin with; a quarter of its focal length is far away.

@@ -166,6 +166,8 @@ def test_a_lens_changes_what_is_known_of_a_camera():
     bent = Intrinsics(**{**vars(camera), "distortion": (0.1, 0.2, 0.001, 0.002, 0.3)})
     moved = Lens(1.1, centre=(0.02, -0.01)).put_on(camera)
     assert (moved.cx, moved.cy) == pytest.approx((330.0, 234.9))
+    longer = Lens(2.0).put_on(bent).distortion
+    assert longer == pytest.approx((0.4, 3.2, 0.002, 0.004, 19.2))
     assert Lens(1.0, (-0.05, 0.0)).put_on(bent).distortion == pytest.approx((0.05, 0.2, 0.001, 0.002, 0.3))
 
 
