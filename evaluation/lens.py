@@ -30,8 +30,8 @@ _NOTHING, _NOTHING_SIGMAS = 0.001, 0.5
 #: No bounds are closer than this share: reconstructions with nearly the same lens speak for changes that
 #: differ by as much.
 _MIN_REACH = 0.004
-#: Near the right focal length, within this share of it, what a reconstruction's error grows by may be chance
-#: up to this factor.
+#: Near the right lens, with changes of no more than this (as above), what a reconstruction's error grows by
+#: may be chance up to this factor.
 _NEAR, _WORSE = 0.01, 1.02
 #: One step changes the focal length by this share at most.
 _MAX_STEP = 0.2
@@ -144,7 +144,7 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
         reaches = _reaches(change)
         if _is_nothing(change) or num_steps == _MAX_STEPS:
             break
-        is_near = abs(change.focal) <= _NEAR
+        is_near = np.abs(_values(change)).max() <= _NEAR
         most_px = (_WORSE if is_near else 1.0) * best.heard.mean_px
         trial = tried(_changed(best.lens, change))
         if trial.heard.mean_px > most_px and not is_near:

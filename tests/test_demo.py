@@ -34,7 +34,7 @@ from semcast.real_time import Plan
 from semcast.role import Role
 from semcast.server.replay import ReplaySettings, replay
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 SEQUENCE = Path(__file__).resolve().parents[1] / "deploy" / "demo" / "kitti_06"
 

@@ -10,7 +10,7 @@ from semcast import real_time
 from semcast.common.errors import ConfigError
 from semcast.real_time import MAX_PIXELS, Plan, Speed, make_plan, measure_speed, plan_for
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 #: A machine that serves images of ``MAX_PIXELS`` at 10 Hz with two cores, just so.
 FIT = Speed(coding_ms=41.0, following_ms=12.5)

@@ -159,7 +159,7 @@ def render_scene(settings: RenderSettings) -> int:
     folder = settings.out
     scene = SCENES[settings.scene](settings.seed, settings.pace)
     scene.camera = replace(scene.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
-    Optics.of(scene.camera)
+    Optics.of(scene.camera)  # refuses before anything is written
     try:
         if folder.exists() and any(folder.iterdir()):
             raise SourceError(f"out must be a new or an empty folder, {folder} has files in it")

@@ -168,7 +168,7 @@ class BundleResult:
         T_world_cam: ``(K, 4, 4)``.
         xyz: ``(P, 3)``.
         residual_px: ``(M, 2)`` observed minus projected, NaN behind the camera or not used.
-        covariance: ``(8, 8)`` marginal covariance of the last keyframe's pose in its own frame, rotation
+        covariance: ``(6, 6)`` marginal covariance of the last keyframe's pose in its own frame, rotation
             before translation, or None.
         elapsed_ms: Time it took.
         left_over: ``(K, 8, 8)``, see ``left_over.information``; None where it was not asked for.

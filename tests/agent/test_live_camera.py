@@ -12,7 +12,7 @@ from semcast.agent.source_settings import SourceSettings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 PINHOLE = CameraSettings(fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 

@@ -30,7 +30,7 @@ from semcast.common.transport import free_endpoint, open_hub, open_session
 from semcast.common.wire import pack, unpack
 from semcast.server.receiver import Receiver
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 PROGRAM = """
 import dataclasses, signal, sys, threading

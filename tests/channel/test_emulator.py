@@ -23,7 +23,7 @@ from semcast.common.symbol_payload import lost_slots_of, pack_data_symbols, slot
 from semcast.common.transport import open_hub
 from semcast.common.wire import pack, unpack
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 HW = (64, 128)
 PROGRAM = """

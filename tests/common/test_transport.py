@@ -22,7 +22,7 @@ from semcast.common.transport import (
     zenoh_config,
 )
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 HUB_PROGRAM = """
 import sys, threading

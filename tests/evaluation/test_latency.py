@@ -5,7 +5,7 @@ import pytest
 from semcast.common.errors import ConfigError
 from semcast.evaluation.latency import LatencySettings, evaluate_latency, stage_profile
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 
 def test_profile_by_hand():

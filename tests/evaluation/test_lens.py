@@ -40,7 +40,7 @@ def world_of(
 ):
     """Reconstructions whose error grows with how wrong the lens is, and which see a share of that."""
 
-    def tried(_, at: Lens, readout) -> LensTrial:
+    def tried(images, at: Lens, readout) -> LensTrial:
         off = focal / at.focal - 1.0
         bent = radial * (at.focal / focal) ** 2 - at.radial[0]  # in the units of the lens believed in
         heard = Heard([], 0.2 + abs(off) + abs(bent), num_frames)
@@ -71,9 +71,9 @@ def test_steps_lead_to_the_lens(images, focal, radial, monkeypatch):
 def test_from_far_away_it_begins_again_nearer(images, monkeypatch):
     near = world_of(1.25)
 
-    def tried(_, at: Lens, readout) -> LensTrial:
+    def tried(images, at: Lens, readout) -> LensTrial:
         if at.focal >= 1.15:
-            return near(_, at, readout)
+            return near(images, at, readout)
         # Lost in a valley of its own.
         return LensTrial(
             at, Heard([], 0.6 - 0.1 * at.focal, 60), LensFit(-0.05, (0.0, 0.0), sigma_focal=0.001)
@@ -88,8 +88,8 @@ def test_from_far_away_it_begins_again_nearer(images, monkeypatch):
 def test_half_a_step_is_tried_where_a_whole_one_leads_too_far(images, monkeypatch):
     near = world_of(1.08, -0.2)
 
-    def tried(_, at: Lens, readout) -> LensTrial:
-        trial = near(_, at, readout)
+    def tried(images, at: Lens, readout) -> LensTrial:
+        trial = near(images, at, readout)
         if at == Lens():
             return replace(
                 trial, change=LensFit(0.12, (-0.4, 0.0), sigma_focal=0.001, sigma_radial=(0.001, 0.0))
@@ -125,7 +125,7 @@ def test_images_that_do_not_tell_are_refused(images, monkeypatch):
 
 
 def test_a_last_step_that_makes_it_worse_widens_the_bounds(images, monkeypatch):
-    def tried(_, at: Lens, readout) -> LensTrial:
+    def tried(images, at: Lens, readout) -> LensTrial:
         error_px = 0.2 + abs(at.focal - 1.1)
         return LensTrial(at, Heard([], error_px, 60), LensFit(0.08, (0.0, 0.0), sigma_focal=0.001))
 
@@ -141,7 +141,7 @@ def test_a_last_step_that_makes_it_worse_widens_the_bounds(images, monkeypatch):
 
 def test_a_small_change_may_make_it_a_little_worse_by_chance(images, monkeypatch):
     def world(growth):
-        def tried(_, at: Lens, readout) -> LensTrial:
+        def tried(images, at: Lens, readout) -> LensTrial:
             steps = round((at.focal - 1.0) / 0.008)
             change = LensFit(0.008 if steps < 3 else 0.0, (0.0, 0.0), sigma_focal=0.004)
             return LensTrial(at, Heard([], 0.2 * growth**steps, 60), change)
@@ -196,7 +196,7 @@ def test_the_lens_of_a_drawn_room_is_found_and_written(tmp_path, capsys, monkeyp
 
 
 def test_a_principal_point_that_was_moved_is_told(images, tmp_path, capsys, monkeypatch):
-    def tried(_, at: Lens, readout) -> LensTrial:
+    def tried(images, at: Lens, readout) -> LensTrial:
         left = (0.04 - at.centre[0], -0.02 - at.centre[1])
         error_px = 0.2 + abs(left[0]) + abs(1.1 - at.focal)
         change = LensFit(1.1 / at.focal - 1.0, centre=left, sigma_focal=0.001, sigma_centre=(0.002, 0.001))

@@ -5,7 +5,7 @@ import pytest
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.evaluation.runtime import RuntimeSettings, evaluate_runtime, variants
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 
 def test_every_runtime_encodes_and_torch_alone_decodes():

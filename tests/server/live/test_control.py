@@ -7,7 +7,7 @@ import pytest
 
 from semcast.common.errors import SemcastError
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 DEADLINE_S = 60.0
 

@@ -12,7 +12,7 @@ from semcast.common.transport import open_client
 from semcast.server.export.outputs import read_ply
 from semcast.server.mapping.settings import ReconstructionSettings
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 AGENT = "cam0"
 DEADLINE_S = 60.0

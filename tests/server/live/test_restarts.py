@@ -13,7 +13,7 @@ from semcast.server.recorded_streams import recorded_streams
 from semcast.server.settings import ViewSettings
 from semcast.server.view.rerun_viewer import RerunStream
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 
 def centre(pose):

@@ -26,7 +26,7 @@ from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server
 from semcast.server.settings import ServerSettings, ViewSettings
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 DEMO = Path(__file__).resolve().parents[3] / "deploy" / "demo" / "kitti_06"
 AGENT = "cam0"

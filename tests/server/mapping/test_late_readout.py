@@ -109,6 +109,7 @@ def test_a_lens_that_is_clearly_another_one_is_told_once(caplog):
     text = told(1.0, radial=-0.1)
     assert text.count("the distortion seems off (k1 -0.1") == 1
     assert "focal length" not in text
+    assert "semcast lens" not in told(1.0, radial=-0.015), "sure, but it moves no pixel by 2 %"
     text = told(1.0, cx_off=12.0)
     assert text.count("the principal point seems off (x +1") == 1
     assert "distortion" not in text

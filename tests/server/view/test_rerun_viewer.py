@@ -31,7 +31,7 @@ from semcast.server.view.feed import MAX_REFUSALS, ViewerFeed, check_view, resol
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
 from semcast.server.view.rerun_viewer import SERIES, blueprint
 
-pytestmark = pytest.mark.xdist_group("real time")
+pytestmark = pytest.mark.xdist_group("real-time")
 
 CAMERA = Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
 DEADLINE_S = 20.0
