@@ -1,7 +1,7 @@
 """Keyframes into map: when to take one, new landmarks, what an adjustment brings, and culling."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +12,7 @@ from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, Observations
+from semcast.server.mapping.refuted import on_something_large, with_neighbours
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
@@ -100,7 +101,8 @@ def keyframe_cues(
         usable_share: See there.
     """
     _, row, row_k = np.intersect1d(ids, reference.ids, assume_unique=True, return_indices=True)
-    flow_px = np.linalg.norm(xy[row] - reference.xy[row_k], axis=1)
+    at_rest = ~np.isin(ids[row], on_something_large(reference))
+    flow_px = np.linalg.norm(xy[row[at_rest]] - reference.xy[row_k[at_rest]], axis=1)
     return KeyframeCues(
         num_inliers=num_inliers,
         num_inliers_at_keyframe=num_inliers_at_keyframe,
@@ -144,6 +146,8 @@ def add_landmarks(
     reach = median_depth(world, newest)
     new = new_landmarks(camera, views, newest, wanted, noise, min_parallax_deg, reach)
     newest.refuted = new.refuted
+    newest.refuted = with_neighbours(newest, ~is_new, camera.width)
+    new = new.without(newest.refuted)
     row = np.searchsorted(newest.ids, new.ids)
     rgb = sample_colours(image, newest.xy[row])
     world.add_landmarks(new.ids, new.xyz, rgb, new.confidence, newest.submap, newest.frame_id)
@@ -165,6 +169,11 @@ class NewLandmarks:
     xyz: Array
     confidence: Array
     refuted: Ids
+
+    def without(self, ids: Ids) -> "NewLandmarks":
+        """Return the same without the points of some tracks."""
+        kept = ~np.isin(self.ids, ids)
+        return replace(self, ids=self.ids[kept], xyz=self.xyz[kept], confidence=self.confidence[kept])
 
 
 def new_landmarks(

@@ -10,9 +10,10 @@ from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import ate
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
-from semcast.server.mapping.mapper import add_landmarks
+from semcast.server.mapping.mapper import add_landmarks, keyframe_cues
 from semcast.server.mapping.rays import rays_of
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
+from semcast.server.mapping.refuted import on_something_large, with_neighbours
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracker import track_pose
 from semcast.server.mapping.tracks import Seen
@@ -143,3 +144,69 @@ def test_tracks_that_no_point_at_rest_explains_are_no_rays():
     assert rays is not None
     assert np.array_equal(others[rays.row], ids[NUM_MARKS:][~moving[NUM_MARKS:]])
     assert rays_of(CAMERA, world, NOISE, ids[moving], MOVED, submap=0) is None
+
+
+def lorry(num_refuted):
+    """A keyframe with a dense block of tracks in its middle, all but every fourth of them refuted.
+
+    Landmarks are to its right, young tracks in the block, among the landmarks and at the left edge.
+    """
+    block = np.stack(np.meshgrid(np.arange(100.0, 140, 4), np.arange(60.0, 120, 4)), axis=-1).reshape(-1, 2)
+    right = np.stack(np.meshgrid(np.arange(220.0, 310, 10), np.arange(20.0, 230, 20)), axis=-1).reshape(-1, 2)
+    left = np.column_stack([np.full(10, 5.0), np.arange(20.0, 220, 20)])
+    xy = np.concatenate([block, right, left])
+    ids = np.arange(len(xy)) + 1000
+    young_block = np.arange(0, len(block), 4)
+    refuted = np.setdiff1d(np.arange(len(block)), young_block)[:num_refuted]
+    is_landmark = np.zeros(len(xy), bool)
+    is_landmark[len(block) : len(block) + len(right)] = True
+    is_landmark[len(block) : len(block) + len(right) : 5] = False
+    seen = keyframe(0, np.eye(4), ids, xy)
+    seen.refuted = ids[refuted]
+    return seen, is_landmark, ids[young_block]
+
+
+def test_young_tracks_among_refuted_ones_are_on_the_same_thing_and_those_elsewhere_are_not():
+    seen, is_landmark, young = lorry(num_refuted=200)
+    found = with_neighbours(seen, is_landmark, WIDTH)
+    assert np.array_equal(found, np.union1d(seen.refuted, young))
+    assert np.array_equal(with_neighbours(seen, np.zeros(len(is_landmark), bool), WIDTH), found)
+
+
+@pytest.mark.parametrize(("num_refuted", "is_large"), [(29, False), (50, False), (60, True)])
+def test_a_few_refuted_tracks_say_nothing_about_their_neighbours(num_refuted, is_large):
+    seen, is_landmark, _ = lorry(num_refuted)
+    assert len(seen.ids) == 259
+    found = with_neighbours(seen, is_landmark, WIDTH)
+    assert (len(found) > num_refuted) == is_large
+    assert np.array_equal(on_something_large(seen), seen.refuted if is_large else [])
+
+
+def test_what_stands_still_in_the_image_and_moves_by_itself_does_not_keep_keyframes_away():
+    seen, is_landmark, _ = lorry(num_refuted=200)
+    now = seen.xy + np.where(is_landmark[:, None], (20.0, 0.0), 0.0)
+    figures = {
+        "num_inliers": 90, "num_inliers_at_keyframe": 100, "max_features": 300,
+        "width_px": WIDTH, "frames_since": 2, "usable_share": 1.0,
+    }  # fmt: skip
+    assert keyframe_cues(seen, seen.ids, now, **figures).median_flow_px == 20.0
+    seen.refuted = seen.refuted[:29]
+    assert keyframe_cues(seen, seen.ids, now, **figures).median_flow_px == 0.0
+
+
+def test_a_young_track_on_something_large_becomes_no_landmark():
+    world, xyz, ids = scene()
+    block = np.stack(np.meshgrid(np.arange(140.0, 180, 4), np.arange(90.0, 150, 4)), axis=-1).reshape(-1, 2)
+    moving = np.arange(len(ids)) >= len(ids) - len(block)
+    world.keyframes[0].xy[moving] = block
+    xyz[moving] = CAMERA.unproject(block) * 4.0
+    xy = project(xyz, MOVED)
+    # Every fifth of them moves as a point at rest would, by chance.
+    refuted = moving & (ids % 5 > 0)
+    xy[refuted] += (0.0, 12.0)
+    world.add_keyframe(keyframe(1, MOVED, ids, xy))
+    add_landmarks(world, CAMERA, NOISE, np.zeros((HEIGHT, WIDTH, 3), np.uint8), 0.2)
+    assert np.isin(ids[refuted], world.keyframes[-1].refuted).all()
+    is_landmark = world.landmarks.rows(ids) >= 0
+    assert is_landmark[moving].sum() <= 4  # those beside a landmark that happens to be there
+    assert is_landmark[NUM_MARKS:][~moving[NUM_MARKS:]].mean() > 0.9
