@@ -66,7 +66,7 @@ class DepthSettings:
     camera: CameraSettings = field(
         default=CameraSettings(), metadata={"help": "intrinsics, where the recording has none"}
     )
-    scene: SceneName = field(default="room", metadata={"help": "scene to draw: room, street, block or orbit"})
+    scene: SceneName = field(default="room", metadata={"help": "scene to draw: " + ", ".join(SCENES)})
     pace: Pace = field(default="normal", metadata={"help": "how fast the camera of a scene moves"})
     scene_seed: int = field(default=0, metadata={"help": "seed of the scene and its path"})
     seconds: float = field(default=4.0, metadata={"help": "length of the scene, at most 120"})

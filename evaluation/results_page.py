@@ -322,6 +322,7 @@ SECTIONS: dict[str, tuple[str, Tables]] = {
     "shutter": ("Rolling shutters, put right and not", _trajectory),
     "readout": ("Readout times found", _readout),
     "lens": ("Lenses found", _lens),
+    "lorry": ("Behind a lorry", _trajectory),
     "focal": ("Paths with a lens that was guessed, and found", _trajectory),
     "pairs": ("Relative pose of frame pairs", _pairs),
     "confidence": ("What the confidence maps are worth", _confidence),

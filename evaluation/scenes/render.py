@@ -15,6 +15,7 @@ from semcast.common.lens import DISTORTION_COUNTS
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.whole_file import write_whole
 from semcast.evaluation.scenes.block import Block
+from semcast.evaluation.scenes.lorry import Lorry
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.optics import Optics
 from semcast.evaluation.scenes.orbit import Orbit
@@ -47,11 +48,12 @@ class Scene(Protocol):
         """Return ``(H, W, 3)`` grey levels of what is seen where no surface is."""
 
 
-SceneName = Literal["room", "street", "block", "orbit"]
+SceneName = Literal["room", "street", "block", "lorry", "orbit"]
 SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street]] = {
     "room": Room,
     "street": Street,
     "block": Block,
+    "lorry": Lorry,
     "orbit": Orbit,
 }
 
@@ -110,7 +112,7 @@ class RenderSettings:
         default="room",
         metadata={
             "help": "room: handheld, 30 Hz; street: from a car, 10 Hz; block: the same round a block of "
-            "houses and on; orbit: round a still life, 10 Hz"
+            "houses and on; lorry: the street behind a lorry; orbit: round a still life, 10 Hz"
         },
     )
     pace: Pace = field(default="normal", metadata={"help": "how fast the camera moves and shakes"})

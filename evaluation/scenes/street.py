@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 #: Steps of the road's centre line, in metres.
 STEP_M = 0.25
 _LANE_M = 1.75
+#: Where on the line the camera begins.
+_START_M = 15
 _EYE_M = 1.65
 
 
@@ -64,25 +66,32 @@ class Street:
         position = (1 - share) * self._line[low] + share * self._line[low + 1]
         return position, float((1 - share) * self._yaw[low] + share * self._yaw[low + 1])
 
+    def in_lane(self, way_m: float, left_m: float = -_LANE_M) -> tuple[float, float, float]:
+        """Return x, y and heading after a way along the line and beside it, in the camera's lane by default."""
+        (x, y), yaw = self._place(way_m)
+        return x - left_m * np.sin(yaw), y + left_m * np.cos(yaw), yaw
+
+    def camera_way_m(self, t_s: float) -> float:
+        """Return how far along the line the camera is at a time."""
+        return self._way_m(t_s) + _START_M
+
     def _way_m(self, t_s: float) -> float:
         return float(np.interp(t_s, self._time_s, np.arange(len(self._time_s)) * STEP_M))
 
     def surfaces(self, t_s: float) -> list[Surface]:
         """Return the town, the car ahead and those that come towards the camera."""
-        ways = [(self._way_m(t_s) + 15 + self._ahead_m, -_LANE_M)]
+        ways = [(self.camera_way_m(t_s) + self._ahead_m, -_LANE_M)]
         for meeting_s in self._oncoming_s:
             ways.append((self._way_m(meeting_s) - 8.0 * (t_s - meeting_s), _LANE_M))
         moving: list[Surface] = []
         for (way_m, left_m), painted in zip(ways, self._cars, strict=True):
             if 0 < way_m < (len(self._line) - 2) * STEP_M:
-                (x, y), yaw = self._place(way_m)
-                moving += _car(x - left_m * np.sin(yaw), y + left_m * np.cos(yaw), yaw, painted)
+                moving += _car(*self.in_lane(way_m, left_m), painted)
         return [*self._surfaces, *moving]
 
     def T_world_cam(self, t_s: float) -> Array:
         """Return the camera's pose at a time."""
-        (x, y), yaw = self._place(self._way_m(t_s) + 15)
-        x, y = x + _LANE_M * np.sin(yaw), y - _LANE_M * np.cos(yaw)
+        x, y, yaw = self.in_lane(self.camera_way_m(t_s))
         position = np.array([x, y, _EYE_M + self._bounce.at(t_s)])
         return look(position, yaw, self._pitch.at(t_s), self._roll.at(t_s))
 

@@ -148,3 +148,19 @@ def test_rows_of_a_rolling_shutter_are_drawn_at_their_times() -> None:
             np.abs(rolled[rows].astype(int) - image).mean() for image in (at_its_time, at_another)
         )
         assert error < 0.1 * other
+
+
+def test_a_lorry_goes_ahead_of_the_camera_and_hides_the_end_of_the_street() -> None:
+    scene, street = SCENES["lorry"](5, "normal"), SCENES["street"](5, "normal")
+    for t_s in (0.0, 4.0, 8.0):
+        lorry = scene.surfaces(t_s)[-6:]
+        middle = np.mean([s.corner_m + (s.edge_u_m + s.edge_v_m) / 2 for s in lorry], axis=0)
+        T_world_cam = scene.T_world_cam(t_s)
+        assert np.allclose(T_world_cam, street.T_world_cam(t_s))
+        forward_m = T_world_cam[:3, 2] @ (middle - T_world_cam[:3, 3])
+        assert 9 < forward_m < 15
+    rng = np.random.default_rng(0)
+    hidden = np.abs(frame_of(scene, 0.0, 0.0, rng).astype(float) - frame_of(street, 0.0, 0.0, rng)) > 8
+    height, width = hidden.shape[:2]
+    assert hidden[height // 2 - 20 : height // 2 + 20, width // 2 - 60 : width // 2 + 60].mean() > 0.7
+    assert 0.05 < hidden.mean() < 0.4
