@@ -38,7 +38,10 @@ VERBS: dict[str, tuple[str, str]] = {
     "calibrate": ("calibrate", "find a camera's intrinsics from pictures of a chessboard or live"),
     "lens": ("lens", "find a camera's intrinsics from a video or live, without a chessboard"),
     "shutter": ("shutter", "find how long a camera's rolling shutter takes, from a video or live"),
-    "render": ("render", "draw a sequence with an exact path: a room, a street, a block, a lorry ahead, an orbit"),
+    "render": (
+        "render",
+        "draw a sequence with an exact path: a room, a street, a block, a lorry ahead, an orbit",
+    ),
     "eval": ("evaluate", "measure trajectories, frame pairs, codecs and confidence offline"),
     "train": ("train", "train a transceiver from a settings file"),
     "onnx": ("onnx", "write a codec's encoder for agents without torch"),
