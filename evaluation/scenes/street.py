@@ -67,7 +67,7 @@ class Street:
         return position, float((1 - share) * self._yaw[low] + share * self._yaw[low + 1])
 
     def in_lane(self, way_m: float, left_m: float = -_LANE_M) -> tuple[float, float, float]:
-        """Return x, y and heading after a way along the line and beside it, in the camera's lane by default."""
+        """Return x, y and heading after a way along the line, in the camera's lane or elsewhere beside it."""
         (x, y), yaw = self._place(way_m)
         return x - left_m * np.sin(yaw), y + left_m * np.cos(yaw), yaw
 
