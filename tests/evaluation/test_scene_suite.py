@@ -17,8 +17,8 @@ def test_suite_has_every_scene_at_two_paces_some_at_night_and_files_of_their_own
     by_day = [f"{scene}_{pace}" for scene in scene_suite.SCENE_SECONDS for pace in ("normal", "fast")]
     assert names == [*by_day, "room_night", "street_night"]
     assert [run.render.brightness < 1 for run in runs] == [False] * len(by_day) + [True, True]
-    assert len({run.render.seed for run in runs}) == len(SCENES) + 2
-    assert set(scene_suite.SCENE_SECONDS) == set(SCENES)
+    assert len({run.render.seed for run in runs}) == len(scene_suite.SCENE_SECONDS) + 2
+    assert set(scene_suite.SCENE_SECONDS) == set(SCENES) - {"lorry"}
     assert len({run.settings.json for run in runs}) == len(names)
     assert all(run.settings.sequence == run.render.out for run in runs)
 
