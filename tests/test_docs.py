@@ -1,5 +1,6 @@
 """What the documentation says about the command line is what the command line takes."""
 
+import ast
 import json
 import re
 import shlex
@@ -112,3 +113,28 @@ def test_the_script_of_the_library_page_runs(monkeypatch, capsys):
     poses, points = (int(word) for word in re.findall(r"\d+", last))
     assert poses == 8
     assert points > 100
+
+
+def reasons_of_drops():
+    """Every constant that the code gives as the reason of a drop."""
+    for role in ("agent", "channel", "server"):
+        for file in (ROOT / role).rglob("*.py"):
+            for call in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Attribute | ast.Name):
+                    continue
+                name = call.func.attr if isinstance(call.func, ast.Attribute) else call.func.id
+                if name not in ("drop", "_drop", "_on_failure") or not call.args:
+                    continue
+                reason = call.args[1] if name == "_on_failure" else call.args[0]
+                outcomes = [reason.body, reason.orelse] if isinstance(reason, ast.IfExp) else [reason]
+                yield from (
+                    o.value for o in outcomes if isinstance(o, ast.Constant) and isinstance(o.value, str)
+                )
+
+
+def test_every_reason_of_a_drop_is_explained_and_no_other():
+    page = (ROOT / "docs/troubleshooting.md").read_text(encoding="utf-8")
+    table = page.split("## Dropped frames, by reason")[1].split("\n## ")[0]
+    cells = re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
+    explained = [reason for cell in cells for reason in re.findall(r"`(\w+)`", cell)]
+    assert sorted(explained) == sorted(set(reasons_of_drops()))
