@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from semcast import demo
+from semcast.channel.settings import ChannelSettings
 from semcast.cli import main
 from semcast.commands.demo import summary_table, why_no_pose
 from semcast.common.camera import Intrinsics
@@ -79,12 +80,16 @@ def commands_of(settings):
 
 def test_every_setting_reaches_a_process(tmp_path):
     settings = DemoSettings(
-        codec="webp-ldpc", modulation="analog", snr_db=3, channel="burst", confidence="paper", view="web",
-        seed=7, out=tmp_path / "o", viewer_port=9877, web_port=9091,
+        codec="webp-ldpc", modulation="analog", confidence="paper", view="web", seed=7,
+        link=ChannelSettings(channel="burst", snr_db=3.5, slot_loss=0.3, delay_ms=250, frame_loss=0.125),
+        out=tmp_path / "o", viewer_port=9877, web_port=9091,
     )  # fmt: skip
     words = [w for command in commands_of(settings).values() for w in command]
-    for value in ("webp-ldpc", "analog", "3", "burst", "paper", "web", "7", "0.5", "8", str(tmp_path / "o")):
+    for value in ("webp-ldpc", "analog", "burst", "paper", "web", "7", "0.5", "8", str(tmp_path / "o")):
         assert value in words
+    link = " ".join(role_commands(settings, SEQUENCE, "tcp/127.0.0.1:1")["channel"])
+    for flag in ("--snr-db 3.5", "--slot-loss 0.3", "--delay-ms 250", "--frame-loss 0.125"):
+        assert f"{flag} " in link
     assert tuple(words[words.index(f"--{name}-port") + 1] for name in ("viewer", "web")) == ("9877", "9091")
 
 
@@ -103,7 +108,6 @@ def test_the_camera_reaches_the_agent_and_the_reference_it_is_compared_with(tmp_
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"snr_db": 42.0}, "snr_db must be in"),
         ({"resize": 2.0}, "resize"),
         ({"stride": 0}, "stride"),
         ({"seed": -1}, r"seed must be in \[0, 2147483647\], got -1"),
@@ -131,7 +135,7 @@ def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong, m
     values |= {
         "codec": {"codec": "no-such-codec"},
         "weights": {"codec": str(encoder)},
-        "channel": {"channel": "raleigh"},
+        "channel": {"link": ChannelSettings(channel="trace", trace="file", trace_file=tmp_path / "none.csv")},
         "record": {"record": former / "summary.json" / "run.mcap"},
         "out": {"out": former / "summary.json"},
         "view": {"view": "native", "viewer_port": int(free_endpoint().rpartition(":")[2])},
@@ -140,7 +144,7 @@ def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong, m
         "codec": "no-such-codec",
         "weights": "can only send",
         "camera": "camera of plain is unknown",
-        "channel": "raleigh",
+        "channel": "none.csv",
         "record": r"record can't be written to .*run\.mcap",
         "out": "summary.json can't be made a folder for outputs",
         "view": "no display: use --view web",
@@ -246,7 +250,7 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
     for name in ("trajectory.tum", "map.ply", "summary.json", "settings.toml"):
         assert (tmp_path / name).stat().st_size > 0
     in_force = build_settings(DemoSettings, read_toml(tmp_path / "demo.toml"))
-    assert (in_force.sequence, in_force.channel, in_force.snr_db) == (SEQUENCE, "awgn", 10.0)
+    assert (in_force.sequence, in_force.link) == (SEQUENCE, ChannelSettings())
     assert None not in (in_force.stride, in_force.rate_hz), "what this machine could serve"
     assert summary["completeness"] > 0.3  # live, so a loaded machine drops frames
     assert summary["ate_percent"] < 5.0
@@ -265,7 +269,9 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
 @pytest.mark.slow
 def test_a_link_that_nothing_can_be_decoded_on_is_said(tmp_path):
     told = []
-    settings = DemoSettings(codec="jpeg-ldpc", snr_db=0.0, view="file", resize=0.3, out=tmp_path)
+    settings = DemoSettings(
+        codec="jpeg-ldpc", link=ChannelSettings(snr_db=0.0), view="file", resize=0.3, out=tmp_path
+    )
     summary, error = run_demo(
         settings, threading.Event(), lambda line: None, lambda done, text: told.append((done, text))
     )

@@ -9,13 +9,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.agent.pace_control import start_stride
-from semcast.channel.settings import ChannelName
+from semcast.channel.link import Link
+from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.codecs import check_codec, named_weights
@@ -66,10 +67,7 @@ class DemoSettings:
     rate: RateChoice = field(
         default=NATIVE_RATE, metadata={"help": "channel uses per pixel value; auto: as the link needs"}
     )
-    snr_db: float = field(default=10.0, metadata={"help": "Es/N0 of the link in dB"})
-    channel: ChannelName = field(
-        default="awgn", metadata={"help": "kind of link; erasure loses 20 percent of the slots"}
-    )
+    link: ChannelSettings = field(default=ChannelSettings(), metadata={"help": "the channel"})
     confidence: Literal["robust", "paper", "off"] = field(
         default="robust", metadata={"help": "how the geometry uses confidence"}
     )
@@ -117,12 +115,6 @@ class DemoSettings:
         """Check what the three processes would only notice after their start."""
         _ = self.view_settings
         ReconstructionSettings(seed=self.seed)
-        if self.channel not in get_args(ChannelName):
-            raise ValueError(
-                f"channel must be one of {', '.join(get_args(ChannelName))}, got {self.channel!r}"
-            )
-        if not -5.0 <= self.snr_db <= 30.0:
-            raise ValueError(f"snr_db must be in [-5, 30], got {self.snr_db:g}")
         if self.resize is not None and not 0.05 <= self.resize <= 1.0:
             raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
         if self.stride is not None and self.stride < 1:
@@ -171,7 +163,7 @@ class Playback:
 def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict[str, list[str]]:
     """Return the command lines of server and channel, in the order they are started."""
     server = [*_PROGRAM, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
-    server += ["--reference", str(sequence), *_camera_flags(settings.camera)]
+    server += ["--reference", str(sequence), *_flags(settings.camera)]
     server += ["--confidence", settings.confidence, "--view", settings.view]
     server += ["--viewer-port", str(settings.viewer_port), "--web-port", str(settings.web_port)]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
@@ -180,15 +172,14 @@ def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict
     if settings.record is not None:
         server += ["--record", str(settings.record)]
     channel = [*_PROGRAM, "channel", "--agent-id", AGENT_ID, "--connect", endpoint]
-    channel += ["--channel", settings.channel, "--snr-db", f"{settings.snr_db:g}"]
-    channel += ["--seed", str(settings.seed)]
+    channel += [*_flags(settings.link), "--seed", str(settings.seed)]
     return {"server": server, "channel": channel}
 
 
 def agent_command(settings: DemoSettings, sequence: Path, endpoint: str, playback: Playback) -> list[str]:
     """Return the command line of the agent, which is started last."""
     agent = [*_PROGRAM, "agent", "--agent-id", AGENT_ID, "--connect", endpoint]
-    agent += ["--source", str(sequence), *_camera_flags(settings.camera)]
+    agent += ["--source", str(sequence), *_flags(settings.camera)]
     agent += ["--codec", settings.codec, "--modulation", settings.modulation, "--rate", settings.rate]
     agent += ["--resize", f"{playback.resize:g}", "--stride", str(playback.stride)]
     if playback.speed != 1.0:
@@ -196,11 +187,11 @@ def agent_command(settings: DemoSettings, sequence: Path, endpoint: str, playbac
     return agent
 
 
-def _camera_flags(camera: CameraSettings) -> list[str]:
-    """Return the flags that give a process the same camera."""
+def _flags(part: CameraSettings | ChannelSettings) -> list[str]:
+    """Return the flags that give a process the same camera or link."""
     words: list[str] = []
-    for entry in fields(camera):
-        value = getattr(camera, entry.name)
+    for entry in fields(part):
+        value = getattr(part, entry.name)
         if value is not None and value != ():
             values = value if isinstance(value, tuple) else (value,)
             words += ["--" + entry.name.replace("_", "-"), *(str(v) for v in values)]
@@ -325,6 +316,7 @@ def _prepare(settings: DemoSettings, sequence: Path) -> tuple[Sequence, Path]:
     check_codec(settings.codec)
     named_weights(settings.codec)
     check_viewer(ServerSettings(out=settings.out, view=settings.view_settings))
+    Link(settings.link, settings.seed)  # reads a trace
     for name, file in (("record", settings.record), ("json", settings.json)):
         if file is not None:
             check_writable(file, name)

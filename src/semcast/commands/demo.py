@@ -11,6 +11,7 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from semcast.channel.emulator import warn_of_idle
 from semcast.commands.console import plain_console
 from semcast.commands.running import add_settings, read_settings, run_until_stopped
 from semcast.common.sequence import open_sequence
@@ -79,6 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     With ``--json -`` the summary has stdout for itself.
     """
     settings = read_settings(DemoSettings, arguments)
+    warn_of_idle(settings.link, settings.link.without_effect())
     json_to_stdout = settings.json == STDOUT
     if json_to_stdout:
         settings = replace(settings, json=None)
