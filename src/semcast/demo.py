@@ -172,7 +172,7 @@ def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict
     if settings.record is not None:
         server += ["--record", str(settings.record)]
     channel = [*_PROGRAM, "channel", "--agent-id", AGENT_ID, "--connect", endpoint]
-    channel += [*_flags(settings.link), "--seed", str(settings.seed)]
+    channel += [*_flags(settings.link, ("channel", "snr_db")), "--seed", str(settings.seed)]
     return {"server": server, "channel": channel}
 
 
@@ -187,12 +187,12 @@ def agent_command(settings: DemoSettings, sequence: Path, endpoint: str, playbac
     return agent
 
 
-def _flags(part: CameraSettings | ChannelSettings) -> list[str]:
-    """Return the flags that give a process the same camera or link."""
+def _flags(part: CameraSettings | ChannelSettings, always: tuple[str, ...] = ()) -> list[str]:
+    """Return the flags that give a process the same camera or link: values that are no default."""
     words: list[str] = []
     for entry in fields(part):
         value = getattr(part, entry.name)
-        if value is not None and value != ():
+        if value != entry.default or entry.name in always:
             values = value if isinstance(value, tuple) else (value,)
             words += ["--" + entry.name.replace("_", "-"), *(str(v) for v in values)]
     return words
