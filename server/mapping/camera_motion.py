@@ -29,6 +29,8 @@ _SAME_DIRECTION = 0.5
 _SHORT_STAY = 2
 #: Points must lie so far in front of the camera, as share of their usual depth.
 _LEAST_DEPTH_SHARE = 0.05
+#: A frame that comes after so many intervals of those before it comes after a gap.
+_GAP_INTERVALS = 3.0
 _S_PER_NS = 1e-9
 
 
@@ -49,6 +51,7 @@ class CameraMotion:
         self._moving: tuple[int, Array] | None = None
         self._still: list[int] = []
         self._still_ns = 0
+        self._posed_ns: list[int] = []
 
     @property
     def speed_map_per_s(self) -> float:
@@ -71,6 +74,13 @@ class CameraMotion:
         """Where a camera that seems to have stopped would be if it went on, None where it did not stop."""
         return self._motion.predict(t_source_ns) if self._still else None
 
+    def is_after_gap(self, t_source_ns: int) -> bool:
+        """Whether a frame comes so much later than those before it came that some between are missing."""
+        if len(self._posed_ns) < 2:
+            return False
+        before_ns, last_ns = self._posed_ns
+        return t_source_ns - last_ns > _GAP_INTERVALS * (last_ns - before_ns)
+
     def observe(self, frame_id: int, t_source_ns: int, T_world_cam: Array, xyz: Array) -> list[int]:
         """Take the pose of a frame.
 
@@ -83,6 +93,7 @@ class CameraMotion:
         Returns:
             Earlier frames whose poses are of another time: their image was an older one.
         """
+        self._posed_ns = [*self._posed_ns[-1:], t_source_ns]
         T_world_go = self._motion.predict(t_source_ns)
         if self._moving is None or T_world_go is None:
             self._go_on(t_source_ns, T_world_cam)

@@ -88,8 +88,8 @@ class Reconstruction:
         self._last_frame_id = -1
         self._last_posed_id: int | None = None
         self._lost_ns: list[int] = []
-        self._frames_since_keyframe = 0
-        self._keyframes_since_join = 0
+        self._frames_since_keyframe = self._keyframes_since_join = 0
+        self._is_after_gap = False
         self._stage_ms: dict[str, float] = {}
         self._on_pose: Callable[[FrameResult], None] | None = None
 
@@ -126,8 +126,7 @@ class Reconstruction:
             ValueError: An array has another shape than the camera's image, or another number type.
         """
         frame.check(self._camera.shape_hw)
-        self._stage_ms = {}
-        self._on_pose = on_pose
+        self._stage_ms, self._on_pose = {}, on_pose
         if frame.frame_id <= self._last_frame_id:
             return self._result(frame, self._map.world.pose_of_frame(frame.frame_id), None)
         self._last_frame_id = frame.frame_id
@@ -138,6 +137,7 @@ class Reconstruction:
         since = time.perf_counter_ns()
         sight = self._shutter.see(frame)
         T_world_guess = self._motion.predict(frame.t_source_ns)
+        self._is_after_gap = self._motion.is_after_gap(frame.t_source_ns)
         self._follow(sight, T_world_guess)
         sight, is_first = self._shutter.settle(frame, sight, self._tracks)
         if is_first:
@@ -164,8 +164,7 @@ class Reconstruction:
 
     def _moved(self, scale: float) -> None:
         """The map was moved: so is the last pose."""
-        T_world_last = self._last_pose()
-        if T_world_last is not None:
+        if (T_world_last := self._last_pose()) is not None:
             self._motion.correct(T_world_last, scale)
 
     def _moves_to(self, frame_id: int, t_source_ns: int, T_world_cam: Array, ids: Ids) -> None:
@@ -197,6 +196,7 @@ class Reconstruction:
         self, T_world_guess: Array | None, seen: Seen | None = None, **how: Unpack[Believing]
     ) -> TrackedPose | None:
         seen = self._tracks.seen() if seen is None else seen
+        how["is_after_gap"] = self._is_after_gap
         known = {"submap": self._map.submap, "seed": self._settings.seed}
         noise = self._map.noise.model
         return track_pose(self._camera, self._map.world, noise, seen, T_world_guess, **known, **how)
@@ -217,6 +217,8 @@ class Reconstruction:
         if pose is not None:
             return self._accept(sight, pose)
         logger.debug("frame %d: tracking is lost", sight.frame.frame_id)
+        if self._is_after_gap:
+            self._tracks.drop_seen(self._map.world.landmarks.ids)
         self._state = TrackingState.LOST
         self._lost_ns = []
         self._initialiser.clear()
@@ -334,14 +336,12 @@ class Reconstruction:
 
     def _recover(self, sight: Sight) -> TrackedPose | None:
         """Pose of a frame after tracking was lost: by tracks that are still alive, else by recognition."""
-        world = self._map.world
-        if not world.keyframes:
+        if not self._map.world.keyframes:
             return None
         since = time.perf_counter_ns()
         is_lost = self._state is TrackingState.LOST
         pose = self._pose(None, min_share=_MIN_SHARE_WHEN_LOST) if is_lost else None
-        if pose is None:
-            pose = self._recognise(sight)
+        pose = self._recognise(sight) if pose is None else pose
         self._lap("relocalise", since)
         return pose
 

@@ -25,6 +25,9 @@ MIN_INLIERS = 15
 _MIN_INLIER_SHARE = 0.5
 #: Share of the landmarks in sight that must agree with a pose, when the frame before had one.
 MIN_BELIEVED_SHARE = 0.25
+#: And when frames are missing since then and the pose was searched for: a row of equal houses fits itself one
+#: house on as well, with all that is seen of it.
+_BELIEVED_AFTER_GAP = 0.5
 #: So many rays, and that share of them, must agree to steady a pose, and that share of its landmarks still.
 _STEADY, _MIN_KEPT_SHARE = (10, 0.5), 0.8
 #: Rays that steady a pose may raise the cost of its landmarks, errors cut off at so many standard deviations,
@@ -43,6 +46,7 @@ class Believing(TypedDict, total=False):
 
     min_share: float
     may_carry: bool
+    is_after_gap: bool
 
 
 @dataclass(frozen=True)
@@ -144,6 +148,7 @@ def track_pose(
     min_inliers: int = MIN_INLIERS,
     min_share: float = MIN_BELIEVED_SHARE,
     may_carry: bool = False,
+    is_after_gap: bool = False,
 ) -> TrackedPose | None:
     """Pose from the landmarks among the tracks of a frame, steadied by the other tracks.
 
@@ -159,6 +164,7 @@ def track_pose(
         min_share: And their share of all that are in sight: fewer are a chance find.
         may_carry: Where landmarks have all but run out, let many other tracks carry the guess on with fewer
             than ``min_inliers``.
+        is_after_gap: Frames are missing before this one: what contradicts the guess must have more behind it.
 
     Returns:
         The pose, or None when too few landmarks agree with any.
@@ -171,18 +177,19 @@ def track_pose(
     if T_world_guess is not None and len(points) >= min_inliers:
         best = refine_pose(camera, invert_transform(T_world_guess), points, marks.xy, sigma, gate)
     if best is None or best.num_inliers < max(min_inliers, _MIN_INLIER_SHARE * len(points)):
-        searched = search_pose(camera, points, marks.xy, sigma, gate, seed=seed, min_inliers=min_inliers)
+        least = max(min_inliers, round(_BELIEVED_AFTER_GAP * len(points)) if is_after_gap else 0)
+        searched = search_pose(camera, points, marks.xy, sigma, gate, seed=seed, min_inliers=least)
         if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
             best = searched
     enough = max(min_inliers, min_share * len(points))
     if best is not None and (best.num_inliers < enough or not np.isfinite(best.T_cam_world).all()):
         best = None
     if best is None and may_carry and T_world_guess is not None and len(points) < _RUN_OUT:
-        least = max(_MIN_LEFT, min_share * len(points))
-        best = _steadied(camera, world, noise, marks, others, T_world_guess, submap, _CARRY, least)
+        left = max(_MIN_LEFT, min_share * len(points))
+        best = _steadied(camera, world, noise, marks, others, T_world_guess, submap, _CARRY, left)
     elif best is not None and len(others):
-        T, least = invert_transform(best.T_cam_world), max(enough, _MIN_KEPT_SHARE * best.num_inliers)
-        steadied = _steadied(camera, world, noise, marks, others, T, submap, _STEADY, least)
+        T, kept = invert_transform(best.T_cam_world), max(enough, _MIN_KEPT_SHARE * best.num_inliers)
+        steadied = _steadied(camera, world, noise, marks, others, T, submap, _STEADY, kept)
         most_taken = _MOST_TAKEN + _MOST_TAKEN_EACH * len(marks)
         if steadied is not None and _cost(steadied, sigma) < _cost(best, sigma) + most_taken:
             best = steadied

@@ -90,6 +90,32 @@ def test_a_camera_that_stood_sets_off_from_rest():
     assert np.allclose(motion.predict(9 * FRAME_NS), at(1.2), atol=1e-2)
 
 
+def test_a_gap_is_longer_than_the_frames_before_were_apart():
+    motion = CameraMotion(CAMERA)
+    assert not motion.is_after_gap(50 * FRAME_NS), "nothing is known yet"
+    go(motion, [0.0, 0.2])
+    assert not motion.is_after_gap(3 * FRAME_NS)
+    assert motion.is_after_gap(5 * FRAME_NS)
+    go(motion, [0.2, 0.2, 0.2], first=2)
+    assert not motion.is_after_gap(5 * FRAME_NS), "the camera stands, and frames come"
+    motion.reset()
+    assert not motion.is_after_gap(50 * FRAME_NS)
+
+
+def test_a_row_of_equal_houses_does_not_hold_the_camera_back_after_a_gap():
+    """What is seen of the houses fits where the camera was before the gap, but for one house."""
+    sequence = open_sequence(STREET)
+    reconstruction = Reconstruction(sequence.intrinsics, ReconstructionSettings(), InlineBundle())
+    times_ns = {}
+    for k in (0, 1, 2, *range(12, 24)):
+        times_ns[k] = int(sequence.times_ns[k])
+        reconstruction.process(DecodedFrame(k, times_ns[k], sequence.image(k)))
+    poses = reconstruction.final_trajectory()
+    reconstruction.close()
+    assert set(poses) == set(times_ns)
+    assert ate(trajectory_of(poses, times_ns), sequence.groundtruth()).rmse_m < 1.0
+
+
 def test_less_than_the_error_of_poses_is_no_stop():
     assert go(CameraMotion(CAMERA), 0.01 * np.array([0, 1, 2, 3, 3, 3, 6, 7])) == {}
 

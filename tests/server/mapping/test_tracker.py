@@ -35,3 +35,49 @@ def test_few_agreeing_landmarks_among_many_are_a_chance_find(min_share, is_belie
     if pose is not None:
         np.testing.assert_allclose(pose.T_world_cam, np.eye(4), atol=1e-3)
         assert 30 <= pose.num_inliers < 36
+
+
+@pytest.mark.parametrize(
+    ("is_after_gap", "from_repetition", "is_believed"),
+    [
+        (False, 20, True),
+        (True, 20, False),
+        (True, 40, True),
+    ],
+)
+def test_what_contradicts_the_guess_after_a_gap_needs_more_behind_it(
+    is_after_gap, from_repetition, is_believed
+):
+    """Of a row of equal houses, some points fit the camera one house further on."""
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (60, 3))
+    T_world_repeated, T_world_guess = np.eye(4), np.eye(4)
+    T_world_repeated[0, 3], T_world_guess[0, 3] = 0.2, 1.0
+    xy = rng.uniform((0, 0), (319, 239), (60, 2))
+    xy[:from_repetition] = CAMERA.project(xyz[:from_repetition] - T_world_repeated[:3, 3])
+    ids = np.arange(60)
+    world = WorldMap()
+    world.add_landmarks(ids, xyz, np.zeros((60, 3), np.uint8), np.ones(60), 0, 0)
+    noise, seen = NoiseModel(0.7, 0.0), Seen(ids, xy, np.ones(60))
+    how = {"submap": 0, "seed": 0, "is_after_gap": is_after_gap}
+    pose = track_pose(CAMERA, world, noise, seen, T_world_guess, **how)
+    assert (pose is not None) == is_believed
+    if pose is not None:
+        np.testing.assert_allclose(pose.T_world_cam, T_world_repeated, atol=1e-2)
+
+
+def test_a_pose_near_the_guess_is_believed_after_a_gap_too():
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (60, 3))
+    xy = CAMERA.project(xyz)
+    xy[20:] = rng.uniform((0, 0), (319, 239), (40, 2))
+    world = WorldMap()
+    world.add_landmarks(np.arange(60), xyz, np.zeros((60, 3), np.uint8), np.ones(60), 0, 0)
+    T_world_guess = np.eye(4)
+    T_world_guess[0, 3] = 0.01
+    seen = Seen(np.arange(60), xy, np.ones(60))
+    pose = track_pose(
+        CAMERA, world, NoiseModel(0.7, 0.0), seen, T_world_guess, submap=0, seed=0, is_after_gap=True
+    )
+    assert pose is not None
+    np.testing.assert_allclose(pose.T_world_cam, np.eye(4), atol=1e-2)
