@@ -139,7 +139,7 @@ class TrackTable:
     def drop_seen(self, ids: Ids) -> None:
         """Forget those among some tracks that the newest image shows.
 
-        What is found beyond a gap and agrees with no pose would agree with a wrong one once most of it is gone.
+        What is found beyond a gap and fits no pose would fit a wrong one once most of it is gone.
         """
         self.keep(~(self.visible & np.isin(self.ids, ids)))
 
