@@ -12,8 +12,9 @@ T = TypeVar("T")
 MAX_WAIT_S = 0.5
 #: A consumer that has not caught up after so long will not: from then on only the newest waits,
 CATCH_UP_S = 1.0
-#: until nothing had to give way for so long.
-RECOVERY_S = 2.0
+#: until nothing had to give way for so long. This is not for one that all that came in that time takes no more
+#: than a share of it: on a link with jitter frames come in bursts, and something would give way for ever.
+RECOVERY_S, KEEPS_UP_SHARE = 2.0, 0.8
 #: Whatever their rate, no more are kept.
 MAX_WAITING = 64
 
@@ -43,6 +44,9 @@ class Backlog(Generic[T]):
         self._behind_since_s: float | None = None
         self._newest_only = False
         self._last_drop_s = 0.0
+        self._came_s: deque[float] = deque()
+        self._took_s: deque[tuple[float, float]] = deque()  # when it was done, how long it took
+        self._taken_s: float | None = None
 
     @property
     def dropped(self) -> int:
@@ -60,6 +64,7 @@ class Backlog(Generic[T]):
             if self._closed:
                 return False
             now_s = self._clock()
+            self._came_s.append(now_s)
             self._waiting.append(_Waiting(item, now_s))
             self._thin_out(now_s)
             self._changed.notify_all()
@@ -68,23 +73,44 @@ class Backlog(Generic[T]):
     def get(self, timeout_s: float | None = None) -> T | None:
         """Take the oldest item; None when there was none in time, or the queue is closed and empty."""
         with self._changed:
+            self._note_done(self._clock())
             self._changed.wait_for(lambda: bool(self._waiting) or self._closed, timeout_s)
             if not self._waiting:
                 return None
             now_s = self._clock()
             self._thin_out(now_s)
-            item = self._waiting.popleft().item
+            item, self._taken_s = self._waiting.popleft().item, now_s
             if not self._waiting:
                 self._behind_since_s = None
             elif self._behind_since_s is None:
                 self._behind_since_s = now_s
             return item
 
+    def _note_done(self, now_s: float) -> None:
+        """The consumer is done with what it took last."""
+        if self._taken_s is not None:
+            self._took_s.append((now_s, now_s - self._taken_s))
+            self._taken_s = None
+
+    def _keeps_up(self, now_s: float) -> bool:
+        """Whether the consumer would have got through all that came in the last ``RECOVERY_S``."""
+        since_s = now_s - RECOVERY_S
+        while self._came_s and self._came_s[0] < since_s:
+            self._came_s.popleft()
+        while self._took_s and self._took_s[0][0] < since_s:
+            self._took_s.popleft()
+        if not self._took_s:
+            return False
+        each_s = sum(took_s for _, took_s in self._took_s) / len(self._took_s)
+        return each_s * len(self._came_s) <= KEEPS_UP_SHARE * RECOVERY_S
+
     def _thin_out(self, now_s: float) -> None:
         """Let older items give way, as it is time; the newest stays."""
-        if self._behind_since_s is not None and now_s - self._behind_since_s > CATCH_UP_S:
+        if self._keeps_up(now_s):
+            self._newest_only = False
+        elif self._behind_since_s is not None and now_s - self._behind_since_s > CATCH_UP_S:
             self._newest_only, self._last_drop_s = True, now_s
-        elif self._newest_only and now_s - self._last_drop_s > RECOVERY_S:
+        elif now_s - self._last_drop_s > RECOVERY_S:
             self._newest_only = False
         while len(self._waiting) > 1 and (
             self._newest_only

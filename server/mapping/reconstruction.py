@@ -217,8 +217,6 @@ class Reconstruction:
         if pose is not None:
             return self._accept(sight, pose)
         logger.debug("frame %d: tracking is lost", sight.frame.frame_id)
-        if self._is_after_gap:
-            self._tracks.drop_seen(self._map.world.landmarks.ids)
         self._state = TrackingState.LOST
         self._lost_ns = []
         self._initialiser.clear()

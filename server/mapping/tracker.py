@@ -1,5 +1,6 @@
 """Pose of each frame from the landmarks it sees, with a motion prior."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypedDict
@@ -25,9 +26,9 @@ MIN_INLIERS = 15
 _MIN_INLIER_SHARE = 0.5
 #: Share of the landmarks in sight that must agree with a pose, when the frame before had one.
 MIN_BELIEVED_SHARE = 0.25
-#: And when frames are missing since then and the pose was searched for: a row of equal houses fits itself one
-#: house on as well, with all that is seen of it.
-_BELIEVED_AFTER_GAP = 0.5
+#: So many, and that share, must agree when frames are missing since then and the pose was searched for: a row of
+#: equal houses fits itself one house on as well, with all that is seen of it.
+_BELIEVED_AFTER_GAP = (30, 0.5)
 #: So many rays, and that share of them, must agree to steady a pose, and that share of its landmarks still.
 _STEADY, _MIN_KEPT_SHARE = (10, 0.5), 0.8
 #: Rays that steady a pose may raise the cost of its landmarks, errors cut off at so many standard deviations,
@@ -177,7 +178,8 @@ def track_pose(
     if T_world_guess is not None and len(points) >= min_inliers:
         best = refine_pose(camera, invert_transform(T_world_guess), points, marks.xy, sigma, gate)
     if best is None or best.num_inliers < max(min_inliers, _MIN_INLIER_SHARE * len(points)):
-        least = max(min_inliers, round(_BELIEVED_AFTER_GAP * len(points)) if is_after_gap else 0)
+        count, share = _BELIEVED_AFTER_GAP if is_after_gap else (0, 0.0)
+        least = max(min_inliers, count, math.ceil(share * len(points)))
         searched = search_pose(camera, points, marks.xy, sigma, gate, seed=seed, min_inliers=least)
         if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
             best = searched

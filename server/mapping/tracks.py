@@ -136,13 +136,6 @@ class TrackTable:
         for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[mask])
 
-    def drop_seen(self, ids: Ids) -> None:
-        """Forget those among some tracks that the newest image shows.
-
-        What is found beyond a gap and fits no pose would fit a wrong one once most of it is gone.
-        """
-        self.keep(~(self.visible & np.isin(self.ids, ids)))
-
     def adopt(self, ids: Ids, xy: Array, confidence: float) -> None:
         """Replace all tracks by points of the newest image, as after relocalisation.
 

@@ -19,18 +19,23 @@ class Clock:
         return self.now_s
 
 
-def worked_off(num_frames, service_s, missing=()):
-    """Return ``[(frame, wait_s)]`` of a consumer that takes ``service_s(frame)`` for each that comes."""
+def worked_off(num_frames, service_s, missing=(), burst=1):
+    """Return ``[(frame, wait_s)]`` of a consumer that takes ``service_s(frame)`` for each that comes.
+
+    So many as ``burst`` come at once, at the time of the last of them.
+    """
     clock = Clock()
     waiting = Backlog(clock)
-    taken, free_s, put = [], 0.0, 0
+    taken, free_s, put, has_asked = [], 0.0, 0, False
     while put < num_frames or len(waiting):
-        arrives_s = put * PERIOD_S if put < num_frames else float("inf")
-        if len(waiting) and free_s <= arrives_s:
+        arrives_s = (put // burst * burst + burst - 1) * PERIOD_S if put < num_frames else float("inf")
+        if free_s <= arrives_s and (len(waiting) or not has_asked):
             clock.now_s = max(clock.now_s, free_s)
             frame = waiting.get(0)
-            taken.append((frame, clock.now_s - frame * PERIOD_S))
-            free_s = clock.now_s + service_s(frame)
+            has_asked = frame is None
+            if frame is not None:
+                taken.append((frame, clock.now_s - frame * PERIOD_S))
+                free_s = clock.now_s + service_s(frame)
         else:
             clock.now_s = max(clock.now_s, arrives_s)
             if put not in missing:
@@ -73,6 +78,20 @@ def test_after_an_overload_busy_moments_are_worked_off_again():
     taken = worked_off(120, lambda frame: 0.15 if frame < 30 else 0.45 if frame == 90 else 0.04)
     assert [frame for frame, _ in taken if frame >= 60] == list(range(60, 120))
     assert len([frame for frame, _ in taken if frame < 30]) < 25
+
+
+def test_frames_that_come_three_at_once_do_not_keep_an_overload_going():
+    taken = worked_off(120, lambda frame: 0.5 if frame < 30 else 0.07, burst=3)
+    assert len([frame for frame, _ in taken if frame < 30]) < 15
+    assert [frame for frame, _ in taken if frame >= 60] == list(range(60, 120))
+
+
+@pytest.mark.parametrize("burst", [1, 3])
+def test_an_overload_in_bursts_gets_the_newest(burst):
+    taken = worked_off(300, lambda frame: 0.13, burst=burst)
+    lasting = [frame for frame, _ in taken if 60 <= frame]
+    assert max(wait_s for frame, wait_s in taken if frame >= 60) <= 0.14 + burst * PERIOD_S
+    assert len(lasting) >= 75
 
 
 def test_a_flood_is_bounded_in_number():
