@@ -1,5 +1,6 @@
 """Frames that wait for the decoder: a busy moment is worked off, a lasting overload gets the newest frame."""
 
+import math
 import threading
 import time
 from collections import deque
@@ -44,6 +45,7 @@ class Backlog(Generic[T]):
         self._behind_since_s: float | None = None
         self._newest_only = False
         self._last_drop_s = 0.0
+        self._began_s = math.inf
         self._came_s: deque[float] = deque()
         self._took_s: deque[tuple[float, float]] = deque()  # when it was done, how long it took
         self._taken_s: float | None = None
@@ -64,6 +66,7 @@ class Backlog(Generic[T]):
             if self._closed:
                 return False
             now_s = self._clock()
+            self._began_s = min(self._began_s, now_s)
             self._came_s.append(now_s)
             self._waiting.append(_Waiting(item, now_s))
             self._thin_out(now_s)
@@ -102,7 +105,7 @@ class Backlog(Generic[T]):
         if not self._took_s:
             return False
         each_s = sum(took_s for _, took_s in self._took_s) / len(self._took_s)
-        return each_s * len(self._came_s) <= KEEPS_UP_SHARE * RECOVERY_S
+        return each_s * len(self._came_s) <= KEEPS_UP_SHARE * (now_s - max(since_s, self._began_s))
 
     def _thin_out(self, now_s: float) -> None:
         """Let older items give way, as it is time; the newest stays."""
