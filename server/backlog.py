@@ -13,8 +13,8 @@ T = TypeVar("T")
 MAX_WAIT_S = 0.5
 #: A consumer that has not caught up after so long will not: from then on only the newest waits,
 CATCH_UP_S = 1.0
-#: until nothing had to give way for so long. This is not for one that all that came in that time takes no more
-#: than a share of it: on a link with jitter frames come in bursts, and something would give way for ever.
+#: until nothing had to give way for so long. It is not too slow if all that came in that time takes it no
+#: more than a share of it: on a link with jitter frames come in bursts, and some would give way for ever.
 RECOVERY_S, KEEPS_UP_SHARE = 2.0, 0.8
 #: Whatever their rate, no more are kept.
 MAX_WAITING = 64

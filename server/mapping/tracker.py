@@ -26,8 +26,8 @@ MIN_INLIERS = 15
 _MIN_INLIER_SHARE = 0.5
 #: Share of the landmarks in sight that must agree with a pose, when the frame before had one.
 MIN_BELIEVED_SHARE = 0.25
-#: So many, and that share, must agree when frames are missing since then and the pose was searched for: a row of
-#: equal houses fits itself one house on as well, with all that is seen of it.
+#: So many, and that share, must agree when frames are missing since then and the pose was searched for: a row
+#: of equal houses fits itself one house on as well, with all that is seen of it.
 _BELIEVED_AFTER_GAP = (30, 0.5)
 #: So many rays, and that share of them, must agree to steady a pose, and that share of its landmarks still.
 _STEADY, _MIN_KEPT_SHARE = (10, 0.5), 0.8
