@@ -74,6 +74,10 @@ class CameraMotion:
         """Where a camera that seems to have stopped would be if it went on, None where it did not stop."""
         return self._motion.predict(t_source_ns) if self._still else None
 
+    def bridge(self, t_source_ns: int, T_after_later: Array, later_s: float) -> Array | None:
+        """As ``ConstantVelocity.bridge``; None while the camera stands."""
+        return None if self._still else self._motion.bridge(t_source_ns, T_after_later, later_s)
+
     def is_after_gap(self, t_source_ns: int) -> bool:
         """Whether a frame comes so much later than those before it came that some between are missing."""
         if len(self._posed_ns) < 2:

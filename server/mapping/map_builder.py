@@ -12,7 +12,9 @@ from semcast.common.geometry import invert_transform, make_transform, skew, tran
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
 from semcast.server.mapping import mapper
 from semcast.server.mapping.anchoring import anchor_tracks
+from semcast.server.mapping.bridging import bridge
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
+from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, colours_of
 from semcast.server.mapping.late_readout import put_map_right
@@ -36,8 +38,6 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: A speed that is older than this says nothing of a new map's unit.
-_MAX_BRIDGE_S = 5.0
 #: Keyframes whose images are kept: 45 MB of 640x480.
 _MAX_IMAGES = 150
 #: A keyframe has landmarks enough with one for this share of the tracks that are wanted.
@@ -355,36 +355,12 @@ class MapBuilder:
             self._adjusted = None
         return num_adjusted
 
-    def bridge(
-        self, T_world_guess: Array | None, speed_map_per_s: float, start: Start
-    ) -> tuple[Array, float]:
-        """Where a new submap begins and how large its unit is, as long as nothing better is known.
-
-        It begins where the camera was heading. Its unit makes the camera go on at its old speed, or, where it
-        stood or too long ago, makes things as far away as they were.
-
-        Args:
-            T_world_guess: ``(4, 4)`` where the first camera of the start should be, None where nobody knows.
-            speed_map_per_s: How fast the camera was before.
-            start: The new submap.
-
-        Returns:
-            ``T_world_cam (4, 4)`` of its first camera, and world units per unit of the start.
-        """
+    def bridge(self, motion: CameraMotion, start: Start, grown: Start) -> tuple[Array, float]:
+        """Where a new submap begins and its unit, see ``bridging.bridge``."""
         before = self.reference_before()
-        if T_world_guess is None or before is None:
-            return np.eye(4), 1.0
-        first, last = start.keyframes[0], start.keyframes[-1]
-        way = float(np.linalg.norm(last.T_world_cam[:3, 3] - first.T_world_cam[:3, 3]))
-        elapsed_s = (last.t_source_ns - first.t_source_ns) * 1e-9
-        depth = mapper.median_depth(self.world, before)
-        depth = depth if np.isfinite(depth) else 1.0
-        since_s = (first.t_source_ns - before.t_source_ns) * 1e-9
-        if since_s < _MAX_BRIDGE_S and way > 0 and speed_map_per_s * elapsed_s > 0.02 * depth:
-            scale = speed_map_per_s * elapsed_s / way
-            if 0.2 * depth < scale < 5.0 * depth:
-                return T_world_guess, scale
-        return T_world_guess, depth
+        depth = 1.0 if before is None else mapper.median_depth(self.world, before)
+        last_ns = None if before is None else before.t_source_ns
+        return bridge(motion, start, grown, last_ns, depth if np.isfinite(depth) else 1.0)
 
     def reference_before(self) -> Keyframe | None:
         """Newest keyframe of any submap."""

@@ -362,9 +362,7 @@ class Reconstruction:
         since = time.perf_counter_ns()
         history = self._initialiser.history
         grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
-        guess = self._motion.predict(grown.keyframes[0].t_source_ns)
-        # The unit is told by the start alone: before it, the camera may have stood still.
-        T_world_ref, scale = self._map.bridge(guess, self._motion.speed_map_per_s, start)
+        T_world_ref, scale = self._map.bridge(self._motion, start, grown)
         self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, history)
         backfilled = backfill(
             self._camera,

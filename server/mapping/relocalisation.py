@@ -39,6 +39,10 @@ _SEARCH_ITERATIONS = 400
 _GUIDED_RADIUS_PX = 14.0
 _GUIDED_MAX_BITS = 70
 _MIN_GUIDED_SHARE = 0.35
+#: A wrong one of a row of equal houses has none of what stands around it. Where fewer than a share of the
+#: landmarks in view are found, they must lie as those in view lie, by the Bhattacharyya coefficient over
+#: fields of the image. In 650 measurements it was at most 0.73 at wrong places, and at 6 of 618 right ones.
+_MANY_SHARE, _LEAST_ALIKE, _FIELDS_XY = 0.3, 0.73, (12, 5)
 #: Octaves of the query, so that a view from nearer or further still matches.
 _OCTAVES = (0, 2, 4)
 #: Binary descriptors do not know the noise model: a match is good to about this.
@@ -189,6 +193,8 @@ class Relocaliser:
         if refined.num_inliers < max(self._min_inliers, _MIN_GUIDED_SHARE * len(point)):
             return None
         good = refined.inliers
+        if good.sum() < _MANY_SHARE * len(expected) and self._alike(expected, xy[row][good]) < _LEAST_ALIKE:
+            return None
         return Place(
             invert_transform(refined.T_cam_world),
             keyframe.frame_id,
@@ -196,6 +202,19 @@ class Relocaliser:
             xy[row][good],
             keyframe.submap,
         )
+
+    def _alike(self, in_view_xy: Array, found_xy: Array) -> float:
+        """Bhattacharyya coefficient of how landmarks in view and those found are spread over the image."""
+        last = np.array(_FIELDS_XY) - 1
+        shares = []
+        for xy in (in_view_xy, found_xy):
+            x, y = np.clip(
+                (xy / (self._camera.width, self._camera.height) * _FIELDS_XY).astype(int), 0, last
+            ).T
+            shares.append(
+                np.bincount(x * _FIELDS_XY[1] + y, minlength=_FIELDS_XY[0] * _FIELDS_XY[1]) / len(xy)
+            )
+        return float(np.sqrt(shares[0] * shares[1]).sum())
 
 
 def _likeliest(candidates: Sequence[Keyframe], descriptors: NDArray[np.uint8]) -> list[Keyframe]:

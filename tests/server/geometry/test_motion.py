@@ -1,6 +1,7 @@
 import numpy as np
+import pytest
 
-from semcast.common.geometry import exp_se3, exp_so3, make_transform
+from semcast.common.geometry import exp_se3, exp_so3, make_transform, rotation_angle_deg
 from semcast.server.geometry.motion import ConstantVelocity
 
 STEP = make_transform(exp_so3((0.0, 0.02, 0.01)), (0.1, 0.0, 0.3))
@@ -23,6 +24,45 @@ def test_a_gap_is_bridged_by_time():
     motion.observe(FRAME_NS, make_transform(np.eye(3), (0, 0, 0.5)))
     assert np.allclose(motion.predict(4 * FRAME_NS)[:3, 3], (0, 0, 2.0))
     assert np.isclose(motion.speed_map_per_s, 5.0)
+
+
+def arc(turn_deg_per_s, t_s, speed=10.0, num=2000):
+    """Pose after driving forwards while turning about the vertical at a rate that is a function of time."""
+    T, dt = np.eye(4), t_s / num
+    for k in range(num):
+        turn = np.radians(turn_deg_per_s((k + 0.5) * dt)) * dt
+        T = T @ make_transform(exp_so3((0, turn, 0)), (0, 0, speed * dt))
+    return T
+
+
+@pytest.mark.parametrize(
+    "rate_deg_per_s",
+    [lambda t: 0.0, lambda t: 40.0, lambda t: 30.0 * np.clip(t - 0.1, 0.0, 1.0)],
+    ids=["straight on", "an orbit", "into a bend"],
+)
+def test_a_gap_is_bridged_by_what_came_before_and_after(rate_deg_per_s):
+    motion = ConstantVelocity()
+    motion.observe(0, np.eye(4))
+    motion.observe(FRAME_NS, arc(rate_deg_per_s, 0.1))
+    after = arc(rate_deg_per_s, 1.1)
+    later = np.linalg.inv(after) @ arc(rate_deg_per_s, 1.3)
+    found = motion.bridge(11 * FRAME_NS, later, 0.2)
+    angle_deg = rotation_angle_deg(found[:3, :3].T @ after[:3, :3])
+    assert angle_deg < 2.0
+    assert np.linalg.norm(found[:3, 3] - after[:3, 3]) < 0.25
+    if rate_deg_per_s(1.1) != rate_deg_per_s(0.0):
+        guess = motion.predict(11 * FRAME_NS)
+        assert rotation_angle_deg(guess[:3, :3].T @ after[:3, :3]) > 10.0, "going on as before does not"
+
+
+def test_a_gap_that_is_too_long_is_not_bridged():
+    motion = ConstantVelocity()
+    assert motion.bridge(FRAME_NS, STEP, 0.1) is None
+    motion.observe(0, np.eye(4))
+    motion.observe(FRAME_NS, STEP)
+    assert motion.bridge(FRAME_NS, STEP, 0.1) is None, "no gap at all"
+    assert motion.bridge(16 * FRAME_NS, STEP, 0.1) is not None
+    assert motion.bridge(17 * FRAME_NS, STEP, 0.1) is None
 
 
 def test_extrapolation_ends():

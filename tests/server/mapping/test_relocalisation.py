@@ -27,12 +27,18 @@ GREY = texture()
 SIGHT = Sight(DecodedFrame(1, 10**8, np.repeat(GREY[..., None], 3, axis=2)), GREY, np.ones(240, bool))
 
 
-def wall(relocaliser, num_landmarks):
-    """A map of one keyframe that sees landmarks on a wall at distance 1."""
+def wall(relocaliser, num_landmarks, looks_alike=lambda xy: np.ones(len(xy), bool)):
+    """A map of one keyframe that sees landmarks on a wall at distance 1.
+
+    Landmarks that don't look alike have descriptors of something else.
+    """
     corners = detect_corners(GREY, 800, None, None, 40).astype(np.float64)
     ids = np.arange(len(corners))
     described, descriptors = relocaliser.describe(GREY, ids, corners)
     chosen = described[np.linspace(0, len(described) - 1, num_landmarks).astype(int)]
+    chosen_descriptors = descriptors[np.isin(described, chosen)]
+    other = ~looks_alike(corners[chosen])
+    chosen_descriptors[other] = np.random.default_rng(1).integers(0, 256, (other.sum(), 32), np.uint8)
     world = WorldMap()
     world.add_keyframe(
         Keyframe(
@@ -44,7 +50,7 @@ def wall(relocaliser, num_landmarks):
             xy=corners[chosen],
             confidence=np.ones(num_landmarks),
             descriptor_ids=chosen,
-            descriptors=descriptors[np.isin(described, chosen)],
+            descriptors=chosen_descriptors,
         )
     )
     colour = np.zeros((num_landmarks, 3), np.uint8)
@@ -65,6 +71,22 @@ def test_thirty_landmarks_are_enough_only_where_few_are_followed(max_features, i
     relocaliser = Relocaliser(CAMERA, 0, max_features)
     place = relocaliser.find(SIGHT, wall(relocaliser, 32), NOISE)
     assert (place is not None) is is_enough
+
+
+@pytest.mark.parametrize(
+    ("looks_alike", "is_place"),
+    [
+        (lambda xy: np.arange(len(xy)) % 5 == 0, True),
+        (lambda xy: abs(xy[:, 0] - 160) < 32, False),
+        (lambda xy: abs(xy[:, 0] - 160) < 96, True),
+    ],
+    ids=["a fifth of everything", "all of a house and nothing around it", "more than half"],
+)
+def test_a_house_like_another_is_no_place(looks_alike, is_place):
+    relocaliser = Relocaliser(CAMERA, 0, 200)
+    world = wall(relocaliser, 300, looks_alike)
+    assert looks_alike(world.keyframes[0].xy).sum() > 30
+    assert (relocaliser.find(SIGHT, world, NOISE) is not None) == is_place
 
 
 def test_another_image_is_no_place():

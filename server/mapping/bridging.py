@@ -1,0 +1,58 @@
+"""Where a new submap is put, and how large its unit is, as long as nothing better is known."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.server.mapping.camera_motion import CameraMotion
+from semcast.server.mapping.initialiser import Start
+
+Array = NDArray[np.float64]
+
+#: A speed that is older than this says nothing of a new map's unit.
+_MAX_BRIDGE_S = 5.0
+#: The camera moved, where a new map's length is that of more than this share of the depth,
+_LEAST_WAY = 0.02
+#: and its unit makes things no more than so many times as far or near as they were.
+_MOST_FARTHER = 5.0
+#: What the camera does after a gap is told from so long a time, for the less of it, the noisier.
+_LATER_NS = 500_000_000
+
+
+def bridge(
+    motion: CameraMotion, start: Start, grown: Start, last_ns: int | None, depth: float
+) -> tuple[Array, float]:
+    """Lay a way from what is known to where a new submap begins.
+
+    Its unit makes the camera go on at its old speed, or, where it stood or too long ago, makes things as far
+    away as they were. It begins where the camera got to: turning and moving change evenly from what they were
+    to what the submap says, or, where its unit isn't told by the speed, go on as they were.
+
+    Args:
+        motion: Of the camera so far.
+        start: The new submap. It alone tells the unit: before it, the camera may have stood still.
+        grown: The same and what came before.
+        last_ns: Time of the newest keyframe of the map, None where there is none.
+        depth: Median of what that sees.
+
+    Returns:
+        ``T_world_cam (4, 4)`` of the first camera of ``grown``, and world units per unit of the start.
+    """
+    at_ns = grown.keyframes[0].t_source_ns
+    T_world_guess = motion.predict(at_ns)
+    if T_world_guess is None or last_ns is None:
+        return np.eye(4), 1.0
+    first, last = start.keyframes[0], start.keyframes[-1]
+    way = float(np.linalg.norm(last.T_world_cam[:3, 3] - first.T_world_cam[:3, 3]))
+    elapsed_s = (last.t_source_ns - first.t_source_ns) * 1e-9
+    since_s = (first.t_source_ns - last_ns) * 1e-9
+    gone = motion.speed_map_per_s * elapsed_s
+    if since_s >= _MAX_BRIDGE_S or way <= 0.0 or gone <= _LEAST_WAY * depth:
+        return T_world_guess, depth
+    scale = gone / way
+    if not depth / _MOST_FARTHER < scale < _MOST_FARTHER * depth:
+        return T_world_guess, depth
+    soon = [k for k in grown.keyframes[1:] if k.t_source_ns - at_ns <= _LATER_NS] or grown.keyframes[1:2]
+    T_later = soon[-1].T_world_cam.copy()
+    T_later[:3, 3] *= scale
+    T_world_first = motion.bridge(at_ns, T_later, (soon[-1].t_source_ns - at_ns) * 1e-9)
+    return T_world_guess if T_world_first is None else T_world_first, scale

@@ -1,0 +1,84 @@
+"""Where a submap begins that the camera makes after it was lost."""
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, make_transform
+from semcast.server.mapping.bridging import bridge
+from semcast.server.mapping.camera_motion import CameraMotion
+from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.world_map import Keyframe
+
+CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
+FRAME_NS = 100_000_000
+POINTS = np.random.default_rng(0).uniform((-4, -3, 6), (4, 3, 12), (200, 3))
+
+
+def moved(speed=2.0, num=3):
+    """A camera that went straight on for ``num`` frames."""
+    motion = CameraMotion(CAMERA)
+    for k in range(num):
+        motion.observe(k, k * FRAME_NS, make_transform(np.eye(3), (0, 0, 0.1 * speed * k)), POINTS)
+    return motion
+
+
+def start_at(first, num=3, turn_deg=0.0, step=0.05):
+    """Keyframes of a new submap, one per frame, that turn and go on by so much from one to the next."""
+    none = np.zeros(0, np.int64)
+    step = make_transform(exp_so3((0, np.radians(turn_deg), 0)), (0, 0, step))
+    keyframes = [
+        Keyframe(
+            *(first + k, (first + k) * FRAME_NS, np.linalg.matrix_power(step, k), 1),
+            *(none, np.zeros((0, 2)), np.zeros(0), none, np.zeros((0, 32), np.uint8)),
+        )
+        for k in range(num)
+    ]
+    return Start(keyframes, none, np.zeros((0, 3)), np.zeros(0))
+
+
+def test_speed_tells_the_unit_and_how_far_the_camera_got():
+    start = start_at(12)
+    T, scale = bridge(moved(), start, start, 2 * FRAME_NS, 8.0)
+    assert np.isclose(scale, 0.2 / 0.05)
+    np.testing.assert_allclose(T, make_transform(np.eye(3), (0, 0, 0.4 + 2.0)), atol=1e-9)
+
+
+def test_half_of_a_bend_was_driven_out_of_sight():
+    start = start_at(12, turn_deg=4.0)
+    T, _ = bridge(moved(), start, start, 2 * FRAME_NS, 8.0)
+    turned_deg = np.degrees(np.arctan2(T[0, 2], T[2, 2]))
+    assert turned_deg == pytest.approx(20.0, abs=0.5), "from 0 to 40 degrees per second, in a second"
+    assert T[0, 3] > 0.1
+    np.testing.assert_allclose(np.linalg.norm(T[:3, 3] - (0, 0, 0.4)), 2.0, atol=0.03)
+
+
+def test_what_is_seen_of_the_time_before_the_start_is_where_it_begins():
+    start, grown = start_at(14), start_at(12, num=5)
+    T, scale = bridge(moved(), start, grown, 2 * FRAME_NS, 8.0)
+    np.testing.assert_allclose(T[:3, 3], (0, 0, 2.4), atol=1e-9)
+    assert np.isclose(scale, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("motion", "first", "step"),
+    [
+        (moved(speed=0.0), 12, 0.05),
+        (moved(), 60, 0.05),
+        (moved(), 12, 0.0),
+        (moved(), 12, 0.001),
+    ],
+    ids=["the camera stood", "too long ago", "it stands now", "the unit would be absurd"],
+)
+def test_else_things_are_as_far_away_as_they_were(motion, first, step):
+    start = start_at(first, step=step)
+    T, scale = bridge(motion, start, start, 2 * FRAME_NS, 8.0)
+    assert scale == 8.0
+    np.testing.assert_array_equal(T, motion.predict(first * FRAME_NS))
+
+
+def test_a_first_map_begins_at_the_origin():
+    start = start_at(0)
+    T, scale = bridge(CameraMotion(CAMERA), start, start, None, 1.0)
+    np.testing.assert_array_equal(T, np.eye(4))
+    assert scale == 1.0
