@@ -9,6 +9,8 @@ Array = NDArray[np.float64]
 
 #: A motion that was seen longer ago than this says nothing.
 MAX_EXTRAPOLATION_S = 1.5
+#: What came before and after a gap says nothing of one that is longer.
+MAX_GAP_S = 3.0
 #: Parts of a gap in which the motion is taken to be steady.
 _BRIDGE_STEPS = 10
 
@@ -84,7 +86,7 @@ class ConstantVelocity:
             return None
         t_ns, T_world_cam = self._last
         gap_s = (t_source_ns - t_ns) * 1e-9
-        if not 0.0 < gap_s <= MAX_EXTRAPOLATION_S:
+        if not 0.0 < gap_s <= MAX_GAP_S:
             return None
         turn = np.stack([self._rotation_rad_per_s, log_so3(T_after_later[:3, :3]) / later_s])
         way = np.stack([self._translation_per_s, T_after_later[:3, 3] / later_s])

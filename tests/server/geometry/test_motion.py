@@ -61,8 +61,8 @@ def test_a_gap_that_is_too_long_is_not_bridged():
     motion.observe(0, np.eye(4))
     motion.observe(FRAME_NS, STEP)
     assert motion.bridge(FRAME_NS, STEP, 0.1) is None, "no gap at all"
-    assert motion.bridge(16 * FRAME_NS, STEP, 0.1) is not None
-    assert motion.bridge(17 * FRAME_NS, STEP, 0.1) is None
+    assert motion.bridge(31 * FRAME_NS, STEP, 0.1) is not None
+    assert motion.bridge(32 * FRAME_NS, STEP, 0.1) is None
 
 
 def test_extrapolation_ends():
