@@ -30,11 +30,13 @@ class _Layout:
         rows: Finds the rows in the result.
         columns: Name of a column -> where in a row its figure is, dots between keys, and its format.
         notes: Returns the lines below the table.
+        optional: Columns that are left out where no row has a figure.
     """
 
     rows: Callable[[Report], list[dict[str, Any]]]
     columns: dict[str, tuple[str, str]]
     notes: Callable[[Report], list[str]] = lambda report: []
+    optional: frozenset[str] = frozenset()
 
 
 def result_table(what: str, report: Report) -> ResultTable:
@@ -45,8 +47,14 @@ def result_table(what: str, report: Report) -> ResultTable:
         report: What it returned.
     """
     layout = LAYOUTS[what]
-    rows = [[_cell(row, *column) for column in layout.columns.values()] for row in layout.rows(report)]
-    return ResultTable(list(layout.columns), rows, layout.notes(report))
+    entries = layout.rows(report)
+    columns = {
+        name: column
+        for name, column in layout.columns.items()
+        if name not in layout.optional or any(_cell(entry, *column) != "-" for entry in entries)
+    }
+    rows = [[_cell(entry, *column) for column in columns.values()] for entry in entries]
+    return ResultTable(list(columns), rows, layout.notes(report))
 
 
 def _cell(row: Mapping[str, Any], where: str, form: str) -> str:
@@ -81,8 +89,10 @@ LAYOUTS: dict[str, _Layout] = {
             "RPE %": ("rpe_trans_percent", ".2f"),
             "RPE deg": ("rpe_rot_deg", ".3f"),
             "PSNR dB": ("psnr_db", ".2f"),
+            "again s": ("recovery_s", ".2f"),
             "failed": ("num_failed", "d"),
         },
+        optional=frozenset({"again s"}),
     ),
     "pairs": _Layout(
         lambda report: _named(report["results"]),

@@ -66,6 +66,10 @@ def _codec(report: Report) -> Iterator[str]:
 
 def _trajectory(report: Report) -> Iterator[str]:
     head = ["SNR dB", "confidence", "ATE m", "ATE %", "completeness", "RPE %", "RPE deg", "PSNR dB", "seeds"]
+    if gap_s := report["settings"].get("gap_s"):
+        yield f"Nothing arrives for {gap_s:g} s, at another place for each seed. `again`: from the first"
+        yield "frame after that to the first with a pose.\n"
+        head.append("again s")
     yield from table(
         head,
         [
@@ -79,6 +83,7 @@ def _trajectory(report: Report) -> Iterator[str]:
                 number(cell["rpe_rot_deg"], 3),
                 number(cell["psnr_db"]),
                 str(len(cell["seeds"])),
+                *([number(cell["recovery_s"])] if gap_s else []),
             ]
             for cell in report["cells"]
         ],
@@ -360,12 +365,14 @@ def results_page(folder: Path = RESULTS) -> str:
 def readme_table(folder: Path = RESULTS) -> str:
     """Return the README's short table: path errors in the default mode, recordings by links.
 
-    Recordings that were sent over most links come first.
+    Recordings that were sent over most links come first. Those with a gap are not in it.
     """
     errors: dict[str, dict[str, str]] = {}
     for file in sorted(folder.glob("trajectory_*.json")):
         report = json.loads(file.read_text(encoding="utf-8"))
         channel = report["settings"]["link"]["channel"]
+        if report["settings"].get("gap_s"):
+            continue
         for cell in report["cells"]:
             link = None if cell["snr_db"] is None else (channel, cell["snr_db"])
             if cell["confidence"] == "robust" and link in README_LINKS:

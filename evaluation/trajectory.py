@@ -12,6 +12,7 @@ from semcast.common.codec import Codec
 from semcast.common.errors import SemcastError
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.trajectory_error import MIN_MATCHES, ate
+from semcast.evaluation.gap import Gap, gap_in, outside, recovery_s
 from semcast.evaluation.pipeline import (
     CLEAN,
     UNUSED_LINK_FIELDS,
@@ -32,6 +33,7 @@ logger = logging.getLogger(__name__)
 VERB = "eval trajectory"
 #: Flags that this verb sets itself: the mode is a list here, the seed is that of the run.
 UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.confidence", "reconstruction.seed"}
+MAX_GAP_S = 60.0
 #: Figures of a run that are summarised over seeds.
 FIGURES = ("ate_rmse_m", "ate_percent", "completeness", "rpe_trans_percent", "rpe_rot_deg", "psnr_db")
 
@@ -50,6 +52,13 @@ class TrajectorySettings(StreamSettings):
     reconstruction: ReconstructionSettings = field(
         default=ReconstructionSettings(), metadata={"help": "the server's estimation"}
     )
+    gap_s: float = field(
+        default=0.0,
+        metadata={
+            "help": "seconds of every run in which nothing arrives, at another place for each seed; frames "
+            "of that time count neither as lost nor for completeness"
+        },
+    )
     rows: bool = field(default=True, metadata={"help": "keep one row per frame in the result"})
     out: Path | None = field(
         default=None,
@@ -64,6 +73,8 @@ class TrajectorySettings(StreamSettings):
         super().__post_init__()
         if not self.confidence or len(set(self.confidence)) != len(self.confidence):
             raise ValueError(f"confidence must be one or more different modes, got {self.confidence}")
+        if not 0.0 <= self.gap_s <= MAX_GAP_S:
+            raise ValueError(f"gap_s must be in [0, {MAX_GAP_S:g}], got {self.gap_s:g}")
 
 
 def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None) -> dict[str, Any]:
@@ -78,7 +89,8 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
         ``FIGURES``, ``num_failed`` (runs without a path), and ``runs``, the full summary of each seed.
         ``comparisons`` holds, per SNR, the paired difference in ATE of each mode to the mode ``off`` where
         that was run. ``frames_left_out`` are those that can't be read. With one cell its figures and
-        ``stage_ms`` also stand at the top level.
+        ``stage_ms`` also stand at the top level. With a gap, runs have ``gap``, its first and last frame and
+        ``recovery_s``, see ``recovery_s``, and cells the median of that.
 
     Raises:
         SourceError: The recording can't be read.
@@ -101,11 +113,13 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     for snr_db in snrs_db:
         runs: dict[str, list[dict[str, Any]]] = {mode: [] for mode in settings.confidence}
         for seed in settings.all_seeds:
-            frames = FrameRun(sequence, chosen.ids, codec, settings.link_at(snr_db), seed)
+            gap = gap_in(chosen.ids, sequence.times_ns, settings.gap_s, seed) if settings.gap_s else None
+            ids = chosen.ids if gap is None else outside(chosen.ids, gap)
+            frames = FrameRun(sequence, ids, codec, settings.link_at(snr_db), seed)
             for mode in settings.confidence:
                 how = replace(settings.reconstruction, confidence=mode, seed=seed)
                 run = reconstruct(frames, sequence.intrinsics, how, truth)
-                runs[mode].append(_run_entry(run, seed, settings.rows))
+                runs[mode].append(_run_entry(run, seed, gap, with_rows=settings.rows))
                 if settings.out is not None and seed == settings.seed:
                     label = CLEAN if codec is None else f"{snr_db:g}db"
                     _write_files(settings.out, f"{label}_{mode}", run)
@@ -129,8 +143,10 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     return dict(report)
 
 
-def _run_entry(run: ReconstructedRun, seed: int, with_rows: bool) -> dict[str, Any]:
+def _run_entry(run: ReconstructedRun, seed: int, gap: Gap | None, *, with_rows: bool) -> dict[str, Any]:
     entry = {"seed": seed, **run.summary, "num_landmarks": run.num_landmarks}
+    if gap is not None:
+        entry["gap"] = {**vars(gap), "recovery_s": recovery_s(run.rows, gap)}
     return {**entry, "rows": run.rows} if with_rows else entry
 
 
@@ -156,6 +172,11 @@ def _cell(snr_db: float | None, mode: str, runs: list[dict[str, Any]], *, has_tr
         "confidence": mode,
         "seeds": [run["seed"] for run in runs],
         **{name: median_or_none([run[name] for run in runs]) for name in FIGURES},
+        **(
+            {"recovery_s": median_or_none([run["gap"]["recovery_s"] for run in runs])}
+            if "gap" in runs[0]
+            else {}
+        ),
         "num_failed": sum(_has_failed(run, has_truth=has_truth) for run in runs),
         "runs": runs,
     }
