@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from semcast.common.errors import ConfigError
 
-#: Share of the recording at either end in which no gap begins or ends: there must be a map, and time for more.
+#: Share of the recording at either end in which no gap begins or ends: before and after it a map is needed.
 _MARGIN_SHARE = 0.2
 
 

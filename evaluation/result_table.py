@@ -89,10 +89,10 @@ LAYOUTS: dict[str, _Layout] = {
             "RPE %": ("rpe_trans_percent", ".2f"),
             "RPE deg": ("rpe_rot_deg", ".3f"),
             "PSNR dB": ("psnr_db", ".2f"),
-            "again s": ("recovery_s", ".2f"),
+            "again": ("recovery_s", ".2f"),
             "failed": ("num_failed", "d"),
         },
-        optional=frozenset({"again s"}),
+        optional=frozenset({"again"}),
     ),
     "pairs": _Layout(
         lambda report: _named(report["results"]),
