@@ -39,10 +39,10 @@ _SEARCH_ITERATIONS = 400
 _GUIDED_RADIUS_PX = 14.0
 _GUIDED_MAX_BITS = 70
 _MIN_GUIDED_SHARE = 0.35
-#: A wrong one of a row of equal houses has none of what stands around it. Where fewer than a share of the
-#: landmarks in view are found, they must lie as those in view lie, by the Bhattacharyya coefficient over
-#: fields of the image. In 650 measurements it was at most 0.73 at wrong places, and at 6 of 618 right ones.
-_MANY_SHARE, _LEAST_ALIKE, _FIELDS_XY = 0.3, 0.73, (12, 5)
+#: A wrong one of a row of equal houses has none of what stands around it. Found landmarks must lie as those
+#: in view lie, by the Bhattacharyya coefficient over fields of the image. In 650 measurements it was at most
+#: 0.73 at wrong places, and at 6 of 618 right ones.
+_LEAST_ALIKE, _FIELDS_XY = 0.73, (12, 5)
 #: Octaves of the query, so that a view from nearer or further still matches.
 _OCTAVES = (0, 2, 4)
 #: Binary descriptors do not know the noise model: a match is good to about this.
@@ -193,7 +193,7 @@ class Relocaliser:
         if refined.num_inliers < max(self._min_inliers, _MIN_GUIDED_SHARE * len(point)):
             return None
         good = refined.inliers
-        if good.sum() < _MANY_SHARE * len(expected) and self._alike(expected, xy[row][good]) < _LEAST_ALIKE:
+        if self._alike(expected, xy[row][good]) < _LEAST_ALIKE:
             return None
         return Place(
             invert_transform(refined.T_cam_world),
