@@ -43,6 +43,7 @@ class CameraMotion:
 
     def __init__(self, camera: Intrinsics) -> None:
         self._camera = camera
+        self._came_ns: list[int] = []
         self.reset()
 
     def reset(self) -> None:
@@ -51,7 +52,7 @@ class CameraMotion:
         self._moving: tuple[int, Array] | None = None
         self._still: list[int] = []
         self._still_ns = 0
-        self._posed_ns: list[int] = []
+        self._has_gap = False
 
     @property
     def speed_map_per_s(self) -> float:
@@ -78,12 +79,16 @@ class CameraMotion:
         """As ``ConstantVelocity.bridge``; None while the camera stands."""
         return None if self._still else self._motion.bridge(t_source_ns, T_after_later, later_s)
 
-    def is_after_gap(self, t_source_ns: int) -> bool:
-        """Whether a frame comes so much later than those before it came that some between are missing."""
-        if len(self._posed_ns) < 2:
-            return False
-        before_ns, last_ns = self._posed_ns
-        return t_source_ns - last_ns > _GAP_INTERVALS * (last_ns - before_ns)
+    def comes_after_gap(self, t_source_ns: int) -> bool:
+        """Note that a frame has come; whether between the last pose and it some are missing.
+
+        It comes so much later than the one before as those before it did not.
+        """
+        if len(self._came_ns) == 2:
+            before_ns, last_ns = self._came_ns
+            self._has_gap |= t_source_ns - last_ns > _GAP_INTERVALS * (last_ns - before_ns)
+        self._came_ns = [*self._came_ns[-1:], t_source_ns]
+        return self._has_gap
 
     def observe(self, frame_id: int, t_source_ns: int, T_world_cam: Array, xyz: Array) -> list[int]:
         """Take the pose of a frame.
@@ -97,7 +102,7 @@ class CameraMotion:
         Returns:
             Earlier frames whose poses are of another time: their image was an older one.
         """
-        self._posed_ns = [*self._posed_ns[-1:], t_source_ns]
+        self._has_gap = False
         T_world_go = self._motion.predict(t_source_ns)
         if self._moving is None or T_world_go is None:
             self._go_on(t_source_ns, T_world_cam)

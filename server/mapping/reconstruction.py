@@ -137,7 +137,7 @@ class Reconstruction:
         since = time.perf_counter_ns()
         sight = self._shutter.see(frame)
         T_world_guess = self._motion.predict(frame.t_source_ns)
-        self._is_after_gap = self._motion.is_after_gap(frame.t_source_ns)
+        self._is_after_gap = self._motion.comes_after_gap(frame.t_source_ns)
         self._follow(sight, T_world_guess)
         sight, is_first = self._shutter.settle(frame, sight, self._tracks)
         if is_first:

@@ -92,14 +92,18 @@ def test_a_camera_that_stood_sets_off_from_rest():
 
 def test_a_gap_is_longer_than_the_frames_before_were_apart():
     motion = CameraMotion(CAMERA)
-    assert not motion.is_after_gap(50 * FRAME_NS), "nothing is known yet"
-    go(motion, [0.0, 0.2])
-    assert not motion.is_after_gap(3 * FRAME_NS)
-    assert motion.is_after_gap(5 * FRAME_NS)
-    go(motion, [0.2, 0.2, 0.2], first=2)
-    assert not motion.is_after_gap(5 * FRAME_NS), "the camera stands, and frames come"
+    assert not motion.comes_after_gap(0)
+    assert not motion.comes_after_gap(5 * FRAME_NS), "nothing is known yet"
+    assert not motion.comes_after_gap(20 * FRAME_NS), "three intervals"
+    assert motion.comes_after_gap(66 * FRAME_NS)
+    assert motion.comes_after_gap(67 * FRAME_NS), "until there is a pose"
+    motion.observe(67, 67 * FRAME_NS, at(0.0), POINTS)
+    assert not motion.comes_after_gap(68 * FRAME_NS)
+    assert motion.comes_after_gap(72 * FRAME_NS)
     motion.reset()
-    assert not motion.is_after_gap(50 * FRAME_NS)
+    assert not motion.comes_after_gap(73 * FRAME_NS)
+    assert not motion.comes_after_gap(74 * FRAME_NS)
+    assert motion.comes_after_gap(78 * FRAME_NS), "how often frames come is known still"
 
 
 def test_a_row_of_equal_houses_does_not_hold_the_camera_back_after_a_gap():
