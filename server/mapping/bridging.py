@@ -51,8 +51,10 @@ def bridge(
     scale = gone / way
     if not depth / _MOST_FARTHER < scale < _MOST_FARTHER * depth:
         return T_world_guess, depth
-    soon = [k for k in grown.keyframes[1:] if k.t_source_ns - at_ns <= _LATER_NS] or grown.keyframes[1:2]
-    T_later = soon[-1].T_world_cam.copy()
+    # Of a source that gives two images one time, the second tells no speed.
+    later = [k for k in grown.keyframes if k.t_source_ns > at_ns]
+    soon = ([k for k in later if k.t_source_ns - at_ns <= _LATER_NS] or later[:1])[-1]
+    T_later = soon.T_world_cam.copy()
     T_later[:3, 3] *= scale
-    T_world_first = motion.bridge(at_ns, T_later, (soon[-1].t_source_ns - at_ns) * 1e-9)
+    T_world_first = motion.bridge(at_ns, T_later, (soon.t_source_ns - at_ns) * 1e-9)
     return T_world_guess if T_world_first is None else T_world_first, scale

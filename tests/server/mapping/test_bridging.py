@@ -60,6 +60,14 @@ def test_what_is_seen_of_the_time_before_the_start_is_where_it_begins():
     assert np.isclose(scale, 4.0)
 
 
+def test_two_images_of_one_time_tell_no_speed():
+    start = start_at(12, num=4)
+    start.keyframes[1].t_source_ns = start.keyframes[0].t_source_ns
+    T, scale = bridge(moved(), start, start, 2 * FRAME_NS, 8.0)
+    assert np.isclose(scale, 0.2 / 0.05)
+    np.testing.assert_allclose(T, make_transform(np.eye(3), (0, 0, 0.4 + 2.0)), atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("motion", "first", "step"),
     [
