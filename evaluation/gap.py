@@ -43,7 +43,7 @@ def gap_in(frame_ids: Sequence[int], times_ns: NDArray[np.int64], gap_s: float, 
     latest_s = t_s[-1] - margin_s - gap_s
     if latest_s < margin_s:
         raise ConfigError(
-            f"gap_s must be at most {0.6 * t_s[-1]:.3g} in {t_s[-1]:.3g} s of frames, got {gap_s:g}"
+            f"gap_s must be at most {t_s[-1] - 2 * margin_s:.3g} in {t_s[-1]:.3g} s of frames, got {gap_s:g}"
         )
     begin_s = np.random.default_rng(seed).uniform(margin_s, latest_s)
     inside = np.flatnonzero((t_s >= begin_s) & (t_s < begin_s + gap_s))

@@ -33,6 +33,7 @@ logger = logging.getLogger(__name__)
 VERB = "eval trajectory"
 #: Flags that this verb sets itself: the mode is a list here, the seed is that of the run.
 UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.confidence", "reconstruction.seed"}
+#: Longest gap: far beyond what any motion can bridge.
 MAX_GAP_S = 60.0
 #: Figures of a run that are summarised over seeds.
 FIGURES = ("ate_rmse_m", "ate_percent", "completeness", "rpe_trans_percent", "rpe_rot_deg", "psnr_db")

@@ -65,6 +65,7 @@ def pairings_of(
             values = np.maximum(np.array(known, dtype=np.float64), 1e-6)
             settings = report["settings"]
             title = f"{report['sequence']}, {settings['codec']}, {settings['link']['channel']}, {snr_db:g} dB"
+            title += f", {gap_s:g} s gap" if (gap_s := settings.get("gap_s")) else ""
             posed = [float(np.mean([runs_of[s]["completeness"] for s in shared])) for runs_of in (a, b)]
             num_failed = len(both) - len(known)
             found.append(Pairing(title, values[:, 0], values[:, 1], posed[0], posed[1], num_failed))

@@ -14,7 +14,7 @@ _MAX_BRIDGE_S = 5.0
 _LEAST_WAY = 0.02
 #: and its unit makes things no more than so many times as far or near as they were.
 _MOST_FARTHER = 5.0
-#: What the camera does after a gap is told from so long a time, for the less of it, the noisier.
+#: How the camera moves after a gap is told from so long a time: the shorter, the noisier.
 _LATER_NS = 500_000_000
 
 

@@ -80,9 +80,11 @@ class CameraMotion:
         return None if self._still else self._motion.bridge(t_source_ns, T_after_later, later_s)
 
     def comes_after_gap(self, t_source_ns: int) -> bool:
-        """Note that a frame has come; whether between the last pose and it some are missing.
+        """Note that a frame has come, and tell whether frames are missing between the last pose and it.
 
-        It comes so much later than the one before as those before it did not.
+        Args:
+            t_source_ns: Time of the frame. Much further from the one before than that was from its own, some
+                are missing.
         """
         if len(self._came_ns) == 2:
             before_ns, last_ns = self._came_ns

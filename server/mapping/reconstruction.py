@@ -126,7 +126,8 @@ class Reconstruction:
             ValueError: An array has another shape than the camera's image, or another number type.
         """
         frame.check(self._camera.shape_hw)
-        self._stage_ms, self._on_pose = {}, on_pose
+        self._stage_ms = {}
+        self._on_pose = on_pose
         if frame.frame_id <= self._last_frame_id:
             return self._result(frame, self._map.world.pose_of_frame(frame.frame_id), None)
         self._last_frame_id = frame.frame_id
@@ -339,7 +340,8 @@ class Reconstruction:
         since = time.perf_counter_ns()
         is_lost = self._state is TrackingState.LOST
         pose = self._pose(None, min_share=_MIN_SHARE_WHEN_LOST) if is_lost else None
-        pose = self._recognise(sight) if pose is None else pose
+        if pose is None:
+            pose = self._recognise(sight)
         self._lap("relocalise", since)
         return pose
 

@@ -204,17 +204,10 @@ class Relocaliser:
         )
 
     def _alike(self, in_view_xy: Array, found_xy: Array) -> float:
-        """Bhattacharyya coefficient of how landmarks in view and those found are spread over the image."""
-        last = np.array(_FIELDS_XY) - 1
-        shares = []
-        for xy in (in_view_xy, found_xy):
-            x, y = np.clip(
-                (xy / (self._camera.width, self._camera.height) * _FIELDS_XY).astype(int), 0, last
-            ).T
-            shares.append(
-                np.bincount(x * _FIELDS_XY[1] + y, minlength=_FIELDS_XY[0] * _FIELDS_XY[1]) / len(xy)
-            )
-        return float(np.sqrt(shares[0] * shares[1]).sum())
+        """Bhattacharyya coefficient of how two sets of pixels ``(N, 2)`` and ``(M, 2)`` lie in the image."""
+        size = ((0, self._camera.width), (0, self._camera.height))
+        p, q = (np.histogramdd(xy, _FIELDS_XY, size)[0] / len(xy) for xy in (in_view_xy, found_xy))
+        return float(np.sqrt(p * q).sum())
 
 
 def _likeliest(candidates: Sequence[Keyframe], descriptors: NDArray[np.uint8]) -> list[Keyframe]:

@@ -62,10 +62,12 @@ def test_what_is_seen_of_the_time_before_the_start_is_where_it_begins():
 
 def test_two_images_of_one_time_tell_no_speed():
     start = start_at(12, num=4)
-    start.keyframes[1].t_source_ns = start.keyframes[0].t_source_ns
+    for keyframe, frames_later in zip(start.keyframes, (0, 0, 6, 7), strict=True):
+        keyframe.t_source_ns = (12 + frames_later) * FRAME_NS
     T, scale = bridge(moved(), start, start, 2 * FRAME_NS, 8.0)
-    assert np.isclose(scale, 0.2 / 0.05)
-    np.testing.assert_allclose(T, make_transform(np.eye(3), (0, 0, 0.4 + 2.0)), atol=1e-9)
+    assert np.isclose(scale, 1.4 / 0.15)
+    later_per_s = 0.1 * scale / 0.6
+    np.testing.assert_allclose(T[:3, 3], (0, 0, 0.4 + 0.5 * (2.0 + later_per_s)), atol=1e-9)
 
 
 @pytest.mark.parametrize(
