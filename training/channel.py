@@ -80,6 +80,17 @@ class LinkDraw:
     gain: Tensor
     estimate_error_db: Tensor
 
+    def to(self, device: torch.device) -> "LinkDraw":
+        """Return the draw on a device."""
+        return LinkDraw(*(to_device(t, device) for t in vars(self).values()))
+
+
+def to_device(values: Tensor, device: torch.device) -> Tensor:
+    """Bring values from the CPU to a device without waiting for what the device does."""
+    if device.type == "cuda" and not values.is_pinned():
+        values = values.pin_memory()
+    return values.to(device, non_blocking=True)
+
 
 def draw_links(settings: ChannelSettings, batch: int, num_slots: int, generator: torch.Generator) -> LinkDraw:
     """Draw the links of a batch on the CPU."""

@@ -1,7 +1,10 @@
 """Training images: decoded once, held in memory, cut and changed at random but repeatably."""
 
-from concurrent.futures import Future, ThreadPoolExecutor
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -9,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
 
 from semcast.common.errors import SourceError
 
@@ -98,7 +102,7 @@ def random_crop(
     return np.ascontiguousarray(crop, dtype=np.uint8)
 
 
-class Batches:
+class Batches(Dataset[Tensor]):
     """The batch of every step, a function of seed, step and rank alone, prepared ahead of its use.
 
     Args:
@@ -107,8 +111,9 @@ class Batches:
         batch: Crops in a batch.
         seed: Of the whole run.
         rank: Of this process.
-        workers: Threads that prepare batches; a CPU that also trains needs one, a GPU waits for fewer than
-            about eight. The batches are the same for any number.
+        workers: What prepares batches: 1 is a thread beside the one that trains, more are processes. The
+            batches are the same for any number.
+        pinned: Processes leave batches in memory from which a GPU fetches them on its own.
 
     Raises:
         ValueError: ``workers`` is less than 1.
@@ -122,6 +127,7 @@ class Batches:
         seed: int,
         rank: int = 0,
         workers: int = 1,
+        pinned: bool = False,
     ) -> None:
         if workers < 1:
             raise ValueError(f"workers must be >= 1, got {workers}")
@@ -129,11 +135,11 @@ class Batches:
         self._settings = settings
         self._batch = batch
         self._key = (seed, rank)
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="batches")
-        self._num_ahead = workers if workers == 1 else 2 * workers
-        self._ahead: dict[int, Future[Tensor]] = {}
+        self._workers, self._pinned = workers, pinned
+        self._next_step = -1
+        self._ahead: Iterator[Tensor] = iter(())
 
-    def make(self, step: int) -> Tensor:
+    def __getitem__(self, step: int) -> Tensor:
         """Return the batch of a step, ``(B, 3, size, size)`` uint8."""
         rng = np.random.default_rng((*self._key, step))
         chosen = rng.integers(len(self._images), size=self._batch)
@@ -142,12 +148,36 @@ class Batches:
 
     def get(self, step: int) -> Tensor:
         """Return the batch of a step and start on the next ones."""
-        ready = self._ahead.pop(step, None)
-        batch = ready.result() if ready is not None else self.make(step)
-        wanted = range(step + 1, step + 1 + self._num_ahead)
-        self._ahead = {k: self._ahead.get(k) or self._pool.submit(self.make, k) for k in wanted}
-        return batch
+        if step != self._next_step:
+            self.close()
+            self._ahead = self._from(step)
+        self._next_step = step + 1
+        return next(self._ahead)
+
+    def _from(self, step: int) -> Iterator[Tensor]:
+        if self._workers > 1:
+            loader = DataLoader(
+                self,
+                batch_size=None,
+                sampler=range(step, sys.maxsize),
+                num_workers=self._workers,
+                pin_memory=self._pinned,
+                worker_init_fn=_one_thread,
+            )
+            yield from loader
+        with ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
+            ahead = pool.submit(self.__getitem__, step)
+            for k in count(step + 1):
+                batch = ahead.result()
+                ahead = pool.submit(self.__getitem__, k)
+                yield batch
 
     def close(self) -> None:
-        """Stop the threads that prepare batches."""
-        self._pool.shutdown(cancel_futures=True)
+        """Stop what prepares batches."""
+        self._ahead = iter(())
+        self._next_step = -1
+
+
+def _one_thread(worker: int) -> None:
+    # A forked process has none of its parent's threads, which OpenCV would wait for.
+    cv2.setNumThreads(0)

@@ -23,7 +23,7 @@ from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS, channel_bandwidth_ratio
 from semcast.common.whole_file import check_writable, whole_file
 from semcast.training.centring import centre_hidden, folded, unfolded
-from semcast.training.channel import LinkDraw, draw_links, through_link
+from semcast.training.channel import draw_links, through_link, to_device
 from semcast.training.data import Batches, read_images
 from semcast.training.growing import grow
 from semcast.training.klt import start_from_klt
@@ -87,6 +87,7 @@ class Run:
         use_cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
         local = int(os.environ.get("LOCAL_RANK", "0"))
         self.device = torch.device("cuda", local) if use_cuda else torch.device("cpu")
+        torch.backends.cudnn.benchmark = True  # crops keep their size
         entry = architecture(settings.architecture)
         torch.manual_seed(settings.seed)  # layers draw their first weights from the global generator
         model: Transceiver = entry.build(entry.sizes)
@@ -109,13 +110,21 @@ class Run:
         else:
             centre_hidden(self.model)
         self.average = copy.deepcopy(self.model).eval()
+        if settings.compile:
+            self.model.encoder.compile(dynamic=False)
+            self.model.decoder.compile(dynamic=False)
         self.optimisers = build_optimisers(self.model, settings)
         if checkpoint is not None:
             self._restore(checkpoint)
         self.batches = Batches(
-            self.images, settings.crop, settings.batch, settings.seed, rank, settings.data_workers
+            self.images,
+            settings.crop,
+            settings.batch,
+            settings.seed,
+            rank,
+            settings.data_workers,
+            pinned=use_cuda,
         )
-        self.loss = torch.compile(transceiver_loss) if settings.compile else transceiver_loss
 
     @property
     def checkpoint_path(self) -> Path:
@@ -198,15 +207,13 @@ class Run:
         blocks = settings.crop.size_px // BLOCK_PX
         generator = torch.Generator().manual_seed(settings.seed)
         for k in range(_FOLD_BATCHES):
-            x = crops.make(_FOLD_STEP + k).to(device).float() / 255.0
-            draw = draw_links(settings.channel, len(x), blocks, generator)
-            draw = LinkDraw(*(t.to(device) for t in vars(draw).values()))
+            x = crops[_FOLD_STEP + k].to(device).float() / 255.0
+            draw = draw_links(settings.channel, len(x), blocks, generator).to(device)
             noise = torch.randn((len(x), LATENT_CHANNELS, blocks, blocks), generator=generator)
             with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
                 symbols = model.transmit(model.latent(x, draw.expected_snr_db, draw.is_qam), draw.is_qam)
                 y_rx, snr_db = through_link(symbols, draw, noise.to(device))
                 model.receive(y_rx, snr_db, draw.is_qam)
-        crops.close()
 
     def export(self, valid: dict[str, float]) -> Path:
         """Write the averaged weights in half precision with their manifest."""
@@ -250,7 +257,7 @@ class Run:
     def one_step(self) -> dict[str, torch.Tensor]:
         """Draw a batch and its links, and update the weights once."""
         settings, share = self.settings, self.share_done()
-        x = self.batches.get(self.step).to(self.device).float() / 255.0
+        x = to_device(self.batches.get(self.step), self.device).float() / 255.0
         x = x.contiguous(memory_format=torch.channels_last)
         seed = (settings.seed * 1_000_003 + self.step) * 64 + self.rank
         generator = torch.Generator().manual_seed(seed)
@@ -258,8 +265,7 @@ class Run:
         channel = settings.channel
         if share < settings.analog_share:
             channel = replace(channel, share_16qam=0.0)
-        draw = draw_links(channel, settings.batch, blocks, generator)
-        draw = LinkDraw(*(t.to(self.device) for t in vars(draw).values()))
+        draw = draw_links(channel, settings.batch, blocks, generator).to(self.device)
         # Drawn where it is used: on a CPU the noise of a large batch would cost a GPU more than the network.
         on_device = torch.Generator(self.device).manual_seed(seed + 1_000_003)
         shape = (settings.batch, LATENT_CHANNELS, blocks, blocks)
@@ -271,14 +277,11 @@ class Run:
             if share < settings.pretrain_share:
                 loss, logs = masked_image_loss(self.model, x, settings.mask_share, generator)
             else:
-                loss, logs = self.loss(self.model, x, draw, noise, settings.loss, with_heads)
+                loss, logs = transceiver_loss(self.model, x, draw, noise, settings.loss, with_heads)
         loss.backward()
-        self._share_gradients()
-        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip)
-        if bool(torch.isfinite(norm)):
-            for optimiser in self.optimisers:
-                optimiser.step()
+        norm = self._share_gradients()
         for optimiser in self.optimisers:
+            optimiser.step()
             optimiser.zero_grad(set_to_none=True)
         self.step += 1
         self._update_average()
@@ -289,21 +292,28 @@ class Run:
         self._is_asked_to_stop = True
         self.agreed_stop = self.agreed_stop or self.world == 1
 
-    def _share_gradients(self) -> None:
+    def _share_gradients(self) -> torch.Tensor:
+        """Take the mean of the gradient over all processes, clip it, and return its norm.
+
+        Nothing here waits for a GPU, which would run dry meanwhile. One that is not finite becomes zero.
+        """
+        # Heads have no gradient in some steps, the same ones in every process.
+        weights = [p for p in self.model.parameters() if p.grad is not None]
+        flat = torch.cat([p.grad.reshape(-1) for p in weights if p.grad is not None])
         if self.world == 1:
             self.agreed_s = self.elapsed_s
-            return
-        # Heads have no gradient in some steps, the same ones in every process.
-        grads = [p.grad for p in self.model.parameters() if p.grad is not None]
-        clock = torch.tensor([self.elapsed_s, float(self._is_asked_to_stop)], device=self.device)
-        flat = torch.cat([*(g.reshape(-1) for g in grads), clock])
-        dist.all_reduce(flat)
-        flat /= self.world
-        self.agreed_s, self.agreed_stop = float(flat[-2]), float(flat[-1]) > 0.0
-        start = 0
-        for grad in grads:
-            grad.copy_(flat[start : start + grad.numel()].view_as(grad))
-            start += grad.numel()
+        else:
+            clock = torch.tensor([self.elapsed_s, float(self._is_asked_to_stop)], device=self.device)
+            flat = torch.cat((flat, clock))
+            dist.all_reduce(flat)
+            flat /= self.world
+            self.agreed_s, self.agreed_stop = float(flat[-2]), float(flat[-1]) > 0.0
+            flat = flat[:-2]
+        norm = flat.norm()
+        flat = torch.where(norm.isfinite(), flat * (self.settings.clip / norm).clamp(max=1.0), 0.0)
+        for weight, part in zip(weights, flat.split([p.numel() for p in weights]), strict=True):
+            weight.grad = part.view_as(weight)
+        return norm
 
     @torch.no_grad()
     def _update_average(self) -> None:
@@ -332,8 +342,7 @@ def _append(path: Path, row: dict[str, Any]) -> None:
 def _mean_logs(rows: list[dict[str, torch.Tensor]]) -> dict[str, float]:
     names = {name for row in rows for name in row}
     means = {
-        n: float(torch.stack([row[n].float().cpu() for row in rows if n in row]).mean())
-        for n in sorted(names)
+        n: float(torch.stack([row[n].float() for row in rows if n in row]).mean()) for n in sorted(names)
     }
     means["psnr_db"] = -10.0 * float(torch.log10(torch.tensor(max(means["mse"], 1e-10))))
     return means

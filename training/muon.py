@@ -1,6 +1,6 @@
 """Muon: momentum whose matrix is replaced by the nearest orthogonal one (Jordan et al. 2024)."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -51,27 +51,30 @@ class Muon(torch.optim.Optimizer):
         """Update all weights that have a gradient."""
         loss = closure() if closure is not None else None
         for group in self.param_groups:
-            same_shape: dict[tuple[int, int], list[Tensor]] = {}
-            for weight in group["params"]:
-                if weight.grad is not None:
-                    rows = weight.shape[0]
-                    same_shape.setdefault((rows, weight.numel() // rows), []).append(weight)
-            for (rows, columns), weights in same_shape.items():
-                update = torch.stack([self._blend(w, group["momentum"]).flatten(1) for w in weights])
+            weights = [weight for weight in group["params"] if weight.grad is not None]
+            if not weights:
+                continue
+            updates = self._blend(weights, group["momentum"])
+            torch._foreach_mul_(weights, 1.0 - group["lr"] * group["weight_decay"])
+            same_shape: dict[tuple[int, int], list[int]] = {}
+            for idx, weight in enumerate(weights):
+                rows = weight.shape[0]
+                same_shape.setdefault((rows, weight.numel() // rows), []).append(idx)
+            for (rows, columns), members in same_shape.items():
+                nearest = orthogonalise(torch.stack([updates[idx].flatten(1) for idx in members]))
                 # The factor keeps the rms of the update independent of the shape.
                 size = max(1.0, rows / columns) ** 0.5
-                for weight, one in zip(weights, orthogonalise(update), strict=True):
-                    weight.mul_(1.0 - group["lr"] * group["weight_decay"])
-                    weight.add_(one.view_as(weight), alpha=-group["lr"] * size)
+                alike = [weights[idx] for idx in members]
+                steps = [one.view_as(weight) for one, weight in zip(nearest, alike, strict=True)]
+                torch._foreach_add_(alike, steps, alpha=-group["lr"] * size)
         return loss
 
-    def _blend(self, weight: Tensor, momentum: float) -> Tensor:
-        """Take the gradient into the momentum and return their Nesterov mean."""
-        gradient = weight.grad
-        assert gradient is not None  # the caller has looked
-        state = self.state[weight]
-        if "momentum" not in state:
-            state["momentum"] = torch.zeros_like(weight)
-        buffer: Tensor = state["momentum"]
-        buffer.lerp_(gradient, 1.0 - momentum)
-        return gradient.lerp(buffer, momentum)
+    def _blend(self, weights: list[Tensor], momentum: float) -> Sequence[Tensor]:
+        """Take the gradients into the momenta and return their Nesterov means."""
+        gradients = [weight.grad for weight in weights if weight.grad is not None]
+        for weight in weights:
+            if "momentum" not in self.state[weight]:
+                self.state[weight]["momentum"] = torch.zeros(weight.shape, device=weight.device)
+        buffers = [self.state[weight]["momentum"] for weight in weights]
+        torch._foreach_lerp_(buffers, gradients, 1.0 - momentum)
+        return torch._foreach_lerp(gradients, buffers, momentum)

@@ -11,6 +11,7 @@ what rounding takes is noise like that of the link: a network need not know how 
 well.
 """
 
+from functools import cache
 from typing import Any
 
 import torch
@@ -22,8 +23,9 @@ from semcast.common.nets.rounding import (
     LOADING,
     MEAN_INNER,
     MEAN_OUTER,
+    SNR_GRID_DB,
     mixing,
-    rounded_snr_db,
+    share_known,
 )
 from semcast.common.phy.qam import SHAPED_OUTER_SHARE
 
@@ -86,7 +88,7 @@ def spread(symbols: Tensor) -> Tensor:
     Args:
         symbols: ``(B, C, h, w)``; a slot is a row of blocks.
     """
-    order, _, signs, columns, channels = _mixing_of(symbols)
+    order, _, signs, columns, channels = _mixing_on(symbols.shape[1], symbols.shape[3], symbols.device)
     with torch.autocast(symbols.device.type, enabled=False):
         slots = symbols.float().permute(0, 2, 1, 3)  # (B, h, C, w)
         shuffled = slots.flatten(2)[..., order].view(slots.shape) * signs
@@ -95,7 +97,7 @@ def spread(symbols: Tensor) -> Tensor:
 
 def unspread(symbols: Tensor) -> Tensor:
     """Invert ``spread``."""
-    _, inverse, signs, columns, channels = _mixing_of(symbols)
+    _, inverse, signs, columns, channels = _mixing_on(symbols.shape[1], symbols.shape[3], symbols.device)
     with torch.autocast(symbols.device.type, enabled=False):
         slots = symbols.float().permute(0, 2, 1, 3)
         shuffled = (channels.mT @ slots @ columns * signs).flatten(2)
@@ -103,22 +105,44 @@ def unspread(symbols: Tensor) -> Tensor:
         return back.permute(0, 2, 1, 3)
 
 
-def _mixing_of(symbols: Tensor) -> list[Tensor]:
-    of = mixing(symbols.shape[1], symbols.shape[3])
-    arrays = (of.order, of.inverse, of.signs, of.columns, of.channels)
-    return [torch.from_numpy(array).to(symbols.device) for array in arrays]
+# What is constant is brought to a device once: for every copy, a GPU and the program wait for each other. It may
+# not become inference tensors, which gradients can't pass.
+@cache
+def _mixing_on(num_channels: int, num_columns: int, device: torch.device) -> tuple[Tensor, ...]:
+    of = mixing(num_channels, num_columns)
+    with torch.inference_mode(False):
+        arrays = (of.order, of.inverse, of.signs, of.columns, of.channels)
+        return tuple(torch.from_numpy(array).to(device) for array in arrays)
+
+
+@cache
+def _share_known_on(device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        return torch.from_numpy(share_known()).to(device)
+
+
+def _may_hold(flags: Tensor) -> bool:
+    """Tell whether any flag is set; always true of a GPU's, which would have to be waited for."""
+    return flags.device.type != "cpu" or bool(flags.any())
 
 
 def effective_snr_db(snr_db: Tensor, is_qam: Tensor) -> Tensor:
     """Return the SNR in dB at which values arrive behind the link and, with 16-QAM, the rounding.
 
+    Computes ``rounding.rounded_snr_db`` where the tensors are.
+
     Args:
         snr_db: ``(B, ...)`` of the link.
         is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
     """
-    rounded = torch.from_numpy(rounded_snr_db(snr_db.detach().cpu().double().numpy()))
+    table = _share_known_on(snr_db.device)
+    place = (snr_db.detach().double() - SNR_GRID_DB[0]) / (SNR_GRID_DB[1] - SNR_GRID_DB[0])
+    place = place.clamp(0.0, len(table) - 1.0)
+    below = place.long().clamp_max(len(table) - 2)
+    known = torch.lerp(table[below], table[below + 1], place - below)
+    rounded = 10.0 * torch.log10(known / (1.0 - known))
     flag = is_qam.view(-1, *(1,) * (snr_db.ndim - 1))
-    return torch.where(flag > 0, rounded.to(snr_db), snr_db)
+    return torch.where(flag > 0, rounded.to(snr_db.dtype), snr_db)
 
 
 def shrink_of(snr_db: Tensor) -> Tensor:
@@ -135,7 +159,7 @@ def modulate(latent: Tensor, is_qam: Tensor) -> Tensor:
         is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
     """
     analog = analog_symbols(latent)
-    if bool((is_qam == 0).all()):
+    if not _may_hold(is_qam > 0):
         return analog
     rounded = nearest_level(_TO_ROUNDED * spread(analog))
     return torch.where(is_qam.view(-1, 1, 1, 1) > 0, rounded, analog)
@@ -154,7 +178,7 @@ def demodulate(y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, Te
         arrived, rounding included; and the ``(B, 1, 1, 1)`` factor that undid the transmitter's division.
     """
     analog = y_rx
-    if bool((is_qam > 0).any()):
+    if _may_hold(is_qam > 0):
         means = unspread(mean_before_rounding(y_rx, shrink_of(snr_db))) / _TO_ROUNDED
         analog = torch.where(is_qam.view(-1, 1, 1, 1) > 0, means.to(y_rx.dtype), y_rx)
     snr_db = effective_snr_db(snr_db, is_qam)

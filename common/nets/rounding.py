@@ -21,7 +21,8 @@ LEVEL_STEP: Final = 2.0 / math.sqrt(10.0) * SHAPED_SPACING
 CLIP: Final = 2.0 * LEVEL_STEP
 #: Standard deviation of a value before it is rounded.
 LOADING: Final = LEVEL_STEP
-_SNR_GRID_DB = np.arange(-30.0, 40.5, 0.5)
+#: SNR in dB of the link for which ``share_known`` is given, ascending in equal steps.
+SNR_GRID_DB: Final = np.arange(-30.0, 40.5, 0.5)
 
 
 def _density(x: NDArray[np.float64] | float) -> NDArray[np.float64]:
@@ -34,8 +35,8 @@ MEAN_OUTER: Final = LOADING * 2.0 * float(_density(1.0)) / SHAPED_OUTER_SHARE
 
 
 @cache
-def _share_known() -> NDArray[np.float64]:
-    """Variance of a value's mean given what arrives, against its own, on ``_SNR_GRID_DB``."""
+def share_known() -> NDArray[np.float64]:
+    """Return the variance of a value's mean given what arrives, against its own, on ``SNR_GRID_DB``."""
     outer = SHAPED_OUTER_SHARE
     levels = np.array([-1.5, -0.5, 0.5, 1.5]) * LEVEL_STEP
     priors = np.array([outer, 1.0 - outer, 1.0 - outer, outer]) / 2.0
@@ -43,7 +44,7 @@ def _share_known() -> NDArray[np.float64]:
     nodes = np.linspace(-6.0, 6.0, 601)
     weights = _density(nodes) / _density(nodes).sum()
     known = []
-    for snr_db in _SNR_GRID_DB:
+    for snr_db in SNR_GRID_DB:
         sd = math.sqrt(0.5 * 10.0 ** (-snr_db / 10.0))
         arrived = levels[:, None] + sd * nodes  # (4 sent, nodes)
         distance = (arrived[..., None] - levels) / sd
@@ -62,7 +63,7 @@ def rounded_snr_db(snr_db: NDArray[np.float64] | float) -> NDArray[np.float64]:
     Args:
         snr_db: Of the link, for each complex symbol.
     """
-    known = np.interp(snr_db, _SNR_GRID_DB, _share_known())
+    known = np.interp(snr_db, SNR_GRID_DB, share_known())
     return np.asarray(10.0 * np.log10(known / (1.0 - known)))
 
 

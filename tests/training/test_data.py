@@ -20,7 +20,7 @@ def batches():
 
 def test_the_batch_of_a_step_does_not_depend_on_the_steps_before(batches):
     in_order = [batches.get(step) for step in range(3)]
-    torch.testing.assert_close(batches.make(2), in_order[2])
+    torch.testing.assert_close(batches[2], in_order[2])
     torch.testing.assert_close(batches.get(1), in_order[1])
     assert in_order[0].shape == (4, 3, 32, 32)
     assert not torch.equal(in_order[0], in_order[1])
@@ -28,7 +28,7 @@ def test_the_batch_of_a_step_does_not_depend_on_the_steps_before(batches):
 
 def test_the_batches_do_not_depend_on_the_number_of_workers():
     images = [photo(seed=k) for k in range(3)]
-    made = [Batches(images, CropSettings(size_px=32), 4, seed=7, workers=workers) for workers in (1, 3)]
+    made = [Batches(images, CropSettings(size_px=32), 4, seed=7, workers=workers) for workers in (1, 2)]
     for step in (0, 1, 2, 7, 8):
         torch.testing.assert_close(made[0].get(step), made[1].get(step))
     for one in made:
@@ -40,7 +40,7 @@ def test_the_batches_do_not_depend_on_the_number_of_workers():
 def test_ranks_see_different_crops():
     images = [photo(seed=k) for k in range(3)]
     both = [Batches(images, CropSettings(size_px=32), 4, seed=7, rank=rank) for rank in (0, 1)]
-    assert not torch.equal(both[0].make(0), both[1].make(0))
+    assert not torch.equal(both[0][0], both[1][0])
     for made in both:
         made.close()
 
