@@ -105,8 +105,8 @@ def unspread(symbols: Tensor) -> Tensor:
         return back.permute(0, 2, 1, 3)
 
 
-# What is constant is brought to a device once: for every copy, a GPU and the program wait for each other. It may
-# not become inference tensors, which gradients can't pass.
+# Constants are brought to a device once: for every copy, a GPU and the program wait for each other. They must
+# not be inference tensors, which gradients can't pass.
 @cache
 def _mixing_on(num_channels: int, num_columns: int, device: torch.device) -> tuple[Tensor, ...]:
     of = mixing(num_channels, num_columns)
