@@ -110,6 +110,8 @@ class Run:
         else:
             centre_hidden(self.model)
         self.average = copy.deepcopy(self.model).eval()
+        # Walking through the modules for them in every step takes a GPU's time.
+        self.weights, self.averages = list(self.model.parameters()), list(self.average.parameters())
         if settings.compile:
             self.model.encoder.compile(dynamic=False)
             self.model.decoder.compile(dynamic=False)
@@ -298,7 +300,7 @@ class Run:
         Nothing here waits for a GPU, which would run dry meanwhile. One that is not finite becomes zero.
         """
         # Heads have no gradient in some steps, the same ones in every process.
-        weights = [p for p in self.model.parameters() if p.grad is not None]
+        weights = [p for p in self.weights if p.grad is not None]
         flat = torch.cat([p.grad.reshape(-1) for p in weights if p.grad is not None])
         if self.world == 1:
             self.agreed_s = self.elapsed_s
@@ -309,7 +311,7 @@ class Run:
             flat /= self.world
             self.agreed_s, self.agreed_stop = float(flat[-2]), float(flat[-1]) > 0.0
             flat = flat[:-2]
-        norm = flat.norm()
+        norm: torch.Tensor = flat.norm()
         flat = torch.where(norm.isfinite(), flat * (self.settings.clip / norm).clamp(max=1.0), 0.0)
         for weight, part in zip(weights, flat.split([p.numel() for p in weights]), strict=True):
             weight.grad = part.view_as(weight)
@@ -318,8 +320,7 @@ class Run:
     @torch.no_grad()
     def _update_average(self) -> None:
         keep = min(self.settings.ema, (1.0 + self.step) / (10.0 + self.step))
-        averaged = list(self.average.parameters())
-        torch._foreach_lerp_(averaged, [p.detach() for p in self.model.parameters()], 1.0 - keep)
+        torch._foreach_lerp_(self.averages, self.weights, 1.0 - keep)
 
 
 def _commit() -> str:

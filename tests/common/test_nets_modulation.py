@@ -17,7 +17,7 @@ from semcast.common.nets.modulation import (
     undo_analog,
     unspread,
 )
-from semcast.common.nets.rounding import CLIP, LOADING
+from semcast.common.nets.rounding import CLIP, LOADING, rounded_snr_db
 from semcast.common.phy.qam import SHAPED_SPACING, pam_levels
 
 
@@ -118,6 +118,7 @@ def test_the_snr_after_rounding_is_what_a_simulated_link_leaves(snr_db):
     known = (back * values).mean() / values.square().mean()
     expected_db = effective_snr_db(torch.tensor([snr_db]), torch.ones(1)).item()
     assert 10 * math.log10(known / (1 - known)) == pytest.approx(expected_db, abs=0.1)
+    assert expected_db == pytest.approx(float(rounded_snr_db(snr_db)), abs=1e-5)
     assert 2.0 * sent.square().mean() == pytest.approx(1.0, abs=0.02), "all the power that is allowed"
 
 

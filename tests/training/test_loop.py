@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import semcast.common.nets.registry as registry
+import semcast.training.loop as loop
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.checkpoint import load_transceiver
@@ -120,6 +121,41 @@ def test_training_lowers_the_loss_on_the_images_it_sees(tiny_network, photos, tm
 @pytest.mark.parametrize("changes", [{"optimiser": "adamw"}, {"loss": LossSettings(descriptor=0.01)}])
 def test_other_optimisers_and_terms_run(tiny_network, photos, tmp_path, changes):
     assert train(settings_for(photos, tmp_path / "run", steps=2, **changes)).steps == 2
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute:UserWarning")  # torch's own tracing looks at it
+def test_a_compiled_run_equals_a_plain_one(tiny_network, photos, tmp_path, monkeypatch):
+    compiled = []
+
+    def as_written(module, *, dynamic):
+        # What would be compiled, in one graph; the compiler itself takes most of a minute.
+        compiled.append(type(module).__name__)
+        module._compiled_call_impl = torch.compile(
+            module._call_impl, dynamic=dynamic, fullgraph=True, backend="eager"
+        )
+
+    monkeypatch.setattr(torch.nn.Module, "compile", as_written)
+    train(settings_for(photos, tmp_path / "compiled", compile=True))
+    train(settings_for(photos, tmp_path / "plain"))
+    assert compiled == ["Encoder", "Decoder"]
+    states = [final_state(tmp_path / name)["model"] for name in ("compiled", "plain")]
+    for name, weight in states[0].items():
+        torch.testing.assert_close(weight, states[1][name])
+
+
+def test_a_gradient_that_is_not_finite_spoils_nothing(tiny_network, photos, tmp_path, monkeypatch):
+    real = loop.transceiver_loss
+    steps = []
+
+    def once_not_finite(*args):
+        steps.append(len(steps))
+        loss, logs = real(*args)
+        return (loss * math.inf if steps[-1] == 2 else loss), logs
+
+    monkeypatch.setattr(loop, "transceiver_loss", once_not_finite)
+    train(settings_for(photos, tmp_path / "out"))
+    assert len(steps) == 6
+    assert all(torch.isfinite(weight).all() for weight in final_state(tmp_path / "out")["model"].values())
 
 
 def test_a_run_can_begin_with_analog_links(tiny_network, photos, tmp_path):
@@ -248,6 +284,7 @@ import os, sys
 from pathlib import Path
 import torch
 import semcast.common.nets.registry as registry
+import semcast.training.loop as loop
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
 from semcast.training.data import CropSettings
 from semcast.training.loop import train
