@@ -32,6 +32,7 @@ class MaeSizes:
         heads: Attention heads.
         encoder_depth: Transformer blocks at the transmitter.
         decoder_depth: Transformer blocks at the receiver.
+        window: Patches a side over which attention reaches, no more than a crop of training has.
         block_channels: Values a block of pixels is brought down to before it joins its patch, and back.
         confidence_channels: Width of the confidence branch.
     """
@@ -41,6 +42,7 @@ class MaeSizes:
     heads: int = 8
     encoder_depth: int = 2
     decoder_depth: int = 2
+    window: int = 3
     block_channels: int = 96
     confidence_channels: int = 32
 
@@ -62,7 +64,7 @@ class MaeEncoder(nn.Module):
         self.fold = nn.PixelUnshuffle(BLOCK_PX)
         self.stem = nn.Conv2d(_BLOCK_VALUES, sizes.block_channels, 1)
         self.gather = nn.Conv2d(sizes.block_channels, sizes.dim, side, stride=side)
-        self.trunk = Trunk(sizes.dim, sizes.heads, sizes.encoder_depth)
+        self.trunk = Trunk(sizes.dim, sizes.heads, sizes.encoder_depth, sizes.window)
         self.head = nn.ConvTranspose2d(sizes.dim, LATENT_CHANNELS, side, stride=side)
 
     def embed(self, x: Tensor) -> Tensor:
@@ -86,7 +88,7 @@ class MaeDecoder(nn.Module):
         self.patch_blocks = sizes.patch_blocks
         side = sizes.patch_blocks
         self.stem = nn.Conv2d(RECEIVED_CHANNELS, sizes.dim, side, stride=side)
-        self.trunk = Trunk(sizes.dim, sizes.heads, sizes.decoder_depth)
+        self.trunk = Trunk(sizes.dim, sizes.heads, sizes.decoder_depth, sizes.window)
         self.spread = nn.ConvTranspose2d(sizes.dim, sizes.block_channels, side, stride=side)
         self.head = nn.Conv2d(sizes.block_channels, _BLOCK_VALUES, 1)
         self.unfold = nn.PixelShuffle(BLOCK_PX)

@@ -4,7 +4,7 @@ import torch
 from semcast.common.nets.blocks import ChannelAttention, ResidualUnit, Upsample
 from semcast.common.nets.registry import build
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
-from semcast.common.nets.vit import positions
+from semcast.common.nets.vit import Trunk, positions, window_starts
 
 TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
 
@@ -121,3 +121,23 @@ def test_positions_tell_every_patch_apart():
     grid = positions(6, 9, 64, torch.zeros(()))[0]
     distance = torch.cdist(grid, grid) + 10 * torch.eye(54)
     assert distance.min() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("length", "size", "starts"), [(7, 7, [0]), (10, 10, [0]), (11, 6, [0, 5]), (32, 8, [0, 8, 16, 24])]
+)
+def test_equal_windows_cover_a_side(length, size, starts):
+    assert window_starts(length, largest=10) == (size, starts)
+    assert {k for start in starts for k in range(start, start + size)} == set(range(length))
+
+
+def test_attention_stays_in_its_window():
+    torch.manual_seed(0)
+    trunk = Trunk(dim=16, heads=2, depth=1, window=4)
+    for weight in trunk.parameters():
+        torch.nn.init.normal_(weight, std=0.3)
+    tokens, condition = torch.randn(2, 16, 4, 8), torch.randn(2, 1)
+    left = trunk(tokens[..., :4], condition)
+    torch.testing.assert_close(trunk(tokens, condition)[..., :4], left)
+    torch.testing.assert_close(trunk(tokens, condition)[..., 4:], trunk(tokens[..., 4:], condition))
+    assert not torch.allclose(trunk(tokens.roll(1, dims=2), condition)[..., :4], left)
