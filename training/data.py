@@ -102,8 +102,8 @@ def random_crop(
     return np.ascontiguousarray(crop, dtype=np.uint8)
 
 
-class Batches(Dataset[Tensor]):
-    """The batch of every step, a function of seed, step and rank alone, prepared ahead of its use.
+class Crops(Dataset[Tensor]):
+    """The batch of every step, a function of seed, step and rank alone.
 
     Args:
         images: From ``read_images``.
@@ -111,33 +111,15 @@ class Batches(Dataset[Tensor]):
         batch: Crops in a batch.
         seed: Of the whole run.
         rank: Of this process.
-        workers: What prepares batches: 1 is a thread beside the one that trains, more are processes. The
-            batches are the same for any number.
-        pinned: Processes leave batches in memory from which a GPU fetches them on its own.
-
-    Raises:
-        ValueError: ``workers`` is less than 1.
     """
 
     def __init__(
-        self,
-        images: list[NDArray[np.uint8]],
-        settings: CropSettings,
-        batch: int,
-        seed: int,
-        rank: int = 0,
-        workers: int = 1,
-        pinned: bool = False,
+        self, images: list[NDArray[np.uint8]], settings: CropSettings, batch: int, seed: int, rank: int = 0
     ) -> None:
-        if workers < 1:
-            raise ValueError(f"workers must be >= 1, got {workers}")
         self._images = images
         self._settings = settings
         self._batch = batch
         self._key = (seed, rank)
-        self._workers, self._pinned = workers, pinned
-        self._next_step = -1
-        self._ahead: Iterator[Tensor] = iter(())
 
     def __getitem__(self, step: int) -> Tensor:
         """Return the batch of a step, ``(B, 3, size, size)`` uint8."""
@@ -146,30 +128,54 @@ class Batches(Dataset[Tensor]):
         crops = [random_crop(self._images[k], self._settings, rng) for k in chosen]
         return torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2)
 
+
+class Batches:
+    """Batches prepared ahead of their use.
+
+    Args:
+        crops: Makes them.
+        workers: What does so: 1 is a thread beside the one that trains, more are processes. The batches are
+            the same for any number.
+        pinned: Processes leave batches in memory from which a GPU fetches them on its own.
+
+    Raises:
+        ValueError: ``workers`` is less than 1.
+    """
+
+    def __init__(self, crops: Crops, workers: int = 1, pinned: bool = False) -> None:
+        if workers < 1:
+            raise ValueError(f"workers must be >= 1, got {workers}")
+        self._crops = crops
+        self._workers, self._pinned = workers, pinned
+        self._next_step = -1
+        self._ahead: Iterator[Tensor] = iter(())
+
     def get(self, step: int) -> Tensor:
         """Return the batch of a step and start on the next ones."""
         if step != self._next_step:
             self.close()
-            self._ahead = self._from(step)
+            self._ahead = self._by_processes(step) if self._workers > 1 else self._by_thread(step)
         self._next_step = step + 1
         return next(self._ahead)
 
-    def _from(self, step: int) -> Iterator[Tensor]:
-        if self._workers > 1:
-            loader = DataLoader(
-                self,
+    def _by_processes(self, step: int) -> Iterator[Tensor]:
+        return iter(
+            DataLoader(
+                self._crops,
                 batch_size=None,
                 sampler=range(step, sys.maxsize),
                 num_workers=self._workers,
                 pin_memory=self._pinned,
                 worker_init_fn=_one_thread,
             )
-            yield from loader
+        )
+
+    def _by_thread(self, step: int) -> Iterator[Tensor]:
         with ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
-            ahead = pool.submit(self.__getitem__, step)
+            ahead = pool.submit(self._crops.__getitem__, step)
             for k in count(step + 1):
                 batch = ahead.result()
-                ahead = pool.submit(self.__getitem__, k)
+                ahead = pool.submit(self._crops.__getitem__, k)
                 yield batch
 
     def close(self) -> None:

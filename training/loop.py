@@ -24,7 +24,7 @@ from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS, channel_bandwidt
 from semcast.common.whole_file import check_writable, whole_file
 from semcast.training.centring import centre_hidden, folded, unfolded
 from semcast.training.channel import draw_links, through_link, to_device
-from semcast.training.data import Batches, read_images
+from semcast.training.data import Batches, Crops, read_images
 from semcast.training.growing import grow
 from semcast.training.klt import start_from_klt
 from semcast.training.losses import transceiver_loss
@@ -118,15 +118,8 @@ class Run:
         self.optimisers = build_optimisers(self.model, settings)
         if checkpoint is not None:
             self._restore(checkpoint)
-        self.batches = Batches(
-            self.images,
-            settings.crop,
-            settings.batch,
-            settings.seed,
-            rank,
-            settings.data_workers,
-            pinned=use_cuda,
-        )
+        crops = Crops(self.images, settings.crop, settings.batch, settings.seed, rank)
+        self.batches = Batches(crops, settings.data_workers, pinned=use_cuda)
 
     @property
     def checkpoint_path(self) -> Path:
@@ -204,7 +197,7 @@ class Run:
     def _pass_images(self, model: Transceiver) -> None:
         """Run fresh crops, the same ones in every process, through the whole link."""
         settings = self.settings
-        crops = Batches(self.images, settings.crop, settings.batch, settings.seed)
+        crops = Crops(self.images, settings.crop, settings.batch, settings.seed)
         device = next(model.parameters()).device
         blocks = settings.crop.size_px // BLOCK_PX
         generator = torch.Generator().manual_seed(settings.seed)
