@@ -17,8 +17,16 @@ from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajector
 
 RESULTS = Path("evaluation/results")
 SCENES_FOLDER = Path("runs/scenes")
-#: Seeds of the scenes; those below were looked at while the renderer was written.
-_FIRST_SCENE_SEED = 100
+#: Seeds of the scenes; those below 100 were looked at while the renderer was written.
+_SEEDS = {
+    "room": 100,
+    "street": 101,
+    "orbit": 102,
+    "block": 103,
+    "room_night": 104,
+    "street_night": 105,
+    "survey": 106,
+}
 _LINK_DB = 6.0
 #: The longest scene and the nights are measured behind that link alone, all others behind a worse one too.
 _POOR_LINK_DB = 2.0
@@ -30,6 +38,7 @@ SCENE_SECONDS: dict[SceneName, tuple[float, float]] = {
     "street": (20.0, 20.0),
     "orbit": (10.0, 10.0),
     "block": (44.0, 30.0),
+    "survey": (20.0, 14.0),
 }
 #: Scenes that are drawn at night as well: a fifth of the light, twice the noise.
 NIGHTS: tuple[SceneName, ...] = ("room", "street")
@@ -52,17 +61,16 @@ def suite(folder: Path, results: Path, seeds: int) -> Iterator[Run]:
         results: Folder of the result files.
         seeds: Seeds of channel and estimation.
     """
-    for number, (scene, seconds) in enumerate(SCENE_SECONDS.items()):
+    for scene, seconds in SCENE_SECONDS.items():
         for pace, length_s in zip(_PACES, seconds, strict=True):
-            seed = _FIRST_SCENE_SEED + number
             out = folder / f"{scene}_{pace}"
-            render = RenderSettings(scene=scene, pace=pace, seed=seed, seconds=length_s, out=out)
+            render = RenderSettings(scene=scene, pace=pace, seed=_SEEDS[scene], seconds=length_s, out=out)
             links_db = (_LINK_DB,) if scene == "block" else (_POOR_LINK_DB, _LINK_DB)
             yield _run(render, links_db, results, seeds)
-    for number, scene in enumerate(NIGHTS):
+    for scene in NIGHTS:
         render = RenderSettings(
             scene=scene,
-            seed=_FIRST_SCENE_SEED + len(SCENE_SECONDS) + number,
+            seed=_SEEDS[f"{scene}_night"],
             seconds=SCENE_SECONDS[scene][0],
             brightness=_NIGHT_BRIGHTNESS,
             noise_sd=_NIGHT_NOISE_SD,

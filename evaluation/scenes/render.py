@@ -22,6 +22,7 @@ from semcast.evaluation.scenes.orbit import Orbit
 from semcast.evaluation.scenes.room import Room
 from semcast.evaluation.scenes.street import Street
 from semcast.evaluation.scenes.surfaces import Surface, draw
+from semcast.evaluation.scenes.survey import Survey
 
 Array = NDArray[np.float64]
 
@@ -48,13 +49,14 @@ class Scene(Protocol):
         """Return ``(H, W, 3)`` grey levels of what is seen where no surface is."""
 
 
-SceneName = Literal["room", "street", "block", "lorry", "orbit"]
-SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street]] = {
+SceneName = Literal["room", "street", "block", "lorry", "orbit", "survey"]
+SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street] | type[Survey]] = {
     "room": Room,
     "street": Street,
     "block": Block,
     "lorry": Lorry,
     "orbit": Orbit,
+    "survey": Survey,
 }
 
 
@@ -112,7 +114,8 @@ class RenderSettings:
         default="room",
         metadata={
             "help": "room: handheld, 30 Hz; street: from a car, 10 Hz; block: the same round a block of "
-            "houses and on; lorry: the street behind a lorry; orbit: round a still life, 10 Hz"
+            "houses and on; lorry: the street behind a lorry; orbit: round a still life, 10 Hz; survey: "
+            "fields from a drone that looks down, 10 Hz"
         },
     )
     pace: Pace = field(default="normal", metadata={"help": "how fast the camera moves and shakes"})
