@@ -40,15 +40,16 @@ def side_by_side(images: Sequence[Image], width_px: int) -> Image:
 
 
 def scene_picture() -> Image:
-    """Return a street and an orbit above; below a room as drawn, as it arrives, and its confidence."""
-    street, orbit, room = _frame("street", 1.0), _frame("orbit", 4.0), _frame("room", 1.0)
+    """Return a street, an orbit and a survey above; below a room as drawn, as it arrives, and its confidence."""
+    above = [_frame("street", 1.0), _frame("orbit", 4.0), _frame("survey", 6.0)]
+    room = _frame("room", 1.0)
     codec = load_codec(DEFAULT_CODEC, num_threads=1)
     link = Link(ChannelSettings(channel="rayleigh", snr_db=_LINK_DB), _SEED)
     received = link.carry(codec.encode(room, _LINK_DB), 0.0)
     assert received is not None, "this link loses no frames"
     decoded = codec.decode(received)
     below = [room, decoded.image, confidence_colours(decoded.confidence)]
-    return np.vstack([side_by_side([street, orbit], _WIDTH_PX), side_by_side(below, _WIDTH_PX)])
+    return np.vstack([side_by_side(above, _WIDTH_PX), side_by_side(below, _WIDTH_PX)])
 
 
 def _frame(scene: SceneName, t_s: float) -> Image:
