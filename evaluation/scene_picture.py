@@ -40,7 +40,7 @@ def side_by_side(images: Sequence[Image], width_px: int) -> Image:
 
 
 def scene_picture() -> Image:
-    """Return a street, an orbit and a survey above; below a room as drawn, as it arrives, and its confidence."""
+    """Return a street, an orbit and a survey above; below a room as drawn, as it arrives, its confidence."""
     above = [_frame("street", 1.0), _frame("orbit", 4.0), _frame("survey", 6.0)]
     room = _frame("room", 1.0)
     codec = load_codec(DEFAULT_CODEC, num_threads=1)
