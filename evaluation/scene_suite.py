@@ -26,6 +26,7 @@ _SEEDS = {
     "room_night": 104,
     "street_night": 105,
     "survey": 106,
+    "corridor": 107,
 }
 _LINK_DB = 6.0
 #: The longest scene and the nights are measured behind that link alone, all others behind a worse one too.
@@ -39,6 +40,7 @@ SCENE_SECONDS: dict[SceneName, tuple[float, float]] = {
     "orbit": (10.0, 10.0),
     "block": (44.0, 30.0),
     "survey": (20.0, 14.0),
+    "corridor": (20.0, 12.0),
 }
 #: Scenes that are drawn at night as well: a fifth of the light, twice the noise.
 NIGHTS: tuple[SceneName, ...] = ("room", "street")

@@ -15,6 +15,7 @@ from semcast.common.lens import DISTORTION_COUNTS
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.whole_file import write_whole
 from semcast.evaluation.scenes.block import Block
+from semcast.evaluation.scenes.corridor import Corridor
 from semcast.evaluation.scenes.lorry import Lorry
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.optics import Optics
@@ -49,14 +50,15 @@ class Scene(Protocol):
         """Return ``(H, W, 3)`` grey levels of what is seen where no surface is."""
 
 
-SceneName = Literal["room", "street", "block", "lorry", "orbit", "survey"]
-SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street] | type[Survey]] = {
+SceneName = Literal["room", "street", "block", "lorry", "orbit", "survey", "corridor"]
+SCENES: dict[SceneName, type[Room] | type[Orbit] | type[Street] | type[Survey] | type[Corridor]] = {
     "room": Room,
     "street": Street,
     "block": Block,
     "lorry": Lorry,
     "orbit": Orbit,
     "survey": Survey,
+    "corridor": Corridor,
 }
 
 
@@ -115,7 +117,7 @@ class RenderSettings:
         metadata={
             "help": "room: handheld, 30 Hz; street: from a car, 10 Hz; block: the same round a block of "
             "houses and on; lorry: the street behind a lorry; orbit: round a still life, 10 Hz; survey: "
-            "fields from a drone that looks down, 10 Hz"
+            "fields from a drone that looks down, 10 Hz; corridor: bare walls from a small robot, 15 Hz"
         },
     )
     pace: Pace = field(default="normal", metadata={"help": "how fast the camera moves and shakes"})

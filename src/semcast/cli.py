@@ -40,7 +40,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "shutter": ("shutter", "find how long a camera's rolling shutter takes, from a video or live"),
     "render": (
         "render",
-        "draw a sequence with an exact path: a room, a street, a block, a lorry ahead, an orbit, a survey",
+        "draw a sequence with an exact path: room, street, block, lorry ahead, orbit, survey, corridor",
     ),
     "eval": ("evaluate", "measure trajectories, frame pairs, codecs and confidence offline"),
     "train": ("train", "train a transceiver from a settings file"),

@@ -152,3 +152,16 @@ def test_hamming_by_hand_and_no_descriptors():
     assert rows.shape == (0,)
     assert descriptors.shape == (0, 32)
     assert len(match_descriptors(descriptors, descriptors)[0]) == 0
+
+
+def test_faint_corners_are_found_beside_a_strong_one():
+    # A door handle on a bare wall must not hide the little that the floor has.
+    grey = np.full((200, 300), 120, np.uint8)
+    grey[90:100, 140:165] = 10
+    faint = [(x, y) for x in (40, 90, 220, 260) for y in (40, 150)]
+    for x, y in faint:
+        grey[y - 6 : y + 6, x - 6 : x + 6] += 4
+    found = detect_corners(grey, 200)
+    for x, y in faint:
+        assert np.linalg.norm(found - (x, y), axis=1).min() < 12.0
+    assert len(detect_corners(np.full((200, 300), 120, np.uint8), 200)) == 0
