@@ -17,9 +17,9 @@ Grey = NDArray[np.uint8]
 BORDER_PX = 8
 #: OpenCV's KLT gives the smaller eigenvalue of the mean structure tensor in units of 32^2 / 2^20 grey^2.
 _EIGEN_UNIT = 1024.0
-#: Corners weaker than this mean gradient energy (grey levels^2 per pixel^2) are noise: of a sensor with 1.5
-#: grey levels of it a tenth of the pixels has as much. Bare walls and floors have little that is stronger, and
-#: the noise model knows what it is worth.
+#: Corners weaker than this mean gradient energy (grey levels^2 per pixel^2) are noise: of a sensor with
+#: 1.5 grey levels of it a tenth of the pixels has as much. Bare walls and floors have little that is
+#: stronger, and the noise model knows what it is worth.
 _MIN_EIGEN_GREY2 = 0.5
 #: Nor are corners weaker than this share of the strongest worth following.
 _MIN_EIGEN_SHARE = 0.0005

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.common.geometry import rotation_angle_deg
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Start
 
@@ -16,6 +17,9 @@ _LEAST_WAY = 0.02
 _MOST_FARTHER = 5.0
 #: How the camera moves after a gap is told from so long a time: the shorter, the noisier.
 _LATER_NS = 500_000_000
+#: A submap turned from where it was put by more than this, and so much more for each second of the gap before
+#: it, was not recognised: the camera is in another corridor that looks the same.
+_MOST_TURNED_DEG, _MOST_TURNED_DEG_S = 30.0, 60.0
 
 
 def bridge(
@@ -58,3 +62,20 @@ def bridge(
     T_later[:3, 3] *= scale
     T_world_first = motion.bridge(at_ns, T_later, (soon.t_source_ns - at_ns) * 1e-9)
     return T_world_guess if T_world_first is None else T_world_first, scale
+
+
+def may_turn(R_join: Array, older_ns: Array, newer_ns: Array) -> bool:
+    """Tell whether a submap may be turned so much against where it was put.
+
+    How a camera turns is known well before and after a gap, so short ones leave little doubt about it.
+
+    Args:
+        R_join: ``(3, 3)`` rotation that a recognised place asks for.
+        older_ns: Times of the keyframes of the submap that the place is in, or that began first.
+        newer_ns: Those of the other.
+    """
+    before = older_ns[older_ns < newer_ns.min()] if len(newer_ns) else older_ns[:0]
+    if len(before) == 0:
+        return True
+    gap_s = float(newer_ns.min() - before.max()) * 1e-9
+    return rotation_angle_deg(R_join) <= _MOST_TURNED_DEG + _MOST_TURNED_DEG_S * gap_s

@@ -12,7 +12,7 @@ from semcast.common.geometry import invert_transform, make_transform, skew, tran
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
 from semcast.server.mapping import mapper
 from semcast.server.mapping.anchoring import anchor_tracks
-from semcast.server.mapping.bridging import bridge
+from semcast.server.mapping.bridging import bridge, may_turn
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Start
@@ -391,6 +391,12 @@ class MapBuilder:
         if found is None:
             return None
         scale, T_place_mine = found
+        older, newer = (
+            np.array([k.t_source_ns for k in self.world.keyframes_of(submap)])
+            for submap in sorted((self.submap, place.submap))
+        )
+        if not may_turn(T_place_mine[:3, :3], older, newer):
+            return None
         if self._bundle.busy:
             self._bundle.take(wait=True)
         self._version += 1
