@@ -290,7 +290,8 @@ class Run:
     def _share_gradients(self) -> torch.Tensor:
         """Take the mean of the gradient over all processes, clip it, and return its norm.
 
-        Nothing here waits for a GPU, which would run dry meanwhile. One that is not finite becomes zero.
+        A gradient that is not finite becomes zero. With one process nothing waits for a GPU, which would run
+        dry meanwhile.
         """
         # Heads have no gradient in some steps, the same ones in every process.
         weights = [p for p in self.weights if p.grad is not None]

@@ -18,7 +18,7 @@ _FIELD_M, _TRACK_M = 32.0, 4.0
 
 
 class Survey:
-    """Almost flat ground from 45 m above: fields, tracks, low buildings, trees.
+    """Almost flat ground from 35 to 55 m above: fields, tracks, low buildings, trees.
 
     Attributes:
         camera: 640x480, 67 degrees wide.

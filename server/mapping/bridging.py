@@ -64,17 +64,17 @@ def bridge(
     return T_world_guess if T_world_first is None else T_world_first, scale
 
 
-def may_turn(R_join: Array, older_ns: Array, newer_ns: Array) -> bool:
-    """Tell whether a submap may be turned so much against where it was put.
+def may_turn(R_join: Array, older_ns: NDArray[np.int64], newer_ns: NDArray[np.int64]) -> bool:
+    """Tell whether a submap may be turned so much against where ``bridge`` put it.
 
     How a camera turns is known well before and after a gap, so short ones leave little doubt about it.
 
     Args:
         R_join: ``(3, 3)`` rotation that a recognised place asks for.
-        older_ns: Times of the keyframes of the submap that the place is in, or that began first.
-        newer_ns: Those of the other.
+        older_ns: ``(N,)`` source times in ns of the keyframes of the submap that began first.
+        newer_ns: ``(M,)`` those of the other; both submaps have keyframes.
     """
-    before = older_ns[older_ns < newer_ns.min()] if len(newer_ns) else older_ns[:0]
+    before = older_ns[older_ns < newer_ns.min()]
     if len(before) == 0:
         return True
     gap_s = float(newer_ns.min() - before.max()) * 1e-9

@@ -392,7 +392,7 @@ class MapBuilder:
             return None
         scale, T_place_mine = found
         older, newer = (
-            np.array([k.t_source_ns for k in self.world.keyframes_of(submap)])
+            np.array([k.t_source_ns for k in self.world.keyframes_of(submap)], dtype=np.int64)
             for submap in sorted((self.submap, place.submap))
         )
         if not may_turn(T_place_mine[:3, :3], older, newer):

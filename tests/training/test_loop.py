@@ -284,7 +284,6 @@ import os, sys
 from pathlib import Path
 import torch
 import semcast.common.nets.registry as registry
-import semcast.training.loop as loop
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
 from semcast.training.data import CropSettings
 from semcast.training.loop import train

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from drawn_boards import CAMERA, FRAME_NS, ate_percent, frame_of, make, render
 
+import semcast.server.mapping.map_builder as map_builder
 from semcast.common.geometry import (
     exp_so3,
     make_transform,
@@ -100,6 +101,21 @@ def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch
     trajectory = reconstruction.final_trajectory()
     assert len(trajectory) >= len(x) - 3
     assert ate_percent(trajectory, truth) < 1.0
+
+
+def test_a_place_that_turns_a_new_map_too_far_joins_nothing(caplog, monkeypatch):
+    asked = []
+    monkeypatch.setattr(map_builder, "may_turn", lambda *a: asked.append(a) or False)
+    x = [0.12 * k for k in range(8)] + [13.0 - 0.3 * k for k in range(42)]
+    reconstruction = make(lost_after_s=0.05)
+    with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
+        for k, v in enumerate(x):
+            reconstruction.process(frame_of(k, render(make_transform(np.eye(3), (v, 0.05 * np.sin(v), 0.0)))))
+    assert asked
+    assert "submaps are joined" not in caplog.text
+    for R_join, older_ns, newer_ns in asked:
+        assert np.allclose(R_join, np.eye(3), atol=0.1), "where the new map was put it need not turn"
+        assert older_ns.max() < newer_ns.min()
 
 
 def test_a_join_leaves_the_older_part_where_it_is(caplog):
