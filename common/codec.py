@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.levels import ALL_LEVELS, Levels
+from semcast.common.nets.allocation import Allocation
+from semcast.common.phy.slots import layout_for
 
 Modulation = Literal["16qam", "analog"]
 MODULATIONS: tuple[Modulation, ...] = ("16qam", "analog")
@@ -36,12 +38,15 @@ class EncodedImage:
             every symbol is a point of the Gray-mapped constellation in ``phy/qam.py``, plain or shaped.
         modulation: How the symbols travel.
         levels: What the image's grey levels were stretched from; it travels with the frame's header.
+        allocation: Code of how many values each block sends (``nets.allocation``), in the header too; empty:
+            all alike.
     """
 
     shape_hw: tuple[int, int]
     symbols: NDArray[np.complex64]
     modulation: Modulation
     levels: Levels = ALL_LEVELS
+    allocation: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,7 @@ class ReceivedImage:
             receiver estimated it, never below ``LOST_SLOT_SNR_DB``.
         modulation: How the symbols travelled.
         levels: What the image's grey levels were stretched from.
+        allocation: Code of how many values each block sends.
     """
 
     shape_hw: tuple[int, int]
@@ -63,6 +69,20 @@ class ReceivedImage:
     effective_snr_db: NDArray[np.float32]
     modulation: Modulation
     levels: Levels = ALL_LEVELS
+    allocation: bytes = b""
+
+    @property
+    def row_snr_db(self) -> NDArray[np.float32]:
+        """``(num_slots,)`` SNR of each row of blocks: that of the worst slot its values are in.
+
+        Raises:
+            ValueError: ``allocation`` is no code of so many blocks.
+        """
+        if not self.allocation:
+            return self.effective_snr_db
+        layout = layout_for(self.shape_hw)
+        grid = (layout.num_slots, layout.blocks_per_slot)
+        return Allocation.from_code(self.allocation, grid).row_snr_db(self.effective_snr_db)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from semcast.common.codec import LOST_SLOT_SNR_DB
+from semcast.common.nets.modulation import effective_snr_db
 
 #: Networks are told no more than this.
 _MAX_SNR_DB = 30.0
@@ -83,6 +84,18 @@ class LinkDraw:
     def to(self, device: torch.device) -> "LinkDraw":
         """Return the draw on a device."""
         return LinkDraw(*(to_device(t, device) for t in vars(self).values()))
+
+    def as_analog(self) -> "LinkDraw":
+        """Return the links over which analog values arrive as well as those of these links, rounded or not."""
+        arriving_db = self.snr_db.view(-1, 1, 1, 1) + 10.0 * torch.log10(self.gain.clamp_min(1e-6))
+        arriving = 10.0 ** (effective_snr_db(arriving_db, self.is_qam) / 10.0)
+        return LinkDraw(
+            torch.zeros_like(self.snr_db),
+            effective_snr_db(self.expected_snr_db, self.is_qam),
+            torch.zeros_like(self.is_qam),
+            torch.where(self.gain == 0.0, 0.0, arriving),
+            self.estimate_error_db,
+        )
 
 
 def to_device(values: Tensor, device: torch.device) -> Tensor:

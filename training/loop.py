@@ -20,18 +20,20 @@ from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.codec import check_device
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
-from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS, channel_bandwidth_ratio
+from semcast.common.phy.slots import BLOCK_PX, channel_bandwidth_ratio
 from semcast.common.whole_file import check_writable, whole_file
+from semcast.training.allocations import draw_values
 from semcast.training.centring import centre_hidden, folded, unfolded
-from semcast.training.channel import draw_links, through_link, to_device
+from semcast.training.channel import draw_links, to_device
 from semcast.training.data import Batches, Crops, read_images
 from semcast.training.growing import grow
 from semcast.training.klt import start_from_klt
-from semcast.training.losses import transceiver_loss
+from semcast.training.losses import through_whole_link, transceiver_loss
 from semcast.training.masked import masked_image_loss
 from semcast.training.optimisers import build_optimisers, rate_factor, set_rate
 from semcast.training.settings import TrainSettings
 from semcast.training.validation import validate
+from semcast.training.varying import Observations, vary
 
 logger = logging.getLogger(__name__)
 
@@ -99,7 +101,14 @@ class Run:
         checkpoint = self._read_checkpoint()
         if checkpoint is None and settings.grow_from is not None:
             small, _ = load_transceiver(settings.grow_from)
-            grow(small if settings.only_heads else unfolded(small, self._pass_images), model)
+            small = small if settings.only_heads else unfolded(small, self._pass_images)
+            if model.is_variable and not small.is_variable:
+                seen = Observations()
+                with torch.no_grad():
+                    self._pass_images(small, seen.add)
+                vary(small, model, seen)
+            else:
+                grow(small, model)
         elif checkpoint is None and settings.start == "klt":
             start_from_klt(model, self.images, torch.Generator().manual_seed(settings.seed))
         self.model = model.to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -194,21 +203,34 @@ class Run:
         average: Transceiver = self.average
         return average if self.settings.only_heads else folded(average, self._pass_images)
 
-    def _pass_images(self, model: Transceiver) -> None:
-        """Run fresh crops, the same ones in every process, through the whole link."""
+    def _pass_images(
+        self,
+        model: Transceiver,
+        see: Callable[[torch.Tensor, torch.Tensor, torch.Tensor], None] | None = None,
+    ) -> None:
+        """Run fresh crops, the same ones in every process, through the whole link.
+
+        Args:
+            model: The transceiver.
+            see: Called with the images, the latent and the decoded images of every batch.
+        """
         settings = self.settings
         crops = Crops(self.images, settings.crop, settings.batch, settings.seed)
         device = next(model.parameters()).device
         blocks = settings.crop.size_px // BLOCK_PX
         generator = torch.Generator().manual_seed(settings.seed)
         for k in range(_FOLD_BATCHES):
-            x = crops[_FOLD_STEP + k].to(device).float() / 255.0
+            pixels = crops[_FOLD_STEP + k]
+            x = pixels.to(device).float() / 255.0
             draw = draw_links(settings.channel, len(x), blocks, generator).to(device)
-            noise = torch.randn((len(x), LATENT_CHANNELS, blocks, blocks), generator=generator)
+            noise = torch.randn((len(x), model.channels, blocks, blocks), generator=generator).to(device)
+            values = None
+            if model.is_variable:
+                values = draw_values(pixels, settings.allocation, generator).to(device)
             with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
-                symbols = model.transmit(model.latent(x, draw.expected_snr_db, draw.is_qam), draw.is_qam)
-                y_rx, snr_db = through_link(symbols, draw, noise.to(device))
-                model.receive(y_rx, snr_db, draw.is_qam)
+                _, x_hat, _ = through_whole_link(model, x, draw, noise, values)
+                if see is not None:
+                    see(x, model.latent(x, draw.expected_snr_db, draw.is_qam, values), x_hat)
 
     def export(self, valid: dict[str, float]) -> Path:
         """Write the averaged weights in half precision with their manifest."""
@@ -252,7 +274,8 @@ class Run:
     def one_step(self) -> dict[str, torch.Tensor]:
         """Draw a batch and its links, and update the weights once."""
         settings, share = self.settings, self.share_done()
-        x = to_device(self.batches.get(self.step), self.device).float() / 255.0
+        pixels = self.batches.get(self.step)
+        x = to_device(pixels, self.device).float() / 255.0
         x = x.contiguous(memory_format=torch.channels_last)
         seed = (settings.seed * 1_000_003 + self.step) * 64 + self.rank
         generator = torch.Generator().manual_seed(seed)
@@ -263,8 +286,11 @@ class Run:
         draw = draw_links(channel, settings.batch, blocks, generator).to(self.device)
         # Drawn where it is used: on a CPU the noise of a large batch would cost a GPU more than the network.
         on_device = torch.Generator(self.device).manual_seed(seed + 1_000_003)
-        shape = (settings.batch, LATENT_CHANNELS, blocks, blocks)
+        shape = (settings.batch, self.model.channels, blocks, blocks)
         noise = torch.randn(shape, generator=on_device, device=self.device)
+        values = None
+        if self.model.is_variable:
+            values = to_device(draw_values(pixels, settings.allocation, generator), self.device)
         is_ending = share >= 1.0 - settings.decay_share / 4.0
         with_heads = settings.only_heads or is_ending or self.step % settings.head_every == 0
         set_rate(self.optimisers, rate_factor(share, self.step, settings))
@@ -272,7 +298,7 @@ class Run:
             if share < settings.pretrain_share:
                 loss, logs = masked_image_loss(self.model, x, settings.mask_share, generator)
             else:
-                loss, logs = transceiver_loss(self.model, x, draw, noise, settings.loss, with_heads)
+                loss, logs = transceiver_loss(self.model, x, draw, noise, settings.loss, with_heads, values)
         loss.backward()
         norm = self._share_gradients()
         for optimiser in self.optimisers:

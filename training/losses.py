@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from semcast.common.nets.decoder import DecoderFeatures
 from semcast.common.nets.transceiver import Transceiver
 from semcast.training.channel import LinkDraw, through_link
 from semcast.training.descriptors import descriptor_loss
@@ -82,8 +83,42 @@ def displacement_loss(predicted_px: Tensor, label_px: Tensor, strength: Tensor) 
     return (weight * (torch.log(scale) + label_px / scale)).sum() / weight.sum()
 
 
+def through_whole_link(
+    model: Transceiver, x: Tensor, draw: LinkDraw, noise: Tensor, values: Tensor | None
+) -> tuple[Tensor, Tensor, DecoderFeatures]:
+    """Encode a batch, send it and decode it.
+
+    Args:
+        model: The transceiver.
+        x: ``(B, 3, H, W)`` images in [0, 1].
+        draw: The links of the batch.
+        noise: Standard normal values of the latent's shape.
+        values: ``(B, 1, h, w)`` what each block sends, where the rate is variable. Values are then sent one by
+            one and analog, over links at which they arrive as well as rounded ones would.
+
+    Returns:
+        Symbols, the decoded images and the decoder's features.
+    """
+    if values is None:
+        latent = model.latent(x, draw.expected_snr_db, draw.is_qam)
+        symbols = model.transmit(latent, draw.is_qam)
+        y_rx, snr_db = through_link(symbols, draw, noise)
+        return symbols, *model.receive(y_rx, snr_db, draw.is_qam)
+    draw = draw.as_analog()
+    latent = model.latent(x, draw.expected_snr_db, draw.is_qam, values)
+    symbols = model.send_blocks(latent, values)
+    y_rx, snr_db = through_link(symbols, draw, noise)
+    return symbols, *model.receive_blocks(y_rx, snr_db, values)
+
+
 def transceiver_loss(
-    model: Transceiver, x: Tensor, draw: LinkDraw, noise: Tensor, settings: LossSettings, with_heads: bool
+    model: Transceiver,
+    x: Tensor,
+    draw: LinkDraw,
+    noise: Tensor,
+    settings: LossSettings,
+    with_heads: bool,
+    values: Tensor | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Run one batch through the whole link and sum the loss terms.
 
@@ -94,14 +129,12 @@ def transceiver_loss(
         noise: Standard normal values of the latent's shape.
         settings: Weights of the terms.
         with_heads: Compute the confidence heads in this step.
+        values: See ``through_whole_link``.
 
     Returns:
         The loss and detached scalars for the log.
     """
-    latent = model.latent(x, draw.expected_snr_db, draw.is_qam)
-    symbols = model.transmit(latent, draw.is_qam)
-    y_rx, snr_db = through_link(symbols, draw, noise)
-    x_hat, features = model.receive(y_rx, snr_db, draw.is_qam)
+    symbols, x_hat, features = through_whole_link(model, x, draw, noise, values)
     x_hat = x_hat.float()
     reconstruction, mse = reconstruction_loss(x_hat, x, settings.mse_knee)
     loss = settings.mse * reconstruction

@@ -6,6 +6,9 @@ from semcast.common.nets.transceiver import Transceiver
 from semcast.training.muon import Muon
 from semcast.training.settings import TrainSettings
 
+#: Layers that read pixels, or a single plane.
+_EDGES = ("encoder.stem.weight", "decoder.estimate.weight", "encoder.share.weight")
+
 
 def rate_factor(progress: float, step: int, settings: TrainSettings) -> float:
     """Return the share of the learning rate: linear warm-up, constant, linear fall to 0.
@@ -32,7 +35,7 @@ def build_optimisers(model: Transceiver, settings: TrainSettings) -> list[torch.
             continue
         is_heart = ".linear." in name
         is_matrix = weight.ndim == 4 or (weight.ndim == 2 and ".blocks." in name)
-        is_edge = "head." in name or name.endswith(("encoder.stem.weight", "decoder.estimate.weight"))
+        is_edge = "head." in name or name.endswith(_EDGES)
         if is_heart:
             linear.append(weight)
         elif is_matrix and not is_edge and settings.optimiser == "muon":

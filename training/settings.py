@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from semcast.training.allocations import AllocationSettings
 from semcast.training.channel import ChannelSettings
 from semcast.training.data import CropSettings
 from semcast.training.losses import LossSettings
@@ -50,7 +51,8 @@ class TrainSettings:
     grow_from: Path | None = field(
         default=None,
         metadata={
-            "help": "start as a trained network of this very size, or a smaller 3dcsc one; a weights file"
+            "help": "start as a trained network of this very size, or a smaller 3dcsc one, or one of fixed "
+            "rate and this size where the rate is variable; a weights file"
         },
     )
     pretrain_share: float = field(
@@ -98,6 +100,7 @@ class TrainSettings:
     crop: CropSettings = field(default_factory=CropSettings)
     channel: ChannelSettings = field(default_factory=ChannelSettings)
     loss: LossSettings = field(default_factory=LossSettings)
+    allocation: AllocationSettings = field(default_factory=AllocationSettings)
 
     def __post_init__(self) -> None:
         for name in (

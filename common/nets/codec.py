@@ -18,11 +18,11 @@ from semcast.common.codec import (
     confidence_from_displacement_px,
 )
 from semcast.common.errors import ConfigError
+from semcast.common.nets.allocation import Allocation
 from semcast.common.nets.checkpoint import Manifest, load_transceiver, weights_path
 from semcast.common.nets.coder_input import coder_input
-from semcast.common.nets.inference import inference_net
+from semcast.common.nets.inference import Blocks, inference_net
 from semcast.common.nets.latent import latent_from_symbols, symbols_from_latent
-from semcast.common.nets.modulation import modulate
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import layout_for
 from semcast.common.shapes import check_shape
@@ -82,6 +82,7 @@ class NeuralCodec:
         self._device = device
         half = device.type == "cuda" or has_fast_bfloat16()
         model = model.to(device).eval().requires_grad_(False)
+        self._model = model
         self._net = inference_net(model, torch.bfloat16 if half else torch.float32)
         self._is_qam = (
             torch.ones(1, device=device) if modulation == "16qam" else torch.zeros(1, device=device)
@@ -136,7 +137,11 @@ class NeuralCodec:
         """Encode and decode one empty frame, so that the first real one is not slow."""
         encoded = self.encode(np.zeros((*shape_hw, 3), dtype=np.uint8), 10.0)
         snr_db = np.full(encoded.symbols.shape[0], 10.0, dtype=np.float32)
-        self.decode(ReceivedImage(shape_hw, encoded.symbols, snr_db, encoded.modulation))
+        self.decode(
+            ReceivedImage(
+                shape_hw, encoded.symbols, snr_db, encoded.modulation, allocation=encoded.allocation
+            )
+        )
 
     def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
         """Encode one image for a link whose expected SNR is ``snr_db``.
@@ -151,17 +156,23 @@ class NeuralCodec:
             ValueError: The image is not of that shape and type, or has no pixel.
         """
         given = coder_input(image, snr_db, self.manifest.snr_range_db)
+        allocation = Allocation.of_image(given.image) if self._model.is_variable else None
         with torch.inference_mode():
             pixels = torch.from_numpy(given.image).to(self._device)
             snr = torch.full((1,), given.snr_db, device=self._device)
-            latent = self._net.latent(pixels, snr, self._is_qam)
-            symbols = modulate(latent, self._is_qam)[0]
+            values = None if allocation is None else self._plane(allocation.values)
+            latent = self._net.latent(pixels, snr, self._is_qam, values)
+            symbols = self._model.transmit(latent, self._is_qam, values)[0]
         return EncodedImage(
             shape_hw=given.shape_hw,
             symbols=symbols_from_latent(symbols.cpu().numpy()),
             modulation=self._modulation,
             levels=given.levels,
+            allocation=b"" if allocation is None else allocation.code,
         )
+
+    def _plane(self, of_blocks: NDArray[np.generic]) -> torch.Tensor:
+        return torch.from_numpy(of_blocks)[None, None].to(self._device)
 
     def decode(self, received: ReceivedImage) -> DecodedImage:
         """Decode one frame with its two confidence maps.
@@ -173,7 +184,8 @@ class NeuralCodec:
             received: Equalised symbols; their number must fit the image's shape.
 
         Raises:
-            ValueError: Sizes contradict each other, or the modulation is not this codec's.
+            ValueError: Sizes contradict each other, the modulation is not this codec's, or the allocation is
+                none of this frame.
         """
         layout = layout_for(received.shape_hw)
         check_shape(received.symbols, f"{layout.num_slots} {layout.data_per_slot}", "symbols")
@@ -191,11 +203,23 @@ class NeuralCodec:
             latent = np.nan_to_num(latent, nan=0.0, posinf=0.0, neginf=0.0)
         latent = latent.clip(-_MAX_SYMBOL, _MAX_SYMBOL)
         height, width = received.shape_hw
+        allocation = None
+        if self._model.is_variable:
+            grid = (layout.num_slots, layout.blocks_per_slot)
+            allocation = Allocation.from_code(received.allocation, grid)
+        elif received.allocation:
+            raise ValueError(
+                f"allocation must be empty for a codec of fixed rate, got {len(received.allocation)} bytes"
+            )
         with torch.inference_mode():
             y_rx = torch.from_numpy(latent)[None].to(self._device, memory_format=torch.channels_last)
             plane = torch.from_numpy(snr_db).to(self._device).view(1, 1, -1, 1)
             plane = plane.expand(1, 1, -1, layout.blocks_per_slot)
-            maps = self._net.decode(y_rx, plane, self._is_qam)
+            blocks = None
+            if allocation is not None:
+                block_snr_db = allocation.block_snr_db(snr_db)
+                blocks = Blocks(self._plane(allocation.values), self._plane(block_snr_db))
+            maps = self._net.decode(y_rx, plane, self._is_qam, blocks)
             image, confidence, moved_px = (m[:height, :width].contiguous().cpu().numpy() for m in maps)
         return DecodedImage(
             image=received.levels.unstretch(image),

@@ -16,12 +16,15 @@ class ConfidenceBranch(nn.Module):
     Args:
         widths: Decoder channels at 1/4, 1/8 and 1/16 of the resolution.
         channels: Width of the branch.
+        received: Planes that are received.
     """
 
-    def __init__(self, widths: tuple[int, int, int], channels: int) -> None:
+    def __init__(
+        self, widths: tuple[int, int, int], channels: int, received: int = RECEIVED_CHANNELS
+    ) -> None:
         super().__init__()
         quarter, eighth, sixteenth = widths
-        self.start = nn.Conv2d(RECEIVED_CHANNELS, channels, 3, padding=1)
+        self.start = nn.Conv2d(received, channels, 3, padding=1)
         self.fuse16 = nn.Conv2d(channels + sixteenth, channels, 1)
         self.up8 = Upsample(channels, channels)
         self.fuse8 = nn.Conv2d(channels + eighth, channels, 3, padding=1)

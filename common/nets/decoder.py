@@ -27,8 +27,13 @@ class DecoderFeatures:
     at4: Tensor
 
 
-#: Received latent, normalised SNR, shrink factor.
-RECEIVED_CHANNELS = LATENT_CHANNELS + 2
+def received_channels(channels: int, is_variable: bool) -> int:
+    """Return how many planes are received: the latent, the normalised SNR, the shrink factor, the share."""
+    return channels + (3 if is_variable else 2)
+
+
+#: Planes that codecs of fixed rate receive.
+RECEIVED_CHANNELS = received_channels(LATENT_CHANNELS, is_variable=False)
 
 
 class Decoder(nn.Module):
@@ -37,15 +42,23 @@ class Decoder(nn.Module):
     Args:
         widths: Channels at 1/4, 1/8 and 1/16 of the resolution.
         units: Residual units at the same three resolutions.
+        channels: Values of the latent for each block.
+        is_variable: Blocks send different numbers of values, and the decoder is told how many.
     """
 
-    def __init__(self, widths: tuple[int, int, int], units: tuple[int, int, int]) -> None:
+    def __init__(
+        self,
+        widths: tuple[int, int, int],
+        units: tuple[int, int, int],
+        channels: int = LATENT_CHANNELS,
+        is_variable: bool = False,
+    ) -> None:
         super().__init__()
         quarter, eighth, sixteenth = widths
-        self.linear = BlockSynthesis()
-        self.stem = nn.Conv2d(RECEIVED_CHANNELS, sixteenth, 3, padding=1)
+        self.linear = BlockSynthesis(channels)
+        self.stem = nn.Conv2d(received_channels(channels, is_variable), sixteenth, 3, padding=1)
         self.stage16 = Stage(sixteenth, units[2])
-        self.adapt_head = nn.Conv2d(sixteenth, 2 * LATENT_CHANNELS, 1)
+        self.adapt_head = nn.Conv2d(sixteenth, 2 * channels, 1)
         self.up8 = Upsample(sixteenth, eighth)
         self.stage8 = Stage(eighth, units[1])
         self.up4 = Upsample(eighth, quarter)
@@ -59,18 +72,20 @@ class Decoder(nn.Module):
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
 
     def forward(
-        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor
+        self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor, share: Tensor | None = None
     ) -> tuple[Tensor, DecoderFeatures]:
         """Map the received latent to ``(B, 3, 16 h, 16 w)``, not clipped, and the features of each stage.
 
         Args:
-            y: ``(B, 94, h, w)`` latent, each slot shrunk by ``shrink``.
+            y: ``(B, C, h, w)`` latent, each slot shrunk by ``shrink``.
             snr_db: ``(B, 1, h, w)`` SNR in dB at which the values of each slot arrived.
             shrink: ``(B, 1, h, w)``, ``snr / (1 + snr)``.
             scale: ``(B, 1, 1, 1)`` factor the frame was scaled back with.
+            share: ``(B, 1, h, w)`` of ``share_plane``, where blocks send different numbers of values.
         """
         condition = condition_vector(snr_db.mean(dim=(1, 2, 3)))
-        received = torch.cat((y, normalise_snr_db(snr_db), shrink), dim=1)
+        planes = (y, normalise_snr_db(snr_db), shrink)
+        received = torch.cat(planes if share is None else (*planes, share), dim=1)
         at16 = self.stage16(self.stem(received).relu(), condition)
         estimate = self.linear(y, shrink, scale, self.adapt_head(at16.relu()))
         at8 = self.stage8(self.up8(at16.relu()).relu(), condition)

@@ -7,7 +7,7 @@ long runs, activations happen in place, and no picture is built where only its f
 """
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +24,14 @@ from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import Decoder
 from semcast.common.nets.encoder import Encoder
 from semcast.common.nets.linear import BlockSynthesis
-from semcast.common.nets.modulation import demodulate, effective_snr_db, shrink_of
+from semcast.common.nets.modulation import (
+    analog_values,
+    demodulate,
+    effective_snr_db,
+    shrink_of,
+    undo_analog,
+)
+from semcast.common.nets.packing import sent_mask, share_plane, unpack
 from semcast.common.nets.transceiver import Transceiver
 
 _MAX_LOG_GAIN = 3.0
@@ -35,21 +42,36 @@ _FOLD, _GROUPS = 4, 4
 class InferenceNet(Protocol):
     """What a codec needs of a network."""
 
-    def latent(self, pixels: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
-        """Map ``(H, W, 3)`` uint8, sides multiples of 16, to the float latent ``(1, 94, H/16, W/16)``."""
+    def latent(self, pixels: Tensor, snr_db: Tensor, is_qam: Tensor, values: Tensor | None = None) -> Tensor:
+        """Map ``(H, W, 3)`` uint8, sides multiples of 16, to the float latent ``(1, C, H/16, W/16)``."""
 
-    def decode(self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def decode(
+        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, blocks: "Blocks | None" = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Decode equalised symbols.
 
         Args:
             y_rx: ``(1, 94, h, w)`` float32.
-            snr_db: ``(1, 1, h, w)`` effective SNR in dB.
+            snr_db: ``(1, 1, h, w)`` effective SNR of each slot in dB.
             is_qam: ``(1,)``.
+            blocks: Where the rate is variable.
 
         Returns:
             Image ``(16 h, 16 w, 3)`` uint8; confidence in [0, 1] and expected keypoint displacement in
             pixels, both ``(16 h, 16 w)`` float32.
         """
+
+
+class Blocks(NamedTuple):
+    """What is known of the blocks of a frame of variable rate, both ``(1, 1, h, w)``.
+
+    Attributes:
+        values: How many values each block sends.
+        snr_db: Effective SNR on the link.
+    """
+
+    values: Tensor
+    snr_db: Tensor
 
 
 def inference_net(model: Transceiver, dtype: torch.dtype) -> InferenceNet:
@@ -76,18 +98,20 @@ class PlainNet:
             if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)) and self._half:
                 module.to(dtype)
 
-    def latent(self, pixels: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+    def latent(self, pixels: Tensor, snr_db: Tensor, is_qam: Tensor, values: Tensor | None = None) -> Tensor:
         """See ``InferenceNet``."""
         with torch.autocast(pixels.device.type, torch.bfloat16, enabled=self._half):
             # (1, 3, H, W) in channels_last: the memory of the image as it is.
             x = pixels[None].permute(0, 3, 1, 2).float().mul_(1.0 / 255.0)
-            latent: Tensor = self._model.latent(x, snr_db, is_qam)
+            latent: Tensor = self._model.latent(x, snr_db, is_qam, values)
         return latent
 
-    def decode(self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def decode(
+        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, blocks: Blocks | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """See ``InferenceNet``."""
         with torch.autocast(y_rx.device.type, torch.bfloat16, enabled=self._half):
-            x_hat, features = self._model.receive(y_rx, snr_db, is_qam)
+            x_hat, features = self._model.receive(y_rx, snr_db, is_qam, *(blocks or ()))
             logit, displacement = self._model.judge(features, x_hat)
         pixels: Tensor = x_hat[0].float().clamp_(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
         return pixels.permute(1, 2, 0).contiguous(), torch.sigmoid(logit[0, 0].float()), displacement[0, 0]
@@ -162,6 +186,7 @@ class _Conv:
         self._weight = weight.to(dtype).contiguous(memory_format=torch.channels_last)
         self._bias = None if bias is None else bias.detach().to(dtype)
         self._stride, self._padding = conv.stride, conv.padding
+        self.num_inputs = conv.in_channels
 
     def __call__(self, x: Tensor) -> Tensor:
         """Convolve ``(1, C, h, w)``."""
@@ -215,14 +240,18 @@ class _ArrangedEncoder:
         self._head = _Conv(encoder.head, dtype)
         self._transform = _Conv(encoder.linear.transform, dtype, inputs=_block_order(), scale=scale)
         self._mix = _Conv(encoder.linear.mix, dtype)
+        self._share = None if encoder.share is None else _Conv(encoder.share, dtype)
 
-    def __call__(self, pixels: Tensor, snr_db: Tensor) -> Tensor:
-        """Encode ``(H, W, 3)`` uint8 to the float latent ``(1, 94, H/16, W/16)``."""
+    def __call__(self, pixels: Tensor, snr_db: Tensor, share: Tensor | None) -> Tensor:
+        """Encode ``(H, W, 3)`` uint8 to the float latent ``(1, C, H/16, W/16)``."""
         condition = condition_vector(snr_db)
         folded = _gather(pixels, _FOLD).to(self._dtype).sub_(127.5)  # (H/4, W/4, 48)
         f = self._stages[0](self._stem(_image(folded)).relu_(), condition)
         f = self._stages[1](self._down8(f).relu_(), condition)
-        f = self._stages[2](self._down16(f).relu_(), condition)
+        f = self._down16(f)
+        if self._share is not None and share is not None:
+            f += self._share(share.to(self._dtype))
+        f = self._stages[2](f.relu_(), condition)
         added, log_gain = self._head(f.relu_()).float().chunk(2, dim=1)
         gain = torch.exp(log_gain.clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN))
         coefficients = self._transform(_image(_gather(folded, _GROUPS))) * gain
@@ -257,12 +286,23 @@ class _ArrangedDecoder:
         coefficients = self._unmix(y.to(self._dtype)).float() * gain
         return _image(_spread(_rows(self._transform(coefficients.to(self._dtype))), _GROUPS))
 
-    def __call__(self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def __call__(
+        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, blocks: Blocks | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """See ``InferenceNet.decode``."""
-        y, snr_db, scale = demodulate(y_rx, snr_db, is_qam)
-        shrink = shrink_of(snr_db)
+        share: tuple[Tensor, ...] = ()
+        if blocks is None:
+            y, snr_db, scale = demodulate(y_rx, snr_db, is_qam)
+            shrink = shrink_of(snr_db)
+        else:
+            share = (share_plane(blocks.values),)
+            sent = sent_mask(blocks.values, self._unmix.num_inputs)
+            y = unpack(analog_values(y_rx, snr_db, is_qam), sent)
+            snr_db = effective_snr_db(blocks.snr_db, is_qam)
+            shrink = shrink_of(snr_db)
+            y, scale = undo_analog(y, shrink, sent)
         condition = condition_vector(snr_db.mean(dim=(1, 2, 3)))
-        planes = (y, normalise_snr_db(snr_db), shrink)
+        planes = (y, normalise_snr_db(snr_db), shrink, *share)
         received = torch.cat(planes, dim=1).to(self._dtype).contiguous(memory_format=torch.channels_last)
         at16 = self._stages[0](self._stem(received).relu_(), condition)
         opened = at16.relu()
@@ -305,10 +345,13 @@ class ArrangedNet:
         self._encoder = _ArrangedEncoder(model.encoder, dtype)
         self._decoder = _ArrangedDecoder(model.decoder, model.confidence, dtype)
 
-    def latent(self, pixels: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+    def latent(self, pixels: Tensor, snr_db: Tensor, is_qam: Tensor, values: Tensor | None = None) -> Tensor:
         """See ``InferenceNet``."""
-        return self._encoder(pixels, effective_snr_db(snr_db, is_qam))
+        share = None if values is None else share_plane(values)
+        return self._encoder(pixels, effective_snr_db(snr_db, is_qam), share)
 
-    def decode(self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def decode(
+        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, blocks: Blocks | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """See ``InferenceNet``."""
-        return self._decoder(y_rx, snr_db, is_qam)
+        return self._decoder(y_rx, snr_db, is_qam, blocks)

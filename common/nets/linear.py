@@ -22,20 +22,24 @@ _MAX_LOG_GAIN = 3.0
 
 
 class BlockAnalysis(nn.Module):
-    """Transform every 16x16 RGB block, scale its coefficients by local gains, mix them into the latent."""
+    """Transform every 16x16 RGB block, scale its coefficients by local gains, mix them into the latent.
 
-    def __init__(self) -> None:
+    Args:
+        channels: Values of the latent for each block.
+    """
+
+    def __init__(self, channels: int = LATENT_CHANNELS) -> None:
         super().__init__()
         self.fold = nn.PixelUnshuffle(BLOCK_PX)
-        self.transform = nn.Conv2d(_BLOCK_VALUES, LATENT_CHANNELS, 1)
-        self.mix = nn.Conv2d(LATENT_CHANNELS, LATENT_CHANNELS, 1, bias=False)
+        self.transform = nn.Conv2d(_BLOCK_VALUES, channels, 1)
+        self.mix = nn.Conv2d(channels, channels, 1, bias=False)
 
     def forward(self, x: Tensor, log_gain: Tensor) -> Tensor:
-        """Map an image ``(B, 3, H, W)`` to ``(B, 94, H/16, W/16)``.
+        """Map an image ``(B, 3, H, W)`` to ``(B, C, H/16, W/16)``.
 
         Args:
             x: Image around zero.
-            log_gain: ``(B, 94, H/16, W/16)`` from the network: flat blocks may be sent louder than busy ones.
+            log_gain: ``(B, C, H/16, W/16)`` from the network: flat blocks may be sent louder than busy ones.
         """
         gain = torch.exp(log_gain.float().clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN))
         mixed: Tensor = self.mix(self.transform(self.fold(x)) * gain)
@@ -43,25 +47,29 @@ class BlockAnalysis(nn.Module):
 
 
 class BlockSynthesis(nn.Module):
-    """Unmix the received latent, weight each coefficient by its Wiener gain, and return to pixels."""
+    """Unmix the received latent, weight each coefficient by its Wiener gain, and return to pixels.
 
-    def __init__(self) -> None:
+    Args:
+        channels: Values of the latent for each block.
+    """
+
+    def __init__(self, channels: int = LATENT_CHANNELS) -> None:
         super().__init__()
-        self.unmix = nn.Conv2d(LATENT_CHANNELS, LATENT_CHANNELS, 1)
-        self.log_power = nn.Parameter(torch.zeros(LATENT_CHANNELS))
+        self.unmix = nn.Conv2d(channels, channels, 1)
+        self.log_power = nn.Parameter(torch.zeros(channels))
         #: Log variance of what the receiver can't undo.
         self.log_distortion = nn.Parameter(torch.tensor(math.log(0.01)))
-        self.transform = nn.Conv2d(LATENT_CHANNELS, _BLOCK_VALUES, 1)
+        self.transform = nn.Conv2d(channels, _BLOCK_VALUES, 1)
         self.unfold = nn.PixelShuffle(BLOCK_PX)
 
     def forward(self, y: Tensor, shrink: Tensor, scale: Tensor, adapt: Tensor) -> Tensor:
         """Estimate the image linearly.
 
         Args:
-            y: ``(B, 94, h, w)`` latent, each slot still shrunk by ``shrink``.
+            y: ``(B, C, h, w)`` latent, each slot still shrunk by ``shrink``.
             shrink: ``(B, 1, h, w)``, ``snr / (1 + snr)``.
             scale: ``(B, 1, 1, 1)`` factor by which the frame was scaled back; it scales the noise too.
-            adapt: ``(B, 188, h, w)`` from the network: what to add to the log prior power of each
+            adapt: ``(B, 2 C, h, w)`` from the network: what to add to the log prior power of each
                 coefficient, and the log gain that undoes the transmitter's local one.
 
         Returns:
@@ -72,7 +80,7 @@ class BlockSynthesis(nn.Module):
         return x
 
     def gain(self, shrink: Tensor, scale: Tensor, adapt: Tensor) -> Tensor:
-        """Wiener gain of each coefficient, ``(B, 94, h, w)``, which also undoes ``shrink``."""
+        """Wiener gain of each coefficient, ``(B, C, h, w)``, which also undoes ``shrink``."""
         shrink = shrink.clamp_min(1e-2)
         noise = (1.0 - shrink) / shrink * scale.square()  # noise variance for unit power
         more_power, log_gain = adapt.float().chunk(2, dim=1)

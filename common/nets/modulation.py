@@ -69,17 +69,30 @@ def carrier_pattern(like: Tensor) -> Tensor:
     return sign_c.view(1, -1, 1, 1) * board.view(1, 1, rows, columns)
 
 
-def analog_symbols(y: Tensor) -> Tensor:
-    """Add the carrier and scale each image to average power 1/2 for each real value.
+def _mean(values: Tensor, sent: Tensor | None) -> Tensor:
+    """Mean of each image, ``(B, 1, 1, 1)``, over what is sent; ``values`` are 0 where nothing is."""
+    if sent is None:
+        return values.mean(dim=(1, 2, 3), keepdim=True)
+    total = values.sum(dim=(1, 2, 3), keepdim=True)
+    return total / sent.sum(dim=(1, 2, 3), keepdim=True)
+
+
+def analog_symbols(y: Tensor, sent: Tensor | None = None) -> Tensor:
+    """Add the carrier and scale each image to average power 1/2 for each real value that is sent.
 
     Args:
         y: ``(B, C, h, w)`` latent.
+        sent: 1 where a value is sent, 0 where not, of the same shape; None: all are.
+
+    Returns:
+        Of the shape of ``y``, 0 where nothing is sent.
     """
     pattern = carrier_pattern(y)
-    y = y - (y * pattern).mean(dim=(1, 2, 3), keepdim=True) * pattern
+    if sent is not None:
+        y, pattern = y * sent, pattern * sent
+    y = y - _mean(y * pattern, sent) * pattern
     y = y + CARRIER_AMPLITUDE * pattern
-    power = y.square().mean(dim=(1, 2, 3), keepdim=True)
-    return y * torch.rsqrt(2.0 * power + 1e-12)
+    return y * torch.rsqrt(2.0 * _mean(y.square(), sent) + 1e-12)
 
 
 def spread(symbols: Tensor) -> Tensor:
@@ -158,7 +171,11 @@ def modulate(latent: Tensor, is_qam: Tensor) -> Tensor:
         latent: ``(B, C, h, w)``.
         is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
     """
-    analog = analog_symbols(latent)
+    return rounded_symbols(analog_symbols(latent), is_qam)
+
+
+def rounded_symbols(analog: Tensor, is_qam: Tensor) -> Tensor:
+    """Return the analog symbols ``(B, C, h, w)`` as they travel: mixed and rounded with 16-QAM."""
     if not _may_hold(is_qam > 0):
         return analog
     rounded = nearest_level(_TO_ROUNDED * spread(analog))
@@ -177,13 +194,24 @@ def demodulate(y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> tuple[Tensor, Te
         The latent, shrunk as far as it is uncertain; the SNR ``(B, 1, h, w)`` in dB at which its values
         arrived, rounding included; and the ``(B, 1, 1, 1)`` factor that undid the transmitter's division.
     """
-    analog = y_rx
-    if _may_hold(is_qam > 0):
-        means = unspread(mean_before_rounding(y_rx, shrink_of(snr_db))) / _TO_ROUNDED
-        analog = torch.where(is_qam.view(-1, 1, 1, 1) > 0, means.to(y_rx.dtype), y_rx)
+    analog = analog_values(y_rx, snr_db, is_qam)
     snr_db = effective_snr_db(snr_db, is_qam)
     latent, scale = undo_analog(analog, shrink_of(snr_db))
     return latent, snr_db, scale
+
+
+def analog_values(y_rx: Tensor, snr_db: Tensor, is_qam: Tensor) -> Tensor:
+    """Return the analog values behind the link: as they arrived, or their means before they were rounded.
+
+    Args:
+        y_rx: ``(B, C, h, w)`` MMSE-equalised values.
+        snr_db: ``(B, 1, h, w)`` effective SNR of each slot on the link.
+        is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
+    """
+    if not _may_hold(is_qam > 0):
+        return y_rx
+    means = unspread(mean_before_rounding(y_rx, shrink_of(snr_db))) / _TO_ROUNDED
+    return torch.where(is_qam.view(-1, 1, 1, 1) > 0, means.to(y_rx.dtype), y_rx)
 
 
 def mean_before_rounding(y_rx: Tensor, shrink: Tensor) -> Tensor:
@@ -214,18 +242,21 @@ def mean_before_rounding(y_rx: Tensor, shrink: Tensor) -> Tensor:
     return torch.copysign(mean, y).to(y_rx.dtype)
 
 
-def undo_analog(y_rx: Tensor, shrink: Tensor) -> tuple[Tensor, Tensor]:
+def undo_analog(y_rx: Tensor, shrink: Tensor, sent: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Estimate the transmitter's divisor from the carrier, undo it and take the carrier away.
 
     Args:
         y_rx: ``(B, C, h, w)`` MMSE-equalised values, each slot shrunk by ``shrink``.
         shrink: ``(B, 1, h, w)`` in [0, 1], ``snr / (1 + snr)`` of each slot.
+        sent: See ``analog_symbols``; ``y_rx`` is 0 where it is 0.
 
     Returns:
         The latent, still shrunk by ``shrink``, and the ``(B, 1, 1, 1)`` factor that was applied.
     """
     pattern = carrier_pattern(y_rx)
-    amplitude = (y_rx * pattern).mean(dim=(1, 2, 3), keepdim=True)
-    amplitude = amplitude / shrink.mean(dim=(1, 2, 3), keepdim=True).clamp_min(1e-3)
+    if sent is not None:
+        pattern = pattern * sent
+    amplitude = _mean(y_rx * pattern, sent)
+    amplitude = amplitude / _mean(shrink if sent is None else shrink * sent, sent).clamp_min(1e-3)
     scale = CARRIER_AMPLITUDE / amplitude.clamp_min(CARRIER_AMPLITUDE / _MAX_SCALE)
     return y_rx * scale - CARRIER_AMPLITUDE * pattern * shrink, scale

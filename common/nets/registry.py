@@ -8,7 +8,7 @@ from semcast.common.config import near_match
 from semcast.common.errors import CheckpointError
 from semcast.common.nets.cnn import CnnSizes, build_cnn
 from semcast.common.nets.mae import MaeSizes, build_mae
-from semcast.common.nets.transceiver import Sizes, Transceiver, build_3dcsc
+from semcast.common.nets.transceiver import Sizes, Transceiver, build_3dcsc, build_variable_3dcsc
 from semcast.common.nets.vit import VitSizes, build_vit
 
 
@@ -33,6 +33,7 @@ def _entries() -> tuple[Architecture, ...]:
     return (
         Architecture("3dcsc", main, build_3dcsc),
         Architecture("3dcsc-lite", lite, build_3dcsc),
+        Architecture("3dcsc-vr", lite, build_variable_3dcsc),
         Architecture("cnn", CnnSizes(), build_cnn),
         Architecture("vit", VitSizes(), build_vit),
         Architecture("mae", MaeSizes(), build_mae),

@@ -1,0 +1,76 @@
+"""How many values blocks send in training: about what the rule of ``allocation`` gives them, and more various.
+
+The networks are to serve whatever rule chooses later, so its exponent, the budget and single blocks vary. The
+blocks of a batch share one budget: a crop of a wall alone must be sent with as little as within a frame.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from semcast.common.nets.allocation import DETAIL_FLOOR, LEVELS, demand_of, detail_of, levels_for
+from semcast.common.phy.slots import LATENT_CHANNELS
+
+_VALUES = torch.tensor(LEVELS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AllocationSettings:
+    """How allocations are drawn.
+
+    Attributes:
+        exponent_min: Smallest exponent of a block's detail.
+        exponent_max: Largest.
+        floor: Detail of a block without any, in squared grey levels.
+        block_sd: Standard deviation of single blocks' log2 of values from the rule.
+        budget: Values of a block, the mean over a batch.
+        budget_sd: Standard deviation of the budget's log2.
+    """
+
+    exponent_min: float = field(default=0.3, metadata={"help": "smallest exponent of a block's detail"})
+    exponent_max: float = field(default=0.75, metadata={"help": "largest exponent of a block's detail"})
+    floor: float = field(
+        default=DETAIL_FLOOR, metadata={"help": "detail added to every block's, in squared grey levels"}
+    )
+    block_sd: float = field(
+        default=0.35, metadata={"help": "scatter of single blocks about the rule, log2 of values"}
+    )
+    budget: float = field(default=91.0, metadata={"help": "values of a block, mean over a batch"})
+    budget_sd: float = field(default=0.3, metadata={"help": "scatter of the budget between batches, log2"})
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.exponent_min <= self.exponent_max <= 2.0:
+            raise ValueError(
+                "exponent_min and exponent_max must be in [0, 2] and ordered, "
+                f"got {self.exponent_min}, {self.exponent_max}"
+            )
+        if not 0.0 < self.floor < 65025.0:
+            raise ValueError(f"floor must be in (0, 65025), got {self.floor}")
+        for name in ("block_sd", "budget_sd"):
+            if not 0.0 <= getattr(self, name) <= 4.0:
+                raise ValueError(f"{name} must be in [0, 4], got {getattr(self, name)}")
+        if not LEVELS[0] <= self.budget <= 2 * LATENT_CHANNELS:
+            raise ValueError(f"budget must be in [{LEVELS[0]}, {2 * LATENT_CHANNELS}], got {self.budget}")
+
+
+def draw_values(crops: Tensor, settings: AllocationSettings, generator: torch.Generator) -> Tensor:
+    """Draw how many values each block of a batch sends.
+
+    Args:
+        crops: ``(B, 3, H, W)`` uint8 on the CPU.
+        settings: Of the draw.
+        generator: On the CPU.
+
+    Returns:
+        ``(B, 1, H/16, W/16)`` int64.
+    """
+    detail = np.stack([detail_of(crop) for crop in crops.permute(0, 2, 3, 1).numpy()])
+    span = settings.exponent_max - settings.exponent_min
+    exponent = settings.exponent_min + span * float(torch.rand(1, generator=generator))
+    scatter = torch.randn(detail.shape, generator=generator).numpy()
+    demand = demand_of(detail, exponent, settings.floor) + settings.block_sd * scatter
+    budget = settings.budget * 2.0 ** (settings.budget_sd * float(torch.randn(1, generator=generator)))
+    levels = levels_for(demand, round(budget * detail.size))
+    return _VALUES[torch.from_numpy(levels).long()][:, None]
