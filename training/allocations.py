@@ -1,4 +1,4 @@
-"""How many values blocks send in training: about what the rule of ``allocation`` gives them, and more various.
+"""How many values blocks send in training: about what the rule of ``allocation`` gives them, scattered.
 
 The networks are to serve whatever rule chooses later, so its exponent, the budget and single blocks vary. The
 blocks of a batch share one budget: a crop of a wall alone must be sent with as little as within a frame.

@@ -86,7 +86,7 @@ class LinkDraw:
         return LinkDraw(*(to_device(t, device) for t in vars(self).values()))
 
     def as_analog(self) -> "LinkDraw":
-        """Return the links over which analog values arrive as well as those of these links, rounded or not."""
+        """Return links over which analog values arrive as well as over these those that they carry."""
         arriving_db = self.snr_db.view(-1, 1, 1, 1) + 10.0 * torch.log10(self.gain.clamp_min(1e-6))
         arriving = 10.0 ** (effective_snr_db(arriving_db, self.is_qam) / 10.0)
         return LinkDraw(

@@ -93,8 +93,8 @@ def through_whole_link(
         x: ``(B, 3, H, W)`` images in [0, 1].
         draw: The links of the batch.
         noise: Standard normal values of the latent's shape.
-        values: ``(B, 1, h, w)`` what each block sends, where the rate is variable. Values are then sent one by
-            one and analog, over links at which they arrive as well as rounded ones would.
+        values: ``(B, 1, h, w)`` what each block sends, where the rate is variable. Values are then sent
+            outside of slots and analog, over links over which they arrive as well as rounded ones would.
 
     Returns:
         Symbols, the decoded images and the decoder's features.

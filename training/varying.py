@@ -82,7 +82,7 @@ def vary(fixed: Transceiver, variable: Transceiver, seen: Observations) -> None:
         ConfigError: The networks are not of the 3dcsc kind and the same sizes.
     """
     theirs, ours = fixed.state_dict(), variable.state_dict()
-    # What differs are the layers that hold values of the latent, and the layer that is told how many are sent.
+    # What differs are the layers that hold values of the latent, and the one that is told how many are sent.
     own = {name for name in ours if name not in theirs or theirs[name].shape != ours[name].shape}
     layers = {name.rpartition(".")[0] for name in own}
     expected = {
@@ -105,8 +105,10 @@ def vary(fixed: Transceiver, variable: Transceiver, seen: Observations) -> None:
     for name, weight in theirs.items():
         if name not in own:
             ours[name].copy_(weight)
-    assert isinstance(fixed.encoder, Encoder) and isinstance(variable.encoder, Encoder)
-    assert isinstance(fixed.decoder, Decoder) and isinstance(variable.decoder, Decoder)
+    assert isinstance(fixed.encoder, Encoder)
+    assert isinstance(variable.encoder, Encoder)
+    assert isinstance(fixed.decoder, Decoder)
+    assert isinstance(variable.decoder, Decoder)
     order, (directions, variances) = seen.order(), seen.missing()
     power = variances.sqrt() / variances.sqrt().mean() * _NEW_POWER * seen.power()
     amplitude = (power / variances).sqrt()
@@ -156,7 +158,7 @@ def _vary_decoder(old: Decoder, new: Decoder, order: Tensor, added: Tensor, log_
 
 
 def _set_received(layer: nn.Conv2d, weight: Tensor, order: Tensor) -> None:
-    """Set a layer that reads what is received: ordered values, nothing of the new ones, SNR and shrink factor."""
+    """Set a layer that reads what is received: ordered values, no new ones, SNR and shrink factor."""
     count = LATENT_CHANNELS
     layer.weight.zero_()
     layer.weight[:, :count] = torch.einsum("oikl,ij->ojkl", weight[:, :count], order)
