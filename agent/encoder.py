@@ -106,6 +106,7 @@ class FrameEncoder:
             image_hw=encoded.shape_hw,
             modulation=encoded.modulation,
             levels=encoded.levels.numbers,
+            allocation=encoded.allocation,
             num_slots=layout.num_slots,
             uses_per_slot=layout.uses_per_slot,
             direction="tx",

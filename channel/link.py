@@ -152,6 +152,7 @@ class Link:
             slot_lost=sent.slot_lost,
             knowledge=sent.truth if perfect_csi else None,
             levels=encoded.levels,
+            allocation=encoded.allocation,
         )
 
     def carry(

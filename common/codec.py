@@ -48,6 +48,14 @@ class EncodedImage:
     levels: Levels = ALL_LEVELS
     allocation: bytes = b""
 
+    def arrived(
+        self, symbols: NDArray[np.complex64], effective_snr_db: NDArray[np.float32]
+    ) -> "ReceivedImage":
+        """Return what is received of it: equalised symbols of the same shape, ``(num_slots,)`` SNRs."""
+        return ReceivedImage(
+            self.shape_hw, symbols, effective_snr_db, self.modulation, self.levels, self.allocation
+        )
+
 
 @dataclass(frozen=True)
 class ReceivedImage:

@@ -29,11 +29,14 @@ from semcast.common.message_fields import (
     WholeNumber,
     rule,
 )
-from semcast.common.phy.slots import SlotLayout, layout_for
+from semcast.common.nets.allocation import Allocation
+from semcast.common.phy.slots import BLOCK_PX, SlotLayout, layout_for
 
 PROTOCOL_VERSION = 1
 MAX_PAYLOAD_BYTES = 16 * 1024**2
 MAX_SIDE_PX = 8192
+#: Five bits for each block of the largest image.
+_MAX_ALLOCATION_BYTES = 5 * (MAX_SIDE_PX // BLOCK_PX) ** 2 // 8
 #: Keyframes of a day and more: all there ever were, also those that were thinned out since.
 MAX_KEYFRAMES = 200_000
 ROLES = ("agent", "channel", "server")
@@ -143,6 +146,7 @@ class SymbolFrame:
         modulation: How symbols travel.
         levels: Ends of the range of grey levels that was stretched to 0 .. 255 before encoding; with a knee
             also the level it is at, and the one it became, see ``Levels``.
+        allocation: How many values each block sends, the code of ``Allocation``; empty where all send alike.
         num_slots: Of the grid.
         uses_per_slot: Of the grid, pilots included.
         direction: ``tx`` carries data symbols only, ``rx`` pilots and data as received.
@@ -168,6 +172,7 @@ class SymbolFrame:
     image_hw: tuple[int, int] = field(metadata=_SIZE)
     modulation: Modulation = field(metadata=rule(Choice(MODULATIONS)))
     levels: tuple[int, ...] = field(default=(0, 255), metadata=rule(Many(WholeNumber(0, 255), at_most=4)))
+    allocation: bytes = field(default=b"", metadata=rule(Bytes(_MAX_ALLOCATION_BYTES)))
     num_slots: int = field(metadata=rule(WholeNumber(1, MAX_SIDE_PX)))
     uses_per_slot: int = field(metadata=rule(WholeNumber(1, 48 * MAX_SIDE_PX)))
     direction: Literal["tx", "rx"] = field(metadata=rule(Choice(("tx", "rx"))))
@@ -201,6 +206,10 @@ class SymbolFrame:
                 f"slots of a {self.image_hw} image must be {layout.num_slots}x{layout.uses_per_slot}, "
                 f"got {self.num_slots}x{self.uses_per_slot}",
             )
+        try:
+            Allocation.from_code(self.allocation, (layout.num_slots, layout.blocks_per_slot))
+        except ValueError as err:
+            raise FieldError("shape", str(err)) from None
         received_bytes = 4 * layout.num_uses
         if received_bytes > MAX_PAYLOAD_BYTES:
             # Small on its way to the channel, or lost, it would become large only where it is worked on.

@@ -215,6 +215,7 @@ def run_frames(
             encoded.modulation,
             slot_lost=sent.slot_lost,
             levels=encoded.levels,
+            allocation=encoded.allocation,
         )
         stage_ms["equalise"] = _elapsed_ms(since)
         feedback_db = reporter.snr_db(equalised)
@@ -226,7 +227,7 @@ def run_frames(
             t_source_ns,
             original,
             None if decoded.outage else decoded,
-            equalised.received.effective_snr_db,
+            equalised.received.row_snr_db,
             equalised.snr_db,
             stage_ms,
         )

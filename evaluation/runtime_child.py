@@ -10,7 +10,6 @@ import time
 
 import numpy as np
 
-from semcast.common.codec import ReceivedImage
 from semcast.common.codecs import load_codec
 
 
@@ -26,7 +25,7 @@ def main() -> None:
     image = np.ascontiguousarray(coarse.repeat(16, axis=0).repeat(16, axis=1)[:height, :width])
     encoded = codec.encode(image, 10.0)
     snr_db = np.full(encoded.symbols.shape[0], 10.0, dtype=np.float32)
-    received = ReceivedImage(encoded.shape_hw, encoded.symbols * np.float32(10 / 11), snr_db, "16qam")
+    received = encoded.arrived(encoded.symbols * np.float32(10 / 11), snr_db)
 
     def call() -> None:
         if task["work"] == "encode":

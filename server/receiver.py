@@ -69,10 +69,10 @@ class ReceivedFrame:
 
     @property
     def slot_snr_db(self) -> NDArray[np.float32] | None:
-        """``(num_slots,)`` effective SNR of each slot of the camera's grid, None when the frame was lost."""
+        """``(num_slots,)`` SNR of each row of blocks of the camera's grid, None when the frame was lost."""
         if self.received is None:
             return None
-        return slots_at(self.received.effective_snr_db, self.received.shape_hw[0], self.camera.image_wh[1])
+        return slots_at(self.received.row_snr_db, self.received.shape_hw[0], self.camera.image_wh[1])
 
 
 class Receiver:
@@ -328,6 +328,7 @@ class Receiver:
                 message.modulation,
                 slot_lost=lost_slots_of(message),
                 levels=Levels(*message.levels),
+                allocation=message.allocation,
             )
             equalise_ms = (time.perf_counter_ns() - started_ns) * 1e-6
             received, snr_db = equalised.received, float(equalised.snr_db)

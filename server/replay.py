@@ -346,7 +346,12 @@ def _arrivals(
         )
         if slots is not None:
             equalised = equalise(
-                slots, frame.image_hw, frame.modulation, slot_lost=lost, levels=Levels(*frame.levels)
+                slots,
+                frame.image_hw,
+                frame.modulation,
+                slot_lost=lost,
+                levels=Levels(*frame.levels),
+                allocation=frame.allocation,
             )
             arrival = replace(arrival, received=equalised.received, snr_db=float(equalised.snr_db))
         yield arrival

@@ -80,14 +80,14 @@ class LinearLink:
 
 
 def linear_link(
-    images: list[NDArray[np.uint8]], num_coefficients: int, generator: torch.Generator
+    images: list[NDArray[np.uint8]], num_coefficients: int, generator: torch.Generator | None
 ) -> LinearLink:
     """Return the linear transceiver of these images that sends so many coefficients of each block.
 
     Args:
         images: ``(H, W, 3)`` uint8.
-        num_coefficients: At most 94.
-        generator: Draws the orthogonal mixing.
+        num_coefficients: At most 94 where they are mixed.
+        generator: Draws the orthogonal mixing; None: coefficients stay apart, the largest first.
     """
     mean, covariance = block_statistics(images)
     variances, vectors = np.linalg.eigh(covariance)
@@ -95,9 +95,12 @@ def linear_link(
     basis = vectors[:, ::-1][:, :num_coefficients].T
     power = np.sqrt(variances) / np.sqrt(variances).mean()
     gain = np.sqrt(power / variances)
-    rotation = torch.linalg.qr(torch.randn(LATENT_CHANNELS, LATENT_CHANNELS, generator=generator))[0].numpy()
-    mixing = rotation[:, :num_coefficients]
-    scale = _LATENT_RMS * math.sqrt(LATENT_CHANNELS / num_coefficients)
+    if generator is None:
+        mixing, scale = np.eye(num_coefficients), _LATENT_RMS
+    else:
+        normal = torch.randn(LATENT_CHANNELS, LATENT_CHANNELS, generator=generator)
+        mixing = torch.linalg.qr(normal)[0].numpy()[:, :num_coefficients]
+        scale = _LATENT_RMS * math.sqrt(LATENT_CHANNELS / num_coefficients)
     return LinearLink(
         mean, gain[:, None] * basis, power, scale * mixing, mixing.T / scale, (basis / gain[:, None]).T
     )
@@ -117,7 +120,8 @@ def start_from_klt(model: Transceiver, images: list[NDArray[np.uint8]], generato
     encoder, decoder = model.encoder, model.decoder
     with torch.no_grad():
         if isinstance(encoder, Encoder) and isinstance(decoder, Decoder):
-            _start_linear(encoder.linear, decoder.linear, linear_link(images, LATENT_CHANNELS, generator))
+            mixed = None if model.is_variable else generator
+            _start_linear(encoder.linear, decoder.linear, linear_link(images, model.channels, mixed))
         elif isinstance(encoder, VitEncoder) and isinstance(decoder, VitDecoder):
             _start_vit(encoder, decoder, linear_link(images, LATENT_CHANNELS, generator))
         elif isinstance(encoder, MaeEncoder) and isinstance(decoder, MaeDecoder):
@@ -144,7 +148,7 @@ def _start_linear(analysis: BlockAnalysis, synthesis: BlockSynthesis, link: Line
     _set(analysis.transform.bias, -link.analysis @ link.mean)
     _set(analysis.mix.weight, link.mix)
     _set(synthesis.unmix.weight, link.unmix)
-    _set(synthesis.unmix.bias, np.zeros(LATENT_CHANNELS))
+    _set(synthesis.unmix.bias, np.zeros(link.power.size))
     _set(synthesis.log_power, np.log(link.power))
     _set(synthesis.transform.weight, link.synthesis)
     _set(synthesis.transform.bias, link.mean)

@@ -13,8 +13,10 @@ from torch import Tensor, nn
 
 from semcast.common.errors import CheckpointError
 from semcast.common.nets.checkpoint import load_transceiver, weights_path
-from semcast.common.nets.onnx_encoder import FORMAT, INPUTS, OUTPUT
+from semcast.common.nets.onnx_encoder import FORMAT, INPUTS, OUTPUT, VALUES_INPUT
+from semcast.common.nets.packing import share_plane
 from semcast.common.nets.rounding import rounded_snr_db
+from semcast.common.phy.slots import LATENT_CHANNELS
 from semcast.common.whole_file import write_whole
 from semcast.training.data import read_images
 from semcast.training.onnx_int8 import quantise
@@ -30,9 +32,10 @@ class _ImageToLatent(nn.Module):
         super().__init__()
         self.encoder = encoder
 
-    def forward(self, image: Tensor, snr_db: Tensor) -> Tensor:
+    def forward(self, image: Tensor, snr_db: Tensor, values: Tensor | None = None) -> Tensor:
         x = image.permute(0, 3, 1, 2).to(torch.float32) * (1.0 / 255.0)
-        latent: Tensor = self.encoder(x, snr_db)
+        told = (x, snr_db) if values is None else (x, snr_db, share_plane(values))
+        latent: Tensor = self.encoder(*told)
         return latent
 
 
@@ -41,7 +44,8 @@ def export_encoder(name_or_path: str | Path, out: Path, int8_images: Path | None
 
     Weights stay in half precision in the file and are widened when it is loaded. The graph takes ``image``
     ``(1, H, W, 3)`` uint8 with sides that are multiples of 16, and the ``snr_db`` ``(1,)`` at which values
-    arrive; it gives ``latent (1, 94, H/16, W/16)``.
+    arrive; it gives ``latent (1, 94, H/16, W/16)``. That of a variable rate also takes the ``values``
+    ``(1, 1, H/16, W/16)`` each block sends, and gives more of them.
 
     Args:
         name_or_path: Shipped name or weights file.
@@ -54,7 +58,9 @@ def export_encoder(name_or_path: str | Path, out: Path, int8_images: Path | None
     """
     images = [] if int8_images is None else read_images(int8_images)
     model, manifest = load_transceiver(weights_path(name_or_path))
-    example = (torch.zeros(1, 64, 96, 3, dtype=torch.uint8), torch.full((1,), 10.0))
+    example: tuple[Tensor, ...] = (torch.zeros(1, 64, 96, 3, dtype=torch.uint8), torch.full((1,), 10.0))
+    if model.is_variable:
+        example = (*example, torch.full((1, 1, 4, 6), float(LATENT_CHANNELS)))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory() as folder:
@@ -79,7 +85,7 @@ def export_encoder(name_or_path: str | Path, out: Path, int8_images: Path | None
 
 def _exported(
     encoder: nn.Module,
-    example: tuple[Tensor, Tensor],
+    example: tuple[Tensor, ...],
     path: Path,
     images: list[NDArray[np.uint8]],
     snr_range_db: tuple[float, float],
@@ -89,22 +95,24 @@ def _exported(
     ``path`` is a file to work in.
     """
     sides = {1: "height", 2: "width"}
+    names = [*INPUTS, VALUES_INPUT][: len(example)]
+    axes = {"image": sides, OUTPUT: {2: "rows", 3: "columns"}, VALUES_INPUT: {2: "rows", 3: "columns"}}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporter, about its own future
         torch.onnx.export(
             _ImageToLatent(encoder).eval(),
             example,
             str(path),
-            input_names=list(INPUTS),
+            input_names=names,
             output_names=[OUTPUT],
             opset_version=OPSET,
-            dynamic_axes={"image": sides, OUTPUT: {2: "rows", 3: "columns"}},
+            dynamic_axes={name: axes[name] for name in ("image", *names[2:], OUTPUT)},
             dynamo=False,
         )
     if images:
         low_db, high_db = snr_range_db
-        names = [node.name for node in onnx.load(str(path)).graph.node if node.op_type == "Conv"]
-        quantise(path, names, images, (float(rounded_snr_db(low_db)), high_db))
+        convolutions = [node.name for node in onnx.load(str(path)).graph.node if node.op_type == "Conv"]
+        quantise(path, convolutions, images, (float(rounded_snr_db(low_db)), high_db))
     return onnx.load(str(path))
 
 

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from onnxruntime import InferenceSession
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
-from semcast.common.nets.onnx_encoder import INPUTS
+from semcast.common.nets.allocation import Allocation
+from semcast.common.nets.onnx_encoder import INPUTS, VALUES_INPUT
 from semcast.common.phy.slots import BLOCK_PX
 
 #: Images the ranges are taken from, at most, and their longer side in pixels.
@@ -24,21 +26,29 @@ _EXACT = ("/linear/", "/head/")
 class _Ranges(CalibrationDataReader):  # type: ignore[misc]
     """Inputs that show which values activations take: photos under links from bad to good."""
 
-    def __init__(self, images: list[NDArray[np.uint8]], snr_range_db: tuple[float, float]) -> None:
-        self._inputs = self._all(images, snr_range_db)
+    def __init__(
+        self, path: Path, images: list[NDArray[np.uint8]], snr_range_db: tuple[float, float]
+    ) -> None:
+        names = {given.name for given in InferenceSession(str(path)).get_inputs()}
+        self._inputs = self._all(VALUES_INPUT in names, images, snr_range_db)
 
     @staticmethod
     def _all(
-        images: list[NDArray[np.uint8]], snr_range_db: tuple[float, float]
+        is_variable: bool, images: list[NDArray[np.uint8]], snr_range_db: tuple[float, float]
     ) -> Iterator[dict[str, NDArray[np.generic]]]:
         image_name, snr_name = INPUTS
         chosen = images[:: max(1, len(images) // _NUM_IMAGES)][:_NUM_IMAGES]
         for image, snr_db in zip(chosen, np.linspace(*snr_range_db, len(chosen)), strict=True):
             height, width = (min(_SIDE_PX, side) // BLOCK_PX * BLOCK_PX for side in image.shape[:2])
-            yield {
-                image_name: np.ascontiguousarray(image[None, :height, :width]),
+            pixels = np.ascontiguousarray(image[:height, :width])
+            inputs: dict[str, NDArray[np.generic]] = {
+                image_name: pixels[None],
                 snr_name: np.array([snr_db], dtype=np.float32),
             }
+            if is_variable:
+                values = Allocation.of_image(pixels).values
+                inputs[VALUES_INPUT] = values[None, None].astype(np.float32)
+            yield inputs
 
     def get_next(self) -> dict[str, NDArray[np.generic]] | None:
         """Return the next input, None behind the last."""
@@ -68,7 +78,7 @@ def quantise(
         quantize_static(
             str(path),
             str(path),
-            _Ranges(images, snr_range_db),
+            _Ranges(path, images, snr_range_db),
             quant_format=QuantFormat.QDQ,
             op_types_to_quantize=["Conv"],
             nodes_to_quantize=[name for name in convolutions if not any(part in name for part in _EXACT)],

@@ -47,7 +47,8 @@ class Observations:
         """Return the orthonormal ``(94, 94)`` whose columns lead from old values to ordered ones."""
         latents = torch.cat(self._latents)[self._flat()]
         _, vectors = torch.linalg.eigh(latents.T @ latents / len(latents))
-        return vectors.flip(1)
+        ordered: Tensor = vectors.flip(1)
+        return ordered
 
     def missing(self) -> tuple[Tensor, Tensor]:
         """Return the directions ``(768, C)`` that errors of blocks with detail have, and their variance."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import Modulation
 from semcast.common.nets.rounding import LEVEL_STEP, LOADING, mixing
+from semcast.common.phy.slots import LATENT_CHANNELS
 
 CARRIER_AMPLITUDE = 0.12
 
@@ -35,18 +36,44 @@ def carrier_pattern(channels: int, rows: int, columns: int) -> NDArray[np.float3
     return (sign[:, None, None] * board).astype(np.float32)
 
 
-def analog_symbols(latent: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Add the carrier and scale the frame to average power 1/2 for each real value."""
+def analog_symbols(latent: NDArray[np.float32], sent: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
+    """Add the carrier and scale the frame to average power 1/2 for each real value that is sent."""
     pattern = carrier_pattern(*latent.shape)
-    y = latent - (latent * pattern).mean(dtype=np.float64).astype(np.float32) * pattern
+    share = np.float64(1.0)
+    if sent is not None:
+        latent, pattern, share = latent * sent, pattern * sent, sent.mean()
+    y = latent - np.float32((latent * pattern).mean(dtype=np.float64) / share) * pattern
     y = y + np.float32(CARRIER_AMPLITUDE) * pattern
-    power = np.square(y).mean(dtype=np.float64)
+    power = np.square(y).mean(dtype=np.float64) / share
     return np.asarray(y / np.sqrt(2.0 * power + 1e-12), dtype=np.float32)
 
 
-def transmit(latent: NDArray[np.float32], modulation: Modulation) -> NDArray[np.float32]:
-    """Modulate the latent ``(94, h, w)`` of one frame: real parts of power 1/2 of unit-power symbols."""
-    symbols = analog_symbols(latent)
+def pack(symbols: NDArray[np.float32], sent: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Put the values ``(C, h, w)`` of blocks into slots, ``(94, h, w)``; see ``packing.pack``."""
+    _, rows, columns = symbols.shape
+    stream = np.empty(rows * columns * LATENT_CHANNELS, dtype=np.float32)
+    chosen = symbols.transpose(1, 2, 0)[sent.transpose(1, 2, 0)]
+    stream[: chosen.size] = chosen
+    place = np.arange(stream.size - chosen.size)
+    stream[chosen.size :] = 0.5**0.5 * (1.0 - 2.0 * (place * (place + 1) // 2 % 2))
+    return stream.reshape(rows, columns, LATENT_CHANNELS).transpose(2, 0, 1)
+
+
+def transmit(
+    latent: NDArray[np.float32], modulation: Modulation, values: NDArray[np.int64] | None = None
+) -> NDArray[np.float32]:
+    """Modulate the latent of one frame: real parts of power 1/2 of unit-power symbols, ``(94, h, w)``.
+
+    Args:
+        latent: ``(94, h, w)``, or ``(C, h, w)`` with ``values``.
+        modulation: How symbols travel.
+        values: ``(h, w)`` how many values each block sends, where the rate is variable.
+    """
+    if values is None:
+        symbols = analog_symbols(latent)
+    else:
+        sent = np.arange(len(latent))[:, None, None] < values
+        symbols = pack(analog_symbols(latent, sent), sent)
     if modulation == "analog":
         return symbols
     return nearest_level(np.float32(2.0**0.5 * LOADING) * spread(symbols))

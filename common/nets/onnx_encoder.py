@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import MODULATIONS, DecodedImage, EncodedImage, Modulation, ReceivedImage
 from semcast.common.errors import CheckpointError, ConfigError
+from semcast.common.nets.allocation import Allocation
 from semcast.common.nets.coder_input import coder_input
 from semcast.common.nets.latent import symbols_from_latent
 from semcast.common.nets.modulation_numpy import transmit
@@ -21,6 +22,8 @@ SUFFIX = ".onnx"
 #: Version of what the graph takes and gives, and of its metadata.
 FORMAT = "2"
 INPUTS = ("image", "snr_db")
+#: Third input of an encoder of variable rate: the values of each block, ``(1, 1, h, w)`` float32.
+VALUES_INPUT = "values"
 OUTPUT = "latent"
 
 
@@ -89,6 +92,7 @@ class OnnxEncoder:
                 f"encoder {path} must have format {FORMAT}, got {facts.get('semcast_format')}"
             )
         self._name, self._digest = str(facts["architecture"]), str(facts["digest"])
+        self._is_variable = VALUES_INPUT in {given.name for given in self._session.get_inputs()}
         self._snr_range_db = float(facts["snr_min_db"]), float(facts["snr_max_db"])
         #: ``int8`` where convolutions are, else ``float``.
         self.precision = str(facts.get("precision", "float"))
@@ -128,12 +132,17 @@ class OnnxEncoder:
         is_qam = self._modulation == "16qam"
         arriving_db = rounded_snr_db(given.snr_db) if is_qam else given.snr_db
         inputs = {"image": given.image[None], "snr_db": np.array([arriving_db], dtype=np.float32)}
+        allocation = Allocation.of_image(given.image) if self._is_variable else None
+        if allocation is not None:
+            inputs[VALUES_INPUT] = allocation.values[None, None].astype(np.float32)
         latent = self._session.run([OUTPUT], inputs)[0][0]
+        values = None if allocation is None else allocation.values
         return EncodedImage(
             shape_hw=given.shape_hw,
-            symbols=symbols_from_latent(transmit(latent, self._modulation)),
+            symbols=symbols_from_latent(transmit(latent, self._modulation, values)),
             modulation=self._modulation,
             levels=given.levels,
+            allocation=b"" if allocation is None else allocation.code,
         )
 
     def decode(self, received: ReceivedImage) -> DecodedImage:

@@ -185,6 +185,7 @@ def equalise(
     slot_lost: NDArray[np.bool_] | None = None,
     knowledge: ChannelKnowledge | None = None,
     levels: Levels = ALL_LEVELS,
+    allocation: bytes = b"",
 ) -> Equalised:
     """Turn the received slots of one frame into data symbols and their reliability.
 
@@ -195,6 +196,7 @@ def equalise(
         slot_lost: ``(num_slots,)`` slots known not to have arrived; their symbols become zero.
         knowledge: True channel, for perfect-CSI curves; None estimates it.
         levels: Passed on to the decoder.
+        allocation: Passed on to the decoder.
 
     Raises:
         ValueError: An array doesn't have the size that ``shape_hw`` demands.
@@ -237,5 +239,6 @@ def equalise(
         effective_snr_db=effective_snr_db,
         modulation=modulation,
         levels=levels,
+        allocation=allocation,
     )
     return Equalised(received=received, snr_db=channel.snr_db, channel=channel)

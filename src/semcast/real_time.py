@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.codec import Codec, Modulation, ReceivedImage
+from semcast.common.codec import Codec, Modulation
 from semcast.common.codecs import load_codec
 from semcast.common.cores import usable_cores
 from semcast.common.interrupts import deaf_children
@@ -144,7 +144,7 @@ def _coding_ms(coder: Codec, coded: NDArray[np.uint8]) -> float:
         symbols = (shrink * (encoded.symbols + noise[0] + 1j * noise[1])).astype(np.complex64)
         snr_db = np.full(symbols.shape[0], _SNR_DB, np.float32)
         since_s = time.perf_counter()
-        coder.decode(ReceivedImage(encoded.shape_hw, symbols, snr_db, encoded.modulation))
+        coder.decode(encoded.arrived(symbols, snr_db))
         times_s.append(encoded_s + time.perf_counter() - since_s)
         if until_s == math.inf:
             until_s = time.perf_counter() + _MEASURE_S  # the first call, which warms up, counts for nothing

@@ -7,6 +7,7 @@ from semcast.agent.encoder import FrameEncoder, LinkFeedback
 from semcast.agent.source import SourceFrame
 from semcast.common.levels import ALL_LEVELS, Levels
 from semcast.common.messages import LinkReport, SymbolFrame
+from semcast.common.nets.allocation import Allocation
 from semcast.common.symbol_payload import data_symbols
 from semcast.common.wire import pack, unpack
 
@@ -80,6 +81,18 @@ def test_messages_say_what_grey_levels_were_stretched_from(codec):
         message = FrameEncoder(stretching, 3, False).encode(frame, 5.0)
         assert message.levels == numbers
         assert Levels(*unpack(pack(message), SymbolFrame).levels) == levels
+
+
+def test_messages_say_what_each_block_sends(codec):
+    allocation = Allocation(np.array([[2, 3, 0]], np.uint8)).code
+
+    class Varying(type(codec)):
+        def encode(self, image, snr_db):
+            return replace(super().encode(image, snr_db), allocation=allocation)
+
+    frame = SourceFrame(0, 0, 0, np.zeros((16, 48, 3), np.uint8))
+    message = FrameEncoder(Varying(), 3, False).encode(frame, 5.0)
+    assert unpack(pack(message), SymbolFrame).allocation == allocation
 
 
 def test_symbols_that_do_not_fit_the_grid_are_refused_and_not_numbered(codec):

@@ -2,6 +2,7 @@ import threading
 import time
 from dataclasses import replace
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_
 from semcast.common.levels import Levels
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
+from semcast.common.nets.allocation import Allocation
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.phy.qam import constellation
@@ -99,6 +101,29 @@ def ends():
     yield open_ends
     for one in opened:
         one.close()
+
+
+def test_a_row_is_as_good_as_the_slots_its_values_are_in(ends, make):
+    e = ends()
+    e.answer_camera(camera())
+    levels = np.full((4, 8), 2, np.uint8)
+    levels[0] = 4  # twice the usual values: they fill the first two slots
+    levels[1] = 0
+    e.put(make(3, lost=[1], allocation=Allocation(levels).code))
+    frame = e.receiver.next(5)
+    assert frame.received.allocation == Allocation(levels).code
+    assert (frame.slot_snr_db == -20.0).tolist() == [True, False, False, False]
+
+
+def test_a_frame_whose_allocation_is_none_is_dropped(ends, make):
+    e = ends()
+    e.answer_camera(camera())
+    good = make(3)
+    values = {**msgpack.unpackb(pack(good)), "allocation": b"\x01"}
+    e.rx.put(msgpack.packb(values))
+    e.put(make(4))
+    assert e.receiver.next(5).message.seq == 4
+    assert e.metrics.drops["protocol"] == 1
 
 
 def test_a_frame_is_equalised_and_reported(ends, make, sent):

@@ -4,7 +4,7 @@ import torch
 
 from semcast.common.errors import ConfigError
 from semcast.common.nets.registry import build
-from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.common.nets.transceiver import Sizes, build_3dcsc, build_variable_3dcsc
 from semcast.training.klt import LinearLink, block_statistics, linear_link, start_from_klt
 
 TINY = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
@@ -39,8 +39,13 @@ def test_images_without_a_block_are_refused():
 
 @pytest.mark.parametrize(
     ("make", "psnr_db"),
-    [(lambda: build_3dcsc(TINY), 20.0), (lambda: build("vit"), 20.0), (lambda: build("mae"), 18.0)],
-    ids=["3dcsc", "vit", "mae"],
+    [
+        (lambda: build_3dcsc(TINY), 20.0),
+        (lambda: build_variable_3dcsc(TINY), 20.0),
+        (lambda: build("vit"), 20.0),
+        (lambda: build("mae"), 18.0),
+    ],
+    ids=["3dcsc", "3dcsc-vr", "vit", "mae"],
 )
 @pytest.mark.parametrize("flag", [0.0, 1.0])
 def test_before_any_training_the_link_already_carries_the_image(make, psnr_db, flag):
@@ -51,9 +56,11 @@ def test_before_any_training_the_link_already_carries_the_image(make, psnr_db, f
     x = torch.from_numpy(photos[0][::2, ::2].copy()).permute(2, 0, 1)[None] / 255.0
     snr_db, is_qam = torch.full((1,), 20.0), torch.full((1,), flag)
     with torch.inference_mode():
-        latent = model.latent(x, snr_db, is_qam)
-        symbols = model.transmit(latent, is_qam) * (100 / 101)
-        x_hat, _ = model.receive(symbols, torch.full((1, 1, 6, 6), 20.0), is_qam)
+        plane = torch.full((1, 1, 6, 6), 20.0)
+        values = torch.full((1, 1, 6, 6), 94) if model.is_variable else None
+        latent = model.latent(x, snr_db, is_qam, values)
+        symbols = model.transmit(latent, is_qam, values) * (100 / 101)
+        x_hat, _ = model.receive(symbols, plane, is_qam, values, plane)
     assert -10 * torch.log10((x_hat - x).square().mean()) > psnr_db
 
 

@@ -20,7 +20,7 @@ from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.codec import NeuralCodec
 from semcast.common.nets.mae import MaeSizes, build_mae
 from semcast.common.nets.registry import architectures
-from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.common.nets.transceiver import Sizes, build_3dcsc, build_variable_3dcsc
 from semcast.training.channel import ChannelSettings
 from semcast.training.data import CropSettings
 from semcast.training.loop import train
@@ -260,6 +260,43 @@ def test_heads_alone_leave_every_image_as_it_is(tiny_network, photos, tmp_path):
     assert again.steps == 8, "it goes on from its checkpoint"
     resumed = load_transceiver(again.weights)[0].state_dict()
     assert torch.equal(whole["decoder.head.weight"], resumed["decoder.head.weight"])
+
+
+def test_a_variable_rate_is_trained_from_a_fixed_one(photos, tmp_path, monkeypatch):
+    variable = registry.Architecture("3dcsc-vr", TINY.sizes, build_variable_3dcsc)
+    monkeypatch.setattr(registry, "_entries", lambda: (TINY, variable))
+    fixed = train(settings_for(photos, tmp_path / "fixed", steps=2))
+    settings = settings_for(
+        photos, tmp_path / "run", architecture="3dcsc-vr", grow_from=fixed.weights, valid=photos
+    )
+    result = train(settings)
+    assert result.valid["power"] == pytest.approx(1.0, abs=0.2)
+    codec = NeuralCodec.load(result.weights)
+    encoded = codec.encode(cv2.imread(str(photos / "0.png")), 10.0)
+    assert encoded.symbols.shape == (6, 8 * 47)
+    assert encoded.allocation
+    heads = settings_for(
+        photos,
+        tmp_path / "heads",
+        architecture="3dcsc-vr",
+        only_heads=True,
+        grow_from=result.weights,
+        steps=2,
+        loss=LossSettings(confidence=1.0),
+    )
+    before, after = (load_transceiver(r.weights)[0].state_dict() for r in (result, train(heads)))
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert {name.partition(".")[0] for name in changed} == {"confidence"}
+
+
+def test_a_variable_rate_can_start_from_the_images_alone(photos, tmp_path, monkeypatch):
+    variable = registry.Architecture("3dcsc-vr", TINY.sizes, build_variable_3dcsc)
+    monkeypatch.setattr(registry, "_entries", lambda: (variable,))
+    for k in range(6):  # enough blocks for 282 directions
+        cv2.imwrite(str(photos / f"large{k}.png"), np.random.default_rng(k).integers(0, 256, (512, 512, 3)))
+    settings = settings_for(photos, tmp_path / "run", architecture="3dcsc-vr", steps=2, valid=photos)
+    linear = train(settings).valid["psnr_10db"]
+    assert linear > train(replace(settings, start="random", out=tmp_path / "r")).valid["psnr_10db"] + 1.0
 
 
 def test_heads_alone_need_a_network_and_a_loss(tmp_path):

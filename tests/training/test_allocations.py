@@ -1,0 +1,52 @@
+import pytest
+import torch
+
+from semcast.common.nets.allocation import LEVELS
+from semcast.training.allocations import AllocationSettings, draw_values
+
+
+def crops():
+    """One flat crop and one full of detail."""
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randint(0, 256, (1, 3, 64, 64), generator=generator, dtype=torch.uint8)
+    return torch.cat((torch.full_like(noise, 120), noise))
+
+
+def draw(seed=0, **changes):
+    generator = torch.Generator().manual_seed(seed)
+    return draw_values(crops(), AllocationSettings(**changes), generator)
+
+
+def test_the_blocks_of_a_batch_share_one_budget():
+    values = draw(block_sd=0.0, budget_sd=0.0, budget=94.0)
+    assert values.shape == (2, 1, 4, 4)
+    assert set(values.flatten().tolist()) <= set(LEVELS)
+    assert 94 * 32 - LEVELS[-1] < int(values.sum()) <= 94 * 32
+    assert values[0].max() < values[1].min()
+
+
+def test_without_an_exponent_all_blocks_are_alike():
+    values = draw(exponent_min=0.0, exponent_max=0.0, block_sd=0.0, budget_sd=0.0, budget=94.0)
+    assert (values == 94).all()
+
+
+def test_draws_are_repeatable_and_differ_from_seed_to_seed():
+    assert torch.equal(draw(3), draw(3))
+    assert len({int(draw(seed).sum()) for seed in range(8)}) > 4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"exponent_min": 0.9},
+            "must be in \\[0, 2\\] and ordered, got 0.9, 0.75",
+        ),
+        ({"floor": 0.0}, "floor must be in \\(0, 65025\\), got 0.0"),
+        ({"block_sd": -1.0}, "block_sd must be in \\[0, 4\\], got -1.0"),
+        ({"budget": 5.0}, "budget must be in \\[12, 188\\], got 5.0"),
+    ],
+)
+def test_settings_are_checked(change, message):
+    with pytest.raises(ValueError, match=message):
+        AllocationSettings(**change)
