@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.levels import ALL_LEVELS, Levels
-from semcast.common.nets.allocation import Allocation
+from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.slots import layout_for
 
 Modulation = Literal["16qam", "analog"]
@@ -38,8 +38,8 @@ class EncodedImage:
             every symbol is a point of the Gray-mapped constellation in ``phy/qam.py``, plain or shaped.
         modulation: How the symbols travel.
         levels: What the image's grey levels were stretched from; it travels with the frame's header.
-        allocation: Code of how many values each block sends (``nets.allocation``), in the header too; empty:
-            all alike.
+        allocation: Code of how many values each block sends (``phy.allocation``), in the header too; empty
+            at a fixed rate.
     """
 
     shape_hw: tuple[int, int]
@@ -81,7 +81,7 @@ class ReceivedImage:
 
     @property
     def row_snr_db(self) -> NDArray[np.float32]:
-        """``(num_slots,)`` SNR of each row of blocks: that of the worst slot its values are in.
+        """``(num_slots,)`` SNR of each row of blocks, which is a slot at a fixed rate.
 
         Raises:
             ValueError: ``allocation`` is no code of so many blocks.
@@ -109,6 +109,18 @@ class DecodedImage:
     confidence: NDArray[np.float32]
     keypoint_confidence: NDArray[np.float32] | None = None
     outage: bool = False
+
+
+def check_fixed_rate(received: ReceivedImage) -> None:
+    """Make sure that a frame was sent at a fixed rate.
+
+    Raises:
+        ValueError: It has an allocation.
+    """
+    if received.allocation:
+        raise ValueError(
+            f"allocation must be empty for a codec of fixed rate, got {len(received.allocation)} bytes"
+        )
 
 
 def confidence_from_displacement_px(displacement_px: NDArray[np.float32]) -> NDArray[np.float32]:

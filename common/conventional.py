@@ -20,7 +20,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.codec import LOST_SLOT_SNR_DB, DecodedImage, EncodedImage, Modulation, ReceivedImage
+from semcast.common.codec import (
+    LOST_SLOT_SNR_DB,
+    DecodedImage,
+    EncodedImage,
+    Modulation,
+    ReceivedImage,
+    check_fixed_rate,
+)
 from semcast.common.conventional_source import ImageFormat, compress_to_fit, decompress
 from semcast.common.conventional_transport import Transport, hash_words
 from semcast.common.phy.qam import indices_to_symbols
@@ -211,6 +218,7 @@ class ConventionalCodec:
         layout = layout_for(received.shape_hw)
         check_shape(received.symbols, f"{layout.num_slots} {layout.data_per_slot}", "symbols")
         check_shape(received.effective_snr_db, f"{layout.num_slots}", "effective_snr_db")
+        check_fixed_rate(received)
         arrived = np.isfinite(received.symbols)
         snr_db = np.where(arrived.all(axis=1), received.effective_snr_db, LOST_SLOT_SNR_DB)
         snr_db = np.nan_to_num(snr_db.astype(np.float64), nan=LOST_SLOT_SNR_DB)

@@ -29,7 +29,7 @@ from semcast.common.message_fields import (
     WholeNumber,
     rule,
 )
-from semcast.common.nets.allocation import Allocation
+from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.slots import BLOCK_PX, SlotLayout, layout_for
 
 PROTOCOL_VERSION = 1
@@ -146,7 +146,7 @@ class SymbolFrame:
         modulation: How symbols travel.
         levels: Ends of the range of grey levels that was stretched to 0 .. 255 before encoding; with a knee
             also the level it is at, and the one it became, see ``Levels``.
-        allocation: How many values each block sends, the code of ``Allocation``; empty where all send alike.
+        allocation: How many values each block sends, the code of ``Allocation``; empty at a fixed rate.
         num_slots: Of the grid.
         uses_per_slot: Of the grid, pilots included.
         direction: ``tx`` carries data symbols only, ``rx`` pilots and data as received.
@@ -206,10 +206,6 @@ class SymbolFrame:
                 f"slots of a {self.image_hw} image must be {layout.num_slots}x{layout.uses_per_slot}, "
                 f"got {self.num_slots}x{self.uses_per_slot}",
             )
-        try:
-            Allocation.from_code(self.allocation, (layout.num_slots, layout.blocks_per_slot))
-        except ValueError as err:
-            raise FieldError("shape", str(err)) from None
         received_bytes = 4 * layout.num_uses
         if received_bytes > MAX_PAYLOAD_BYTES:
             # Small on its way to the channel, or lost, it would become large only where it is worked on.
@@ -233,6 +229,11 @@ class SymbolFrame:
         expected = (layout.num_slots + 7) // 8 if self.direction == "rx" else 0
         if len(self.slot_lost) != expected:
             raise FieldError("shape", f"slot_lost must have {expected} bytes, got {len(self.slot_lost)}")
+        try:
+            if self.allocation:
+                Allocation.from_code(self.allocation, (layout.num_slots, layout.blocks_per_slot))
+        except ValueError as err:
+            raise FieldError("shape", str(err)) from None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -96,13 +96,13 @@ def _grade_at(
     for seed in settings.all_seeds:
         run = FrameRun(sequence, frame_ids, codec, settings.link_at(snr_db), seed, cache_bytes=0)
         for frame in run:
-            if frame.decoded is None or frame.effective_snr_db is None:
+            if frame.decoded is None or frame.row_snr_db is None:
                 num_lost += 1
                 continue
             quality_db.append(psnr_db(frame.original, frame.decoded.image))
             pixel.add(frame.decoded, frame.original)
             keypoint.add(frame.decoded, frame.original)
-            slots.add(frame.decoded, frame.effective_snr_db)
+            slots.add(frame.decoded, frame.row_snr_db)
     if num_lost == len(frame_ids) * settings.seeds:
         raise ConfigError(f"no frame was received at snr_db {snr_db:g}: there is no confidence to grade")
     return {

@@ -153,6 +153,10 @@ class KeypointGrader:
         }
 
 
+#: A row whose values were in several lost slots has their SNR up to rounding.
+_LOST_WITHIN_DB = 0.01
+
+
 class SlotGrader:
     """Mean confidence where a slot was lost and where it was received."""
 
@@ -160,12 +164,13 @@ class SlotGrader:
         self._lost: list[float] = []
         self._received: list[float] = []
 
-    def add(self, decoded: DecodedImage, effective_snr_db: NDArray[np.float32]) -> None:
-        """Take one frame and the ``(num_slots,)`` SNR its slots had at the receiver."""
-        for slot_idx, snr_db in enumerate(effective_snr_db):
+    def add(self, decoded: DecodedImage, row_snr_db: NDArray[np.float32]) -> None:
+        """Take one frame and the ``(num_slots,)`` SNR its rows of blocks had at the receiver."""
+        for slot_idx, snr_db in enumerate(row_snr_db):
             band = decoded.confidence[slot_idx * SLOT_PX : (slot_idx + 1) * SLOT_PX]
             if band.size:
-                (self._lost if snr_db <= LOST_SLOT_SNR_DB else self._received).append(float(band.mean()))
+                is_lost = snr_db <= LOST_SLOT_SNR_DB + _LOST_WITHIN_DB
+                (self._lost if is_lost else self._received).append(float(band.mean()))
 
     def result(self) -> dict[str, float | int | None]:
         """Return ``confidence_lost``, ``confidence_received`` (None without such slots) and counts."""

@@ -240,7 +240,7 @@ def _neighbours(
     """
     recent: deque[LinkedFrame] = deque(maxlen=max(gaps) + 1)
     for idx, frame in enumerate(run):
-        if frame.decoded is not None and frame.effective_snr_db is not None:
+        if frame.decoded is not None and frame.row_snr_db is not None:
             quality_db.append(psnr_db(frame.original, frame.decoded.image))
         recent.append(frame)
         for gap in gaps:

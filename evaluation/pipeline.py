@@ -102,7 +102,7 @@ class LinkedFrame:
         t_source_ns: Recorded time.
         original: ``(H, W, 3)`` uint8 RGB.
         decoded: What the receiver has; None when the frame was lost or nothing usable arrived.
-        effective_snr_db: ``(num_slots,)`` at the receiver; None for clean or lost frames.
+        row_snr_db: ``(num_slots,)`` of each row of blocks at the receiver; None for clean or lost frames.
         snr_db_estimate: The receiver's estimate of the link SNR; None for clean or lost frames.
         stage_ms: Duration of ``encode``, ``channel``, ``equalise`` and ``decode``, as far as run.
     """
@@ -111,7 +111,7 @@ class LinkedFrame:
     t_source_ns: int
     original: NDArray[np.uint8]
     decoded: DecodedImage | None
-    effective_snr_db: NDArray[np.float32] | None
+    row_snr_db: NDArray[np.float32] | None
     snr_db_estimate: float | None
     stage_ms: dict[str, float]
 

@@ -85,7 +85,7 @@ def as_received(frame: LinkedFrame) -> DecodedFrame:
         image=decoded.image,
         confidence=decoded.confidence,
         keypoint_confidence=decoded.keypoint_confidence,
-        slot_snr_db=frame.effective_snr_db,
+        slot_snr_db=frame.row_snr_db,
     )
 
 
@@ -151,7 +151,7 @@ def _process(
         snr_set_db=None,
         snr_estimated_db=frame.snr_db_estimate,
         # A clean original equals itself: that says nothing about a codec.
-        psnr_db=None if frame.effective_snr_db is None else psnr_db(frame.original, decoded.image),
+        psnr_db=None if frame.row_snr_db is None else psnr_db(frame.original, decoded.image),
         age_ms=sum(ms for stage, ms in stage_ms.items() if stage not in _NOT_BEFORE_POSE),
         stage_ms=stage_ms,
     )

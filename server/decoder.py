@@ -11,7 +11,7 @@ import numpy as np
 
 from semcast.common.codec import LOST_SLOT_SNR_DB, Codec, Modulation, ReceivedImage
 from semcast.common.codecs import load_codec, named_weights
-from semcast.common.errors import CheckpointError
+from semcast.common.errors import CheckpointError, ProtocolError
 from semcast.common.phy.slots import layout_for
 from semcast.common.rate import from_coded
 from semcast.server.mapping.state import DecodedFrame
@@ -127,6 +127,7 @@ class FrameDecoder:
         Raises:
             CheckpointError: See ``codec_for``.
             ConfigError: See ``codec_for``.
+            ProtocolError: What the frame says of itself is not its codec's.
         """
         message = arrival.message
         if arrival.received is None:
@@ -134,7 +135,13 @@ class FrameDecoder:
         with self._lock:
             codec = self.codec_for(message.codec, message.modulation, message.digest)
             started_ns = time.perf_counter_ns()
-            decoded = from_coded(codec.decode(arrival.received), arrival.camera.intrinsics.shape_hw)
+            try:
+                decoded = codec.decode(arrival.received)
+            except ValueError as err:
+                raise ProtocolError(
+                    f"codec {message.codec} can't decode frame {message.frame_id}: {err}"
+                ) from err
+            decoded = from_coded(decoded, arrival.camera.intrinsics.shape_hw)
         t_decoded_ns = time.perf_counter_ns()
         decode_ms = (t_decoded_ns - started_ns) * 1e-6
         if decoded.outage:

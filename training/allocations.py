@@ -1,7 +1,9 @@
-"""How many values blocks send in training: about what the rule of ``allocation`` gives them, scattered.
+"""What blocks send in training: about what the rule of ``detail`` gives them, scattered.
 
 The networks are to serve whatever rule chooses later, so its exponent, the budget and single blocks vary. The
 blocks of a batch share one budget: a crop of a wall alone must be sent with as little as within a frame.
+
+On the air the values of a row of blocks begin in one slot and may end in the next, which fades on its own.
 """
 
 from dataclasses import dataclass, field
@@ -10,10 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semcast.common.nets.allocation import DETAIL_FLOOR, LEVELS, demand_of, detail_of, levels_for
+from semcast.common.nets.detail import DETAIL_FLOOR, demand_of, detail_of
+from semcast.common.phy.allocation import LEVELS, MAX_VALUES, levels_for
 from semcast.common.phy.slots import LATENT_CHANNELS
+from semcast.training.channel import to_device
 
 _VALUES = torch.tensor(LEVELS)
+#: Share of rows that end in the slot they begin in.
+_SHARE_WHOLE = 0.35
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,16 +61,39 @@ class AllocationSettings:
             raise ValueError(f"budget must be in [{LEVELS[0]}, {2 * LATENT_CHANNELS}], got {self.budget}")
 
 
-def draw_values(crops: Tensor, settings: AllocationSettings, generator: torch.Generator) -> Tensor:
-    """Draw how many values each block of a batch sends.
+@dataclass(frozen=True)
+class AllocationDraw:
+    """What the blocks of a batch send, and in which slots.
+
+    Attributes:
+        values: ``(B, 1, h, w)`` int64 how many values each block sends.
+        num_before: ``(B, 1, h, 1)`` int64 how many values of a row are in the row's own slot; the others are
+            in the one below.
+    """
+
+    values: Tensor
+    num_before: Tensor
+
+    def to(self, device: torch.device) -> "AllocationDraw":
+        """Return the draw on a device."""
+        return AllocationDraw(to_device(self.values, device), to_device(self.num_before, device))
+
+    def in_next_slot(self) -> Tensor:
+        """Tell which values are in the slot below that of their row, ``(B, 282, h, w)``."""
+        before = self.values.cumsum(dim=3) - self.values  # values of the row before each block
+        channel = torch.arange(MAX_VALUES, device=self.values.device).view(1, -1, 1, 1)
+        return before + channel >= self.num_before
+
+
+def draw_allocation(
+    crops: Tensor, settings: AllocationSettings, generator: torch.Generator
+) -> AllocationDraw:
+    """Draw what each block of a batch sends.
 
     Args:
         crops: ``(B, 3, H, W)`` uint8 on the CPU.
         settings: Of the draw.
         generator: On the CPU.
-
-    Returns:
-        ``(B, 1, H/16, W/16)`` int64.
     """
     detail = np.stack([detail_of(crop) for crop in crops.permute(0, 2, 3, 1).numpy()])
     span = settings.exponent_max - settings.exponent_min
@@ -73,4 +102,7 @@ def draw_values(crops: Tensor, settings: AllocationSettings, generator: torch.Ge
     demand = demand_of(detail, exponent, settings.floor) + settings.block_sd * scatter
     budget = settings.budget * 2.0 ** (settings.budget_sd * float(torch.randn(1, generator=generator)))
     levels = levels_for(demand, round(budget * detail.size))
-    return _VALUES[torch.from_numpy(levels).long()][:, None]
+    values = _VALUES[torch.from_numpy(levels).long()][:, None]
+    in_row = values.sum(dim=3, keepdim=True)
+    cut = torch.rand(in_row.shape, generator=generator) / (1.0 - _SHARE_WHOLE)
+    return AllocationDraw(values, (cut * in_row).long())

@@ -4,7 +4,7 @@ It follows the definitions of the real link: ``noise_var = 10 ** (-snr_db / 10)`
 half for each real, one fading coefficient for each slot, whose phase the equaliser removes.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -71,8 +71,9 @@ class LinkDraw:
         snr_db: ``(B,)`` true average SNR.
         expected_snr_db: ``(B,)`` what the transmitter believes.
         is_qam: ``(B,)`` 1 for 16-QAM.
-        gain: ``(B, 1, h, 1)`` power gain ``|h|^2`` of each slot, 0 where it is lost.
-        estimate_error_db: ``(B, 1, h, 1)``.
+        gain: ``(B, 1, h, 1)`` power gain ``|h|^2`` of each slot, 0 where it is lost; or ``(B, C, h, w)`` of
+            each value.
+        estimate_error_db: Of the same shape.
     """
 
     snr_db: Tensor
@@ -87,15 +88,28 @@ class LinkDraw:
 
     def as_analog(self) -> "LinkDraw":
         """Return links over which analog values arrive as well as over these those that they carry."""
-        arriving_db = self.snr_db.view(-1, 1, 1, 1) + 10.0 * torch.log10(self.gain.clamp_min(1e-6))
-        arriving = 10.0 ** (effective_snr_db(arriving_db, self.is_qam) / 10.0)
+        slot_db = self.snr_db.view(-1, 1, 1, 1) + 10.0 * torch.log10(self.gain.clamp_min(1e-6))
+        arriving_db = effective_snr_db(slot_db, self.is_qam)
+        believed_db = effective_snr_db(slot_db + self.estimate_error_db, self.is_qam)
         return LinkDraw(
             torch.zeros_like(self.snr_db),
             effective_snr_db(self.expected_snr_db, self.is_qam),
             torch.zeros_like(self.is_qam),
-            torch.where(self.gain == 0.0, 0.0, arriving),
-            self.estimate_error_db,
+            torch.where(self.gain == 0.0, 0.0, 10.0 ** (arriving_db / 10.0)),
+            believed_db - arriving_db,
         )
+
+    def per_value(self, in_next_slot: Tensor) -> "LinkDraw":
+        """Return the links of values some of which are in the slot below that of their row.
+
+        Args:
+            in_next_slot: ``(B, C, h, w)`` bool.
+        """
+        gain, error_db = (
+            torch.where(in_next_slot, slots.roll(-1, dims=2), slots)
+            for slots in (self.gain, self.estimate_error_db)
+        )
+        return replace(self, gain=gain, estimate_error_db=error_db)
 
 
 def to_device(values: Tensor, device: torch.device) -> Tensor:
@@ -140,8 +154,8 @@ def through_link(y: Tensor, draw: LinkDraw, noise: Tensor) -> tuple[Tensor, Tens
         noise: Standard normal values of the shape of ``y``.
 
     Returns:
-        The MMSE estimate ``(B, C, h, w)`` and the effective SNR as the receiver knows it, ``(B, 1, h, w)``
-        in dB.
+        The MMSE estimate ``(B, C, h, w)`` and the effective SNR as the receiver knows it, in dB: ``(B, 1, h,
+        w)``, or ``(B, C, h, w)`` where gains are those of values.
     """
     noise_var = 10.0 ** (-draw.snr_db / 10.0).view(-1, 1, 1, 1)
     lost = draw.gain == 0.0
@@ -151,4 +165,4 @@ def through_link(y: Tensor, draw: LinkDraw, noise: Tensor) -> tuple[Tensor, Tens
     linear = 10.0 ** (effective_db / 10.0)
     unbiased = y + noise * (0.5 * noise_var / draw.gain.clamp_min(1e-6)).sqrt()
     y_rx = torch.where(lost, torch.zeros_like(y), unbiased * linear / (1.0 + linear))
-    return y_rx, effective_db.expand(-1, 1, -1, y.shape[-1])
+    return y_rx, effective_db.expand(-1, -1, -1, y.shape[-1])

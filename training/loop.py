@@ -22,7 +22,7 @@ from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, channel_bandwidth_ratio
 from semcast.common.whole_file import check_writable, whole_file
-from semcast.training.allocations import draw_values
+from semcast.training.allocations import draw_allocation
 from semcast.training.centring import centre_hidden, folded, unfolded
 from semcast.training.channel import draw_links, to_device
 from semcast.training.data import Batches, Crops, read_images
@@ -224,12 +224,13 @@ class Run:
             x = pixels.to(device).float() / 255.0
             draw = draw_links(settings.channel, len(x), blocks, generator).to(device)
             noise = torch.randn((len(x), model.channels, blocks, blocks), generator=generator).to(device)
-            values = None
+            sent = None
             if model.is_variable:
-                values = draw_values(pixels, settings.allocation, generator).to(device)
+                sent = draw_allocation(pixels, settings.allocation, generator).to(device)
             with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
-                _, x_hat, _ = through_whole_link(model, x, draw, noise, values)
+                _, x_hat, _ = through_whole_link(model, x, draw, noise, sent)
                 if see is not None:
+                    values = None if sent is None else sent.values
                     see(x, model.latent(x, draw.expected_snr_db, draw.is_qam, values), x_hat)
 
     def export(self, valid: dict[str, float]) -> Path:
@@ -288,9 +289,9 @@ class Run:
         on_device = torch.Generator(self.device).manual_seed(seed + 1_000_003)
         shape = (settings.batch, self.model.channels, blocks, blocks)
         noise = torch.randn(shape, generator=on_device, device=self.device)
-        values = None
+        sent = None
         if self.model.is_variable:
-            values = to_device(draw_values(pixels, settings.allocation, generator), self.device)
+            sent = draw_allocation(pixels, settings.allocation, generator).to(self.device)
         is_ending = share >= 1.0 - settings.decay_share / 4.0
         with_heads = settings.only_heads or is_ending or self.step % settings.head_every == 0
         set_rate(self.optimisers, rate_factor(share, self.step, settings))
@@ -298,7 +299,7 @@ class Run:
             if share < settings.pretrain_share:
                 loss, logs = masked_image_loss(self.model, x, settings.mask_share, generator)
             else:
-                loss, logs = transceiver_loss(self.model, x, draw, noise, settings.loss, with_heads, values)
+                loss, logs = transceiver_loss(self.model, x, draw, noise, settings.loss, with_heads, sent)
         loss.backward()
         norm = self._share_gradients()
         for optimiser in self.optimisers:

@@ -9,7 +9,9 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from semcast.common.nets.decoder import DecoderFeatures
+from semcast.common.nets.modulation import shrink_of
 from semcast.common.nets.transceiver import Transceiver
+from semcast.training.allocations import AllocationDraw
 from semcast.training.channel import LinkDraw, through_link
 from semcast.training.descriptors import descriptor_loss
 from semcast.training.displacement import grey, lucas_kanade_step
@@ -84,7 +86,7 @@ def displacement_loss(predicted_px: Tensor, label_px: Tensor, strength: Tensor) 
 
 
 def through_whole_link(
-    model: Transceiver, x: Tensor, draw: LinkDraw, noise: Tensor, values: Tensor | None
+    model: Transceiver, x: Tensor, draw: LinkDraw, noise: Tensor, sent: AllocationDraw | None
 ) -> tuple[Tensor, Tensor, DecoderFeatures]:
     """Encode a batch, send it and decode it.
 
@@ -93,22 +95,22 @@ def through_whole_link(
         x: ``(B, 3, H, W)`` images in [0, 1].
         draw: The links of the batch.
         noise: Standard normal values of the latent's shape.
-        values: ``(B, 1, h, w)`` what each block sends, where the rate is variable. Values are then sent
-            outside of slots and analog, over links over which they arrive as well as rounded ones would.
+        sent: What each block sends, where the rate is variable. Values are then analog, over links over which
+            they arrive as well as rounded ones would.
 
     Returns:
         Symbols, the decoded images and the decoder's features.
     """
-    if values is None:
+    if sent is None:
         latent = model.latent(x, draw.expected_snr_db, draw.is_qam)
         symbols = model.transmit(latent, draw.is_qam)
         y_rx, snr_db = through_link(symbols, draw, noise)
         return symbols, *model.receive(y_rx, snr_db, draw.is_qam)
-    draw = draw.as_analog()
-    latent = model.latent(x, draw.expected_snr_db, draw.is_qam, values)
-    symbols = model.send_blocks(latent, values)
+    draw = draw.as_analog().per_value(sent.in_next_slot())
+    latent = model.latent(x, draw.expected_snr_db, draw.is_qam, sent.values)
+    symbols = model.send_blocks(latent, sent.values)
     y_rx, snr_db = through_link(symbols, draw, noise)
-    return symbols, *model.receive_blocks(y_rx, snr_db, values)
+    return symbols, *model.receive_blocks(y_rx, shrink_of(snr_db), sent.values)
 
 
 def transceiver_loss(
@@ -118,7 +120,7 @@ def transceiver_loss(
     noise: Tensor,
     settings: LossSettings,
     with_heads: bool,
-    values: Tensor | None = None,
+    sent: AllocationDraw | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Run one batch through the whole link and sum the loss terms.
 
@@ -129,12 +131,12 @@ def transceiver_loss(
         noise: Standard normal values of the latent's shape.
         settings: Weights of the terms.
         with_heads: Compute the confidence heads in this step.
-        values: See ``through_whole_link``.
+        sent: See ``through_whole_link``.
 
     Returns:
         The loss and detached scalars for the log.
     """
-    symbols, x_hat, features = through_whole_link(model, x, draw, noise, values)
+    symbols, x_hat, features = through_whole_link(model, x, draw, noise, sent)
     x_hat = x_hat.float()
     reconstruction, mse = reconstruction_loss(x_hat, x, settings.mse_knee)
     loss = settings.mse * reconstruction

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from semcast.common.errors import CheckpointError
 from semcast.common.nets.checkpoint import load_transceiver, weights_path
-from semcast.common.nets.onnx_encoder import FORMAT, INPUTS, OUTPUT, VALUES_INPUT
+from semcast.common.nets.onnx_encoder import FORMAT, INPUTS, OUTPUT, VALUES_INPUT, VARIABLE_FORMAT
 from semcast.common.nets.packing import share_plane
 from semcast.common.nets.rounding import rounded_snr_db
 from semcast.common.phy.slots import LATENT_CHANNELS
@@ -69,7 +69,7 @@ def export_encoder(name_or_path: str | Path, out: Path, int8_images: Path | None
             )
         halve_weights(graph)
         facts = {
-            "semcast_format": FORMAT,
+            "semcast_format": VARIABLE_FORMAT if model.is_variable else FORMAT,
             "architecture": manifest.architecture,
             "digest": manifest.sha256[:16],
             "precision": "int8" if images else "float",

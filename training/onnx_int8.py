@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from onnxruntime import InferenceSession
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
-from semcast.common.nets.allocation import Allocation
+from semcast.common.nets.detail import allocation_for
 from semcast.common.nets.onnx_encoder import INPUTS, VALUES_INPUT
 from semcast.common.phy.slots import BLOCK_PX
 
@@ -46,7 +46,7 @@ class _Ranges(CalibrationDataReader):  # type: ignore[misc]
                 snr_name: np.array([snr_db], dtype=np.float32),
             }
             if is_variable:
-                values = Allocation.of_image(pixels).values
+                values = allocation_for(pixels).values
                 inputs[VALUES_INPUT] = values[None, None].astype(np.float32)
             yield inputs
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from semcast.common.nets.allocation import Allocation
+from semcast.common.nets.detail import allocation_for
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.training.channel import LinkDraw, through_link
@@ -40,7 +40,7 @@ def validate(
             x = torch.from_numpy(pixels).permute(2, 0, 1)[None].to(device) / 255.0
             values = None
             if model.is_variable:
-                values = torch.from_numpy(Allocation.of_image(pixels).values)[None, None].to(device)
+                values = torch.from_numpy(allocation_for(pixels).values)[None, None].to(device)
             for snr_db in SNRS_DB:
                 slots = (1, 1, height // BLOCK_PX, 1)
                 level = torch.full((1,), snr_db)
@@ -50,7 +50,7 @@ def validate(
                 symbols = model.transmit(latent, draw.is_qam, values)
                 noise = torch.randn(symbols.shape, generator=generator).to(device)
                 y_rx, plane = through_link(symbols, draw, noise)
-                x_hat, _ = model.receive(y_rx, plane, draw.is_qam, values, plane)  # no slot differs
+                x_hat, _ = model.receive(y_rx, plane, draw.is_qam, values)
                 rounded = (x_hat.float().clamp(0, 1) * 255).round() / 255
                 mse = float((rounded - x).square().mean())
                 psnr_db[f"psnr_{snr_db:g}db"].append(-10.0 * math.log10(max(mse, 1e-10)))

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from semcast.common.errors import ConfigError
-from semcast.common.nets.allocation import MAX_VALUES, detail_of
 from semcast.common.nets.decoder import Decoder
+from semcast.common.nets.detail import demand_of, detail_of
 from semcast.common.nets.encoder import Encoder
 from semcast.common.nets.transceiver import Transceiver
+from semcast.common.phy.allocation import LEVELS, MAX_VALUES, levels_for
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
 
 #: Share of blocks, by detail, that are flat.
@@ -55,11 +56,25 @@ class Observations:
         errors = torch.cat(self._errors)[~self._flat()]
         variances, vectors = torch.linalg.eigh(errors.T @ errors / len(errors))
         num_new = MAX_VALUES - LATENT_CHANNELS
-        return vectors.flip(1)[:, :num_new], variances.flip(0)[:num_new].clamp_min(1e-9)
+        least = 1e-4 * float(variances[-1])  # of few blocks most directions have none
+        return vectors.flip(1)[:, :num_new], variances.flip(0)[:num_new].clamp_min(least)
 
     def power(self) -> float:
         """Mean square of the old values of blocks with detail."""
         return float(torch.cat(self._latents)[~self._flat()].square().mean())
+
+    def scale(self) -> float:
+        """Factor that gives the values that are sent, by the usual rule, the power all values had.
+
+        Flat blocks send few values, the loudest: the frame would be louder, and the carrier weaker beside it.
+        """
+        latents = torch.cat(self._latents)
+        levels = levels_for(demand_of(torch.cat(self._details).numpy()), LATENT_CHANNELS * len(latents))
+        values = torch.tensor(LEVELS)[torch.from_numpy(levels).long()]
+        squares = (latents @ self.order()).square()
+        of_old = (squares * (torch.arange(LATENT_CHANNELS) < values[:, None])).sum()
+        of_new = _NEW_POWER * self.power() * (values - LATENT_CHANNELS).clamp_min(0).sum()
+        return float((squares.mean() * values.sum() / (of_old + of_new)).sqrt())
 
     def _flat(self) -> Tensor:
         details = torch.cat(self._details)
@@ -118,6 +133,7 @@ def vary(fixed: Transceiver, variable: Transceiver, seen: Observations) -> None:
     start = variable.confidence.start
     assert isinstance(start, nn.Conv2d)
     _set_received(start, fixed.confidence.start.weight, order)  # type: ignore[arg-type,union-attr]
+    _scale_latent(variable.encoder, variable.decoder, start, seen.scale())
 
 
 def _vary_encoder(old: Encoder, new: Encoder, order: Tensor, added: Tensor) -> None:
@@ -164,6 +180,14 @@ def _set_received(layer: nn.Conv2d, weight: Tensor, order: Tensor) -> None:
     layer.weight.zero_()
     layer.weight[:, :count] = torch.einsum("oikl,ij->ojkl", weight[:, :count], order)
     layer.weight[:, MAX_VALUES : MAX_VALUES + 2] = weight[:, count:]
+
+
+def _scale_latent(encoder: Encoder, decoder: Decoder, start: nn.Conv2d, factor: float) -> None:
+    encoder.linear.mix.weight.mul_(factor)
+    encoder.head.weight[:MAX_VALUES].mul_(factor)
+    _bias(encoder.head)[:MAX_VALUES].mul_(factor)
+    for layer in (decoder.linear.unmix, decoder.stem, start):
+        layer.weight[:, :MAX_VALUES].div_(factor)
 
 
 def _bias(layer: nn.Conv2d) -> Tensor:

@@ -15,15 +15,17 @@ from semcast.common.codec import (
     EncodedImage,
     Modulation,
     ReceivedImage,
+    check_fixed_rate,
     confidence_from_displacement_px,
 )
 from semcast.common.errors import ConfigError
-from semcast.common.nets.allocation import Allocation
 from semcast.common.nets.checkpoint import Manifest, load_transceiver, weights_path
 from semcast.common.nets.coder_input import coder_input
-from semcast.common.nets.inference import Blocks, inference_net
+from semcast.common.nets.detail import allocation_for
+from semcast.common.nets.inference import inference_net
 from semcast.common.nets.latent import latent_from_symbols, symbols_from_latent
 from semcast.common.nets.transceiver import Transceiver
+from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.slots import layout_for
 from semcast.common.shapes import check_shape
 
@@ -152,7 +154,7 @@ class NeuralCodec:
             ValueError: The image is not of that shape and type, or has no pixel.
         """
         given = coder_input(image, snr_db, self.manifest.snr_range_db)
-        allocation = Allocation.of_image(given.image) if self._model.is_variable else None
+        allocation = allocation_for(given.image) if self._model.is_variable else None
         with torch.inference_mode():
             pixels = torch.from_numpy(given.image).to(self._device)
             snr = torch.full((1,), given.snr_db, device=self._device)
@@ -166,6 +168,17 @@ class NeuralCodec:
             levels=given.levels,
             allocation=b"" if allocation is None else allocation.code,
         )
+
+    def _allocation_of(self, received: ReceivedImage) -> Allocation | None:
+        """Return what each block sent, None at a fixed rate."""
+        if not self._model.is_variable:
+            check_fixed_rate(received)
+            return None
+        layout = layout_for(received.shape_hw)
+        grid = (layout.num_slots, layout.blocks_per_slot)
+        if not received.allocation and (received.effective_snr_db <= LOST_SLOT_SNR_DB).all():
+            return Allocation.fixed(grid)  # of a frame of which nothing arrived
+        return Allocation.from_code(received.allocation, grid)
 
     def _plane(self, of_blocks: NDArray[np.generic]) -> torch.Tensor:
         return torch.from_numpy(of_blocks)[None, None].to(self._device)
@@ -199,23 +212,13 @@ class NeuralCodec:
             latent = np.nan_to_num(latent, nan=0.0, posinf=0.0, neginf=0.0)
         latent = latent.clip(-_MAX_SYMBOL, _MAX_SYMBOL)
         height, width = received.shape_hw
-        allocation = None
-        if self._model.is_variable:
-            grid = (layout.num_slots, layout.blocks_per_slot)
-            allocation = Allocation.from_code(received.allocation, grid)
-        elif received.allocation:
-            raise ValueError(
-                f"allocation must be empty for a codec of fixed rate, got {len(received.allocation)} bytes"
-            )
+        allocation = self._allocation_of(received)
         with torch.inference_mode():
             y_rx = torch.from_numpy(latent)[None].to(self._device, memory_format=torch.channels_last)
             plane = torch.from_numpy(snr_db).to(self._device).view(1, 1, -1, 1)
             plane = plane.expand(1, 1, -1, layout.blocks_per_slot)
-            blocks = None
-            if allocation is not None:
-                block_snr_db = allocation.block_snr_db(snr_db)
-                blocks = Blocks(self._plane(allocation.values), self._plane(block_snr_db))
-            maps = self._net.decode(y_rx, plane, self._is_qam, blocks)
+            values = None if allocation is None else self._plane(allocation.values)
+            maps = self._net.decode(y_rx, plane, self._is_qam, values)
             image, confidence, moved_px = (m[:height, :width].contiguous().cpu().numpy() for m in maps)
         return DecodedImage(
             image=received.levels.unstretch(image),

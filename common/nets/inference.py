@@ -7,7 +7,7 @@ long runs, activations happen in place, and no picture is built where only its f
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -29,9 +29,8 @@ from semcast.common.nets.modulation import (
     demodulate,
     effective_snr_db,
     shrink_of,
-    undo_analog,
 )
-from semcast.common.nets.packing import sent_mask, share_plane, unpack
+from semcast.common.nets.packing import blocks_arrived, sent_mask, share_plane, unpack
 from semcast.common.nets.transceiver import Transceiver
 
 _MAX_LOG_GAIN = 3.0
@@ -46,7 +45,7 @@ class InferenceNet(Protocol):
         """Map ``(H, W, 3)`` uint8, sides multiples of 16, to the float latent ``(1, C, H/16, W/16)``."""
 
     def decode(
-        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, blocks: "Blocks | None" = None
+        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, values: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Decode equalised symbols.
 
@@ -54,24 +53,12 @@ class InferenceNet(Protocol):
             y_rx: ``(1, 94, h, w)`` float32.
             snr_db: ``(1, 1, h, w)`` effective SNR of each slot in dB.
             is_qam: ``(1,)``.
-            blocks: Where the rate is variable.
+            values: ``(1, 1, h, w)`` how many values each block sends, where the rate is variable.
 
         Returns:
             Image ``(16 h, 16 w, 3)`` uint8; confidence in [0, 1] and expected keypoint displacement in
             pixels, both ``(16 h, 16 w)`` float32.
         """
-
-
-class Blocks(NamedTuple):
-    """What is known of the blocks of a frame of variable rate, both ``(1, 1, h, w)``.
-
-    Attributes:
-        values: How many values each block sends.
-        snr_db: Effective SNR on the link.
-    """
-
-    values: Tensor
-    snr_db: Tensor
 
 
 def inference_net(model: Transceiver, dtype: torch.dtype) -> InferenceNet:
@@ -107,11 +94,11 @@ class PlainNet:
         return latent
 
     def decode(
-        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, blocks: Blocks | None = None
+        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, values: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """See ``InferenceNet``."""
         with torch.autocast(y_rx.device.type, torch.bfloat16, enabled=self._half):
-            x_hat, features = self._model.receive(y_rx, snr_db, is_qam, *(blocks or ()))
+            x_hat, features = self._model.receive(y_rx, snr_db, is_qam, values)
             logit, displacement = self._model.judge(features, x_hat)
         pixels: Tensor = x_hat[0].float().clamp_(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
         return pixels.permute(1, 2, 0).contiguous(), torch.sigmoid(logit[0, 0].float()), displacement[0, 0]
@@ -287,20 +274,19 @@ class _ArrangedDecoder:
         return _image(_spread(_rows(self._transform(coefficients.to(self._dtype))), _GROUPS))
 
     def __call__(
-        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, blocks: Blocks | None
+        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, values: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """See ``InferenceNet.decode``."""
         share: tuple[Tensor, ...] = ()
-        if blocks is None:
+        if values is None:
             y, snr_db, scale = demodulate(y_rx, snr_db, is_qam)
             shrink = shrink_of(snr_db)
         else:
-            share = (share_plane(blocks.values),)
-            sent = sent_mask(blocks.values, self._unmix.num_inputs)
+            share = (share_plane(values),)
+            sent = sent_mask(values, self._unmix.num_inputs)
             y = unpack(analog_values(y_rx, snr_db, is_qam), sent)
-            snr_db = effective_snr_db(blocks.snr_db, is_qam)
-            shrink = shrink_of(snr_db)
-            y, scale = undo_analog(y, shrink, sent)
+            of_slots = shrink_of(effective_snr_db(snr_db, is_qam)).expand_as(y_rx)
+            y, snr_db, shrink, scale = blocks_arrived(y, unpack(of_slots, sent), sent)
         condition = condition_vector(snr_db.mean(dim=(1, 2, 3)))
         planes = (y, normalise_snr_db(snr_db), shrink, *share)
         received = torch.cat(planes, dim=1).to(self._dtype).contiguous(memory_format=torch.channels_last)
@@ -351,7 +337,7 @@ class ArrangedNet:
         return self._encoder(pixels, effective_snr_db(snr_db, is_qam), share)
 
     def decode(
-        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, blocks: Blocks | None = None
+        self, y_rx: Tensor, snr_db: Tensor, is_qam: Tensor, values: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """See ``InferenceNet``."""
-        return self._decoder(y_rx, snr_db, is_qam, blocks)
+        return self._decoder(y_rx, snr_db, is_qam, values)

@@ -247,7 +247,7 @@ def undo_analog(y_rx: Tensor, shrink: Tensor, sent: Tensor | None = None) -> tup
 
     Args:
         y_rx: ``(B, C, h, w)`` MMSE-equalised values, each slot shrunk by ``shrink``.
-        shrink: ``(B, 1, h, w)`` in [0, 1], ``snr / (1 + snr)`` of each slot.
+        shrink: ``(B, 1, h, w)`` in [0, 1], ``snr / (1 + snr)`` of each slot; or ``(B, C, h, w)`` of values.
         sent: See ``analog_symbols``; ``y_rx`` is 0 where it is 0.
 
     Returns:

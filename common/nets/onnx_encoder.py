@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import MODULATIONS, DecodedImage, EncodedImage, Modulation, ReceivedImage
 from semcast.common.errors import CheckpointError, ConfigError
-from semcast.common.nets.allocation import Allocation
 from semcast.common.nets.coder_input import coder_input
+from semcast.common.nets.detail import allocation_for
 from semcast.common.nets.latent import symbols_from_latent
 from semcast.common.nets.modulation_numpy import transmit
 from semcast.common.nets.rounding import rounded_snr_db
@@ -21,8 +21,10 @@ from semcast.common.nets.rounding import rounded_snr_db
 SUFFIX = ".onnx"
 #: Version of what the graph takes and gives, and of its metadata.
 FORMAT = "2"
+#: That of encoders of variable rate, which have a third input.
+VARIABLE_FORMAT = "3"
 INPUTS = ("image", "snr_db")
-#: Third input of an encoder of variable rate: the values of each block, ``(1, 1, h, w)`` float32.
+#: The values of each block, ``(1, 1, h, w)`` float32.
 VALUES_INPUT = "values"
 OUTPUT = "latent"
 
@@ -87,12 +89,13 @@ class OnnxEncoder:
             facts = self._session.get_modelmeta().custom_metadata_map
         except Exception as err:  # onnxruntime has no common class of errors
             raise CheckpointError(f"encoder {path} can't be read: {err}") from err
-        if facts.get("semcast_format") != FORMAT:
+        if facts.get("semcast_format") not in (FORMAT, VARIABLE_FORMAT):
             raise CheckpointError(
-                f"encoder {path} must have format {FORMAT}, got {facts.get('semcast_format')}"
+                f"encoder {path} must have format {FORMAT} or {VARIABLE_FORMAT}, "
+                f"got {facts.get('semcast_format')}"
             )
         self._name, self._digest = str(facts["architecture"]), str(facts["digest"])
-        self._is_variable = VALUES_INPUT in {given.name for given in self._session.get_inputs()}
+        self._is_variable = facts["semcast_format"] == VARIABLE_FORMAT
         self._snr_range_db = float(facts["snr_min_db"]), float(facts["snr_max_db"])
         #: ``int8`` where convolutions are, else ``float``.
         self.precision = str(facts.get("precision", "float"))
@@ -132,7 +135,7 @@ class OnnxEncoder:
         is_qam = self._modulation == "16qam"
         arriving_db = rounded_snr_db(given.snr_db) if is_qam else given.snr_db
         inputs = {"image": given.image[None], "snr_db": np.array([arriving_db], dtype=np.float32)}
-        allocation = Allocation.of_image(given.image) if self._is_variable else None
+        allocation = allocation_for(given.image) if self._is_variable else None
         if allocation is not None:
             inputs[VALUES_INPUT] = allocation.values[None, None].astype(np.float32)
         latent = self._session.run([OUTPUT], inputs)[0][0]

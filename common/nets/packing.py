@@ -1,12 +1,14 @@
 """Values of blocks that send different numbers of them, as the values of a frame's slots, and back.
 
 The values follow each other block by block, row by row, and fill the slots in this order; a slot holds as
-many as at a fixed rate. What the code of the allocation takes the place of lies behind them.
+many as at a fixed rate. What the code of the allocation takes the place of lies behind them. So the values of
+a block may be in two slots, and arrive differently well.
 """
 
 import torch
 from torch import Tensor
 
+from semcast.common.nets.modulation import undo_analog
 from semcast.common.phy.slots import LATENT_CHANNELS
 
 #: Amplitude of what stands for the symbols of the allocation's code: power 1/2 for each real part.
@@ -54,3 +56,25 @@ def unpack(packed: Tensor, sent: Tensor) -> Tensor:
     blocks = torch.zeros(mask.shape, dtype=packed.dtype, device=packed.device)
     blocks.masked_scatter_(mask, stream)
     return blocks.permute(2, 0, 1)[None]
+
+
+def blocks_arrived(y_rx: Tensor, shrink: Tensor, sent: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the latent of blocks as well as it is known, with one reliability for each block.
+
+    A decoder is told one shrink factor and SNR for a block: those of the mean share of its values' variance
+    that arrived. Values that arrived better are brought to the same factor.
+
+    Args:
+        y_rx: ``(B, C, h, w)`` analog values, shrunk by ``shrink``.
+        shrink: ``(B, C, h, w)`` in (0, 1), ``snr / (1 + snr)`` of each value.
+        sent: 1 where a value is sent, of the same shape.
+
+    Returns:
+        The latent ``(B, C, h, w)``; the SNR in dB and the shrink factor of each block, ``(B, 1, h, w)``; the
+        factor ``(B, 1, 1, 1)`` that undid the transmitter's division.
+    """
+    shrink = shrink.clamp(1e-3, 1.0 - 1e-4)
+    latent, scale = undo_analog(y_rx * sent, shrink, sent)
+    of_block = (shrink * sent).sum(dim=1, keepdim=True) / sent.sum(dim=1, keepdim=True)
+    snr_db = 10.0 * torch.log10(of_block / (1.0 - of_block))
+    return latent * (of_block / shrink), snr_db, of_block, scale

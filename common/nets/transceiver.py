@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from semcast.common.nets.allocation import MAX_VALUES
 from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import Decoder, DecoderFeatures, received_channels
 from semcast.common.nets.encoder import Encoder
@@ -16,9 +15,9 @@ from semcast.common.nets.modulation import (
     modulate,
     rounded_symbols,
     shrink_of,
-    undo_analog,
 )
-from semcast.common.nets.packing import pack, sent_mask, share_plane, unpack
+from semcast.common.nets.packing import blocks_arrived, pack, sent_mask, share_plane, unpack
+from semcast.common.phy.allocation import MAX_VALUES
 from semcast.common.phy.slots import LATENT_CHANNELS
 
 
@@ -97,7 +96,6 @@ class Transceiver(nn.Module):
         snr_db: Tensor,
         is_qam: Tensor,
         values: Tensor | None = None,
-        block_snr_db: Tensor | None = None,
     ) -> tuple[Tensor, DecoderFeatures]:
         """Decode equalised symbols to an image that is not yet clipped.
 
@@ -106,15 +104,15 @@ class Transceiver(nn.Module):
             snr_db: ``(B, 1, h, w)`` effective SNR of each slot in dB.
             is_qam: ``(B,)`` 1 for 16-QAM, 0 for analog.
             values: Where the rate is variable; B is 1 then.
-            block_snr_db: ``(1, 1, h, w)`` effective SNR of each block, with ``values``.
         """
         if values is None:
             y, snr_db, scale = demodulate(y_rx, snr_db, is_qam)
             decoded: tuple[Tensor, DecoderFeatures] = self.decoder(y, snr_db, shrink_of(snr_db), scale)
             return decoded
-        assert block_snr_db is not None
-        blocks = unpack(analog_values(y_rx, snr_db, is_qam), sent_mask(values, self.channels))
-        return self.receive_blocks(blocks, effective_snr_db(block_snr_db, is_qam), values)
+        sent = sent_mask(values, self.channels)
+        y = unpack(analog_values(y_rx, snr_db, is_qam), sent)
+        shrink = shrink_of(effective_snr_db(snr_db, is_qam))
+        return self.receive_blocks(y, unpack(shrink.expand(-1, LATENT_CHANNELS, -1, -1), sent), values)
 
     def send_blocks(self, latent: Tensor, values: Tensor) -> Tensor:
         """Return analog symbols of blocks, ``(B, C, h, w)`` and 0 where nothing is sent, outside of slots.
@@ -124,18 +122,18 @@ class Transceiver(nn.Module):
         """
         return analog_symbols(latent, sent_mask(values, self.channels))
 
-    def receive_blocks(self, y_rx: Tensor, snr_db: Tensor, values: Tensor) -> tuple[Tensor, DecoderFeatures]:
+    def receive_blocks(self, y_rx: Tensor, shrink: Tensor, values: Tensor) -> tuple[Tensor, DecoderFeatures]:
         """Decode what arrived of ``send_blocks``.
 
         Args:
             y_rx: ``(B, C, h, w)`` behind an MMSE equaliser.
-            snr_db: ``(B, 1, h, w)`` SNR in dB at which the values of each block arrived.
+            shrink: ``(B, C, h, w)``, ``snr / (1 + snr)`` of each value.
             values: ``(B, 1, h, w)``.
         """
-        sent = sent_mask(values, self.channels)
-        shrink = shrink_of(snr_db)
-        y, scale = undo_analog(y_rx * sent, shrink, sent)
-        decoded: tuple[Tensor, DecoderFeatures] = self.decoder(y, snr_db, shrink, scale, share_plane(values))
+        y, snr_db, of_block, scale = blocks_arrived(y_rx, shrink, sent_mask(values, self.channels))
+        decoded: tuple[Tensor, DecoderFeatures] = self.decoder(
+            y, snr_db, of_block, scale, share_plane(values)
+        )
         return decoded
 
     def judge(self, features: DecoderFeatures, x_hat: Tensor) -> tuple[Tensor, Tensor]:

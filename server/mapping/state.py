@@ -30,7 +30,7 @@ class DecodedFrame:
         image: ``(H, W, 3)`` uint8 RGB without distortion.
         confidence: ``(H, W)`` float32 in [0, 1], or None where the codec gives none.
         keypoint_confidence: ``(H, W)`` float32 in [0, 1] trained on keypoint displacement, or None.
-        slot_snr_db: ``(num_slots,)`` effective SNR of each 16-pixel band, or None.
+        slot_snr_db: ``(num_slots,)`` SNR of each 16-pixel band, ``ReceivedImage.row_snr_db``, or None.
     """
 
     frame_id: int

@@ -7,7 +7,7 @@ from semcast.agent.encoder import FrameEncoder, LinkFeedback
 from semcast.agent.source import SourceFrame
 from semcast.common.levels import ALL_LEVELS, Levels
 from semcast.common.messages import LinkReport, SymbolFrame
-from semcast.common.nets.allocation import Allocation
+from semcast.common.phy.allocation import Allocation
 from semcast.common.symbol_payload import data_symbols
 from semcast.common.wire import pack, unpack
 

@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 
-from semcast.common.nets.allocation import (
-    FIXED_LEVEL,
-    LEVELS,
-    Allocation,
-    demand_of,
-    detail_of,
-    levels_for,
-)
+from semcast.common.nets.detail import allocation_for, demand_of, detail_of
+from semcast.common.phy.allocation import FIXED_LEVEL, LEVELS, Allocation, levels_for
 
 
 def half_busy(rows=6, columns=10):
@@ -65,7 +59,7 @@ def test_more_budget_takes_from_no_block():
 
 
 def test_busy_blocks_get_more_and_the_frame_is_filled_but_for_the_code():
-    allocation = Allocation.of_image(half_busy())
+    allocation = allocation_for(half_busy())
     left, right = allocation.values[:, :5], allocation.values[:, 5:]
     assert left.min() > right[:, 1:].max()
     used = allocation.num_values + allocation.num_values_of_code
@@ -76,7 +70,7 @@ def test_busy_blocks_get_more_and_the_frame_is_filled_but_for_the_code():
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (30, 40)])
 def test_an_image_of_any_size_fits(shape):
     image = np.random.default_rng(1).integers(0, 256, (16 * shape[0], 16 * shape[1], 3), dtype=np.uint8)
-    allocation = Allocation.of_image(image)
+    allocation = allocation_for(image)
     assert allocation.levels.shape == shape
     assert allocation.num_values + allocation.num_values_of_code <= 94 * shape[0] * shape[1]
 
@@ -84,7 +78,7 @@ def test_an_image_of_any_size_fits(shape):
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (8, 1), (7, 11)])
 def test_the_code_tells_the_levels(shape):
     for seed in range(20):
-        levels = np.minimum(random_levels(shape, seed), FIXED_LEVEL)
+        levels = np.minimum(random_levels(shape, seed), FIXED_LEVEL - 1)
         again = Allocation.from_code(Allocation(levels).code, shape)
         np.testing.assert_array_equal(again.levels, levels)
 
@@ -95,19 +89,16 @@ def test_the_code_of_an_even_picture_is_one_bit_for_each_block():
     assert len(allocation.code) == 24 * 32 // 8
 
 
-def test_no_code_means_that_all_blocks_send_alike():
-    allocation = Allocation.from_code(b"", (3, 4))
-    assert (allocation.values == 94).all()
-    assert allocation.values.shape == (3, 4)
-
-
 @pytest.mark.parametrize(
     "code",
     [
         Allocation(np.zeros((3, 4), np.uint8)).code[:-1],
         Allocation(np.zeros((3, 4), np.uint8)).code + b"\0",
         Allocation(np.full((3, 4), len(LEVELS) - 1, np.uint8)).code,
+        Allocation.fixed((3, 4)).code,  # fits, but leaves no channel use for itself
+        b"\0\x01",  # twelve blocks of one bit each and four bits that mean nothing
         b"\xff",
+        b"",
     ],
 )
 def test_codes_of_other_frames_are_refused(code):
@@ -115,12 +106,23 @@ def test_codes_of_other_frames_are_refused(code):
         Allocation.from_code(code, (3, 4))
 
 
-def test_a_block_is_as_good_as_the_worst_slot_its_values_are_in():
-    # Slots of 2 x 94 values: the first block fills the first slot and 94 of the second.
+def test_levels_that_were_read_can_not_be_changed():
+    code = Allocation(np.zeros((3, 4), np.uint8)).code
+    with pytest.raises(ValueError, match="read-only"):
+        Allocation.from_code(code, (3, 4)).levels[0, 0] = 5
+
+
+def test_a_row_is_as_good_as_the_mean_share_of_its_values_that_arrives():
+    # Slots of 2 x 94 values: the first row has 330, 188 of them in the first slot; the second row 24.
     allocation = Allocation(np.array([[5, 2], [0, 0]], np.uint8))
     assert allocation.values.tolist() == [[282, 48], [12, 12]]
-    snr_db = allocation.block_snr_db(np.array([10.0, 3.0], np.float32))
-    assert snr_db.tolist() == [[3.0, 3.0], [3.0, 3.0]]
-    allocation = Allocation(np.array([[2, 2], [3, 3]], np.uint8))
-    assert allocation.block_snr_db(np.array([3.0, 10.0], np.float32)).tolist() == [[3.0, 3.0], [3.0, 10.0]]
-    assert allocation.row_snr_db(np.array([3.0, 10.0], np.float32)).tolist() == [3.0, 3.0]
+    snr_db = allocation.row_snr_db(np.array([0.0, 10.0 * np.log10(3.0)], np.float32))
+    share = (188 * 0.5 + 142 * 0.75) / 330
+    np.testing.assert_allclose(snr_db, 10.0 * np.log10([share / (1.0 - share), 3.0]), rtol=1e-5)
+
+
+def test_a_row_most_of_which_is_lost_counts_as_lost():
+    allocation = Allocation(np.array([[3, 3], [2, 2], [2, 2]], np.uint8))
+    rows = allocation.row_snr_db(np.array([-20.0, 10.0, 10.0], np.float32))
+    assert rows[0] == pytest.approx(-20.0, abs=0.01)
+    np.testing.assert_allclose(rows[1:], 10.0, atol=0.01)

@@ -3,7 +3,7 @@ import copy
 import pytest
 import torch
 
-from semcast.common.nets.inference import ArrangedNet, Blocks, PlainNet, inference_net
+from semcast.common.nets.inference import ArrangedNet, PlainNet, inference_net
 from semcast.common.nets.modulation import modulate
 from semcast.common.nets.registry import build
 
@@ -57,15 +57,14 @@ def test_arranged_network_of_variable_rate_equals_its_modules(is_qam):
     assert isinstance(net, ArrangedNet)
     pixels, snr_db, plane, y_rx, flag = example(is_qam)
     values = torch.tensor([[[[12, 24, 48, 94, 188], [94, 12, 12, 282, 24], [94, 94, 48, 24, 12]]]])
-    blocks = Blocks(values, plane.flip(2))
     with torch.inference_mode():
         x = pixels.permute(2, 0, 1)[None].float() / 255.0
         ours, expected = net.latent(pixels, snr_db, flag, values), model.latent(x, snr_db, flag, values)
         torch.testing.assert_close(ours, expected, rtol=1e-4, atol=1e-4)
         assert (ours - net.latent(pixels, snr_db, flag, values.flip(3))).abs().max() > 0.01  # it is told
-        x_hat, features = model.receive(y_rx, plane, flag, *blocks)
+        x_hat, features = model.receive(y_rx, plane, flag, values)
         logit, displacement_px = model.judge(features, x_hat)
-        image, confidence, moved_px = net.decode(y_rx, plane, flag, blocks)
+        image, confidence, moved_px = net.decode(y_rx, plane, flag, values)
     expected = x_hat[0].clamp(0, 1).mul(255).round().permute(1, 2, 0)
     assert expected.std() > 10
     assert (image.float() - expected).abs().max() <= 1

@@ -5,9 +5,15 @@ import pytest
 import torch
 
 from semcast.common.nets import modulation_numpy
-from semcast.common.nets.allocation import MAX_VALUES
-from semcast.common.nets.modulation import analog_symbols, rounded_symbols, undo_analog
-from semcast.common.nets.packing import pack, sent_mask, share_plane, unpack
+from semcast.common.nets.modulation import (
+    CARRIER_AMPLITUDE,
+    analog_symbols,
+    carrier_pattern,
+    rounded_symbols,
+    undo_analog,
+)
+from semcast.common.nets.packing import blocks_arrived, pack, sent_mask, share_plane, unpack
+from semcast.common.phy.allocation import MAX_VALUES
 
 VALUES = torch.tensor([[[[12, 188, 94], [24, 48, 94]]]])
 
@@ -65,3 +71,20 @@ def test_packing_without_torch_is_the_same(way):
     expected = rounded_symbols(pack(analog_symbols(latent, sent), sent), is_qam)[0].numpy()
     ours = modulation_numpy.transmit(latent[0].numpy(), way, VALUES[0, 0].numpy())
     assert (np.abs(ours - expected) > 2e-6).mean() < 0.001
+
+
+def test_blocks_in_two_slots_are_brought_to_one_factor():
+    """A link without noise, whose slots are shrunk differently: every value comes back as large as it was."""
+    latent, sent = blocks(), sent_mask(VALUES, MAX_VALUES)
+    slots = torch.tensor([0.9, 0.5]).view(1, 1, 2, 1).expand(1, 94, 2, 3)
+    symbols = analog_symbols(latent, sent)
+    shrink = unpack(slots, sent)
+    y, snr_db, of_block, scale = blocks_arrived(unpack(pack(symbols, sent) * slots, sent), shrink, sent)
+    # The second block holds values 13 to 200 of the frame, a slot 282.
+    assert float(of_block[0, 0, 0, 0]) == pytest.approx(0.9)
+    assert float(of_block[0, 0, 1, 2]) == pytest.approx(0.5)
+    third = (82 * 0.9 + 12 * 0.5) / 94  # values 201 to 294
+    assert float(of_block[0, 0, 0, 2]) == pytest.approx(third)
+    assert float(snr_db[0, 0, 1, 2]) == pytest.approx(0.0, abs=1e-4)
+    carrier = CARRIER_AMPLITUDE * carrier_pattern(symbols) * sent
+    torch.testing.assert_close((y / of_block + carrier) / scale, symbols, rtol=1e-3, atol=1e-3)

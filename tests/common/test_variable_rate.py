@@ -1,5 +1,7 @@
 """A codec of variable rate: the same slots as any other, filled as the picture asks for."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,12 +9,14 @@ import torch
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
-from semcast.common.codec import LOST_SLOT_SNR_DB
-from semcast.common.nets.allocation import Allocation
-from semcast.common.nets.checkpoint import save_transceiver
+from semcast.common.codec import LOST_SLOT_SNR_DB, ReceivedImage
+from semcast.common.codecs import load_codec
+from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.codec import NeuralCodec
+from semcast.common.nets.detail import allocation_for
 from semcast.common.nets.onnx_encoder import OnnxEncoder
 from semcast.common.nets.transceiver import Sizes, build_3dcsc, build_variable_3dcsc
+from semcast.common.phy.allocation import Allocation
 from semcast.training.klt import start_from_klt
 from semcast.training.onnx_export import export_encoder
 
@@ -78,12 +82,17 @@ def test_pictures_with_flat_parts_come_closer_than_at_a_fixed_rate(weights):
     assert error(variable) < 0.8 * error(fixed)
 
 
-def test_what_it_sends_depends_on_the_allocation_that_travels_with_it(weights):
-    codec = NeuralCodec.load(weights["3dcsc-vr"], modulation="analog")
-    encoded = codec.encode(pictures()[0], 25.0)
+def test_the_picture_comes_back_with_its_allocation_and_no_other(weights):
+    codec, image = NeuralCodec.load(weights["3dcsc-vr"], modulation="analog"), pictures()[0]
+    encoded = codec.encode(image, 25.0)
     levels = Allocation.from_code(encoded.allocation, (8, 12)).levels
     assert levels[:, 7:].min() >= levels[:, :5].max()
     assert levels[:, 7:].mean() > levels[:, :5].mean() + 1.0
+    received = encoded.arrived(encoded.symbols, np.full(8, 30.0, np.float32))
+    other = replace(received, allocation=Allocation(levels[:, ::-1].copy()).code)
+    ours, theirs = (np.mean((codec.decode(r).image.astype(float) - image) ** 2) for r in (received, other))
+    assert ours < 100
+    assert theirs > 5 * ours
     codec.warm_up((32, 48))
 
 
@@ -96,7 +105,7 @@ def test_a_lost_slot_spoils_the_rows_whose_values_it_held(weights):
     symbols = encoded.symbols.copy()
     symbols[3] = 0
     received = encoded.arrived(symbols, snr_db)
-    hit = received.row_snr_db == LOST_SLOT_SNR_DB
+    hit = received.row_snr_db < 24.0
     assert hit[3]
     assert 1 <= hit.sum() <= 3
     errors = np.abs(codec.decode(received).image.astype(float) - image).reshape(8, 16, -1).mean(axis=(1, 2))
@@ -104,13 +113,30 @@ def test_a_lost_slot_spoils_the_rows_whose_values_it_held(weights):
     assert errors[~hit].max() < errors[3]
 
 
-def test_without_a_code_all_blocks_are_taken_to_send_alike(weights):
+@pytest.mark.parametrize("way", ["16qam", "analog"])
+def test_what_is_in_a_lost_slot_is_not_made_louder(weights, way):
+    """Blocks that are partly lost are no further from the original than one grey would be."""
+    codec = NeuralCodec.load(weights["3dcsc-vr"], modulation=way)
+    for image in pictures():
+        encoded = codec.encode(image, 25.0)
+        for lost in range(8):
+            snr_db = np.full(8, 25.0, np.float32)
+            snr_db[lost] = LOST_SLOT_SNR_DB
+            symbols = encoded.symbols.copy()
+            symbols[lost] = 0
+            decoded = codec.decode(encoded.arrived(symbols, snr_db)).image.astype(float)
+            blocks = np.square(decoded - image).reshape(8, 16, 12, 16, 3).mean(axis=(1, 3, 4))
+            grey = np.square(128.0 - image).reshape(8, 16, 12, 16, 3).mean(axis=(1, 3, 4))
+            assert (blocks < 2.0 * grey + 400.0).all()
+
+
+def test_a_frame_of_which_nothing_arrived_needs_no_code(weights):
     codec = NeuralCodec.load(weights["3dcsc-vr"])
-    encoded = codec.encode(pictures()[0], 10.0)
-    received = encoded.arrived(encoded.symbols, np.full(8, 10.0, np.float32))
-    bare = type(received)(received.shape_hw, received.symbols, received.effective_snr_db, "16qam")
-    assert codec.decode(bare).image.shape == (128, 192, 3)
-    np.testing.assert_array_equal(bare.row_snr_db, bare.effective_snr_db)
+    nothing = ReceivedImage(
+        (32, 32), np.zeros((2, 94), np.complex64), np.full(2, LOST_SLOT_SNR_DB, np.float32), "16qam"
+    )
+    assert codec.decode(nothing).outage
+    np.testing.assert_array_equal(nothing.row_snr_db, nothing.effective_snr_db)
 
 
 def test_codes_that_do_not_fit_are_refused(weights):
@@ -119,11 +145,12 @@ def test_codes_that_do_not_fit_are_refused(weights):
     received = encoded.arrived(encoded.symbols, np.full(8, 10.0, np.float32))
     with pytest.raises(ValueError, match="allocation must be empty for a codec of fixed rate"):
         fixed.decode(received)
-    broken = type(received)(
-        received.shape_hw, received.symbols, received.effective_snr_db, "16qam", allocation=b"\xff"
-    )
-    with pytest.raises(ValueError, match="allocation must be the code of 8x12 blocks"):
-        variable.decode(broken)
+    for code in (b"\xff", b""):
+        with pytest.raises(ValueError, match="allocation must be the code of 8x12 blocks"):
+            variable.decode(replace(received, allocation=code))
+    conventional = load_codec("jpeg-ldpc")
+    with pytest.raises(ValueError, match="allocation must be empty for a codec of fixed rate"):
+        conventional.decode(received)
 
 
 @pytest.mark.parametrize("way", ["16qam", "analog"])
@@ -131,10 +158,8 @@ def test_the_exported_encoder_sends_the_same(weights, tmp_path, way):
     path = export_encoder(weights["3dcsc-vr"], tmp_path / "vr.onnx")
     image = pictures()[1]
     ours = OnnxEncoder(path, way, 1).encode(image, 8.0)
-    codec = NeuralCodec.load(weights["3dcsc-vr"], modulation=way)
-    codec._net = None  # its half precision would round other values to other levels
-    model = codec._model.float()
-    allocation = Allocation.of_image(image)
+    model = load_transceiver(weights["3dcsc-vr"])[0]  # in full precision
+    allocation = allocation_for(image)
     assert ours.allocation == allocation.code
     is_qam = torch.tensor([float(way == "16qam")])
     values = torch.from_numpy(allocation.values)[None, None]

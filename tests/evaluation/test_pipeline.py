@@ -56,7 +56,7 @@ def test_without_codec_the_originals_come_with_full_confidence(sequence):
     (frame,) = run_frames(sequence, [5], None, None)
     np.testing.assert_array_equal(frame.decoded.image, sequence.image(5))
     assert frame.decoded.confidence.min() == 1.0
-    assert frame.effective_snr_db is None
+    assert frame.row_snr_db is None
     with pytest.raises(ValueError, match="both or neither"):
         list(run_frames(sequence, [5], None, Link(ChannelSettings(), 0)))
 

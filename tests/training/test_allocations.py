@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from semcast.common.nets.allocation import LEVELS
-from semcast.training.allocations import AllocationSettings, draw_values
+from semcast.common.phy.allocation import LEVELS
+from semcast.training.allocations import AllocationDraw, AllocationSettings, draw_allocation
 
 
 def crops():
@@ -14,7 +14,7 @@ def crops():
 
 def draw(seed=0, **changes):
     generator = torch.Generator().manual_seed(seed)
-    return draw_values(crops(), AllocationSettings(**changes), generator)
+    return draw_allocation(crops(), AllocationSettings(**changes), generator).values
 
 
 def test_the_blocks_of_a_batch_share_one_budget():
@@ -28,6 +28,23 @@ def test_the_blocks_of_a_batch_share_one_budget():
 def test_without_an_exponent_all_blocks_are_alike():
     values = draw(exponent_min=0.0, exponent_max=0.0, block_sd=0.0, budget_sd=0.0, budget=94.0)
     assert (values == 94).all()
+
+
+def test_what_is_behind_the_cut_of_a_row_is_in_the_next_slot():
+    values = torch.tensor([[[[12, 24, 12]]]])
+    behind = AllocationDraw(values, torch.tensor([[[[20]]]])).in_next_slot()
+    assert behind.shape == (1, 282, 1, 3)
+    assert not behind[0, :12, 0, 0].any()
+    assert behind[0, :24, 0, 1].tolist() == [False] * 8 + [True] * 16
+    assert behind[0, :12, 0, 2].all()
+
+
+def test_cuts_are_anywhere_in_a_row_or_behind_it():
+    generator = torch.Generator().manual_seed(0)
+    draws = [draw_allocation(crops(), AllocationSettings(), generator) for _ in range(60)]
+    shares = torch.cat([(d.num_before / d.values.sum(dim=3, keepdim=True)).flatten() for d in draws])
+    assert shares.min() < 0.05
+    assert float((shares >= 1.0).float().mean()) == pytest.approx(0.35, abs=0.08)
 
 
 def test_draws_are_repeatable_and_differ_from_seed_to_seed():

@@ -1,9 +1,11 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from semcast.common.codec import LOST_SLOT_SNR_DB
+from semcast.common.nets.rounding import rounded_snr_db
 from semcast.training.channel import ChannelSettings, LinkDraw, draw_links, through_link
 
 
@@ -67,3 +69,41 @@ def test_shares_and_ranges_are_checked():
     for values in ({"snr_min_db": math.nan}, {"snr_min_db": -500.0}, {"feedback_sd_db": -1.0}):
         with pytest.raises(ValueError, match=next(iter(values)) + " must be in"):
             ChannelSettings(**values)
+
+
+def test_links_of_rounded_values_as_links_of_analog_ones():
+    draw = LinkDraw(
+        snr_db=torch.tensor([10.0, 10.0]),
+        expected_snr_db=torch.tensor([9.0, 9.0]),
+        is_qam=torch.tensor([1.0, 0.0]),
+        gain=torch.tensor([1.0, 0.25, 0.0]).view(1, 1, 3, 1).repeat(2, 1, 1, 1),
+        estimate_error_db=torch.full((2, 1, 3, 1), 0.5),
+    )
+    analog = draw.as_analog()
+    assert not analog.is_qam.any()
+    assert not analog.snr_db.any()
+    slots_db = np.array([10.0, 10.0 + 10.0 * np.log10(0.25)])
+    for k, arriving_db in enumerate((rounded_snr_db(slots_db), slots_db)):
+        gains_db = 10.0 * torch.log10(analog.gain[k, 0, :2, 0])
+        np.testing.assert_allclose(gains_db.numpy(), arriving_db, atol=1e-4)
+        assert analog.gain[k, 0, 2, 0] == 0.0
+    # What the receiver believes is wrong by as much as it would be behind the rounding.
+    believed_db = 10.0 * torch.log10(analog.gain) + analog.estimate_error_db
+    np.testing.assert_allclose(believed_db[0, 0, :2, 0], rounded_snr_db(slots_db + 0.5), atol=1e-4)
+    np.testing.assert_allclose(believed_db[1, 0, :2, 0], slots_db + 0.5, atol=1e-4)
+    assert analog.expected_snr_db[0] == pytest.approx(float(rounded_snr_db(9.0)), abs=1e-4)
+    assert analog.expected_snr_db[1] == 9.0
+
+
+def test_values_in_the_next_slot_fade_as_it_does():
+    generator = torch.Generator().manual_seed(0)
+    draw = draw_links(ChannelSettings(share_faded=1.0, share_lossy=0.0), 2, 3, generator)
+    behind = torch.zeros(2, 5, 3, 4, dtype=torch.bool)
+    behind[:, 3:, 1] = True
+    links = draw.per_value(behind)
+    assert links.gain.shape == (2, 5, 3, 4)
+    torch.testing.assert_close(links.gain[:, 0, :, 0], draw.gain[:, 0, :, 0])
+    torch.testing.assert_close(links.gain[:, 3, 1, 0], draw.gain[:, 0, 2, 0])
+    y_rx, snr_db = through_link(torch.ones(2, 5, 3, 4), links, torch.zeros(2, 5, 3, 4))
+    assert snr_db.shape == y_rx.shape
+    torch.testing.assert_close(y_rx, 10 ** (snr_db / 10) / (1 + 10 ** (snr_db / 10)))
