@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from semcast.common.nets.detail import DETAIL_FLOOR, demand_of, detail_of
+from semcast.common.nets.detail import demand_of, detail_of
 from semcast.common.phy.allocation import LEVELS, MAX_VALUES, levels_for
 from semcast.common.phy.slots import LATENT_CHANNELS
 from semcast.training.channel import to_device
@@ -38,7 +38,7 @@ class AllocationSettings:
     exponent_min: float = field(default=0.3, metadata={"help": "smallest exponent of a block's detail"})
     exponent_max: float = field(default=0.75, metadata={"help": "largest exponent of a block's detail"})
     floor: float = field(
-        default=DETAIL_FLOOR, metadata={"help": "detail added to every block's, in squared grey levels"}
+        default=8.0, metadata={"help": "detail added to every block's, in squared grey levels"}
     )
     block_sd: float = field(
         default=0.35, metadata={"help": "scatter of single blocks about the rule, log2 of values"}

@@ -8,7 +8,7 @@ from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.slots import BLOCK_PX
 
 #: A block asks for values in proportion to its detail plus the second number, to the power of the first.
-EXPONENT, DETAIL_FLOOR = 0.55, 8.0
+EXPONENT, DETAIL_FLOOR = 0.65, 16.0
 
 
 def detail_of(image: NDArray[np.uint8]) -> NDArray[np.float32]:
