@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from semcast.common.errors import SemcastError
 
 _MARKERS = "os^Dv<>P*Xh"
-#: Matplotlib's own ten and black: as many as a pair benchmark has estimators.
+#: Matplotlib's own ten and black: as many as a pair benchmark has estimators, or Kodak codecs.
 _COLOURS = (*(f"C{k}" for k in range(10)), "black")
 
 
@@ -93,7 +93,8 @@ def plot_against_snr(
         if len(values) != len(snr_db):
             raise ValueError(f"curve {name!r} must have {len(snr_db)} values, got {len(values)}")
         y = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
-        axes.plot(snr_db, y, marker=_MARKERS[k % len(_MARKERS)], markersize=4, label=name)
+        colour, marker = _COLOURS[k % len(_COLOURS)], _MARKERS[k % len(_MARKERS)]
+        axes.plot(snr_db, y, color=colour, marker=marker, markersize=4, label=name)
     axes.set(xlabel="SNR (dB)", ylabel=y_label, title=title)
     if from_zero:
         axes.set_ylim(bottom=0.0)
