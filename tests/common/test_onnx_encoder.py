@@ -149,7 +149,7 @@ def test_bad_files_are_one_clear_error(exported, tmp_path):
     other = onnx.load(str(exported))
     onnx.helper.set_model_props(other, {"semcast_format": "99"})
     onnx.save(other, str(tmp_path / "other.onnx"))
-    with pytest.raises(CheckpointError, match="must have format 2, got 99"):
+    with pytest.raises(CheckpointError, match="must have format 2 or 3, got 99"):
         OnnxEncoder(tmp_path / "other.onnx")
     with pytest.raises(ValueError, match="num_threads must be >= 1, got 0"):
         OnnxEncoder(exported, num_threads=0)
