@@ -7,8 +7,13 @@ from numpy.typing import NDArray
 from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.slots import BLOCK_PX
 
-#: A block asks for values in proportion to its detail plus the second number, to the power of the first.
-EXPONENT, DETAIL_FLOOR = 0.65, 16.0
+#: A block asks for values in proportion to a power of its detail plus a floor.
+EXPONENT = 0.65
+#: The floor, in squared grey levels; of smooth pictures no more than this share of their mean detail, or all
+#: of their blocks would ask for the same.
+DETAIL_FLOOR, _FLOOR_SHARE = 16.0, 0.3
+#: The floor of a picture of one grey.
+_LEAST_FLOOR = 0.25
 
 
 def detail_of(image: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -36,4 +41,6 @@ def demand_of(
 
 def allocation_for(image: NDArray[np.uint8]) -> Allocation:
     """Return what each block of an image sends: ``(H, W, 3)`` uint8 RGB, sides multiples of 16."""
-    return Allocation.of_demand(demand_of(detail_of(image)))
+    detail = detail_of(image)
+    floor = min(DETAIL_FLOOR, max(_LEAST_FLOOR, _FLOOR_SHARE * float(detail.mean())))
+    return Allocation.of_demand(demand_of(detail, floor=floor))

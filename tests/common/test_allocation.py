@@ -126,3 +126,11 @@ def test_a_row_most_of_which_is_lost_counts_as_lost():
     rows = allocation.row_snr_db(np.array([-20.0, 10.0, 10.0], np.float32))
     assert rows[0] == pytest.approx(-20.0, abs=0.01)
     np.testing.assert_allclose(rows[1:], 10.0, atol=0.01)
+
+
+def test_a_smooth_picture_is_divided_like_a_sharp_one():
+    """With a tenth of the contrast, detail is far below the floor for sharp pictures."""
+    faint = (128 + (half_busy().astype(float) - 128) / 40).astype(np.uint8)
+    values = allocation_for(faint).values
+    assert values[:, :5].min() > values[:, 6:].max()
+    assert values[:, :5].mean() > 1.5 * values[:, 6:].mean()
