@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import number, table, with_part
 from semcast.evaluation.pair_summary import RIVAL, pair_summary
 from semcast.evaluation.plots import variant_name
@@ -328,6 +329,7 @@ SECTIONS: dict[str, tuple[str, Tables]] = {
     "readout": ("Readout times found", _readout),
     "lens": ("Lenses found", _lens),
     "lorry": ("Behind a lorry", _trajectory),
+    "variable": ("Paths with a variable rate, and with a fixed one", _trajectory),
     "focal": ("Paths with a lens that was guessed, and found", _trajectory),
     "pairs": ("Relative pose of frame pairs", _pairs),
     "confidence": ("What the confidence maps are worth", _confidence),
@@ -365,13 +367,13 @@ def results_page(folder: Path = RESULTS) -> str:
 def readme_table(folder: Path = RESULTS) -> str:
     """Return the README's short table: path errors in the default mode, recordings by links.
 
-    Recordings that were sent over most links come first. Those with a gap are not in it.
+    Recordings that were sent over most links come first. Those with a gap or another codec are not in it.
     """
     errors: dict[str, dict[str, str]] = {}
     for file in sorted(folder.glob("trajectory_*.json")):
         report = json.loads(file.read_text(encoding="utf-8"))
         channel = report["settings"]["link"]["channel"]
-        if report["settings"].get("gap_s"):
+        if report["settings"].get("gap_s") or report["settings"]["codec"] not in ("none", DEFAULT_CODEC):
             continue
         for cell in report["cells"]:
             link = None if cell["snr_db"] is None else (channel, cell["snr_db"])
