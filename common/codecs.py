@@ -15,7 +15,7 @@ Runtime = Literal["auto", "torch", "onnx"]
 
 _WEIGHTS_SUFFIXES = (".safetensors", ".onnx")
 #: Learned transceivers in the order they are listed; their networks are in ``semcast.common.nets.registry``.
-LEARNED_CODECS = ("3dcsc", "3dcsc-lite", "3dcsc-vr", "cnn", "vit", "mae")
+LEARNED_CODECS = ("3dcsc", "3dcsc-lite", "3dcsc-vr", "3dcsc-lite-vr", "cnn", "vit", "mae")
 
 
 def _shipped_weights() -> list[str]:

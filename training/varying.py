@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from semcast.common.errors import ConfigError
+from semcast.common.nets.blocks import Stage
 from semcast.common.nets.decoder import Decoder
 from semcast.common.nets.detail import demand_of, detail_of
 from semcast.common.nets.encoder import Encoder
@@ -91,13 +92,14 @@ def vary(fixed: Transceiver, variable: Transceiver, seen: Observations) -> None:
 
     Args:
         fixed: Trained.
-        variable: Of the same sizes.
+        variable: Of the same sizes, or with fewer units: the last ones are taken, and it computes nearly the
+            same.
         seen: Training images through ``fixed``.
 
     Raises:
-        ConfigError: The networks are not of the 3dcsc kind and the same sizes.
+        ConfigError: The networks are not of the 3dcsc kind and the same widths.
     """
-    theirs, ours = fixed.state_dict(), variable.state_dict()
+    theirs, ours = _last_units(fixed, variable), variable.state_dict()
     # What differs are the layers that hold values of the latent, and the one that is told how many are sent.
     own = {name for name in ours if name not in theirs or theirs[name].shape != ours[name].shape}
     layers = {name.rpartition(".")[0] for name in own}
@@ -115,7 +117,7 @@ def vary(fixed: Transceiver, variable: Transceiver, seen: Observations) -> None:
     }
     if layers != expected or not theirs.keys() <= ours.keys():
         raise ConfigError(
-            "grow_from must hold a 3dcsc network of fixed rate and the same sizes, got one in which "
+            "grow_from must hold a 3dcsc network of fixed rate and the same widths, got one in which "
             f"{sorted(layers ^ expected)[0] if layers ^ expected else 'a layer'} differs"
         )
     for name, weight in theirs.items():
@@ -134,6 +136,22 @@ def vary(fixed: Transceiver, variable: Transceiver, seen: Observations) -> None:
     assert isinstance(start, nn.Conv2d)
     _set_received(start, fixed.confidence.start.weight, order)  # type: ignore[arg-type,union-attr]
     _scale_latent(variable.encoder, variable.decoder, start, seen.scale())
+
+
+def _last_units(fixed: Transceiver, variable: Transceiver) -> dict[str, Tensor]:
+    """Return the weights of a network without the first units of stages that have fewer in the other one."""
+    state, others = fixed.state_dict(), dict(variable.named_modules())
+    for name, stage in fixed.named_modules():
+        other = others.get(name)
+        if not (isinstance(stage, Stage) and isinstance(other, Stage)):
+            continue
+        num_dropped = max(0, len(stage.units) - len(other.units))
+        for key in [key for key in state if key.startswith(f"{name}.units.")]:
+            place, _, rest = key.removeprefix(f"{name}.units.").partition(".")
+            weight = state.pop(key)
+            if int(place) >= num_dropped:
+                state[f"{name}.units.{int(place) - num_dropped}.{rest}"] = weight
+    return state
 
 
 def _vary_encoder(old: Encoder, new: Encoder, order: Tensor, added: Tensor) -> None:

@@ -114,6 +114,23 @@ def test_networks_of_other_sizes_are_refused(pair):
     fixed, _, seen = pair
     other = build_variable_3dcsc(Sizes((8, 12, 20), (1, 1, 1), (1, 1, 1), 8))
     with pytest.raises(
-        ConfigError, match="grow_from must hold a 3dcsc network of fixed rate and the same sizes"
+        ConfigError, match="grow_from must hold a 3dcsc network of fixed rate and the same widths"
     ):
         vary(fixed, other, seen)
+
+
+def test_a_network_with_fewer_units_takes_the_last_ones():
+    fixed = build_3dcsc(Sizes((8, 12, 16), (1, 1, 3), (1, 1, 1), 8)).eval()
+    with torch.no_grad():
+        for weight in fixed.parameters():
+            weight.add_(0.05 * torch.randn_like(weight))
+        for weight in fixed.encoder.stage16.units[0].parameters():
+            weight.zero_()  # it adds nothing: without it the network computes the same
+    seen = seen_by(fixed)
+    variable = build_variable_3dcsc(Sizes((8, 12, 16), (1, 1, 2), (1, 1, 1), 8)).eval()
+    vary(fixed, variable, seen)
+    with torch.no_grad():
+        x = images()
+        theirs, ours = through(fixed, x)[0], through(variable, x, FIXED)[0]
+    ordered = seen.scale() * torch.einsum("ij,bihw->bjhw", seen.order(), theirs)
+    torch.testing.assert_close(ours[:, :94], ordered, atol=1e-4, rtol=1e-4)
