@@ -30,8 +30,8 @@ class Architecture:
 def _entries() -> tuple[Architecture, ...]:
     main = Sizes((96, 160, 192), (1, 2, 3), (1, 2, 3), 48)
     lite = Sizes((64, 96, 160), (1, 1, 2), (1, 2, 3), 32)
-    # With its longer latent the whole of the main network would not fit into the 16 MB of a weights file; of its
-    # units that of the encoder at 1/16 did least.
+    # With its longer latent the whole of the main network would not fit into the 16 MB of a weights file; of
+    # its units the first of the encoder at 1/16 did least.
     main_variable = Sizes((96, 160, 192), (1, 2, 2), (1, 2, 3), 48)
     return (
         Architecture("3dcsc", main, build_3dcsc),
