@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.image import psnr_db
+from semcast.common.image_header import states_at_most
 
 ImageFormat = Literal["jpeg", "webp", "avif"]
 #: Below this quality a smaller image at higher quality may look better, so both are tried.
@@ -46,8 +47,11 @@ def compress(image_bgr: NDArray[np.uint8], image_format: ImageFormat, quality: i
 
 
 def decompress(data: bytes, shape_hw: tuple[int, int]) -> NDArray[np.uint8] | None:
-    """Return the ``(H, W, 3)`` RGB image of a file, scaled to ``shape_hw``; None when it is no image."""
-    if not data:
+    """Return the ``(H, W, 3)`` RGB image of a file, scaled up to ``shape_hw``.
+
+    None when it is no image or states that it is larger.
+    """
+    if not states_at_most(data, shape_hw):
         return None
     image_bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
     if image_bgr is None:

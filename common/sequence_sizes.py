@@ -4,12 +4,10 @@ import struct
 from pathlib import Path
 from typing import BinaryIO
 
-_PNG_START = b"\x89PNG\r\n\x1a\n"
+from semcast.common.image_header import JPEG_START, PNG_START, jpeg_size_wh, png_size_wh
+
 _PNG_END = b"IEND\xaeB`\x82"
-_JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
-#: Start-of-frame markers are C0 to CF, but for these: Huffman tables, a reserved one, arithmetic coding.
-_NO_FRAME_MARKERS = (0xC4, 0xC8, 0xCC)
 
 
 def size_in_header_wh(path: Path) -> tuple[int, int] | None:
@@ -20,11 +18,11 @@ def size_in_header_wh(path: Path) -> tuple[int, int] | None:
     """
     try:
         with path.open("rb") as file:
-            start = file.read(len(_PNG_START))
-            if start == _PNG_START and _ends_with(file, _PNG_END):
-                return _png_size_wh(file)
-            if start.startswith(_JPEG_START) and _ends_with(file, _JPEG_END):
-                return _jpeg_size_wh(file)
+            start = file.read(len(PNG_START))
+            if start == PNG_START and _ends_with(file, _PNG_END):
+                return png_size_wh(file)
+            if start.startswith(JPEG_START) and _ends_with(file, _JPEG_END):
+                return jpeg_size_wh(file)
     except (OSError, struct.error):
         return None
     return None
@@ -33,22 +31,3 @@ def size_in_header_wh(path: Path) -> tuple[int, int] | None:
 def _ends_with(file: BinaryIO, end: bytes) -> bool:
     file.seek(-len(end), 2)
     return file.read() == end
-
-
-def _png_size_wh(file: BinaryIO) -> tuple[int, int]:
-    # The header chunk comes first: its length, "IHDR", width and height.
-    file.seek(len(_PNG_START) + 8)
-    width, height = struct.unpack(">II", file.read(8))
-    return width, height
-
-
-def _jpeg_size_wh(file: BinaryIO) -> tuple[int, int] | None:
-    file.seek(len(_JPEG_START))
-    while True:
-        mark, marker, length = struct.unpack(">BBH", file.read(4))
-        if mark != 0xFF:
-            return None
-        if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME_MARKERS:
-            _, height, width = struct.unpack(">BHH", file.read(5))
-            return width, height
-        file.seek(length - 2, 1)

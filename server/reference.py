@@ -13,6 +13,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
+from semcast.common.image_header import stated_size_wh
 from semcast.common.messages import CameraInfo, SourceImage
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence, retimed
@@ -126,8 +127,11 @@ def _recorded_images(reader: RecordingReader, camera: CameraInfo) -> Iterator[So
 
 
 def _pixels(image: SourceImage) -> NDArray[np.uint8]:
+    if stated_size_wh(image.data) != image.image_hw[::-1]:
+        height, width = image.image_hw
+        raise ValueError(f"the original of frame {image.frame_id} is no image of {width}x{height}")
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    bgr = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags) if image.data else None
+    bgr = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags)
     if bgr is None:
         raise ValueError(f"the original of frame {image.frame_id} is no {image.image_format} image")
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
