@@ -12,6 +12,7 @@ import numpy as np
 from semcast.channel.delay import DelayLine
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.link import Link
+from semcast.channel.registry import build_channel
 from semcast.channel.settings import ChannelSettings
 from semcast.common.config import build_settings, settings_to_dict
 from semcast.common.errors import ConfigError, SemcastError, TransportError
@@ -51,6 +52,7 @@ class Emulator:
         self._metrics = metrics
         self._link = Link(settings.link, settings.seed)
         self._link_lock = threading.Lock()
+        self._control_lock = threading.Lock()  # one change after the other, while frames pass
         self._box: Mailbox[SymbolFrame] = Mailbox(1, "newest")
         self._epoch = 0
         self._carried_seq = -1
@@ -170,11 +172,13 @@ class Emulator:
     def _control(self, request: ControlRequest) -> dict[str, Any]:
         if request.op not in ("get", "set"):
             raise ConfigError(f"op must be get or set, got {request.op!r}")
-        with self._link_lock:
+        with self._control_lock:
             if request.op == "set":
                 current = settings_to_dict(self._link.settings)
                 changed = build_settings(ChannelSettings, {**current, **request.settings})
-                self._link.update(changed)
+                model = build_channel(changed, self._settings.seed)
+                with self._link_lock:
+                    self._link.switch(changed, model)
                 logger.info("channel set: %s", ", ".join(f"{k}={v}" for k, v in request.settings.items()))
                 warn_of_idle(changed, request.settings)
             in_force = settings_to_dict(self._link.settings)

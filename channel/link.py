@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from semcast.channel.awgn import complex_noise
 from semcast.channel.power import mean_power, normalise_power
-from semcast.channel.registry import build_channel
+from semcast.channel.registry import ChannelModel, build_channel
 from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import EncodedImage, ReceivedImage
 from semcast.common.phy.equaliser import ChannelKnowledge, Equalised, equalise
@@ -69,11 +69,11 @@ class Link:
         Raises:
             ConfigError: A trace can't be read; the old settings stay in force.
         """
-        if settings.channel == self._settings.channel:
-            self._model.update(settings)
-        else:
-            self._model = build_channel(settings, self._seed)
-        self._settings = settings
+        self.switch(settings, build_channel(settings, self._seed))
+
+    def switch(self, settings: ChannelSettings, model: ChannelModel) -> None:
+        """Change to settings and the channel that was built of them: reading a trace may take long."""
+        self._settings, self._model = settings, model
 
     def restart(self) -> None:
         """Let time begin anew with the next frame, and with it fading and SNR traces."""

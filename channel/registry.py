@@ -44,7 +44,7 @@ class SlotDraw:
 
 
 class ChannelModel(Protocol):
-    """One kind of channel."""
+    """One kind of channel with its settings; it has no state but those and a seed."""
 
     def draw(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> SlotDraw:
         """Draw one frame.
@@ -55,13 +55,6 @@ class ChannelModel(Protocol):
             rng: Randomness of this frame alone.
         """
 
-    def update(self, settings: ChannelSettings) -> None:
-        """Take new settings from the next frame on.
-
-        Raises:
-            ConfigError: The settings name another channel or a trace that can't be read.
-        """
-
 
 class _Model:
     """AWGN; the other models change parts of its draw."""
@@ -69,13 +62,6 @@ class _Model:
     def __init__(self, settings: ChannelSettings, seed: int) -> None:
         self._settings = settings
         self._seed = seed
-
-    def update(self, settings: ChannelSettings) -> None:
-        if settings.channel != self._settings.channel:
-            raise ConfigError(
-                f"channel must stay {self._settings.channel!r} in an update, got {settings.channel!r}"
-            )
-        self._settings = settings
 
     def _snr_db(self, elapsed_s: float) -> float:
         del elapsed_s
@@ -145,11 +131,6 @@ class _Trace(_Model):
         if settings.trace == "file" and settings.trace_file is not None:
             return read_trace_csv(settings.trace_file)
         return ConstantTrace(settings.snr_db)
-
-    def update(self, settings: ChannelSettings) -> None:
-        trace = self._build(settings)
-        super().update(settings)
-        self._trace = trace
 
     def _snr_db(self, elapsed_s: float) -> float:
         return self._trace.snr_db(elapsed_s)

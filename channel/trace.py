@@ -17,6 +17,8 @@ SNR_RANGE_DB = (-5.0, 30.0)
 WALK_INTERVAL_S = 0.5
 #: A walk longer than this repeats its last value (4.5 hours).
 _MAX_WALK_STEPS = 1 << 15
+#: Largest file of a trace: half a million lines.
+_MAX_BYTES = 16 << 20
 
 
 class SnrTrace(Protocol):
@@ -100,12 +102,17 @@ def read_trace_csv(path: Path) -> TableTrace:
     values_db: list[float] = []
     low, high = SNR_RANGE_DB
     try:
+        if path.exists() and not path.is_file():  # reading a pipe or device might never end
+            raise ConfigError(f"{path} must be a file with an SNR trace, got something else")
+        if path.stat().st_size > _MAX_BYTES:
+            raise ConfigError(f"{path} must be an SNR trace of at most {_MAX_BYTES >> 20} MB, got more")
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = csv.DictReader(file)
             names = [name.strip() for name in rows.fieldnames or []]
             rows.fieldnames = names
             if not {"t_s", "snr_db"} <= set(names):
-                raise ConfigError(f"{path} must have the columns t_s,snr_db, got {','.join(names) or 'none'}")
+                # Not what it has instead: the message may go to another machine, the file be any file.
+                raise ConfigError(f"{path} must name the columns t_s,snr_db in its first line")
             for row in rows:
                 where = f"{path} line {rows.line_num}"
                 try:

@@ -156,6 +156,19 @@ def test_settings_change_while_it_runs_and_bad_ones_are_refused(ends, make):
     assert e.reports[-1].channel == "rayleigh"
 
 
+def test_no_trace_file_stops_the_stream_or_tells_what_is_in_it(ends, make, tmp_path):
+    e = ends()
+    e.pass_one(make(0))
+    secret, pipe = tmp_path / "secret", tmp_path / "pipe"
+    secret.write_text("password=1234\n")
+    os.mkfifo(pipe)
+    for file, message in ((secret, "must name the columns t_s,snr_db"), (pipe, "must be a file with an SNR")):
+        with pytest.raises(ConfigError, match=message) as refused:
+            set_channel(e.network, "a", {"channel": "trace", "trace": "file", "trace_file": str(file)})
+        assert "1234" not in str(refused.value)
+    e.pass_one(make(1))
+
+
 def test_a_trace_file_whose_name_is_no_text_does_not_silence_the_channel(ends, tmp_path):
     file = tmp_path / os.fsdecode(b"walk\xff.csv")
     file.write_text("t_s,snr_db\n0,7\n")

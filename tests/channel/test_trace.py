@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 
@@ -53,8 +55,8 @@ def test_a_file_is_read_and_interpolated(tmp_path, encoding):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("time,snr\n0,1\n", "must have the columns t_s,snr_db, got time,snr"),
-        ("", "must have the columns t_s,snr_db, got none"),
+        ("time,snr\n0,1\n", "must name the columns t_s,snr_db in its first line$"),
+        ("", "must name the columns t_s,snr_db in its first line$"),
         ("t_s,snr_db\n", "holds no rows"),
         ("t_s,snr_db\n0,ten\n", r"line 2: t_s and snr_db must be numbers, got '0', 'ten'"),
         ("t_s,snr_db\n0\n", r"line 2: t_s and snr_db must be numbers, got '0', None"),
@@ -84,3 +86,16 @@ def test_bad_tables_are_named():
         TableTrace([0, 1], [1])
     with pytest.raises(ValueError, match="times of a trace must increase"):
         TableTrace([0, 0], [1, 2])
+
+
+def test_what_is_no_file_of_fair_size_is_not_read(tmp_path, monkeypatch):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for path in (pipe, tmp_path):
+        with pytest.raises(ConfigError, match=f"{path} must be a file with an SNR trace"):
+            read_trace_csv(path)
+    long = tmp_path / "long.csv"
+    with long.open("wb") as file:
+        file.truncate((16 << 20) + 1)
+    with pytest.raises(ConfigError, match="must be an SNR trace of at most 16 MB, got more"):
+        read_trace_csv(long)
