@@ -83,7 +83,7 @@ class _Sending:
         follows = settings.follow_server and not self.lossless
         self._pace = PaceControl(self.agent_epoch, source.rate_hz) if follows else None
         self._settings = settings
-        self._last_seq = -1
+        self._last_seq = self._last_frame_id = -1
         self._rate = RateControl(settings.rate, source.intrinsics.shape_hw)
         self._encoder = FrameEncoder(codec, self.agent_epoch, self.lossless)
         agent_id = settings.agent_id
@@ -105,6 +105,12 @@ class _Sending:
             report = unpack(payload, LinkReport)
         except WireError as err:
             self.refuse(err)
+            return
+        if report.agent_epoch == self.agent_epoch and report.frame_id > self._last_frame_id:
+            # Believed, it would be the newest for good.
+            self.refuse(
+                WireError("range", f"a report must be of a frame that was sent, got {report.frame_id}")
+            )
             return
         self.feedback.update(report)
         if self._pace is not None:
@@ -130,6 +136,7 @@ class _Sending:
 
     def send(self, message: SymbolFrame) -> None:
         """Publish a frame, which is counted and timed once however often it is sent."""
+        self._last_frame_id = max(self._last_frame_id, message.frame_id)  # it may be reported on at once
         with self.metrics.stage("send"):
             self._symbols.put(pack(message))
         if message.seq <= self._last_seq:

@@ -9,6 +9,10 @@ from semcast.common.messages import SymbolFrame
 _SILENCE_NS = 3_000_000_000
 _OFFSET_WINDOW_NS = 10_000_000_000
 _REMEMBERED = 256
+#: A live agent sends fewer frames a second, and no more between two that arrive without a break.
+_MAX_RATE_HZ, _MAX_GAP = 1000.0, 1000
+#: Frames in a row whose numbers rise, and follow on nothing, before they are taken for the stream.
+_BELIEVED = 3
 
 
 class CaptureAge:
@@ -44,7 +48,8 @@ class Arrivals:
 
     Live: the newest frame seen sets the pace. Reasons of drops: ``duplicate``, ``stale`` (older than one that
     came before it), ``epoch`` (of an agent that was restarted since), ``missing`` (never arrived: seen by the
-    gap in ``seq``; taken back if the frame turns up late).
+    gap in ``seq``; taken back if the frame turns up late), ``ahead`` (numbered as no agent can have got to).
+    When nothing else comes for three seconds, the numbering of what is refused is the one that holds.
 
     Lossless: only the frame that follows the last one is taken. Reasons: ``duplicate``, ``epoch``, ``gap``
     (one before it is missing; the agent will send both again).
@@ -66,6 +71,8 @@ class Arrivals:
         self._lossless = lossless
         self._drop = drop
         self._last_ns = 0
+        self._taken_ns = 0
+        self._odd_in_order, self._odd_seq = 0, 0
         self._recent: deque[int] = deque()
         self._forgotten_seq = 0  # the newest one that may have come without being remembered
         self._done_early: set[int] = set()
@@ -91,20 +98,40 @@ class Arrivals:
         elif frame.seq in self._recent:
             self._drop("duplicate", 1)
             return False
-        elif frame.seq < self.arrived_seq:
-            # It was counted as missing when a later one came, unless that was before this receiver's time, or
-            # it came and is no longer remembered.
-            if frame.seq > self._forgotten_seq:
-                self._drop("missing", -1)
-            self._remember(frame.seq)
-            self._drop("stale", 1)
-            return False
+        elif self._is_odd(frame, arrival_ns):
+            if self._odd_in_order < _BELIEVED or arrival_ns - self._taken_ns <= _SILENCE_NS:
+                self._refuse(frame)
+                return False
+            # One message with a number out of nowhere must not shut out all others for good.
+            self._start(frame)
         else:
             self._drop("missing", frame.seq - self.arrived_seq)
+        self._odd_in_order = 0
         self.arrived_seq = frame.seq + 1
+        self._taken_ns = arrival_ns
         self._remember(frame.seq)
         self._age.arrived(frame.t_capture_ns, arrival_ns)
         return True
+
+    def _is_odd(self, frame: SymbolFrame, arrival_ns: int) -> bool:
+        """Tell whether a live frame's number is not one that can follow; count those that rise."""
+        since_s = (arrival_ns - self._taken_ns) * 1e-9
+        if 0 <= frame.seq - self.arrived_seq <= _MAX_GAP + since_s * _MAX_RATE_HZ:
+            return False
+        self._odd_in_order = self._odd_in_order + 1 if frame.seq > self._odd_seq else 1
+        self._odd_seq = frame.seq
+        return True
+
+    def _refuse(self, frame: SymbolFrame) -> None:
+        if frame.seq > self.arrived_seq:
+            self._drop("ahead", 1)
+            return
+        # It was counted as missing when a later one came, unless that was before this receiver's time, or it
+        # came and is no longer remembered.
+        if frame.seq > self._forgotten_seq:
+            self._drop("missing", -1)
+        self._remember(frame.seq)
+        self._drop("stale", 1)
 
     def _remember(self, seq: int) -> None:
         if len(self._recent) == _REMEMBERED:

@@ -21,8 +21,8 @@ from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
-from semcast.common.keys import status_key
-from semcast.common.messages import CameraInfo, StatusMessage
+from semcast.common.keys import link_key, status_key
+from semcast.common.messages import CameraInfo, LinkReport, StatusMessage
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.sequence import open_sequence
@@ -156,6 +156,25 @@ def test_images_cross_the_link_and_feedback_comes_back(bench):
     assert np.median(bench.codec.snrs_db[5:]) == pytest.approx(20.0, abs=3.0)
     assert agent.result["counts"]["link_reports"] > 10
     assert (agent.result["source"], agent.result["complete"]) == ("steps", False)
+
+
+def test_a_report_of_a_frame_that_was_never_sent_is_not_believed(bench, until):
+    bench.channel(snr_db=20.0)
+    receiver = bench.receiver()
+    agent = bench.agent(source={"repeat": "loop"})
+    (first,) = take(receiver, count=1)
+    report = LinkReport(
+        agent_epoch=first.message.agent_epoch,
+        frame_id=2**40,
+        t_capture_ns=first.message.t_capture_ns,
+        snr_db_estimate=-4.0,
+        num_superseded=0,
+    )
+    bench.hub.publisher(link_key("agent0"), "newest").put(pack(report))
+    take(receiver, count=20)
+    agent.end()
+    assert agent.result["drops"]["protocol"] == 1
+    assert np.median(bench.codec.snrs_db[-10:]) == pytest.approx(20.0, abs=3.0)
 
 
 @pytest.mark.parametrize(("rate", "coded_hw"), [("1/48", (32, 32)), ("auto", (64, 96))])

@@ -53,6 +53,30 @@ def test_frames_before_the_first_one_seen_are_not_missing(metrics):
     assert metrics.drops == {"stale": 1}
 
 
+def test_one_number_out_of_nowhere_does_not_shut_out_the_stream(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    assert accepted(arrivals, [frame(k) for k in (0, 1, MAX_COUNT - 2, 2, 4)]) == [0, 1, 2, 4]
+    assert metrics.drops == {"ahead": 1, "missing": 1}
+
+
+def test_a_stream_that_begins_with_a_wrong_number_is_taken_up_after_a_while(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    times_ns = [k * 100 * MS for k in range(60)]
+    assert arrivals.accept(frame(MAX_COUNT - 2), 0)
+    taken = [k for k, t_ns in enumerate(times_ns) if arrivals.accept(frame(k), t_ns)]
+    assert taken == list(range(31, 60))
+    assert metrics.drops == {"stale": 31}
+
+
+def test_after_a_long_break_of_the_link_the_numbering_goes_on(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    assert arrivals.accept(frame(0), 0)
+    assert arrivals.accept(frame(5000), 60_000 * MS)
+    assert not arrivals.accept(frame(4000), 64_000 * MS), "late, and alone"
+    assert arrivals.accept(frame(5001), 64_001 * MS)
+    assert metrics.drops == {"missing": 4998, "stale": 1}
+
+
 def test_a_frame_that_comes_again_long_after_is_not_taken_for_a_missing_one(metrics):
     arrivals = Arrivals(lossless=False, drop=metrics.drop)
     accepted(arrivals, [frame(k) for k in (5, 6, 8, 7, *range(9, 9 + 255))])
