@@ -1,5 +1,6 @@
 """Video files, webcams and network cameras, read by OpenCV."""
 
+import contextlib
 import logging
 import re
 import threading
@@ -273,6 +274,7 @@ class LiveSource(_Captured):
         self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         fps = float(self._capture.get(cv2.CAP_PROP_FPS))
         self._fps = fps if np.isfinite(fps) and 0.1 <= fps <= 1000 else 30.0
+        self._trouble = ""  # why no image can be sent, as far as it was said
 
     @property
     def name(self) -> str:
@@ -309,8 +311,11 @@ class LiveSource(_Captured):
             image = _read(self._capture) if self._capture is not None else None
             now_ns = time.monotonic_ns()
             if image is None or not self._usable(image):
-                self._reopen(stop)
+                self._reopen(stop, "gives no images any more" if image is None else self._other_size(image))
                 continue
+            if self._trouble:
+                logger.info("%s gives images again", self.name)
+                self._trouble = ""
             grabbed += 1
             if grabbed % self._settings.stride or now_ns < due_ns:
                 continue
@@ -332,14 +337,16 @@ class LiveSource(_Captured):
                 return
             since_s = now_s
 
-    def _reopen(self, stop: threading.Event) -> None:
-        if self._capture is not None:
-            logger.warning("%s gives no images any more, trying again", self.name)
-            self.close()
-        if stop.wait(_REOPEN_AFTER_S):
-            return
-        try:
-            self._capture = _open(self._settings.source, live=True)
-        except SourceError:
-            return
-        logger.info("%s gives images again", self.name)
+    def _other_size(self, image: NDArray[np.uint8]) -> str:
+        """Say that images have another size than the stream was begun with; its receivers know that one."""
+        (width, height), (rows, columns) = self._stored_wh, image.shape[:2]
+        return f"gives {columns}x{rows} images, must give {width}x{height} as at its start, or start anew"
+
+    def _reopen(self, stop: threading.Event, trouble: str) -> None:
+        if trouble != self._trouble and self._capture is not None:
+            logger.warning("%s %s, trying again", self.name, trouble)
+            self._trouble = trouble
+        self.close()
+        if not stop.wait(_REOPEN_AFTER_S):
+            with contextlib.suppress(SourceError):
+                self._capture = _open(self._settings.source, live=True)

@@ -261,7 +261,12 @@ def _take(
         if viewer is not None:
             viewer.submit(missing_view(decoded, drops))
         return False
-    outcome = _process(session, decoded, drops)
+    try:
+        outcome = _process(session, decoded, drops)
+    except Exception:  # as a live server would
+        logger.exception("frame %d could not be tracked and is left out", message.frame_id)
+        drops["track"] = drops.get("track", 0) + 1
+        return False
     if viewer is not None:
         viewer.submit(outcome.view, outcome.update, outcome.patches)
     return True

@@ -20,13 +20,24 @@ class RequestDesk:
         self._waiting: dict[str, Future[Any]] = {}
 
     def ask(self, what: str, wait_s: float) -> Any:
-        """Return what serving gave; None when it takes longer than ``wait_s``, or failed."""
+        """Return what serving gave; None when it takes longer than ``wait_s``.
+
+        Raises:
+            SemcastError: Serving failed.
+        """
         with self._lock:
             served = self._waiting.setdefault(what, Future())
         try:
             return served.result(wait_s)
         except FutureTimeoutError:
             return None
+
+    def error_of(self, what: str, wait_s: float) -> str:
+        """Ask for something that gives what went wrong, and return that; "" also where it takes longer."""
+        try:
+            return self.ask(what, wait_s) or ""
+        except SemcastError as err:
+            return str(err)
 
     def serve(self, handlers: Mapping[str, Callable[[], Any]]) -> None:
         """Serve what was asked for, in the order of the handlers; who asks must not end what serves."""
@@ -39,5 +50,9 @@ class RequestDesk:
                 answer = handle()
             except SemcastError as err:
                 logger.warning("%s can't be served: %s", what, err)
-                answer = None
-            waiting[what].set_result(answer)
+                waiting[what].set_exception(err)
+            except Exception as err:
+                logger.exception("%s can't be served", what)
+                waiting[what].set_exception(SemcastError(f"{what} can't be served: {err}"))
+            else:
+                waiting[what].set_result(answer)

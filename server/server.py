@@ -163,7 +163,7 @@ class Server:
         if request.op not in ("get", "reset", "save"):
             return pack(ControlReply(ok=False, error=f"op must be get, reset or save, got {request.op}"))
         # A busy server answers that it will serve it.
-        error = (self._desk.ask(request.op, SERVE_WAIT_S) or "") if request.op != "get" else ""
+        error = self._desk.error_of(request.op, SERVE_WAIT_S) if request.op != "get" else ""
         values = {"mode": self._settings.mode, "view": self._settings.view.view}
         return pack(ControlReply(ok=not error, error=sendable(error, 1000), settings=values))
 

@@ -160,37 +160,41 @@ class Allocation:
         return np.asarray(10.0 * np.log10(arriving / (1.0 - arriving)), dtype=np.float32)
 
 
+def _words(bits: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Return what each code word stands for: its ones, which end with a zero or when there are five."""
+    zeros = np.flatnonzero(bits == 0)
+    ones = np.diff(zeros, prepend=-1) - 1
+    ends = np.cumsum(ones // _LONGEST + 1)
+    left_over = (len(bits) - 1 - int(zeros[-1]) if len(zeros) else len(bits)) // _LONGEST
+    words = np.full((int(ends[-1]) if len(ends) else 0) + left_over, _LONGEST, dtype=np.int64)
+    words[ends - 1] = ones % _LONGEST
+    return words
+
+
 @lru_cache(maxsize=_REMEMBERED)
 def _read(code: bytes, grid: tuple[int, int]) -> Allocation:
     rows, columns = grid
-    bits = np.unpackbits(np.frombuffer(code, dtype=np.uint8)).tolist()
+    bits = np.unpackbits(np.frombuffer(code, dtype=np.uint8))
+    places = _words(bits)[: rows * columns]
+    if len(places) < rows * columns:
+        raise ValueError(f"allocation must be the code of {rows}x{columns} blocks, got {len(code)} bytes")
+    at = int(np.minimum(places + 1, _LONGEST).sum())
     likeliest = _LIKELIEST.tolist()
     levels = np.empty(grid, dtype=np.uint8)
     above: list[int] = []
-    at = 0
-    try:
-        for row in range(rows):
-            line: list[int] = []
-            left = above[0] if above else FIXED_LEVEL
-            for column in range(columns):
-                place = 0
-                while place < _LONGEST and bits[at]:
-                    place += 1
-                    at += 1
-                at += place < _LONGEST
-                left = likeliest[left][above[column] if above else left][place]
-                line.append(left)
-            levels[row] = line
-            above = line
-    except IndexError:
-        raise ValueError(
-            f"allocation must be the code of {rows}x{columns} blocks, got {len(code)} bytes"
-        ) from None
+    for row, of_row in enumerate(places.reshape(grid).tolist()):
+        line: list[int] = []
+        left = above[0] if above else FIXED_LEVEL
+        for column, place in enumerate(of_row):
+            left = likeliest[left][above[column] if above else left][place]
+            line.append(left)
+        levels[row] = line
+        above = line
     levels.flags.writeable = False  # it may be handed out again
     allocation = Allocation(levels)
     capacity = LATENT_CHANNELS * levels.size
     taken = allocation.num_values + VALUES_PER_BIT * at
-    if len(code) != (at + 7) // 8 or any(bits[at:]) or taken > capacity:
+    if len(code) != (at + 7) // 8 or bits[at:].any() or taken > capacity:
         raise ValueError(
             f"allocation must be the code of {rows}x{columns} blocks that take at most {capacity} values, "
             f"got {len(code)} bytes for {taken}"

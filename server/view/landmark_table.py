@@ -59,6 +59,16 @@ class LandmarkTable:
         rows = np.flatnonzero(np.isin(self._ids, ids) & self._alive)
         self._alive[rows] = False
         self._touch(rows)
+        if len(self._ids) > max(CHUNK_LANDMARKS, 2 * len(self)):
+            self._close_gaps()
+
+    def _close_gaps(self) -> None:
+        """Forget rows of hidden landmarks: a long drive hides without end what a bounded map gives up."""
+        self._touch(np.arange(len(self._ids)))
+        alive = self._alive
+        self._ids, self._confidence = self._ids[alive], self._confidence[alive]
+        self._xyz, self._rgb = self._xyz[alive], self._rgb[alive]
+        self._alive = alive[alive]
 
     def _touch(self, rows: NDArray[np.int64]) -> None:
         while len(self.chunk_versions) * CHUNK_LANDMARKS < len(self._ids):

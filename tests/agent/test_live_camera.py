@@ -24,7 +24,7 @@ class Camera:
     """
 
     def __init__(self, frames_per_connection, at_once=1, interval_s=0.0):
-        jpegs = [
+        self.jpegs = [
             cv2.imencode(".jpg", np.full((48, 64, 3), 20 * k % 255, np.uint8))[1].tobytes() for k in range(12)
         ]
         self.connections = 0
@@ -33,6 +33,7 @@ class Camera:
         class Handler(http.server.BaseHTTPRequestHandler):
             def do_GET(self):
                 camera.connections += 1
+                jpegs = camera.jpegs
                 self.send_response(200)
                 self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
                 self.end_headers()
@@ -94,6 +95,31 @@ def test_a_network_camera_is_read_and_found_again_when_it_hangs_up(camera, caplo
     assert [f.final for f in frames] == [False] * 69 + [True]
     assert frames[0].image.shape == (48, 64, 3)
     assert source.groundtruth() is None
+
+
+def test_a_camera_that_comes_back_with_another_size_is_said_once_and_waited_for(camera, caplog, monkeypatch):
+    monkeypatch.setattr("semcast.agent.video._REOPEN_AFTER_S", 0.01)
+    caplog.set_level("INFO", "semcast")
+    source = open_source(SourceSettings(source=camera.address, camera=PINHOLE, max_frames=90))
+    frames, usual = [], camera.jpegs
+    turned = [cv2.imencode(".jpg", np.zeros((64, 48, 3), np.uint8))[1].tobytes()]
+    for frame in source.frames(threading.Event()):
+        frames.append(frame)
+        if len(frames) == 20:
+            camera.jpegs = turned  # from the next connection on
+
+            def turn_back(wanted=camera.connections + 4):
+                while camera.connections < wanted:
+                    time.sleep(0.01)
+                camera.jpegs = usual
+
+            threading.Thread(target=turn_back).start()
+    source.close()
+    assert len(frames) == 90
+    assert all(frame.image.shape == (48, 64, 3) for frame in frames)
+    said = [r.message.partition(" ")[2] for r in caplog.records if "gives" in r.message]
+    assert said.count("gives 48x64 images, must give 64x48 as at its start, or start anew, trying again") == 1
+    assert said[-1] == "gives images again"
 
 
 def test_images_that_waited_before_the_start_are_thrown_away(make_camera):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import itertools
 import json
 import re
 import threading
@@ -35,6 +36,7 @@ from semcast.describe import describe_recording
 from semcast.server.record import RecordSettings, StreamNotes, kind_of_key, run_record
 from semcast.server.recorded_streams import recorded_streams
 from semcast.server.replay import ReplaySettings, replay
+from semcast.server.session import Session
 from semcast.server.settings import ViewSettings
 
 SEQUENCE = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
@@ -318,6 +320,23 @@ def test_a_frame_of_another_codec_costs_itself_alone(recording, tmp_path, caplog
     assert mixed["drops"] == {**whole["drops"], "codec": 1}
     assert mixed["frames"]["tracked"] == whole["frames"]["tracked"] - 1
     assert "is left out" in caplog.text
+
+
+def test_a_frame_that_can_not_be_tracked_costs_itself_alone(recording, tmp_path, caplog, monkeypatch):
+    process, count = Session.process, itertools.count()
+
+    def fails_once(self, *args, **kwargs):
+        if next(count) == 2:
+            raise np.linalg.LinAlgError("singular")
+        return process(self, *args, **kwargs)
+
+    whole = replay(ReplaySettings(file=recording))
+    monkeypatch.setattr(Session, "process", fails_once)
+    other = replay(ReplaySettings(file=recording, out=tmp_path / "run"))
+    assert other["drops"] == {**whole["drops"], "track": 1}
+    assert other["frames"]["tracked"] == whole["frames"]["tracked"] - 1
+    assert (tmp_path / "run" / "summary.json").is_file()
+    assert "could not be tracked and is left out" in caplog.text
 
 
 def test_a_stream_is_chosen_by_its_number(with_a_later_start):

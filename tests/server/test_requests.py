@@ -2,6 +2,9 @@ import functools
 import threading
 import time
 
+import pytest
+
+from semcast.common.errors import SemcastError
 from semcast.server.requests import RequestDesk
 
 
@@ -34,3 +37,53 @@ def test_what_is_not_served_in_time_has_no_answer():
     assert served == [1], "it is served all the same"
     desk.serve({"save": lambda: served.append(2)})
     assert served == [1], "and once"
+
+
+@pytest.mark.parametrize("error", [SemcastError("disk is full"), ValueError("disk is full")])
+def test_who_asks_for_what_fails_is_told_so_and_the_rest_is_served(error):
+    desk, told = RequestDesk(), []
+
+    def ask():
+        with pytest.raises(SemcastError, match="disk is full") as caught:
+            desk.ask("save", 60.0)
+        told.append(caught)
+
+    def fail():
+        raise error
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    deadline_s = time.monotonic() + 60.0
+    while not desk._waiting and time.monotonic() < deadline_s:
+        time.sleep(0.001)
+    served = []
+    threading.Thread(target=lambda: served.append(desk.ask("map", 60.0))).start()
+    while len(desk._waiting) < 2 and time.monotonic() < deadline_s:
+        time.sleep(0.001)
+    desk.serve({"save": fail, "map": lambda: "map"})
+    asking.join(60.0)
+    assert told
+    while not served and time.monotonic() < deadline_s:
+        time.sleep(0.001)
+    assert served == ["map"]
+
+
+def test_what_went_wrong_is_told_in_words():
+    for handle, words in (
+        (lambda: "no room", "no room"),
+        (lambda: "", ""),
+        (lambda: 1 / 0, "division by zero"),
+    ):
+        desk, told = RequestDesk(), []
+        asking = threading.Thread(
+            target=lambda desk=desk, told=told: told.append(desk.error_of("save", 60.0))
+        )
+        asking.start()
+        deadline_s = time.monotonic() + 60.0
+        while not desk._waiting and time.monotonic() < deadline_s:
+            time.sleep(0.001)
+        desk.serve({"save": handle})
+        asking.join(60.0)
+        assert words in told[0]
+        assert bool(words) == bool(told[0])
+    assert RequestDesk().error_of("save", 0.01) == ""

@@ -178,6 +178,30 @@ def test_only_touched_chunks_are_sent_and_removed_landmarks_are_gone():
     assert table.chunk(0)[0][:, 0].min() == 1.0
 
 
+def test_a_table_is_as_long_as_what_it_shows():
+    table, shown = LandmarkTable(), 2 * CHUNK_LANDMARKS
+    for k in range(40):
+        table.update(*points(np.arange(500 * k, 500 * k + 500)))
+        table.remove(np.arange(500 * k + 500 - shown - 500, 500 * k + 500 - shown))
+    assert len(table) == shown
+    assert len(table._ids) <= 2 * shown
+    assert len(table.chunk_versions) <= 2 * shown // CHUNK_LANDMARKS + 1
+    xyz = np.concatenate([table.chunk(k)[0] for k in range(len(table.chunk_versions))])
+    assert xyz[:, 0].tolist() == list(range(500 * 40 - shown, 500 * 40))
+
+
+def test_chunks_that_moved_or_became_empty_are_drawn_again():
+    table = LandmarkTable()
+    table.update(*points(np.arange(3 * CHUNK_LANDMARKS)))
+    seen = {k: (version, table.chunk(k)[0]) for k, version in enumerate(table.chunk_versions)}
+    table.remove(np.arange(2 * CHUNK_LANDMARKS + 10))
+    for k, version in enumerate(table.chunk_versions):
+        if version != seen[k][0]:
+            seen[k] = (version, table.chunk(k)[0])
+    drawn = np.concatenate([xyz for _, xyz in seen.values()])
+    assert drawn[:, 0].tolist() == list(range(2 * CHUNK_LANDMARKS + 10, 3 * CHUNK_LANDMARKS))
+
+
 def test_landmarks_in_any_order_land_at_their_own_coordinates():
     table, rng = LandmarkTable(), np.random.default_rng(0)
     ids = rng.permutation(3000)
