@@ -321,6 +321,8 @@ def run_agent(
                 _send_live(sending, capture, stop)
             capture.raise_failure()
             summary.update(agent_epoch=sending.agent_epoch, complete=capture.ended and not stop.is_set())
+            if summary["complete"]:
+                metrics.end()  # the server may have missed the last frame
         except (SourceError, TransportError) as err:
             metrics.error(str(err))
             raise

@@ -395,6 +395,7 @@ class StatusMessage:
         stages_ms: Stage to (p50, p95, max) over the last frames.
         last_error: One line, empty when there was none.
         activity: What it is at besides frames, in a few words; empty when it is at nothing else.
+        ended: Of an agent: its source came to its end, and ``counts["sent"]`` frames are all there are.
     """
 
     version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
@@ -408,6 +409,7 @@ class StatusMessage:
     stages_ms: dict[str, tuple[float, ...]] = field(metadata=rule(Named(Many(Number(0.0), count=3))))
     last_error: str = field(metadata=rule(Text(1000)))
     activity: str = field(default="", metadata=rule(Text(200)))
+    ended: bool = field(default=False, metadata=rule(Flag()))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,6 +37,7 @@ class Metrics:
         self._stages_ms: dict[str, deque[float]] = {}
         self._last_error = ""
         self._activity = ""
+        self._ended = False
 
     def count(self, event: str, by: int = 1) -> None:
         """Count an event; its rate is reported too."""
@@ -72,6 +73,11 @@ class Metrics:
         with self._lock:
             self._last_error = sendable(text, 1000)
             self._counts["errors"] = self._counts.get("errors", 0) + 1
+
+    def end(self) -> None:
+        """Let the status say from now on that there is no more to do."""
+        with self._lock:
+            self._ended = True
 
     def be_at(self, activity: str) -> None:
         """Note what the process is at besides frames, in a few words; empty when it is done with that."""
@@ -122,7 +128,7 @@ class Metrics:
     def status(self, agent_epoch: int) -> StatusMessage:
         """Return the message that is sent once a second."""
         with self._lock:
-            last_error, activity = self._last_error, self._activity
+            last_error, activity, ended = self._last_error, self._activity, self._ended
         return StatusMessage(
             role=self._role,
             agent_epoch=agent_epoch,
@@ -133,6 +139,7 @@ class Metrics:
             stages_ms={stage: tuple(values) for stage, values in self.stages_ms().items()},
             last_error=last_error,
             activity=activity,
+            ended=ended,
         )
 
     def summary(self) -> dict[str, Any]:

@@ -22,6 +22,7 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
+_NONE: Array = np.zeros(0)
 _STATE_COLOURS = {"initializing": "#f0c040", "lost": "#d05050"}
 #: Stages outside the time to the pose: the map is extended when a frame has its pose, its adjustment
 #: runs beside the frames, and the last is a sum of others.
@@ -45,6 +46,7 @@ class RunToPlot:
         num_sent: Frames that were sent, None where the run did not say.
         drops: Frames that never reached the tracker, by reason, as far as the run said.
         num_parts: Parts of the map, whose poses don't fit together.
+        unposed: First and last id of each run of frames that were sent and have no pose.
     """
 
     name: str
@@ -54,6 +56,23 @@ class RunToPlot:
     num_sent: int | None = None
     drops: Mapping[str, int] = field(default_factory=dict)
     num_parts: int = 1
+    unposed: Sequence[tuple[int, int]] = ()
+
+    @property
+    def truth_on_the_way(self) -> Trajectory | None:
+        """The true path from the first frame that was decoded to the last: errors are a share of that.
+
+        So a run's summary has it too.
+        """
+        if self.truth is None or not self.rows:
+            return self.truth
+        return self.truth.between(self.rows[0].t_source_ns * 1e-9, self.rows[-1].t_source_ns * 1e-9)
+
+    @property
+    def missing_s(self) -> Array:
+        """When the frames were recorded that were sent and never decoded."""
+        t_s = np.array([row.t_source_ns for row in self.rows], dtype=np.float64) * 1e-9
+        return missing_times({row.frame_id: row.seq for row in self.rows}, t_s, self.unposed)
 
     @staticmethod
     def read(folder: Path, truth: Trajectory | None) -> "RunToPlot":
@@ -84,6 +103,7 @@ class RunToPlot:
             num_sent=counts.get("sent", counts.get("source")),
             drops=summary.get("drops", {}),
             num_parts=max(1, len(summary.get("parts") or ())),
+            unposed=[(int(first), int(last)) for first, last in summary.get("unposed_frames") or ()],
         )
 
 
@@ -110,13 +130,14 @@ def plot_run(run: RunToPlot, out: Path, image_format: str = "png") -> list[Path]
 
 
 def _plot_path(run: RunToPlot, path: Path) -> Path:
-    result = ate(run.trajectory, run.truth) if run.truth is not None else None
+    on_the_way = run.truth_on_the_way
+    result = ate(run.trajectory, on_the_way) if on_the_way is not None else None
     estimate = run.trajectory.positions
     unit = "map units"
     if result is not None:
         estimate = result.scale * estimate @ result.R_truth_map.T + result.t_truth_map
         unit = "m"
-    doubt = time_span_doubt(run.trajectory, run.truth) if run.truth is not None else None
+    doubt = time_span_doubt(run.trajectory, run.truth, run.missing_s) if run.truth is not None else None
     if doubt is not None:
         logger.warning("%s: %s", run.name, doubt)
     figure, grid = new_grid(1 if result is None else 2, 2, 9.0, 4.2 if result is None else 6.4)
@@ -159,21 +180,23 @@ def path_title(run: RunToPlot, result: AteResult | None) -> str:
     return f"{run.name}: {error}{matched}"
 
 
-def time_span_doubt(trajectory: Trajectory, truth: Trajectory) -> str | None:
+def time_span_doubt(trajectory: Trajectory, truth: Trajectory, missing_s: Array = _NONE) -> str | None:
     """Return what to say where a path and the truth hardly share a time and may not belong together.
 
     Args:
         trajectory: At least one pose.
         truth: At least one pose.
+        missing_s: Times of frames that were sent and could not have a pose.
     """
-    spans_s = [(float(path.t_s.min()), float(path.t_s.max())) for path in (trajectory, truth)]
+    times_s = (np.concatenate((trajectory.t_s, missing_s)), truth.t_s)
+    spans_s = [(float(t_s.min()), float(t_s.max())) for t_s in times_s]
     (first_s, last_s), (true_first_s, true_last_s) = spans_s
     shared_s = min(last_s, true_last_s) - max(first_s, true_first_s)
     if max(last_s - first_s, true_last_s - true_first_s) <= _MAX_SPAN_RATIO * shared_s:
         return None
     return (
-        f"poses are from {first_s:.1f} to {last_s:.1f} s, the true path from {true_first_s:.1f} to "
-        f"{true_last_s:.1f} s: is it of the same recording? ATE in percent is of the whole true path"
+        f"frames are from {first_s:.1f} to {last_s:.1f} s, the true path from {true_first_s:.1f} to "
+        f"{true_last_s:.1f} s: is it of the same recording?"
     )
 
 
@@ -227,7 +250,7 @@ def _plot_timeline(run: RunToPlot, path: Path) -> Path:
     meaning = "recorded time (s); yellow: no map yet, red: lost, |: keyframe"
     keyframes = t_s[[row.is_keyframe for row in rows]]
     top.plot(keyframes, np.ones(len(keyframes)), "|", color="k", transform=top.get_xaxis_transform())
-    missing = missing_times({row.frame_id: row.seq for row in rows}, t_s)
+    missing = run.missing_s - rows[0].t_source_ns * 1e-9
     if len(missing):
         at_bottom = np.zeros(len(missing))
         top.plot(missing, at_bottom, "x", color="r", transform=top.get_xaxis_transform(), clip_on=False)
@@ -248,16 +271,31 @@ def timeline_title(run: RunToPlot) -> str:
     return f"{run.name}: {count} frames{f' ({dropped})' if dropped else ''}, {posed} with a pose at once"
 
 
-def missing_times(numbers: Mapping[int, int | None], t_s: Array) -> Array:
-    """Return when the frames were recorded that were sent and are missing between others, evenly spread.
+def missing_times(
+    numbers: Mapping[int, int | None], t_s: Array, unposed: Sequence[tuple[int, int]] = ()
+) -> Array:
+    """Return when the frames were recorded that were sent and are missing, evenly spread.
 
     Args:
         numbers: N frame ids, each with its number among those that were sent, or None.
         t_s: ``(N,)`` their times in seconds.
+        unposed: Ranges of ids without pose: they tell what is missing before the first and after the last.
     """
+    if not numbers:
+        return _NONE
     ids, index = np.unique(np.array(list(numbers), dtype=np.int64), return_index=True)
+    t_s = t_s[index]
     sent = np.concatenate([stretch.frame_ids for stretch in stretches(numbers)])
-    return np.asarray(np.interp(np.setdiff1d(sent, ids), ids, t_s[index]), dtype=np.float64)
+    between = np.interp(np.setdiff1d(sent, ids), ids, t_s)
+    if len(ids) < 2:
+        return np.asarray(between, dtype=np.float64)
+    step = int(np.diff(ids).min())
+    period_s = (t_s[-1] - t_s[0]) / (ids[-1] - ids[0])
+    num_before = max(0, ids[0] - min((first for first, _ in unposed), default=ids[0])) // step
+    num_after = max(0, max((last for _, last in unposed), default=ids[-1]) - ids[-1]) // step
+    before = t_s[0] - period_s * step * np.arange(num_before, 0, -1)
+    after = t_s[-1] + period_s * step * np.arange(1, num_after + 1)
+    return np.concatenate((before, between, after))
 
 
 def held(values: Array) -> Array:

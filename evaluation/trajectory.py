@@ -64,7 +64,7 @@ class TrajectorySettings(StreamSettings):
     out: Path | None = field(
         default=None,
         metadata={
-            "help": "folder for trajectories (TUM) and top views of the first seed and, without --json, "
+            "help": "folder for trajectories (TUM) and drawn paths of the first seed and, without --json, "
             "result.json"
         },
     )

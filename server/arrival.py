@@ -6,7 +6,7 @@ from collections.abc import Callable
 from semcast.common.messages import SymbolFrame
 
 #: An agent that was silent this long may come back with a clock set to the past.
-_SILENCE_NS = 3_000_000_000
+SILENCE_NS = 3_000_000_000
 _OFFSET_WINDOW_NS = 10_000_000_000
 _REMEMBERED = 256
 #: A live agent sends fewer frames a second, and no more between two that arrive without a break.
@@ -81,7 +81,7 @@ class Arrivals:
     def accept(self, frame: SymbolFrame, arrival_ns: int) -> bool:
         """Tell whether a frame counts, and count it under its reason where it does not."""
         if frame.agent_epoch != self.epoch:
-            silent = arrival_ns - self._last_ns > _SILENCE_NS
+            silent = arrival_ns - self._last_ns > SILENCE_NS
             if frame.agent_epoch < self.epoch and not silent:
                 self._drop("epoch", 1)
                 return False
@@ -99,7 +99,7 @@ class Arrivals:
             self._drop("duplicate", 1)
             return False
         elif self._is_odd(frame, arrival_ns):
-            if self._odd_in_order < _BELIEVED or arrival_ns - self._taken_ns <= _SILENCE_NS:
+            if self._odd_in_order < _BELIEVED or arrival_ns - self._taken_ns <= SILENCE_NS:
                 self._refuse(frame)
                 return False
             # One message with a number out of nowhere must not shut out all others for good.

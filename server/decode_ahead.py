@@ -39,6 +39,8 @@ class DecodeAhead(Generic[In, Out]):
         self._decode = decode
         self._on_failure = on_failure
         self._slot: Out | None = None
+        #: A message was taken and is not decoded yet.
+        self.is_busy = False
         self._condition = threading.Condition()
         self._stopping = threading.Event()
         self._reported: set[str] = set()
@@ -58,6 +60,7 @@ class DecodeAhead(Generic[In, Out]):
                 continue
             if message is None:
                 continue
+            self.is_busy = True
             try:
                 decoded = self._decode(message)
             except SemcastError as err:
@@ -70,6 +73,8 @@ class DecodeAhead(Generic[In, Out]):
                 logger.exception("a frame could not be decoded and is left out")
                 self._on_failure(message, "decode")
                 continue
+            finally:
+                self.is_busy = False
             with self._condition:
                 self._slot = decoded
                 self._condition.notify_all()

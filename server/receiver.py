@@ -155,6 +155,13 @@ class Receiver:
         with self._lock:
             return self._arrivals.epoch
 
+    def count_missing(self, agent_epoch: int, num_sent: int | None) -> None:
+        """Count the frames behind the newest that never came, of so many that were sent; None: not known."""
+        if num_sent is not None and self._mode == "live":
+            with self._lock:
+                arrived_seq = self._arrivals.arrived_seq if agent_epoch == self._arrivals.epoch else 0
+            self._metrics.drop("missing", max(0, num_sent - arrived_seq))
+
     def _tell_once(self, text: str) -> None:
         if text not in self._told and len(self._told) < 100:
             self._told.add(text)

@@ -115,7 +115,8 @@ def recording(session: Session, agent_id: str, file: Path, settings_toml: str) -
         settings_toml: Resolved settings of the program, kept in the recording.
 
     Raises:
-        SourceError: The file can't be written.
+        SourceError: The file can't be written, said before anything else; or it could not be written to its
+            end, said when the context ends.
     """
     with Recorder(file, recording_metadata(settings_toml, __version__)) as recorder:
 
@@ -128,6 +129,8 @@ def recording(session: Session, agent_id: str, file: Path, settings_toml: str) -
         session.subscribe_keyed(all_keys(agent_id), "every", notes.put)
         notes.put_camera(agent_id)
         yield recorder
+    if recorder.error is not None:
+        raise SourceError(f"{file} is not complete: {recorder.error}")
 
 
 def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any]:
@@ -151,8 +154,6 @@ def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any
     ):
         while not stop.wait(_LOOK_INTERVAL_S) and recorder.error is None:
             pass
-    if recorder.error is not None:
-        raise SourceError(f"{settings.file} is not complete: {recorder.error}")
     return {
         "messages": recorder.num_written,
         "bytes": recorder.bytes_written,

@@ -94,9 +94,21 @@ def sequence_reference(folder: Path, camera: Intrinsics, given: CameraSettings |
         SourceError: The folder is no sequence.
     """
     sequence = open_sequence(folder, given)
-    return Reference(
-        lambda frame_id: sequence.image(frame_id, camera), sequence.groundtruth(), sequence.times_ns
-    )
+    is_told = False
+
+    def original(frame_id: int) -> NDArray[np.uint8] | None:
+        nonlocal is_told
+        if frame_id < len(sequence):
+            return sequence.image(frame_id, camera)
+        if not is_told:
+            logger.warning(
+                "the reference has %d frames: those of a second pass (--repeat) are not compared with it",
+                len(sequence),
+            )
+        is_told = True
+        return None
+
+    return Reference(original, sequence.groundtruth(), sequence.times_ns)
 
 
 def recording_reference(reader: RecordingReader, camera: CameraInfo) -> Reference | None:

@@ -216,7 +216,7 @@ def _replayed(
                     on_frame(arrival.message.frame_id)
         if not processed and not drops and not stop.is_set():
             raise SourceError(_none_in_part(reader, stream, settings))
-        if not processed:
+        if not processed and not stop.is_set():
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
         with contextlib.suppress(OSError):  # said at the end
             session.write_results(settings.out)  # who stops the replay may not wait for the adjustment

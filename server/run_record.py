@@ -181,7 +181,8 @@ def summarise(
 ) -> dict[str, Any]:
     """Return the figures of a run; None where one has no meaning.
 
-    ``frame_rate_hz`` counts tracked frames by the source's time, ``processed_rate_hz`` by when they arrived.
+    ``frame_rate_hz`` counts tracked frames by the source's time, from the first that was sent to the last;
+    ``processed_rate_hz`` by when they arrived. ``snr_estimated_db`` is of tracked frames.
 
     Args:
         rows: One per frame that reached the tracker.
@@ -199,7 +200,11 @@ def summarise(
     stages = sorted({stage for row in rows for stage in row.stage_ms})
     stage_ms = {s: percentiles(row.stage_ms[s] for row in rows if s in row.stage_ms) for s in stages}
     stage_ms["arrival_to_pose"] = percentiles(row.age_ms for row in rows)
-    span_s = (rows[-1].t_source_ns - rows[0].t_source_ns) * 1e-9 if len(rows) > 1 else 0.0
+    span_s = 0.0
+    if len(rows) > 1:
+        ids = rows[-1].frame_id - rows[0].frame_id
+        all_ids = max(ids, sent[-1].last_id - sent[0].first_id) if sent else ids
+        span_s = (rows[-1].t_source_ns - rows[0].t_source_ns) * 1e-9 * all_ids / ids
     return {
         **trajectory_summary(trajectory, truth, num_sent),
         "psnr_db": float(psnr_db.mean()) if len(psnr_db) else None,

@@ -31,19 +31,23 @@ class Stretch:
         return np.rint(np.linspace(self.first_id, self.last_id, self.num)).astype(np.int64)
 
 
-def stretches(numbers: Mapping[int, int | None], *, from_first: bool = False) -> list[Stretch]:
-    """Return what was sent up to the newest frame that arrived, in order.
+def stretches(
+    numbers: Mapping[int, int | None], *, from_first: bool = False, num_sent: int | None = None
+) -> list[Stretch]:
+    """Return what was sent up to the newest frame that arrived, or all that was, in order.
 
     Args:
         numbers: Frame id of each that arrived -> its number, counted from 0 and rising with the id; where one
             is None, all are taken to have been sent at their ids' common stride.
         from_first: Begin with frame number 0, whichever arrived first.
+        num_sent: How many were sent in all, where that is known.
     """
     ids = sorted(numbers)
     steps = np.diff(np.array(ids, dtype=np.int64))
     seqs = [numbers[k] for k in ids]
     known = [seq for seq in seqs if seq is not None]
     if len(known) < len(seqs):
+        num_sent = None  # nothing says which of those that were sent these are
         stride = max(1, int(np.gcd.reduce(steps)) if len(steps) else 1)
         known = [(k - ids[0]) // stride for k in ids]
     found: list[Stretch] = []
@@ -58,6 +62,11 @@ def stretches(numbers: Mapping[int, int | None], *, from_first: bool = False) ->
                 step = gap / (num + 1)
                 found.append(Stretch(round(ids[k - 1] + step), round(frame_id - step), num))
         found.append(Stretch(frame_id, frame_id, 1))
+    if num_sent is not None and (num := num_sent - (known[-1] + 1 if known else 0)) > 0:
+        before = ids[-1] if ids else -1
+        # As evenly spaced as those that arrived.
+        step = (ids[-1] - ids[0]) / (known[-1] - known[0]) if len(known) > 1 else 1.0
+        found.append(Stretch(round(before + step), round(before + num * step), num))
     return found
 
 

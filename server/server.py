@@ -36,7 +36,8 @@ from semcast.server.reference import Reference, sequence_reference
 from semcast.server.requests import RequestDesk
 from semcast.server.session import Arrival, Outcome, Session, new_bundle
 from semcast.server.settings import ServerSettings
-from semcast.server.stream_identity import StreamIdentity, is_nearly_final
+from semcast.server.stream_end import StreamEnd
+from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.choice import SuccessiveViews, check_viewer
 
 logger = logging.getLogger(__name__)
@@ -44,10 +45,6 @@ logger = logging.getLogger(__name__)
 POLL_S = 0.1
 CAMERA_TIMEOUT_S = 0.5
 WARM_UP_SHAPE_HW = (256, 384)
-#: How long stragglers are waited for after the source's last frame.
-FINAL_IDLE_S = 0.5
-#: The last frame may be lost on the air: one of the last ones is the end once the agent is gone so long.
-AGENT_GONE_S = 2.0
 #: How long after a restart of the agent its former start's frames may still come: above any channel's delay.
 STRAGGLER_NS = 20_000_000_000
 #: Time for depth that is still missing where another stream waits, and where the server was stopped.
@@ -90,8 +87,6 @@ class Server:
         self._inbox_lock = threading.Lock()
         self._drops_before: dict[str, int] = {}
         self._spare_bundle: BundleRunner | None = None
-        self._complete = False
-        self._nearly_final = False
         self._new_map = False
         self._resources = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
@@ -101,6 +96,7 @@ class Server:
             self._receiver = stack.enter_context(
                 Receiver(session, self._agent_id, settings.mode, self._metrics, settings.max_age_ms)
             )
+            self._end_of = StreamEnd(session, self._agent_id)
             self._outbox = Outbox(session, self._agent_id, self._metrics)
             stack.callback(self._outbox.close)
             self._beat = StatusBeat(
@@ -207,11 +203,9 @@ class Server:
         """Tell whether nothing more is to come, after a pause of ``idle_s``."""
         if self._session is None or self._settings.keep_running:
             return False
-        if self._complete and idle_s >= FINAL_IDLE_S:
-            return True
-        gone = "agent" not in self._receiver.roles_alive
-        if self._nearly_final and gone and idle_s >= AGENT_GONE_S:
-            self._complete = True
+        epoch, is_there = self._session.identity.agent_epoch, "agent" in self._receiver.roles_alive
+        if self._end_of.has_come(epoch, idle_s, agent_is_there=is_there, is_busy=self._ahead.is_busy):
+            self._receiver.count_missing(epoch, self._end_of.num_sent(epoch))
             return True
         limit_s = self._settings.idle_timeout_s
         return limit_s is not None and idle_s >= limit_s
@@ -281,8 +275,7 @@ class Server:
         if session is None or session.identity.agent_epoch != message.agent_epoch:
             session = self._begin(decoded.arrival.camera)
         session.note_arrival(message.frame_id, message.seq, final=message.final)
-        self._complete = message.final
-        self._nearly_final = is_nearly_final(message.frame_id, decoded.arrival.camera)
+        self._end_of.note(message, decoded.arrival.camera)
         if decoded.frame is None:
             self._metrics.drop("lost_on_air" if decoded.arrival.received is None else "outage")
             self._views.submit(missing_view(decoded, self._metrics.drops))
@@ -355,7 +348,7 @@ class Server:
             self._end_former(former)
             self._be_at("")
         self._former_epochs.discard(identity.agent_epoch)
-        self._complete = self._nearly_final = False
+        self._end_of.begin()
         other_camera = former is not None and former.identity.camera != identity.camera
         if other_camera and self._reference is not None:
             self._reference.close()
@@ -434,9 +427,10 @@ class Server:
     def _end(self, session: Session, folder: Path | None) -> dict[str, Any]:
         """Write what a stream leaves behind into a folder and release it."""
         try:
-            if not self._complete:
+            complete, num_sent = self._end_of.complete, self._end_of.num_sent(session.identity.agent_epoch)
+            if not complete:
                 session.save_checkpoint()
-            return session.write_outputs(folder, self._drops(), complete=self._complete)
+            return session.write_outputs(folder, self._drops(), complete=complete, num_sent=num_sent)
         finally:
             session.close()
             if folder is not None and folder != self._settings.out:
@@ -448,7 +442,7 @@ class Server:
         if session is None:
             return {}
         try:
-            self._conclude(session, None if self._complete else _STOPPED_S)
+            self._conclude(session, None if self._end_of.complete else _STOPPED_S)
             summary = self._end(session, self._settings.out)
         except OSError as err:
             raise SemcastError(_not_written(self._settings.out, err)) from err
@@ -459,15 +453,21 @@ class Server:
         return summary
 
     def close(self) -> None:
-        """Release threads, processes and ports. Idempotent."""
-        self._resources.close()
-        session, self._session = self._session, None
-        if session is not None:
-            session.close()
-        self._views.close(leave_window=self._complete and self._settings.view.leave_open)
-        reference, self._reference = self._reference, None
-        if reference is not None:
-            reference.close()
+        """Release threads, processes and ports. Idempotent.
+
+        Raises:
+            SourceError: The recording could not be written to its end.
+        """
+        try:
+            self._resources.close()
+        finally:
+            session, self._session = self._session, None
+            if session is not None:
+                session.close()
+            self._views.close(leave_window=self._end_of.complete and self._settings.view.leave_open)
+            reference, self._reference = self._reference, None
+            if reference is not None:
+                reference.close()
 
 
 def _not_written(folder: Path | None, err: Exception) -> str:
@@ -487,7 +487,7 @@ def run_server(settings: ServerSettings, stop_event: threading.Event) -> dict[st
     Raises:
         TransportError: The port is taken, or no hub was found.
         ConfigError: The viewer can't be started or a codec is unknown.
-        SourceError: The reference can't be read.
+        SourceError: The reference can't be read, or the recording could not be written to its end.
         SemcastError: The outputs can't be written.
     """
     network = open_session(settings.network, stop_event)

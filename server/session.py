@@ -360,7 +360,12 @@ class Session:
         return self._cloud.complete(budget_s)
 
     def write_outputs(
-        self, folder: Path | None, drops: Mapping[str, int], *, complete: bool
+        self,
+        folder: Path | None,
+        drops: Mapping[str, int],
+        *,
+        complete: bool,
+        num_sent: int | None = None,
     ) -> dict[str, Any]:
         """Write trajectory, map, reconstruction and summary, and return the summary.
 
@@ -368,6 +373,7 @@ class Session:
             folder: Where to, or None to only make the summary.
             drops: Frames that never reached the tracker, by reason.
             complete: The source came to its end, so frames that were sent before any arrived count too.
+            num_sent: Frames the agent sent, if it said so: those after the last that arrived count too.
 
         Raises:
             OSError: Files can't be written; the others are.
@@ -375,7 +381,7 @@ class Session:
         """
         with EachFile() as each:
             results = self._write_results(folder, each)
-            summary = self._summary(results, drops, complete)
+            summary = self._summary(results, drops, complete, num_sent)
             if folder is not None:
                 with each.attempt(folder / SUMMARY_NAME) as path:
                     write_json(path, summary)
@@ -383,7 +389,9 @@ class Session:
             logger.log(logging.INFO if posed else logging.WARNING, "%s", run_line(summary))
         return summary
 
-    def _summary(self, results: Results, drops: Mapping[str, int], complete: bool) -> dict[str, Any]:
+    def _summary(
+        self, results: Results, drops: Mapping[str, int], complete: bool, num_sent: int | None
+    ) -> dict[str, Any]:
         rows = self._record.rows()
         truth = self._reference.truth_of(self._t_source_ns) if self._reference is not None else None
         if truth is not None and rows:
@@ -395,7 +403,7 @@ class Session:
             results.trajectory,
             results.part_of,
             truth,
-            stretches(self._numbers, from_first=num_frames is not None),
+            stretches(self._numbers, from_first=num_frames is not None, num_sent=num_sent),
             num_frames,
             drops,
             results.num_keyframes,

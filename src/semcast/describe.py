@@ -75,7 +75,11 @@ def describe_recording(path: Path) -> list[Section]:
     reader = RecordingReader(path)
     info = reader.info()
     header = info.metadata.get(RECORDING_METADATA, {})
-    state = "whole" if info.complete else "cut off: replay reads it up to there, 'semcast recover' mends it"
+    state = (
+        "whole, by its index; 'semcast replay' tests every checksum"
+        if info.complete
+        else "cut off: replay reads it up to there, 'semcast recover' mends it"
+    )
     facts = [("state", state), ("size", _bytes(reader.size_bytes))]
     if info.start_ns is not None and info.end_ns is not None:
         began = datetime.datetime.fromtimestamp(info.start_ns * 1e-9, datetime.UTC)
@@ -169,13 +173,16 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
         ("completeness", "frames with a pose", "{:.1%}"),
         ("ate_percent", "position error (ATE)", "{:.2f} % of the path"),
         ("psnr_db", "image quality (PSNR)", "{:.2f} dB"),
-        ("snr_estimated_db", "SNR at the receiver", "{:.1f} dB"),
+        ("snr_estimated_db", "SNR at the receiver", "{:.1f} dB in frames that were decoded"),
         ("confidence_mean", "mean confidence", "{:.2f}"),
         ("frame_rate_hz", "tracked by recorded time", "{:.1f} frames a second"),
         ("processed_rate_hz", "tracked by time of arrival", "{:.1f} frames a second"),
     ):
         if summary.get(key) is not None:
             facts.append((name, form.format(summary[key])))
+    num_posed, num_matched = summary.get("num_posed"), summary.get("num_matched")
+    if summary.get("ate_percent") is not None and num_matched != num_posed:
+        facts.append(("compared with the truth", f"{num_matched} of {num_posed} poses"))
     age = (summary.get("stage_ms") or {}).get("arrival_to_pose")
     if age:
         facts.append(("arrival to pose", f"p50 {age['p50']:.0f} ms, p95 {age['p95']:.0f} ms"))

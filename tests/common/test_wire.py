@@ -107,7 +107,7 @@ def test_a_message_cut_anywhere_is_refused(message):
 def test_each_field_missing_or_of_another_type_is_refused(message):
     good = values_of(message)
     optional = {"base_seq", "slot_lost", "lossless", "final", "error", "settings", "submap", "last_frame_id"}
-    optional |= {"readout_ms", "readout_from", "levels", "allocation", "activity"}
+    optional |= {"readout_ms", "readout_from", "levels", "allocation", "activity", "ended"}
     for name in good:
         if name not in optional and name not in ("version", "kind"):
             without = {k: v for k, v in good.items() if k != name}

@@ -93,6 +93,24 @@ def test_missing_frames_lie_between_those_that_are_there():
     np.testing.assert_allclose(missing_times({0: 0, 2: 1, 4: 2, 10: 4, 12: 5}, t_s), [0.85])
 
 
+def test_frames_missing_before_the_first_and_after_the_last_are_known_from_the_summary():
+    numbers, t_s = {6: 0, 8: 1, 12: 3}, np.array([0.6, 0.8, 1.2])
+    unposed = [(0, 8), (10, 10), (12, 18)]
+    np.testing.assert_allclose(missing_times(numbers, t_s, unposed), [0.0, 0.2, 0.4, 1.0, 1.4, 1.6, 1.8])
+    assert len(missing_times({}, np.zeros(0), unposed)) == 0
+
+
+def test_a_run_whose_link_died_is_measured_by_the_way_until_then_and_shows_the_rest(tmp_path, caplog):
+    rows = [row(k) for k in range(10)]
+    folder = write_run(tmp_path / "run", rows, {"unposed_frames": [[10, 49]]})
+    write_tum(folder / TRAJECTORY_NAME, line(range(10)))
+    run = RunToPlot.read(folder, line(range(50)))
+    assert run.truth_on_the_way.path_length == pytest.approx(9.0)
+    np.testing.assert_allclose(run.missing_s, np.arange(10, 50) * 0.1)
+    plot_run(run, tmp_path / "plots")
+    assert not caplog.records, "the truth is that of this recording"
+
+
 def test_missing_frames_are_marked(tmp_path):
     there = [row(k, snr_estimated_db=None) for k in (0, 1, 2, 3, 5, 6, 7, 8)]
     renumbered = [row(k, snr_estimated_db=None, t_source_ns=r.t_source_ns) for k, r in enumerate(there)]
@@ -165,7 +183,7 @@ def test_a_truth_of_other_times_is_doubted():
     for truth in (line(range(20)), line(range(200)), line(range(1000, 1050))):
         assert "is it of the same recording?" in time_span_doubt(line(range(50)), truth)
     assert time_span_doubt(line(range(50)), line(range(20))).startswith(
-        "poses are from 0.0 to 4.9 s, the true path from 0.0 to 1.9 s: "
+        "frames are from 0.0 to 4.9 s, the true path from 0.0 to 1.9 s: "
     )
 
 
@@ -173,7 +191,7 @@ def test_a_doubtful_truth_is_drawn_and_warned_of(tmp_path, caplog):
     run, _ = to_plot(range(50), range(20))
     with caplog.at_level("WARNING"):
         (path,) = plot_run(run, tmp_path)
-    assert "run: poses are from" in caplog.text
+    assert "run: frames are from" in caplog.text
     assert cv2.imread(str(path)) is not None
 
 

@@ -41,3 +41,12 @@ def test_unposed_ranges_by_hand():
     assert unposed_ranges(sent, {0, 1, 2, 3, 5, 6, 9}) == [(4, 4), (7, 8)]
     assert unposed_ranges(stretches({0: 0, 1: 1}), {0, 1}) == []
     assert unposed_ranges([], set()) == []
+
+
+def test_what_was_sent_behind_the_last_that_arrived_counts_where_it_is_known():
+    numbers = {0: 0, 3: 1, 6: 2}
+    assert stretches(numbers, num_sent=3) == stretches(numbers)
+    assert stretches(numbers, num_sent=5)[-1] == Stretch(9, 12, 2)
+    assert stretches({}, num_sent=4) == [Stretch(0, 3, 4)]
+    assert stretches({5: 2}, num_sent=4)[-1] == Stretch(6, 6, 1)
+    assert stretches({0: None, 1: None}, num_sent=9) == stretches({0: None, 1: None})

@@ -67,9 +67,9 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
 def why_no_pose(summary: Mapping[str, Any]) -> str:
     """Say in a line what is likely of a run that gave no frame a pose."""
     if not (summary.get("frames") or {}).get("tracked"):
-        return "semcast demo: no frame has a pose, as no image could be decoded"
+        return "no frame has a pose, as no image could be decoded"
     return (
-        "semcast demo: no frame has a pose: the camera must move sideways and see things with texture, large "
+        "no frame has a pose: the camera must move sideways and see things with texture, large "
         "enough in the images, and consecutive images must show much the same"
     )
 
@@ -131,6 +131,6 @@ def run(arguments: argparse.Namespace) -> int:
     elif settings.json is not None:
         write_json(settings.json, report)
     if not code and not result.get("completeness"):
-        talk.print(why_no_pose(result), soft_wrap=True)
+        talk.print(f"semcast demo: {why_no_pose(result)}", soft_wrap=True)
         return 1
     return code

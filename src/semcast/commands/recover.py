@@ -18,7 +18,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Copy every whole message and say what was there."""
     out = arguments.out or arguments.file
     info = recover_file(arguments.file, out)
-    state = "was whole" if info.complete else "was cut off"
-    damaged = f", {info.num_damaged_chunks} damaged chunks left out" if info.num_damaged_chunks else ""
-    print(f"{out}: {info.counts.total()} messages; {arguments.file} {state}{damaged}")
+    faults = [] if info.complete else ["cut off"]
+    if count := info.num_damaged_chunks:
+        faults.append(f"damaged: {count} chunk{'s' * (count > 1)} left out")
+    print(f"{out}: {info.counts.total()} messages; {arguments.file} was {' and '.join(faults) or 'whole'}")
     return 0

@@ -8,7 +8,7 @@ from typing import Any
 from rich.text import Text
 
 from semcast.commands.console import plain_console
-from semcast.commands.demo import summary_table
+from semcast.commands.demo import summary_table, why_no_pose
 from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
 from semcast.common.run_folder import (
     DENSE_NAME,
@@ -61,4 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     if settings.out is not None:
         there = ", ".join(name for name in _FILES if (settings.out / name).is_file())
         print(f"in {settings.out}: {there}")
+    if not code and not summary.get("completeness"):
+        talk.print(f"semcast replay: {why_no_pose(summary)}", soft_wrap=True)
+        return 1
     return code

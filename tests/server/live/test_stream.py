@@ -14,13 +14,14 @@ from semcast.common.codecs import load_codec
 from semcast.common.errors import SemcastError
 from semcast.common.keys import status_key
 from semcast.common.messages import StatusMessage
+from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.slots import layout_for
 from semcast.common.run_folder import read_run
 from semcast.common.symbol_payload import pack_lost
 from semcast.common.trajectory import read_tum
 from semcast.common.transport import open_client, open_hub
-from semcast.common.wire import unpack
+from semcast.common.wire import pack, unpack
 from semcast.server.export.outputs import read_ply
 from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server
@@ -160,3 +161,40 @@ def test_a_server_decodes_with_weights_of_ones_own(tiny_weights):
             decoder.codec_for("3dcsc", "16qam", load_codec("3dcsc").digest)
         shipped = load_codec("3dcsc-lite").digest
         assert decoder.codec_for("3dcsc-lite", "16qam", shipped).digest == shipped
+
+
+@pytest.mark.parametrize("num_seen", [0, 5])
+def test_a_stream_whose_end_is_lost_ends_and_says_what_is_missing(air, num_seen):
+    running = air.serve()
+    radio = air.agent(100)
+    radio.stream(range(num_seen))
+    metrics = Metrics("agent")
+    metrics.count("sent", 20)
+    metrics.end()
+    radio.session.publisher(status_key(AGENT, "agent"), "newest").put(pack(metrics.status(100)))
+    summary = running.finish()
+    assert summary["frames"] == {
+        "source": 24, "sent": 20, "tracked": num_seen, "posed": summary["num_posed"],
+        "keyframes": summary["frames"]["keyframes"],
+    }  # fmt: skip
+    assert summary["drops"]["missing"] == 20 - num_seen
+    assert summary["unposed_frames"][-1][1] == 19
+
+
+def test_an_agent_that_was_there_before_goes_on_when_one_of_the_same_name_has_ended(air):
+    running = air.serve()
+    first, second = air.agent(100), None
+    first.stream(range(4))
+    second = air.agent(200)
+    second.stream(range(3))
+    second.stream([3], final=True)
+    second.close()
+    deadline_s = time.monotonic() + DEADLINE_S
+    k = 4
+    while not set(first.posed_ids()) & set(range(4, 24)):
+        assert time.monotonic() < deadline_s
+        first.send(min(k, 22), seq=k, frame_id=k, final=False)
+        k += 1
+        time.sleep(0.2)
+    running.finish(stop=True)
+    assert running.server._metrics.drops["epoch"] > 0, "while the second was sending"
