@@ -284,6 +284,28 @@ def test_a_link_that_nothing_can_be_decoded_on_is_said(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_link_that_loses_all_ends_the_demo_and_is_said(tmp_path):
+    settings = DemoSettings(
+        codec="jpeg-ldpc",
+        link=ChannelSettings(frame_loss=1.0),
+        view="none",
+        resize=0.25,
+        rate_hz=20.0,
+        stride=4,
+        out=tmp_path,
+    )
+    stop = threading.Event()
+    patience = threading.Timer(90.0, stop.set)
+    patience.start()
+    summary, error = run_demo(settings, stop, lambda line: None, lambda done, text: None)
+    patience.cancel()
+    assert not stop.is_set(), "it ends by itself"
+    assert error is None
+    assert summary["frames"]["tracked"] == 0
+    assert summary["drops"]["missing"] == summary["frames"]["sent"] > 3
+
+
+@pytest.mark.slow
 def test_an_agent_that_gives_up_ends_the_demo_with_what_came_out_so_far(tmp_path):
     sequence = tmp_path / "sequence"
     shutil.copytree(SEQUENCE, sequence)

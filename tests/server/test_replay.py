@@ -168,6 +168,17 @@ def test_names_with_brackets_are_shown_as_they_are(recording, tmp_path, capsys):
     assert f"in {out}: " in capsys.readouterr().out
 
 
+def test_a_replay_that_is_stopped_before_its_first_frame_does_not_blame_the_recording(recording, tmp_path):
+    stop = threading.Event()
+    stop.set()
+    assert replay(ReplaySettings(file=recording, out=tmp_path), stop)["frames"]["tracked"] == 0
+
+
+def test_a_replay_without_a_pose_says_so_and_fails(recording, tmp_path, capsys):
+    assert main(["replay", str(recording), "--end-s", "0.05"]) == 1
+    assert "semcast replay: no frame has a pose" in capsys.readouterr().err
+
+
 def test_a_replay_that_is_broken_off_in_its_last_adjustment_has_left_results(
     recording, tmp_path, monkeypatch
 ):
@@ -226,12 +237,18 @@ def test_a_channel_means_the_transmitted_symbols(recording):
         ReplaySettings(file=recording, pace=-1.0)
 
 
-def test_a_cut_recording_is_recovered_and_still_replays(recording, tmp_path):
+def test_a_cut_recording_is_recovered_and_still_replays(recording, tmp_path, capsys):
     cut = tmp_path / "cut.mcap"
     data = recording.read_bytes()
     cut.write_bytes(data[: len(data) * 3 // 4])
     info = recover_file(cut, tmp_path / "whole.mcap")
     assert not info.complete
+    assert main(["recover", str(cut), "--out", str(tmp_path / "again.mcap")]) == 0
+    assert capsys.readouterr().out.endswith(f"messages; {cut} was cut off\n")
+    holed = tmp_path / "holed.mcap"
+    holed.write_bytes(data[: len(data) // 2] + bytes(1000) + data[len(data) // 2 + 1000 :])
+    assert main(["recover", str(holed), "--out", str(tmp_path / "again.mcap")]) == 0
+    assert capsys.readouterr().out.endswith(f"messages; {holed} was damaged: 1 chunk left out\n")
     assert RecordingReader(tmp_path / "whole.mcap").info().complete
     assert replay(ReplaySettings(file=tmp_path / "whole.mcap"))["frames"]
 

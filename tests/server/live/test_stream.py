@@ -1,6 +1,7 @@
 """A stream over real loopback Zenoh: an agent's frames in, poses and files out."""
 
 import contextlib
+import errno
 import json
 import re
 import threading
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from semcast.common.codecs import load_codec
-from semcast.common.errors import SemcastError
+from semcast.common.errors import SemcastError, SourceError
 from semcast.common.keys import status_key
 from semcast.common.messages import StatusMessage
 from semcast.common.metrics import Metrics
@@ -161,6 +162,22 @@ def test_a_server_decodes_with_weights_of_ones_own(tiny_weights):
             decoder.codec_for("3dcsc", "16qam", load_codec("3dcsc").digest)
         shipped = load_codec("3dcsc-lite").digest
         assert decoder.codec_for("3dcsc-lite", "16qam", shipped).digest == shipped
+
+
+def test_a_recording_that_breaks_off_leaves_the_results_and_is_an_error_at_the_end(
+    air, tmp_path, monkeypatch
+):
+    def no_room(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("semcast.common.recorder.RecordingWriter.add", no_room)
+    running = air.serve(out=tmp_path / "run", record=tmp_path / "run.mcap")
+    radio = air.agent(100)
+    radio.stream(range(3))
+    with pytest.raises(SourceError, match=r"run\.mcap is not complete: .*No space left"):
+        running.finish(stop=True)
+    assert running.summary["frames"]["tracked"] == 3
+    assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"]["tracked"] == 3
 
 
 @pytest.mark.parametrize("num_seen", [0, 5])
