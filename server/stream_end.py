@@ -35,8 +35,10 @@ class StreamEnd:
     def _on_status(self, payload: bytes) -> None:
         with contextlib.suppress(WireError):  # of no use to anybody, and counted nowhere
             status = unpack(payload, StatusMessage)
-            if status.ended and len(self._num_sent) < _REMEMBERED:
+            if status.ended:
                 self._num_sent[status.agent_epoch] = status.counts.get("sent", 0)
+                if len(self._num_sent) > _REMEMBERED:
+                    self._num_sent.pop(min(self._num_sent))
 
     def begin(self) -> None:
         """Begin on another stream."""
