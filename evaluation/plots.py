@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from semcast.common.errors import SemcastError
 
-_MARKERS = "os^Dv<>P*Xh"
-#: Matplotlib's own ten and black: as many as a pair benchmark has estimators, or Kodak codecs.
-_COLOURS = (*(f"C{k}" for k in range(10)), "black")
+_MARKERS = "os^Dv<>P*Xhp"
+#: Matplotlib's own ten and two more: as many as Kodak has codecs. Further curves are dashed.
+_COLOURS = (*(f"C{k}" for k in range(10)), "black", "goldenrod")
 
 
 def _new_figure(width_in: float = 5.0, height_in: float = 3.6) -> tuple[Figure, Axes]:
@@ -94,7 +94,8 @@ def plot_against_snr(
             raise ValueError(f"curve {name!r} must have {len(snr_db)} values, got {len(values)}")
         y = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
         colour, marker = _COLOURS[k % len(_COLOURS)], _MARKERS[k % len(_MARKERS)]
-        axes.plot(snr_db, y, color=colour, marker=marker, markersize=4, label=name)
+        style = "-" if k < len(_COLOURS) else "--"
+        axes.plot(snr_db, y, style, color=colour, marker=marker, markersize=4, label=name)
     axes.set(xlabel="SNR (dB)", ylabel=y_label, title=title)
     if from_zero:
         axes.set_ylim(bottom=0.0)
