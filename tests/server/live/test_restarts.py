@@ -213,7 +213,7 @@ def test_a_former_start_that_goes_on_sending_is_taken_up_again(air, monkeypatch)
 
 
 def test_a_start_with_an_earlier_clock_is_followed_after_a_silence(air, monkeypatch):
-    monkeypatch.setattr("semcast.server.arrival._SILENCE_NS", 0)
+    monkeypatch.setattr("semcast.server.arrival.SILENCE_NS", 0)
     running = air.serve()
     for epoch, num_frames in ((200, 4), (100, 6)):
         radio = air.agent(epoch)
