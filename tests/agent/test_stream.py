@@ -141,8 +141,7 @@ def take(receiver, count=None, deadline_s=60.0, pause_s=0.0):
 
 def test_images_cross_the_link_and_feedback_comes_back(bench):
     channel = bench.channel(snr_db=20.0)
-    receiver = bench.receiver()
-    agent = bench.agent(source={"repeat": "loop"})
+    receiver, agent = bench.receiver(), bench.agent(source={"repeat": "loop"})
     frames = take(receiver, count=20)
     agent.end()
     channel.end()
@@ -160,17 +159,11 @@ def test_images_cross_the_link_and_feedback_comes_back(bench):
 
 def test_a_report_of_a_frame_that_was_never_sent_is_not_believed(bench, until):
     bench.channel(snr_db=20.0)
-    receiver = bench.receiver()
-    agent = bench.agent(source={"repeat": "loop"})
-    (first,) = take(receiver, count=1)
-    report = LinkReport(
-        agent_epoch=first.message.agent_epoch,
-        frame_id=2**40,
-        t_capture_ns=first.message.t_capture_ns,
-        snr_db_estimate=-4.0,
-        num_superseded=0,
-    )
-    bench.hub.publisher(link_key("agent0"), "newest").put(pack(report))
+    receiver, agent = bench.receiver(), bench.agent(source={"repeat": "loop"})
+    message = take(receiver, count=1)[0].message
+    told = {"agent_epoch": message.agent_epoch, "t_capture_ns": message.t_capture_ns, "num_superseded": 0}
+    report = pack(LinkReport(frame_id=2**40, snr_db_estimate=-4.0, **told))
+    bench.hub.publisher(link_key("agent0"), "newest").put(report)
     take(receiver, count=20)
     agent.end()
     assert agent.result["drops"]["protocol"] == 1
@@ -180,8 +173,7 @@ def test_a_report_of_a_frame_that_was_never_sent_is_not_believed(bench, until):
 @pytest.mark.parametrize(("rate", "coded_hw"), [("1/48", (32, 32)), ("auto", (64, 96))])
 def test_frames_travel_at_the_rate_and_feedback_chooses_it(bench, rate, coded_hw):
     bench.channel(snr_db=-3.0)
-    receiver = bench.receiver()
-    agent = bench.agent(rate=rate, source={"repeat": "loop"})
+    receiver, agent = bench.receiver(), bench.agent(rate=rate, source={"repeat": "loop"})
     frames = take(receiver, count=20)
     agent.end()
     assert frames[-1].message.image_hw == coded_hw
@@ -383,8 +375,8 @@ class Picky:
 def test_a_frame_that_can_not_be_sent_live_is_left_out_and_counted(bench, caplog):
     bench.codec = Picky(bench.codec)
     bench.channel()
-    receiver = bench.receiver()
-    agent = bench.agent(follow_server=False, source={"pace": "rate", "rate_hz": 10.0})
+    source = {"pace": "rate", "rate_hz": 10.0}
+    receiver, agent = bench.receiver(), bench.agent(follow_server=False, source=source)
     frames = take(receiver, count=5)
     agent.join(40)
     assert agent.error is None
