@@ -1,7 +1,8 @@
 """The size an image states in its header, read without decoding it.
 
 Whatever comes over the air is decoded only if it states no more pixels than there can be: a few kilobytes may
-stand for gigabytes.
+stand for gigabytes. So nothing is read in a way in which a decoder could read another size: what is unusual
+states none.
 """
 
 import io
@@ -12,6 +13,8 @@ PNG_START = b"\x89PNG\r\n\x1a\n"
 JPEG_START = b"\xff\xd8"
 #: Start-of-frame markers are C0 to CF, but for these: Huffman tables, a reserved one, arithmetic coding.
 _NO_FRAME_MARKERS = (0xC4, 0xC8, 0xCC)
+#: Filling and markers that no length follows.
+_BARE_MARKERS = (0x01, *range(0xD0, 0xDA), 0xFF)
 #: A RIFF file: its length, "WEBP", the kind of the first chunk and its length.
 _WEBP_DATA = 20
 
@@ -29,7 +32,7 @@ def jpeg_size_wh(file: BinaryIO) -> tuple[int, int] | None:
     file.seek(len(JPEG_START))
     while True:
         mark, marker, length = struct.unpack(">BBH", file.read(4))
-        if mark != 0xFF:
+        if mark != 0xFF or marker in _BARE_MARKERS or length < 2:
             return None
         if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME_MARKERS:
             _, height, width = struct.unpack(">BHH", file.read(5))
@@ -54,11 +57,19 @@ def _webp_size_wh(data: bytes) -> tuple[int, int] | None:
 
 def _avif_size_wh(data: bytes) -> tuple[int, int] | None:
     """Return the largest of the sizes stated for the pictures of a file."""
+    # Boxes follow each other: their length, their kind. Sizes are in "meta", the coded pictures elsewhere.
+    begin, end, kind = 0, 0, b""
+    while kind != b"meta":
+        begin = end
+        length, kind = struct.unpack_from(">I4s", data, begin)
+        if length < 8:  # in 64 bits, or to the end of the file: not in a file as small as these
+            return None
+        end = begin + length
     sizes = []
-    at = data.find(b"ispe")  # image spatial extents: version and flags, width, height
+    at = data.find(b"ispe", begin, end)  # image spatial extents: version and flags, width, height
     while at >= 0:
         sizes.append(struct.unpack_from(">II", data, at + 8))
-        at = data.find(b"ispe", at + 4)
+        at = data.find(b"ispe", at + 4, end)
     if not sizes:
         return None
     return max(width for width, _ in sizes), max(height for _, height in sizes)

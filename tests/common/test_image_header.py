@@ -56,3 +56,21 @@ def test_a_file_that_states_more_pixels_than_a_frame_has_is_not_decoded(kind, mo
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     for shape_hw in ((47, 64), (48, 63), (16, 16)):
         assert decompress(data, shape_hw) is None
+
+
+def test_what_decoders_would_read_in_another_way_states_nothing():
+    data = file_of("jpeg", (48, 64, 3))
+    for marker in (b"\xff\xff", b"\xff\x01", b"\xff\xd0"):
+        assert stated_size_wh(data[:2] + marker + data[2:]) is None
+    assert stated_size_wh(data[:2] + b"\xff\xfe\x00\x01" + data[2:]) is None, (
+        "a segment shorter than its length"
+    )
+    data = file_of("avif", (48, 64, 3))
+    for length in (0, 1, 7):
+        assert stated_size_wh(length.to_bytes(4, "big") + data[4:]) is None
+
+
+def test_bytes_of_a_coded_picture_are_no_size():
+    data = file_of("avif", (48, 64, 3)) + b"ispe" + b"\xff" * 12
+    assert stated_size_wh(data) == (64, 48)
+    assert b"mdat" in data[: data.rfind(b"ispe")]

@@ -1,5 +1,6 @@
 import pytest
 
+from semcast.common.keys import status_key
 from semcast.common.metrics import Metrics
 from semcast.common.wire import pack
 from semcast.server.stream_end import StreamEnd
@@ -9,7 +10,7 @@ class Network:
     """Gives what an agent says of itself to who listens."""
 
     def subscribe(self, key, service, handle):
-        assert key.endswith("/agent/status") or "agent" in key
+        assert key == status_key("a", "agent")
         self.say = handle
 
 
