@@ -1,7 +1,7 @@
 """What blocks send in training: about what the rule of ``detail`` gives them, scattered.
 
 The networks are to serve whatever rule chooses later, so its exponent, the budget and single blocks vary. The
-blocks of a batch share one budget: a crop of a wall alone must be sent with as little as within a frame.
+blocks of some crops share one budget: a crop of a wall alone must be sent with as little as within a frame.
 
 On the air the values of a row of blocks begin in one slot and may end in the next, which fades on its own.
 """
@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from semcast.common.nets.detail import demand_of, detail_of
@@ -20,6 +21,9 @@ from semcast.training.channel import to_device
 _VALUES = torch.tensor(LEVELS)
 #: Share of rows that end in the slot they begin in.
 _SHARE_WHOLE = 0.35
+#: Crops that share one budget. Of the blocks of many crops there are always as many with detail as without,
+#: but frames differ.
+_GROUP = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +35,7 @@ class AllocationSettings:
         exponent_max: Largest.
         floor: Detail of a block without any, in squared grey levels.
         block_sd: Standard deviation of single blocks' log2 of values from the rule.
-        budget: Values of a block, the mean over a batch.
+        budget: Values of a block, the mean over the crops of a group.
         budget_sd: Standard deviation of the budget's log2.
     """
 
@@ -43,8 +47,10 @@ class AllocationSettings:
     block_sd: float = field(
         default=0.35, metadata={"help": "scatter of single blocks about the rule, log2 of values"}
     )
-    budget: float = field(default=91.0, metadata={"help": "values of a block, mean over a batch"})
-    budget_sd: float = field(default=0.3, metadata={"help": "scatter of the budget between batches, log2"})
+    budget: float = field(default=91.0, metadata={"help": "values of a block, mean over 16 crops"})
+    budget_sd: float = field(
+        default=0.3, metadata={"help": "scatter of the budget between groups of crops, log2"}
+    )
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.exponent_min <= self.exponent_max <= 2.0:
@@ -78,6 +84,10 @@ class AllocationDraw:
         """Return the draw on a device."""
         return AllocationDraw(to_device(self.values, device), to_device(self.num_before, device))
 
+    def pin_memory(self) -> "AllocationDraw":
+        """Return the draw in memory from which a GPU fetches it on its own."""
+        return AllocationDraw(self.values.pin_memory(), self.num_before.pin_memory())
+
     def in_next_slot(self) -> Tensor:
         """Tell which values are in the slot below that of their row, ``(B, 282, h, w)``."""
         before = self.values.cumsum(dim=3) - self.values  # values of the row before each block
@@ -95,14 +105,20 @@ def draw_allocation(
         settings: Of the draw.
         generator: On the CPU.
     """
+    groups = [_draw_levels(group, settings, generator) for group in crops.split(_GROUP)]
+    values = _VALUES[torch.from_numpy(np.concatenate(groups)).long()][:, None]
+    in_row = values.sum(dim=3, keepdim=True)
+    cut = torch.rand(in_row.shape, generator=generator) / (1.0 - _SHARE_WHOLE)
+    return AllocationDraw(values, (cut * in_row).long())
+
+
+def _draw_levels(
+    crops: Tensor, settings: AllocationSettings, generator: torch.Generator
+) -> NDArray[np.uint8]:
     detail = np.stack([detail_of(crop) for crop in crops.permute(0, 2, 3, 1).numpy()])
     span = settings.exponent_max - settings.exponent_min
     exponent = settings.exponent_min + span * float(torch.rand(1, generator=generator))
     scatter = torch.randn(detail.shape, generator=generator).numpy()
     demand = demand_of(detail, exponent, settings.floor) + settings.block_sd * scatter
     budget = settings.budget * 2.0 ** (settings.budget_sd * float(torch.randn(1, generator=generator)))
-    levels = levels_for(demand, round(budget * detail.size))
-    values = _VALUES[torch.from_numpy(levels).long()][:, None]
-    in_row = values.sum(dim=3, keepdim=True)
-    cut = torch.rand(in_row.shape, generator=generator) / (1.0 - _SHARE_WHOLE)
-    return AllocationDraw(values, (cut * in_row).long())
+    return levels_for(demand, round(budget * detail.size))

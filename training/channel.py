@@ -86,6 +86,10 @@ class LinkDraw:
         """Return the draw on a device."""
         return LinkDraw(*(to_device(t, device) for t in vars(self).values()))
 
+    def pin_memory(self) -> "LinkDraw":
+        """Return the draw in memory from which a GPU fetches it on its own."""
+        return LinkDraw(*(t.pin_memory() for t in vars(self).values()))
+
     def as_analog(self) -> "LinkDraw":
         """Return links over which analog values arrive as well as over these those that they carry."""
         slot_db = self.snr_db.view(-1, 1, 1, 1) + 10.0 * torch.log10(self.gain.clamp_min(1e-6))

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from semcast.common.errors import SourceError
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+T = TypeVar("T")
 #: A whole 16x16 block at half size, from which linear layers start.
 MIN_SIDE_PX = 32
 
@@ -129,39 +131,39 @@ class Crops(Dataset[Tensor]):
         return torch.from_numpy(np.stack(crops)).permute(0, 3, 1, 2)
 
 
-class Batches:
-    """Batches prepared ahead of their use.
+class Ahead(Generic[T]):
+    """What the steps are made of, prepared ahead of its use.
 
     Args:
-        crops: Makes them.
-        workers: What does so: 1 is a thread beside the one that trains, more are processes. The batches are
-            the same for any number.
-        pinned: Processes leave batches in memory from which a GPU fetches them on its own.
+        items: Makes it, by step.
+        workers: What does so: 1 is a thread beside the one that trains, more are processes. Items are the
+            same for any number.
+        pinned: Items are left in memory from which a GPU fetches them on its own.
 
     Raises:
         ValueError: ``workers`` is less than 1.
     """
 
-    def __init__(self, crops: Crops, workers: int = 1, pinned: bool = False) -> None:
+    def __init__(self, items: Dataset[T], workers: int = 1, pinned: bool = False) -> None:
         if workers < 1:
             raise ValueError(f"workers must be >= 1, got {workers}")
-        self._crops = crops
+        self._items = items
         self._workers, self._pinned = workers, pinned
         self._next_step = -1
-        self._ahead: Iterator[Tensor] = iter(())
+        self._ahead: Iterator[T] = iter(())
 
-    def get(self, step: int) -> Tensor:
-        """Return the batch of a step and start on the next ones."""
+    def get(self, step: int) -> T:
+        """Return the item of a step and start on the next ones."""
         if step != self._next_step:
             self.close()
             self._ahead = self._by_processes(step) if self._workers > 1 else self._by_thread(step)
         self._next_step = step + 1
         return next(self._ahead)
 
-    def _by_processes(self, step: int) -> Iterator[Tensor]:
+    def _by_processes(self, step: int) -> Iterator[T]:
         return iter(
             DataLoader(
-                self._crops,
+                self._items,
                 batch_size=None,
                 sampler=range(step, sys.maxsize),
                 num_workers=self._workers,
@@ -170,16 +172,16 @@ class Batches:
             )
         )
 
-    def _by_thread(self, step: int) -> Iterator[Tensor]:
-        with ThreadPoolExecutor(1, thread_name_prefix="batches") as pool:
-            ahead = pool.submit(self._crops.__getitem__, step)
+    def _by_thread(self, step: int) -> Iterator[T]:
+        with ThreadPoolExecutor(1, thread_name_prefix="ahead") as pool:
+            ahead = pool.submit(self._items.__getitem__, step)
             for k in count(step + 1):
-                batch = ahead.result()
-                ahead = pool.submit(self._crops.__getitem__, k)
-                yield batch
+                item = ahead.result()
+                ahead = pool.submit(self._items.__getitem__, k)
+                yield item
 
     def close(self) -> None:
-        """Stop what prepares batches."""
+        """Stop what prepares items."""
         self._ahead = iter(())
         self._next_step = -1
 

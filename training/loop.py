@@ -22,10 +22,10 @@ from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, channel_bandwidth_ratio
 from semcast.common.whole_file import check_writable, whole_file
-from semcast.training.allocations import draw_allocation
 from semcast.training.centring import centre_hidden, folded, unfolded
-from semcast.training.channel import draw_links, to_device
-from semcast.training.data import Batches, Crops, read_images
+from semcast.training.channel import to_device
+from semcast.training.data import Ahead, Crops, read_images
+from semcast.training.draws import Draws, seed_of_step
 from semcast.training.growing import grow
 from semcast.training.klt import start_from_klt
 from semcast.training.losses import through_whole_link, transceiver_loss
@@ -40,8 +40,8 @@ logger = logging.getLogger(__name__)
 _VALID_IMAGES = 16
 #: Raised when the same weights mean another network.
 CHECKPOINT_FORMAT = 3
-#: Batches the means of hidden units are taken from, and a step no run gets to.
-_FOLD_BATCHES, _FOLD_STEP = 24, 2**40
+#: Batches the means of hidden units are taken from, crops in each, and a step no run gets to.
+_FOLD_BATCHES, _FOLD_CROPS, _FOLD_STEP = 24, 16, 2**40
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,7 @@ class Run:
         entry = architecture(settings.architecture)
         torch.manual_seed(settings.seed)  # layers draw their first weights from the global generator
         model: Transceiver = entry.build(entry.sizes)
+        self._is_variable = model.is_variable
         self.images = read_images(settings.data)
         self.valid_images = read_images(settings.valid)[:_VALID_IMAGES] if settings.valid else []
         self.step, self.elapsed_s = 0, 0.0
@@ -127,8 +128,7 @@ class Run:
         self.optimisers = build_optimisers(self.model, settings)
         if checkpoint is not None:
             self._restore(checkpoint)
-        crops = Crops(self.images, settings.crop, settings.batch, settings.seed, rank)
-        self.batches = Batches(crops, settings.data_workers, pinned=use_cuda)
+        self.ahead = Ahead(self._draws(settings.batch, rank), settings.data_workers, pinned=use_cuda)
 
     @property
     def checkpoint_path(self) -> Path:
@@ -203,6 +203,12 @@ class Run:
         average: Transceiver = self.average
         return average if self.settings.only_heads else folded(average, self._pass_images)
 
+    def _draws(self, batch: int, rank: int) -> Draws:
+        settings = self.settings
+        crops = Crops(self.images, settings.crop, batch, settings.seed, rank)
+        allocation = settings.allocation if self._is_variable else None
+        return Draws(crops, settings.channel, allocation, settings.seed, rank)
+
     def _pass_images(
         self,
         model: Transceiver,
@@ -215,18 +221,16 @@ class Run:
             see: Called with the images, the latent and the decoded images of every batch.
         """
         settings = self.settings
-        crops = Crops(self.images, settings.crop, settings.batch, settings.seed)
+        draws = self._draws(_FOLD_CROPS, rank=0)
         device = next(model.parameters()).device
         blocks = settings.crop.size_px // BLOCK_PX
         generator = torch.Generator().manual_seed(settings.seed)
         for k in range(_FOLD_BATCHES):
-            pixels = crops[_FOLD_STEP + k]
-            x = pixels.to(device).float() / 255.0
-            draw = draw_links(settings.channel, len(x), blocks, generator).to(device)
+            drawn = draws[_FOLD_STEP + k]
+            x = drawn.pixels.to(device).float() / 255.0
+            draw = drawn.links.to(device)
             noise = torch.randn((len(x), model.channels, blocks, blocks), generator=generator).to(device)
-            sent = None
-            if model.is_variable:
-                sent = draw_allocation(pixels, settings.allocation, generator).to(device)
+            sent = drawn.sent.to(device) if drawn.sent is not None and model.is_variable else None
             with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
                 _, x_hat, _ = through_whole_link(model, x, draw, noise, sent)
                 if see is not None:
@@ -275,29 +279,26 @@ class Run:
     def one_step(self) -> dict[str, torch.Tensor]:
         """Draw a batch and its links, and update the weights once."""
         settings, share = self.settings, self.share_done()
-        pixels = self.batches.get(self.step)
-        x = to_device(pixels, self.device).float() / 255.0
+        drawn = self.ahead.get(self.step)
+        x = to_device(drawn.pixels, self.device).float() / 255.0
         x = x.contiguous(memory_format=torch.channels_last)
-        seed = (settings.seed * 1_000_003 + self.step) * 64 + self.rank
-        generator = torch.Generator().manual_seed(seed)
+        seed = seed_of_step(settings.seed, self.rank, self.step)
         blocks = settings.crop.size_px // BLOCK_PX
-        channel = settings.channel
+        draw = drawn.links.to(self.device)
         if share < settings.analog_share:
-            channel = replace(channel, share_16qam=0.0)
-        draw = draw_links(channel, settings.batch, blocks, generator).to(self.device)
+            draw = replace(draw, is_qam=torch.zeros_like(draw.is_qam))
         # Drawn where it is used: on a CPU the noise of a large batch would cost a GPU more than the network.
         on_device = torch.Generator(self.device).manual_seed(seed + 1_000_003)
         shape = (settings.batch, self.model.channels, blocks, blocks)
         noise = torch.randn(shape, generator=on_device, device=self.device)
-        sent = None
-        if self.model.is_variable:
-            sent = draw_allocation(pixels, settings.allocation, generator).to(self.device)
+        sent = None if drawn.sent is None else drawn.sent.to(self.device)
         is_ending = share >= 1.0 - settings.decay_share / 4.0
         with_heads = settings.only_heads or is_ending or self.step % settings.head_every == 0
         set_rate(self.optimisers, rate_factor(share, self.step, settings))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=settings.bf16):
             if share < settings.pretrain_share:
-                loss, logs = masked_image_loss(self.model, x, settings.mask_share, generator)
+                hiding = torch.Generator().manual_seed(seed + 2_000_003)
+                loss, logs = masked_image_loss(self.model, x, settings.mask_share, hiding)
             else:
                 loss, logs = transceiver_loss(self.model, x, draw, noise, settings.loss, with_heads, sent)
         loss.backward()
@@ -435,7 +436,7 @@ def _train(
             if run.step % settings.save_every == 0:
                 run.save()
     finally:
-        run.batches.close()
+        run.ahead.close()
         run.save()
     if run.rank == 0 and run.valid_images:
         valid = validate(run.shippable(), run.valid_images, run.device, settings.bf16)

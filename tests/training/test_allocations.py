@@ -67,3 +67,11 @@ def test_draws_are_repeatable_and_differ_from_seed_to_seed():
 def test_settings_are_checked(change, message):
     with pytest.raises(ValueError, match=message):
         AllocationSettings(**change)
+
+
+def test_groups_of_crops_have_budgets_of_their_own():
+    many = crops()[1:].repeat(64, 1, 1, 1)
+    settings = AllocationSettings(block_sd=0.0, exponent_min=0.5, exponent_max=0.5, budget_sd=1.0)
+    values = draw_allocation(many, settings, torch.Generator().manual_seed(0)).values
+    means = values.float().mean(dim=(1, 2, 3)).view(4, 16)
+    assert len({round(float(mean)) for mean in means.mean(dim=1)}) > 2

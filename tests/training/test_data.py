@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from semcast.common.errors import SourceError
-from semcast.training.data import Batches, Crops, CropSettings, random_crop, read_images
+from semcast.training.data import Ahead, Crops, CropSettings, random_crop, read_images
 
 
 def photo(height=80, width=100, seed=0):
@@ -19,7 +19,7 @@ def crops(seed=7, rank=0):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_batch_of_a_step_does_not_depend_on_the_steps_before_or_on_workers(workers):
-    batches = Batches(crops(), workers)
+    batches = Ahead(crops(), workers)
     for step in (0, 1, 2, 7, 8, 1):
         torch.testing.assert_close(batches.get(step), crops()[step])
     batches.close()
@@ -31,7 +31,7 @@ def test_the_batch_of_a_step_does_not_depend_on_the_steps_before_or_on_workers(w
 
 def test_there_is_at_least_one_worker():
     with pytest.raises(ValueError, match="workers must be >= 1, got 0"):
-        Batches(crops(), workers=0)
+        Ahead(crops(), workers=0)
 
 
 def test_ranks_see_different_crops():
