@@ -18,7 +18,7 @@ Modulation = Literal["16qam", "analog"]
 MODULATIONS: tuple[Modulation, ...] = ("16qam", "analog")
 
 #: Codec of every command that is not told another.
-DEFAULT_CODEC = "3dcsc-lite"
+DEFAULT_CODEC = "3dcsc-lite-vr"
 
 #: Side of the window in which keypoints are tracked, and whose displacement the keypoint confidence predicts.
 KLT_WINDOW_PX = 21

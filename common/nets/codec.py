@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from semcast.common.codec import (
+    DEFAULT_CODEC,
     LOST_SLOT_SNR_DB,
     MODULATIONS,
     DecodedImage,
@@ -93,7 +94,7 @@ class NeuralCodec:
     @classmethod
     def load(
         cls,
-        name_or_path: str | Path = "3dcsc-lite",
+        name_or_path: str | Path = DEFAULT_CODEC,
         modulation: Modulation = "16qam",
         num_threads: int | None = None,
         device: Device = "auto",
