@@ -66,6 +66,7 @@ def _codec(report: Report) -> Iterator[str]:
 
 
 def _trajectory(report: Report) -> Iterator[str]:
+    yield from _other_codec(report)
     head = ["SNR dB", "confidence", "ATE m", "ATE %", "completeness", "RPE %", "RPE deg", "PSNR dB", "seeds"]
     if gap_s := report["settings"].get("gap_s"):
         yield f"Nothing arrives for {gap_s:g} s, at another place for each seed. `again`: from the first"
@@ -91,8 +92,15 @@ def _trajectory(report: Report) -> Iterator[str]:
     )
 
 
+def _other_codec(report: Report) -> Iterator[str]:
+    codec = report["settings"]["codec"]
+    if codec not in ("none", DEFAULT_CODEC):
+        yield f"Codec `{codec}`.\n"
+
+
 def _pairs(report: Report) -> Iterator[str]:
     methods = list(report["results"])
+    yield from _other_codec(report)
     yield "Mean translation-direction error in degrees; the last column is its 95 % interval.\n"
     rows = []
     for cell in report["cells"]:

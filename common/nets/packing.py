@@ -16,13 +16,14 @@ _FILLER = 0.5**0.5
 
 
 def sent_mask(values: Tensor, channels: int) -> Tensor:
-    """Return 1 for each value that is sent and 0 for the others, ``(B, C, h, w)`` float32.
+    """Return 1 for each value that is sent and 0 for the others, ``(B, C, h, w)`` float32, channels last.
 
     Args:
         values: ``(B, 1, h, w)`` how many values each block sends, the first ones.
         channels: Values a block has.
     """
-    return (torch.arange(channels, device=values.device).view(1, -1, 1, 1) < values).float()
+    of_blocks = torch.arange(channels, device=values.device) < values.permute(0, 2, 3, 1)
+    return of_blocks.float().permute(0, 3, 1, 2)
 
 
 def share_plane(values: Tensor) -> Tensor:

@@ -30,7 +30,9 @@ def test_a_step_is_made_of_the_same_whoever_draws_it():
 def test_steps_seeds_and_ranks_differ_in_crops_links_and_allocations():
     base = tensors(draws()[3])
     for other in (draws()[4], draws(seed=1)[3], draws(rank=1)[3]):
-        for name, one, two in zip(("pixels", "snr_db", "expected_snr_db"), base, tensors(other), strict=False):
+        for name, one, two in zip(
+            ("pixels", "snr_db", "expected_snr_db"), base, tensors(other), strict=False
+        ):
             assert not torch.equal(one, two), name
         assert not torch.equal(base[-1], tensors(other)[-1])
 
