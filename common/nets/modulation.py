@@ -58,7 +58,7 @@ def nearest_level(y: Tensor) -> Tensor:
 
 
 def carrier_pattern(like: Tensor) -> Tensor:
-    """Return the known ``(1, C, h, w)`` pattern of +-1 for a latent of the shape of ``like``, not to be changed."""
+    """Return the known ``(1, C, h, w)`` pattern of +-1 for a latent of the shape of ``like``."""
     _, channels, rows, columns = like.shape
     return _pattern(channels, rows, columns, like.dtype, like.device)
 
