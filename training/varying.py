@@ -179,12 +179,9 @@ def _vary_decoder(old: Decoder, new: Decoder, order: Tensor, added: Tensor, log_
     _bias(new.linear.unmix).zero_()[:count] = _bias(old.linear.unmix)
     new.linear.log_power[:count] = old.linear.log_power
     new.linear.log_power[count:] = log_power
-    new.linear.log_distortion.copy_(old.linear.log_distortion)
     new.linear.transform.weight[:, :count] = old.linear.transform.weight
     new.linear.transform.weight[:, count:, 0, 0] = added
-    _bias(new.linear.transform).copy_(_bias(old.linear.transform))
     _set_received(new.stem, old.stem.weight, order)
-    _bias(new.stem).copy_(_bias(old.stem))
     new.adapt_head.weight.zero_()
     _bias(new.adapt_head).zero_()
     for start, part in ((0, slice(0, count)), (MAX_VALUES, slice(count, 2 * count))):
