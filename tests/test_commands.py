@@ -25,6 +25,7 @@ from semcast.commands.doctor import check_packages, check_processor
 from semcast.commands.evaluate import EVALUATIONS
 from semcast.commands.running import read_given, read_settings, run_until_stopped
 from semcast.common.argument_order import arguments_last
+from semcast.common.codec import DEFAULT_CODEC
 from semcast.common.config import to_toml
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.transport import free_endpoint, open_hub
@@ -218,7 +219,7 @@ def test_weights_decide_on_the_codec_unless_one_is_named(tmp_path):
 
     file = tmp_path / "settings.toml"
     file.write_text('codec = "3dcsc"\n')
-    assert codec() == "3dcsc-lite"
+    assert codec() == DEFAULT_CODEC
     assert codec("--weights", "cnn") == "cnn"
     assert codec("--weights", "cnn", "--codec", "3dcsc-lite") == "3dcsc-lite"
     assert codec("--weights", "cnn", "--config", str(file)) == "3dcsc"

@@ -1,5 +1,6 @@
 import pytest
 
+from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import table, with_part
 from semcast.evaluation.pair_summary import cells_of, pair_summary
 
@@ -31,7 +32,7 @@ def cell(snr_db, errors_deg, interval=(-1.0, 1.0), **values):
 
 
 def report(*cells):
-    settings = {"codec": "3dcsc-lite", "link": {"channel": "awgn"}}
+    settings = {"codec": DEFAULT_CODEC, "link": {"channel": "awgn"}}
     return {"sequence": "room", "settings": settings, "cells": list(cells)}
 
 
