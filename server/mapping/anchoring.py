@@ -1,10 +1,12 @@
-"""Takes the drift out of tracks: at keyframes they are aligned with how earlier keyframes saw them.
+"""Tracks against how earlier keyframes saw them: their drift is taken out, and chance finds are told.
 
 Following a point from image to image makes a small error at every step, and a larger one where images are
 noisy: about a pixel in a dozen decoded frames. At a keyframe the pose is known, so that patches of older
 keyframes can be warped to how they should look now, and the point put back on them. Every older image has
 noise of its own, so a point is aligned with all of them and put in the median of where they have it.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.patch_alignment import (
     ANCHOR_PATCH_PX,
+    AlignedPatches,
     Templates,
     affine_warps,
     align_patches,
@@ -20,7 +23,7 @@ from semcast.server.geometry.patch_alignment import (
 )
 from semcast.server.geometry.pnp import MIN_DEPTH_MAP
 from semcast.server.geometry.weighting import MAD_TO_SIGMA
-from semcast.server.mapping.recall import KeyframeImages
+from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -31,6 +34,10 @@ Array = NDArray[np.float64]
 NUM_ANCHORS = 10
 #: Places from which on their scatter tells how well a track is known.
 _MIN_PLACES = 4
+#: Keyframes that the tracks behind a pose are compared with, and how many of those these show must look as
+#: they did, and what share. Behind gaps of 3 to 10 frames 46 to 100 % of 11 to 122 did where the pose was
+#: right, in noisy images too, and none of 2 to 39 where it was wrong.
+_NUM_COMPARED, _MIN_ALIKE, _MIN_ALIKE_SHARE = 3, 5, 0.2
 #: Landmarks next to a track without one, by which its patch is warped, and how many a keyframe must show.
 _NEIGHBOURS, _MIN_LANDMARKS = 5, 5
 
@@ -62,33 +69,94 @@ def anchor_tracks(
     Returns:
         How many tracks were aligned.
     """
+    views = _views(world, images, submap, NUM_ANCHORS)
+    all_rows = np.flatnonzero(tracks.visible)
+    aligned = _align(camera, world, views, tracks, all_rows, sight, T_world_cam)
+    if aligned is None:
+        return 0
+    rows, anchor, found = aligned
+    fits = found.fits(tracks.xy[rows])
+    places = np.full((len(views), len(tracks), 2), np.nan)
+    places[anchor[fits], rows[fits]] = found.xy[fits]
+    settled = np.unique(rows[fits])
+    middle, scatter_px2 = _middle(places[:, settled])
+    tracks.settle_at(settled, middle, scatter_px2)
+    return len(settled)
+
+
+def resembles(
+    camera: Intrinsics,
+    world: WorldMap,
+    images: KeyframeImages,
+    tracks: TrackTable,
+    sight: Sight,
+    T_world_cam: Array,
+    ids: NDArray[np.int64],
+    *,
+    submap: int,
+) -> bool:
+    """Tell whether tracks that agree with a pose show what the newest keyframes saw.
+
+    KLT finds something near almost any guess, and all that was found near one guess agrees with its pose.
+
+    Args:
+        camera: Pinhole.
+        world: The map.
+        images: Of keyframes.
+        tracks: Followed to the new image.
+        sight: The new image.
+        T_world_cam: Its pose.
+        ids: ``(N,)`` the tracks that agree.
+        submap: The current one.
+    """
+    views = _views(world, images, submap, _NUM_COMPARED)
+    rows = np.flatnonzero(tracks.visible & np.isin(tracks.ids, ids))
+    aligned = _align(camera, world, views, tracks, rows, sight, T_world_cam)
+    if aligned is None:
+        return False
+    rows, _, found = aligned
+    num_alike = len(np.unique(rows[found.fits(tracks.xy[rows])]))
+    return num_alike >= max(_MIN_ALIKE, _MIN_ALIKE_SHARE * len(np.unique(rows)))
+
+
+def _views(
+    world: WorldMap, images: KeyframeImages, submap: int, count: int
+) -> list[tuple[SeenFrom, Keyframe]]:
+    """Newest kept keyframes of a submap with their images, oldest first."""
     by_id = {k.frame_id: k for k in world.keyframes_of(submap)}
+    return [(image, by_id[image.frame_id]) for image in images.newest(count) if image.frame_id in by_id]
+
+
+def _align(
+    camera: Intrinsics,
+    world: WorldMap,
+    views: Sequence[tuple[SeenFrom, Keyframe]],
+    tracks: TrackTable,
+    wanted: NDArray[np.intp],
+    sight: Sight,
+    T_world_cam: Array,
+) -> tuple[NDArray[np.intp], NDArray[np.intp], AlignedPatches] | None:
+    """Align some tracks with each keyframe that saw them.
+
+    Returns:
+        Rows of tracks ``(M,)``, one for each keyframe that shows it, that keyframe's row ``(M,)``, and where
+        the patches are; None where no keyframe shows any well enough.
+    """
     T_cam_world = invert_transform(T_world_cam)
     parts: list[tuple[NDArray[np.intp], Array, Templates]] = []
-    for image in images.newest(NUM_ANCHORS):
-        keyframe = by_id.get(image.frame_id)
-        if keyframe is None:
-            continue
-        rows, xy0 = _shared(tracks, keyframe)
+    for image, keyframe in views:
+        rows, xy0 = _shared(tracks, wanted, keyframe)
         depth = _depths(world, keyframe, tracks.ids[rows], xy0)
         told = depth > 0.0
         rows, xy0, depth = rows[told], xy0[told], depth[told]
         warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
         alike = seen_alike(warps, depth_now)
-        if alike.any():
-            parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike], ANCHOR_PATCH_PX)))
-    if not parts:
-        return 0
+        parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike], ANCHOR_PATCH_PX)))
+    if not any(len(part[0]) for part in parts):
+        return None
     rows, warps = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
     found = align_patches(Templates.join([part[2] for part in parts]), sight.grey, tracks.xy[rows], warps)
-    fits = found.fits(tracks.xy[rows])
-    anchor = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
-    places = np.full((len(parts), len(tracks), 2), np.nan)
-    places[anchor[fits], rows[fits]] = found.xy[fits]
-    aligned = np.unique(rows[fits])
-    middle, scatter_px2 = _middle(places[:, aligned])
-    tracks.settle_at(aligned, middle, scatter_px2)
-    return len(aligned)
+    return rows, np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts]), found
 
 
 def _middle(places: Array) -> tuple[Array, Array]:
@@ -103,9 +171,8 @@ def _middle(places: Array) -> tuple[Array, Array]:
     return middle, np.where(enough, deviation_px**2, np.nan)
 
 
-def _shared(tracks: TrackTable, keyframe: Keyframe) -> tuple[NDArray[np.intp], Array]:
-    """Rows of visible tracks that a keyframe saw too, and where."""
-    rows = np.flatnonzero(tracks.visible)
+def _shared(tracks: TrackTable, rows: NDArray[np.intp], keyframe: Keyframe) -> tuple[NDArray[np.intp], Array]:
+    """Return those of some tracks that a keyframe saw too, and where."""
     _, mine, theirs = np.intersect1d(tracks.ids[rows], keyframe.ids, assume_unique=True, return_indices=True)
     return rows[mine], keyframe.xy[theirs]
 

@@ -11,7 +11,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, make_transform, skew, transform_points
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
 from semcast.server.mapping import mapper
-from semcast.server.mapping.anchoring import anchor_tracks
+from semcast.server.mapping.anchoring import anchor_tracks, resembles
 from semcast.server.mapping.bridging import bridge, may_turn
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.camera_motion import CameraMotion
@@ -21,7 +21,7 @@ from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, View, share_out
 from semcast.server.mapping.readout_watch import ReadoutWatch
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom
+from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, place_anew
 from semcast.server.mapping.rolling_shutter import ImageFlow
@@ -156,6 +156,21 @@ class MapBuilder:
         """Align tracks with how earlier keyframes of this submap saw them; the number aligned."""
         return anchor_tracks(
             self._camera, self.world, self.images, tracks, sight, T_world_cam, submap=self.submap
+        )
+
+    def resembles(self, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: Ids) -> bool:
+        """Tell whether tracks that agree with a pose show what the newest keyframes saw."""
+        return resembles(
+            self._camera, self.world, self.images, tracks, sight, T_world_cam, ids, submap=self.submap
+        )
+
+    def recall(
+        self, tracks: TrackTable, sight: Sight, T_world_cam: Array, *, wanted: int, reach_px: float
+    ) -> Ids:
+        """Give lost landmarks of the newest keyframes their tracks back; ids of those found."""
+        how = {"submap": self.submap, "wanted": wanted}
+        return recall_landmarks(
+            self._camera, self.world, self.images, tracks, sight, T_world_cam, reach_px=reach_px, **how
         )
 
     def revisit(

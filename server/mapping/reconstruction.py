@@ -21,7 +21,6 @@ from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.readout import Readout
-from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Seen, Sight
@@ -213,7 +212,10 @@ class Reconstruction:
             pose = self._pose(T_world_on)
         if pose is None and self._tracks.follow_jump(sight):
             pose = self._pose(T_world_guess)
+        is_vague = pose is None or self._is_after_gap
         pose = self._with_more(sight, pose, T_world_guess)
+        if pose is not None and is_vague:
+            pose = self._if_alike(sight, pose)
         self._lap("pose", since)
         if pose is not None:
             return self._accept(sight, pose)
@@ -231,23 +233,22 @@ class Reconstruction:
         few = _FEW_INLIERS_SHARE * self._settings.max_features
         if T_world_cam is None or (pose is not None and pose.num_inliers >= few):
             return pose
-        recalled = recall_landmarks(
-            self._camera,
-            self._map.world,
-            self._map.images,
-            self._tracks,
-            sight,
-            T_world_cam,
-            submap=self._map.submap,
-            wanted=round(few) - (0 if pose is None else pose.num_inliers),
-            reach_px=_REACH_PX if pose is not None and pose.num_inliers >= MIN_INLIERS else _REACH_BLIND_PX,
-        )
+        wanted = round(few) - (0 if pose is None else pose.num_inliers)
+        reach_px = _REACH_PX if pose is not None and pose.num_inliers >= MIN_INLIERS else _REACH_BLIND_PX
+        recalled = self._map.recall(self._tracks, sight, T_world_cam, wanted=wanted, reach_px=reach_px)
         again = self._pose(T_world_cam) if len(recalled) else None
         if again is not None and (pose is None or again.num_inliers > pose.num_inliers):
             return again
         # What was recalled has proved nothing.
         self._tracks.keep(~np.isin(self._tracks.ids, recalled))
         return pose
+
+    def _if_alike(self, sight: Sight, pose: TrackedPose) -> TrackedPose | None:
+        """Return a pose whose tracks look as they did; of others nothing that was found is kept."""
+        if self._map.resembles(self._tracks, sight, pose.T_world_cam, pose.ids[pose.inliers]):
+            return pose
+        self._tracks.clear()
+        return None
 
     def _accept(self, sight: Sight, pose: TrackedPose) -> FrameResult:
         """Take a pose: note it, weed out tracks that slipped, and make a keyframe where one is due."""
