@@ -1,23 +1,24 @@
-"""Finds tracks again after a jump of the image that Lucas-Kanade can't follow: descriptors, then geometry.
+"""Matches of two images however far points moved between them: SIFT, then one epipolar geometry.
 
-A gap in the stream, a low frame rate or a jerk moves points further than a pyramid reaches. Tracks are then
-described where they were last seen, corners of the new image are matched with them, and what agrees on one
-epipolar geometry gives each track a place to start from.
+A gap in the stream, a low frame rate or a jerk moves points further than a pyramid of Lucas-Kanade reaches,
+and turns and scales what is around them. What is matched gives every point nearby a place to start from.
 """
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from semcast.server.geometry.features import Describer, Grey, detect_corners, match_descriptors
+from semcast.server.geometry.features import Grey
 
 Array = NDArray[np.float64]
 
-#: Octaves of the new image, so that points that came nearer still match.
-_OCTAVES = (0, 1, 2, 3)
-_NUM_CORNERS = 800
-_CELL_PX = 40
+#: Features of an image at most, the strongest; decoded images are soft, so that weak ones count.
+_NUM_FEATURES, _MIN_CONTRAST = 2000, 0.02
+#: A descriptor's nearest one must be nearer than this share of the distance to the second nearest.
+_MAX_RATIO = 0.8
 _EPIPOLAR_PX = 3.0
 _NEIGHBOURS = 7
 _FREE_FLOW_PX = 15.0
@@ -25,6 +26,87 @@ _FREE_FLOW_PX = 15.0
 MIN_AGREEING = 15
 #: Nor does a share of all matches below this.
 _MIN_AGREEING_SHARE = 0.4
+
+
+@dataclass(frozen=True)
+class WideFeatures:
+    """SIFT features (Lowe 2004) of an image.
+
+    Attributes:
+        xy: ``(N, 2)`` pixels.
+        size_px: ``(N,)`` diameter of each.
+        angle_rad: ``(N,)`` its direction, from x to y.
+        descriptors: ``(N, 128)`` float32.
+    """
+
+    xy: Array
+    size_px: Array
+    angle_rad: Array
+    descriptors: NDArray[np.float32]
+
+    @staticmethod
+    def of(grey: Grey, usable: NDArray[np.bool_] | None = None) -> "WideFeatures":
+        """Find the features of an ``(H, W)`` image, where ``usable (H, W)`` is True."""
+        sift = cv2.SIFT.create(nfeatures=_NUM_FEATURES, contrastThreshold=_MIN_CONTRAST)
+        mask = None if usable is None else usable.astype(np.uint8)
+        found, descriptors = sift.detectAndCompute(grey, mask)
+        if descriptors is None:
+            return WideFeatures(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 128), np.float32))
+        return WideFeatures(
+            xy=np.array([k.pt for k in found], dtype=np.float64),
+            size_px=np.array([k.size for k in found]),
+            angle_rad=np.radians([k.angle for k in found]),
+            descriptors=np.asarray(descriptors, dtype=np.float32),
+        )
+
+
+@dataclass(frozen=True)
+class WideMatches:
+    """Matches of two images, with how what is around them was turned and scaled.
+
+    Attributes:
+        from_xy: ``(M, 2)`` pixels in the first image.
+        to_xy: ``(M, 2)`` pixels in the second.
+        turns: ``(M, 2, 2)`` from offsets in the first image to those in the second.
+    """
+
+    from_xy: Array
+    to_xy: Array
+    turns: Array
+
+    def carry(self, xy: Array, max_offset_px: float) -> tuple[NDArray[np.intp], Array]:
+        """Take pixels ``(N, 2)`` of the first image to the second: for each match the one next to it.
+
+        Args:
+            xy: Pixels.
+            max_offset_px: One further from its match is left out.
+
+        Returns:
+            Rows of those that were taken ``(K,)``, and where they come to lie ``(K, 2)``.
+        """
+        if len(xy) == 0 or len(self.from_xy) == 0:
+            return np.zeros(0, np.intp), np.zeros((0, 2))
+        square = ((xy[:, None] - self.from_xy[None]) ** 2).sum(axis=2)
+        next_to = square.argmin(axis=0)
+        near = np.flatnonzero(square[next_to, np.arange(len(next_to))] < max_offset_px**2)
+        rows, first = np.unique(next_to[near], return_index=True)
+        match = near[first]
+        offset = np.einsum("nij,nj->ni", self.turns[match], xy[rows] - self.from_xy[match])
+        return rows, self.to_xy[match] + offset
+
+
+def match_wide(features0: WideFeatures, features1: WideFeatures) -> WideMatches:
+    """Match two images by descriptors that clearly have a nearest one; some matches are wrong."""
+    clear: list[tuple[int, int]] = []
+    if len(features0.xy) and len(features1.xy) > 1:
+        pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(features0.descriptors, features1.descriptors, k=2)
+        clear = [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < _MAX_RATIO * b.distance]
+    row0, row1 = np.array(clear, dtype=np.intp).reshape(-1, 2).T
+    scale = features1.size_px[row1] / features0.size_px[row0]
+    angle = features1.angle_rad[row1] - features0.angle_rad[row0]
+    cos, sin = scale * np.cos(angle), scale * np.sin(angle)
+    turns = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
+    return WideMatches(features0.xy[row0], features1.xy[row1], turns)
 
 
 def search_wide(
@@ -39,31 +121,22 @@ def search_wide(
         usable: ``(H, W)`` bool, False where ``grey1`` shows nothing.
 
     Returns:
-        ``(N, 2)`` places in ``grey1`` to start Lucas-Kanade from: of matched points where their match is, of
-        the others where the matched point next to them would take them. None where too few matches agree.
+        ``(N, 2)`` places in ``grey1`` to start Lucas-Kanade from. None where too few matches agree.
     """
-    describer = Describer()
-    corners = detect_corners(grey1, _NUM_CORNERS, None, usable, _CELL_PX).astype(np.float64)
-    rows0, known = describer.describe(grey0, xy0)
-    rows1, seen = describer.describe(grey1, corners, _OCTAVES)
-    of_seen, of_known = match_descriptors(seen, known)
-    if len(of_seen) < MIN_AGREEING:
+    matches = match_wide(WideFeatures.of(grey0), WideFeatures.of(grey1, usable))
+    from_xy, flow = matches.from_xy, matches.to_xy - matches.from_xy
+    if len(from_xy) < MIN_AGREEING:
         return None
-    point, corner = rows0[of_known], rows1[of_seen]
-    from_xy, to_xy = xy0[point], corners[corner]
-    agrees = epipolar_inliers(from_xy, to_xy)
-    if agrees is None or int(agrees.sum()) < max(MIN_AGREEING, _MIN_AGREEING_SHARE * len(point)):
+    agrees = epipolar_inliers(from_xy, matches.to_xy)
+    if agrees is None or int(agrees.sum()) < max(MIN_AGREEING, _MIN_AGREEING_SHARE * len(from_xy)):
         return None
     # A wrong match may lie on its epipolar line by chance; it hardly moves like the matches around it.
-    agrees &= _moves_like_its_neighbours(from_xy, to_xy - from_xy, agrees)
+    agrees &= _moves_like_its_neighbours(from_xy, flow, agrees)
     if int(agrees.sum()) < MIN_AGREEING:
         return None
-    point, from_xy, to_xy = point[agrees], from_xy[agrees], to_xy[agrees]
-    square = ((xy0[:, None] - from_xy[None]) ** 2).sum(axis=2)
-    nearest = square.argmin(axis=1)
-    guess: Array = xy0 + (to_xy - from_xy)[nearest]
-    guess[point] = to_xy
-    return guess
+    square = ((xy0[:, None] - from_xy[agrees][None]) ** 2).sum(axis=2)
+    there: Array = xy0 + flow[agrees][square.argmin(axis=1)]
+    return there
 
 
 def epipolar_inliers(from_xy: Array, to_xy: Array) -> NDArray[np.bool_] | None:

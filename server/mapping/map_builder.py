@@ -30,6 +30,7 @@ from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.whole_map import adjust_whole_map
+from semcast.server.mapping.wide_recognition import WideRecogniser
 from semcast.server.mapping.window import build_problem
 from semcast.server.mapping.world_map import Keyframe, MapChanges, WorldMap
 
@@ -73,6 +74,7 @@ class MapBuilder:
         self.world = WorldMap()
         self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
         self.relocaliser = Relocaliser(self._camera, s.seed, s.max_features)
+        self._wide = WideRecogniser(self._camera, s.seed)
         self._adjusted: tuple[int, Array] | None = None
         self.enter(0)
         self.num_inliers_at_keyframe = 0
@@ -157,6 +159,12 @@ class MapBuilder:
         return anchor_tracks(
             self._camera, self.world, self.images, tracks, sight, T_world_cam, submap=self.submap
         )
+
+    def recognise(self, sight: Sight) -> Place | None:
+        """Look for the place of an image whose camera is lost."""
+        noise = self.noise.model
+        place = self.relocaliser.find(sight, self.world, noise)
+        return place or self._wide.find(sight, self.world, self.images, noise)
 
     def resembles(self, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: Ids) -> bool:
         """Tell whether tracks that agree with a pose show what the newest keyframes saw."""

@@ -347,7 +347,7 @@ class Reconstruction:
         return pose
 
     def _recognise(self, sight: Sight) -> TrackedPose | None:
-        place = self._map.relocaliser.find(sight, self._map.world, self._map.noise.model)
+        place = self._map.recognise(sight)
         if place is None:
             return None
         # Nothing is given up for a place before there is a pose in it.

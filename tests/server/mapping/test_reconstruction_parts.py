@@ -22,7 +22,7 @@ from semcast.server.mapping.state import TrackingState
 
 def test_another_place_becomes_a_map_of_its_own(room):
     _, images = room
-    other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
+    other = [np.ascontiguousarray(image[:, ::-1]) for image in images]
     reconstruction = make(lost_after_s=0.15)
     sequence = images[:8] + other[:8]
     results = [reconstruction.process(frame_of(k, image)) for k, image in enumerate(sequence)]
@@ -202,7 +202,7 @@ def test_a_place_without_a_pose_gives_nothing_up(room, monkeypatch):
     _, images = room
     monkeypatch.setattr(settings, "_LEAST_LOST_FRAMES", 2)  # with more, the start follows at once
     reconstruction = make(lost_after_s=0.05)
-    other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
+    other = [np.ascontiguousarray(image[:, ::-1]) for image in images]
     for k, image in enumerate(images[:8] + other[:2]):
         result = reconstruction.process(frame_of(k, image))
     assert result.state is TrackingState.INITIALIZING
@@ -218,7 +218,7 @@ def test_a_place_without_a_pose_gives_nothing_up(room, monkeypatch):
 def test_a_part_that_is_lost_as_it_begins_has_its_time_to_be_found_again(room, monkeypatch):
     _, images = room
     reconstruction = make(lost_after_s=0.25)
-    other = [np.ascontiguousarray(np.rot90(image, 2)) for image in images]
+    other = [np.ascontiguousarray(image[:, ::-1]) for image in images]
     posed = Reconstruction._pose
 
     def no_pose_in_the_second_part(self, *args, **how):
@@ -229,3 +229,16 @@ def test_a_part_that_is_lost_as_it_begins_has_its_time_to_be_found_again(room, m
     begun = next(k for k, r in enumerate(results) if r.is_keyframe and r.submap == 1)
     assert [r.state for r in results[begun : begun + 4]] == [TrackingState.LOST] * 4
     assert results[begun + 4].state is TrackingState.INITIALIZING
+
+
+def test_a_camera_that_was_turned_upside_down_is_found_again(room):
+    poses, images = room
+    reconstruction = make()
+    upside_down = [np.ascontiguousarray(np.rot90(image, 2)) for image in images[8:16]]
+    for k, image in enumerate(images[:8] + upside_down):
+        result = reconstruction.process(frame_of(k, image))
+    assert result.state is TrackingState.TRACKING
+    assert result.submap == 0
+    turned = reconstruction.final_trajectory()[7][:3, :3].T @ result.T_world_cam[:3, :3]
+    rolled = poses[7][:3, :3].T @ poses[15][:3, :3] @ np.diag([-1.0, -1.0, 1.0])
+    assert rotation_angle_deg(turned.T @ rolled) < 2.0

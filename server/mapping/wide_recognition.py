@@ -1,0 +1,162 @@
+"""Where am I after a gap? SIFT against the newest keyframes, then their landmarks by warped patches.
+
+Binary descriptors of upright corners recognise a place from nearly where it was seen. A camera that went on
+for a second sees it turned and from elsewhere. What looks as it did there, once pose and depth have warped
+it, proves the place, and says to a fraction of a pixel where each landmark is.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.geometry.patch_alignment import (
+    ANCHOR_PATCH_PX,
+    Templates,
+    affine_warps,
+    align_patches,
+    seen_alike,
+)
+from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
+from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
+from semcast.server.geometry.wide_search import WideFeatures, match_wide
+from semcast.server.mapping.recall import KeyframeImages, SeenFrom
+from semcast.server.mapping.relocalisation import Place
+from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+Array = NDArray[np.float64]
+
+#: Keyframes that are looked at, the newest ones, and frames after which a camera that was not found with them
+#: is somewhere else: a look takes as long as everything else of a frame.
+_NUM_KEYFRAMES, _MAX_FRAMES = 3, 8
+#: A landmark further from its match goes elsewhere, and a place by such a match is good to about this.
+_MAX_OFFSET_PX, _CARRIED_SIGMA_PX = 15.0, 2.5
+#: Landmarks that must agree with a pose: so many do by chance once in a lifetime, within a few pixels each.
+_MIN_FIRST = 8
+#: Share of a keyframe's landmarks that must look as they did where the pose has them, in rounds: the first
+#: pose is a rough one. And the share of those that must agree with the next pose.
+_LEAST_SHARES, _MIN_AGREEING_SHARE = (0.0, 0.0, 0.2), 0.5
+_ALIGNED_SIGMA_PX = 1.0
+_BORDER_PX = 8
+_SEARCH_ITERATIONS = 400
+
+
+@dataclass(frozen=True)
+class _Aligned:
+    """Landmarks of a keyframe that were found.
+
+    Attributes:
+        rows: ``(N,)`` of them.
+        xy: ``(N, 2)`` where.
+        num_looked_for: Of all of them.
+    """
+
+    rows: NDArray[np.intp]
+    xy: Array
+    num_looked_for: int
+
+
+class WideRecogniser:
+    """Recognises the newest keyframes from further away than ``Relocaliser``.
+
+    Args:
+        camera: Pinhole.
+        seed: Of the pose search.
+    """
+
+    def __init__(self, camera: Intrinsics, seed: int) -> None:
+        self._camera = camera
+        self._seed = seed
+        self._known: dict[int, WideFeatures] = {}
+        self._looked_for: tuple[int, int] = (-1, 0)
+
+    def find(self, sight: Sight, world: WorldMap, images: KeyframeImages, noise: NoiseModel) -> Place | None:
+        """Look for the place of an image among the newest keyframes, in the first frames after the newest.
+
+        Args:
+            sight: The image.
+            world: The map.
+            images: Of keyframes.
+            noise: Of observations.
+        """
+        by_id = {k.frame_id: k for k in world.keyframes}
+        newest = [image for image in images.newest(_NUM_KEYFRAMES) if image.frame_id in by_id][::-1]
+        if not newest:
+            return None
+        last_id, num_looked = self._looked_for
+        num_looked = num_looked if newest[0].frame_id == last_id else 0
+        if num_looked == _MAX_FRAMES:
+            return None
+        self._looked_for = newest[0].frame_id, num_looked + 1
+        usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
+        features = WideFeatures.of(sight.grey, usable)
+        known = {i.frame_id: self._known.get(i.frame_id) or WideFeatures.of(i.grey) for i in newest}
+        self._known = known
+        for image in newest:
+            keyframe = by_id[image.frame_id]
+            place = self._place(sight, world, keyframe, image, known[image.frame_id], features, noise)
+            if place is not None:
+                return place
+        return None
+
+    def _place(
+        self,
+        sight: Sight,
+        world: WorldMap,
+        keyframe: Keyframe,
+        image: SeenFrom,
+        known: WideFeatures,
+        features: WideFeatures,
+        noise: NoiseModel,
+    ) -> Place | None:
+        row = world.landmarks.rows(keyframe.ids)
+        ids, xy0, xyz = keyframe.ids[row >= 0], keyframe.xy[row >= 0], world.landmarks.xyz[row[row >= 0]]
+        rows, carried = match_wide(known, features).carry(xy0, _MAX_OFFSET_PX)
+        sigma = np.full(len(rows), max(_CARRIED_SIGMA_PX, noise.sigma0_px))
+        gate = GATE_SIGMAS * sigma
+        how = {"seed": self._seed, "min_inliers": _MIN_FIRST, "max_iterations": _SEARCH_ITERATIONS}
+        found = search_pose(self._camera, xyz[rows], carried, sigma, gate, **how)
+        for least_share in _LEAST_SHARES:
+            if found is None:
+                return None
+            aligned = self._aligned(sight, keyframe, image, xy0, xyz, found.T_cam_world)
+            found = self._pose(found, xyz, aligned, noise, least_share)
+        if found is None:
+            return None
+        good = aligned.rows[found.inliers]
+        T_world_cam = invert_transform(found.T_cam_world)
+        return Place(T_world_cam, keyframe.frame_id, ids[good], aligned.xy[found.inliers], keyframe.submap)
+
+    def _aligned(
+        self, sight: Sight, keyframe: Keyframe, image: SeenFrom, xy0: Array, xyz: Array, T_cam_world: Array
+    ) -> _Aligned:
+        """Look for all landmarks of a keyframe where a pose has them."""
+        depth0 = transform_points(invert_transform(keyframe.T_world_cam), xyz)[:, 2]
+        expected = self._camera.project(transform_points(T_cam_world, xyz))
+        size = np.array([self._camera.width, self._camera.height])
+        inside = ((expected >= _BORDER_PX) & (expected < size - _BORDER_PX)).all(axis=1) & (depth0 > 0.0)
+        inside[inside] &= ~sight.near_lost(expected[inside], _BORDER_PX)
+        rows = np.flatnonzero(inside)
+        T_cam_keyframe = T_cam_world @ keyframe.T_world_cam
+        warps, depth1 = affine_warps(self._camera, T_cam_keyframe, xy0[rows], depth0[rows])
+        alike = seen_alike(warps, depth1)
+        rows, warps = rows[alike], warps[alike]
+        templates = Templates.cut(image.grey, xy0[rows], ANCHOR_PATCH_PX)
+        patches = align_patches(templates, sight.grey, expected[rows], warps)
+        fits = patches.fits(expected[rows])
+        return _Aligned(rows[fits], patches.xy[fits], len(rows))
+
+    def _pose(
+        self, found: PoseEstimate, xyz: Array, aligned: _Aligned, noise: NoiseModel, least_share: float
+    ) -> PoseEstimate | None:
+        """Pose of landmarks that look as they did, None where those are too few."""
+        enough = max(_MIN_FIRST, least_share * aligned.num_looked_for)
+        if len(aligned.rows) < enough:
+            return None
+        sigma = np.full(len(aligned.rows), max(_ALIGNED_SIGMA_PX, noise.sigma0_px))
+        points = xyz[aligned.rows]
+        pose = refine_pose(self._camera, found.T_cam_world, points, aligned.xy, sigma, GATE_SIGMAS * sigma)
+        return pose if pose.num_inliers >= max(_MIN_FIRST, _MIN_AGREEING_SHARE * len(points)) else None

@@ -1,0 +1,82 @@
+"""A camera that went on for most of a second is found again by what looks as it did."""
+
+import numpy as np
+import pytest
+
+from semcast.common.geometry import invert_transform, rotation_angle_deg
+from semcast.common.sequence import open_sequence
+from semcast.evaluation.scenes.render import RenderSettings, render_scene
+from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.reconstruction import Reconstruction
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.wide_recognition import WideRecogniser
+
+NUM_MAPPED = 14
+NOISE = NoiseModel(0.7, 0.0)
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory):
+    """A still life and its map, made of the first frames; the camera turns by 3.5 degrees a frame."""
+    path = tmp_path_factory.mktemp("scenes") / "orbit"
+    render_scene(RenderSettings(scene="orbit", seconds=2.2, out=path))
+    sequence = open_sequence(path)
+    reconstruction = Reconstruction(sequence.intrinsics, ReconstructionSettings(), InlineBundle())
+    for k in range(NUM_MAPPED):
+        reconstruction.process(DecodedFrame(k, int(sequence.times_ns[k]), sequence.image(k)))
+    yield sequence, reconstruction
+    reconstruction.close()
+
+
+def sight_of(image, frame_id, num_lost_rows=0):
+    usable = np.arange(len(image)) >= num_lost_rows
+    return Sight(DecodedFrame(frame_id, frame_id * 10**8, image), to_grey(image), usable)
+
+
+def find(mapped, sight, recogniser=None):
+    sequence, reconstruction = mapped
+    recogniser = recogniser or WideRecogniser(sequence.intrinsics, seed=0)
+    return recogniser.find(sight, reconstruction.world, reconstruction._map.images, NOISE)
+
+
+@pytest.mark.parametrize("num_lost_rows", [0, 160])
+def test_the_place_is_found_from_20_degrees_on(mapped, num_lost_rows):
+    sequence, reconstruction = mapped
+    k = NUM_MAPPED + 5
+    image = sequence.image(k).copy()
+    image[:num_lost_rows] = 128
+    place = find(mapped, sight_of(image, k, num_lost_rows))
+    assert place is not None
+    world, camera = reconstruction.world, sequence.intrinsics
+    seen_from = next(n for n in world.keyframes if n.frame_id == place.keyframe_id)
+    truth = sequence.groundtruth().T_world_cam
+    ours = seen_from.T_world_cam[:3, :3].T @ place.T_world_cam[:3, :3]
+    true = truth[place.keyframe_id][:3, :3].T @ truth[k][:3, :3]
+    assert rotation_angle_deg(true) > 17.0
+    assert rotation_angle_deg(ours.T @ true) < 1.0
+    assert len(np.unique(place.ids)) == len(place.ids) > 20
+    assert place.xy[:, 1].min() > num_lost_rows
+    T = invert_transform(place.T_world_cam)
+    xyz = world.landmarks.xyz[world.landmarks.rows(place.ids)] @ T[:3, :3].T + T[:3, 3]
+    assert np.median(np.linalg.norm(camera.project(xyz) - place.xy, axis=1)) < 1.5
+
+
+def test_another_place_is_not_taken_for_it(mapped):
+    image = mapped[0].image(NUM_MAPPED)
+    for other in (image[:, ::-1].copy(), np.random.default_rng(0).permutation(image), image // 255 + 90):
+        assert find(mapped, sight_of(other, NUM_MAPPED)) is None
+
+
+def test_what_is_not_found_in_eight_frames_is_not_looked_for_any_more(mapped):
+    sequence, _ = mapped
+    recogniser = WideRecogniser(sequence.intrinsics, seed=0)
+    nothing = sight_of(np.full_like(sequence.image(0), 90), NUM_MAPPED)
+    seen = sight_of(sequence.image(NUM_MAPPED), NUM_MAPPED)
+    for _ in range(7):
+        assert find(mapped, nothing, recogniser) is None
+    assert find(mapped, seen, recogniser) is not None
+    assert find(mapped, seen, recogniser) is None
