@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 #: Keyframes that are looked at, the newest ones, and frames after which a camera that was not found with them
 #: is somewhere else: a look takes as long as everything else of a frame.
 _NUM_KEYFRAMES, _MAX_FRAMES = 3, 8
+#: Ratio of distances up to which a nearest descriptor counts: landmarks tell wrong matches surely.
+_MAX_RATIO = 0.85
 #: A landmark further from its match goes elsewhere, and a place by such a match is good to about this.
 _MAX_OFFSET_PX, _CARRIED_SIGMA_PX = 15.0, 2.5
 #: Landmarks that must agree with a pose: so many do by chance once in a lifetime, within a few pixels each.
@@ -93,11 +95,12 @@ class WideRecogniser:
         self._looked_for = newest[0].frame_id, num_looked + 1
         usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
         features = WideFeatures.of(sight.grey, usable)
-        known = {i.frame_id: self._known.get(i.frame_id) or WideFeatures.of(i.grey) for i in newest}
-        self._known = known
+        self._known = {i.frame_id: self._known[i.frame_id] for i in newest if i.frame_id in self._known}
         for image in newest:
-            keyframe = by_id[image.frame_id]
-            place = self._place(sight, world, keyframe, image, known[image.frame_id], features, noise)
+            if image.frame_id not in self._known:
+                self._known[image.frame_id] = WideFeatures.of(image.grey)
+            known, keyframe = self._known[image.frame_id], by_id[image.frame_id]
+            place = self._place(sight, world, keyframe, image, known, features, noise)
             if place is not None:
                 return place
         return None
@@ -114,7 +117,7 @@ class WideRecogniser:
     ) -> Place | None:
         row = world.landmarks.rows(keyframe.ids)
         ids, xy0, xyz = keyframe.ids[row >= 0], keyframe.xy[row >= 0], world.landmarks.xyz[row[row >= 0]]
-        rows, carried = match_wide(known, features).carry(xy0, _MAX_OFFSET_PX)
+        rows, carried = match_wide(known, features, _MAX_RATIO).carry(xy0, _MAX_OFFSET_PX)
         sigma = np.full(len(rows), max(_CARRIED_SIGMA_PX, noise.sigma0_px))
         gate = GATE_SIGMAS * sigma
         how = {"seed": self._seed, "min_inliers": _MIN_FIRST, "max_iterations": _SEARCH_ITERATIONS}
