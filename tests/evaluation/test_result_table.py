@@ -73,4 +73,5 @@ def test_a_variant_that_did_not_run_says_why_below_the_table():
     report["results"][-1] |= {"p50_ms": None, "p95_ms": None, "fps": None, "error": "no exported encoder"}
     table = result_table("runtime", report)
     assert table.rows[-1][-3:] == ["-", "-", "-"]
-    assert table.notes == ["3dcsc-lite, encode, onnx: no exported encoder"]
+    codec = report["results"][-1]["codec"]
+    assert table.notes == [f"{codec}, encode, onnx: no exported encoder"]
