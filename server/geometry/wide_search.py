@@ -26,7 +26,7 @@ _EPIPOLAR_PX = 3.0
 _NEIGHBOURS = 7
 _FREE_FLOW_PX = 15.0
 #: Matches that agree, at least; fewer prove nothing.
-MIN_AGREEING = 15
+_MIN_AGREEING = 15
 #: Nor does a share of all matches below this.
 _MIN_AGREEING_SHARE = 0.4
 
@@ -127,30 +127,28 @@ def match_wide(
     return WideMatches(features0.xy[row0], features1.xy[row1], turns)
 
 
-def search_wide(
-    grey0: Grey, grey1: Grey, xy0: Array, usable: NDArray[np.bool_] | None = None
-) -> Array | None:
+def search_wide(features0: WideFeatures, features1: WideFeatures, xy0: Array) -> Array | None:
     """Find where points of one image are in another, however far they moved.
 
     Args:
-        grey0: Image the points are known in.
-        grey1: Image they are looked for in.
-        xy0: ``(N, 2)`` pixels in ``grey0``.
-        usable: ``(H, W)`` bool, False where ``grey1`` shows nothing.
+        features0: Of the image the points are known in.
+        features1: Of the image they are looked for in.
+        xy0: ``(N, 2)`` pixels in the first image.
 
     Returns:
-        ``(N, 2)`` places in ``grey1`` to start Lucas-Kanade from. None where too few matches agree.
+        ``(N, 2)`` places in the second to start Lucas-Kanade from: each point goes with the match next to it.
+        None where too few matches agree.
     """
-    matches = match_wide(WideFeatures.of(grey0), WideFeatures.of(grey1, usable))
+    matches = match_wide(features0, features1)
     from_xy, flow = matches.from_xy, matches.to_xy - matches.from_xy
-    if len(from_xy) < MIN_AGREEING:
+    if len(from_xy) < _MIN_AGREEING:
         return None
     agrees = epipolar_inliers(from_xy, matches.to_xy)
-    if agrees is None or int(agrees.sum()) < max(MIN_AGREEING, _MIN_AGREEING_SHARE * len(from_xy)):
+    if agrees is None or int(agrees.sum()) < max(_MIN_AGREEING, _MIN_AGREEING_SHARE * len(from_xy)):
         return None
     # A wrong match may lie on its epipolar line by chance; it hardly moves like the matches around it.
     agrees &= _moves_like_its_neighbours(from_xy, flow, agrees)
-    if int(agrees.sum()) < MIN_AGREEING:
+    if int(agrees.sum()) < _MIN_AGREEING:
         return None
     square = ((xy0[:, None] - from_xy[agrees][None]) ** 2).sum(axis=2)
     there: Array = xy0 + flow[agrees][square.argmin(axis=1)]

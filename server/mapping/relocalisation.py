@@ -126,8 +126,7 @@ class Relocaliser:
         """
         if not candidates and not tried_anyway:
             return None
-        usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
-        corners = detect_corners(sight.grey, 800, None, usable, cell_px=40).astype(np.float64)
+        corners = detect_corners(sight.grey, 800, None, sight.usable_pixels, cell_px=40).astype(np.float64)
         rows, descriptors = self._describer.describe(sight.grey, corners, _OCTAVES)
         if len(rows) < _MIN_FIRST:
             return None

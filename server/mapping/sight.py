@@ -1,12 +1,14 @@
 """What one image shows: the image itself with the rows that arrived, and tracks in it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.geometry.features import Grey
+from semcast.server.geometry.wide_search import WideFeatures
 from semcast.server.mapping.state import DecodedFrame
 
 Array = NDArray[np.float64]
@@ -39,6 +41,16 @@ class Sight:
     frame: DecodedFrame
     grey: Grey
     usable: NDArray[np.bool_]
+
+    @cached_property
+    def usable_pixels(self) -> NDArray[np.bool_]:
+        """Pixels that arrived, ``(H, W)``."""
+        return np.repeat(self.usable[:, None], self.grey.shape[1], axis=1)
+
+    @cached_property
+    def wide_features(self) -> WideFeatures:
+        """Features of what arrived: found once, when first asked for."""
+        return WideFeatures.of(self.grey, self.usable_pixels)
 
     def near_lost(self, xy: Array, margin_px: int) -> NDArray[np.bool_]:
         """Which points have a lost row within the margin."""

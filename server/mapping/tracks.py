@@ -23,7 +23,7 @@ from semcast.server.geometry.weighting import (
     observation_confidence,
     variance_confidence,
 )
-from semcast.server.geometry.wide_search import search_wide
+from semcast.server.geometry.wide_search import WideFeatures, search_wide
 from semcast.server.mapping.found import Found
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood
@@ -279,8 +279,7 @@ class TrackTable:
     def _jump(self, sight: Sight, found: Found) -> bool:
         """Find tracks of the last image by descriptors, where that finds more; whether it did."""
         rows = np.flatnonzero(self.missed == 0)
-        usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
-        jump = search_wide(self._greys[-1], sight.grey, self.xy[rows], usable)
+        jump = search_wide(WideFeatures.of(self._greys[-1]), sight.wide_features, self.xy[rows])
         if jump is None:
             return False
         points = track_points(self._greys[-1], sight.grey, self.xy[rows], jump, max_level=1)

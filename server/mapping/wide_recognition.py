@@ -36,7 +36,7 @@ _NUM_KEYFRAMES, _MAX_FRAMES = 3, 8
 _MAX_RATIO = 0.85
 #: A landmark further from its match goes elsewhere, and a place by such a match is good to about this.
 _MAX_OFFSET_PX, _CARRIED_SIGMA_PX = 15.0, 2.5
-#: Landmarks that must agree with a pose: so many do by chance once in a lifetime, within a few pixels each.
+#: Landmarks that must agree with a pose. Of a few dozen wrong matches hardly two are within pixels of any.
 _MIN_FIRST = 8
 #: Share of a keyframe's landmarks that must look as they did where the pose has them, in rounds: the first
 #: pose is a rough one. And the share of those that must agree with the next pose.
@@ -72,7 +72,7 @@ class WideRecogniser:
     def __init__(self, camera: Intrinsics, seed: int) -> None:
         self._camera = camera
         self._seed = seed
-        self._known: dict[int, WideFeatures] = {}
+        self._known: list[tuple[SeenFrom, WideFeatures]] = []
         self._looked_for: tuple[int, int] = (-1, 0)
 
     def find(self, sight: Sight, world: WorldMap, images: KeyframeImages, noise: NoiseModel) -> Place | None:
@@ -93,17 +93,21 @@ class WideRecogniser:
         if num_looked == _MAX_FRAMES:
             return None
         self._looked_for = newest[0].frame_id, num_looked + 1
-        usable = np.repeat(sight.usable[:, None], sight.grey.shape[1], axis=1)
-        features = WideFeatures.of(sight.grey, usable)
-        self._known = {i.frame_id: self._known[i.frame_id] for i in newest if i.frame_id in self._known}
+        self._known = [(image, known) for image, known in self._known if any(image is i for i in newest)]
         for image in newest:
-            if image.frame_id not in self._known:
-                self._known[image.frame_id] = WideFeatures.of(image.grey)
-            known, keyframe = self._known[image.frame_id], by_id[image.frame_id]
-            place = self._place(sight, world, keyframe, image, known, features, noise)
+            known = self._features_of(image)
+            place = self._place(sight, world, by_id[image.frame_id], image, known, noise)
             if place is not None:
                 return place
         return None
+
+    def _features_of(self, image: SeenFrom) -> WideFeatures:
+        """Features of a keyframe, kept as long as its image is neither old nor replaced."""
+        known = next((features for kept, features in self._known if kept is image), None)
+        if known is None:
+            known = WideFeatures.of(image.grey)
+            self._known.append((image, known))
+        return known
 
     def _place(
         self,
@@ -112,12 +116,11 @@ class WideRecogniser:
         keyframe: Keyframe,
         image: SeenFrom,
         known: WideFeatures,
-        features: WideFeatures,
         noise: NoiseModel,
     ) -> Place | None:
         row = world.landmarks.rows(keyframe.ids)
         ids, xy0, xyz = keyframe.ids[row >= 0], keyframe.xy[row >= 0], world.landmarks.xyz[row[row >= 0]]
-        rows, carried = match_wide(known, features, _MAX_RATIO).carry(xy0, _MAX_OFFSET_PX)
+        rows, carried = match_wide(known, sight.wide_features, _MAX_RATIO).carry(xy0, _MAX_OFFSET_PX)
         sigma = np.full(len(rows), max(_CARRIED_SIGMA_PX, noise.sigma0_px))
         gate = GATE_SIGMAS * sigma
         how = {"seed": self._seed, "min_inliers": _MIN_FIRST, "max_iterations": _SEARCH_ITERATIONS}

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from semcast.server.geometry.wide_search import epipolar_inliers, search_wide
+from semcast.server.geometry.wide_search import WideFeatures, epipolar_inliers, search_wide
 
 
 def drifted(seed, count=30, num_wrong=2):
@@ -24,6 +24,6 @@ def test_matches_of_images_that_hardly_moved_are_no_error():
 
 
 def test_images_without_anything_give_no_places():
-    blank = np.full((240, 320), 90, np.uint8)
+    blank = WideFeatures.of(np.full((240, 320), 90, np.uint8))
     assert search_wide(blank, blank, np.zeros((0, 2))) is None
     assert search_wide(blank, blank, np.full((30, 2), 100.0)) is None
