@@ -17,7 +17,8 @@ from semcast.agent.source_settings import SourceSettings
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import HOW_TO_GIVE
 from semcast.common.errors import SourceError
-from semcast.common.sequence import ImageRectifier, as_rgb, resized_wh
+from semcast.common.image_file import as_rgb
+from semcast.common.sequence import ImageRectifier, resized_wh
 from semcast.common.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)

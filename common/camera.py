@@ -4,6 +4,7 @@ Pixel centres have integer coordinates: the image spans ``[-0.5, width - 0.5]``.
 """
 
 import json
+import logging
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -15,6 +16,8 @@ from semcast.common.errors import SourceError
 from semcast.common.lens import DISTORTION_COUNTS, check_pinhole, distortion_in
 from semcast.common.whole_file import write_whole
 
+logger = logging.getLogger(__name__)
+
 Array = NDArray[np.float64]
 
 #: Side of the image that a rolling shutter exposes first.
@@ -22,6 +25,9 @@ ReadoutFrom = Literal["top", "bottom", "left", "right"]
 #: Time in ms a shutter takes at most; slower ones are no cameras for moving.
 MAX_READOUT_MS = 100.0
 
+#: Share of a side by which a principal point may be off the middle; cameras keep within a twentieth, cut
+#: images do not.
+_MOST_OFF_CENTRE = 0.25
 #: Side of an image in focal lengths at most: a view of 2 atan(6), 161 degrees.
 _MAX_SIZE_PER_FOCAL = 12.0
 
@@ -75,6 +81,8 @@ class Intrinsics:
     def check_possible(self, name: str) -> None:
         """Check that a camera can be like that, for those who read what a user gave.
 
+        A principal point far from the middle is warned of: it is what a calibration for larger images gives.
+
         Args:
             name: What the intrinsics belong to, for the message.
 
@@ -85,6 +93,12 @@ class Intrinsics:
         for axis, centre, size in (("cx", self.cx, self.width), ("cy", self.cy, self.height)):
             if not -0.5 <= centre <= size - 0.5:
                 raise SourceError(f"{wrong}: {axis} must be in [-0.5, {size - 0.5}], got {centre:g}")
+            if abs(centre + 0.5 - size / 2) > _MOST_OFF_CENTRE * size:
+                logger.warning(
+                    "%s: %s is %g px in images of %dx%d, far from their middle: is the calibration for "
+                    "another image size?",
+                    *(name, axis, centre, self.width, self.height),
+                )
         for axis, focal_px, size in (("fx", self.fx, self.width), ("fy", self.fy, self.height)):
             least_px = size / _MAX_SIZE_PER_FOCAL
             if focal_px < least_px:

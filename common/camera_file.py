@@ -21,7 +21,7 @@ from semcast.common.lens import check_pinhole, distortion_in
 _LINE = re.compile(r"^(?P<indent> *)(?P<key>[A-Za-z_][\w.\- ]*?) *:(?: +|$)(?P<value>.*)$")
 _ITEM = re.compile(r"^(?P<indent> *)(?:- +)+(?P<value>.*)$")
 _SIZE_KEYS = (("image_width", "image_height"), ("Camera.width", "Camera.height"), ("width", "height"))
-_MATRIX_KEYS = ("camera_matrix", "K", "Camera_Matrix", "cameraMatrix")
+_MATRIX_KEYS = ("camera_matrix", "K", "k", "Camera_Matrix", "cameraMatrix")
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -165,7 +165,7 @@ def _numbers(values: dict[str, Any], keys: tuple[str, ...], count: int) -> list[
     found = _list(values, keys)
     there = next((key for key in keys if key in values), None)
     if there is None:
-        raise KeyError(keys[0])
+        raise KeyError(" or ".join(keys[:2]))
     if found is None or len(found) != count:
         got = found or values.get(f"{there}/data", values[there])
         raise ValueError(f"{there} must be a list of {count} numbers, got {got!r}")

@@ -19,6 +19,8 @@ _DISTORTION_KEYS = (
     "distCoeffs",
     "dist",
     "D",
+    "d",
+    "coeffs",
 )
 #: The same one by one, in OpenCV's order.
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -36,6 +38,8 @@ _NO_PINHOLE = (
     "spheri",
 )
 _NO_PINHOLE_WORDS = ("mei", "ds", "eucm", "fov", "kb4", "kb8")
+#: Part of the words for models that map the other way, as RealSense's ``inverse_brown_conrady`` does.
+_INVERSE = "inverse"
 #: Parts of the words for models whose coefficients are known here.
 _KNOWN_MODELS = ("none", "rad", "plumb", "rational", "brown", "opencv", "pinhole")
 
@@ -77,6 +81,9 @@ def distortion_in(values: dict[str, Any]) -> tuple[float, ...]:
     found = {key: coefficients for key, coefficients in read.items() if coefficients}
     if len(set(found.values())) > 1:
         raise ValueError(f"{' and '.join(found)} must say the same, got {list(found.values())}")
+    for key, value in values.items() if any(map(any, found.values())) else ():
+        if key.lower() in _MODEL_KEYS and _INVERSE in str(value).lower():
+            raise ValueError(f"{key} must map points to where the lens shows them, got {value!r}")
     for key in ("distortion_model", "distortion_type") if found else ():
         word = str(values.get(key) or "none").lower()
         if not any(part in word for part in _KNOWN_MODELS):

@@ -50,7 +50,8 @@ class Number:
 
     def load(self, value: Any) -> float:
         """Return the value as received."""
-        if type(value) not in (int, float):
+        # A number of numpy's is a float too; a bool is an int, but no number.
+        if isinstance(value, bool) or not isinstance(value, int | float):
             raise FieldError("type", f"must be a number, got {_short(value)}")
         try:
             number = float(value)

@@ -1,7 +1,8 @@
 """A recorded image sequence with random access: images as the codec gets them, times, camera, true path."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -13,9 +14,9 @@ from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import HOW_TO_GIVE, CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.geometry import interpolate_pose
+from semcast.common.image_file import bit_depth_of, read_image
 from semcast.common.sequence_layouts import Layout, SequenceFiles, ns_to_seconds, read_layout
-from semcast.common.sequence_sizes import size_in_header_wh
-from semcast.common.tiff_alpha import is_laid_on_black
+from semcast.common.sequence_sizes import size_in_header_wh, states_16_bits
 from semcast.common.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
@@ -24,112 +25,27 @@ logger = logging.getLogger(__name__)
 _MAX_GAP_FRAMES = 2.0
 #: The first image that can be read tells the size; so many unreadable ones may come before it.
 _MAX_BAD_AT_START = 9
-#: Resampling and sharpening leave pictures of 0..1 or 0..255 with values above, but hardly by this factor.
-_OVERSHOOT = 2.0
-#: Bits of a 16-bit image that cameras use, always the lower ones.
-_BIT_DEPTHS = (8, 10, 12, 14, 16)
-#: So many images, spread over a recording, tell its bit depth: a dark beginning alone would mislead.
-_MAX_DEPTH_IMAGES = 9
 
 
-def read_image(path: Path, bit_depth: Callable[[], int | None] | None = None) -> NDArray[np.uint8]:
-    """Read an image file as ``(H, W, 3)`` uint8 RGB.
+def resized(image: NDArray[np.uint8], size_wh: tuple[int, int]) -> NDArray[np.uint8]:
+    """Resize by area averaging (bilinear where it grows); the same object when the size is right."""
+    height, width = image.shape[:2]
+    if (width, height) == size_wh:
+        return image
+    shrinks = size_wh[0] <= width and size_wh[1] <= height
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size_wh, interpolation=how), dtype=np.uint8)
 
-    Grey is repeated, 16-bit is cut to 8, transparency is laid on white. Orientation notes of cameras are
-    not applied: a calibration belongs to the pixels as stored.
 
-    Args:
-        path: The file.
-        bit_depth: Tells how many bits of a 16-bit file are in use; asked for such files alone. None, or
-            an answer of None, goes by the brightest value of this one, so that images read one by one may
-            differ in brightness.
+def resized_wh(width: int, height: int, factor: float) -> tuple[int, int]:
+    """Return the size after a resize by ``factor``, rounded to whole pixels.
 
     Raises:
-        SourceError: The file is missing or damaged.
+        ValueError: The factor is not in [0.05, 1].
     """
-    raw, is_on_black = _read_raw(path)
-    if raw.dtype == np.uint16:
-        bits = (bit_depth() if bit_depth is not None else None) or _bits_for(int(raw.max()))
-        raw = (np.minimum(raw, 2**bits - 1) >> (bits - 8)).astype(np.uint8)
-    try:
-        return as_rgb(raw, is_on_black=is_on_black)
-    except SourceError as err:
-        raise SourceError(f"{path}: {err}") from err
-
-
-def bit_depth_of(paths: tuple[Path, ...]) -> int | None:
-    """Tell how many bits of 16-bit images are in use: 8, 10, 12, 14 or 16; None where none is seen.
-
-    Machine vision and thermal cameras store 10 to 14 bits as the lower ones of 16.
-
-    Args:
-        paths: Images of one camera; a few are looked at.
-    """
-    brightest: int | None = None
-    spread = np.linspace(0, len(paths) - 1, min(len(paths), _MAX_DEPTH_IMAGES)).astype(int)
-    for path in (paths[k] for k in spread):
-        try:
-            raw, _ = _read_raw(path)
-        except SourceError:
-            continue
-        if raw.dtype == np.uint16:
-            brightest = max(brightest or 0, int(raw.max()))
-    return None if brightest is None else _bits_for(brightest)
-
-
-def _bits_for(brightest: int) -> int:
-    return next(bits for bits in _BIT_DEPTHS if brightest < 2**bits)
-
-
-def _read_raw(path: Path) -> tuple[NDArray, bool]:
-    """Read what OpenCV makes of a file, and whether its colours are multiplied by alpha."""
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-    except OSError as err:
-        raise SourceError(f"{path} can't be read: {err.strerror or err}") from err
-    raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    if raw is None:
-        raise SourceError(f"{path} is not a readable image (damaged, or of an unknown format)")
-    is_on_black = raw.ndim == 3 and raw.shape[2] == 4 and is_laid_on_black(data.tobytes(), 8 * raw.itemsize)
-    return np.asarray(raw), is_on_black
-
-
-def as_rgb(raw: NDArray, *, is_on_black: bool = False) -> NDArray[np.uint8]:
-    """Turn what OpenCV reads (grey, BGR or BGRA, of any number type) into ``(H, W, 3)`` uint8 RGB.
-
-    Transparency is laid on white.
-
-    Args:
-        raw: The image.
-        is_on_black: Colours are multiplied by alpha.
-
-    Raises:
-        SourceError: The values are neither those of 0..1 nor of 0..255, nor 16-bit.
-    """
-    raw = _as_bytes(raw)
-    if raw.ndim == 2 or raw.shape[2] == 1:
-        return np.asarray(cv2.cvtColor(raw, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
-    if raw.shape[2] == 4:
-        alpha = raw[:, :, 3:].astype(np.uint16)
-        colours = raw[:, :, 2::-1].astype(np.uint16)
-        on_black = colours if is_on_black else (colours * alpha + 127) // 255
-        return np.asarray(np.minimum(on_black + (255 - alpha), 255), dtype=np.uint8)
-    return np.asarray(cv2.cvtColor(raw, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-
-def _as_bytes(raw: NDArray) -> NDArray[np.uint8]:
-    """Bring values to 0..255; where white is, the type tells for 8 and 16 bit, else the values themselves."""
-    if raw.dtype == np.uint8:
-        return raw
-    if raw.dtype == np.uint16:
-        return (raw >> 8).astype(np.uint8)
-    values = np.asarray(raw, dtype=np.float64)
-    brightest = float(values.max(where=np.isfinite(values), initial=0.0))
-    if brightest > 255.0 * _OVERSHOOT:
-        raise SourceError(f"values must be in 0..1 or 0..255, got up to {brightest:g}")
-    scale = 255.0 if raw.dtype.kind == "f" and brightest <= _OVERSHOOT else 1.0
-    scaled = np.nan_to_num(values * scale, nan=0.0, posinf=255.0, neginf=0.0)
-    return np.rint(np.clip(scaled, 0.0, 255.0)).astype(np.uint8)
+    if not 0.05 <= factor <= 1.0:
+        raise ValueError(f"resize must be in [0.05, 1], got {factor:g}")
+    return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 class ImageRectifier:
@@ -159,27 +75,6 @@ class ImageRectifier:
         return resized(image, self._size_wh)
 
 
-def resized(image: NDArray[np.uint8], size_wh: tuple[int, int]) -> NDArray[np.uint8]:
-    """Resize by area averaging (bilinear where it grows); the same object when the size is right."""
-    height, width = image.shape[:2]
-    if (width, height) == size_wh:
-        return image
-    shrinks = size_wh[0] <= width and size_wh[1] <= height
-    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, size_wh, interpolation=how), dtype=np.uint8)
-
-
-def resized_wh(width: int, height: int, factor: float) -> tuple[int, int]:
-    """Return the size after a resize by ``factor``, rounded to whole pixels.
-
-    Raises:
-        ValueError: The factor is not in [0.05, 1].
-    """
-    if not 0.05 <= factor <= 1.0:
-        raise ValueError(f"resize must be in [0.05, 1], got {factor:g}")
-    return max(1, round(width * factor)), max(1, round(height * factor))
-
-
 class Sequence:
     """A recording, opened by ``open_sequence``. Safe to read from several threads.
 
@@ -194,7 +89,7 @@ class Sequence:
         self,
         files: SequenceFiles,
         camera: Intrinsics | None,
-        size_wh: tuple[int, int],
+        first: "_FirstImage",
         resize: float,
         kept: slice,
     ) -> None:
@@ -204,9 +99,10 @@ class Sequence:
         self.times_ns: NDArray[np.int64] = files.times_ns[kept]
         self._all_paths = files.image_paths
         self._paths = files.image_paths[kept]
-        self._stored_wh = size_wh
+        self._stored_wh = first.size_wh
+        self._is_16_bit = first.is_16_bit
         self._stored_camera = camera
-        self._size_wh = resized_wh(*size_wh, resize)
+        self._size_wh = resized_wh(*first.size_wh, resize)
         self._rectify = ImageRectifier(camera, self._size_wh)
         self._truth = _truth_of(files, self.times_ns)
 
@@ -257,14 +153,12 @@ class Sequence:
 
         Raises:
             IndexError: There is no such frame.
-            SourceError: The file is missing, damaged or of another size than the first readable one.
+            SourceError: The file is missing or damaged, or not of the first readable one's size or bits.
             ValueError: ``camera`` is not a resized version of this one.
         """
         if not 0 <= index < len(self._paths):
             raise IndexError(f"frame must be in [0, {len(self._paths) - 1}], got {index}")
-        raw = read_image(self._paths[index], lambda: self._bit_depth)
-        self._check_size(self._paths[index], (raw.shape[1], raw.shape[0]))
-        image = self._rectify(raw)
+        image = self._rectify(self._read(self._paths[index]))
         if camera is None or (camera.width, camera.height) == self._size_wh:
             return image
         if self._stored_camera is not None:
@@ -294,12 +188,29 @@ class Sequence:
             try:
                 if size_wh is None:
                     num_decoded += 1
-                    height, width = read_image(path).shape[:2]
-                    size_wh = (width, height)
+                    self._read(path)
+                    continue
                 self._check_size(path, size_wh)
+                if states_16_bits(path):
+                    self._check_may_be_16_bit(path)
             except SourceError as err:
                 messages.append(str(err))
         return messages, num_skipped
+
+    def _read(self, path: Path) -> NDArray[np.uint8]:
+        image = read_image(path, lambda: self._bits_in(path))
+        self._check_size(path, (image.shape[1], image.shape[0]))
+        return image
+
+    def _bits_in(self, path: Path) -> int | None:
+        self._check_may_be_16_bit(path)
+        return self._bit_depth
+
+    def _check_may_be_16_bit(self, path: Path) -> None:
+        if not self._is_16_bit:
+            raise SourceError(
+                f"{path} is a 16-bit image, the first readable image of the sequence is 8-bit: a depth image?"
+            )
 
     def _check_size(self, path: Path, size_wh: tuple[int, int]) -> None:
         if size_wh != self._stored_wh:
@@ -445,7 +356,8 @@ def open_sequence(
     if not rate_hz > 0:
         raise ValueError(f"rate_hz must be positive, got {rate_hz:g}")
     files = read_layout(Path(path), layout, rate_hz)
-    width, height = _first_size_wh(files.image_paths)
+    first = _first_image(files.image_paths)
+    width, height = first.size_wh
     camera = intrinsics.resolve(width, height) if isinstance(intrinsics, CameraSettings) else intrinsics
     if camera is None:
         camera = files.camera(width, height)
@@ -457,18 +369,30 @@ def open_sequence(
     if camera is not None:
         camera.check_possible(files.name)
     stop = None if max_frames is None else max_frames * stride
-    return Sequence(files, camera, (width, height), resize, slice(None, stop, stride))
+    return Sequence(files, camera, first, resize, slice(None, stop, stride))
 
 
-def _first_size_wh(paths: tuple[Path, ...]) -> tuple[int, int]:
-    """Return the size of the first image that can be read: one damaged file does not spoil the rest."""
+@dataclass(frozen=True)
+class _FirstImage:
+    size_wh: tuple[int, int]
+    is_16_bit: bool
+
+
+def _first_image(paths: tuple[Path, ...]) -> _FirstImage:
+    """Return what the first image that can be read is like: one damaged file does not spoil the rest."""
     first_error: SourceError | None = None
     for path in paths[: _MAX_BAD_AT_START + 1]:
+        is_16_bit = False
+
+        def asked_of_16_bit() -> None:
+            nonlocal is_16_bit
+            is_16_bit = True
+
         try:
-            height, width = read_image(path).shape[:2]
+            height, width = read_image(path, asked_of_16_bit).shape[:2]
         except SourceError as err:
             first_error = first_error or err
         else:
-            return width, height
+            return _FirstImage((width, height), is_16_bit)
     assert first_error is not None, "a layout has at least one image"
     raise first_error

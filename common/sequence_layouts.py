@@ -3,14 +3,13 @@
 Images are not opened here. Poses are brought to ``T_world_cam`` of the camera whose images are used.
 """
 
-import json
 import logging
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +18,9 @@ from semcast.common.camera import Intrinsics
 from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transform_from_yaml
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
-from semcast.common.lens import check_pinhole, distortion_in
 from semcast.common.numbered_images import lines_of_images, numbers_in_names
-from semcast.common.trajectory import Trajectory, read_tum
+from semcast.common.trajectory import Trajectory, read_tum, seconds_of
+from semcast.common.transforms_file import read_transforms_json
 
 logger = logging.getLogger(__name__)
 
@@ -30,9 +29,6 @@ Layout = Literal["auto", "native", "tum", "kitti", "euroc", "transforms", "folde
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 _TRANSFORMS_NAMES = ("transforms.json", "transforms_test.json", "transforms_train.json")
 _CALIBRATION_NAMES = ("intrinsics.json", "intrinsics.yaml", "camera.yaml", "calibration.yaml", "sensor.yaml")
-#: Models that undistortion turns into a pinhole; nerfstudio's others are fisheyes and panoramas.
-_PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
-_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Calibration published with the TUM RGB-D benchmark (Sturm et al. 2012), which its folders don't hold.
 _TUM_CAMERAS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -166,11 +162,15 @@ def _check_times(path: Path, num_images: int, times_ns: NDArray[np.int64]) -> No
     falls = np.flatnonzero(np.diff(times_ns) <= 0)
     if len(falls):
         k = int(falls[0])
-        before_s, after_s = ns_to_seconds(times_ns[k : k + 2]).tolist()
+        before_ns, after_ns = times_ns[k : k + 2].tolist()
         raise SourceError(
-            f"times of {path} must strictly increase, image {k + 2} has {after_s:.9g} s "
-            f"after {before_s:.9g} s"
+            f"times of {path} must strictly increase, image {k + 2} has {_short_s(after_ns)} s "
+            f"after {_short_s(before_ns)} s"
         )
+
+
+def _short_s(time_ns: int) -> str:
+    return seconds_of(time_ns).rstrip("0").rstrip(".")
 
 
 def _check_there(path: Path) -> None:
@@ -331,7 +331,7 @@ def _read_kitti(path: Path, rate_hz: float) -> SequenceFiles:
     def camera(width: int, height: int) -> Intrinsics | None:
         if projection is None:
             return _calibration_beside(path)(width, height)
-        fx, fy, cx, cy = projection[0, 0], projection[1, 1], projection[0, 2], projection[1, 2]
+        (fx, _, cx, _), (_, fy, cy, _), _ = projection.tolist()
         return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
     return SequenceFiles(name, images, times_ns, camera, truth)
@@ -364,9 +364,16 @@ def _kitti_projection(path: Path, camera_idx: int) -> NDArray[np.float64] | None
     for label, *numbers in _fields(path, 2):
         if label.rstrip(":") == f"P{camera_idx}":
             try:
-                return np.array([float(n) for n in numbers]).reshape(3, 4)
+                projection = np.array(_finite(numbers)).reshape(3, 4)
             except ValueError as err:
-                raise SourceError(f"{path}: P{camera_idx} must have 12 numbers, got {len(numbers)}") from err
+                raise SourceError(
+                    f"{path}: P{camera_idx} must have 12 finite numbers, got {' '.join(numbers)}"
+                ) from err
+            if not (projection[0, 0] > 0 and projection[1, 1] > 0 and projection[2, 2] > 0):
+                raise SourceError(
+                    f"{path}: P{camera_idx} must have positive focal lengths, got {' '.join(numbers)}"
+                )
+            return projection
     raise SourceError(f"{path} has no line P{camera_idx}")
 
 
@@ -427,67 +434,12 @@ def _euroc_truth(path: Path, sensor: Path) -> Trajectory | None:
 
 
 def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
-    """Read NeRF-synthetic or nerfstudio ``transforms.json``: OpenGL axes, x right, y up, z backward."""
     if path.is_dir():
         found = next((path / name for name in _TRANSFORMS_NAMES if (path / name).is_file()), None)
         if found is None:
             raise SourceError(f"{path} has no transforms.json, transforms_test.json or transforms_train.json")
         path = found
-    try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
-        frames = sorted(document["frames"], key=lambda f: natural_key(str(f["file_path"])))
-        images = tuple(_transforms_image(path.parent, str(frame["file_path"])) for frame in frames)
-        T_world_gl = np.array([f["transform_matrix"] for f in frames], dtype=np.float64).reshape(-1, 4, 4)
-        if not np.isfinite(T_world_gl).all():
-            raise ValueError("transform_matrix must be finite")
-    except (OSError, ValueError, KeyError, TypeError) as err:
-        what = f"{err} is missing" if isinstance(err, KeyError) else str(err)
-        raise SourceError(f"{path} can't be used as transforms.json: {what}") from err
-    for T in T_world_gl:
-        T[:3, :3] = project_to_so3(T[:3, :3])
-    times_ns = _nominal_times_ns(len(images), rate_hz)
-    truth = Trajectory(ns_to_seconds(times_ns), T_world_gl @ _OPENGL_TO_OPENCV)
-
-    def camera(width: int, height: int) -> Intrinsics | None:
-        try:
-            return _transforms_camera({**frames[0], **document}, width, height)
-        except (ValueError, TypeError) as err:
-            raise SourceError(f"{path} holds no usable intrinsics: {err}") from err
-
-    return SequenceFiles(path.resolve().parent.name, images, times_ns, camera, truth)
-
-
-def _transforms_image(folder: Path, name: str) -> Path:
-    place = folder / name
-    return place if place.suffix.lower() in IMAGE_SUFFIXES else place.with_name(place.name + ".png")
-
-
-def _transforms_camera(values: dict[str, Any], width: int, height: int) -> Intrinsics | None:
-    """Read the pinhole; these files count pixels from their corners, so principal points move by half.
-
-    Raises:
-        ValueError: It is no pinhole, or a value is out of range.
-    """
-    model = values.get("camera_model")
-    if model and str(model).upper() not in _PINHOLE_MODELS:
-        raise ValueError(f"camera_model must be one of {', '.join(_PINHOLE_MODELS)}, got {model!r}")
-    check_pinhole(values)
-    width, height = int(values.get("w", width)), int(values.get("h", height))
-    if "fl_x" in values:
-        fx = float(values["fl_x"])
-    elif "camera_angle_x" in values:
-        angle_rad = float(values["camera_angle_x"])
-        if not 0.0 < angle_rad < np.pi:
-            raise ValueError(f"camera_angle_x must be in (0, pi) radians, got {angle_rad:g}")
-        fx = 0.5 * width / float(np.tan(0.5 * angle_rad))
-    else:
-        return None
-    return Intrinsics(
-        fx=fx,
-        fy=float(values.get("fl_y", fx)),
-        cx=float(values.get("cx", width / 2)) - 0.5,
-        cy=float(values.get("cy", height / 2)) - 0.5,
-        width=width,
-        height=height,
-        distortion=distortion_in(values),
-    )
+    file = read_transforms_json(path, IMAGE_SUFFIXES, natural_key)
+    times_ns = _nominal_times_ns(len(file.image_paths), rate_hz)
+    truth = Trajectory(ns_to_seconds(times_ns), file.T_world_cam)
+    return SequenceFiles(path.resolve().parent.name, file.image_paths, times_ns, file.camera, truth)

@@ -1,4 +1,4 @@
-"""Size of an image file without decoding it, where its format makes that easy."""
+"""Size and bits of an image file without decoding it, where its format makes that easy."""
 
 import struct
 from pathlib import Path
@@ -6,6 +6,8 @@ from typing import BinaryIO
 
 from semcast.common.image_header import JPEG_START, PNG_START, jpeg_size_wh, png_size_wh
 
+#: Where a PNG states its bits a value: behind length and kind of the header chunk, width and height.
+_PNG_BITS = len(PNG_START) + 16
 _PNG_END = b"IEND\xaeB`\x82"
 _JPEG_END = b"\xff\xd9"
 
@@ -26,6 +28,16 @@ def size_in_header_wh(path: Path) -> tuple[int, int] | None:
     except (OSError, struct.error):
         return None
     return None
+
+
+def states_16_bits(path: Path) -> bool:
+    """Tell whether a file is a PNG with 16 bits a value."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(_PNG_BITS + 1)
+    except OSError:
+        return False
+    return start.startswith(PNG_START) and start[_PNG_BITS:] == b"\x10"
 
 
 def _ends_with(file: BinaryIO, end: bytes) -> bool:

@@ -18,10 +18,13 @@ class Trajectory:
     Attributes:
         t_s: ``(N,)`` seconds, strictly increasing.
         T_world_cam: ``(N, 4, 4)``, camera axes x right, y down, z forward.
+        times_ns: ``(N,)`` the same times exactly, where they came as nanoseconds: seconds since 1970 as a
+            float are some 200 ns off.
     """
 
     t_s: NDArray[np.float64]
     T_world_cam: NDArray[np.float64]
+    times_ns: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and order.
@@ -53,7 +56,15 @@ class Trajectory:
         """Return the poses of a span of time, with the ones that enclose it."""
         first = max(0, int(np.searchsorted(self.t_s, start_s, side="right")) - 1)
         last = int(np.searchsorted(self.t_s, end_s, side="left"))
-        return Trajectory(self.t_s[first : last + 1], self.T_world_cam[first : last + 1])
+        span = slice(first, last + 1)
+        times_ns = None if self.times_ns is None else self.times_ns[span]
+        return Trajectory(self.t_s[span], self.T_world_cam[span], times_ns)
+
+
+def seconds_of(time_ns: int) -> str:
+    """Return a time as decimal seconds with all its nanoseconds, which a float of the year 2026 has not."""
+    sign, time_ns = ("-", -time_ns) if time_ns < 0 else ("", time_ns)
+    return f"{sign}{time_ns // 10**9}.{time_ns % 10**9:09d}"
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -68,6 +79,7 @@ def read_tum(path: Path) -> Trajectory:
         raise SourceError(f"{path} can't be read: {err}") from err
     times: list[float] = []
     poses: list[NDArray[np.float64]] = []
+    before = ""
     for number, line in enumerate(lines, start=1):
         fields = line.split("#", 1)[0].replace(",", " ").split()
         if not fields:
@@ -79,18 +91,25 @@ def read_tum(path: Path) -> Trajectory:
             poses.append(make_transform(rotation_from_quat_wxyz((qw, qx, qy, qz)), (tx, ty, tz)))
         except ValueError as err:
             raise SourceError(f"{path}:{number} must be 't tx ty tz qx qy qz qw', got {line!r}") from err
+        if times and not t > times[-1]:
+            raise SourceError(
+                f"{path}:{number}: times must strictly increase, got {fields[0]} s after {before}"
+            )
+        before = fields[0]
         times.append(t)
-    try:
-        return Trajectory(np.array(times), np.array(poses).reshape(-1, 4, 4))
-    except ValueError as err:
-        raise SourceError(f"{path}: {err}") from err
+    return Trajectory(np.array(times), np.array(poses).reshape(-1, 4, 4))
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write ``t tx ty tz qx qy qz qw`` lines with nanosecond times and 9-digit poses, all or none of them."""
+    """Write ``t tx ty tz qx qy qz qw`` lines with nine digits behind the point, all or none of them."""
+    times = (
+        [f"{t_s:.9f}" for t_s in trajectory.t_s]
+        if trajectory.times_ns is None
+        else [seconds_of(t_ns) for t_ns in trajectory.times_ns.tolist()]
+    )
     rows = ["# t_s tx ty tz qx qy qz qw (camera to world; x right, y down, z forward)"]
-    for t_s, T_world_cam in zip(trajectory.t_s, trajectory.T_world_cam, strict=True):
+    for time, T_world_cam in zip(times, trajectory.T_world_cam, strict=True):
         w, x, y, z = quat_wxyz_from_rotation(T_world_cam[:3, :3])
         numbers = " ".join(f"{v:.9f}" for v in (*T_world_cam[:3, 3], x, y, z, w))
-        rows.append(f"{t_s:.9f} {numbers}")
+        rows.append(f"{time} {numbers}")
     write_whole(path, "\n".join(rows) + "\n")

@@ -25,6 +25,10 @@ FORMATS = {
 }
 
 
+#: Format -> the file by which a folder that it was exported to is known.
+_MARKS = {"colmap": "sparse/0/points3D.txt", "nerfstudio": "points3D.ply"}
+
+
 def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> list[Path]:
     """Write a run in another tool's format; returns the files a person opens.
 
@@ -67,25 +71,29 @@ def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> li
         logger.warning("parts of the map: %s; --part %s writes one that fits together", parts, LARGEST)
     try:
         if FORMATS[format_name].startswith("FOLDER"):
-            _check_not_foreign(out, images)
+            _check_not_foreign(out, format_name, images)
         return writers[format_name]()
     except OSError as err:
         raise SemcastError(f"{out} can't be written: {err}") from err
 
 
-def _check_not_foreign(out: Path, images: Mapping[int, Path]) -> None:
-    """Refuse a folder with images or a ``transforms.json`` that no export wrote: they would be written over.
+def _check_not_foreign(out: Path, format_name: str, images: Mapping[int, Path]) -> None:
+    """Refuse a folder with images or a ``transforms.json`` that others need: they would be written over.
 
+    Those of an earlier export in the same format are; those that the other format's model shows must stay.
     An export that found no room has left some of its images, and no list of them.
     """
-    if (out / "sparse" / "0" / "points3D.txt").exists() or (out / "points3D.ply").exists():
+    exported = {name for name, mark in _MARKS.items() if (out / mark).exists()}
+    if exported == {format_name}:
         return
     ours = {path.name: path for path in images.values()}
     there = sorted((out / "images").iterdir()) if (out / "images").is_dir() else []
+    if exported:
+        there = [f for f in there if f.name in ours]
     foreign = [
         f for f in there if f.name not in ours or f.is_dir() or f.read_bytes() != ours[f.name].read_bytes()
     ]
-    if (out / "transforms.json").exists():
+    if "nerfstudio" not in exported and (out / "transforms.json").exists():
         foreign.append(out / "transforms.json")
     if foreign:
         raise ConfigError(f"out must hold no images of others, there is {foreign[0]}: give another folder")

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from semcast import __version__
 from semcast.common.errors import SourceError
+from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.whole_file import write_whole
 
@@ -128,17 +129,19 @@ def trajectory_of(poses: Mapping[int, NDArray[np.float64]], t_source_ns: Mapping
         poses: Frame id to ``T_world_cam``.
         t_source_ns: Frame id to recorded time.
     """
-    times_s: list[float] = []
+    times_ns: list[int] = []
     kept: list[NDArray[np.float64]] = []
     for frame_id in sorted(poses):
         if frame_id not in t_source_ns:
             continue
-        t_s = t_source_ns[frame_id] * 1e-9
-        if times_s and t_s <= times_s[-1]:
+        t_ns = t_source_ns[frame_id]
+        # As floats of seconds two times may be one.
+        if times_ns and t_ns * 1e-9 <= times_ns[-1] * 1e-9:
             continue
-        times_s.append(t_s)
+        times_ns.append(t_ns)
         kept.append(poses[frame_id])
-    return Trajectory(np.array(times_s), np.array(kept, dtype=np.float64).reshape(-1, 4, 4))
+    exactly = np.array(times_ns, dtype=np.int64)
+    return Trajectory(ns_to_seconds(exactly), np.array(kept, dtype=np.float64).reshape(-1, 4, 4), exactly)
 
 
 def plain(value: Any) -> Any:

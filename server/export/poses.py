@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from semcast.common.run_folder import RunData
-from semcast.common.trajectory import Trajectory, write_tum
+from semcast.common.sequence_layouts import ns_to_seconds
+from semcast.common.trajectory import Trajectory, seconds_of, write_tum
 from semcast.common.whole_file import write_whole
 
 
@@ -17,7 +18,8 @@ def write_run_tum(path: Path, data: RunData) -> list[Path]:
     times_ns = data.t_source_ns
     rising = np.concatenate([[True], times_ns[1:] > np.maximum.accumulate(times_ns)[:-1]])[: len(times_ns)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_tum(path, Trajectory(times_ns[rising] * 1e-9, data.T_world_cam[rising]))
+    times_ns = times_ns[rising]
+    write_tum(path, Trajectory(ns_to_seconds(times_ns), data.T_world_cam[rising], times_ns))
     return [path]
 
 
@@ -31,6 +33,6 @@ def write_run_kitti(path: Path, data: RunData) -> list[Path]:
     times, frames = (path.with_name(f"{path.stem}.{what}.txt") for what in ("times", "frames"))
     poses = data.T_world_cam[:, :3].reshape(-1, 12)
     write_whole(path, "".join(" ".join(f"{v:.12e}" for v in row) + "\n" for row in poses.tolist()))
-    write_whole(times, "".join(f"{t * 1e-9:.9f}\n" for t in data.t_source_ns.tolist()))
+    write_whole(times, "".join(f"{seconds_of(t)}\n" for t in data.t_source_ns.tolist()))
     write_whole(frames, "".join(f"{k}\n" for k in data.frame_ids.tolist()))
     return [path, times, frames]

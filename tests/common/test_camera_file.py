@@ -36,6 +36,8 @@ def read(tmp_path, text, encoding="utf-8"):
         f"- [0, 0,\n   1]\ndistortion_coefficients:\n- {list(COEFFICIENTS)}\n",
         "height: 24\nwidth: 32\ndistortion_model: plumb_bob\nD: [0.1, -0.2, 0.001, 0.002, 0.3]\n"
         "K: [30.0, 0.0, 15.5, 0.0, 31.0, 11.5, 0.0, 0.0, 1.0]\n",
+        "height: 24\nwidth: 32\ndistortion_model: plumb_bob\n"
+        f"d:\n{block(COEFFICIENTS, 0)}k:\n{block([30.0, 0.0, 15.5, 0.0, 31.0, 11.5, 0.0, 0.0, 1.0], 0)}",
         f"{EUROC}camera_model: pinhole\ndistortion_model: radtan\ndistortion_coeffs: {list(COEFFICIENTS)}\n",
         "cam0:\n  T_cam_imu:\n  - [1, 0, 0, 0]\n  - [0, 1, 0, 0]\n  camera_model: pinhole\n"
         f"  distortion_coeffs: {list(COEFFICIENTS)}\n  distortion_model: radtan\n"
@@ -48,6 +50,7 @@ def read(tmp_path, text, encoding="utf-8"):
         "ros all in blocks",
         "lists of lists",
         "ros message",
+        "ros 2 message",
         "euroc",
         "kalibr",
         "named",
@@ -100,7 +103,7 @@ def test_orbslam_without_tangential_distortion_is_read(tmp_path):
         (f"{EUROC}distortion_coeffs:\n- k1: 0.1\n", "distortion_coeffs must be .*, got '- k1: 0.1'"),
         (
             f"{EUROC}distortion_parameters:\n  k1: 0.1\n",
-            "distortion_parameters must be .* distCoeffs, dist, D, got",
+            "distortion_parameters must be .* distCoeffs, dist, D, d, coeffs, got",
         ),
         (f"{EUROC}D: 0.1\n", "D must be a list of numbers.*, got 0.1"),
         (
@@ -111,7 +114,7 @@ def test_orbslam_without_tangential_distortion_is_read(tmp_path):
             f"{ROS_HEAD}camera_matrix: {{data: [1]}}\n",
             "camera_matrix must be a list of 9 numbers, got '{data",
         ),
-        (ROS_HEAD, "'camera_matrix' is missing"),
+        (ROS_HEAD, "'camera_matrix or K' is missing"),
         ("resolution: [32, 24]\nintrinsics: [1, 2, 3, 4, 5]\n", "intrinsics must be a list of 4 numbers"),
         (
             f"{EUROC}distortion_model: equidistant\n",

@@ -4,7 +4,8 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
-from semcast.common.sequence import as_rgb, open_sequence, read_image
+from semcast.common.image_file import as_rgb, read_image
+from semcast.common.sequence import open_sequence
 
 CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
 
@@ -70,9 +71,17 @@ def test_floats_of_another_range_are_refused_by_the_name_of_their_file(tmp_path)
         read_image(tmp_path / "a.tif")
 
 
-def test_a_single_sixteen_bit_image_among_others_goes_by_itself(tmp_path):
-    for k in range(30):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((24, 32), 100, np.uint8))
-    ramp = np.linspace(0, 65535, 24 * 32).astype(np.uint16).reshape(24, 32)
-    cv2.imwrite(str(tmp_path / "8.png"), ramp)
-    np.testing.assert_array_equal(open_sequence(tmp_path).image(8)[:, :, 0], ramp >> 8)
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_depth_images_among_those_of_a_colour_camera_are_refused(tmp_path, suffix):
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.color.png"), np.full((24, 32, 3), 100, np.uint8))
+        cv2.imwrite(str(tmp_path / f"{k}.depth{suffix}"), np.full((24, 32), 1500, np.uint16))
+    sequence = open_sequence(tmp_path)
+    assert sequence.image(2)[0, 0, 0] == 100
+    with pytest.raises(SourceError, match="1.depth.* is a 16-bit image, .* 8-bit: a depth image"):
+        sequence.image(3)
+    messages, num_skipped = sequence.refused_images()
+    assert [message.split(" ")[0] for message in messages] == [
+        str(tmp_path / f"{k}.depth{suffix}") for k in range(3)
+    ]
+    assert num_skipped == 0

@@ -37,6 +37,8 @@ def test_a_longer_distortion_model_that_is_used_is_refused():
         {"distortion": {"k1": -0.3, "k2": 0.1, "p1": 0.01, "p2": 0.02}},
         {"distortion_coefficients": {"rows": 1, "cols": 5, "data": [-0.3, 0.1, 0.01, 0.02, 0]}},
         {"D": [-0.3, 0.1, 0.01, 0.02], "distortion_model": "none given", "distortion": []},
+        {"d": [-0.3, 0.1, 0.01, 0.02, 0.0]},
+        {"coeffs": [-0.3, 0.1, 0.01, 0.02, 0.0], "model": "distortion.brown_conrady"},
     ],
 )
 def test_distortion_is_read_under_its_usual_names(lens):
@@ -51,6 +53,7 @@ def test_distortion_is_read_under_its_usual_names(lens):
         {"distortion": [], "distortion_coeffs": 0},
         {"distortion": "none", "undistorted": True, "distance_unit": "m"},
         {"distortion_model": "none (not a fisheye)", "is_fisheye": False},
+        {"model": "distortion.inverse_brown_conrady", "coeffs": [0.0, 0.0, 0.0, 0.0, 0.0]},
     ],
 )
 def test_notes_about_a_lens_without_distortion_are_ignored(lens):
@@ -70,7 +73,11 @@ def test_notes_about_a_lens_without_distortion_are_ignored(lens):
         ({"D": [[0.1], [0], [0], [0]]}, r"D must be of numbers, got \[0.1\]"),
         ({"k1": 0.1, "k2": 0.1, "k3": 0.1, "k4": 0.1}, "k4 must be 0 or come with k5 and k6, got 0.1"),
         ({"distortion": {"model": "equidistant", "k1": 0.1}}, "model must be a pinhole camera's"),
-        ({"distortion": {"coeffs": [0.1, 0, 0, 0]}}, "distortion must be a list of numbers named"),
+        ({"distortion": {"values": [0.1, 0, 0, 0]}}, "distortion must be a list of numbers named"),
+        (
+            {"model": "inverse_brown_conrady", "coeffs": [0.1, 0, 0, 0]},
+            "model must map .* got 'inverse_brown",
+        ),
         ({"lens_distortion": [0.1, 0, 0, 0]}, "lens_distortion must be a list of numbers named"),
         ({"distortion_model": "division", "D": [0.1, 0, 0, 0]}, "distortion_model must be .* got 'division'"),
         ({"k1": 0.1, "D": [0.2, 0, 0, 0]}, "k1 and D must say the same"),

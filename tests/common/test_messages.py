@@ -5,7 +5,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import EncodedImage
-from semcast.common.message_fields import FieldError
+from semcast.common.message_fields import FieldError, Number
 from semcast.common.messages import CameraInfo, SymbolFrame
 from semcast.common.phy.qam import SHAPED_SPACING, constellation
 from semcast.common.phy.slots import layout_for
@@ -61,6 +61,13 @@ def test_camera_info_gives_the_pinhole():
     assert info.intrinsics == pinhole
     rolling = dataclasses.replace(info, readout_ms=20.0, readout_from="left")
     assert rolling.intrinsics == dataclasses.replace(pinhole, readout_ms=20.0, readout_from="left")
+
+
+def test_a_number_of_numpys_is_a_number_on_the_air():
+    assert isinstance(Number().dump(np.float64(403.14)), float)
+    for none in (True, "1", None):
+        with pytest.raises(FieldError, match="must be a number"):
+            Number().load(none)
 
 
 def test_qam_symbols_travel_in_four_bits_and_come_back_exactly(rng):

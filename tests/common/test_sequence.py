@@ -184,6 +184,16 @@ def test_a_camera_that_can_not_be_is_refused(native, change, message):
         open_sequence(native, given, resize=0.5)
 
 
+@pytest.mark.parametrize(("scale", "is_warned_of"), [(1.0, False), (1.9, True)])
+def test_a_calibration_for_larger_images_is_warned_of(native, scale, is_warned_of, caplog):
+    values = {**CAMERA.to_dict(), "cx": scale * CAMERA.cx, "cy": scale * CAMERA.cy}
+    (native / "intrinsics.json").write_text(json.dumps(values))
+    open_sequence(native)
+    assert (
+        "far from their middle: is the calibration for another image size?" in caplog.text
+    ) is is_warned_of
+
+
 def test_a_wide_camera_with_its_principal_point_in_a_corner_is_taken(native):
     given = CameraSettings(fx=2.7, fy=2.0, cx=-0.5, cy=23.5)
     sequence = open_sequence(native, given, resize=0.5)

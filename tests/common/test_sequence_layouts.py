@@ -88,6 +88,22 @@ def test_what_is_wrong_with_a_kitti_recording_is_said(tmp_path, write_images, ti
         open_sequence(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("projection", "message"),
+    [
+        ("0 0 15.5 0 0 31 11.5 0 0 0 1 0", "P0 must have positive focal lengths, got 0 0 15.5"),
+        ("-30 0 15.5 0 0 31 11.5 0 0 0 1 0", "P0 must have positive focal lengths, got -30 0"),
+        ("inf 0 15.5 0 0 31 11.5 0 0 0 1 0", "P0 must have 12 finite numbers, got inf 0"),
+        ("30 0 15.5", "P0 must have 12 finite numbers, got 30 0 15.5"),
+    ],
+)
+def test_a_damaged_kitti_calibration_is_said(tmp_path, write_images, projection, message):
+    write_images(tmp_path / "image_0", 1)
+    (tmp_path / "calib.txt").write_text(f"P0: {projection}\n")
+    with pytest.raises(SourceError, match=f"calib.txt: {message}"):
+        open_sequence(tmp_path)
+
+
 @pytest.mark.parametrize(("pattern", "first"), [("{:06d}.png", 0), ("{:06d}.png", 4), ("night_{}.png", 0)])
 def test_images_cut_out_of_a_kitti_recording_keep_their_poses(tmp_path, write_images, poses, pattern, first):
     write_images(tmp_path / "image_0", 8, pattern)
@@ -206,6 +222,38 @@ def test_a_transforms_file_with_pinhole_numbers_counts_from_pixel_corners(tmp_pa
     assert open_sequence(tmp_path / "transforms.json").intrinsics == CAMERA
 
 
+def test_a_transforms_file_may_leave_out_the_last_row_of_its_matrices(tmp_path, write_images, poses):
+    write_images(tmp_path / "images", 5)
+    found = []
+    for rows in (4, 3):
+        frames = [
+            {"file_path": f"images/{k:06d}.png", "transform_matrix": T[:rows].tolist()}
+            for k, T in enumerate(poses(5))
+        ]
+        (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+        found.append(open_sequence(tmp_path).groundtruth().T_world_cam)
+    np.testing.assert_array_equal(found[1], found[0])
+    assert found[0].shape == (5, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("focal_px", "message"),
+    [((30.0, 30.1), None), ((30.0, 45.0), "fl_x must be the same for all frames .*, got 30 to 45")],
+)
+def test_a_transforms_file_of_several_cameras_is_refused(tmp_path, write_images, focal_px, message):
+    write_images(tmp_path / "images", 2)
+    frames = [
+        {"file_path": f"images/{k:06d}.png", "transform_matrix": np.eye(4).tolist(), "fl_x": focal}
+        for k, focal in enumerate(focal_px)
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"w": 32, "h": 24, "frames": frames}))
+    if message is None:
+        assert open_sequence(tmp_path).intrinsics.fx == 30.0
+        return
+    with pytest.raises(SourceError, match=message):
+        open_sequence(tmp_path)
+
+
 @pytest.fixture
 def transforms_folder(tmp_path, write_images):
     """Return a function that writes a recording of one image with more keys in its transforms.json."""
@@ -249,6 +297,7 @@ def test_a_transforms_file_of_another_model_is_refused(transforms_folder, docume
         (0.0, np.eye(4), r"camera_angle_x must be in \(0, pi\) radians, got 0"),
         (45.0, np.eye(4), r"camera_angle_x must be in \(0, pi\) radians, got 45"),
         (0.8, np.full((4, 4), np.nan), "transform_matrix must be finite"),
+        (0.8, np.eye(3), "transform_matrix must be 4x4 or 3x4, got 3x3"),
     ],
 )
 def test_nonsense_in_a_transforms_file_is_said(tmp_path, write_images, angle_rad, matrix, message):

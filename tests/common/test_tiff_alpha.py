@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcast.common.sequence import read_image
+from semcast.common.image_file import read_image
 from semcast.common.tiff_alpha import is_laid_on_black
 
 NOT_SAID, ASSOCIATED, UNASSOCIATED = 0, 1, 2

@@ -15,6 +15,15 @@ def test_tum_round_trip(tmp_path, rng):
     np.testing.assert_allclose(again.T_world_cam, poses, atol=1e-8)
 
 
+def test_times_that_came_as_nanoseconds_are_written_to_the_nanosecond(tmp_path):
+    times_ns = np.array([-1_500_000_000, 1403636579763555584, 1403636579763555999])
+    trajectory = Trajectory(times_ns[:2] * 1e-9, np.tile(np.eye(4), (2, 1, 1)), times_ns[:2])
+    write_tum(tmp_path / "t.tum", trajectory)
+    lines = (tmp_path / "t.tum").read_text().splitlines()[1:]
+    assert [line.split()[0] for line in lines] == ["-1.500000000", "1403636579.763555584"]
+    assert trajectory.between(0.0, 0.0).times_ns.tolist() == times_ns[:2].tolist()
+
+
 def test_path_length_adds_the_steps():
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[1, :3, 3] = [3, 4, 0]
@@ -51,6 +60,8 @@ def test_a_file_that_is_no_text_is_named(tmp_path):
 
 
 def test_times_must_increase(tmp_path):
-    (tmp_path / "t.tum").write_text("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
-    with pytest.raises(SourceError, match="strictly increase"):
+    lines = [f"{t} 0 0 0 0 0 0 1" for t in ("1403636579.7", "1403636579.8", "1403636579.75")]
+    (tmp_path / "t.tum").write_text("\n".join(["# head", *lines]))
+    message = "t.tum:4: times must strictly increase, got 1403636579.75 s after 1403636579.8$"
+    with pytest.raises(SourceError, match=message):
         read_tum(tmp_path / "t.tum")

@@ -12,8 +12,9 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.config import build_settings, read_toml
+from semcast.common.image_file import read_image
 from semcast.common.run_folder import FRAMES_NAME, read_image_paths, read_run
-from semcast.common.sequence import open_sequence, read_image
+from semcast.common.sequence import open_sequence
 from semcast.server.export.outputs import read_ply
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame

@@ -101,7 +101,7 @@ def read_pictures(files: list[Path]) -> Iterator[tuple[str, "NDArray[np.uint8]"]
     Raises:
         SourceError: A file is no picture, or sizes differ.
     """
-    from semcast.common.sequence import read_image
+    from semcast.common.image_file import read_image
 
     size = None
     for file in files:

@@ -333,6 +333,19 @@ def test_exports_into_one_folder_follow_each_other(tmp_path, arc_run, write_arc_
         export_run(tmp_path / "run", format_name, out)
 
 
+def test_an_export_leaves_the_images_of_the_other_formats_model_alone(tmp_path, arc_run, write_arc_run):
+    for name in ("run", "other"):
+        write_arc_run(tmp_path / name, arc_run())
+    image = next(iter(read_image_paths(tmp_path / "other").values()))
+    image.write_bytes(image.read_bytes() + b"differs")
+    out = tmp_path / "out"
+    export_run(tmp_path / "run", "nerfstudio", out)
+    with pytest.raises(ConfigError, match=f"there is .*{image.name}: give another folder"):
+        export_run(tmp_path / "other", "colmap", out)
+    export_run(tmp_path / "other", "nerfstudio", out)
+    assert (out / "images" / image.name).read_bytes() == image.read_bytes()
+
+
 def test_trimesh_reads_the_points_with_their_colours(tmp_path, arc_run, write_arc_run):
     data = arc_run()
     write_arc_run(tmp_path / "run", data)
