@@ -85,9 +85,7 @@ class Emulator:
         self._count_missing(frame)
         # A lossless agent never has more frames under way than this; a live one is served its newest.
         self._box.resize(_REPLAY_CAPACITY if frame.lossless else 1)
-        before = self._box.dropped
-        self._box.put(frame)
-        self._metrics.drop("superseded", self._box.dropped - before)
+        self._metrics.drop("superseded", self._box.put(frame) or 0)
 
     def _count_missing(self, frame: SymbolFrame) -> None:
         """Count the frames before this one that never came; what is sent again opens no gap."""

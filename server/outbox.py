@@ -83,9 +83,7 @@ class Outbox:
             self._put("map")
 
     def _put(self, entry: PoseMessage | Literal["map"]) -> None:
-        before = self._box.dropped
-        self._box.put(entry)
-        self._metrics.drop("outbox", self._box.dropped - before)
+        self._metrics.drop("outbox", self._box.put(entry) or 0)
 
     def _run(self) -> None:
         while (entry := self._box.get()) is not None:
