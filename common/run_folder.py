@@ -20,11 +20,9 @@ times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks(
 """
 
 import contextlib
-import json
 import logging
 import queue
 import threading
-import zipfile
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, fields
@@ -37,8 +35,8 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
+from semcast.common.npz_file import read_npz, write_npz
 from semcast.common.shapes import check_shape
-from semcast.common.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -54,11 +52,17 @@ RECONSTRUCTION_NAME = "reconstruction.npz"
 IMAGES_NAME = "images"
 CHECKPOINT_NAME = "checkpoint.npz"
 
+#: What is written at the end of a run, and when it is asked for.
+RESULT_FILES = (TRAJECTORY_NAME, MAP_NAME, DENSE_NAME, RECONSTRUCTION_NAME, SUMMARY_NAME, SETTINGS_NAME)
+#: What is written on the way.
+RECORD_FILES = (FRAMES_NAME, VIEWER_NAME, CHECKPOINT_NAME)
+#: All files a run may leave, besides those in the folder ``IMAGES_NAME``.
+RUN_FILES = (*RESULT_FILES, DEMO_SETTINGS_NAME, *RECORD_FILES)
+
 FORMAT = 1
 #: Frames that may wait for a map to begin, whose start can make keyframes of them.
 MAX_PROVISIONAL = 300
 MAX_UNPACKED_BYTES = 4 * 1024**3
-_HEADER = "header"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,14 +166,10 @@ def write_run(folder: Path, data: RunData) -> None:
     Raises:
         SourceError: The folder can't be made or the file can't be written.
     """
-    header = json.dumps({"format": FORMAT, "intrinsics": data.intrinsics.to_dict()}).encode()
-    content: dict[str, Any] = {name: getattr(data, name) for name in _ARRAYS}
-    content[_HEADER] = np.frombuffer(header, dtype=np.uint8)
     path = folder / RECONSTRUCTION_NAME
+    header = {"format": FORMAT, "intrinsics": data.intrinsics.to_dict()}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as file:
-            np.savez_compressed(file, allow_pickle=False, **content)
+        write_npz(path, header, {name: getattr(data, name) for name in _ARRAYS}, compressed=True)
     except OSError as err:
         raise SourceError(f"{path} can't be written: {err}") from err
 
@@ -188,22 +188,19 @@ def read_run(folder: Path) -> RunData:
             f"{folder} holds no {RECONSTRUCTION_NAME}; a run writes it when it ends, and only with a map"
         )
     try:
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(member.file_size for member in archive.infolist())
-        if unpacked > MAX_UNPACKED_BYTES:
-            raise SourceError(f"{path} must unpack to at most {MAX_UNPACKED_BYTES} bytes, got {unpacked}")
-        with np.load(path, allow_pickle=False) as content:
-            there = [name for name in (_HEADER, *_ARRAYS) if name in content or name not in _ADDED]
-            arrays = {name: np.array(content[name]) for name in there}
-        header = json.loads(arrays.pop(_HEADER).tobytes())
-        if header.get("format") != FORMAT:
-            raise SourceError(f"{path} has format {header.get('format')}, this semcast reads {FORMAT}")
+        header, content = read_npz(path, MAX_UNPACKED_BYTES)
+    except OSError as err:
+        raise SourceError(f"{path} can't be read: {err}") from err
+    except ValueError as err:
+        raise SourceError(f"{path} {err}") from err
+    if header.get("format") != FORMAT:
+        raise SourceError(f"{path} has format {header.get('format')}, this semcast reads {FORMAT}")
+    try:
+        arrays = {name: content[name] for name in _ARRAYS if name in content or name not in _ADDED}
         for name, owner in _ADDED.items():
             arrays.setdefault(name, np.zeros(len(arrays[owner]), dtype=np.int64))
         return RunData(intrinsics=Intrinsics.from_dict(header["intrinsics"]), **arrays)
-    except SourceError:
-        raise
-    except Exception as err:  # a damaged zip or array fails in many ways
+    except Exception as err:  # what is in place of an array or a number fails in many ways
         raise SourceError(f"{path} is damaged: {err}") from err
 
 

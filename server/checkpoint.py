@@ -3,10 +3,8 @@
 One uncompressed ``.npz`` (a zip of plain arrays with a CRC each, read without pickle), replaced atomically.
 """
 
-import json
 import logging
 import threading
-import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,13 +15,12 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import CheckpointError
-from semcast.common.whole_file import whole_file
+from semcast.common.npz_file import read_npz, write_npz
 
 logger = logging.getLogger(__name__)
 
 FORMAT = 1
 MAX_BYTES = 2 * 1024**3
-_HEADER = "header"
 _MAP = "map."
 
 
@@ -72,11 +69,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     header = {"format": FORMAT, **asdict(checkpoint.header)}
     header["camera"] = checkpoint.header.camera.to_dict()
     content = {_MAP + name: array for name, array in checkpoint.arrays.items()}
-    content[_HEADER] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path, durable=True) as file:
-            np.savez(file, allow_pickle=False, **content)
+        write_npz(path, header, content, compressed=False, durable=True)
     except OSError as err:
         raise CheckpointError(f"{path} can't be written: {err}") from err
 
@@ -88,22 +82,18 @@ def load_checkpoint(path: Path) -> Checkpoint:
         CheckpointError: The file is missing, damaged, too large or of another format.
     """
     try:
-        size = path.stat().st_size
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(member.file_size for member in archive.infolist())
-        if max(size, unpacked) > MAX_BYTES:
-            raise CheckpointError(f"{path} must be at most {MAX_BYTES} bytes, got {max(size, unpacked)}")
-        with np.load(path, allow_pickle=False) as content:
-            arrays = {name: np.array(content[name]) for name in content.files}
-        header = json.loads(arrays.pop(_HEADER).tobytes())
-        if header.pop("format") != FORMAT:
-            raise CheckpointError(f"{path} is a checkpoint of another version of semcast")
+        header, arrays = read_npz(path, MAX_BYTES)
+    except OSError as err:
+        raise CheckpointError(f"{path} can't be read as a checkpoint: {err}") from err
+    except ValueError as err:
+        raise CheckpointError(f"{path} can't be read as a checkpoint: it {err}") from err
+    if header.pop("format", None) != FORMAT:
+        raise CheckpointError(f"{path} is a checkpoint of another version of semcast")
+    try:
         header["camera"] = Intrinsics.from_dict(header["camera"])
         maps = {name.removeprefix(_MAP): array for name, array in arrays.items() if name.startswith(_MAP)}
         return Checkpoint(CheckpointHeader(**header), maps)
-    except CheckpointError:
-        raise
-    except Exception as err:  # a damaged zip or array fails in many ways
+    except Exception as err:  # what is in place of a field fails in many ways
         raise CheckpointError(f"{path} can't be read as a checkpoint: {err}") from err
 
 

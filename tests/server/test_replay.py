@@ -154,7 +154,9 @@ def test_the_command_shows_what_is_known_and_names_its_files(recording, tmp_path
     shown = capsys.readouterr().out
     assert "frames with a pose" in shown
     assert "error" not in shown, "there is no truth"
-    names = "trajectory.tum, map.ply, dense.ply, reconstruction.npz, summary.json, settings.toml"
+    names = (
+        "trajectory.tum, map.ply, dense.ply, reconstruction.npz, summary.json, settings.toml, frames.jsonl"
+    )
     assert shown.endswith(f"in {tmp_path / 'out'}: {names}\n")
 
 
