@@ -13,7 +13,6 @@ from semcast.common.errors import SemcastError
 from semcast.common.run_folder import MAP_NAME, TRAJECTORY_NAME, RunData, write_run
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.server.export.outputs import EachFile, trajectory_of, write_ply
-from semcast.server.export.parts import frame_parts
 from semcast.server.mapping.reconstruction import Reconstruction
 
 logger = logging.getLogger(__name__)
@@ -52,7 +51,7 @@ def results_of(reconstruction: Reconstruction, t_source_ns: Mapping[int, int]) -
     return Results(
         poses=poses,
         trajectory=trajectory_of(poses, t_source_ns),
-        part_of=frame_parts(reconstruction.snapshot()),
+        part_of=world.part_of_frames(),
         num_landmarks=len(world.landmarks),
         num_keyframes=len(np.unique(world.observations()[1])),
     )
