@@ -44,7 +44,8 @@ class Emulator:
         session: Open.
         settings: Of the process.
         metrics: Where to count. Drops: ``superseded`` by a newer frame while busy, ``lost`` on the air,
-            ``missing`` (gaps in what the agent sent), ``protocol``, ``overflow`` (too many are delayed).
+            ``missing`` (gaps in what the agent sent), ``protocol``, ``overflow`` (too many are delayed),
+            ``unsent`` (a delayed one could not be sent).
     """
 
     def __init__(self, session: Session, settings: EmulatorSettings, metrics: Metrics) -> None:
@@ -62,7 +63,8 @@ class Emulator:
         self._live = session.publisher(rx_key(agent_id), "newest")
         self._lossless = session.publisher(rx_key(agent_id), "every")
         self._reports = session.publisher(channel_key(agent_id), "newest")
-        self._delay = DelayLine(self._send, np.random.default_rng((settings.seed, _JITTER_STREAM)))
+        jitter = np.random.default_rng((settings.seed, _JITTER_STREAM))
+        self._delay = DelayLine(self._send, jitter, self._on_unsent)
         session.answer(control_key(agent_id, ROLE), self._on_request)
         session.subscribe(tx_key(agent_id), "newest", self._on_symbols, _RING_CAPACITY)
 
@@ -159,6 +161,10 @@ class Emulator:
             (self._lossless if lossless else self._live).put(packet)
         except TransportError as err:
             logger.debug("not sent: %s", err)
+
+    def _on_unsent(self, text: str) -> None:
+        self._metrics.drop("unsent")
+        self._metrics.error(text)
 
     def _on_request(self, payload: bytes) -> bytes:
         try:

@@ -21,7 +21,6 @@ times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks(
 
 import contextlib
 import logging
-import queue
 import threading
 from collections import deque
 from collections.abc import Collection
@@ -35,6 +34,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
+from semcast.common.mailbox import Mailbox
 from semcast.common.npz_file import read_npz, write_npz
 from semcast.common.shapes import check_shape
 
@@ -227,7 +227,8 @@ class _Image:
 class ImageWriter:
     """Writes decoded images into ``images/`` on its own thread, so that tracking does not wait for the disk.
 
-    A full disk is reported once; the stream goes on without images.
+    A full disk, or whatever else keeps an image from being written, is reported once; the stream goes on
+    without images, which are counted as dropped.
 
     Args:
         folder: The run folder.
@@ -241,60 +242,65 @@ class ImageWriter:
 
     def __init__(self, folder: Path, *, lossless: bool, quality: int = 95, capacity: int = 8) -> None:
         self._images = folder / IMAGES_NAME
-        self._lossless = lossless
+        self._wait_s = None if lossless else 0.0
         self._quality = quality
-        self._queue: queue.Queue[_Image | None] = queue.Queue(capacity)
+        self._box: Mailbox[_Image] = Mailbox(capacity, "all")
         #: What is kept of the provisional images written so far; not in the queue, which may be full.
         self._settled: deque[tuple[int, frozenset[int]]] = deque()
         self._num_put = 0
         self.num_written = 0
-        self.num_dropped = 0
+        # Each belongs to one thread: that of the caller, and that of the writer.
+        self._num_refused = self._num_failed = 0
         try:
             self._images.mkdir(parents=True, exist_ok=True)
         except OSError as err:
             raise SourceError(f"{self._images} can't be written: {err}") from err
-        self._closed = False
         self._provisional: deque[int] = deque()
         self._thread = threading.Thread(target=self._run, name="semcast-images", daemon=True)
         self._thread.start()
 
+    @property
+    def num_dropped(self) -> int:
+        """Images that found no room in the queue, or could not be written."""
+        return self._num_refused + self._num_failed
+
     def put(self, frame_id: int, image: NDArray[np.uint8], *, provisional: bool = False) -> None:
-        """Queue one image; the caller must not change it afterwards.
+        """Queue one image; the caller must not change it afterwards. After ``close`` it is ignored.
 
         Args:
             frame_id: Names the file.
             image: ``(H, W, 3)`` uint8 RGB.
             provisional: ``settle`` will say whether it is kept; of many only the newest are.
         """
-        if self._closed:
-            return
-        item = _Image(frame_id, image, provisional)
-        try:
-            self._queue.put(item, block=self._lossless)
+        if self._box.put(_Image(frame_id, image, provisional), self._wait_s) is not None:
             self._num_put += 1
-        except queue.Full:
-            self.num_dropped += 1
+        elif not self._box.closed:
+            self._num_refused += 1
 
     def settle(self, kept: Collection[int]) -> None:
         """Remove the provisional images of all other frames put so far. Returns at once."""
         self._settled.append((self._num_put, frozenset(kept)))
 
     def _run(self) -> None:
-        failed, num_taken = False, 0
-        while (item := self._queue.get()) is not None:
+        num_taken = 0
+        while (item := self._box.get()) is not None:
             while self._settled and self._settled[0][0] <= num_taken:
                 self._drop_provisional(self._settled.popleft()[1])
             num_taken += 1
-            if failed:
-                self.num_dropped += 1
+            if self._num_failed:
+                self._num_failed += 1
                 continue
             try:
                 self._write(item)
-            except (OSError, cv2.error) as err:
-                failed = True
-                self.num_dropped += 1
+            except Exception as err:
+                self._num_failed += 1
                 self._remove(item.frame_id)  # a part of it may be there
-                logger.warning("%s can't be written: %s; the run goes on without images", self._images, err)
+                logger.warning(
+                    "%s can't be written: %s; the run goes on without images",
+                    self._images,
+                    str(err) or type(err).__name__,
+                    exc_info=not isinstance(err, (OSError, cv2.error)),
+                )
         while self._settled:
             self._drop_provisional(self._settled.popleft()[1])
         self._drop_provisional(frozenset())
@@ -322,12 +328,12 @@ class ImageWriter:
             (self._images / image_name(frame_id)).unlink()
 
     def close(self, deadline_s: float = 30.0) -> None:
-        """Write what waits and end the thread. Idempotent."""
-        if self._closed:
-            return
-        self._closed = True
-        self._queue.put(None)
+        """Write what waits and end the thread; what is not written by the deadline is dropped. Idempotent."""
+        self._box.close()
         self._thread.join(deadline_s)
+        if num_left := self._box.clear():
+            self._num_refused += num_left
+            logger.warning("%d images are not written: the disk is too slow", num_left)
 
     def __enter__(self) -> "ImageWriter":
         return self

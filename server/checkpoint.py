@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import CheckpointError
+from semcast.common.mailbox import Mailbox
 from semcast.common.npz_file import read_npz, write_npz
 
 logger = logging.getLogger(__name__)
@@ -114,15 +115,15 @@ def mismatch(header: CheckpointHeader, wanted: Mapping[str, Any]) -> str | None:
 class CheckpointWriter:
     """Writes checkpoints on its own thread; of several waiting only the newest is written.
 
+    One that can't be written is counted in ``num_failed``, the first is reported, and the next one is tried.
+
     Args:
         path: The checkpoint file.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._waiting: Checkpoint | None = None
-        self._condition = threading.Condition()
-        self._closed = False
+        self._box: Mailbox[Checkpoint] = Mailbox(1, "newest")
         self.num_written = 0
         self.num_failed = 0
         self._thread = threading.Thread(target=self._run, name="semcast-checkpoint", daemon=True)
@@ -130,28 +131,23 @@ class CheckpointWriter:
 
     def submit(self, checkpoint: Checkpoint) -> None:
         """Write this one next, instead of any that still waits."""
-        with self._condition:
-            self._waiting = checkpoint
-            self._condition.notify()
+        self._box.put(checkpoint)
 
     def _run(self) -> None:
-        while True:
-            with self._condition:
-                self._condition.wait_for(lambda: self._waiting is not None or self._closed)
-                checkpoint, self._waiting = self._waiting, None
-            if checkpoint is None:
-                return
+        while (checkpoint := self._box.get()) is not None:
             try:
                 save_checkpoint(self._path, checkpoint)
                 self.num_written += 1
-            except CheckpointError as err:
+            except Exception as err:
                 self.num_failed += 1
                 if self.num_failed == 1:
-                    logger.warning("%s; the stream goes on without checkpoints", err)
+                    logger.warning(
+                        "%s; the stream goes on without checkpoints",
+                        str(err) or type(err).__name__,
+                        exc_info=not isinstance(err, CheckpointError),
+                    )
 
     def close(self, deadline_s: float = 10.0) -> None:
         """Write what waits and end the thread. Idempotent."""
-        with self._condition:
-            self._closed = True
-            self._condition.notify()
+        self._box.close()
         self._thread.join(deadline_s)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from semcast.common.errors import SemcastError
+from semcast.common.worker_guard import WorkerGuard
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +45,7 @@ class DecodeAhead(Generic[In, Out]):
         self._condition = threading.Condition()
         self._stopping = threading.Event()
         self._reported: set[str] = set()
+        self._guard = WorkerGuard("leaving a frame out")
         self._thread = threading.Thread(target=self._run, name="semcast-decode", daemon=True)
         self._thread.start()
 
@@ -67,17 +69,21 @@ class DecodeAhead(Generic[In, Out]):
                 if str(err) not in self._reported and len(self._reported) < 100:
                     self._reported.add(str(err))
                     logger.warning("%s", err)
-                self._on_failure(message, "codec")
+                self._tell(message, "codec")
                 continue
             except Exception:
                 logger.exception("a frame could not be decoded and is left out")
-                self._on_failure(message, "decode")
+                self._tell(message, "decode")
                 continue
             finally:
                 self.is_busy = False
             with self._condition:
                 self._slot = decoded
                 self._condition.notify_all()
+
+    def _tell(self, message: In, reason: str) -> None:
+        with self._guard:
+            self._on_failure(message, reason)
 
     def get(self, timeout_s: float) -> Out | None:
         """Return the next decoded frame, None when there was none in time."""
