@@ -12,14 +12,15 @@ MAX_LOGGED = 20
 
 
 class WorkerGuard:
-    """Goes around one round of a worker's loop. Belongs to that thread.
+    """Goes around one round of a worker's loop, and around one at a time.
 
     An exception ends the round and not the thread: it is logged with its traceback, once where it comes again
     and again, and counted. Without that the thread would be dead, and who waits for it wait for ever.
 
     Args:
         what: What a round does, for the log: "sending the status".
-        on_failure: Is told in a line what failed, each time.
+        on_failure: Is told in a line what failed, each time, and brings the worker into a state from which it
+            goes on.
 
     Attributes:
         num_failed: Rounds that failed.
