@@ -1,5 +1,6 @@
 """The channel process: takes the agent's symbols, does to them what a radio link does, passes them on."""
 
+import contextlib
 import logging
 import math
 import threading
@@ -63,10 +64,11 @@ class Emulator:
         self._live = session.publisher(rx_key(agent_id), "newest")
         self._lossless = session.publisher(rx_key(agent_id), "every")
         self._reports = session.publisher(channel_key(agent_id), "newest")
-        jitter = np.random.default_rng((settings.seed, _JITTER_STREAM))
-        self._delay = DelayLine(self._send, jitter, self._on_unsent)
         session.answer(control_key(agent_id, ROLE), self._on_request)
         session.subscribe(tx_key(agent_id), "newest", self._on_symbols, _RING_CAPACITY)
+        # Last, as it has a thread that nobody would end if one of the others failed.
+        jitter = np.random.default_rng((settings.seed, _JITTER_STREAM))
+        self._delay = DelayLine(self._send, jitter, self._on_unsent)
 
     @property
     def agent_epoch(self) -> int:
@@ -221,18 +223,17 @@ def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, 
     session = open_session(settings.network, stop)
     if session is None:
         return metrics.summary()
-    with session:
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(session)
+        stack.callback(lambda: logger.info("%s", metrics.closing_line("carried")))
         emulator = Emulator(session, settings, metrics)
         beat = StatusBeat(session, settings.agent_id, ROLE, metrics, lambda: emulator.agent_epoch)
+        stack.callback(beat.close)
+        stack.callback(emulator.close)
         session.declare_alive(settings.agent_id, ROLE)
         logger.info("channel %s at %g dB", settings.link.channel, settings.link.snr_db)
         warn_of_idle(settings.link, settings.link.without_effect())
-        try:
-            emulator.work(stop)
-        finally:
-            emulator.close()
-            beat.close()
-            logger.info("%s", metrics.closing_line("carried"))
+        emulator.work(stop)
     return metrics.summary()
 
 

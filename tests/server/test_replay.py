@@ -215,6 +215,18 @@ def test_recorded_originals_give_the_same_psnr_as_the_sequence(recording, tmp_pa
     assert all(recorded == sequence and 15.0 < recorded < 45.0 for recorded, sequence in pairs)
 
 
+def test_a_replay_that_can_not_be_shown_ends_its_threads(recording, tmp_path, monkeypatch):
+    def fail(*_):
+        raise ConfigError("no display here")
+
+    monkeypatch.setattr("semcast.server.replay.open_viewer", fail)
+    before = set(threading.enumerate())
+    with pytest.raises(ConfigError, match="no display here"):
+        replay(ReplaySettings(file=recording, out=tmp_path, save_images="all"))
+    left = {thread.name for thread in set(threading.enumerate()) - before}
+    assert not {name for name in left if name.startswith("semcast")}
+
+
 def test_a_paced_and_shown_replay_gives_the_same_poses(recording, tmp_path):
     plain = ReplaySettings(file=recording, out=tmp_path / "plain", end_s=0.6)
     assert plain.source == "received"
