@@ -69,21 +69,19 @@ class DecodeAhead(Generic[In, Out]):
                 if str(err) not in self._reported and len(self._reported) < 100:
                     self._reported.add(str(err))
                     logger.warning("%s", err)
-                self._tell(message, "codec")
+                with self._guard:
+                    self._on_failure(message, "codec")
                 continue
             except Exception:
                 logger.exception("a frame could not be decoded and is left out")
-                self._tell(message, "decode")
+                with self._guard:
+                    self._on_failure(message, "decode")
                 continue
             finally:
                 self.is_busy = False
             with self._condition:
                 self._slot = decoded
                 self._condition.notify_all()
-
-    def _tell(self, message: In, reason: str) -> None:
-        with self._guard:
-            self._on_failure(message, reason)
 
     def get(self, timeout_s: float) -> Out | None:
         """Return the next decoded frame, None when there was none in time."""
