@@ -75,8 +75,9 @@ class _Sending:
         codec: Codec,
         metrics: Metrics,
         stop: threading.Event,
+        agent_epoch: int,
     ) -> None:
-        self.agent_epoch = time.time_ns()
+        self.agent_epoch = agent_epoch
         self.metrics = metrics
         self.lossless = settings.mode == "replay"
         self.feedback = LinkFeedback(self.agent_epoch, settings.snr_db, settings.feedback_max_age_s)
@@ -283,52 +284,63 @@ def run_agent(
         TransportError: Its port is taken, where it is the hub.
     """
     metrics = Metrics(ROLE)
-    source = open_source(settings.source)
-    try:
+    with contextlib.ExitStack() as stack:
+        source = open_source(settings.source)
+        unread = stack.enter_context(contextlib.ExitStack())
+        unread.callback(source.close)
         if on_source is not None:
             on_source(source)
-        if codec is None:
-            codec = load_codec(
-                settings.codec,
-                modulation=settings.modulation,
-                num_threads=settings.threads,
-                device=settings.device,
-                weights=settings.weights,
-                runtime=settings.runtime,
-            )
+        codec = codec if codec is not None else _codec_of(settings)
         session = open_session(settings.network, stop)
-    except BaseException:
-        source.close()
-        raise
-    summary: dict[str, Any] = {"agent_epoch": 0, "source": source.name, "complete": False}
-    if session is None:
-        source.close()
-        return {**metrics.summary(), **summary}
-    with session:
-        sending = _Sending(session, settings, source, codec, metrics, stop)
-        beat = StatusBeat(session, settings.agent_id, ROLE, metrics, lambda: sending.agent_epoch)
+        summary: dict[str, Any] = {"agent_epoch": 0, "source": source.name, "complete": False}
+        if session is None:
+            return {**metrics.summary(), **summary}
+        stack.enter_context(session)
+        stack.callback(lambda: logger.info("%s", metrics.closing_line("sent")))
+        agent_epoch = time.time_ns()
+        beat = StatusBeat(session, settings.agent_id, ROLE, metrics, lambda: agent_epoch)
+        stack.callback(beat.close)
+        sending = _Sending(session, settings, source, codec, metrics, stop, agent_epoch)
+        stack.callback(sending.close)
         session.declare_alive(settings.agent_id, ROLE)
         if settings.wait:
             _wait_for_peers(session, settings.agent_id, stop)
             if not sending.lossless:
-                _wait_until_ready(session, settings.agent_id, sending.agent_epoch, stop)
+                _wait_until_ready(session, settings.agent_id, agent_epoch, stop)
         logger.info("sending %s with %s, %s", source.name, codec.name, settings.mode)
         capture = Capture(source, "all" if sending.lossless else "newest", metrics, sending.wants)
-        try:
-            if sending.lossless:
-                _send_lossless(sending, capture, session, settings.agent_id, stop)
-            else:
-                _send_live(sending, capture, stop)
-            capture.raise_failure()
-            summary.update(agent_epoch=sending.agent_epoch, complete=capture.ended and not stop.is_set())
-            if summary["complete"]:
-                metrics.end()  # the server may have missed the last frame
-        except (SourceError, TransportError) as err:
-            metrics.error(str(err))
-            raise
-        finally:
-            capture.close()
-            sending.close()
-            beat.close()
-            logger.info("%s", metrics.closing_line("sent"))
+        stack.callback(capture.close)
+        unread.pop_all()  # from now on it is the capture's, which frees it when nobody reads from it
+        complete = _send(sending, capture, session, settings.agent_id, stop)
+        summary.update(agent_epoch=agent_epoch, complete=complete)
     return {**metrics.summary(), **summary}
+
+
+def _codec_of(settings: AgentSettings) -> Codec:
+    return load_codec(
+        settings.codec,
+        modulation=settings.modulation,
+        num_threads=settings.threads,
+        device=settings.device,
+        weights=settings.weights,
+        runtime=settings.runtime,
+    )
+
+
+def _send(
+    sending: _Sending, capture: Capture, session: Session, agent_id: str, stop: threading.Event
+) -> bool:
+    """Send until the source ends or ``stop`` is set, and tell whether it came to its end."""
+    try:
+        if sending.lossless:
+            _send_lossless(sending, capture, session, agent_id, stop)
+        else:
+            _send_live(sending, capture, stop)
+        capture.raise_failure()
+    except (SourceError, TransportError) as err:
+        sending.metrics.error(str(err))
+        raise
+    complete = capture.ended and not stop.is_set()
+    if complete:
+        sending.metrics.end()  # the server may have missed the last frame
+    return complete

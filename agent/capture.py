@@ -52,9 +52,7 @@ class Capture:
                 if not (frame.final or self._wants is None or self._wants(frame)):
                     self._metrics.drop("thinned")
                     continue
-                before = self._box.dropped
-                self._box.put(frame)
-                self._metrics.drop("superseded", self._box.dropped - before)
+                self._metrics.drop("superseded", self._box.put(frame) or 0)
                 if self._stopping.is_set():
                     return
         except SourceError as err:

@@ -76,10 +76,10 @@ class OriginalSharer:
 
     def put(self, frame: SourceFrame) -> None:
         """Share a frame."""
-        before = self._box.dropped
-        while not (self._box.put(frame, _POLL_S) or self._box.closed or self._stop.is_set()):
-            pass
-        self._metrics.drop("source_superseded", self._box.dropped - before)
+        while (gave_way := self._box.put(frame, _POLL_S)) is None:
+            if self._box.closed or self._stop.is_set():
+                return
+        self._metrics.drop("source_superseded", gave_way)
 
     def _run(self) -> None:
         try:

@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from semcast.common.worker_guard import WorkerGuard
+
 #: Ten seconds of delay at 50 frames per second.
 CAPACITY = 512
 
@@ -17,11 +19,17 @@ class DelayLine:
     Jitter is exponential. A radio link doesn't reorder: a packet leaves no sooner than the one before it.
 
     Args:
-        send: Gets the packet.
+        send: Gets the packet. Where it fails on the line's thread, that packet is lost and the next one sent.
         rng: Randomness of the jitter.
+        on_failure: Is told in a line what failed there.
     """
 
-    def __init__(self, send: Callable[[bytes, bool], None], rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        send: Callable[[bytes, bool], None],
+        rng: np.random.Generator,
+        on_failure: Callable[[str], None] | None = None,
+    ) -> None:
         self._send = send
         self._rng = rng
         self._waiting: deque[tuple[float, bytes, bool]] = deque()
@@ -29,6 +37,7 @@ class DelayLine:
         self._sending = False
         self._last_due_s = 0.0
         self._closed = False
+        self._guard = WorkerGuard("sending a delayed packet", on_failure)
         self._thread = threading.Thread(target=self._run, name="semcast-delay", daemon=True)
         self._thread.start()
 
@@ -36,11 +45,13 @@ class DelayLine:
         """Take a packet; without any delay it is sent at once, by the caller.
 
         Returns:
-            False when too many packets wait already; it is dropped then.
+            False when too many packets wait already, or the line is closed; it is dropped then.
         """
         extra_ms = float(self._rng.exponential(jitter_ms)) if jitter_ms > 0 else 0.0
         due_s = time.monotonic() + 1e-3 * (delay_ms + extra_ms)
         with self._changed:
+            if self._closed:
+                return False
             at_once = delay_ms + extra_ms == 0.0 and not self._waiting and not self._sending
             if not at_once:
                 if len(self._waiting) >= CAPACITY:
@@ -66,7 +77,8 @@ class DelayLine:
                     continue
                 self._waiting.popleft()
                 self._sending = True
-            self._send(packet, lossless)
+            with self._guard:
+                self._send(packet, lossless)
 
     def close(self) -> None:
         """Drop what still waits and end the thread. Idempotent."""

@@ -1,5 +1,6 @@
 """The channel process: takes the agent's symbols, does to them what a radio link does, passes them on."""
 
+import contextlib
 import logging
 import math
 import threading
@@ -44,7 +45,8 @@ class Emulator:
         session: Open.
         settings: Of the process.
         metrics: Where to count. Drops: ``superseded`` by a newer frame while busy, ``lost`` on the air,
-            ``missing`` (gaps in what the agent sent), ``protocol``, ``overflow`` (too many are delayed).
+            ``missing`` (gaps in what the agent sent), ``protocol``, ``overflow`` (too many are delayed),
+            ``unsent`` (a delayed one could not be sent).
     """
 
     def __init__(self, session: Session, settings: EmulatorSettings, metrics: Metrics) -> None:
@@ -62,9 +64,11 @@ class Emulator:
         self._live = session.publisher(rx_key(agent_id), "newest")
         self._lossless = session.publisher(rx_key(agent_id), "every")
         self._reports = session.publisher(channel_key(agent_id), "newest")
-        self._delay = DelayLine(self._send, np.random.default_rng((settings.seed, _JITTER_STREAM)))
         session.answer(control_key(agent_id, ROLE), self._on_request)
         session.subscribe(tx_key(agent_id), "newest", self._on_symbols, _RING_CAPACITY)
+        # Last, as it has a thread that nobody would end if one of the others failed.
+        jitter = np.random.default_rng((settings.seed, _JITTER_STREAM))
+        self._delay = DelayLine(self._send, jitter, self._on_unsent)
 
     @property
     def agent_epoch(self) -> int:
@@ -85,9 +89,7 @@ class Emulator:
         self._count_missing(frame)
         # A lossless agent never has more frames under way than this; a live one is served its newest.
         self._box.resize(_REPLAY_CAPACITY if frame.lossless else 1)
-        before = self._box.dropped
-        self._box.put(frame)
-        self._metrics.drop("superseded", self._box.dropped - before)
+        self._metrics.drop("superseded", self._box.put(frame) or 0)
 
     def _count_missing(self, frame: SymbolFrame) -> None:
         """Count the frames before this one that never came; what is sent again opens no gap."""
@@ -162,6 +164,10 @@ class Emulator:
         except TransportError as err:
             logger.debug("not sent: %s", err)
 
+    def _on_unsent(self, text: str) -> None:
+        self._metrics.drop("unsent")
+        self._metrics.error(text)
+
     def _on_request(self, payload: bytes) -> bytes:
         try:
             request = unpack(payload, ControlRequest)
@@ -217,18 +223,17 @@ def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, 
     session = open_session(settings.network, stop)
     if session is None:
         return metrics.summary()
-    with session:
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(session)
+        stack.callback(lambda: logger.info("%s", metrics.closing_line("carried")))
         emulator = Emulator(session, settings, metrics)
         beat = StatusBeat(session, settings.agent_id, ROLE, metrics, lambda: emulator.agent_epoch)
+        stack.callback(beat.close)
+        stack.callback(emulator.close)
         session.declare_alive(settings.agent_id, ROLE)
         logger.info("channel %s at %g dB", settings.link.channel, settings.link.snr_db)
         warn_of_idle(settings.link, settings.link.without_effect())
-        try:
-            emulator.work(stop)
-        finally:
-            emulator.close()
-            beat.close()
-            logger.info("%s", metrics.closing_line("carried"))
+        emulator.work(stop)
     return metrics.summary()
 
 

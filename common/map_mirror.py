@@ -94,7 +94,10 @@ class MapMirror:
         self._asking = threading.Lock()
         self._map = _EMPTY
         self._early: list[MapMessage] | None = None
-        self._is_behind = True
+        #: Counts servers that went away, and of which of them the map is. One may go while its answer is on
+        #: its way: the map is its then, and not that of the next one.
+        self._server = 0
+        self._map_of: int | None = None
         session.subscribe(map_key(agent_id), "every", self._on_change)
         self._catch_up()
         session.watch_alive(agent_id, self._on_role)
@@ -105,6 +108,11 @@ class MapMirror:
         with self._lock:
             return self._map
 
+    @property
+    def _is_behind(self) -> bool:
+        """Whether the map isn't that of the present server."""
+        return self._map_of != self._server
+
     def _catch_up(self, *early: MapMessage) -> None:
         """Take the whole map from the server, where it has one.
 
@@ -113,7 +121,7 @@ class MapMirror:
         """
         with self._asking:
             with self._lock:
-                self._early = [*early]
+                self._early, asked = [*early], self._server
             try:
                 answer = self._session.request(map_key(self._agent_id), b"", self._timeout_s)
                 whole = unpack(answer, MapMessage) if answer is not None else None
@@ -126,7 +134,7 @@ class MapMirror:
                     self._map = _EMPTY.updated(whole)
                     now = (whole.agent_epoch, whole.map_epoch)
                     changes = [m for m in changes if (m.agent_epoch, m.map_epoch) >= now]
-                    self._is_behind = False
+                    self._map_of = asked
                 for message in changes:
                     self._map = self._map.updated(message)
 
@@ -134,9 +142,11 @@ class MapMirror:
         """A server that was away may be another one, with another map."""
         if role != "server":
             return
-        if not alive:
-            self._is_behind = True
-        elif self._is_behind:
+        with self._lock:
+            if not alive:
+                self._server += 1
+            must_ask = alive and self._is_behind
+        if must_ask:
             self._catch_up()
 
     def _on_change(self, payload: bytes) -> None:

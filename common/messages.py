@@ -424,7 +424,7 @@ class ControlRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class ControlReply:
-    """Answer to a ``ControlRequest``: the settings now in force, or one line of what was wrong."""
+    """Answer to a ``ControlRequest``: the settings now in force, or one line of why it is not done."""
 
     version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("reply")

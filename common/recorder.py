@@ -17,6 +17,8 @@ from semcast.common.recording import FLUSH_INTERVAL_S, RecordingWriter
 logger = logging.getLogger(__name__)
 
 QUEUE_BYTES = 64 * 1024**2
+#: What a disk, or a number the format has no room for, ends a recording with; the rest is logged in full.
+_EXPECTED = (OSError, ValueError, struct.error)
 
 
 class Recorder:
@@ -127,8 +129,7 @@ class Recorder:
                 self._writer.flush_if_due()
                 if ending:
                     self._writer.finish()
-            except (OSError, ValueError, struct.error) as err:
-                # struct: of a number that the format has no room for.
+            except Exception as err:
                 self._fail(err)
                 return
             if ending:
@@ -141,9 +142,10 @@ class Recorder:
             self._path,
             err,
             self.num_written,
+            exc_info=None if isinstance(err, _EXPECTED) else err,
         )
         with self._condition:
-            self.error = str(err)
+            self.error = str(err) or type(err).__name__
             self.drops["disk"] += self._num_taken - self.num_written
             self._queue.clear()
             self._queued_bytes = 0

@@ -20,11 +20,8 @@ times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks(
 """
 
 import contextlib
-import json
 import logging
-import queue
 import threading
-import zipfile
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, fields
@@ -37,8 +34,9 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
+from semcast.common.mailbox import Mailbox
+from semcast.common.npz_file import read_npz, write_npz
 from semcast.common.shapes import check_shape
-from semcast.common.whole_file import whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -54,11 +52,17 @@ RECONSTRUCTION_NAME = "reconstruction.npz"
 IMAGES_NAME = "images"
 CHECKPOINT_NAME = "checkpoint.npz"
 
+#: What is written at the end of a run, and when it is asked for.
+RESULT_FILES = (TRAJECTORY_NAME, MAP_NAME, DENSE_NAME, RECONSTRUCTION_NAME, SUMMARY_NAME, SETTINGS_NAME)
+#: What is written on the way.
+RECORD_FILES = (FRAMES_NAME, VIEWER_NAME, CHECKPOINT_NAME)
+#: All files a run may leave, besides those in the folder ``IMAGES_NAME``.
+RUN_FILES = (*RESULT_FILES, DEMO_SETTINGS_NAME, *RECORD_FILES)
+
 FORMAT = 1
 #: Frames that may wait for a map to begin, whose start can make keyframes of them.
 MAX_PROVISIONAL = 300
 MAX_UNPACKED_BYTES = 4 * 1024**3
-_HEADER = "header"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,14 +166,10 @@ def write_run(folder: Path, data: RunData) -> None:
     Raises:
         SourceError: The folder can't be made or the file can't be written.
     """
-    header = json.dumps({"format": FORMAT, "intrinsics": data.intrinsics.to_dict()}).encode()
-    content: dict[str, Any] = {name: getattr(data, name) for name in _ARRAYS}
-    content[_HEADER] = np.frombuffer(header, dtype=np.uint8)
     path = folder / RECONSTRUCTION_NAME
+    header = {"format": FORMAT, "intrinsics": data.intrinsics.to_dict()}
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as file:
-            np.savez_compressed(file, allow_pickle=False, **content)
+        write_npz(path, header, {name: getattr(data, name) for name in _ARRAYS}, compressed=True)
     except OSError as err:
         raise SourceError(f"{path} can't be written: {err}") from err
 
@@ -188,22 +188,19 @@ def read_run(folder: Path) -> RunData:
             f"{folder} holds no {RECONSTRUCTION_NAME}; a run writes it when it ends, and only with a map"
         )
     try:
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(member.file_size for member in archive.infolist())
-        if unpacked > MAX_UNPACKED_BYTES:
-            raise SourceError(f"{path} must unpack to at most {MAX_UNPACKED_BYTES} bytes, got {unpacked}")
-        with np.load(path, allow_pickle=False) as content:
-            there = [name for name in (_HEADER, *_ARRAYS) if name in content or name not in _ADDED]
-            arrays = {name: np.array(content[name]) for name in there}
-        header = json.loads(arrays.pop(_HEADER).tobytes())
-        if header.get("format") != FORMAT:
-            raise SourceError(f"{path} has format {header.get('format')}, this semcast reads {FORMAT}")
+        header, content = read_npz(path, MAX_UNPACKED_BYTES)
+    except OSError as err:
+        raise SourceError(f"{path} can't be read: {err}") from err
+    except ValueError as err:
+        raise SourceError(f"{path} {err}") from err
+    if header.get("format") != FORMAT:
+        raise SourceError(f"{path} has format {header.get('format')}, this semcast reads {FORMAT}")
+    try:
+        arrays = {name: content[name] for name in _ARRAYS if name in content or name not in _ADDED}
         for name, owner in _ADDED.items():
             arrays.setdefault(name, np.zeros(len(arrays[owner]), dtype=np.int64))
         return RunData(intrinsics=Intrinsics.from_dict(header["intrinsics"]), **arrays)
-    except SourceError:
-        raise
-    except Exception as err:  # a damaged zip or array fails in many ways
+    except Exception as err:  # what is in place of an array or a number fails in many ways
         raise SourceError(f"{path} is damaged: {err}") from err
 
 
@@ -230,7 +227,8 @@ class _Image:
 class ImageWriter:
     """Writes decoded images into ``images/`` on its own thread, so that tracking does not wait for the disk.
 
-    A full disk is reported once; the stream goes on without images.
+    A full disk, or whatever else keeps an image from being written, is reported once; the stream goes on
+    without images, which are counted as dropped.
 
     Args:
         folder: The run folder.
@@ -244,60 +242,65 @@ class ImageWriter:
 
     def __init__(self, folder: Path, *, lossless: bool, quality: int = 95, capacity: int = 8) -> None:
         self._images = folder / IMAGES_NAME
-        self._lossless = lossless
+        self._wait_s = None if lossless else 0.0
         self._quality = quality
-        self._queue: queue.Queue[_Image | None] = queue.Queue(capacity)
+        self._box: Mailbox[_Image] = Mailbox(capacity, "all")
         #: What is kept of the provisional images written so far; not in the queue, which may be full.
         self._settled: deque[tuple[int, frozenset[int]]] = deque()
         self._num_put = 0
         self.num_written = 0
-        self.num_dropped = 0
+        # Each belongs to one thread: that of the caller, and that of the writer.
+        self._num_refused = self._num_failed = 0
         try:
             self._images.mkdir(parents=True, exist_ok=True)
         except OSError as err:
             raise SourceError(f"{self._images} can't be written: {err}") from err
-        self._closed = False
         self._provisional: deque[int] = deque()
         self._thread = threading.Thread(target=self._run, name="semcast-images", daemon=True)
         self._thread.start()
 
+    @property
+    def num_dropped(self) -> int:
+        """Images that found no room in the queue, or could not be written."""
+        return self._num_refused + self._num_failed
+
     def put(self, frame_id: int, image: NDArray[np.uint8], *, provisional: bool = False) -> None:
-        """Queue one image; the caller must not change it afterwards.
+        """Queue one image; the caller must not change it afterwards. After ``close`` it is ignored.
 
         Args:
             frame_id: Names the file.
             image: ``(H, W, 3)`` uint8 RGB.
             provisional: ``settle`` will say whether it is kept; of many only the newest are.
         """
-        if self._closed:
-            return
-        item = _Image(frame_id, image, provisional)
-        try:
-            self._queue.put(item, block=self._lossless)
+        if self._box.put(_Image(frame_id, image, provisional), self._wait_s) is not None:
             self._num_put += 1
-        except queue.Full:
-            self.num_dropped += 1
+        elif not self._box.closed:
+            self._num_refused += 1
 
     def settle(self, kept: Collection[int]) -> None:
         """Remove the provisional images of all other frames put so far. Returns at once."""
         self._settled.append((self._num_put, frozenset(kept)))
 
     def _run(self) -> None:
-        failed, num_taken = False, 0
-        while (item := self._queue.get()) is not None:
+        num_taken = 0
+        while (item := self._box.get()) is not None:
             while self._settled and self._settled[0][0] <= num_taken:
                 self._drop_provisional(self._settled.popleft()[1])
             num_taken += 1
-            if failed:
-                self.num_dropped += 1
+            if self._num_failed:
+                self._num_failed += 1
                 continue
             try:
                 self._write(item)
-            except (OSError, cv2.error) as err:
-                failed = True
-                self.num_dropped += 1
+            except Exception as err:
+                self._num_failed += 1
                 self._remove(item.frame_id)  # a part of it may be there
-                logger.warning("%s can't be written: %s; the run goes on without images", self._images, err)
+                logger.warning(
+                    "%s can't be written: %s; the run goes on without images",
+                    self._images,
+                    str(err) or type(err).__name__,
+                    exc_info=not isinstance(err, (OSError, cv2.error)),
+                )
         while self._settled:
             self._drop_provisional(self._settled.popleft()[1])
         self._drop_provisional(frozenset())
@@ -325,12 +328,12 @@ class ImageWriter:
             (self._images / image_name(frame_id)).unlink()
 
     def close(self, deadline_s: float = 30.0) -> None:
-        """Write what waits and end the thread. Idempotent."""
-        if self._closed:
-            return
-        self._closed = True
-        self._queue.put(None)
+        """Write what waits and end the thread; what is not written by the deadline is dropped. Idempotent."""
+        self._box.close()
         self._thread.join(deadline_s)
+        if num_left := self._box.clear():
+            self._num_refused += num_left
+            logger.warning("%d images are not written: the disk is too slow", num_left)
 
     def __enter__(self) -> "ImageWriter":
         return self

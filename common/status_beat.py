@@ -9,6 +9,7 @@ from semcast.common.keys import status_key
 from semcast.common.metrics import STATUS_INTERVAL_S, Metrics
 from semcast.common.transport import Session
 from semcast.common.wire import pack
+from semcast.common.worker_guard import WorkerGuard
 
 logger = logging.getLogger(__name__)
 
@@ -31,12 +32,14 @@ class StatusBeat:
         self._metrics = metrics
         self._agent_epoch = agent_epoch
         self._stopping = threading.Event()
+        self._guard = WorkerGuard("sending the status", metrics.error)
         self._thread = threading.Thread(target=self._run, name="semcast-status", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
         while not self._stopping.wait(STATUS_INTERVAL_S):
-            self.send()
+            with self._guard:
+                self.send()
 
     def send(self) -> None:
         """Send the status now, before work that does not let go of the interpreter for seconds."""

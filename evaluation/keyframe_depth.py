@@ -21,7 +21,6 @@ from semcast.server.dense.neighbours import (
     num_to_confirm,
 )
 from semcast.server.dense.view import View
-from semcast.server.export.parts import frame_parts
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -68,7 +67,7 @@ def reconstructed(
         poses = reconstruction.final_trajectory()
         ids, xyz, _, _ = reconstruction.landmarks()
         seen_ids, seen_by, _ = reconstruction.world.observations()
-        part_of = frame_parts(reconstruction.snapshot())
+        part_of = reconstruction.world.part_of_frames()
     finally:
         reconstruction.close()
     largest, _ = Counter(part_of.values()).most_common(1)[0] if part_of else (0, 0)

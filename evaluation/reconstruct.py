@@ -13,7 +13,6 @@ from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import ate, match_times
 from semcast.evaluation.pipeline import LinkedFrame
 from semcast.server.export.outputs import trajectory_of
-from semcast.server.export.parts import frame_parts
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.reconstruction import Reconstruction
@@ -123,7 +122,7 @@ def reconstruct(
         reconstruction.conclude()
         poses = reconstruction.final_trajectory()
         num_landmarks = len(reconstruction.landmarks()[0])
-        part_of = frame_parts(reconstruction.snapshot())
+        part_of = reconstruction.world.part_of_frames()
         num_keyframes = len(np.unique(reconstruction.world.observations()[1]))
     finally:
         reconstruction.close()

@@ -1,11 +1,12 @@
 """Frames that wait for the decoder: a busy moment is worked off, a lasting overload gets the newest frame."""
 
 import math
-import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
+
+from semcast.common.mailbox import BoundedQueue
 
 T = TypeVar("T")
 
@@ -25,7 +26,7 @@ class _Waiting(NamedTuple, Generic[T]):
     since_s: float
 
 
-class Backlog(Generic[T]):
+class Backlog(BoundedQueue[_Waiting[T]], Generic[T]):
     """A queue bounded in time, in which newer items win; those that gave way are counted.
 
     Beginning a map, or another process, keeps a consumer for some tenths of a second, and then it is faster
@@ -37,11 +38,8 @@ class Backlog(Generic[T]):
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
         self._clock = clock
-        self._waiting: deque[_Waiting[T]] = deque()
-        self._changed = threading.Condition()
-        self._closed = False
-        self._dropped = 0
         self._behind_since_s: float | None = None
         self._newest_only = False
         self._last_drop_s = 0.0
@@ -50,40 +48,30 @@ class Backlog(Generic[T]):
         self._took_s: deque[tuple[float, float]] = deque()  # when it was done, how long it took
         self._taken_s: float | None = None
 
-    @property
-    def dropped(self) -> int:
-        """Items that gave way to newer ones."""
-        with self._changed:
-            return self._dropped
-
-    def __len__(self) -> int:
-        with self._changed:
-            return len(self._waiting)
-
-    def put(self, item: T) -> bool:
-        """Add an item; False when the queue is closed."""
+    def put(self, item: T) -> int | None:
+        """Add an item; return how many gave way to newer ones by now, None when the queue is closed."""
         with self._changed:
             if self._closed:
-                return False
+                return None
             now_s = self._clock()
             self._began_s = min(self._began_s, now_s)
             self._came_s.append(now_s)
-            self._waiting.append(_Waiting(item, now_s))
-            self._thin_out(now_s)
+            self._items.append(_Waiting(item, now_s))
+            gave_way = self._thin_out(now_s)
             self._changed.notify_all()
-            return True
+            return gave_way
 
     def get(self, timeout_s: float | None = None) -> T | None:
         """Take the oldest item; None when there was none in time, or the queue is closed and empty."""
         with self._changed:
             self._note_done(self._clock())
-            self._changed.wait_for(lambda: bool(self._waiting) or self._closed, timeout_s)
-            if not self._waiting:
+            self._changed.wait_for(lambda: bool(self._items) or self._closed, timeout_s)
+            if not self._items:
                 return None
             now_s = self._clock()
             self._thin_out(now_s)
-            item, self._taken_s = self._waiting.popleft().item, now_s
-            if not self._waiting:
+            item, self._taken_s = self._items.popleft().item, now_s
+            if not self._items:
                 self._behind_since_s = None
             elif self._behind_since_s is None:
                 self._behind_since_s = now_s
@@ -107,33 +95,26 @@ class Backlog(Generic[T]):
         each_s = sum(took_s for _, took_s in self._took_s) / len(self._took_s)
         return each_s * len(self._came_s) <= KEEPS_UP_SHARE * (now_s - max(since_s, self._began_s))
 
-    def _thin_out(self, now_s: float) -> None:
-        """Let older items give way, as it is time; the newest stays."""
+    def _thin_out(self, now_s: float) -> int:
+        """Let older items give way, as it is time, and return how many did; the newest stays."""
         if self._keeps_up(now_s):
             self._newest_only = False
         elif self._behind_since_s is not None and now_s - self._behind_since_s > CATCH_UP_S:
             self._newest_only, self._last_drop_s = True, now_s
         elif now_s - self._last_drop_s > RECOVERY_S:
             self._newest_only = False
-        while len(self._waiting) > 1 and (
-            self._newest_only
-            or now_s - self._waiting[0].since_s > MAX_WAIT_S
-            or len(self._waiting) > MAX_WAITING
+        gave_way = 0
+        while len(self._items) > 1 and (
+            self._newest_only or now_s - self._items[0].since_s > MAX_WAIT_S or len(self._items) > MAX_WAITING
         ):
-            self._waiting.popleft()
-            self._dropped += 1
+            self._items.popleft()
+            gave_way += 1
             self._last_drop_s = now_s
+        self._dropped += gave_way
+        return gave_way
 
     def clear(self) -> int:
         """Throw everything away and return how many items that were; they don't count as ``dropped``."""
         with self._changed:
-            count = len(self._waiting)
-            self._waiting.clear()
             self._behind_since_s = None
-            return count
-
-    def close(self) -> None:
-        """Refuse further items and wake all who wait; what is inside can still be taken. Idempotent."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
+            return super().clear()

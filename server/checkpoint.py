@@ -3,10 +3,8 @@
 One uncompressed ``.npz`` (a zip of plain arrays with a CRC each, read without pickle), replaced atomically.
 """
 
-import json
 import logging
 import threading
-import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,13 +15,13 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import CheckpointError
-from semcast.common.whole_file import whole_file
+from semcast.common.mailbox import Mailbox
+from semcast.common.npz_file import read_npz, write_npz
 
 logger = logging.getLogger(__name__)
 
 FORMAT = 1
 MAX_BYTES = 2 * 1024**3
-_HEADER = "header"
 _MAP = "map."
 
 
@@ -72,11 +70,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     header = {"format": FORMAT, **asdict(checkpoint.header)}
     header["camera"] = checkpoint.header.camera.to_dict()
     content = {_MAP + name: array for name, array in checkpoint.arrays.items()}
-    content[_HEADER] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path, durable=True) as file:
-            np.savez(file, allow_pickle=False, **content)
+        write_npz(path, header, content, compressed=False, durable=True)
     except OSError as err:
         raise CheckpointError(f"{path} can't be written: {err}") from err
 
@@ -88,22 +83,18 @@ def load_checkpoint(path: Path) -> Checkpoint:
         CheckpointError: The file is missing, damaged, too large or of another format.
     """
     try:
-        size = path.stat().st_size
-        with zipfile.ZipFile(path) as archive:
-            unpacked = sum(member.file_size for member in archive.infolist())
-        if max(size, unpacked) > MAX_BYTES:
-            raise CheckpointError(f"{path} must be at most {MAX_BYTES} bytes, got {max(size, unpacked)}")
-        with np.load(path, allow_pickle=False) as content:
-            arrays = {name: np.array(content[name]) for name in content.files}
-        header = json.loads(arrays.pop(_HEADER).tobytes())
-        if header.pop("format") != FORMAT:
-            raise CheckpointError(f"{path} is a checkpoint of another version of semcast")
+        header, arrays = read_npz(path, MAX_BYTES)
+    except OSError as err:
+        raise CheckpointError(f"{path} can't be read as a checkpoint: {err}") from err
+    except ValueError as err:
+        raise CheckpointError(f"{path} can't be read as a checkpoint: it {err}") from err
+    if header.pop("format", None) != FORMAT:
+        raise CheckpointError(f"{path} is a checkpoint of another version of semcast")
+    try:
         header["camera"] = Intrinsics.from_dict(header["camera"])
         maps = {name.removeprefix(_MAP): array for name, array in arrays.items() if name.startswith(_MAP)}
         return Checkpoint(CheckpointHeader(**header), maps)
-    except CheckpointError:
-        raise
-    except Exception as err:  # a damaged zip or array fails in many ways
+    except Exception as err:  # what is in place of a field fails in many ways
         raise CheckpointError(f"{path} can't be read as a checkpoint: {err}") from err
 
 
@@ -124,15 +115,15 @@ def mismatch(header: CheckpointHeader, wanted: Mapping[str, Any]) -> str | None:
 class CheckpointWriter:
     """Writes checkpoints on its own thread; of several waiting only the newest is written.
 
+    One that can't be written is counted in ``num_failed``, the first is reported, and the next one is tried.
+
     Args:
         path: The checkpoint file.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._waiting: Checkpoint | None = None
-        self._condition = threading.Condition()
-        self._closed = False
+        self._box: Mailbox[Checkpoint] = Mailbox(1, "newest")
         self.num_written = 0
         self.num_failed = 0
         self._thread = threading.Thread(target=self._run, name="semcast-checkpoint", daemon=True)
@@ -140,28 +131,23 @@ class CheckpointWriter:
 
     def submit(self, checkpoint: Checkpoint) -> None:
         """Write this one next, instead of any that still waits."""
-        with self._condition:
-            self._waiting = checkpoint
-            self._condition.notify()
+        self._box.put(checkpoint)
 
     def _run(self) -> None:
-        while True:
-            with self._condition:
-                self._condition.wait_for(lambda: self._waiting is not None or self._closed)
-                checkpoint, self._waiting = self._waiting, None
-            if checkpoint is None:
-                return
+        while (checkpoint := self._box.get()) is not None:
             try:
                 save_checkpoint(self._path, checkpoint)
                 self.num_written += 1
-            except CheckpointError as err:
+            except Exception as err:
                 self.num_failed += 1
                 if self.num_failed == 1:
-                    logger.warning("%s; the stream goes on without checkpoints", err)
+                    logger.warning(
+                        "%s; the stream goes on without checkpoints",
+                        str(err) or type(err).__name__,
+                        exc_info=not isinstance(err, CheckpointError),
+                    )
 
     def close(self, deadline_s: float = 10.0) -> None:
         """Write what waits and end the thread. Idempotent."""
-        with self._condition:
-            self._closed = True
-            self._condition.notify()
+        self._box.close()
         self._thread.join(deadline_s)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from semcast.common.errors import SemcastError
+from semcast.common.worker_guard import WorkerGuard
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +45,7 @@ class DecodeAhead(Generic[In, Out]):
         self._condition = threading.Condition()
         self._stopping = threading.Event()
         self._reported: set[str] = set()
+        self._guard = WorkerGuard("leaving a frame out")
         self._thread = threading.Thread(target=self._run, name="semcast-decode", daemon=True)
         self._thread.start()
 
@@ -67,11 +69,13 @@ class DecodeAhead(Generic[In, Out]):
                 if str(err) not in self._reported and len(self._reported) < 100:
                     self._reported.add(str(err))
                     logger.warning("%s", err)
-                self._on_failure(message, "codec")
+                with self._guard:
+                    self._on_failure(message, "codec")
                 continue
             except Exception:
                 logger.exception("a frame could not be decoded and is left out")
-                self._on_failure(message, "decode")
+                with self._guard:
+                    self._on_failure(message, "decode")
                 continue
             finally:
                 self.is_busy = False

@@ -10,17 +10,10 @@ from pathlib import Path
 
 from semcast.common.errors import ConfigError
 from semcast.common.run_folder import (
-    CHECKPOINT_NAME,
-    DEMO_SETTINGS_NAME,
-    DENSE_NAME,
     FRAMES_NAME,
     IMAGES_NAME,
-    MAP_NAME,
-    RECONSTRUCTION_NAME,
-    SETTINGS_NAME,
-    SUMMARY_NAME,
+    RUN_FILES,
     TRAJECTORY_NAME,
-    VIEWER_NAME,
     read_image_paths,
 )
 
@@ -30,19 +23,6 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 logger = logging.getLogger(__name__)
-
-_FILES = (
-    TRAJECTORY_NAME,
-    MAP_NAME,
-    DENSE_NAME,
-    SUMMARY_NAME,
-    SETTINGS_NAME,
-    DEMO_SETTINGS_NAME,
-    FRAMES_NAME,
-    VIEWER_NAME,
-    RECONSTRUCTION_NAME,
-    CHECKPOINT_NAME,
-)
 
 
 def is_run(folder: Path) -> bool:
@@ -143,7 +123,7 @@ def set_aside(folder: Path) -> None:
             return
         kept = free_folder(folder)
         kept.mkdir()
-        for name in (*_FILES, IMAGES_NAME):
+        for name in (*RUN_FILES, IMAGES_NAME):
             if (folder / name).exists():
                 (folder / name).rename(kept / name)
     except OSError as err:
@@ -161,7 +141,7 @@ def discard(folder: Path) -> None:
     if not is_run(folder):
         return
     try:
-        for old in (*(folder / name for name in _FILES), *read_image_paths(folder).values()):
+        for old in (*(folder / name for name in RUN_FILES), *read_image_paths(folder).values()):
             old.unlink(missing_ok=True)
     except OSError as err:
         raise ConfigError(f"what an earlier run left in {folder} can't be removed: {err}") from err

@@ -15,6 +15,7 @@ from semcast.common.messages import MapMessage, PoseMessage
 from semcast.common.metrics import Metrics
 from semcast.common.transport import Publisher, Session
 from semcast.common.wire import pack
+from semcast.common.worker_guard import WorkerGuard
 from semcast.server.mapping.state import FrameResult, MapUpdate
 from semcast.server.receiver import ReceivedFrame
 
@@ -44,6 +45,7 @@ class Outbox:
         self._change: MapMessage | None = None
         self._change_lock = threading.Lock()
         self._t_capture_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
+        self._guard = WorkerGuard("sending what was found", self._on_failure)
         self._thread = threading.Thread(target=self._run, name="semcast-outbox", daemon=True)
         self._thread.start()
 
@@ -83,9 +85,7 @@ class Outbox:
             self._put("map")
 
     def _put(self, entry: PoseMessage | Literal["map"]) -> None:
-        before = self._box.dropped
-        self._box.put(entry)
-        self._metrics.drop("outbox", self._box.dropped - before)
+        self._metrics.drop("outbox", self._box.put(entry) or 0)
 
     def _run(self) -> None:
         while (entry := self._box.get()) is not None:
@@ -97,11 +97,16 @@ class Outbox:
                 self._send(self._map, change)
 
     def _send(self, publisher: Publisher, message: PoseMessage | MapMessage) -> None:
-        try:
-            publisher.put(pack(message))
-        except SemcastError as err:
-            self._metrics.drop("unsent")
-            logger.debug("not sent: %s", err)
+        with self._guard:
+            try:
+                publisher.put(pack(message))
+            except SemcastError as err:
+                self._metrics.drop("unsent")
+                logger.debug("not sent: %s", err)
+
+    def _on_failure(self, text: str) -> None:
+        self._metrics.drop("unsent")
+        self._metrics.error(text)
 
     def close(self, deadline_s: float = 2.0) -> None:
         """Send what waits and end the thread. Idempotent."""

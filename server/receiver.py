@@ -24,6 +24,7 @@ from semcast.common.rate import belongs_to, slots_at
 from semcast.common.symbol_payload import lost_slots_of, slots_of
 from semcast.common.transport import Session
 from semcast.common.wire import WireError, pack, unpack
+from semcast.common.worker_guard import WorkerGuard
 from semcast.server.arrival import Arrivals
 from semcast.server.backlog import Backlog
 
@@ -244,8 +245,10 @@ class Receiver:
         self._metrics.drop("superseded", superseded)
 
     def _beat(self) -> None:
+        guard = WorkerGuard("sending how far the server is", self._metrics.error)
         while not self._stopping.wait(FLOW_INTERVAL_S):
-            self._send_flow()
+            with guard:
+                self._send_flow()
 
     def announce_ready(self, agent_epoch: int) -> None:
         """Tell a live agent that everything is set up for its first frame; it waits for this."""

@@ -202,11 +202,17 @@ def _replayed(
         if settings.reference is not None
         else recording_reference(reader, camera)
     )
-    session = Session(server, identity, settings.out, reference, program=settings)
-    viewer = open_viewer(server, identity, reference)
     drops: dict[str, int] = {}
     processed = 0
-    try:
+    with contextlib.ExitStack() as stack:
+        if reference is not None:
+            stack.callback(reference.close)
+        session = stack.enter_context(
+            contextlib.closing(Session(server, identity, settings.out, reference, program=settings))
+        )
+        viewer = open_viewer(server, identity, reference)
+        if viewer is not None:
+            stack.callback(viewer.close, leave_window=settings.view.leave_open)
         for arrival in _paced(_arrivals(reader, stream, settings), settings.pace, stop):
             if stop.is_set():
                 break
@@ -218,25 +224,32 @@ def _replayed(
             raise SourceError(_none_in_part(reader, stream, settings))
         if not processed and not stop.is_set():
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
-        with contextlib.suppress(OSError):  # said at the end
-            session.write_results(settings.out)  # who stops the replay may not wait for the adjustment
-        conclude(
-            session,
-            lambda update, patches: viewer.submit(None, update, patches) if viewer is not None else None,
-            on_activity or (lambda text: None),
-            0.0 if stop.is_set() else None,
-        )
-        try:
-            whole = settings.start_s == 0.0 and settings.end_s is None and not stop.is_set()
-            return session.write_outputs(settings.out, drops, complete=whole)
-        except OSError as err:
-            raise SemcastError(f"outputs can't be written to {settings.out}: {err}") from err
-    finally:
-        session.close()
-        if viewer is not None:
-            viewer.close(leave_window=settings.view.leave_open)
-        if reference is not None:
-            reference.close()
+        return _concluded(settings, session, viewer, drops, on_activity, stopped=stop.is_set())
+
+
+def _concluded(
+    settings: ReplaySettings,
+    session: Session,
+    viewer: "ViewerFeed | None",
+    drops: dict[str, int],
+    on_activity: Callable[[str], None] | None,
+    *,
+    stopped: bool,
+) -> dict[str, Any]:
+    """Adjust the whole map, write what the replay leaves behind and return the summary."""
+    with contextlib.suppress(OSError):  # said at the end
+        session.write_results(settings.out)  # who stops the replay may not wait for the adjustment
+    conclude(
+        session,
+        lambda update, patches: viewer.submit(None, update, patches) if viewer is not None else None,
+        on_activity or (lambda text: None),
+        0.0 if stopped else None,
+    )
+    try:
+        whole = settings.start_s == 0.0 and settings.end_s is None and not stopped
+        return session.write_outputs(settings.out, drops, complete=whole)
+    except OSError as err:
+        raise SemcastError(f"outputs can't be written to {settings.out}: {err}") from err
 
 
 def _take(

@@ -18,26 +18,38 @@ class RequestDesk:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._waiting: dict[str, Future[Any]] = {}
+        self._closed = False
 
     def ask(self, what: str, wait_s: float) -> Any:
-        """Return what serving gave; None when it takes longer than ``wait_s``.
+        """Return what serving gave.
 
         Raises:
-            SemcastError: Serving failed.
+            SemcastError: Serving failed, takes longer than ``wait_s``, in which case it goes on all the same,
+                or is at its end; the message tells which.
         """
         with self._lock:
+            if self._closed:
+                raise _refusal(what)
             served = self._waiting.setdefault(what, Future())
         try:
             return served.result(wait_s)
-        except FutureTimeoutError:
-            return None
+        except FutureTimeoutError as err:
+            raise SemcastError(f"{what} is not done yet: the server is busy, and does it next") from err
 
     def error_of(self, what: str, wait_s: float) -> str:
-        """Ask for something that gives what went wrong, and return that; "" also where it takes longer."""
+        """Ask for something that gives what went wrong, and return that; "" where it is done."""
         try:
             return self.ask(what, wait_s) or ""
         except SemcastError as err:
             return str(err)
+
+    def close(self) -> None:
+        """Refuse what waits, and all that is asked for from now on: nobody serves any more. Idempotent."""
+        with self._lock:
+            self._closed = True
+            waiting, self._waiting = self._waiting, {}
+        for what, served in waiting.items():
+            served.set_exception(_refusal(what))
 
     def serve(self, handlers: Mapping[str, Callable[[], Any]]) -> None:
         """Serve what was asked for, in the order of the handlers; who asks must not end what serves."""
@@ -56,3 +68,7 @@ class RequestDesk:
                 waiting[what].set_exception(SemcastError(f"{what} can't be served: {err}"))
             else:
                 waiting[what].set_result(answer)
+
+
+def _refusal(what: str) -> SemcastError:
+    return SemcastError(f"{what} can't be served: the server is at its end")

@@ -12,6 +12,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from semcast.common.errors import SemcastError
+from semcast.common.run_folder import FRAMES_NAME
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
 from semcast.common.whole_file import whole_file
@@ -22,7 +23,6 @@ from semcast.server.sent_frames import Stretch, unposed_ranges
 
 logger = logging.getLogger(__name__)
 
-FILE_NAME = "frames.jsonl"
 MAX_ROWS_IN_MEMORY = 20_000
 
 
@@ -105,7 +105,7 @@ class RunRecord:
 
     def __init__(self, folder: Path | None, *, resume: bool = False) -> None:
         self._memory: deque[FrameRow] = deque(maxlen=MAX_ROWS_IN_MEMORY)
-        self._path = folder / FILE_NAME if folder is not None else None
+        self._path = folder / FRAMES_NAME if folder is not None else None
         self._file: TextIO | None = None
         if self._path is None:
             return

@@ -1,6 +1,5 @@
 """What there is of a map, and its files: trajectory, landmarks, what exports to other tools are made from."""
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,14 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.errors import SemcastError
-from semcast.common.run_folder import MAP_NAME, TRAJECTORY_NAME, RunData, write_run
+from semcast.common.run_folder import MAP_NAME, RECONSTRUCTION_NAME, TRAJECTORY_NAME, RunData, write_run
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.server.export.outputs import EachFile, trajectory_of, write_ply
-from semcast.server.export.parts import frame_parts
 from semcast.server.mapping.reconstruction import Reconstruction
-
-logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
@@ -52,7 +47,7 @@ def results_of(reconstruction: Reconstruction, t_source_ns: Mapping[int, int]) -
     return Results(
         poses=poses,
         trajectory=trajectory_of(poses, t_source_ns),
-        part_of=frame_parts(reconstruction.snapshot()),
+        part_of=world.part_of_frames(),
         num_landmarks=len(world.landmarks),
         num_keyframes=len(np.unique(world.observations()[1])),
     )
@@ -66,7 +61,7 @@ def write_results(
     t_source_ns: Mapping[int, int],
     each: EachFile,
 ) -> None:
-    """Write trajectory, map and reconstruction.
+    """Write trajectory, map and reconstruction, which is what exports to other tools are made from.
 
     Args:
         folder: Where to.
@@ -84,8 +79,7 @@ def write_results(
         write_ply(path, xyz, rgb, confidence)
     timed = sorted(frame_id for frame_id in results.poses if frame_id in t_source_ns)
     used = np.isin(landmark_ids, ids) & np.isin(keyframe_ids, timed)
-    try:
-        # What exports to other tools are made from.
+    with each.attempt(folder / RECONSTRUCTION_NAME):
         write_run(
             folder,
             RunData(
@@ -105,5 +99,3 @@ def write_results(
                 observed_xy=xy[used].astype(np.float32),
             ),
         )
-    except (SemcastError, ValueError) as err:
-        logger.warning("the reconstruction can't be written for export: %s", err)

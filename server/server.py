@@ -49,7 +49,7 @@ WARM_UP_SHAPE_HW = (256, 384)
 STRAGGLER_NS = 20_000_000_000
 #: Time for depth that is still missing where another stream waits, and where the server was stopped.
 _IN_A_HURRY_S, _STOPPED_S = 2.0, 12.0
-#: How long a control request waits to be served; a busy server answers that it will be.
+#: How long a control request waits to be served; a busy server answers that it is not done yet.
 SERVE_WAIT_S = 2.0
 
 
@@ -90,6 +90,7 @@ class Server:
         self._new_map = False
         self._resources = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
+            stack.callback(self._desk.close)
             stack.enter_context(output_folder(settings.out))
             if settings.record is not None:
                 stack.enter_context(recording(session, self._agent_id, settings.record, to_toml(settings)))
@@ -158,14 +159,15 @@ class Server:
             return pack(ControlReply(ok=False, error=str(err)))
         if request.op not in ("get", "reset", "save"):
             return pack(ControlReply(ok=False, error=f"op must be get, reset or save, got {request.op}"))
-        # A busy server answers that it will serve it.
         error = self._desk.error_of(request.op, SERVE_WAIT_S) if request.op != "get" else ""
         values = {"mode": self._settings.mode, "view": self._settings.view.view}
         return pack(ControlReply(ok=not error, error=sendable(error, 1000), settings=values))
 
     def _answer_map(self, _payload: bytes) -> bytes | None:
-        """Give the whole map to who comes late."""
-        whole: bytes | None = self._desk.ask("map", SERVE_WAIT_S)
+        """Give the whole map to who comes late; who gets none asks again when the map has changed."""
+        whole: bytes | None = None
+        with contextlib.suppress(SemcastError):
+            whole = self._desk.ask("map", SERVE_WAIT_S)
         return whole
 
     def run(self, stop: threading.Event) -> dict[str, Any]:
@@ -196,6 +198,7 @@ class Server:
                 if self._settings.duration_s is not None and now_s - started_s >= self._settings.duration_s:
                     break
         finally:
+            self._desk.close()
             summary = self._finish()
         return summary
 
@@ -226,12 +229,11 @@ class Server:
         """Write checkpoint and results now, as far as they are; return what went wrong."""
         if session is None:
             return ""
-        out = self._settings.out
         session.save_checkpoint()
         try:
-            session.write_results(out)
+            session.write_results(self._settings.out)
         except (OSError, SemcastError) as err:
-            return self._tell_not_written(out, err)
+            return self._tell_not_written(self._settings.out, err)
         return ""
 
     def _whole_map(self, session: Session | None) -> bytes | None:

@@ -18,14 +18,11 @@ from semcast.common.errors import CheckpointError
 from semcast.common.run_folder import (
     CHECKPOINT_NAME,
     DENSE_NAME,
-    FRAMES_NAME,
     IMAGES_NAME,
-    MAP_NAME,
-    RECONSTRUCTION_NAME,
+    RECORD_FILES,
+    RESULT_FILES,
     SETTINGS_NAME,
     SUMMARY_NAME,
-    TRAJECTORY_NAME,
-    VIEWER_NAME,
     ImageWriter,
 )
 from semcast.common.whole_file import write_whole
@@ -58,8 +55,6 @@ logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
 
-#: What is written at the end of a run, and when it is asked for.
-_RESULTS = (TRAJECTORY_NAME, MAP_NAME, DENSE_NAME, RECONSTRUCTION_NAME, SETTINGS_NAME, SUMMARY_NAME)
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
 
@@ -455,9 +450,9 @@ class Session:
         """
         if self._folder is None:
             return
-        for name in (FRAMES_NAME, IMAGES_NAME, CHECKPOINT_NAME, VIEWER_NAME, *_RESULTS):
+        for name in (*RECORD_FILES, IMAGES_NAME, *RESULT_FILES):
             with contextlib.suppress(FileNotFoundError):
-                if name in _RESULTS and (folder / name).exists():
+                if name in RESULT_FILES and (folder / name).exists():
                     (self._folder / name).unlink()
                 else:
                     (self._folder / name).rename(folder / name)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semcast import __version__
-from semcast.common.errors import SourceError
+from semcast.common.errors import SemcastError, SourceError
 from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.whole_file import write_whole
@@ -56,11 +56,12 @@ class EachFile:
 
     @contextmanager
     def attempt(self, path: Path) -> Iterator[Path]:
-        """Take note of a file that can't be written in the block."""
+        """Take note of a file that can't be written in the block, or whose content can't be made."""
         try:
             yield path
-        except OSError as err:
-            self._failures.append(f"{path.name}: {err.strerror or err}")
+        except (OSError, SemcastError, ValueError) as err:
+            at_fault = err if isinstance(err, OSError) else err.__cause__
+            self._failures.append(f"{path.name}: {getattr(at_fault, 'strerror', None) or err}")
 
 
 def write_ply(

@@ -7,28 +7,14 @@ meets an older one and becomes part of it; what is left apart at the end never m
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcast.common.errors import SourceError
 from semcast.common.run_folder import RunData
 
 ALL = "all"
 LARGEST = "largest"
-
-
-def frame_parts(snapshot: Mapping[str, NDArray[Any]]) -> dict[int, int]:
-    """Return posed frame id to the number of its part, from ``Reconstruction.snapshot()``.
-
-    A frame belongs to the part its keyframe is in now, whatever it belonged to when it was tracked.
-    """
-    part_of = dict(zip(snapshot["poses.frame_id"].tolist(), snapshot["poses.submap"].tolist(), strict=True))
-    frame_ids, keyframe_ids = snapshot["frames.frame_id"], snapshot["frames.keyframe_id"]
-    return {
-        k: part_of[keyframe] for k, keyframe in zip(frame_ids.tolist(), keyframe_ids.tolist(), strict=True)
-    }
 
 
 def count_parts(parts: Iterable[int]) -> list[dict[str, int]]:

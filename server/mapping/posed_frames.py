@@ -50,9 +50,18 @@ class PosedFrames:
         self._keyframe_ids = np.concatenate([self._keyframe_ids, np.zeros_like(self._keyframe_ids)])
         self._T_keyframe_cam = np.concatenate([self._T_keyframe_cam, np.zeros_like(self._T_keyframe_cam)])
 
+    def keyframes(self) -> tuple[Ids, Ids]:
+        """Return copies of ``ids (N,)`` ascending and ``keyframe_ids (N,)``."""
+        order = self._in_order()
+        return self._ids[order], self._keyframe_ids[order]
+
+    def _in_order(self) -> NDArray[np.intp]:
+        """Rows by ascending id."""
+        return np.argsort(self._ids[: len(self)], kind="stable")
+
     def columns(self) -> tuple[Ids, Ids, Array]:
         """Return copies of ``ids (N,)`` ascending, ``keyframe_ids (N,)`` and ``T_keyframe_cam (N, 4, 4)``."""
-        order = np.argsort(self._ids[: len(self)], kind="stable")
+        order = self._in_order()
         return self._ids[order], self._keyframe_ids[order], self._T_keyframe_cam[order]
 
     def take(self, ids: Ids, keyframe_ids: Ids, T_keyframe_cam: Array) -> None:

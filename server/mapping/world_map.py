@@ -357,6 +357,12 @@ class WorldMap:
         ids, T_world_cam = self.poses_of_frames()
         return dict(zip(ids.tolist(), T_world_cam, strict=True))
 
+    def part_of_frames(self) -> dict[int, int]:
+        """Posed frame id, ascending, -> the submap its keyframe is in now, whatever it was tracked in."""
+        ids, keyframe_ids = self.frames.keyframes()
+        submaps = (self.submap_of[k] for k in keyframe_ids.tolist())
+        return dict(zip(ids.tolist(), submaps, strict=True))
+
     def observations(self) -> tuple[Ids, Ids, Array]:
         """Landmark id, keyframe's frame id and pixel of every observation of a landmark."""
         ids, frames, xy = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros((0, 2))]

@@ -1,7 +1,8 @@
-"""Feeds viewers beside the tracker, which only drops its results into a queue and never waits.
+"""Feeds viewers beside the tracker, which only drops its results into a queue and waits for no viewer.
 
-Two threads: one owns the scene and writes the ``.rrd`` file, one serves the live viewer. A live viewer may
-be missing, frozen, killed or late: the second thread waits for it and then sends the whole scene anew.
+Two threads: one brings what is in the queue into the scene and writes the ``.rrd`` file, one serves the live
+viewer. A live viewer may be missing, frozen, killed or late: the second thread waits for it and then sends
+the whole scene anew.
 """
 
 import logging
@@ -18,24 +19,24 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError
 from semcast.common.trajectory import Trajectory
+from semcast.common.worker_guard import WorkerGuard
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.settings import ViewSettings
+from semcast.server.view.live_stream import FLUSH_TIMEOUT_S, LiveStream
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary, window_display
-from semcast.server.view.rerun_viewer import Delivery, RerunStream
-from semcast.server.view.scene import Cursor, FrameView, Scene, compress_picture
+from semcast.server.view.rerun_viewer import RerunStream
+from semcast.server.view.scene import Changes, Cursor, FrameView, Scene, compress_picture
 
 logger = logging.getLogger(__name__)
 
+#: What waits for the scene's thread beyond it is brought into the scene by who submits.
 MAX_PENDING = 4096
 PROBE_INTERVAL_S = 0.25
 SUPERVISE_INTERVAL_S = 0.2
-FLUSH_TIMEOUT_S = 1.0
 ALIGN_INTERVAL_S = 1.0
 FILE_FLUSH_INTERVAL_S = 1.0
 JOIN_DEADLINE_S = 5.0
-#: After so many connections in a row that took nothing, what listens is left alone until it no longer does.
-MAX_REFUSALS = 5
 
 
 def resolve_view(view: str, *, has_folder: bool) -> str:
@@ -123,7 +124,8 @@ class ViewerFeed:
         self._footer = footer
         self._scene = Scene(truth, truth_times_ns)
         self._scene_lock = threading.Lock()
-        self._pending: deque[_Pending] = deque(maxlen=MAX_PENDING)
+        #: Taken from only with the scene locked, so that all comes into it in order.
+        self._pending: deque[_Pending] = deque()
         self._newest: FrameView | None = None
         self._queue_lock = threading.Lock()
         self._work = threading.Event()
@@ -133,7 +135,7 @@ class ViewerFeed:
         self._keeps_viewer = False
         self._last_picture_s = -1e9
         self._last_align_s = -1e9
-        self.num_connections = 0
+        self._scene_guard = WorkerGuard("bringing an update into the scene")
         if process is None:
             check_view(settings, has_folder=file is not None)
         view = resolve_view(settings.view, has_folder=file is not None)
@@ -142,12 +144,19 @@ class ViewerFeed:
         if process is None and view in ("native", "web"):
             kind: Literal["native", "web"] = "web" if view == "web" else "native"
             self._process = ViewerProcess(kind, settings.port, settings.web_port, settings.memory_limit)
+        self._live: LiveStream | None = None
         self._threads = [threading.Thread(target=self._run_scene, name="semcast-scene", daemon=True)]
         if self._process is not None:
             self._process.start()
+            self._live = LiveStream(lambda: self._open_stream(None), self._changes_since, settings.port)
             self._threads.append(threading.Thread(target=self._run_live, name="semcast-viewer", daemon=True))
         for thread in self._threads:
             thread.start()
+
+    @property
+    def num_connections(self) -> int:
+        """Live viewers that were connected to."""
+        return self._live.num_connections if self._live is not None else 0
 
     @property
     def url(self) -> str | None:
@@ -162,9 +171,10 @@ class ViewerFeed:
         *,
         new_map: bool = False,
     ) -> None:
-        """Show a frame and what changed in the map before it. Returns at once.
+        """Show a frame and what changed in the map before it. Never waits for a viewer or the disk.
 
         Of images waiting to be shown only the newest is kept; poses, plot values and map changes all are.
+        Where more than ``MAX_PENDING`` wait, each call brings the oldest into the scene itself.
 
         Args:
             view: The processed frame; None when the map alone has changed.
@@ -177,7 +187,25 @@ class ViewerFeed:
             self._pending.append(_Pending(light, update, tuple(patches), new_map))
             if view is not None and view.image is not None:
                 self._newest = view
+            is_behind = len(self._pending) > MAX_PENDING
         self._work.set()
+        if is_behind:
+            with self._scene_lock:
+                self._take(1)
+
+    def _take(self, most: int | None = None) -> int:
+        """Bring what waits into the scene, the oldest first; the scene is locked. Return how much it was."""
+        with self._queue_lock:
+            count = len(self._pending) if most is None else min(most, len(self._pending))
+            items = [self._pending.popleft() for _ in range(count)]
+        for item in items:
+            with self._scene_guard:
+                _apply(self._scene, item)
+        return count
+
+    def _changes_since(self, cursor: Cursor) -> Changes:
+        with self._scene_lock:
+            return self._scene.changes_since(cursor)
 
     def _open_stream(self, file: Path | None) -> RerunStream:
         return RerunStream(
@@ -200,21 +228,18 @@ class ViewerFeed:
         """Own the scene: take what was submitted, compress images, write the file."""
         cursor = Cursor()
         last_flush_s = time.monotonic()
+        guard = WorkerGuard("writing what is shown")
         while True:
             self._work.wait(0.2)
             self._work.clear()
             last_round = self._stopping.is_set()
-            try:
+            with guard:
                 self._take_pending(last_round)
                 if self._file is not None:
-                    with self._scene_lock:
-                        changes = self._scene.changes_since(cursor)
-                    self._file.write(changes)
+                    self._file.write(self._changes_since(cursor))
                     if time.monotonic() - last_flush_s > FILE_FLUSH_INTERVAL_S:
                         self._file.flush(FLUSH_TIMEOUT_S)
                         last_flush_s = time.monotonic()
-            except Exception:
-                logger.exception("the viewer scene failed on an update, which is left out")
             self._live_work.set()
             if last_round:
                 self._drained.set()
@@ -223,8 +248,6 @@ class ViewerFeed:
     def _take_pending(self, force: bool) -> None:
         """Apply what was submitted; ``force`` shows the last image even when it is early."""
         with self._queue_lock:
-            items = list(self._pending)
-            self._pending.clear()
             newest = self._newest
             now = time.monotonic()
             if newest is not None and not force and now - self._last_picture_s < self._image_interval_s:
@@ -236,11 +259,10 @@ class ViewerFeed:
             self._last_picture_s = now
             picture = compress_picture(newest, self._settings.jpeg_quality)
         with self._scene_lock:
-            for item in items:
-                _apply(self._scene, item)
+            num_taken = self._take()
             if picture is not None:
                 self._scene.set_picture(picture)
-            if self._has_truth and items and (force or now - self._last_align_s > ALIGN_INTERVAL_S):
+            if self._has_truth and num_taken and (force or now - self._last_align_s > ALIGN_INTERVAL_S):
                 self._last_align_s = now
                 self._scene.align_truth()
 
@@ -249,55 +271,29 @@ class ViewerFeed:
         return 1.0 / self._settings.image_rate_hz
 
     def _run_live(self) -> None:
-        """Serve the live viewer: wait for it, send it everything, then what changes."""
-        assert self._process is not None
-        stream: RerunStream | None = None
-        cursor = Cursor()
-        stalled = False
-        refusals = 0
+        """Look after the live viewer, and serve it."""
+        live, process = self._live, self._process
+        assert live is not None
+        assert process is not None
+        looking_after = WorkerGuard("looking after the viewer")
+        # Who is connected to anew gets all that the failed round may have kept back.
+        showing = WorkerGuard("showing the run", lambda text: live.let_go())
         last_supervised_s = -1e9
         while True:
             last_round = self._drained.is_set()
             if time.monotonic() - last_supervised_s > SUPERVISE_INTERVAL_S:
                 last_supervised_s = time.monotonic()
-                self._supervise()
-            listening = stream is None and not last_round and is_listening(self._settings.port)
-            if stream is None and not listening:
-                refusals = 0
-            if listening and refusals < MAX_REFUSALS:
-                stream, cursor = self._open_stream(None), Cursor()
-                self.num_connections += 1
-                logger.info("viewer connected on port %d", self._settings.port)
-            if stream is not None:
-                if not stalled:
-                    with self._scene_lock:
-                        changes = self._scene.changes_since(cursor)
-                    if not changes.empty:
-                        stream.write(changes)
-                delivery = stream.flush(FLUSH_TIMEOUT_S)
-                if delivery is Delivery.DONE:
-                    refusals = 0
-                if delivery is Delivery.SEVERED:
-                    logger.info("viewer is gone, the stream goes on")
-                    stream.close()
-                    stream = None
-                    refusals += 1
-                    if refusals == MAX_REFUSALS:
-                        logger.warning(
-                            "what listens on port %d is no viewer, nothing is shown: see --viewer-port",
-                            self._settings.port,
-                        )
-                elif (delivery is Delivery.STALLED) != stalled:
-                    stalled = not stalled
-                    logger.info("viewer %s", "does not answer, sending waits" if stalled else "answers again")
+                with looking_after:
+                    self._supervise()
+            with showing:
+                live.serve(may_connect=not last_round)
             if last_round:
                 break
-            self._live_work.wait(PROBE_INTERVAL_S if stream is None else self._image_interval_s)
+            self._live_work.wait(self._image_interval_s if live.is_connected else PROBE_INTERVAL_S)
             self._live_work.clear()
-        if stalled and not self._keeps_viewer:
-            self._process.close()
-        if stream is not None and not stream.close():
-            logger.warning("the viewer is frozen and was left as it is")
+        if live.is_stalled and not self._keeps_viewer:
+            process.close()
+        live.close()
 
     def _supervise(self) -> None:
         assert self._process is not None

@@ -26,6 +26,7 @@ from semcast.server.view.spectator import Spectator
 Array = NDArray[np.float64]
 
 SEGMENT_POSES = 32
+#: Rows kept; of plot values a viewer that comes late, or stands still for so long, lacks those before.
 MAX_ROWS = 20_000
 MAX_KEYPOINTS = 1500
 #: Depth of the drawn frustum as share of the median landmark distance.
@@ -68,7 +69,7 @@ class FrameView:
     backfilled: Sequence[tuple[int, int, Array]] = ()
 
     def without_image(self) -> "FrameView":
-        """Return the light part: pose and plot values, which are never dropped."""
+        """Return the light part: pose and plot values, all of which come into the scene."""
         none = np.zeros((0, 2), dtype=np.float32)
         return replace(
             self, image=None, confidence=None, keypoints_xy=none, keypoint_inlier=np.zeros(0, dtype=bool)

@@ -26,7 +26,7 @@ from semcast.common.keys import status_key
 from semcast.common.messages import StatusMessage
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.rate import NATIVE_RATE, RateChoice
-from semcast.common.run_folder import DEMO_SETTINGS_NAME, SUMMARY_NAME
+from semcast.common.run_folder import DEMO_SETTINGS_NAME, FRAMES_NAME, SUMMARY_NAME
 from semcast.common.sequence import Sequence, open_sequence
 from semcast.common.transport import Session, free_endpoint, open_session
 from semcast.common.whole_file import check_writable, write_whole
@@ -438,7 +438,7 @@ def _watch(
     progress: Callable[[int, str], None],
 ) -> str | None:
     """Follow the rows the server writes until its summary is there; tell which process gave up, and why."""
-    rows = out / "frames.jsonl"
+    rows = out / FRAMES_NAME
     read_bytes = 0
     num_done = num_outages = 0
     activity = ""

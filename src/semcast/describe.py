@@ -11,13 +11,10 @@ from semcast.common.camera_settings import HOW_TO_GIVE
 from semcast.common.errors import CheckpointError, SourceError
 from semcast.common.recording_reader import RECORDING_METADATA, RecordingReader
 from semcast.common.run_folder import (
-    DENSE_NAME,
     FRAMES_NAME,
-    MAP_NAME,
     RECONSTRUCTION_NAME,
+    RUN_FILES,
     SUMMARY_NAME,
-    TRAJECTORY_NAME,
-    VIEWER_NAME,
     read_image_paths,
     read_run,
 )
@@ -145,16 +142,7 @@ def describe_run(path: Path) -> list[Section]:
         )
     if line := parts_line(parts):
         facts.append(("parts", line))
-    names = (
-        TRAJECTORY_NAME,
-        MAP_NAME,
-        DENSE_NAME,
-        VIEWER_NAME,
-        RECONSTRUCTION_NAME,
-        FRAMES_NAME,
-        SUMMARY_NAME,
-    )
-    files = [(name, _bytes((path / name).stat().st_size)) for name in names if (path / name).is_file()]
+    files = [(name, _bytes((path / name).stat().st_size)) for name in RUN_FILES if (path / name).is_file()]
     images = read_image_paths(path)
     if images:
         files.append(("images/", f"{len(images)} decoded images"))

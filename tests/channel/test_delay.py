@@ -61,3 +61,20 @@ def test_a_full_line_refuses_packets(ends):
     ends.line.close()
     ends.line.close()
     assert ends.out.empty()
+
+
+def test_a_packet_that_can_not_be_sent_costs_itself_alone():
+    sent, failed = queue.Queue(), []
+
+    def send(packet, lossless):
+        if packet == b"bad":
+            raise RuntimeError("no such packet")
+        sent.put(packet)
+
+    line = DelayLine(send, np.random.default_rng(0), failed.append)
+    for packet in (b"bad", b"good"):
+        assert line.put(packet, False, 1.0, 0.0)
+    assert sent.get(timeout=10) == b"good"
+    assert failed == ["sending a delayed packet failed: no such packet"]
+    line.close()
+    assert not line.put(b"late", False, 1.0, 0.0)

@@ -322,3 +322,19 @@ def test_settings_are_checked():
         EmulatorSettings(seed=-1)
     with pytest.raises(ValueError, match="agent_id must be"):
         EmulatorSettings(agent_id="a/b")
+
+
+@pytest.mark.parametrize("at", ["answer", "declare_alive"])
+def test_a_channel_that_fails_to_start_ends_its_threads(monkeypatch, at):
+    def fail(self, *_):
+        raise TransportError("the session is closed")
+
+    monkeypatch.setattr(f"semcast.common.transport.Session.{at}", fail)
+    before = set(threading.enumerate())
+    hub, endpoint = open_hub()
+    with hub:
+        settings = EmulatorSettings(agent_id="a", network=NetworkSettings(connect=(endpoint,)))
+        with pytest.raises(TransportError, match="the session is closed"):
+            run_channel(settings, threading.Event())
+    left = {thread.name for thread in set(threading.enumerate()) - before}
+    assert not {name for name in left if name.startswith("semcast")}

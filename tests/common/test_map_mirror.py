@@ -1,3 +1,4 @@
+import threading
 import time
 
 import numpy as np
@@ -137,3 +138,41 @@ def test_nothing_is_left_of_a_former_server_whose_successor_had_no_map_at_first(
         assert mirror.map.keyframe_ids.tolist() == [0]
         serving.put(message([3]))
         until(lambda: mirror.map.ids.tolist() == [1, 2, 3])
+
+
+class ScriptedSession:
+    """Does something of a test's while an answer is on its way."""
+
+    def __init__(self):
+        self.whole, self.on_the_way = None, lambda: None
+
+    def subscribe(self, key, service, deliver):
+        self.deliver = deliver
+
+    def watch_alive(self, agent_id, on_change):
+        self.on_role = on_change
+
+    def request(self, key, payload, timeout_s):
+        answer = None if self.whole is None else pack(self.whole)
+        # As in life, on the thread that watches who is alive.
+        watching = threading.Thread(target=self.on_the_way)
+        watching.start()
+        watching.join(10)
+        return answer
+
+
+def test_a_server_that_goes_while_its_answer_is_on_its_way_is_not_taken_for_the_next_one():
+    session = ScriptedSession()
+    mirror = MapMirror(session, AGENT)
+    session.whole = message([1, 2])
+    session.on_the_way = lambda: session.on_role("server", False)
+    session.deliver(pack(message([2])))
+    assert mirror.map.ids.tolist() == [1, 2]
+    # The next one took the map up again, as it was once, and goes on.
+    session.on_the_way, session.whole = lambda: None, message([1, 5, 6], offset=0.5)
+    session.on_role("server", True)
+    assert mirror.map.ids.tolist() == [1, 5, 6]
+    session.whole = None
+    session.deliver(pack(message([7], removed=[6])))
+    assert mirror.map.ids.tolist() == [1, 5, 7]
+    assert mirror.map.xyz[:, 0].tolist() == [1.5, 5.5, 7.0]

@@ -374,3 +374,15 @@ def test_a_recording_that_is_not_there_is_named_alone(tmp_path):
     with pytest.raises(SourceError, match=r"missing\.mcap can't be read: No such file"):
         recover_file(missing, missing)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_whatever_ends_a_recording_is_told(tmp_path, monkeypatch, caplog):
+    def broken(self, *item):
+        raise MemoryError
+
+    monkeypatch.setattr("semcast.common.recorder.RecordingWriter.add", broken)
+    with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
+        recorder.put("a/tx/symbols", "symbols", b"data")
+    assert recorder.error == "MemoryError"
+    assert recorder.drops["disk"] == 1
+    assert "the stream goes on, 0 messages were recorded" in caplog.text

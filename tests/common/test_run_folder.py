@@ -216,3 +216,41 @@ def test_an_image_that_finds_no_room_leaves_no_part_of_itself(tmp_path, monkeypa
             writer.put(k, picture(k))
     assert list(read_image_paths(tmp_path)) == [0]
     assert (writer.num_written, writer.num_dropped) == (1, 2)
+
+
+def test_whatever_an_image_can_not_be_written_for_holds_nobody_up(tmp_path, monkeypatch, caplog):
+    def broken(self, item):
+        raise MemoryError
+
+    monkeypatch.setattr(ImageWriter, "_write", broken)
+    writer = ImageWriter(tmp_path, lossless=True, capacity=1)
+    putting = threading.Thread(target=lambda: [writer.put(k, picture(0)) for k in range(6)], daemon=True)
+    putting.start()
+    putting.join(10)
+    assert not putting.is_alive()
+    writer.close()
+    assert (writer.num_written, writer.num_dropped) == (0, 6)
+    assert caplog.text.count("MemoryError; the run goes on without images") == 1
+
+
+def test_a_disk_that_hangs_keeps_nobody_longer_than_the_deadline(tmp_path, monkeypatch):
+    writing, may_go_on = threading.Event(), threading.Event()
+
+    def hanging(self, item):
+        writing.set()
+        may_go_on.wait(30)
+
+    monkeypatch.setattr(ImageWriter, "_write", hanging)
+    writer = ImageWriter(tmp_path, lossless=False, capacity=1)
+    writer.put(0, picture(0))
+    assert writing.wait(10)
+    writer.put(1, picture(1))
+    writer.put(2, picture(2))
+    closing = threading.Thread(target=lambda: writer.close(0.05), daemon=True)
+    closing.start()
+    closing.join(10)
+    assert not closing.is_alive()
+    assert writer.num_dropped == 2
+    writer.put(3, picture(3))
+    assert writer.num_dropped == 2, "after the end it is ignored"
+    may_go_on.set()

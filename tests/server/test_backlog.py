@@ -110,8 +110,8 @@ def test_closing_wakes_whoever_waits_and_keeps_what_is_inside():
     taken = []
     consumer = threading.Thread(target=lambda: taken.extend((waiting.get(5), waiting.get(5))))
     consumer.start()
-    assert waiting.put("last")
+    assert waiting.put("last") == 0
     waiting.close()
     consumer.join(5)
     assert taken == ["last", None]
-    assert not waiting.put("never")
+    assert waiting.put("never") is None

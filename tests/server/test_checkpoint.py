@@ -138,3 +138,22 @@ def test_the_writer_survives_a_full_disk(tmp_path):
         time.sleep(0.01)
     writer.close()
     assert writer.num_failed == 1
+
+
+def test_the_writer_survives_what_nobody_expected(tmp_path, monkeypatch, caplog):
+    def broken(*_args, **_kwargs):
+        raise MemoryError
+
+    path = tmp_path / "map.npz"
+    writer = CheckpointWriter(path)
+    with monkeypatch.context() as patch:
+        patch.setattr("semcast.server.checkpoint.save_checkpoint", broken)
+        writer.submit(checkpoint(1))
+        deadline = time.monotonic() + 10
+        while writer.num_failed == 0 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    writer.submit(checkpoint(2))
+    writer.close()
+    assert (writer.num_failed, writer.num_written) == (1, 1)
+    assert load_checkpoint(path).header.frame_id == 2
+    assert "MemoryError; the stream goes on without checkpoints" in caplog.text

@@ -89,3 +89,18 @@ def test_a_frame_that_can_not_be_taken_never_stops_the_stream(caplog):
     assert drain(ahead, 2) == [100, 102]
     ahead.close()
     assert "could not be taken" in caplog.text
+
+
+def test_a_frame_that_can_not_even_be_left_out_never_stops_the_stream(caplog):
+    def decode(x):
+        if x < 2:
+            raise ZeroDivisionError
+        return x
+
+    def on_failure(message, reason):
+        raise RuntimeError("nobody wants to know")
+
+    ahead = DecodeAhead(Inbox(4).take, decode, on_failure)
+    assert drain(ahead, 2) == [2, 3]
+    ahead.close()
+    assert caplog.text.count("leaving a frame out failed: nobody wants to know") == 1

@@ -1,6 +1,7 @@
 """What is published reaches who is slow: all of the map, and the newest poses."""
 
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -71,3 +72,20 @@ def test_a_slow_subscriber_misses_nothing_of_the_map(rng):
             np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
         assert len(session.sent) == 2, "what waits is sent as one"
         assert not metrics.drops
+
+
+def test_what_can_not_be_sent_costs_itself_alone(rng, monkeypatch):
+    session, metrics = SlowSession(), Metrics("server")
+    session.may_go_on.set()
+    outbox = Outbox(session, AGENT, metrics)
+    with monkeypatch.context() as patch:
+        patch.setattr("semcast.server.outbox.pack", lambda message: 1 / 0)
+        outbox.put_map(5, some_change(rng, 0))
+        deadline_s = time.monotonic() + 30.0
+        while not metrics.drops and time.monotonic() < deadline_s:
+            time.sleep(0.001)
+    outbox.put_map(5, some_change(rng, 0))
+    outbox.close()
+    assert len(session.sent) == 1
+    assert metrics.drops == {"unsent": 1}
+    assert metrics.status(5).last_error == "sending what was found failed: division by zero"

@@ -405,3 +405,14 @@ def test_bad_arguments_are_refused(ends):
         Receiver(e.hub, "a", "fast", e.metrics)
     with pytest.raises(ValueError, match="max_age_ms must be positive, got 0"):
         Receiver(e.hub, "a", "live", e.metrics, max_age_ms=0)
+
+
+def test_a_receiver_that_fails_to_say_how_far_it_is_says_it_the_next_time(ends, monkeypatch):
+    monkeypatch.setattr("semcast.server.receiver.FLOW_INTERVAL_S", 0.01)
+    with monkeypatch.context() as patch:
+        patch.setattr("semcast.server.receiver.pack", lambda message: 1 / 0)
+        both = ends("replay")
+        until(lambda: both.metrics.counts.get("errors", 0) >= 2)
+    came = threading.Event()
+    both.client.subscribe(flow_key("a"), "newest", lambda payload: came.set())
+    assert came.wait(10)

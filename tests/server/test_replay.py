@@ -154,7 +154,9 @@ def test_the_command_shows_what_is_known_and_names_its_files(recording, tmp_path
     shown = capsys.readouterr().out
     assert "frames with a pose" in shown
     assert "error" not in shown, "there is no truth"
-    names = "trajectory.tum, map.ply, dense.ply, reconstruction.npz, summary.json, settings.toml"
+    names = (
+        "trajectory.tum, map.ply, dense.ply, reconstruction.npz, summary.json, settings.toml, frames.jsonl"
+    )
     assert shown.endswith(f"in {tmp_path / 'out'}: {names}\n")
 
 
@@ -211,6 +213,18 @@ def test_recorded_originals_give_the_same_psnr_as_the_sequence(recording, tmp_pa
     pairs = [pair for pair in zip(found["recorded"], found["sequence"], strict=True) if pair[0] is not None]
     assert len(pairs) >= FRAMES // 2
     assert all(recorded == sequence and 15.0 < recorded < 45.0 for recorded, sequence in pairs)
+
+
+def test_a_replay_that_can_not_be_shown_ends_its_threads(recording, tmp_path, monkeypatch):
+    def fail(*_):
+        raise ConfigError("no display here")
+
+    monkeypatch.setattr("semcast.server.replay.open_viewer", fail)
+    before = set(threading.enumerate())
+    with pytest.raises(ConfigError, match="no display here"):
+        replay(ReplaySettings(file=recording, out=tmp_path, save_images="all"))
+    left = {thread.name for thread in set(threading.enumerate()) - before}
+    assert not {name for name in left if name.startswith("semcast")}
 
 
 def test_a_paced_and_shown_replay_gives_the_same_poses(recording, tmp_path):

@@ -29,9 +29,11 @@ def test_requests_for_the_same_thing_are_served_once_and_in_the_order_of_the_han
     assert sorted(answers) == [("reset", "reset done"), ("save", "save done"), ("save", "save done")]
 
 
-def test_what_is_not_served_in_time_has_no_answer():
+def test_what_is_not_served_in_time_is_told_so_and_served_afterwards():
     desk = RequestDesk()
-    assert desk.ask("save", 0.01) is None
+    with pytest.raises(SemcastError, match="^save is not done yet: the server is busy"):
+        desk.ask("save", 0.01)
+    assert desk.error_of("save", 0.01).startswith("save is not done yet")
     served = []
     desk.serve({"save": lambda: served.append(1)})
     assert served == [1], "it is served all the same"
@@ -86,4 +88,20 @@ def test_what_went_wrong_is_told_in_words():
         asking.join(60.0)
         assert words in told[0]
         assert bool(words) == bool(told[0])
-    assert RequestDesk().error_of("save", 0.01) == ""
+
+
+def test_a_desk_that_is_closed_refuses_what_waits_and_what_comes():
+    desk, told = RequestDesk(), []
+    asking = threading.Thread(target=lambda: told.append(desk.error_of("save", 60.0)))
+    asking.start()
+    deadline_s = time.monotonic() + 60.0
+    while not desk._waiting and time.monotonic() < deadline_s:
+        time.sleep(0.001)
+    desk.close()
+    desk.close()
+    asking.join(60.0)
+    assert told == ["save can't be served: the server is at its end"]
+    assert desk.error_of("reset", 60.0) == "reset can't be served: the server is at its end"
+    served = []
+    desk.serve({"save": lambda: served.append(1)})
+    assert not served

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from semcast.common.errors import SemcastError
+from semcast.common.run_folder import FRAMES_NAME
 from semcast.common.trajectory import Trajectory
 from semcast.server.export.outputs import write_json
-from semcast.server.run_record import FILE_NAME, FrameRow, RunRecord, read_rows, summarise
+from semcast.server.run_record import FrameRow, RunRecord, read_rows, summarise
 from semcast.server.sent_frames import stretches
 
 
@@ -50,7 +51,7 @@ def test_rows_are_on_disk_at_once_and_a_torn_last_line_is_left_out(tmp_path):
     record = RunRecord(tmp_path)
     record.add(row(0))
     record.add(row(1, posed=False, psnr_db=float("nan")))
-    path = tmp_path / FILE_NAME
+    path = tmp_path / FRAMES_NAME
     assert [r.frame_id for r in read_rows(path)] == [0, 1]
     assert read_rows(path)[1].psnr_db is None
     path.write_text(path.read_text() + '{"frame_id": 2, "t_sou')
@@ -68,16 +69,16 @@ def test_a_resumed_run_goes_on_behind_its_rows_and_a_new_run_does_not(tmp_path):
 
 
 def test_damage_in_the_middle_is_an_error_with_its_line(tmp_path):
-    (tmp_path / FILE_NAME).write_text('{"frame_id": 1}\n{"frame_id": 2}\n')
+    (tmp_path / FRAMES_NAME).write_text('{"frame_id": 1}\n{"frame_id": 2}\n')
     with pytest.raises(SemcastError, match=r"frames.jsonl:1 "):
-        read_rows(tmp_path / FILE_NAME)
+        read_rows(tmp_path / FRAMES_NAME)
 
 
 def test_rows_tell_the_part_of_the_map_and_older_rows_count_as_the_first(tmp_path):
     record = RunRecord(tmp_path)
     record.add(row(0, submap=2))
     record.close()
-    path = tmp_path / FILE_NAME
+    path = tmp_path / FRAMES_NAME
     assert read_rows(path)[0].submap == 2
     older = json.loads(path.read_text())
     del older["submap"]

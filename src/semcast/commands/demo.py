@@ -14,6 +14,7 @@ from rich.table import Table
 from semcast.channel.emulator import warn_of_idle
 from semcast.commands.console import plain_console
 from semcast.commands.running import add_settings, read_settings, run_until_stopped
+from semcast.common.run_folder import RUN_FILES, VIEWER_NAME
 from semcast.common.sequence import open_sequence
 from semcast.demo import DemoSettings, default_sequence, run_demo
 from semcast.evaluation.report import STDOUT, provenance, write_json
@@ -111,18 +112,10 @@ def run(arguments: argparse.Namespace) -> int:
         return code or 1
     shown = talk if json_to_stdout else plain_console()
     shown.print(summary_table(result))
-    files = (
-        "trajectory.tum",
-        "map.ply",
-        "dense.ply",
-        "run.rrd",
-        "summary.json",
-        "settings.toml",
-        "demo.toml",
-    )
-    there = ", ".join(name for name in files if (settings.out / name).exists())
-    show_again = shlex.join(("rerun", str(settings.out / "run.rrd")))
-    again = f"; look again with: {show_again}" if (settings.out / "run.rrd").exists() else ""
+    there = ", ".join(name for name in RUN_FILES if (settings.out / name).is_file())
+    shown_file = settings.out / VIEWER_NAME
+    show_again = shlex.join(("rerun", str(shown_file)))
+    again = f"; look again with: {show_again}" if shown_file.exists() else ""
     shown.print(f"in {settings.out}: {there}{again}", soft_wrap=True)
     # The demo's own settings in place of the server's, which name folders of this machine.
     report = {**result, **provenance("demo", settings)}

@@ -10,29 +10,11 @@ from rich.text import Text
 from semcast.commands.console import plain_console
 from semcast.commands.demo import summary_table, why_no_pose
 from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
-from semcast.common.run_folder import (
-    DENSE_NAME,
-    MAP_NAME,
-    RECONSTRUCTION_NAME,
-    SETTINGS_NAME,
-    SUMMARY_NAME,
-    TRAJECTORY_NAME,
-    VIEWER_NAME,
-)
+from semcast.common.run_folder import RUN_FILES
 from semcast.server.replay import ReplaySettings, replay
 
 #: A recording is replayed in order and at once; the seed is that of channel and estimation alike.
 _UNUSED = frozenset({"link.delay_ms", "link.jitter_ms", "reconstruction.seed"})
-#: Files of the output folder that are named at the end, where they are there.
-_FILES = (
-    TRAJECTORY_NAME,
-    MAP_NAME,
-    DENSE_NAME,
-    RECONSTRUCTION_NAME,
-    VIEWER_NAME,
-    SUMMARY_NAME,
-    SETTINGS_NAME,
-)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     code = run_until_stopped(work)
     plain_console().print(summary_table(summary))
     if settings.out is not None:
-        there = ", ".join(name for name in _FILES if (settings.out / name).is_file())
+        there = ", ".join(name for name in RUN_FILES if (settings.out / name).is_file())
         print(f"in {settings.out}: {there}")
     if not code and not summary.get("completeness"):
         talk.print(f"semcast replay: {why_no_pose(summary)}", soft_wrap=True)

@@ -11,7 +11,7 @@ from semcast.cli import main
 from semcast.commands.demo import summary_table
 from semcast.common.run_folder import VIEWER_NAME
 from semcast.server.export.formats import export_run
-from semcast.server.export.parts import count_parts, frame_parts, parts_line, select_part
+from semcast.server.export.parts import count_parts, parts_line, select_part
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 
@@ -50,12 +50,12 @@ def two_parts(data):
 
 def test_a_frame_is_in_the_part_of_its_keyframe_and_goes_along_when_parts_meet():
     world = world_of_two_parts()
-    assert frame_parts(world.arrays()) == {0: 0, 1: 0, 5: 1, 6: 1}
+    assert world.part_of_frames() == {0: 0, 1: 0, 5: 1, 6: 1}
     assert world.landmarks.submap.tolist() == [0, 0, 1, 1]
     world.transform_submap(1, 0, 2.0, np.eye(4))
-    assert frame_parts(world.arrays()) == {0: 0, 1: 0, 5: 0, 6: 0}
+    assert world.part_of_frames() == {0: 0, 1: 0, 5: 0, 6: 0}
     assert world.landmarks.submap.tolist() == [0, 0, 0, 0]
-    assert frame_parts(WorldMap().arrays()) == {}
+    assert WorldMap().part_of_frames() == {}
 
 
 def test_parts_are_counted_by_number_and_only_several_are_worth_a_line():

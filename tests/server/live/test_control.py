@@ -12,7 +12,8 @@ pytestmark = pytest.mark.xdist_group("real-time")
 DEADLINE_S = 60.0
 
 
-def test_control_requests_reset_and_save(tmp_path, air):
+def test_control_requests_reset_and_save(tmp_path, air, monkeypatch):
+    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
     running = air.serve(out=tmp_path)
     radio = air.agent(100)
     radio.stream(range(10))
@@ -61,3 +62,14 @@ def test_a_save_that_fails_in_a_folder_whose_name_is_no_text_is_answered(tmp_pat
     assert reply.error.startswith(f"outputs can't be written to {tmp_path}/out?: ")
     with pytest.raises(SemcastError, match="map.ply"):
         running.finish(stop=True)
+
+
+def test_a_server_at_its_end_does_not_say_that_it_did_what_it_was_asked_for(air):
+    running = air.serve()
+    radio = air.agent(100)
+    running.finish(stop=True)
+    for op in ("save", "reset"):
+        reply = radio.ask(op)
+        assert not reply.ok
+        assert reply.error == f"{op} can't be served: the server is at its end"
+    assert radio.ask("get").ok

@@ -10,7 +10,6 @@ from semcast.common.geometry import exp_so3, make_transform
 from semcast.common.sequence import open_sequence
 from semcast.common.trajectory_error import ate
 from semcast.server.export.outputs import trajectory_of
-from semcast.server.export.parts import frame_parts
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.camera_motion import CameraMotion
@@ -139,7 +138,7 @@ def test_a_road_is_driven_past_a_grabber_that_hangs(num_hung, parts):
         times_ns[k] = int(sequence.times_ns[k])
         reconstruction.process(DecodedFrame(k, times_ns[k], image))
     poses = reconstruction.final_trajectory()
-    submaps = set(frame_parts(reconstruction.snapshot()).values())
+    submaps = set(reconstruction.world.part_of_frames().values())
     reconstruction.close()
     assert len(submaps) == parts
     assert sorted(set(range(num)) - set(poses)) == list(hung)

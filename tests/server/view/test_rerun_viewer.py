@@ -27,7 +27,8 @@ pytest.importorskip("rerun")
 import rerun as rr
 
 from semcast.server.view.choice import check_viewer, open_viewer
-from semcast.server.view.feed import MAX_REFUSALS, ViewerFeed, check_view, resolve_view
+from semcast.server.view.feed import ViewerFeed, check_view, resolve_view
+from semcast.server.view.live_stream import MAX_REFUSALS
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
 from semcast.server.view.rerun_viewer import SERIES, blueprint
 

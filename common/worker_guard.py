@@ -1,0 +1,60 @@
+"""What the top of a worker thread does with an exception nobody expected: the thread goes on without it."""
+
+import logging
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+logger = logging.getLogger(__name__)
+
+#: Different exceptions that are logged of one worker; an endless stream of them must not fill the disk.
+MAX_LOGGED = 20
+
+
+class WorkerGuard:
+    """Goes around one round of a worker's loop, and around one at a time.
+
+    An exception ends the round and not the thread: it is logged with its traceback, once where it comes again
+    and again, and counted. Without that the thread would be dead, and who waits for it wait for ever.
+
+    Args:
+        what: What a round does, for the log: "sending the status".
+        on_failure: Is told in a line what failed, each time, and brings the worker into a state from which it
+            goes on.
+
+    Attributes:
+        num_failed: Rounds that failed.
+
+    Example:
+        >>> guard = WorkerGuard("dividing")
+        >>> for divisor in (1, 0, 2):
+        ...     with guard:
+        ...         print(2 // divisor)
+        2
+        1
+        >>> guard.num_failed
+        1
+    """
+
+    def __init__(self, what: str, on_failure: Callable[[str], None] | None = None) -> None:
+        self._what = what
+        self._on_failure = on_failure
+        self._logged: set[str] = set()
+        self.num_failed = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        if not isinstance(error, Exception):
+            return False
+        self.num_failed += 1
+        text = f"{self._what} failed: {str(error) or type(error).__name__}"
+        if text not in self._logged and len(self._logged) < MAX_LOGGED:
+            self._logged.add(text)
+            logger.error("%s", text, exc_info=error)
+        if self._on_failure is not None:
+            self._on_failure(text)
+        return True
