@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transform_from_yaml
 from semcast.common.errors import SourceError
-from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
+from semcast.common.geometry import (
+    T_opencv_opengl,
+    make_transform,
+    project_to_so3,
+    rotation_from_quat_wxyz,
+)
 from semcast.common.lens import check_pinhole, distortion_in
 from semcast.common.numbered_images import lines_of_images, numbers_in_names
 from semcast.common.trajectory import Trajectory, read_tum
@@ -32,7 +37,6 @@ _TRANSFORMS_NAMES = ("transforms.json", "transforms_test.json", "transforms_trai
 _CALIBRATION_NAMES = ("intrinsics.json", "intrinsics.yaml", "camera.yaml", "calibration.yaml", "sensor.yaml")
 #: Models that undistortion turns into a pinhole; nerfstudio's others are fisheyes and panoramas.
 _PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
-_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Calibration published with the TUM RGB-D benchmark (Sturm et al. 2012), which its folders don't hold.
 _TUM_CAMERAS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -446,7 +450,7 @@ def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
     for T in T_world_gl:
         T[:3, :3] = project_to_so3(T[:3, :3])
     times_ns = _nominal_times_ns(len(images), rate_hz)
-    truth = Trajectory(ns_to_seconds(times_ns), T_world_gl @ _OPENGL_TO_OPENCV)
+    truth = Trajectory(ns_to_seconds(times_ns), T_world_gl @ T_opencv_opengl)
 
     def camera(width: int, height: int) -> Intrinsics | None:
         try:

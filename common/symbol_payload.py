@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import EncodedImage
-from semcast.common.messages import PayloadFormat, SymbolFrame
+from semcast.common.messages import IQ_BYTES, PayloadFormat, SymbolFrame
 from semcast.common.phy.qam import (
     SHAPED_SPACING,
     indices_to_symbols,
@@ -36,7 +36,7 @@ def unpack_iq(payload: bytes, shape: tuple[int, int]) -> NDArray[np.complex64]:
     Raises:
         ValueError: The number of bytes doesn't fit the shape.
     """
-    expected = 4 * shape[0] * shape[1]
+    expected = IQ_BYTES * shape[0] * shape[1]
     if len(payload) != expected:
         raise ValueError(f"payload of {shape} samples must have {expected} bytes, got {len(payload)}")
     return np.frombuffer(payload, dtype="<f2").astype(np.float32).view(np.complex64).reshape(shape)

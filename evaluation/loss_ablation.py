@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semcast.common.image import psnr_of_mse
 from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
@@ -78,7 +79,7 @@ def grade(model: Transceiver, images: list[NDArray[np.uint8]], sharpness: float)
         label = confidence_label(x_hat, x, sharpness)
         step = (slice(None), slice(None), slice(1, None, _PIXEL_STEP), slice(1, None, _PIXEL_STEP))
         values = {
-            "psnr_db": -10.0 * float(torch.log10((x_hat - x).square().mean())),
+            "psnr_db": psnr_of_mse(float((x_hat - x).square().mean())),
             "descriptor": float(descriptor_loss(grey(x), grey(x_hat))),
             "corner_px": float(moved_px[corners].mean()),
             "ece": reliability(_flat(torch.sigmoid(logit[step])), _flat(label[step])).ece,

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 #: Name under which the original images are used as they are: the best any codec and link could do.
 CLEAN = "none"
-#: Fields of ``StreamSettings.link`` that have no meaning here: the SNR is a list, time does not pass.
+#: Fields of a ``link`` that have no meaning in evaluations: the SNR is a list, and nothing is delayed.
 UNUSED_LINK_FIELDS = frozenset({"link.snr_db", "link.delay_ms", "link.jitter_ms"})
 
 #: Decoded frames kept for further passes; beyond it frames are sent and decoded again.

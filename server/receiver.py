@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import ReceivedImage
 from semcast.common.errors import TransportError
-from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
+from semcast.common.keys import CAMERA_TIMEOUT_S, camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.levels import Levels
 from semcast.common.link_report import LinkReporter
 from semcast.common.mailbox import Mailbox
@@ -22,7 +22,7 @@ from semcast.common.metrics import Metrics
 from semcast.common.phy.equaliser import equalise
 from semcast.common.rate import belongs_to, slots_at
 from semcast.common.symbol_payload import lost_slots_of, slots_of
-from semcast.common.transport import Session
+from semcast.common.transport import FRAME_RING_CAPACITY, Session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.server.arrival import Arrivals
 from semcast.server.backlog import Backlog
@@ -34,8 +34,6 @@ Mode = Literal["live", "replay"]
 #: Frames under way at most in replay: enough to keep agent, channel, decoder and tracker busy at once.
 WINDOW = 6
 FLOW_INTERVAL_S = 0.2
-_RING_CAPACITY = 16
-_CAMERA_TIMEOUT_S = 0.5
 #: Between two questions for a camera: where nobody is there to answer, each comes back at once.
 _CAMERA_PAUSE_S = 0.05
 _KEPT_REPORTS = 256
@@ -127,9 +125,9 @@ class Receiver:
         self._flow = session.publisher(flow_key(agent_id), "newest")
         self._stopping = threading.Event()
         session.subscribe(camera_key(agent_id), "every", self._on_camera)
-        session.subscribe(channel_key(agent_id), "newest", self._on_report, _RING_CAPACITY)
+        session.subscribe(channel_key(agent_id), "newest", self._on_report, FRAME_RING_CAPACITY)
         session.watch_alive(agent_id, self._on_alive)
-        session.subscribe(rx_key(agent_id), "newest", self._on_symbols, _RING_CAPACITY)
+        session.subscribe(rx_key(agent_id), "newest", self._on_symbols, FRAME_RING_CAPACITY)
         self._thread: threading.Thread | None = None
         if mode == "replay":
             self._thread = threading.Thread(target=self._beat, name="semcast-flow", daemon=True)
@@ -372,7 +370,7 @@ class Receiver:
         if camera is not None:
             return camera
         try:
-            answer = self._session.request(camera_key(self._agent_id), b"", _CAMERA_TIMEOUT_S)
+            answer = self._session.request(camera_key(self._agent_id), b"", CAMERA_TIMEOUT_S)
         except TransportError:
             return None
         if answer is not None:

@@ -12,7 +12,7 @@ from typing import Any
 from semcast.common.codec import Codec, Modulation
 from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError
-from semcast.common.keys import camera_key, control_key, map_key
+from semcast.common.keys import CAMERA_TIMEOUT_S, camera_key, control_key, map_key
 from semcast.common.message_fields import sendable
 from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
 from semcast.common.metrics import Metrics
@@ -43,7 +43,6 @@ from semcast.server.view.choice import SuccessiveViews, check_viewer
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.1
-CAMERA_TIMEOUT_S = 0.5
 WARM_UP_SHAPE_HW = (256, 384)
 #: How long after a restart of the agent its former start's frames may still come: above any channel's delay.
 STRAGGLER_NS = 20_000_000_000

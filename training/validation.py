@@ -1,11 +1,10 @@
 """Quality on whole images that were not trained on."""
 
-import math
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from semcast.common.image import psnr_of_mse
 from semcast.common.nets.detail import allocation_for
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX
@@ -53,6 +52,6 @@ def validate(
                 x_hat, _ = model.receive(y_rx, plane, draw.is_qam, values)
                 rounded = (x_hat.float().clamp(0, 1) * 255).round() / 255
                 mse = float((rounded - x).square().mean())
-                psnr_db[f"psnr_{snr_db:g}db"].append(-10.0 * math.log10(max(mse, 1e-10)))
+                psnr_db[f"psnr_{snr_db:g}db"].append(psnr_of_mse(mse))
                 powers.append(2.0 * float(symbols.square().mean()))
     return {k: float(np.mean(v)) for k, v in psnr_db.items()} | {"power": float(np.mean(powers))}

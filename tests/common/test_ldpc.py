@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from semcast.common.conventional_transport import hash_words
 from semcast.common.phy import ldpc
+from semcast.common.phy.hashing import hash_words
 from semcast.common.phy.ldpc_graph import base_graph, lifting_set, plan_blocks
 from semcast.common.phy.qam import bits_to_indices, indices_to_symbols, soft_demap
 
