@@ -22,7 +22,6 @@ from semcast.common.codecs import load_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.link_report import LinkReporter
-from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence import open_sequence
@@ -209,14 +208,7 @@ def run_frames(
             yield LinkedFrame(frame_id, t_source_ns, original, None, None, None, stage_ms)
             continue
         since = time.perf_counter_ns()
-        equalised = equalise(
-            sent.slots_rx,
-            encoded.shape_hw,
-            encoded.modulation,
-            slot_lost=sent.slot_lost,
-            levels=encoded.levels,
-            allocation=encoded.allocation,
-        )
+        equalised = sent.equalise(encoded)
         stage_ms["equalise"] = _elapsed_ms(since)
         feedback_db = reporter.snr_db(equalised)
         since = time.perf_counter_ns()

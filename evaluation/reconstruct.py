@@ -12,6 +12,7 @@ from semcast.common.image import psnr_db
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import ate, match_times
 from semcast.evaluation.pipeline import LinkedFrame
+from semcast.server.decoder import tracker_frame
 from semcast.server.export.outputs import trajectory_of
 from semcast.server.export.parts import frame_parts
 from semcast.server.mapping.bundle import InlineBundle
@@ -79,14 +80,7 @@ def as_received(frame: LinkedFrame) -> DecodedFrame:
     decoded = frame.decoded
     if decoded is None:
         raise ValueError(f"frame {frame.frame_id} did not arrive")
-    return DecodedFrame(
-        frame_id=frame.frame_id,
-        t_source_ns=frame.t_source_ns,
-        image=decoded.image,
-        confidence=decoded.confidence,
-        keypoint_confidence=decoded.keypoint_confidence,
-        slot_snr_db=frame.row_snr_db,
-    )
+    return tracker_frame(decoded, frame.frame_id, frame.t_source_ns, frame.row_snr_db)
 
 
 def reconstruct(

@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 from semcast.common.codec import ReceivedImage
 from semcast.common.errors import TransportError
 from semcast.common.keys import CAMERA_TIMEOUT_S, camera_key, channel_key, flow_key, link_key, rx_key
-from semcast.common.levels import Levels
 from semcast.common.link_report import LinkReporter
 from semcast.common.mailbox import Mailbox
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
-from semcast.common.phy.equaliser import equalise
 from semcast.common.rate import belongs_to, slots_at
-from semcast.common.symbol_payload import lost_slots_of, slots_of
+from semcast.common.symbol_payload import equalise_frame
 from semcast.common.transport import FRAME_RING_CAPACITY, Session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.server.arrival import Arrivals
@@ -327,14 +325,7 @@ class Receiver:
             return None
         else:
             started_ns = time.perf_counter_ns()
-            equalised = equalise(
-                slots_of(message),
-                message.image_hw,
-                message.modulation,
-                slot_lost=lost_slots_of(message),
-                levels=Levels(*message.levels),
-                allocation=message.allocation,
-            )
+            equalised = equalise_frame(message)
             equalise_ms = (time.perf_counter_ns() - started_ns) * 1e-6
             received, snr_db = equalised.received, float(equalised.snr_db)
             self._metrics.observe("equalise", equalise_ms)

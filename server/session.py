@@ -36,6 +36,7 @@ from semcast.server.checkpoint import (
     load_checkpoint,
     mismatch,
 )
+from semcast.server.decoder import Arrival
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.export.outputs import EachFile, versions, write_json, write_ply
 from semcast.server.former_run import set_aside
@@ -62,27 +63,6 @@ Array = NDArray[np.float64]
 _RESULTS = (TRAJECTORY_NAME, MAP_NAME, DENSE_NAME, RECONSTRUCTION_NAME, SETTINGS_NAME, SUMMARY_NAME)
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
-
-
-@dataclass(frozen=True)
-class Arrival:
-    """What is known about a frame besides its image.
-
-    Attributes:
-        snr_set_db: What the channel node says it applies, None where it says nothing.
-        snr_estimated_db: What the receiver estimated.
-        t_arrival_ns: Server clock (``perf_counter_ns``) when the frame arrived.
-        t_decoded_ns: The same when it was decoded; it may have waited for the tracker since.
-        stage_ms: Stages before the tracker.
-        drops: Frames that did not get this far, by reason, up to now.
-    """
-
-    snr_set_db: float | None
-    snr_estimated_db: float | None
-    t_arrival_ns: int
-    t_decoded_ns: int
-    stage_ms: Mapping[str, float]
-    drops: Mapping[str, int]
 
 
 @dataclass(frozen=True)

@@ -133,6 +133,7 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
             ReplaySettings(file=recording, out=tmp_path / name, reference=SEQUENCE), None, seen.append
         )
         assert summary["completeness"] > 0.4
+        assert summary["stage_ms"]["equalise"]["p50"] > 0.0
     assert len(seen) == 2 * len(set(seen)) >= FRAMES
     first, second = ((tmp_path / name / "trajectory.tum").read_bytes() for name in ("a", "b"))
     assert first == second
@@ -144,7 +145,7 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
         out=tmp_path / "c",
         link=ChannelSettings(snr_db=15.0, frame_loss=0.4),
     )
-    replay(lossy)
+    assert replay(lossy)["stage_ms"]["equalise"]["p50"] > 0.0
     assert (tmp_path / "c" / "trajectory.tum").read_bytes() != first
     assert build_settings(ReplaySettings, read_toml(tmp_path / "c" / "settings.toml")) == lossy
 
