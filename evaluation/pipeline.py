@@ -23,6 +23,7 @@ from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.link_report import LinkReporter
 from semcast.common.phy.pilots import insert_pilots
+from semcast.common.playback import check_playback
 from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.sounding import told_at_first
@@ -73,14 +74,11 @@ class StreamSettings:
         low, high = SNR_RANGE_DB
         if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
             raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
-        for name, least in (("seed", 0), ("seeds", 1), ("start", 0), ("stride", 1)):
+        for name, least in (("seed", 0), ("seeds", 1), ("start", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
         check_threads(self.threads)
-        if self.max_frames is not None and self.max_frames < 1:
-            raise ValueError(f"max_frames must be at least 1, got {self.max_frames}")
-        if not 0.05 <= self.resize <= 1.0:
-            raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
+        check_playback(resize=self.resize, stride=self.stride, max_frames=self.max_frames)
 
     @property
     def all_seeds(self) -> range:

@@ -33,7 +33,7 @@ from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_streams import RecordedStream, choose_stream
 from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Session
-from semcast.server.settings import DenseWhen, ServerSettings, ViewSettings
+from semcast.server.settings import DenseWhen, ServerSettings, ViewSettings, check_save_images
 from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.choice import check_viewer, open_viewer
 
@@ -116,8 +116,7 @@ class ReplaySettings:
         check_threads(self.threads)
         replace(self.reconstruction, seed=self.seed)  # which has the narrower range of the two
         self.camera.check_has(self.reference)
-        if self.save_images != "none" and self.out is None:
-            raise ValueError(f"save_images needs out, got save_images={self.save_images!r} without a folder")
+        check_save_images(self.save_images, self.out)
         if not 0.0 <= self.start_s < math.inf:
             raise ValueError(f"start_s must be at least 0 and finite, got {self.start_s:g}")
         if self.end_s is not None and not self.end_s > self.start_s:

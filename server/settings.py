@@ -84,6 +84,16 @@ class ViewSettings:
             raise ValueError(f"jpeg_quality must be in [10, 100], got {self.jpeg_quality}")
 
 
+def check_save_images(save_images: str, out: Path | None) -> None:
+    """Check that images to be kept have a folder.
+
+    Raises:
+        ValueError: They have none.
+    """
+    if save_images != "none" and out is None:
+        raise ValueError(f"save_images needs out, got save_images={save_images!r} without a folder")
+
+
 @dataclass(frozen=True, kw_only=True)
 class ServerSettings:
     """The server process.
@@ -198,5 +208,4 @@ class ServerSettings:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}")
-        if self.save_images != "none" and self.out is None:
-            raise ValueError(f"save_images needs out, got save_images={self.save_images!r} without a folder")
+        check_save_images(self.save_images, self.out)
