@@ -11,7 +11,7 @@ from pathlib import Path
 
 from semcast.common.errors import SourceError
 from semcast.common.former_file import keep_former
-from semcast.common.recording import FLUSH_INTERVAL_S, RecordingWriter
+from semcast.common.recording_writer import FLUSH_INTERVAL_S, RecordingWriter
 
 logger = logging.getLogger(__name__)
 

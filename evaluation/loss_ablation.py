@@ -23,7 +23,7 @@ from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
 from semcast.evaluation.calibration import reliability
 from semcast.evaluation.report import check_outputs, json_ready, machine_kind, source_commit, write_json
 from semcast.evaluation.statistics import spearman
-from semcast.training.channel import ChannelSettings, draw_links, through_link
+from semcast.training.channel import LinkDrawSettings, draw_links, through_link
 from semcast.training.data import read_images
 from semcast.training.descriptors import descriptor_loss
 from semcast.training.displacement import grey, lucas_kanade_step
@@ -61,7 +61,7 @@ def grade(model: Transceiver, images: list[NDArray[np.uint8]], sharpness: float)
         expected and true displacement.
     """
     generator = torch.Generator().manual_seed(7)
-    channel = ChannelSettings(snr_min_db=_SNR_DB, snr_max_db=_SNR_DB, share_16qam=1.0, share_faded=1.0)
+    channel = LinkDrawSettings(snr_min_db=_SNR_DB, snr_max_db=_SNR_DB, share_16qam=1.0, share_faded=1.0)
     rows: dict[str, list[float]] = {}
     for image in images:
         height, width = (side // BLOCK_PX * BLOCK_PX for side in image.shape[:2])

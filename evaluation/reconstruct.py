@@ -15,12 +15,12 @@ from semcast.evaluation.pipeline import LinkedFrame
 from semcast.server.decoder import tracker_frame
 from semcast.server.export.outputs import trajectory_of
 from semcast.server.export.parts import frame_parts
+from semcast.server.frame_rows import FrameRow, summarise
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
-from semcast.server.run_record import FrameRow, summarise
 from semcast.server.sent_frames import stretches
 
 #: Called after each processed frame; may add stages of its own to the row's ``stage_ms``.

@@ -20,7 +20,7 @@ from semcast.common.keys import (
 from semcast.common.messages import CameraInfo, StatusMessage
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
-from semcast.common.recording import recording_metadata
+from semcast.common.recording_writer import recording_metadata
 from semcast.common.transport import Session, open_session
 from semcast.common.whole_file import check_writable
 from semcast.common.wire import WireError, unpack

@@ -33,9 +33,10 @@ from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_streams import RecordedStream, choose_stream
 from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Session
-from semcast.server.settings import DenseWhen, ServerSettings, ViewSettings, check_save_images
+from semcast.server.settings import DenseWhen, ServerSettings, check_save_images
 from semcast.server.stream_identity import StreamIdentity
-from semcast.server.view.choice import check_viewer, open_viewer
+from semcast.server.view.settings import ViewSettings
+from semcast.server.viewing import check_viewer, open_viewer
 
 if TYPE_CHECKING:
     from semcast.server.view.feed import ViewerFeed

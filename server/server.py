@@ -39,7 +39,7 @@ from semcast.server.session import Outcome, Session, new_bundle
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_end import StreamEnd
 from semcast.server.stream_identity import StreamIdentity
-from semcast.server.view.choice import SuccessiveViews, check_viewer
+from semcast.server.viewing import SuccessiveViews, check_viewer
 
 logger = logging.getLogger(__name__)
 

@@ -40,6 +40,7 @@ from semcast.server.decoder import Arrival
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.export.outputs import EachFile, versions, write_json, write_ply
 from semcast.server.former_run import set_aside
+from semcast.server.frame_rows import FrameRow, FrameRows, run_line, summarise
 from semcast.server.frame_views import frame_view
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleRunner
@@ -47,7 +48,6 @@ from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.reference import Reference
-from semcast.server.run_record import FrameRow, RunRecord, run_line, summarise
 from semcast.server.run_results import Results, results_of, write_results
 from semcast.server.sent_frames import stretches
 from semcast.server.session_cloud import SessionCloud
@@ -119,7 +119,7 @@ class Session:
         self._last_checkpoint_s = time.monotonic()
         self._checkpoints: CheckpointWriter | None = None
         self._images: ImageWriter | None = None
-        self._record = RunRecord(None)
+        self._record = FrameRows(None)
         self.resumed = False
         if folder is not None:
             try:
@@ -140,7 +140,7 @@ class Session:
         self.resumed = settings.resume and self._restore(folder / CHECKPOINT_NAME)
         if not self.resumed:
             set_aside(folder)
-        self._record = RunRecord(folder, resume=self.resumed)
+        self._record = FrameRows(folder, resume=self.resumed)
         self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME)
         if settings.save_images != "none":
             self._images = ImageWriter(folder, lossless=settings.mode == "replay")

@@ -20,10 +20,10 @@ from semcast.common.errors import ConfigError
 from semcast.common.trajectory import Trajectory
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.mapping.state import MapUpdate
-from semcast.server.settings import ViewSettings
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary, window_display
 from semcast.server.view.rerun_viewer import Delivery, RerunStream
 from semcast.server.view.scene import Cursor, FrameView, Scene, compress_picture
+from semcast.server.view.settings import ViewSettings
 
 logger = logging.getLogger(__name__)
 

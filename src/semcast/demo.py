@@ -36,8 +36,9 @@ from semcast.real_time import plan_for
 from semcast.role import Role
 from semcast.server.former_run import check_not_foreign, discard, output_folder
 from semcast.server.mapping.settings import ReconstructionSettings
-from semcast.server.settings import DenseWhen, ServerSettings, ViewSettings
-from semcast.server.view.choice import check_viewer
+from semcast.server.settings import DenseWhen, ServerSettings
+from semcast.server.view.settings import ViewChoice, ViewSettings
+from semcast.server.viewing import check_viewer
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
 START_DEADLINE_S = 60.0
@@ -72,7 +73,7 @@ class DemoSettings:
     confidence: Literal["robust", "paper", "off"] = field(
         default="robust", metadata={"help": "how the geometry uses confidence"}
     )
-    view: Literal["auto", "native", "web", "file", "none"] = field(
+    view: ViewChoice = field(
         default="auto", metadata={"help": "viewer: a window, the browser, only run.rrd, or none"}
     )
     viewer_port: int = field(

@@ -11,18 +11,18 @@ from mcap.reader import make_reader
 
 from semcast import SourceError
 from semcast.common.recorder import Recorder
-from semcast.common.recording import (
-    RecordingWriter,
-    recording_metadata,
-    recover_file,
-    recover_stream,
-)
 from semcast.common.recording_reader import (
     RecordedMessage,
     RecordedMetadata,
     RecordingReader,
     RecordingScan,
     scan_info,
+)
+from semcast.common.recording_writer import (
+    RecordingWriter,
+    recording_metadata,
+    recover_file,
+    recover_stream,
 )
 
 HEADER = recording_metadata('codec = "3dcsc"\n', "9.9")

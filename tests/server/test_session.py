@@ -15,11 +15,11 @@ from semcast.common.config import build_settings, read_toml
 from semcast.common.run_folder import FRAMES_NAME, read_image_paths, read_run
 from semcast.common.sequence import open_sequence, read_image
 from semcast.server.decoder import Arrival
+from semcast.server.frame_rows import read_rows
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.reference import Reference
 from semcast.server.replay import ReplaySettings
-from semcast.server.run_record import read_rows
 from semcast.server.session import Session
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity

@@ -25,7 +25,8 @@ from semcast.common.transport import open_client, open_hub
 from semcast.common.wire import pack, unpack
 from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server
-from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.settings import ServerSettings
+from semcast.server.view.settings import ViewSettings
 
 pytestmark = pytest.mark.xdist_group("real-time")
 
