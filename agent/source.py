@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from semcast.agent.source_settings import SourceSettings
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
+from semcast.common.playback import usual_period_ns
 from semcast.common.sequence import Sequence, open_sequence
 from semcast.common.trajectory import Trajectory
 
@@ -207,11 +208,7 @@ class RecordedSource:
     @property
     def rate_hz(self) -> float:
         """Usual frames per second at this pace."""
-        return self._settings.paced_hz(1e9 / self._period_ns())
-
-    def _period_ns(self) -> float:
-        times_ns = self._sequence.times_ns
-        return float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 1e8
+        return self._settings.paced_hz(1e9 / usual_period_ns(self._sequence.times_ns))
 
     def groundtruth(self) -> Trajectory | None:
         """Return true poses of the first pass."""
@@ -228,7 +225,7 @@ class RecordedSource:
         times_ns = self._sequence.times_ns
         last = self._length - 1
         once, sent = self._settings.repeat == "once", 0
-        period_ns = round(self._period_ns())
+        period_ns = round(usual_period_ns(times_ns))
         frame_id, t_source_ns, previous, bad = -1, 0, -1, 0
         for count, index in enumerate(playback_order(self._length, self._settings.repeat)):
             if count <= last:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from semcast.common.camera_settings import CameraSettings
+from semcast.common.playback import check_playback
 from semcast.common.sequence_layouts import Layout
 
 Pace = Literal["recorded", "rate", "receiver"]
@@ -53,14 +54,9 @@ class SourceSettings:
     def __post_init__(self) -> None:
         if not self.source:
             raise ValueError("source must name a folder, a video, a camera or an address, got nothing")
-        if not 0.05 <= self.resize <= 1.0:
-            raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
-        if self.stride < 1:
-            raise ValueError(f"stride must be at least 1, got {self.stride}")
-        if self.max_frames is not None and self.max_frames < 1:
-            raise ValueError(f"max_frames must be at least 1, got {self.max_frames}")
-        if self.rate_hz is not None and not 0.01 <= self.rate_hz <= 1000.0:
-            raise ValueError(f"rate_hz must be in [0.01, 1000], got {self.rate_hz:g}")
+        check_playback(
+            resize=self.resize, stride=self.stride, max_frames=self.max_frames, rate_hz=self.rate_hz
+        )
         if self.pace == "rate" and self.rate_hz is None:
             raise ValueError("rate_hz must be given for pace 'rate', got None")
 

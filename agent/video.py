@@ -46,7 +46,16 @@ def public_name(source: str) -> str:
     return f"{scheme}://{shown}"
 
 
-def _open(source: str, live: bool) -> cv2.VideoCapture:
+def open_capture(source: str, *, live: bool) -> cv2.VideoCapture:
+    """Open a video file, or a camera by its number or address.
+
+    Args:
+        source: File, number or address.
+        live: It is a camera.
+
+    Raises:
+        SourceError: It can't be opened; a camera is waited for for five seconds.
+    """
     if not live:
         capture = cv2.VideoCapture(source)
     elif is_camera_number(source):
@@ -73,13 +82,19 @@ def _read(capture: cv2.VideoCapture) -> NDArray[np.uint8] | None:
     return as_rgb(image) if good and image is not None else None
 
 
+def _stated_hz(capture: cv2.VideoCapture, else_hz: float) -> float:
+    """Return the images a second that a file or camera says it has, where that can be."""
+    fps = float(capture.get(cv2.CAP_PROP_FPS))
+    return fps if 0.1 <= fps <= 1000.0 else else_hz
+
+
 class _Captured:
     """What video files and live cameras share: the capture, the camera model, the way to a frame."""
 
     def __init__(self, settings: SourceSettings, live: bool, beside: Path | None) -> None:
         self._settings = settings
         self._live = live
-        self._capture: cv2.VideoCapture | None = _open(settings.source, live)
+        self._capture: cv2.VideoCapture | None = open_capture(settings.source, live=live)
         name = public_name(settings.source)
         try:
             first = _read(self._capture)
@@ -154,8 +169,7 @@ class VideoSource(_Captured):
         )
         super().__init__(settings, live=False, beside=beside)
         assert self._capture is not None
-        fps = float(self._capture.get(cv2.CAP_PROP_FPS))
-        self._fps = fps if np.isfinite(fps) and 0.1 <= fps <= 1000 else settings.rate_hz or 30.0
+        self._fps = _stated_hz(self._capture, settings.rate_hz or 30.0)
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self._stored_frames = count if count > 0 else None
         self._is_cut = False
@@ -245,7 +259,7 @@ class VideoSource(_Captured):
             if self._settings.repeat != "loop" or self._capture is None or index == before:
                 return
             self._capture.release()
-            self._capture = _open(self._settings.source, live=False)
+            self._capture = open_capture(self._settings.source, live=False)
 
     def frames(self, stop: threading.Event) -> Iterator[SourceFrame]:
         """Yield frames when they are due. One is read ahead, to know which is the last."""
@@ -273,8 +287,7 @@ class LiveSource(_Captured):
         assert self._capture is not None
         # The driver's queue only makes frames older.
         self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
-        fps = float(self._capture.get(cv2.CAP_PROP_FPS))
-        self._fps = fps if np.isfinite(fps) and 0.1 <= fps <= 1000 else 30.0
+        self._fps = _stated_hz(self._capture, 30.0)
         self._trouble = ""  # why no image can be sent, as far as it was said
 
     @property
@@ -350,4 +363,4 @@ class LiveSource(_Captured):
         self.close()
         if not stop.wait(_REOPEN_AFTER_S):
             with contextlib.suppress(SourceError):
-                self._capture = _open(self._settings.source, live=True)
+                self._capture = open_capture(self._settings.source, live=True)

@@ -26,14 +26,13 @@ from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.status_beat import StatusBeat
 from semcast.common.symbol_payload import data_symbols, pack_iq, pack_lost
-from semcast.common.transport import Session, open_client, open_session
+from semcast.common.transport import FRAME_RING_CAPACITY, Session, open_client, open_session
 from semcast.common.wire import WireError, pack, unpack
 
 logger = logging.getLogger(__name__)
 
 ROLE = "channel"
 _POLL_S = 0.1
-_RING_CAPACITY = 16
 _REPLAY_CAPACITY = 64
 _JITTER_STREAM = 0x717
 
@@ -65,7 +64,7 @@ class Emulator:
         self._lossless = session.publisher(rx_key(agent_id), "every")
         self._reports = session.publisher(channel_key(agent_id), "newest")
         session.answer(control_key(agent_id, ROLE), self._on_request)
-        session.subscribe(tx_key(agent_id), "newest", self._on_symbols, _RING_CAPACITY)
+        session.subscribe(tx_key(agent_id), "newest", self._on_symbols, FRAME_RING_CAPACITY)
         # Last, as it has a thread that nobody would end if one of the others failed.
         jitter = np.random.default_rng((settings.seed, _JITTER_STREAM))
         self._delay = DelayLine(self._send, jitter, self._on_unsent)

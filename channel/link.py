@@ -35,6 +35,23 @@ class Transmission:
     snr_db_set: float
     truth: ChannelKnowledge
 
+    def equalise(self, encoded: EncodedImage, *, perfect_csi: bool = False) -> Equalised:
+        """Do what a receiver does: estimate the channel, MMSE.
+
+        Args:
+            encoded: What was sent; only what its header tells is used.
+            perfect_csi: Hand the true channel to the equaliser instead of the pilots' estimate.
+        """
+        return equalise(
+            self.slots_rx,
+            encoded.shape_hw,
+            encoded.modulation,
+            slot_lost=self.slot_lost,
+            knowledge=self.truth if perfect_csi else None,
+            levels=encoded.levels,
+            allocation=encoded.allocation,
+        )
+
 
 class Link:
     """A channel with its settings, which may change between frames.
@@ -137,23 +154,13 @@ class Link:
             encoded: What a codec made.
             t_s: See ``transmit``.
             frame_id: See ``transmit``.
-            perfect_csi: Hand the true channel to the equaliser instead of the pilots' estimate.
+            perfect_csi: See ``Transmission.equalise``.
 
         Returns:
             Symbols for the decoder and the receiver's own SNR estimate; None when the frame is lost.
         """
         sent = self.transmit(insert_pilots(encoded.symbols), t_s, frame_id)
-        if sent.frame_lost:
-            return None
-        return equalise(
-            sent.slots_rx,
-            encoded.shape_hw,
-            encoded.modulation,
-            slot_lost=sent.slot_lost,
-            knowledge=sent.truth if perfect_csi else None,
-            levels=encoded.levels,
-            allocation=encoded.allocation,
-        )
+        return None if sent.frame_lost else sent.equalise(encoded, perfect_csi=perfect_csi)
 
     def carry(
         self,

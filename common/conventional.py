@@ -29,7 +29,8 @@ from semcast.common.codec import (
     check_fixed_rate,
 )
 from semcast.common.conventional_source import ImageFormat, compress_to_fit, decompress
-from semcast.common.conventional_transport import Transport, hash_words
+from semcast.common.conventional_transport import Transport
+from semcast.common.phy.hashing import hash_words, hashed_qpsk
 from semcast.common.phy.qam import indices_to_symbols
 from semcast.common.phy.slots import SlotLayout, layout_for
 from semcast.common.shapes import check_shape
@@ -255,9 +256,7 @@ class ConventionalCodec:
     def _mode_words(self, layout: SlotLayout) -> NDArray[np.complex64]:
         """Return ``(num_modes, num_slots, header)`` pseudo-random QPSK words, one per mode."""
         shape = (len(self._modes), layout.num_slots, self._header_per_slot(layout))
-        quadrant = (hash_words(int(np.prod(shape)), _MODE_KEY) >> np.uint64(62)).astype(np.int8)
-        points = ((1 - 2 * (quadrant & 1)) + 1j * (1 - 2 * (quadrant >> 1))) / np.sqrt(2.0)
-        return np.asarray(points, dtype=np.complex64).reshape(shape)
+        return hashed_qpsk(hash_words(int(np.prod(shape)), _MODE_KEY)).reshape(shape)
 
     def _choose_mode(self, layout: SlotLayout, snr_db: float) -> int:
         """Return the fastest mode that works at the expected SNR and has room for a block at all."""

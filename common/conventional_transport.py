@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.phy import ldpc
+from semcast.common.phy.hashing import hash_words
 from semcast.common.phy.ldpc_graph import BlockPlan, plan_blocks
 from semcast.common.phy.qam import bits_to_indices, indices_to_symbols, soft_demap
 
@@ -19,14 +20,6 @@ _OVERHEAD_BYTES = 8
 _MIN_INFO_BITS = 8 * _OVERHEAD_BYTES
 #: LLRs beyond this carry no more information and would only slow the decoder's arithmetic down.
 _LLR_LIMIT = 40.0
-
-
-def hash_words(count: int, key: int) -> NDArray[np.uint64]:
-    """Return ``(count,)`` pseudo-random words both ends agree on (SplitMix64 in counter mode)."""
-    x = (np.arange(1, count + 1, dtype=np.uint64) + np.uint64(key << 40)) * np.uint64(0x9E3779B97F4A7C15)
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
 
 
 class Transport:

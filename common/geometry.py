@@ -8,6 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+#: OpenGL's camera axes (x right, y up, z backward) in ours (x right, y down, z forward); its own inverse.
+T_opencv_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
+
 
 def make_transform(R_a_b: ArrayLike, t_a_b: ArrayLike) -> Array:
     """Assemble a 4x4 rigid transform from a 3x3 rotation and a translation of length 3."""

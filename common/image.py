@@ -1,4 +1,4 @@
-"""Images as numpy arrays: the one measure both server and evaluation need."""
+"""Images as numpy arrays: the one measure that server, evaluation and training need."""
 
 import cv2
 import numpy as np
@@ -22,6 +22,14 @@ def psnr_db(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
     if a.shape != b.shape or a.size == 0:
         raise ValueError(f"images must have the same shape, got {a.shape} and {b.shape}")
     mse = float(cv2.norm(a, b, cv2.NORM_L2SQR)) / a.size
-    if mse == 0.0:
-        return 100.0
-    return min(100.0, float(10.0 * np.log10(255.0**2 / mse)))
+    return psnr_of_mse(mse, 255.0)
+
+
+def psnr_of_mse(mse: float, peak: float = 1.0) -> float:
+    """Return the PSNR in dB of a mean squared error, at most 100, so that means stay finite.
+
+    Args:
+        mse: Over all values; NaN comes through.
+        peak: Difference of white and black.
+    """
+    return 100.0 if mse == 0.0 else min(float(10.0 * np.log10(peak**2 / mse)), 100.0)

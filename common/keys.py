@@ -7,6 +7,8 @@ from semcast.common.messages import AGENT_ID_PATTERN, ROLES
 _ROOT = "semcast"
 
 DEFAULT_AGENT_ID = "agent0"
+#: An agent that is there says within this time, when asked on ``camera_key``, what its camera is.
+CAMERA_TIMEOUT_S = 0.5
 
 
 def check_agent_id(agent_id: str) -> str:

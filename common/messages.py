@@ -30,10 +30,12 @@ from semcast.common.message_fields import (
     rule,
 )
 from semcast.common.phy.allocation import Allocation
-from semcast.common.phy.slots import BLOCK_PX, SlotLayout, layout_for
+from semcast.common.phy.slots import BLOCK_PX, USES_PER_BLOCK, SlotLayout, layout_for
 
 PROTOCOL_VERSION = 1
 MAX_PAYLOAD_BYTES = 16 * 1024**2
+#: A sample as it travels: float16 I and Q.
+IQ_BYTES = 4
 MAX_SIDE_PX = 8192
 #: Five bits for each block of the largest image.
 _MAX_ALLOCATION_BYTES = 5 * (MAX_SIDE_PX // BLOCK_PX) ** 2 // 8
@@ -58,6 +60,11 @@ _SIZE = rule(Many(WholeNumber(1, MAX_SIDE_PX), count=2))
 _PIXELS = rule(Number(-1e5, 1e5))
 _FOCAL_PX = rule(Number(1e-3, 1e6))
 _DB = rule(Number(-100.0, 100.0))
+
+
+def received_bytes(layout: SlotLayout) -> int:
+    """Return the payload of a frame behind the channel: all samples of the grid, pilots included."""
+    return IQ_BYTES * layout.num_uses
 
 
 def _kind(name: str) -> Any:
@@ -174,7 +181,7 @@ class SymbolFrame:
     levels: tuple[int, ...] = field(default=(0, 255), metadata=rule(Many(WholeNumber(0, 255), at_most=4)))
     allocation: bytes = field(default=b"", metadata=rule(Bytes(_MAX_ALLOCATION_BYTES)))
     num_slots: int = field(metadata=rule(WholeNumber(1, MAX_SIDE_PX)))
-    uses_per_slot: int = field(metadata=rule(WholeNumber(1, 48 * MAX_SIDE_PX)))
+    uses_per_slot: int = field(metadata=rule(WholeNumber(1, USES_PER_BLOCK * MAX_SIDE_PX)))
     direction: Literal["tx", "rx"] = field(metadata=rule(Choice(("tx", "rx"))))
     payload_format: PayloadFormat = field(metadata=rule(Choice(PAYLOAD_FORMATS)))
     payload: bytes = field(metadata=rule(Bytes(MAX_PAYLOAD_BYTES)))
@@ -206,20 +213,20 @@ class SymbolFrame:
                 f"slots of a {self.image_hw} image must be {layout.num_slots}x{layout.uses_per_slot}, "
                 f"got {self.num_slots}x{self.uses_per_slot}",
             )
-        received_bytes = 4 * layout.num_uses
-        if received_bytes > MAX_PAYLOAD_BYTES:
+        num_bytes = received_bytes(layout)
+        if num_bytes > MAX_PAYLOAD_BYTES:
             # Small on its way to the channel, or lost, it would become large only where it is worked on.
             raise FieldError(
                 "range",
                 f"samples of a {self.image_hw} image must have at most {MAX_PAYLOAD_BYTES} bytes, "
-                f"got {received_bytes}",
+                f"got {num_bytes}",
             )
         if self.direction == "tx":
             symbols = layout.num_slots * layout.data_per_slot
             packed = (symbols + 1) // 2
-            sizes = {"qam16": packed, "qam16_shaped": packed, "iq16": 4 * symbols}
+            sizes = {"qam16": packed, "qam16_shaped": packed, "iq16": IQ_BYTES * symbols}
         else:
-            sizes = {"iq16": received_bytes, "lost": 0}
+            sizes = {"iq16": num_bytes, "lost": 0}
         if self.payload_format not in sizes:
             raise FieldError("range", f"payload_format {self.payload_format} is not for {self.direction}")
         if len(self.payload) != sizes[self.payload_format]:

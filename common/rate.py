@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import DecodedImage, confidence_from_displacement_px, displacement_px
 from semcast.common.errors import ConfigError
-from semcast.common.messages import MAX_PAYLOAD_BYTES, MAX_SIDE_PX
+from semcast.common.messages import MAX_PAYLOAD_BYTES, MAX_SIDE_PX, received_bytes
 from semcast.common.phy.slots import BLOCK_PX, USES_PER_BLOCK, layout_for
 
 Rate = Literal["1/48", "1/32", "1/24", "1/16", "1/12", "1/8"]
@@ -149,8 +149,8 @@ def _log_uses(rate: Rate) -> float:
 
 
 def _can_be_sent(coded_hw: tuple[int, int]) -> bool:
-    """Whether sides and received samples (float16 I and Q) are within the protocol's limits."""
-    return max(coded_hw) <= MAX_SIDE_PX and 4 * layout_for(coded_hw).num_uses <= MAX_PAYLOAD_BYTES
+    """Whether sides and received samples are within the protocol's limits."""
+    return max(coded_hw) <= MAX_SIDE_PX and received_bytes(layout_for(coded_hw)) <= MAX_PAYLOAD_BYTES
 
 
 def _capacity_bits(snr_db: float) -> float:

@@ -8,11 +8,10 @@ import time
 from collections import Counter, deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import BinaryIO
 
 from semcast.common.errors import SourceError
 from semcast.common.former_file import keep_former
-from semcast.common.recording import FLUSH_INTERVAL_S, RecordingWriter
+from semcast.common.recording_writer import FLUSH_INTERVAL_S, RecordingWriter
 
 logger = logging.getLogger(__name__)
 
@@ -33,20 +32,12 @@ class Recorder:
             and no folder made for it.
         header: See ``recording_metadata``.
         queue_bytes: Payload that may wait for the disk.
-        stream: Written instead of ``path``, for tests.
 
     Raises:
         SourceError: The file can't be opened.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        header: Mapping[str, str],
-        *,
-        queue_bytes: int = QUEUE_BYTES,
-        stream: BinaryIO | None = None,
-    ) -> None:
+    def __init__(self, path: Path, header: Mapping[str, str], *, queue_bytes: int = QUEUE_BYTES) -> None:
         self._path = path
         self._limit_bytes = queue_bytes
         self._queue: deque[tuple[str, str, int, int, bytes] | tuple[str, Mapping[str, str]]] = deque()
@@ -58,14 +49,11 @@ class Recorder:
         self.drops: Counter[str] = Counter()
         self.error: str | None = None
         self._former: Path | None = None
-        self._is_own = stream is None
         self._new_folders = [folder for folder in path.parents if not folder.exists()]
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if stream is None:
-                self._former = keep_former(path)
-                stream = path.open("wb")
-            self._stream = stream
+            self._former = keep_former(path)
+            self._stream = path.open("wb")
             self._writer = RecordingWriter(self._stream, header)
         except OSError as err:
             raise SourceError(f"{path} can't be written: {err}") from err
@@ -165,7 +153,7 @@ class Recorder:
 
     def _drop_empty(self) -> None:
         """Leave things as they were where nothing came: a start that fails must not move a good recording."""
-        if self._is_own and self.num_written == 0 and self.error is None:
+        if self.num_written == 0 and self.error is None:
             if self._path.is_file():  # not a device, such as /dev/null
                 self._path.unlink()
             if self._former is not None:

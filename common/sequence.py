@@ -15,6 +15,7 @@ from semcast.common.camera_settings import HOW_TO_GIVE, CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.geometry import interpolate_pose
 from semcast.common.image_file import bit_depth_of, read_image
+from semcast.common.playback import check_playback, usual_period_ns
 from semcast.common.sequence_layouts import Layout, SequenceFiles, ns_to_seconds, read_layout
 from semcast.common.sequence_sizes import size_in_header_wh, states_16_bits
 from semcast.common.trajectory import Trajectory
@@ -43,8 +44,7 @@ def resized_wh(width: int, height: int, factor: float) -> tuple[int, int]:
     Raises:
         ValueError: The factor is not in [0.05, 1].
     """
-    if not 0.05 <= factor <= 1.0:
-        raise ValueError(f"resize must be in [0.05, 1], got {factor:g}")
+    check_playback(resize=factor)
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
@@ -231,7 +231,7 @@ def _truth_of(files: SequenceFiles, times_ns: NDArray[np.int64]) -> Trajectory |
     """Return the true poses at some of a recording's frames; say so where it has some, but none at those."""
     if files.groundtruth is None:
         return None
-    truth = truth_at_frames(files.groundtruth, times_ns, _frame_period_s(files.times_ns))
+    truth = truth_at_frames(files.groundtruth, times_ns, usual_period_ns(files.times_ns) * 1e-9)
     if truth is None and len(files.groundtruth):
         true_s, own_s = files.groundtruth.t_s, ns_to_seconds(times_ns)
         logger.warning(
@@ -254,10 +254,6 @@ def open_truth(path: Path) -> tuple[Trajectory | None, NDArray[np.int64]]:
     """
     files = read_layout(path, "auto", 10.0)
     return _truth_of(files, files.times_ns), files.times_ns
-
-
-def _frame_period_s(times_ns: NDArray[np.int64]) -> float:
-    return float(np.median(np.diff(times_ns))) * 1e-9 if len(times_ns) > 1 else 0.1
 
 
 def truth_at_frames(truth: Trajectory, times_ns: NDArray[np.int64], period_s: float) -> Trajectory | None:
@@ -349,10 +345,7 @@ def open_sequence(
         SourceError: Something is missing, damaged or contradicts itself; the message says what.
         ValueError: An argument is out of range.
     """
-    if stride < 1:
-        raise ValueError(f"stride must be at least 1, got {stride}")
-    if max_frames is not None and max_frames < 1:
-        raise ValueError(f"max_frames must be at least 1, got {max_frames}")
+    check_playback(stride=stride, max_frames=max_frames)
     if not rate_hz > 0:
         raise ValueError(f"rate_hz must be positive, got {rate_hz:g}")
     files = read_layout(Path(path), layout, rate_hz)

@@ -1,4 +1,4 @@
-"""Channel symbols as the bytes of a ``SymbolFrame``, and back."""
+"""Channel symbols as the bytes of a ``SymbolFrame``, and back: for the channel, and for the decoder."""
 
 from collections.abc import Mapping
 
@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import EncodedImage
-from semcast.common.messages import PayloadFormat, SymbolFrame
+from semcast.common.levels import Levels
+from semcast.common.messages import IQ_BYTES, PayloadFormat, SymbolFrame
+from semcast.common.phy.equaliser import Equalised, equalise
 from semcast.common.phy.qam import (
     SHAPED_SPACING,
     indices_to_symbols,
@@ -36,7 +38,7 @@ def unpack_iq(payload: bytes, shape: tuple[int, int]) -> NDArray[np.complex64]:
     Raises:
         ValueError: The number of bytes doesn't fit the shape.
     """
-    expected = 4 * shape[0] * shape[1]
+    expected = IQ_BYTES * shape[0] * shape[1]
     if len(payload) != expected:
         raise ValueError(f"payload of {shape} samples must have {expected} bytes, got {len(payload)}")
     return np.frombuffer(payload, dtype="<f2").astype(np.float32).view(np.complex64).reshape(shape)
@@ -84,6 +86,21 @@ def data_symbols(frame: SymbolFrame) -> NDArray[np.complex64]:
     return symbols
 
 
+def encoded_image(frame: SymbolFrame) -> EncodedImage:
+    """Return what the codec made, of a ``tx`` frame.
+
+    Raises:
+        ValueError: See ``data_symbols``, or the levels are none.
+    """
+    return EncodedImage(
+        shape_hw=frame.image_hw,
+        symbols=data_symbols(frame),
+        modulation=frame.modulation,
+        levels=Levels(*frame.levels),
+        allocation=frame.allocation,
+    )
+
+
 def slots_of(frame: SymbolFrame) -> NDArray[np.complex64]:
     """Return the ``(num_slots, uses_per_slot)`` received samples of an ``rx`` frame, pilots first.
 
@@ -109,3 +126,19 @@ def lost_slots_of(frame: SymbolFrame) -> NDArray[np.bool_]:
     """Return the ``(num_slots,)`` slots of an ``rx`` frame of which nothing arrived."""
     bits = np.unpackbits(np.frombuffer(frame.slot_lost, dtype=np.uint8), count=frame.num_slots)
     return bits.astype(bool)
+
+
+def equalise_frame(frame: SymbolFrame) -> Equalised:
+    """Return what the codec decodes of an ``rx`` frame, and the receiver's estimate of the link.
+
+    Raises:
+        ValueError: It is no ``rx`` frame, or the levels are none.
+    """
+    return equalise(
+        slots_of(frame),
+        frame.image_hw,
+        frame.modulation,
+        slot_lost=lost_slots_of(frame),
+        levels=Levels(*frame.levels),
+        allocation=frame.allocation,
+    )

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
-from semcast.common.geometry import project_to_so3
+from semcast.common.geometry import T_opencv_opengl, project_to_so3
 from semcast.common.lens import check_pinhole, distortion_in
 
 #: Models that undistortion turns into a pinhole; nerfstudio's others are fisheyes and panoramas.
 _PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
-_OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 #: What frames may say each for themselves, and by how much of itself it may differ between them: programs
 #: that fit a camera per image differ by less where it is one, and a zoom moves the focal length by more.
 _CAMERA_OF_FRAME = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x")
@@ -70,7 +69,7 @@ def read_transforms_json(
         except (ValueError, TypeError, OverflowError) as err:
             raise SourceError(f"{path} holds no usable intrinsics: {err}") from err
 
-    return TransformsFile(images, T_world_gl @ _OPENGL_TO_OPENCV, camera)
+    return TransformsFile(images, T_world_gl @ T_opencv_opengl, camera)
 
 
 def _image(folder: Path, name: str, suffixes: tuple[str, ...]) -> Path:

@@ -34,6 +34,8 @@ Service = Literal["newest", "every"]
 #: A frozen or unreachable peer is noticed after this long.
 LEASE_MS = 2000
 RING_CAPACITY = 2
+#: The same where frames come in: more than a lossless stream ever has under way.
+FRAME_RING_CAPACITY = 16
 _FIFO_CAPACITY = 64
 _CONNECT_TRY_MS = 300
 #: Where something answers, the next try may take twice as long: meeting takes several round trips, and over
@@ -314,14 +316,6 @@ class Session:
             return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
         except zenoh.ZError as err:
             raise TransportError(f"asking who is alive failed: {err}") from err
-
-    @property
-    def connected(self) -> bool:
-        """Whether there is a link to the hub, or to anybody where this is the hub."""
-        try:
-            return bool(self._session.info.routers_zid() or self._session.info.peers_zid())
-        except zenoh.ZError:
-            return False
 
     def _add(self, pump: _Pump) -> None:
         with self._lock:

@@ -37,6 +37,7 @@ from semcast.common.sequence_layouts import IMAGE_SUFFIXES, images_in
 from semcast.evaluation.calibration import reliability
 from semcast.evaluation.image_quality import ms_ssim, ssim
 from semcast.evaluation.picture_strip import write_picture_strip
+from semcast.evaluation.pipeline import UNUSED_LINK_FIELDS
 from semcast.evaluation.plots import plot_against_snr
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.sounding import told_at_first
@@ -46,8 +47,7 @@ from semcast.evaluation.uncertainty_maps import block_means, pixel_label
 logger = logging.getLogger(__name__)
 
 VERB = "eval codec"
-#: Fields of ``CodecSettings.link`` that have no meaning here: the SNR is a list, nothing is delayed.
-UNUSED_LINK_FIELDS = frozenset({"link.snr_db", "link.delay_ms", "link.jitter_ms"})
+UNUSED_FIELDS = UNUSED_LINK_FIELDS
 #: Sensitivity of the pixel label that confidence is trained on.
 LABEL_ALPHA = 30.0
 #: What a receiver shows when a whole frame is lost.

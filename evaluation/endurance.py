@@ -16,6 +16,7 @@ import numpy as np
 
 from semcast.common.codec import Codec
 from semcast.common.errors import ConfigError
+from semcast.common.playback import usual_period_ns
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
 from semcast.evaluation.pipeline import (
@@ -112,7 +113,7 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
         raise ConfigError(f"no frame was received at snr_db {settings.snr_db[0]:g}: there is nothing to run")
     if len(frames) < 3:
         raise ConfigError(f"max_frames must leave at least 3 frames that arrive, got {len(frames)}")
-    interval_ns = int(np.median(np.diff([f.t_source_ns for f in frames])))
+    interval_ns = int(usual_period_ns(np.array([f.t_source_ns for f in frames])))
     truth = sequence.groundtruth()
     rows: list[dict[str, Any]] = []
     times_ms: list[float] = []

@@ -21,13 +21,13 @@ from semcast.evaluation.pipeline import (
 )
 from semcast.evaluation.reconstruct import reconstruct
 from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.server.frame_rows import FrameRow
 from semcast.server.frame_views import frame_view
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
-from semcast.server.run_record import FrameRow
-from semcast.server.settings import ViewSettings
 from semcast.server.view.rerun_viewer import RerunStream
 from semcast.server.view.scene import Cursor, Scene, compress_picture
+from semcast.server.view.settings import ViewSettings
 
 VERB = "eval latency"
 #: Flags that have no meaning here: one run, whose seed is also that of the search.

@@ -16,13 +16,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from semcast.common.image import psnr_of_mse
 from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
 from semcast.evaluation.calibration import reliability
 from semcast.evaluation.report import check_outputs, json_ready, machine_kind, source_commit, write_json
 from semcast.evaluation.statistics import spearman
-from semcast.training.channel import ChannelSettings, draw_links, through_link
+from semcast.training.channel import LinkDrawSettings, draw_links, through_link
 from semcast.training.data import read_images
 from semcast.training.descriptors import descriptor_loss
 from semcast.training.displacement import grey, lucas_kanade_step
@@ -60,7 +61,7 @@ def grade(model: Transceiver, images: list[NDArray[np.uint8]], sharpness: float)
         expected and true displacement.
     """
     generator = torch.Generator().manual_seed(7)
-    channel = ChannelSettings(snr_min_db=_SNR_DB, snr_max_db=_SNR_DB, share_16qam=1.0, share_faded=1.0)
+    channel = LinkDrawSettings(snr_min_db=_SNR_DB, snr_max_db=_SNR_DB, share_16qam=1.0, share_faded=1.0)
     rows: dict[str, list[float]] = {}
     for image in images:
         height, width = (side // BLOCK_PX * BLOCK_PX for side in image.shape[:2])
@@ -78,7 +79,7 @@ def grade(model: Transceiver, images: list[NDArray[np.uint8]], sharpness: float)
         label = confidence_label(x_hat, x, sharpness)
         step = (slice(None), slice(None), slice(1, None, _PIXEL_STEP), slice(1, None, _PIXEL_STEP))
         values = {
-            "psnr_db": -10.0 * float(torch.log10((x_hat - x).square().mean())),
+            "psnr_db": psnr_of_mse(float((x_hat - x).square().mean())),
             "descriptor": float(descriptor_loss(grey(x), grey(x_hat))),
             "corner_px": float(moved_px[corners].mean()),
             "ece": reliability(_flat(torch.sigmoid(logit[step])), _flat(label[step])).ece,

@@ -17,6 +17,7 @@ from semcast.agent.source_settings import SourceSettings
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SemcastError, SourceError
+from semcast.common.playback import usual_period_ns
 from semcast.common.sequence import resized
 from semcast.common.sequence_layouts import Layout
 from semcast.evaluation.statistics import small_sample_factor
@@ -113,7 +114,7 @@ def load_images(settings: ImagesSettings) -> Images:
         source.close()
     if len(frames) <= MIN_FRAMES:
         raise SourceError(f"{source.name} must have more than {MIN_FRAMES} images, got {len(frames)}")
-    period_ms = float(np.median(np.diff([frame.t_source_ns for frame in frames]))) * 1e-6
+    period_ms = usual_period_ns(np.array([frame.t_source_ns for frame in frames])) * 1e-6
     return Images(source.name, frames, camera, stored, period_ms)
 
 

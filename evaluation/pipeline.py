@@ -22,8 +22,8 @@ from semcast.common.codecs import load_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.link_report import LinkReporter
-from semcast.common.phy.equaliser import equalise
 from semcast.common.phy.pilots import insert_pilots
+from semcast.common.playback import check_playback
 from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.sounding import told_at_first
@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 #: Name under which the original images are used as they are: the best any codec and link could do.
 CLEAN = "none"
-#: Fields of ``StreamSettings.link`` that have no meaning here: the SNR is a list, time does not pass.
+#: Fields of a ``link`` that have no meaning in evaluations: the SNR is a list, and nothing is delayed.
 UNUSED_LINK_FIELDS = frozenset({"link.snr_db", "link.delay_ms", "link.jitter_ms"})
 
 #: Decoded frames kept for further passes; beyond it frames are sent and decoded again.
@@ -74,14 +74,11 @@ class StreamSettings:
         low, high = SNR_RANGE_DB
         if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
             raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
-        for name, least in (("seed", 0), ("seeds", 1), ("start", 0), ("stride", 1)):
+        for name, least in (("seed", 0), ("seeds", 1), ("start", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
         check_threads(self.threads)
-        if self.max_frames is not None and self.max_frames < 1:
-            raise ValueError(f"max_frames must be at least 1, got {self.max_frames}")
-        if not 0.05 <= self.resize <= 1.0:
-            raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
+        check_playback(resize=self.resize, stride=self.stride, max_frames=self.max_frames)
 
     @property
     def all_seeds(self) -> range:
@@ -209,14 +206,7 @@ def run_frames(
             yield LinkedFrame(frame_id, t_source_ns, original, None, None, None, stage_ms)
             continue
         since = time.perf_counter_ns()
-        equalised = equalise(
-            sent.slots_rx,
-            encoded.shape_hw,
-            encoded.modulation,
-            slot_lost=sent.slot_lost,
-            levels=encoded.levels,
-            allocation=encoded.allocation,
-        )
+        equalised = sent.equalise(encoded)
         stage_ms["equalise"] = _elapsed_ms(since)
         feedback_db = reporter.snr_db(equalised)
         since = time.perf_counter_ns()

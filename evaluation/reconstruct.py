@@ -12,13 +12,14 @@ from semcast.common.image import psnr_db
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import ate, match_times
 from semcast.evaluation.pipeline import LinkedFrame
+from semcast.server.decoder import tracker_frame
 from semcast.server.export.outputs import trajectory_of
+from semcast.server.frame_rows import FrameRow, summarise
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
-from semcast.server.run_record import FrameRow, summarise
 from semcast.server.sent_frames import stretches
 
 #: Called after each processed frame; may add stages of its own to the row's ``stage_ms``.
@@ -78,14 +79,7 @@ def as_received(frame: LinkedFrame) -> DecodedFrame:
     decoded = frame.decoded
     if decoded is None:
         raise ValueError(f"frame {frame.frame_id} did not arrive")
-    return DecodedFrame(
-        frame_id=frame.frame_id,
-        t_source_ns=frame.t_source_ns,
-        image=decoded.image,
-        confidence=decoded.confidence,
-        keypoint_confidence=decoded.keypoint_confidence,
-        slot_snr_db=frame.row_snr_db,
-    )
+    return tracker_frame(decoded, frame.frame_id, frame.t_source_ns, frame.row_snr_db)
 
 
 def reconstruct(

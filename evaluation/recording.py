@@ -12,8 +12,8 @@ import numpy as np
 from semcast import __version__
 from semcast.common.errors import SourceError
 from semcast.common.recorder import Recorder
-from semcast.common.recording import recording_metadata
 from semcast.common.recording_reader import RecordedMessage, RecordingReader
+from semcast.common.recording_writer import recording_metadata
 from semcast.evaluation.report import json_ready, provenance, write_json
 
 VERB = "eval recording"

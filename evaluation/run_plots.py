@@ -15,7 +15,7 @@ from semcast.common.run_summary import read_summary
 from semcast.common.trajectory import Trajectory, read_tum
 from semcast.common.trajectory_error import AteResult, ate, match_times
 from semcast.evaluation.plots import new_grid, save_figure
-from semcast.server.run_record import FrameRow, read_rows
+from semcast.server.frame_rows import FrameRow, read_rows
 from semcast.server.sent_frames import stretches
 
 logger = logging.getLogger(__name__)

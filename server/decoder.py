@@ -3,14 +3,16 @@
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from semcast.common.codec import LOST_SLOT_SNR_DB, Codec, Modulation, ReceivedImage
-from semcast.common.codecs import load_codec, named_weights
+from semcast.common.codec import LOST_SLOT_SNR_DB, Codec, DecodedImage, Modulation, ReceivedImage
+from semcast.common.codecs import load_codec
 from semcast.common.errors import CheckpointError, ProtocolError
 from semcast.common.phy.slots import layout_for
 from semcast.common.rate import from_coded
@@ -23,27 +25,52 @@ CodecLoader = Callable[[str, Modulation], Codec]
 
 
 def codec_loader(
-    codec: str | None, num_threads: int, device: Literal["auto", "cpu", "cuda"]
-) -> tuple[str | None, CodecLoader]:
-    """Return the name of the codec that comes first and what loads it and any other.
+    num_threads: int,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    weights: Path | None = None,
+    only_of: str | None = None,
+) -> CodecLoader:
+    """Return what loads codecs by name and modulation.
 
     Args:
-        codec: Name or file of weights, which then take the place of the shipped ones; None names none.
         num_threads: CPU threads of a codec.
         device: Of a learned one.
-
-    Raises:
-        CheckpointError: The weights are missing or damaged.
+        weights: Taken in place of the shipped ones.
+        only_of: The codec they are for; others have the shipped ones. None: for any that is asked for, which
+            must be theirs.
     """
-    first, own = (None, None) if codec is None else named_weights(codec)
 
     def load(name: str, modulation: Modulation) -> Codec:
-        weights = own if name == first else None
         return load_codec(
-            name, modulation=modulation, num_threads=num_threads, device=device, weights=weights
+            name,
+            modulation=modulation,
+            num_threads=num_threads,
+            device=device,
+            weights=weights if only_of in (None, name) else None,
         )
 
-    return first, load
+    return load
+
+
+def tracker_frame(
+    decoded: DecodedImage, frame_id: int, t_source_ns: int, slot_snr_db: NDArray[np.float32] | None
+) -> DecodedFrame:
+    """Return a decoded image as the tracker takes it.
+
+    Args:
+        decoded: At the size of the camera's images.
+        frame_id: Of the frame.
+        t_source_ns: Its recorded time.
+        slot_snr_db: ``(num_slots,)`` SNR of each band of the camera's images, or None.
+    """
+    return DecodedFrame(
+        frame_id=frame_id,
+        t_source_ns=t_source_ns,
+        image=decoded.image,
+        confidence=decoded.confidence,
+        keypoint_confidence=decoded.keypoint_confidence,
+        slot_snr_db=slot_snr_db,
+    )
 
 
 @dataclass(frozen=True)
@@ -61,6 +88,40 @@ class DecodedArrival:
     frame: DecodedFrame | None
     decode_ms: float
     t_decoded_ns: int
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """What is known about a frame besides its image.
+
+    Attributes:
+        snr_set_db: What the channel node says it applies, None where it says nothing.
+        snr_estimated_db: What the receiver estimated.
+        t_arrival_ns: Server clock (``perf_counter_ns``) when the frame arrived.
+        t_decoded_ns: The same when it was decoded; it may have waited for the tracker since.
+        stage_ms: Stages before the tracker.
+        drops: Frames that did not get this far, by reason, up to now.
+    """
+
+    snr_set_db: float | None
+    snr_estimated_db: float | None
+    t_arrival_ns: int
+    t_decoded_ns: int
+    stage_ms: Mapping[str, float]
+    drops: Mapping[str, int]
+
+    @classmethod
+    def of(cls, decoded: DecodedArrival, drops: Mapping[str, int]) -> "Arrival":
+        """Return what receiver and decoder say of a frame."""
+        arrival = decoded.arrival
+        return cls(
+            snr_set_db=arrival.snr_db_set,
+            snr_estimated_db=arrival.snr_db,
+            t_arrival_ns=arrival.t_arrival_ns,
+            t_decoded_ns=decoded.t_decoded_ns,
+            stage_ms={"equalise": arrival.equalise_ms, "decode": decoded.decode_ms},
+            drops=drops,
+        )
 
 
 class FrameDecoder:
@@ -146,12 +207,5 @@ class FrameDecoder:
         decode_ms = (t_decoded_ns - started_ns) * 1e-6
         if decoded.outage:
             return DecodedArrival(arrival, None, decode_ms, t_decoded_ns)
-        frame = DecodedFrame(
-            frame_id=message.frame_id,
-            t_source_ns=message.t_source_ns,
-            image=decoded.image,
-            confidence=decoded.confidence,
-            keypoint_confidence=decoded.keypoint_confidence,
-            slot_snr_db=arrival.slot_snr_db,
-        )
+        frame = tracker_frame(decoded, message.frame_id, message.t_source_ns, arrival.slot_snr_db)
         return DecodedArrival(arrival, frame, decode_ms, t_decoded_ns)

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from semcast.server.decoder import DecodedArrival
+from semcast.server.frame_rows import FrameRow
 from semcast.server.mapping.state import DecodedFrame, FrameResult
-from semcast.server.run_record import FrameRow
 from semcast.server.view.scene import MISSING, FrameView
 
 #: Stages in the viewer's plot; all of them are in ``frames.jsonl`` and the summary.

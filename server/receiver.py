@@ -13,16 +13,14 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import ReceivedImage
 from semcast.common.errors import TransportError
-from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
-from semcast.common.levels import Levels
+from semcast.common.keys import CAMERA_TIMEOUT_S, camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.link_report import LinkReporter
 from semcast.common.mailbox import Mailbox
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
-from semcast.common.phy.equaliser import equalise
 from semcast.common.rate import belongs_to, slots_at
-from semcast.common.symbol_payload import lost_slots_of, slots_of
-from semcast.common.transport import Session
+from semcast.common.symbol_payload import equalise_frame
+from semcast.common.transport import FRAME_RING_CAPACITY, Session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.common.worker_guard import WorkerGuard
 from semcast.server.arrival import Arrivals
@@ -35,8 +33,6 @@ Mode = Literal["live", "replay"]
 #: Frames under way at most in replay: enough to keep agent, channel, decoder and tracker busy at once.
 WINDOW = 6
 FLOW_INTERVAL_S = 0.2
-_RING_CAPACITY = 16
-_CAMERA_TIMEOUT_S = 0.5
 #: Between two questions for a camera: where nobody is there to answer, each comes back at once.
 _CAMERA_PAUSE_S = 0.05
 _KEPT_REPORTS = 256
@@ -128,9 +124,9 @@ class Receiver:
         self._flow = session.publisher(flow_key(agent_id), "newest")
         self._stopping = threading.Event()
         session.subscribe(camera_key(agent_id), "every", self._on_camera)
-        session.subscribe(channel_key(agent_id), "newest", self._on_report, _RING_CAPACITY)
+        session.subscribe(channel_key(agent_id), "newest", self._on_report, FRAME_RING_CAPACITY)
         session.watch_alive(agent_id, self._on_alive)
-        session.subscribe(rx_key(agent_id), "newest", self._on_symbols, _RING_CAPACITY)
+        session.subscribe(rx_key(agent_id), "newest", self._on_symbols, FRAME_RING_CAPACITY)
         self._thread: threading.Thread | None = None
         if mode == "replay":
             self._thread = threading.Thread(target=self._beat, name="semcast-flow", daemon=True)
@@ -332,14 +328,7 @@ class Receiver:
             return None
         else:
             started_ns = time.perf_counter_ns()
-            equalised = equalise(
-                slots_of(message),
-                message.image_hw,
-                message.modulation,
-                slot_lost=lost_slots_of(message),
-                levels=Levels(*message.levels),
-                allocation=message.allocation,
-            )
+            equalised = equalise_frame(message)
             equalise_ms = (time.perf_counter_ns() - started_ns) * 1e-6
             received, snr_db = equalised.received, float(equalised.snr_db)
             self._metrics.observe("equalise", equalise_ms)
@@ -375,7 +364,7 @@ class Receiver:
         if camera is not None:
             return camera
         try:
-            answer = self._session.request(camera_key(self._agent_id), b"", _CAMERA_TIMEOUT_S)
+            answer = self._session.request(camera_key(self._agent_id), b"", CAMERA_TIMEOUT_S)
         except TransportError:
             return None
         if answer is not None:

@@ -9,16 +9,22 @@ from typing import Any
 
 from semcast import SourceError, TransportError, __version__
 from semcast.common.config import to_toml
-from semcast.common.keys import DEFAULT_AGENT_ID, agent_of, all_keys, camera_key, check_agent_id
+from semcast.common.keys import (
+    CAMERA_TIMEOUT_S,
+    DEFAULT_AGENT_ID,
+    agent_of,
+    all_keys,
+    camera_key,
+    check_agent_id,
+)
 from semcast.common.messages import CameraInfo, StatusMessage
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
-from semcast.common.recording import recording_metadata
+from semcast.common.recording_writer import recording_metadata
 from semcast.common.transport import Session, open_session
 from semcast.common.whole_file import check_writable
 from semcast.common.wire import WireError, unpack
 
-CAMERA_TIMEOUT_S = 0.5
 #: How often a recorder with nothing else to do looks whether it still records.
 _LOOK_INTERVAL_S = 0.5
 #: Name of the metadata record of a stream, followed by its epoch.

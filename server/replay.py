@@ -7,39 +7,36 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.codecs import load_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.keys import agent_of
-from semcast.common.levels import Levels
 from semcast.common.messages import SymbolFrame
-from semcast.common.phy.equaliser import equalise
+from semcast.common.phy.equaliser import Equalised
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.rate import belongs_to
 from semcast.common.recording_reader import RecordingReader
-from semcast.common.symbol_payload import data_symbols, lost_slots_of, slots_of
+from semcast.common.symbol_payload import encoded_image, equalise_frame
 from semcast.common.wire import WireError, unpack
 from semcast.server.conclusion import conclude
-from semcast.server.decoder import DecodedArrival, FrameDecoder
+from semcast.server.decoder import Arrival, FrameDecoder, codec_loader
 from semcast.server.former_run import output_folder
 from semcast.server.frame_views import missing_view
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_streams import RecordedStream, choose_stream
 from semcast.server.reference import recording_reference, sequence_reference
-from semcast.server.session import Arrival, Outcome, Session
-from semcast.server.settings import DenseWhen, ServerSettings, ViewSettings
+from semcast.server.session import Session
+from semcast.server.settings import DenseWhen, ServerSettings, check_save_images
 from semcast.server.stream_identity import StreamIdentity
-from semcast.server.view.choice import check_viewer, open_viewer
+from semcast.server.view.settings import ViewSettings
+from semcast.server.viewing import check_viewer, open_viewer
 
 if TYPE_CHECKING:
     from semcast.server.view.feed import ViewerFeed
@@ -120,8 +117,7 @@ class ReplaySettings:
         check_threads(self.threads)
         replace(self.reconstruction, seed=self.seed)  # which has the narrower range of the two
         self.camera.check_has(self.reference)
-        if self.save_images != "none" and self.out is None:
-            raise ValueError(f"save_images needs out, got save_images={self.save_images!r} without a folder")
+        check_save_images(self.save_images, self.out)
         if not 0.0 <= self.start_s < math.inf:
             raise ValueError(f"start_s must be at least 0 and finite, got {self.start_s:g}")
         if self.end_s is not None and not self.end_s > self.start_s:
@@ -189,11 +185,7 @@ def _replayed(
 ) -> dict[str, Any]:
     """Decode and reconstruct the frames of a stream; return the summary."""
     agent_id, camera = stream.agent_id, stream.camera
-    decoder = FrameDecoder(
-        lambda name, modulation: load_codec(
-            name, modulation=modulation, num_threads=settings.threads, weights=settings.weights
-        )
-    )
+    decoder = FrameDecoder(codec_loader(settings.threads, weights=settings.weights))
     # Before a former run is set aside.
     decoder.codec_for(camera.codec, camera.modulation, camera.digest)
     identity = StreamIdentity.of(agent_id, camera)
@@ -275,7 +267,7 @@ def _take(
             viewer.submit(missing_view(decoded, drops))
         return False
     try:
-        outcome = _process(session, decoded, drops)
+        outcome = session.process(decoded.frame, Arrival.of(decoded, drops))
     except Exception:  # as a live server would
         logger.exception("frame %d could not be tracked and is left out", message.frame_id)
         drops["track"] = drops.get("track", 0) + 1
@@ -283,22 +275,6 @@ def _take(
     if viewer is not None:
         viewer.submit(outcome.view, outcome.update, outcome.patches)
     return True
-
-
-def _process(session: Session, decoded: DecodedArrival, drops: dict[str, int]) -> Outcome:
-    assert decoded.frame is not None
-    arrival = decoded.arrival
-    return session.process(
-        decoded.frame,
-        Arrival(
-            snr_set_db=arrival.snr_db_set,
-            snr_estimated_db=arrival.snr_db,
-            t_arrival_ns=arrival.t_arrival_ns,
-            t_decoded_ns=decoded.t_decoded_ns,
-            stage_ms={"decode": decoded.decode_ms},
-            drops=drops,
-        ),
-    )
 
 
 def _none_in_part(reader: RecordingReader, stream: RecordedStream, settings: ReplaySettings) -> str:
@@ -351,28 +327,17 @@ def _arrivals(
     for t_s, frame in _frames(reader, stream, settings):
         if t_s < settings.start_s or (settings.end_s is not None and t_s > settings.end_s):
             continue
-        slots, lost, snr_db_set = _on_the_air(frame, link, t_s)
-        arrival = ReceivedFrame(
+        equalised, equalise_ms, snr_db_set = _on_the_air(frame, link, t_s)
+        yield ReceivedFrame(
             message=frame,
             camera=stream.camera,
-            received=None,
-            snr_db=None,
+            received=None if equalised is None else equalised.received,
+            snr_db=None if equalised is None else float(equalised.snr_db),
             snr_db_set=snr_db_set,
             t_arrival_ns=time.perf_counter_ns(),
             age_ms=0.0,
-            equalise_ms=0.0,
+            equalise_ms=equalise_ms,
         )
-        if slots is not None:
-            equalised = equalise(
-                slots,
-                frame.image_hw,
-                frame.modulation,
-                slot_lost=lost,
-                levels=Levels(*frame.levels),
-                allocation=frame.allocation,
-            )
-            arrival = replace(arrival, received=equalised.received, snr_db=float(equalised.snr_db))
-        yield arrival
 
 
 def _paced(arrivals: Iterator[ReceivedFrame], pace: float, stop: threading.Event) -> Iterator[ReceivedFrame]:
@@ -389,11 +354,17 @@ def _paced(arrivals: Iterator[ReceivedFrame], pace: float, stop: threading.Event
 
 def _on_the_air(
     frame: SymbolFrame, link: Link | None, t_s: float
-) -> tuple[NDArray[np.complex64] | None, NDArray[np.bool_] | None, float | None]:
-    """Return received slots, which of them are lost, and the SNR set; no slots when the frame is lost."""
+) -> tuple[Equalised | None, float, float | None]:
+    """Return a frame behind the equaliser, None when it is lost; how long that took, in ms; the SNR set."""
+    snr_db_set: float | None = None
     if link is None:
-        if frame.payload_format == "lost":
-            return None, None, None
-        return slots_of(frame), lost_slots_of(frame), None
-    sent = link.transmit(insert_pilots(data_symbols(frame)), t_s, frame.frame_id)
-    return (None if sent.frame_lost else sent.slots_rx), sent.slot_lost, sent.snr_db_set
+        lost, receive = frame.payload_format == "lost", partial(equalise_frame, frame)
+    else:
+        encoded = encoded_image(frame)
+        sent = link.transmit(insert_pilots(encoded.symbols), t_s, frame.frame_id)
+        lost, receive, snr_db_set = sent.frame_lost, partial(sent.equalise, encoded), sent.snr_db_set
+    if lost:
+        return None, 0.0, snr_db_set
+    started_ns = time.perf_counter_ns()
+    equalised = receive()
+    return equalised, (time.perf_counter_ns() - started_ns) * 1e-6, snr_db_set

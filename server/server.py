@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from semcast.common.codec import Codec, Modulation
+from semcast.common.codecs import named_weights
 from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError
-from semcast.common.keys import camera_key, control_key, map_key
+from semcast.common.keys import CAMERA_TIMEOUT_S, camera_key, control_key, map_key
 from semcast.common.message_fields import sendable
 from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
 from semcast.common.metrics import Metrics
@@ -23,7 +24,7 @@ from semcast.common.transport import open_session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.server.conclusion import conclude
 from semcast.server.decode_ahead import DecodeAhead
-from semcast.server.decoder import DecodedArrival, FrameDecoder, codec_loader
+from semcast.server.decoder import Arrival, DecodedArrival, FrameDecoder, codec_loader
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.former_run import free_folder, output_folder
 from semcast.server.frame_views import missing_view
@@ -34,16 +35,15 @@ from semcast.server.receiver import ReceivedFrame, Receiver
 from semcast.server.record import recording
 from semcast.server.reference import Reference, sequence_reference
 from semcast.server.requests import RequestDesk
-from semcast.server.session import Arrival, Outcome, Session, new_bundle
+from semcast.server.session import Outcome, Session, new_bundle
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_end import StreamEnd
 from semcast.server.stream_identity import StreamIdentity
-from semcast.server.view.choice import SuccessiveViews, check_viewer
+from semcast.server.viewing import SuccessiveViews, check_viewer
 
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.1
-CAMERA_TIMEOUT_S = 0.5
 WARM_UP_SHAPE_HW = (256, 384)
 #: How long after a restart of the agent its former start's frames may still come: above any channel's delay.
 STRAGGLER_NS = 20_000_000_000
@@ -75,7 +75,11 @@ class Server:
         self._settings = settings
         self._agent_id = settings.agent_id
         self._metrics = Metrics("server")
-        self._codec, installed = codec_loader(settings.codec, settings.threads, settings.device)
+        self._codec: str | None = None
+        own: Path | None = None
+        if settings.codec is not None:
+            self._codec, own = named_weights(settings.codec)
+        installed = codec_loader(settings.threads, settings.device, own, only_of=self._codec)
         self._decoder = FrameDecoder(load if load is not None else installed)
         self._session: Session | None = None
         self._views = SuccessiveViews(settings)
@@ -288,7 +292,7 @@ class Server:
         try:
             outcome = session.process(
                 decoded.frame,
-                self._arrival_of(decoded),
+                Arrival.of(decoded, self._metrics.drops),
                 lambda found: self._outbox.put_pose(decoded.arrival, found),
             )
         except Exception as err:
@@ -310,17 +314,6 @@ class Server:
             and session.last_frame_id < 0
             and arrival.message.agent_epoch in self._former_epochs
             and arrival.t_arrival_ns - self._begun_ns < STRAGGLER_NS
-        )
-
-    def _arrival_of(self, decoded: DecodedArrival) -> Arrival:
-        arrival = decoded.arrival
-        return Arrival(
-            snr_set_db=arrival.snr_db_set,
-            snr_estimated_db=arrival.snr_db,
-            t_arrival_ns=arrival.t_arrival_ns,
-            t_decoded_ns=decoded.t_decoded_ns,
-            stage_ms={"equalise": arrival.equalise_ms, "decode": decoded.decode_ms},
-            drops=self._metrics.drops,
         )
 
     def _spread(self, decoded: DecodedArrival, outcome: Outcome) -> None:

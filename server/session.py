@@ -33,9 +33,11 @@ from semcast.server.checkpoint import (
     load_checkpoint,
     mismatch,
 )
+from semcast.server.decoder import Arrival
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.export.outputs import EachFile, versions, write_json, write_ply
 from semcast.server.former_run import set_aside
+from semcast.server.frame_rows import FrameRow, FrameRows, run_line, summarise
 from semcast.server.frame_views import frame_view
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleRunner
@@ -43,7 +45,6 @@ from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.reference import Reference
-from semcast.server.run_record import FrameRow, RunRecord, run_line, summarise
 from semcast.server.run_results import Results, results_of, write_results
 from semcast.server.sent_frames import stretches
 from semcast.server.session_cloud import SessionCloud
@@ -57,27 +58,6 @@ Array = NDArray[np.float64]
 
 #: How long a live frame waits for its PSNR; in replay it waits until it is there.
 LIVE_PSNR_WAIT_S = 0.05
-
-
-@dataclass(frozen=True)
-class Arrival:
-    """What is known about a frame besides its image.
-
-    Attributes:
-        snr_set_db: What the channel node says it applies, None where it says nothing.
-        snr_estimated_db: What the receiver estimated.
-        t_arrival_ns: Server clock (``perf_counter_ns``) when the frame arrived.
-        t_decoded_ns: The same when it was decoded; it may have waited for the tracker since.
-        stage_ms: Stages before the tracker.
-        drops: Frames that did not get this far, by reason, up to now.
-    """
-
-    snr_set_db: float | None
-    snr_estimated_db: float | None
-    t_arrival_ns: int
-    t_decoded_ns: int
-    stage_ms: Mapping[str, float]
-    drops: Mapping[str, int]
 
 
 @dataclass(frozen=True)
@@ -134,7 +114,7 @@ class Session:
         self._last_checkpoint_s = time.monotonic()
         self._checkpoints: CheckpointWriter | None = None
         self._images: ImageWriter | None = None
-        self._record = RunRecord(None)
+        self._record = FrameRows(None)
         self.resumed = False
         if folder is not None:
             try:
@@ -155,7 +135,7 @@ class Session:
         self.resumed = settings.resume and self._restore(folder / CHECKPOINT_NAME)
         if not self.resumed:
             set_aside(folder)
-        self._record = RunRecord(folder, resume=self.resumed)
+        self._record = FrameRows(folder, resume=self.resumed)
         self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME)
         if settings.save_images != "none":
             self._images = ImageWriter(folder, lossless=settings.mode == "replay")

@@ -1,6 +1,5 @@
 """Settings of the server process."""
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -11,77 +10,22 @@ from semcast.common.cores import check_threads, usable_cores
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import HubSettings
 from semcast.server.mapping.settings import ReconstructionSettings
-
-#: Sizes the viewer understands.
-_MEMORY = re.compile(r"\d+(\.\d+)? ?(B|[kMGT]B|[KMGT]iB)|(100|\d{1,2}(\.\d+)?)%")
+from semcast.server.view.settings import ViewSettings
 
 #: When the depth of keyframes is estimated.
 DenseWhen = Literal["auto", "live", "end", "none"]
 #: With fewer cores the estimation of depth would keep frames waiting.
 _CORES_FOR_LIVE_DEPTH = 4
 
-View = Literal["auto", "native", "web", "file", "none"]
 
+def check_save_images(save_images: str, out: Path | None) -> None:
+    """Check that images to be kept have a folder.
 
-@dataclass(frozen=True, kw_only=True)
-class ViewSettings:
-    """What is shown where.
-
-    Attributes:
-        view: ``native`` opens a window, ``web`` serves a page on loopback, ``file`` only writes ``run.rrd``,
-            ``none`` shows nothing, ``auto`` is ``native`` where there is a display and ``file`` elsewhere.
-        port: Where the viewer takes the stream, on loopback.
-        web_port: Where the web page is, on loopback.
-        leave_open: Leave a native window open when the source has come to its end.
-        memory_limit: What a viewer may keep before it forgets the oldest data.
-        image_rate_hz: Images shown per second at most; poses and plots are always complete.
-        jpeg_quality: Quality of the images in the viewer and in ``run.rrd``.
+    Raises:
+        ValueError: They have none.
     """
-
-    view: View = field(
-        default="auto",
-        metadata={
-            "help": "viewer: auto (window if there is a display, else file), native, web, file or none"
-        },
-    )
-    port: int = field(
-        default=9876, metadata={"flag": "viewer_port", "help": "loopback port the viewer takes the stream on"}
-    )
-    web_port: int = field(default=9090, metadata={"help": "loopback port of the web viewer's page"})
-    leave_open: bool = field(
-        default=True,
-        metadata={"flag": "viewer_leave_open", "help": "leave the window open when the source has ended"},
-    )
-    memory_limit: str = field(
-        default="1GB", metadata={"flag": "viewer_memory", "help": "memory a viewer may use, such as 1GB"}
-    )
-    image_rate_hz: float = field(
-        default=10.0, metadata={"flag": "viewer_image_rate_hz", "help": "images a second shown at most"}
-    )
-    jpeg_quality: int = field(
-        default=80, metadata={"flag": "viewer_jpeg_quality", "help": "JPEG quality of shown images"}
-    )
-
-    def __post_init__(self) -> None:
-        """Check ranges.
-
-        Raises:
-            ValueError: A value is out of range.
-        """
-        for name, port in (("viewer_port", self.port), ("web_port", self.web_port)):
-            if not 1 <= port <= 65535:
-                raise ValueError(f"{name} must be in [1, 65535], got {port}")
-        if self.port == self.web_port:
-            raise ValueError(f"viewer_port and web_port must differ, got {self.port} for both")
-        if not _MEMORY.fullmatch(self.memory_limit):
-            raise ValueError(
-                f"memory_limit must be a number of MB, GB ... or a percentage up to 100%, such as 1GB, "
-                f"got {self.memory_limit!r}"
-            )
-        if not 0.1 <= self.image_rate_hz <= 60:
-            raise ValueError(f"image_rate_hz must be in [0.1, 60], got {self.image_rate_hz}")
-        if not 10 <= self.jpeg_quality <= 100:
-            raise ValueError(f"jpeg_quality must be in [10, 100], got {self.jpeg_quality}")
+    if save_images != "none" and out is None:
+        raise ValueError(f"save_images needs out, got save_images={save_images!r} without a folder")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,5 +142,4 @@ class ServerSettings:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"{name} must be positive, got {value}")
-        if self.save_images != "none" and self.out is None:
-            raise ValueError(f"save_images needs out, got save_images={self.save_images!r} without a folder")
+        check_save_images(self.save_images, self.out)

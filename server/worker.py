@@ -157,7 +157,6 @@ class Worker(Generic[Problem, Result]):
         self._exchange: _Exchange[Problem, Result] | None = None
         self._closed = False
         self._failures = 0
-        self.num_restarts = 0
         self._is_due = not start_early
         if start_early:
             self._start()
@@ -199,7 +198,6 @@ class Worker(Generic[Problem, Result]):
         if self.given_up:
             self._give_up()
             return
-        self.num_restarts += 1
         logger.warning("%s ended and is started again", self._what)
         self._start_if_possible()
 

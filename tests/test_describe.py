@@ -12,12 +12,12 @@ from semcast.cli import main
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.nets.onnx_encoder import encoder_path
-from semcast.common.recording import RecordingWriter, recording_metadata
+from semcast.common.recording_writer import RecordingWriter, recording_metadata
 from semcast.common.run_folder import RECONSTRUCTION_NAME, RunData, write_run
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.trajectory_error import ate
 from semcast.describe import describe
-from semcast.server.run_record import FrameRow, RunRecord
+from semcast.server.frame_rows import FrameRow, FrameRows
 
 
 def text_of(path):
@@ -57,7 +57,7 @@ def run_folder(tmp_path):
     truth = straight_path()
     truth.T_world_cam[:, :3, 3] *= 2.0
     write_tum(tmp_path / "truth.txt", truth)
-    record = RunRecord(folder)
+    record = FrameRows(folder)
     for k in range(6):
         record.add(
             FrameRow(

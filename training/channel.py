@@ -17,7 +17,7 @@ _MAX_SNR_DB = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChannelSettings:
+class LinkDrawSettings:
     """What the links of a batch look like.
 
     Attributes:
@@ -123,7 +123,9 @@ def to_device(values: Tensor, device: torch.device) -> Tensor:
     return values.to(device, non_blocking=True)
 
 
-def draw_links(settings: ChannelSettings, batch: int, num_slots: int, generator: torch.Generator) -> LinkDraw:
+def draw_links(
+    settings: LinkDrawSettings, batch: int, num_slots: int, generator: torch.Generator
+) -> LinkDraw:
     """Draw the links of a batch on the CPU."""
 
     def uniform(*shape: int) -> Tensor:

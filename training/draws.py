@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.training.allocations import AllocationDraw, AllocationSettings, draw_allocation
-from semcast.training.channel import ChannelSettings, LinkDraw, draw_links
+from semcast.training.channel import LinkDraw, LinkDrawSettings, draw_links
 from semcast.training.data import Crops
 
 
@@ -50,7 +50,7 @@ class Draws(Dataset[StepDraw]):
     def __init__(
         self,
         crops: Crops,
-        channel: ChannelSettings,
+        channel: LinkDrawSettings,
         allocation: AllocationSettings | None,
         seed: int,
         rank: int = 0,

@@ -15,7 +15,7 @@ from semcast.common.nets.linear import BlockAnalysis, BlockSynthesis
 from semcast.common.nets.mae import MaeDecoder, MaeEncoder
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.nets.vit import VitDecoder, VitEncoder
-from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
+from semcast.common.phy.slots import BLOCK_PX, BLOCK_VALUES, LATENT_CHANNELS
 
 #: Rms of the latent, against which the carrier (see ``modulation``) has its amplitude.
 _LATENT_RMS = 0.9
@@ -33,7 +33,7 @@ def block_statistics(images: list[NDArray[np.uint8]]) -> tuple[Array, Array]:
     Raises:
         ValueError: No image has a whole block.
     """
-    total = np.zeros(3 * BLOCK_PX**2)
+    total = np.zeros(BLOCK_VALUES)
     products = np.zeros((total.size, total.size))
     count = 0
     for image in images:

@@ -16,6 +16,7 @@ import torch
 import torch.distributed as dist
 
 from semcast.common.errors import CheckpointError
+from semcast.common.image import psnr_of_mse
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.codec import check_device
 from semcast.common.nets.registry import architecture
@@ -367,7 +368,7 @@ def _mean_logs(rows: list[dict[str, torch.Tensor]]) -> dict[str, float]:
     means = {
         n: float(torch.stack([row[n].float() for row in rows if n in row]).mean()) for n in sorted(names)
     }
-    means["psnr_db"] = -10.0 * float(torch.log10(torch.tensor(max(means["mse"], 1e-10))))
+    means["psnr_db"] = psnr_of_mse(means["mse"])
     return means
 
 

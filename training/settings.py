@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from semcast.training.allocations import AllocationSettings
-from semcast.training.channel import ChannelSettings
+from semcast.training.channel import LinkDrawSettings
 from semcast.training.data import CropSettings
 from semcast.training.losses import LossSettings
 
@@ -98,7 +98,7 @@ class TrainSettings:
         default=True, metadata={"help": "continue from the checkpoint in --out, if there is one"}
     )
     crop: CropSettings = field(default_factory=CropSettings)
-    channel: ChannelSettings = field(default_factory=ChannelSettings)
+    channel: LinkDrawSettings = field(default_factory=LinkDrawSettings)
     loss: LossSettings = field(default_factory=LossSettings)
     allocation: AllocationSettings = field(default_factory=AllocationSettings)
 

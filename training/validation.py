@@ -1,11 +1,10 @@
 """Quality on whole images that were not trained on."""
 
-import math
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from semcast.common.image import psnr_of_mse
 from semcast.common.nets.detail import allocation_for
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX
@@ -19,16 +18,14 @@ def validate(
     images: list[NDArray[np.uint8]],
     device: torch.device,
     bf16: bool,
-    analog: bool = False,
 ) -> dict[str, float]:
-    """Return the mean PSNR of images over AWGN at each of ``SNRS_DB``, and the mean 16-QAM power.
+    """Return the mean PSNR of images over AWGN with 16-QAM at each of ``SNRS_DB``, and the mean power.
 
     Args:
         model: The transceiver.
         images: ``(H, W, 3)`` uint8, cut to whole blocks.
         device: Where the model is.
         bf16: Use bfloat16 autocast.
-        analog: Measure analog modulation instead of 16-QAM.
     """
     generator = torch.Generator().manual_seed(1234)
     psnr_db: dict[str, list[float]] = {f"psnr_{s:g}db": [] for s in SNRS_DB}
@@ -44,7 +41,7 @@ def validate(
             for snr_db in SNRS_DB:
                 slots = (1, 1, height // BLOCK_PX, 1)
                 level = torch.full((1,), snr_db)
-                flag = torch.full((1,), 0.0 if analog else 1.0)
+                flag = torch.full((1,), 1.0)
                 draw = LinkDraw(level, level, flag, torch.ones(slots), torch.zeros(slots)).to(device)
                 latent = model.latent(x, draw.expected_snr_db, draw.is_qam, values)
                 symbols = model.transmit(latent, draw.is_qam, values)
@@ -53,6 +50,6 @@ def validate(
                 x_hat, _ = model.receive(y_rx, plane, draw.is_qam, values)
                 rounded = (x_hat.float().clamp(0, 1) * 255).round() / 255
                 mse = float((rounded - x).square().mean())
-                psnr_db[f"psnr_{snr_db:g}db"].append(-10.0 * math.log10(max(mse, 1e-10)))
+                psnr_db[f"psnr_{snr_db:g}db"].append(psnr_of_mse(mse))
                 powers.append(2.0 * float(symbols.square().mean()))
     return {k: float(np.mean(v)) for k, v in psnr_db.items()} | {"power": float(np.mean(powers))}

@@ -136,12 +136,6 @@ class NeuralCodec:
         """How this codec's symbols travel."""
         return self._modulation
 
-    def warm_up(self, shape_hw: tuple[int, int]) -> None:
-        """Encode and decode one empty frame, so that the first real one is not slow."""
-        encoded = self.encode(np.zeros((*shape_hw, 3), dtype=np.uint8), 10.0)
-        snr_db = np.full(encoded.symbols.shape[0], 10.0, dtype=np.float32)
-        self.decode(encoded.arrived(encoded.symbols, snr_db))
-
     def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
         """Encode one image for a link whose expected SNR is ``snr_db``.
 

@@ -23,7 +23,7 @@ from semcast.common.nets.blocks import (
 from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import Decoder
 from semcast.common.nets.encoder import Encoder
-from semcast.common.nets.linear import BlockSynthesis
+from semcast.common.nets.linear import MAX_LOG_GAIN, BlockSynthesis
 from semcast.common.nets.modulation import (
     analog_values,
     demodulate,
@@ -33,7 +33,6 @@ from semcast.common.nets.modulation import (
 from semcast.common.nets.packing import blocks_arrived, sent_mask, share_plane, unpack
 from semcast.common.nets.transceiver import Transceiver
 
-_MAX_LOG_GAIN = 3.0
 #: Side of the pixel groups the finest convolutions see, and how many of those make a block.
 _FOLD, _GROUPS = 4, 4
 
@@ -240,7 +239,7 @@ class _ArrangedEncoder:
             f += self._share(share.to(self._dtype))
         f = self._stages[2](f.relu_(), condition)
         added, log_gain = self._head(f.relu_()).float().chunk(2, dim=1)
-        gain = torch.exp(log_gain.clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN))
+        gain = torch.exp(log_gain.clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN))
         coefficients = self._transform(_image(_gather(folded, _GROUPS))) * gain
         return self._mix(coefficients.to(self._dtype)).float() + added
 

@@ -12,13 +12,10 @@ import math
 import torch
 from torch import Tensor, nn
 
-from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
-
-_BLOCK_VALUES = 3 * BLOCK_PX * BLOCK_PX
-
+from semcast.common.phy.slots import BLOCK_PX, BLOCK_VALUES, LATENT_CHANNELS
 
 #: Local gains stay within a factor of about 20.
-_MAX_LOG_GAIN = 3.0
+MAX_LOG_GAIN = 3.0
 
 
 class BlockAnalysis(nn.Module):
@@ -31,7 +28,7 @@ class BlockAnalysis(nn.Module):
     def __init__(self, channels: int = LATENT_CHANNELS) -> None:
         super().__init__()
         self.fold = nn.PixelUnshuffle(BLOCK_PX)
-        self.transform = nn.Conv2d(_BLOCK_VALUES, channels, 1)
+        self.transform = nn.Conv2d(BLOCK_VALUES, channels, 1)
         self.mix = nn.Conv2d(channels, channels, 1, bias=False)
 
     def forward(self, x: Tensor, log_gain: Tensor) -> Tensor:
@@ -41,7 +38,7 @@ class BlockAnalysis(nn.Module):
             x: Image around zero.
             log_gain: ``(B, C, H/16, W/16)`` from the network: flat blocks may be sent louder than busy ones.
         """
-        gain = torch.exp(log_gain.float().clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN))
+        gain = torch.exp(log_gain.float().clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN))
         mixed: Tensor = self.mix(self.transform(self.fold(x)) * gain)
         return mixed
 
@@ -59,7 +56,7 @@ class BlockSynthesis(nn.Module):
         self.log_power = nn.Parameter(torch.zeros(channels))
         #: Log variance of what the receiver can't undo.
         self.log_distortion = nn.Parameter(torch.tensor(math.log(0.01)))
-        self.transform = nn.Conv2d(channels, _BLOCK_VALUES, 1)
+        self.transform = nn.Conv2d(channels, BLOCK_VALUES, 1)
         self.unfold = nn.PixelShuffle(BLOCK_PX)
 
     def forward(self, y: Tensor, shrink: Tensor, scale: Tensor, adapt: Tensor) -> Tensor:
@@ -86,4 +83,4 @@ class BlockSynthesis(nn.Module):
         more_power, log_gain = adapt.float().chunk(2, dim=1)
         log_noise = torch.log(noise + torch.exp(self.log_distortion))
         wiener = torch.sigmoid(self.log_power.view(1, -1, 1, 1) + more_power - log_noise)
-        return wiener * torch.exp(log_gain.clamp(-_MAX_LOG_GAIN, _MAX_LOG_GAIN)) / shrink
+        return wiener * torch.exp(log_gain.clamp(-MAX_LOG_GAIN, MAX_LOG_GAIN)) / shrink

@@ -17,9 +17,7 @@ from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import RECEIVED_CHANNELS, DecoderFeatures
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.nets.vit import Trunk
-from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
-
-_BLOCK_VALUES = 3 * BLOCK_PX * BLOCK_PX
+from semcast.common.phy.slots import BLOCK_PX, BLOCK_VALUES, LATENT_CHANNELS
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class MaeEncoder(nn.Module):
         self.patch_blocks = sizes.patch_blocks
         side = sizes.patch_blocks
         self.fold = nn.PixelUnshuffle(BLOCK_PX)
-        self.stem = nn.Conv2d(_BLOCK_VALUES, sizes.block_channels, 1)
+        self.stem = nn.Conv2d(BLOCK_VALUES, sizes.block_channels, 1)
         self.gather = nn.Conv2d(sizes.block_channels, sizes.dim, side, stride=side)
         self.trunk = Trunk(sizes.dim, sizes.heads, sizes.encoder_depth, sizes.window)
         self.head = nn.ConvTranspose2d(sizes.dim, LATENT_CHANNELS, side, stride=side)
@@ -90,7 +88,7 @@ class MaeDecoder(nn.Module):
         self.stem = nn.Conv2d(RECEIVED_CHANNELS, sizes.dim, side, stride=side)
         self.trunk = Trunk(sizes.dim, sizes.heads, sizes.decoder_depth, sizes.window)
         self.spread = nn.ConvTranspose2d(sizes.dim, sizes.block_channels, side, stride=side)
-        self.head = nn.Conv2d(sizes.block_channels, _BLOCK_VALUES, 1)
+        self.head = nn.Conv2d(sizes.block_channels, BLOCK_VALUES, 1)
         self.unfold = nn.PixelShuffle(BLOCK_PX)
         self.fold8, self.fold4 = nn.PixelUnshuffle(8), nn.PixelUnshuffle(4)
         #: Stands for a hidden patch in pre-training.

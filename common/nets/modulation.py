@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from semcast.common.nets.modulation_numpy import CARRIER_AMPLITUDE
 from semcast.common.nets.rounding import (
     CLIP,
     LEVEL_STEP,
@@ -29,8 +30,6 @@ from semcast.common.nets.rounding import (
 )
 from semcast.common.phy.qam import SHAPED_OUTER_SHARE
 
-#: Amplitude of the carrier against a latent whose rms is about 0.9: some 2 % of the power.
-CARRIER_AMPLITUDE = 0.12
 _MAX_SCALE = 6.0
 #: From an analog value, of power 1/2, to one that is rounded.
 _TO_ROUNDED = 2.0**0.5 * LOADING

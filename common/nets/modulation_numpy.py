@@ -10,6 +10,7 @@ from semcast.common.codec import Modulation
 from semcast.common.nets.rounding import LEVEL_STEP, LOADING, mixing
 from semcast.common.phy.slots import LATENT_CHANNELS
 
+#: Amplitude of the carrier against a latent whose rms is about 0.9: some 2 % of the power.
 CARRIER_AMPLITUDE = 0.12
 
 

@@ -121,10 +121,6 @@ class OnnxEncoder:
         """How symbols travel."""
         return self._modulation
 
-    def warm_up(self, shape_hw: tuple[int, int]) -> None:
-        """Encode one empty frame, so that the first real one is not slow."""
-        self.encode(np.zeros((*shape_hw, 3), dtype=np.uint8), 10.0)
-
     def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
         """Encode one image; see ``NeuralCodec.encode``.
 

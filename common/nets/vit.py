@@ -11,9 +11,7 @@ from semcast.common.nets.blocks import NUM_CONDITIONS, condition_vector, normali
 from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import RECEIVED_CHANNELS, DecoderFeatures
 from semcast.common.nets.transceiver import Transceiver
-from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
-
-_PATCH_VALUES = 3 * BLOCK_PX * BLOCK_PX
+from semcast.common.phy.slots import BLOCK_PX, BLOCK_VALUES, LATENT_CHANNELS
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ class VitEncoder(nn.Module):
     def __init__(self, sizes: VitSizes) -> None:
         super().__init__()
         self.fold = nn.PixelUnshuffle(BLOCK_PX)
-        self.stem = nn.Conv2d(_PATCH_VALUES, sizes.dim, 1)
+        self.stem = nn.Conv2d(BLOCK_VALUES, sizes.dim, 1)
         self.trunk = Trunk(sizes.dim, sizes.heads, sizes.encoder_depth, sizes.window)
         self.head = nn.Conv2d(sizes.dim, LATENT_CHANNELS, 1)
 
@@ -166,7 +164,7 @@ class VitDecoder(nn.Module):
         super().__init__()
         self.stem = nn.Conv2d(RECEIVED_CHANNELS, sizes.dim, 1)
         self.trunk = Trunk(sizes.dim, sizes.heads, sizes.decoder_depth, sizes.window)
-        self.head = nn.Conv2d(sizes.dim, _PATCH_VALUES, 1)
+        self.head = nn.Conv2d(sizes.dim, BLOCK_VALUES, 1)
         self.unfold = nn.PixelShuffle(BLOCK_PX)
         self.fold8, self.fold4 = nn.PixelUnshuffle(8), nn.PixelUnshuffle(4)
 

@@ -24,12 +24,10 @@ class DecodedBlocks:
 
     Attributes:
         bits: ``(num_info,)`` uint8.
-        parity_ok: ``(num_blocks,)`` bool, blocks whose parity checks all hold.
         iterations: Iterations run until the last block converged or the limit was reached.
     """
 
     bits: NDArray[np.uint8]
-    parity_ok: NDArray[np.bool_]
     iterations: int
 
 
@@ -180,7 +178,6 @@ def decode(plan: BlockPlan, llr: NDArray[np.float32], max_iterations: int = 30) 
     rows = plan.graph.rows[:num_rows]
     messages = [np.zeros((len(row), *belief.shape[1:]), dtype=np.float32) for row in rows]
     bits = np.empty((plan.info_per_block, plan.num_blocks), dtype=np.uint8)
-    parity_ok = np.zeros(plan.num_blocks, dtype=bool)
     active = np.arange(plan.num_blocks)
     iteration = 0
     while active.size and iteration < max_iterations:
@@ -193,11 +190,10 @@ def decode(plan: BlockPlan, llr: NDArray[np.float32], max_iterations: int = 30) 
         done = slice(None) if iteration == max_iterations else ~failed
         flat = belief.reshape(-1, active.size)[: plan.info_per_block]
         bits[:, active[done]] = flat[:, done] < 0
-        parity_ok[active[~failed]] = True
         active = active[failed]
         belief = np.ascontiguousarray(belief[:, :, failed])
         messages = [np.ascontiguousarray(told[:, :, failed]) for told in messages]
-    return DecodedBlocks(bits=bits.T.reshape(-1), parity_ok=parity_ok, iterations=iteration)
+    return DecodedBlocks(bits=bits.T.reshape(-1), iterations=iteration)
 
 
 def _channel_belief(plan: BlockPlan, llr: NDArray[np.float32]) -> tuple[NDArray[np.float32], int]:

@@ -7,25 +7,15 @@ both ends agree without exchanging anything and the result does not depend on a 
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.common.phy.hashing import INCREMENT, hashed_qpsk, mix
 from semcast.common.phy.slots import DATA_PER_BLOCK, PILOTS_PER_BLOCK, USES_PER_BLOCK, SlotLayout
-
-
-def _mix(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Hash 64-bit integers (the finaliser of SplitMix64, Steele et al. 2014)."""
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(x ^ (x >> np.uint64(31)), dtype=np.uint64)
 
 
 def pilot_symbols(layout: SlotLayout) -> NDArray[np.complex64]:
     """Return the ``(num_slots, pilots_per_slot)`` pilots; pilot k of slot s is the same in every layout."""
     slot = np.arange(layout.num_slots, dtype=np.uint64)[:, None]
     position = np.arange(layout.pilots_per_slot, dtype=np.uint64)[None, :]
-    hashed = _mix(((slot << np.uint64(32)) | position) + np.uint64(0x9E3779B97F4A7C15))
-    quadrant = (hashed >> np.uint64(62)).astype(np.int8)
-    real = 1 - 2 * (quadrant & 1)
-    imag = 1 - 2 * (quadrant >> 1)
-    return np.asarray((real + 1j * imag) / np.sqrt(2.0), dtype=np.complex64)
+    return hashed_qpsk(mix(((slot << np.uint64(32)) | position) + INCREMENT))
 
 
 def _layout_of(num_slots: int, width: int, per_block: int, what: str) -> SlotLayout:

@@ -97,16 +97,6 @@ def bits_to_indices(
     return np.asarray((groups * weights).sum(axis=-1, dtype=np.uint8))
 
 
-def indices_to_bits(
-    indices: NDArray[np.uint8], bits_per_symbol: int = BITS_PER_SYMBOL_16QAM
-) -> NDArray[np.uint8]:
-    """Spread indices ``(..., n)`` into bits ``(..., n * bits_per_symbol)``, highest bit first."""
-    _check_bits(bits_per_symbol)
-    shifts = np.arange(bits_per_symbol - 1, -1, -1, dtype=np.uint8)
-    bits = (indices[..., None] >> shifts) & np.uint8(1)
-    return bits.reshape(*indices.shape[:-1], -1)
-
-
 def pack_indices(indices: NDArray[np.uint8]) -> bytes:
     """Pack 16-QAM indices, flattened, two to a byte, the first in the high half, padded with 0.
 
@@ -150,7 +140,7 @@ def soft_demap(
         bits_per_symbol: 2, 4 or 6.
 
     Returns:
-        ``(..., n * bits_per_symbol)`` float32 in the bit order of ``indices_to_bits``.
+        ``(..., n * bits_per_symbol)`` float32 in the bit order of ``bits_to_indices``.
 
     Raises:
         ValueError: A noise variance is not positive.

@@ -9,6 +9,8 @@ bursts and losses act on whole slots, so damage stays local in the image.
 from dataclasses import dataclass
 
 BLOCK_PX = 16
+#: Values of a block's pixels, RGB.
+BLOCK_VALUES = 3 * BLOCK_PX * BLOCK_PX
 USES_PER_BLOCK = 48
 PILOTS_PER_BLOCK = 1
 DATA_PER_BLOCK = USES_PER_BLOCK - PILOTS_PER_BLOCK

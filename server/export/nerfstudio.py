@@ -11,14 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from semcast.common.errors import SourceError
-from semcast.common.geometry import transform_points
+from semcast.common.geometry import T_opencv_opengl, transform_points
 from semcast.common.run_folder import RunData, image_name
 from semcast.common.whole_file import write_whole
 from semcast.server.export.colmap import PIXEL_CENTRE, copy_images
 from semcast.server.export.outputs import write_ply
 
-#: OpenCV camera axes (x right, y down, z forward) in OpenGL ones (x right, y up, z backward).
-R_opencv_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Our world (first camera: y down, z forward) in a world with z up: x stays, forward becomes y.
 T_up_world = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
@@ -41,7 +39,7 @@ def write_nerfstudio(folder: Path, data: RunData, images: Mapping[int, Path]) ->
     row_of = {frame_id: k for k, frame_id in enumerate(data.frame_ids.tolist())}
     frames = []
     for frame_id in frame_ids:
-        T_up_opengl = T_up_world @ data.T_world_cam[row_of[frame_id]] @ R_opencv_opengl
+        T_up_opengl = T_up_world @ data.T_world_cam[row_of[frame_id]] @ T_opencv_opengl
         frames.append(
             {"file_path": f"images/{image_name(frame_id)}", "transform_matrix": T_up_opengl.tolist()}
         )

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semcast import __version__
-from semcast.common.errors import SemcastError, SourceError
+from semcast.common.errors import SemcastError
 from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.whole_file import write_whole
@@ -101,26 +101,6 @@ def write_ply(
         "end_header",
     ]
     write_whole(path, "\n".join(header).encode("ascii") + b"\n" + vertices.tobytes())
-
-
-def read_ply(path: Path) -> NDArray[Any]:
-    """Read back what ``write_ply`` wrote, as an array of ``PLY_VERTEX``.
-
-    Raises:
-        SourceError: The file can't be read, has other properties, or not as many points as it says.
-    """
-    try:
-        header, end, body = path.read_bytes().partition(b"end_header\n")
-    except OSError as err:
-        raise SourceError(f"{path} can't be read: {err}") from err
-    lines = header.decode("ascii", "replace").splitlines()
-    names = [line.split()[-1] for line in lines if line.startswith("property ")]
-    if not end or names != list(PLY_VERTEX.names or ()) or len(body) % PLY_VERTEX.itemsize:
-        raise SourceError(f"{path} is not a map written by semcast")
-    vertices = np.frombuffer(body, dtype=PLY_VERTEX)
-    if f"element vertex {len(vertices)}" not in lines:
-        raise SourceError(f"{path} is damaged: it does not hold as many points as it says")
-    return vertices
 
 
 def trajectory_of(poses: Mapping[int, NDArray[np.float64]], t_source_ns: Mapping[int, int]) -> Trajectory:

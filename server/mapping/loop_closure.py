@@ -71,7 +71,7 @@ class Loop:
         T[:3, 3] *= self.scale
         return np.asarray(self.T_old_new @ T)
 
-    def agrees(self, other: "Loop", view: "View", depth: float) -> bool:
+    def agrees(self, other: "Loop", view: "LoopView", depth: float) -> bool:
         """Whether another recognition says the same of where a view is and how large its unit is."""
         scale = self.scale / other.scale
         T = invert_transform(self.moved(view.T_world_cam)) @ other.place.T_world_cam
@@ -83,7 +83,7 @@ class Loop:
 
 
 @dataclass(frozen=True)
-class View:
+class LoopView:
     """A posed frame.
 
     Attributes:
@@ -122,7 +122,7 @@ class LoopFinder:
         return self._pending is not None
 
     def look(
-        self, view: View, world: WorldMap, noise: NoiseModel, submap: int, found: Revisit | None
+        self, view: LoopView, world: WorldMap, noise: NoiseModel, submap: int, found: Revisit | None
     ) -> Loop | None:
         """Look for a loop.
 
@@ -168,7 +168,14 @@ class LoopFinder:
         return Place(T_world_cam, found.keyframe_id, ids[pose.inliers], xy[pose.inliers], submap)
 
     def _judge(
-        self, view: View, world: WorldMap, noise: NoiseModel, newest: Keyframe, place: Place, *, is_sure: bool
+        self,
+        view: LoopView,
+        world: WorldMap,
+        noise: NoiseModel,
+        newest: Keyframe,
+        place: Place,
+        *,
+        is_sure: bool,
     ) -> Loop | None:
         """What a recognised place means: that nothing has drifted, or a loop."""
         xyz = world.landmarks.xyz[world.landmarks.rows(place.ids)]

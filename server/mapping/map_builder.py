@@ -19,7 +19,7 @@ from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, colours_of
 from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.left_out import place_left_out
-from semcast.server.mapping.loop_closure import Loop, LoopFinder, View, share_out
+from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
@@ -197,7 +197,7 @@ class MapBuilder:
         """
         found = self._find_revisit(tracks, sight, T_world_cam)
         seen = tracks.visible
-        view = View(sight, T_world_cam, tracks.ids[seen], tracks.xy[seen])
+        view = LoopView(sight, T_world_cam, tracks.ids[seen], tracks.xy[seen])
         loop = self.loops.look(view, self.world, self.noise.model, self.submap, found)
         closed = loop is not None and self._close(loop, on_moved)
         if closed:

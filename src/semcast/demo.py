@@ -25,6 +25,7 @@ from semcast.common.errors import ConfigError, SemcastError, SourceError, Transp
 from semcast.common.keys import status_key
 from semcast.common.messages import StatusMessage
 from semcast.common.network_settings import NetworkSettings
+from semcast.common.playback import check_playback, usual_period_ns
 from semcast.common.rate import NATIVE_RATE, RateChoice
 from semcast.common.run_folder import DEMO_SETTINGS_NAME, FRAMES_NAME, SUMMARY_NAME
 from semcast.common.sequence import Sequence, open_sequence
@@ -35,8 +36,9 @@ from semcast.real_time import plan_for
 from semcast.role import Role
 from semcast.server.former_run import check_not_foreign, discard, output_folder
 from semcast.server.mapping.settings import ReconstructionSettings
-from semcast.server.settings import DenseWhen, ServerSettings, ViewSettings
-from semcast.server.view.choice import check_viewer
+from semcast.server.settings import DenseWhen, ServerSettings
+from semcast.server.view.settings import ViewChoice, ViewSettings
+from semcast.server.viewing import check_viewer
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
 START_DEADLINE_S = 60.0
@@ -71,7 +73,7 @@ class DemoSettings:
     confidence: Literal["robust", "paper", "off"] = field(
         default="robust", metadata={"help": "how the geometry uses confidence"}
     )
-    view: Literal["auto", "native", "web", "file", "none"] = field(
+    view: ViewChoice = field(
         default="auto", metadata={"help": "viewer: a window, the browser, only run.rrd, or none"}
     )
     viewer_port: int = field(
@@ -115,12 +117,7 @@ class DemoSettings:
         """Check what the three processes would only notice after their start."""
         _ = self.view_settings
         ReconstructionSettings(seed=self.seed)
-        if self.resize is not None and not 0.05 <= self.resize <= 1.0:
-            raise ValueError(f"resize must be in [0.05, 1], got {self.resize:g}")
-        if self.stride is not None and self.stride < 1:
-            raise ValueError(f"stride must be at least 1, got {self.stride}")
-        if self.rate_hz is not None and not 0.01 <= self.rate_hz <= 1000.0:
-            raise ValueError(f"rate_hz must be in [0.01, 1000], got {self.rate_hz:g}")
+        check_playback(resize=self.resize, stride=self.stride, rate_hz=self.rate_hz)
 
     @property
     def view_settings(self) -> ViewSettings:
@@ -380,7 +377,7 @@ def choose_playback(
         ConfigError: The codec is unknown.
         CheckpointError: Its weights are missing or damaged.
     """
-    recorded_hz = _usual_rate_hz(recorded)
+    recorded_hz = 1.0 / (usual_period_ns(recorded.times_ns) * 1e-9)
     stride = settings.stride or start_stride(recorded_hz)
     full_hz = recorded_hz / stride
     rate_hz = settings.rate_hz or full_hz
@@ -414,12 +411,6 @@ def _reductions(settings: DemoSettings, playback: Playback) -> Iterator[str]:
         yield f"images are sent at {playback.resize:g} of their size; --resize 1 sends them as they are"
     if settings.rate_hz is None and playback.speed < 1.0:
         yield f"played at {playback.speed:.2g} of the recorded pace, as this machine can serve; see --rate-hz"
-
-
-def _usual_rate_hz(recorded: Sequence) -> float:
-    """Return the images a second of a recording; those of a usual camera where it has but one image."""
-    usual_s = float(np.median(np.diff(recorded.times_ns))) * 1e-9 if len(recorded) > 1 else 0.1
-    return 1.0 / usual_s
 
 
 def _standing(row: Mapping[str, Any]) -> str:

@@ -1,3 +1,6 @@
+import socket
+import time
+
 import cv2
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from semcast.agent.calibrate import (
     is_new_view,
 )
 from semcast.cli import main
+from semcast.commands.calibrate import camera_pictures
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform
 
@@ -242,6 +246,15 @@ def test_a_result_is_not_written_to_a_file_of_another_kind(tmp_path, capsys, nam
     assert main(["calibrate", str(tmp_path / "0.png"), "--out", str(tmp_path / name)]) == 1
     assert f"out must be a .json file, got {tmp_path / name}" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["0.png"]
+
+
+def test_a_camera_that_says_nothing_is_given_up(monkeypatch):
+    monkeypatch.setattr("semcast.agent.video._OPEN_TIMEOUT_MS", 300)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        began_s = time.monotonic()
+        with pytest.raises(SourceError, match="camera http://.* can't be opened"):
+            next(camera_pictures(f"http://127.0.0.1:{silent.getsockname()[1]}/stream.mjpg"))
+    assert time.monotonic() - began_s < 10.0  # by itself OpenCV waits for half a minute
 
 
 def test_a_video_of_the_board_stands_for_a_live_camera(tmp_path, pictures, capsys):

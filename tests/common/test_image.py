@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from semcast.common.image import psnr_db
+from semcast.common.image import psnr_db, psnr_of_mse
 
 
 def test_psnr_by_hand():
@@ -16,6 +16,13 @@ def test_psnr_by_hand():
 
 def test_equal_images_give_100():
     assert psnr_db(np.full((4, 4), 7, np.uint8), np.full((4, 4), 7, np.uint8)) == 100.0
+
+
+def test_psnr_of_an_error_is_that_of_the_images_within_100_db():
+    assert psnr_of_mse(0.01) == pytest.approx(20.0)
+    assert psnr_of_mse(0.01 * 255**2, 255.0) == pytest.approx(20.0)
+    assert psnr_of_mse(0.0) == psnr_of_mse(1e-30) == 100.0
+    assert math.isnan(psnr_of_mse(math.nan))
 
 
 def test_bad_images_are_named():

@@ -5,12 +5,16 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import EncodedImage
+from semcast.common.levels import Levels
 from semcast.common.message_fields import FieldError, Number
 from semcast.common.messages import CameraInfo, SymbolFrame
+from semcast.common.phy.pilots import insert_pilots
 from semcast.common.phy.qam import SHAPED_SPACING, constellation
 from semcast.common.phy.slots import layout_for
 from semcast.common.symbol_payload import (
     data_symbols,
+    encoded_image,
+    equalise_frame,
     lost_slots_of,
     pack_data_symbols,
     pack_iq,
@@ -122,6 +126,24 @@ def test_a_lost_frame_is_all_zero_and_lost_slots_are_the_flagged_ones():
     message = frame(direction="rx", payload_format="lost", slot_lost=pack_lost(lost))
     assert not slots_of(message).any()
     np.testing.assert_array_equal(lost_slots_of(message), lost)
+
+
+def test_a_frame_says_what_the_codec_made_and_what_it_decodes(rng):
+    header = {"modulation": "analog", "levels": (10, 90)}
+    sent = rng.normal(size=(3, 47 * 4)).astype(np.complex64)
+    made = encoded_image(frame(payload=pack_iq(sent), **header))
+    np.testing.assert_allclose(made.symbols, sent, atol=1e-2)
+    lost = np.array([False, True, False])
+    slots = insert_pilots(made.symbols)
+    equalised = equalise_frame(
+        frame(direction="rx", payload=pack_iq(slots), slot_lost=pack_lost(lost), **header)
+    )
+    received = equalised.received
+    assert not received.symbols[1].any()
+    np.testing.assert_allclose(received.symbols[::2], made.symbols[::2], atol=2e-2)
+    for name in ("shape_hw", "modulation", "levels", "allocation"):
+        assert getattr(received, name) == getattr(made, name)
+    assert received.levels == Levels(10, 90)
 
 
 @pytest.mark.parametrize("direction", ["tx", "rx"])

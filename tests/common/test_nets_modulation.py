@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from semcast.common.nets.modulation import (
-    CARRIER_AMPLITUDE,
     analog_symbols,
     carrier_pattern,
     demodulate,
@@ -17,6 +16,7 @@ from semcast.common.nets.modulation import (
     undo_analog,
     unspread,
 )
+from semcast.common.nets.modulation_numpy import CARRIER_AMPLITUDE
 from semcast.common.nets.rounding import CLIP, LOADING, rounded_snr_db
 from semcast.common.phy.qam import SHAPED_SPACING, pam_levels
 

@@ -6,12 +6,12 @@ import torch
 
 from semcast.common.nets import modulation_numpy
 from semcast.common.nets.modulation import (
-    CARRIER_AMPLITUDE,
     analog_symbols,
     carrier_pattern,
     rounded_symbols,
     undo_analog,
 )
+from semcast.common.nets.modulation_numpy import CARRIER_AMPLITUDE
 from semcast.common.nets.packing import blocks_arrived, pack, sent_mask, share_plane, unpack
 from semcast.common.phy.allocation import MAX_VALUES
 

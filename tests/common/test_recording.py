@@ -3,6 +3,7 @@ import io
 import json
 import os
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,18 +11,18 @@ from mcap.reader import make_reader
 
 from semcast import SourceError
 from semcast.common.recorder import Recorder
-from semcast.common.recording import (
-    RecordingWriter,
-    recording_metadata,
-    recover_file,
-    recover_stream,
-)
 from semcast.common.recording_reader import (
     RecordedMessage,
     RecordedMetadata,
     RecordingReader,
     RecordingScan,
     scan_info,
+)
+from semcast.common.recording_writer import (
+    RecordingWriter,
+    recording_metadata,
+    recover_file,
+    recover_stream,
 )
 
 HEADER = recording_metadata('codec = "3dcsc"\n', "9.9")
@@ -308,12 +309,24 @@ class SlowStream(io.BytesIO):
         return super().write(data)
 
 
-def test_a_slow_disk_drops_newest_messages_counts_them_and_never_blocks(tmp_path):
+@pytest.fixture
+def recorder_onto(tmp_path, monkeypatch):
+    """Make a recorder whose file is a given stream."""
+
+    def make(stream, **options):
+        with monkeypatch.context() as patched:
+            patched.setattr(Path, "open", lambda *_: stream)
+            return Recorder(tmp_path / "a", HEADER, **options)
+
+    return make
+
+
+def test_a_slow_disk_drops_newest_messages_counts_them_and_never_blocks(recorder_onto):
     gate = threading.Event()
     stream = SlowStream(gate)
     kept = io.BytesIO()
     stream.close = lambda: kept.write(stream.getvalue())
-    recorder = Recorder(tmp_path / "a", HEADER, queue_bytes=50_000, stream=stream)
+    recorder = recorder_onto(stream, queue_bytes=50_000)
     for _ in range(3000):
         recorder.put("t", "pose", bytes(1000))
     assert recorder.drops["queue"] > 500
@@ -339,11 +352,11 @@ class FullDisk(io.BytesIO):
         return super().write(data)
 
 
-def test_a_full_disk_is_reported_once_and_what_was_written_stays_readable(tmp_path, caplog):
+def test_a_full_disk_is_reported_once_and_what_was_written_stays_readable(recorder_onto, caplog):
     stream = FullDisk(3_000_000)
     kept = io.BytesIO()
     stream.close = lambda: kept.write(stream.getvalue())
-    recorder = Recorder(tmp_path / "a", HEADER, stream=stream)
+    recorder = recorder_onto(stream)
     for k in range(600):
         recorder.put("t", "pose", k.to_bytes(4, "big") + bytes(9996))
     recorder.close()

@@ -175,7 +175,7 @@ def test_clients_survive_a_hub_that_is_killed():
             until(passes)
             process.kill()
             process.wait(10)
-            until(lambda: not sender.connected)
+            until(lambda: not publisher.has_receiver)
             received.clear()
             publisher.put(b"into the void")
             process = start()
@@ -206,9 +206,10 @@ def test_a_client_started_first_finds_a_hub_started_later():
         target=lambda: result.append(open_session(NetworkSettings(connect=(endpoint,)), deadline_s=20))
     )
     thread.start()
-    with open_session(NetworkSettings(listen=(endpoint,), connect=())):
+    with open_session(NetworkSettings(listen=(endpoint,), connect=())) as hub:
+        hub.declare_alive("a", "server")
         thread.join(10)
-        assert result[0].connected
+        assert "server" in result[0].alive_roles("a")
         result[0].close()
 
 
@@ -237,6 +238,7 @@ def test_what_answers_but_is_no_hub_is_said_once(caplog, monkeypatch):
 
 
 def test_a_hub_behind_a_slow_network_is_met(hub):
+    hub[0].declare_alive("a", "server")
     host, port = hub[1].removeprefix("tcp/").split(":")
 
     async def pass_on(reader, writer):
@@ -254,7 +256,7 @@ def test_a_hub_behind_a_slow_network_is_met(hub):
         async with await asyncio.start_server(on_connection, "127.0.0.1", 0) as network:
             endpoint = f"tcp/127.0.0.1:{network.sockets[0].getsockname()[1]}"
             session = await asyncio.to_thread(open_client, NetworkSettings(connect=(endpoint,)), 5)
-            assert session.connected
+            assert "server" in await asyncio.to_thread(session.alive_roles, "a", 5)
             session.close()
 
     asyncio.run(meet())

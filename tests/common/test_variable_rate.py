@@ -93,7 +93,6 @@ def test_the_picture_comes_back_with_its_allocation_and_no_other(weights):
     ours, theirs = (np.mean((codec.decode(r).image.astype(float) - image) ** 2) for r in (received, other))
     assert ours < 100
     assert theirs > 5 * ours
-    codec.warm_up((32, 48))
 
 
 def test_a_lost_slot_spoils_the_rows_whose_values_it_held(weights):

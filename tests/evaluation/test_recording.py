@@ -4,8 +4,8 @@ import pytest
 
 from semcast.common.errors import SourceError
 from semcast.common.recorder import Recorder
-from semcast.common.recording import recording_metadata
 from semcast.common.recording_reader import RecordingReader
+from semcast.common.recording_writer import recording_metadata
 from semcast.evaluation.recording import RecordingSettings, by_frame, evaluate_recording
 
 

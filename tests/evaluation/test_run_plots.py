@@ -19,7 +19,7 @@ from semcast.evaluation.run_plots import (
     time_span_doubt,
     timeline_title,
 )
-from semcast.server.run_record import FrameRow, RunRecord
+from semcast.server.frame_rows import FrameRow, FrameRows
 
 NAN = float("nan")
 
@@ -53,7 +53,7 @@ def line(frame_ids):
 
 def write_run(folder, rows, summary=None):
     folder.mkdir()
-    with_rows = RunRecord(folder)
+    with_rows = FrameRows(folder)
     for each in rows:
         with_rows.add(each)
     with_rows.close()

@@ -6,6 +6,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.common.run_folder import ImageWriter, RunData, write_run
+from semcast.server.export.outputs import PLY_VERTEX
 
 
 def make_arc_run(num_frames=9, num_points=60, noise_px=0.0, seed=0):
@@ -56,6 +57,17 @@ def write_arc_run_to(folder, data, keep="keyframes"):
             writer.put(frame_id, np.full(shape, 10 * frame_id, dtype=np.uint8))
 
 
+def read_ply_from(path):
+    """Return what ``write_ply`` wrote, as an array of ``PLY_VERTEX``."""
+    header, end, body = path.read_bytes().partition(b"end_header\n")
+    lines = header.decode("ascii").splitlines()
+    assert end
+    assert [line.split()[-1] for line in lines if line.startswith("property ")] == list(PLY_VERTEX.names)
+    vertices = np.frombuffer(body, dtype=PLY_VERTEX)
+    assert f"element vertex {len(vertices)}" in lines
+    return vertices
+
+
 @pytest.fixture
 def arc_run():
     """Makes a run; see ``make_arc_run``."""
@@ -66,3 +78,9 @@ def arc_run():
 def write_arc_run():
     """Writes a run and images of one grey level a frame; see ``write_arc_run_to``."""
     return write_arc_run_to
+
+
+@pytest.fixture
+def read_ply():
+    """Reads a map; see ``read_ply_from``."""
+    return read_ply_from

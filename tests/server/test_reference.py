@@ -11,8 +11,8 @@ from semcast.agent.source import SourceFrame
 from semcast.common.keys import source_key
 from semcast.common.messages import CameraInfo, SourceImage
 from semcast.common.recorder import Recorder
-from semcast.common.recording import recording_metadata
 from semcast.common.recording_reader import RecordingReader
+from semcast.common.recording_writer import recording_metadata
 from semcast.common.sequence import open_sequence
 from semcast.common.wire import pack
 from semcast.server.reference import Reference, recording_reference, sequence_reference

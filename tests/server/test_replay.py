@@ -26,8 +26,8 @@ from semcast.common.errors import ConfigError, SemcastError, SourceError
 from semcast.common.messages import CameraInfo, SymbolFrame
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
-from semcast.common.recording import RecordingWriter, recording_metadata, recover_file
 from semcast.common.recording_reader import RecordingReader
+from semcast.common.recording_writer import RecordingWriter, recording_metadata, recover_file
 from semcast.common.run_folder import read_run
 from semcast.common.sequence import open_sequence
 from semcast.common.transport import open_hub
@@ -37,7 +37,7 @@ from semcast.server.record import RecordSettings, StreamNotes, kind_of_key, run_
 from semcast.server.recorded_streams import recorded_streams
 from semcast.server.replay import ReplaySettings, replay
 from semcast.server.session import Session
-from semcast.server.settings import ViewSettings
+from semcast.server.view.settings import ViewSettings
 
 SEQUENCE = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
 FRAMES = 14
@@ -133,6 +133,7 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
             ReplaySettings(file=recording, out=tmp_path / name, reference=SEQUENCE), None, seen.append
         )
         assert summary["completeness"] > 0.4
+        assert summary["stage_ms"]["equalise"]["p50"] > 0.0
     assert len(seen) == 2 * len(set(seen)) >= FRAMES
     first, second = ((tmp_path / name / "trajectory.tum").read_bytes() for name in ("a", "b"))
     assert first == second
@@ -144,7 +145,7 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
         out=tmp_path / "c",
         link=ChannelSettings(snr_db=15.0, frame_loss=0.4),
     )
-    replay(lossy)
+    assert replay(lossy)["stage_ms"]["equalise"]["p50"] > 0.0
     assert (tmp_path / "c" / "trajectory.tum").read_bytes() != first
     assert build_settings(ReplaySettings, read_toml(tmp_path / "c" / "settings.toml")) == lossy
 

@@ -18,8 +18,9 @@ from semcast.common.network_settings import HubSettings
 from semcast.common.sequence import open_sequence
 from semcast.common.transport import open_hub
 from semcast.server.server import Server
-from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import is_nearly_final
+from semcast.server.view.settings import ViewSettings
 
 AGENT = "cam0"
 DEMO = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"

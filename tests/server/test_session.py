@@ -15,13 +15,13 @@ from semcast.common.config import build_settings, read_toml
 from semcast.common.image_file import read_image
 from semcast.common.run_folder import FRAMES_NAME, read_image_paths, read_run
 from semcast.common.sequence import open_sequence
-from semcast.server.export.outputs import read_ply
+from semcast.server.decoder import Arrival
+from semcast.server.frame_rows import read_rows
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.reference import Reference
 from semcast.server.replay import ReplaySettings
-from semcast.server.run_record import read_rows
-from semcast.server.session import Arrival, Session
+from semcast.server.session import Session
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
 
@@ -250,7 +250,7 @@ def test_the_summary_counts_the_keyframes_of_the_map_also_those_it_began_with(de
     assert json.loads((tmp_path / "summary.json").read_text())["frames"]["keyframes"] == num_keyframes
 
 
-def test_the_dense_cloud_lies_around_the_landmarks_where_it_is_wanted(demo, tmp_path):
+def test_the_dense_cloud_lies_around_the_landmarks_where_it_is_wanted(demo, tmp_path, read_ply):
     run_session(demo, tmp_path / "dense", range(14), mode="replay")
     run_session(demo, tmp_path / "sparse", range(14), mode="replay", dense_cloud="none")
     assert not (tmp_path / "sparse" / "dense.ply").exists()
@@ -313,7 +313,7 @@ def test_a_reset_after_a_resume_shows_nothing_of_the_map_before(demo, tmp_path):
     assert shown[1] == 0
 
 
-def test_a_file_that_can_not_be_written_costs_no_other(demo, tmp_path):
+def test_a_file_that_can_not_be_written_costs_no_other(demo, tmp_path, read_ply):
     for name in ("trajectory.tum", "summary.json"):
         (tmp_path / name).mkdir()
     message = "^trajectory.tum: Is a directory; summary.json: Is a directory$"

@@ -6,7 +6,7 @@ import torch
 
 from semcast.common.codec import LOST_SLOT_SNR_DB
 from semcast.common.nets.rounding import rounded_snr_db
-from semcast.training.channel import ChannelSettings, LinkDraw, draw_links, through_link
+from semcast.training.channel import LinkDraw, LinkDrawSettings, draw_links, through_link
 
 
 def plain_draw(snr_db, gains):
@@ -44,7 +44,7 @@ def test_a_lost_slot_is_zero_at_the_floor():
 
 
 def test_draws_follow_the_settings():
-    settings = ChannelSettings(
+    settings = LinkDrawSettings(
         snr_min_db=2.0, snr_max_db=4.0, share_16qam=1.0, share_faded=1.0, share_lossy=0.0
     )
     draw = draw_links(settings, 2000, 8, torch.Generator().manual_seed(0))
@@ -57,18 +57,18 @@ def test_draws_follow_the_settings():
 
 
 def test_without_fading_and_loss_every_slot_has_gain_one():
-    settings = ChannelSettings(share_faded=0.0, share_lossy=0.0)
+    settings = LinkDrawSettings(share_faded=0.0, share_lossy=0.0)
     assert (draw_links(settings, 50, 8, torch.Generator().manual_seed(0)).gain == 1).all()
 
 
 def test_shares_and_ranges_are_checked():
     with pytest.raises(ValueError, match=r"share_lossy must be in \[0, 1\], got 1.5"):
-        ChannelSettings(share_lossy=1.5)
+        LinkDrawSettings(share_lossy=1.5)
     with pytest.raises(ValueError, match="snr_min_db must be <="):
-        ChannelSettings(snr_min_db=20.0)
+        LinkDrawSettings(snr_min_db=20.0)
     for values in ({"snr_min_db": math.nan}, {"snr_min_db": -500.0}, {"feedback_sd_db": -1.0}):
         with pytest.raises(ValueError, match=next(iter(values)) + " must be in"):
-            ChannelSettings(**values)
+            LinkDrawSettings(**values)
 
 
 def test_links_of_rounded_values_as_links_of_analog_ones():
@@ -97,7 +97,7 @@ def test_links_of_rounded_values_as_links_of_analog_ones():
 
 def test_values_in_the_next_slot_fade_as_it_does():
     generator = torch.Generator().manual_seed(0)
-    draw = draw_links(ChannelSettings(share_faded=1.0, share_lossy=0.0), 2, 3, generator)
+    draw = draw_links(LinkDrawSettings(share_faded=1.0, share_lossy=0.0), 2, 3, generator)
     behind = torch.zeros(2, 5, 3, 4, dtype=torch.bool)
     behind[:, 3:, 1] = True
     links = draw.per_value(behind)

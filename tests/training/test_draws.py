@@ -1,7 +1,7 @@
 import torch
 
 from semcast.training.allocations import AllocationSettings
-from semcast.training.channel import ChannelSettings
+from semcast.training.channel import LinkDrawSettings
 from semcast.training.data import Ahead, Crops, CropSettings
 from semcast.training.draws import Draws
 from tests.training.test_data import photo
@@ -9,7 +9,7 @@ from tests.training.test_data import photo
 
 def draws(seed=0, rank=0, is_variable=True):
     crops = Crops([photo(seed=k) for k in range(3)], CropSettings(size_px=32), 4, seed, rank)
-    return Draws(crops, ChannelSettings(), AllocationSettings() if is_variable else None, seed, rank)
+    return Draws(crops, LinkDrawSettings(), AllocationSettings() if is_variable else None, seed, rank)
 
 
 def tensors(draw):

@@ -21,7 +21,7 @@ from semcast.common.nets.codec import NeuralCodec
 from semcast.common.nets.mae import MaeSizes, build_mae
 from semcast.common.nets.registry import architectures
 from semcast.common.nets.transceiver import Sizes, build_3dcsc, build_variable_3dcsc
-from semcast.training.channel import ChannelSettings
+from semcast.training.channel import LinkDrawSettings
 from semcast.training.data import CropSettings
 from semcast.training.loop import train
 from semcast.training.losses import LossSettings
@@ -108,7 +108,7 @@ def test_the_weights_change_and_the_seed_decides_how(tiny_network, photos, tmp_p
 def test_training_lowers_the_loss_on_the_images_it_sees(tiny_network, photos, tmp_path):
     reports = []
     rates = {"lr": 1e-2, "lr_linear": 1e-2, "clip": 1.0}
-    clean = ChannelSettings(snr_min_db=14.0, share_faded=0.0, share_lossy=0.0)
+    clean = LinkDrawSettings(snr_min_db=14.0, share_faded=0.0, share_lossy=0.0)
     train(
         settings_for(
             photos, tmp_path / "run", steps=80, log_every=20, start="random", channel=clean, **rates
@@ -159,7 +159,7 @@ def test_a_gradient_that_is_not_finite_spoils_nothing(tiny_network, photos, tmp_
 
 
 def test_a_run_can_begin_with_analog_links(tiny_network, photos, tmp_path):
-    always_qam = ChannelSettings(share_16qam=1.0)
+    always_qam = LinkDrawSettings(share_16qam=1.0)
     train(settings_for(photos, tmp_path / "o", analog_share=0.5, channel=always_qam, log_every=1))
     rows = [json.loads(line) for line in (tmp_path / "o" / "log.jsonl").read_text().splitlines()]
     power = [row["power"] for row in rows if "power" in row]  # of the 16-QAM images, 0 where there is none

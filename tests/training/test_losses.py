@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
-from semcast.training.channel import ChannelSettings, draw_links
+from semcast.training.channel import LinkDrawSettings, draw_links
 from semcast.training.descriptors import dense_descriptors, descriptor_loss
 from semcast.training.losses import (
     LossSettings,
@@ -89,7 +89,7 @@ def run_loss(settings, with_heads=True):
         for weight in model.parameters():
             weight.add_(0.02 * torch.randn_like(weight))
     generator = torch.Generator().manual_seed(0)
-    draw = draw_links(ChannelSettings(), 2, 2, generator)
+    draw = draw_links(LinkDrawSettings(), 2, 2, generator)
     x = torch.rand(2, 3, 32, 32, generator=generator)
     noise = torch.randn(2, 94, 2, 2, generator=generator)
     loss, logs = transceiver_loss(model, x, draw, noise, settings, with_heads)

@@ -125,12 +125,10 @@ def camera_pictures(camera: str) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
     import numpy as np
 
     from semcast.agent.source import is_camera_number
-    from semcast.agent.video import public_name
+    from semcast.agent.video import open_capture, public_name
 
-    capture = cv2.VideoCapture(int(camera) if is_camera_number(camera) else camera)
+    capture = open_capture(camera, live=is_camera_number(camera) or "://" in camera)
     try:
-        if not capture.isOpened():
-            raise SourceError(f"camera {public_name(camera)} can't be opened")
         for number in range(sys.maxsize):
             if not capture.grab():
                 if number == 0:

@@ -47,7 +47,7 @@ EVALUATIONS: dict[str, _Evaluation] = {
     "codec": (
         codec.CodecSettings,
         codec.evaluate_codec,
-        codec.UNUSED_LINK_FIELDS,
+        codec.UNUSED_FIELDS,
         "image quality of codecs over SNR",
     ),
     "confidence": (

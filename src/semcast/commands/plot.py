@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     from semcast.common.sequence import open_truth, retimed
     from semcast.common.trajectory import read_tum
     from semcast.evaluation.run_plots import RunToPlot, plot_run
-    from semcast.server.run_record import read_rows
+    from semcast.server.frame_rows import read_rows
 
     folder: Path = arguments.run
     truth = None

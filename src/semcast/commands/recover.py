@@ -3,7 +3,7 @@
 import argparse
 
 from semcast.commands.paths import named_path
-from semcast.common.recording import recover_file
+from semcast.common.recording_writer import recover_file
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -19,7 +19,6 @@ from semcast.server.export.colmap import write_colmap
 from semcast.server.export.formats import FORMATS, export_run
 from semcast.server.export.geometry import reprojection_errors_px
 from semcast.server.export.nerfstudio import write_nerfstudio
-from semcast.server.export.outputs import read_ply
 from semcast.server.export.poses import write_run_kitti, write_run_tum
 
 
@@ -142,7 +141,7 @@ def nerfstudio_pixel(content, frame, points_up):
     return np.stack([x, y], axis=1)
 
 
-def test_nerfstudio_poses_and_points_project_onto_the_keypoints(tmp_path, arc_run, write_arc_run):
+def test_nerfstudio_poses_and_points_project_onto_the_keypoints(tmp_path, arc_run, write_arc_run, read_ply):
     data = arc_run()
     images = written(tmp_path, data, write_arc_run, keep="all")
     write_nerfstudio(tmp_path / "ns", data, images)

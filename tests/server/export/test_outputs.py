@@ -7,13 +7,10 @@ import resource
 import numpy as np
 import pytest
 
-from semcast.common.errors import SourceError
 from semcast.common.trajectory import Trajectory, read_tum, write_tum
 from semcast.server.export.outputs import (
-    PLY_VERTEX,
     percentiles,
     plain,
-    read_ply,
     trajectory_of,
     versions,
     write_json,
@@ -50,7 +47,7 @@ def test_ply_is_what_the_format_says_byte_for_byte(tmp_path):
     )
 
 
-def test_ply_round_trip_leaves_out_points_at_infinity(tmp_path):
+def test_ply_round_trip_leaves_out_points_at_infinity(tmp_path, read_ply):
     rng = np.random.default_rng(0)
     xyz = rng.normal(size=(50, 3))
     xyz[7, 1] = np.inf
@@ -62,22 +59,9 @@ def test_ply_round_trip_leaves_out_points_at_infinity(tmp_path):
     assert vertices["green"].tolist() == rgb[kept, 1].tolist()
 
 
-def test_ply_of_an_empty_map_is_valid_and_other_files_are_refused(tmp_path):
+def test_ply_of_an_empty_map_is_valid(tmp_path, read_ply):
     write_ply(tmp_path / "map.ply", np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32))
     assert len(read_ply(tmp_path / "map.ply")) == 0
-    (tmp_path / "other.ply").write_bytes(b"ply\nelement vertex 0\nend_header\n")
-    with pytest.raises(SourceError, match="not a map"):
-        read_ply(tmp_path / "other.ply")
-    with pytest.raises(SourceError, match="can't be read"):
-        read_ply(tmp_path / "missing.ply")
-
-
-def test_a_ply_that_lacks_points_is_refused(tmp_path):
-    path = tmp_path / "map.ply"
-    write_ply(path, np.ones((3, 3)), np.zeros((3, 3), np.uint8), np.ones(3, np.float32))
-    path.write_bytes(path.read_bytes()[: -PLY_VERTEX.itemsize])
-    with pytest.raises(SourceError, match="does not hold as many points as it says"):
-        read_ply(path)
 
 
 def test_ply_opens_in_colmap(tmp_path):
@@ -91,7 +75,7 @@ def test_ply_opens_in_colmap(tmp_path):
     assert [p.color.tolist() for p in points] == rgb.tolist()
 
 
-def test_a_full_disk_leaves_the_results_of_before(tmp_path, full_disk):
+def test_a_full_disk_leaves_the_results_of_before(tmp_path, full_disk, read_ply):
     xyz, rgb, confidence = np.ones((100, 3)), np.zeros((100, 3), np.uint8), np.ones(100, np.float32)
     write_ply(tmp_path / "map.ply", xyz[:1], rgb[:1], confidence[:1])
     write_tum(tmp_path / "t.tum", Trajectory(np.zeros(1), np.eye(4)[None]))

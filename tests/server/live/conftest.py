@@ -30,7 +30,8 @@ from semcast.common.symbol_payload import pack_iq, pack_lost
 from semcast.common.transport import open_client, open_hub
 from semcast.common.wire import pack, unpack
 from semcast.server.server import Server
-from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.settings import ServerSettings
+from semcast.server.view.settings import ViewSettings
 
 DEMO = Path(__file__).resolve().parents[3] / "deploy" / "demo" / "kitti_06"
 RESIZE = 0.5

@@ -9,7 +9,6 @@ from semcast.common.map_mirror import MapMirror
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.run_folder import read_run
 from semcast.common.transport import open_client
-from semcast.server.export.outputs import read_ply
 from semcast.server.mapping.settings import ReconstructionSettings
 
 pytestmark = pytest.mark.xdist_group("real-time")
@@ -25,7 +24,7 @@ def until(condition, what):
         time.sleep(0.01)
 
 
-def test_who_comes_late_has_the_whole_map_and_follows_it(tmp_path, air, monkeypatch):
+def test_who_comes_late_has_the_whole_map_and_follows_it(tmp_path, air, monkeypatch, read_ply):
     monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
     running = air.serve(out=tmp_path)
     radio = air.agent(100)

@@ -10,8 +10,8 @@ from semcast.common.recording_reader import RecordingReader
 from semcast.server.export.outputs import write_ply
 from semcast.server.receiver import WINDOW
 from semcast.server.recorded_streams import recorded_streams
-from semcast.server.settings import ViewSettings
 from semcast.server.view.rerun_viewer import RerunStream
+from semcast.server.view.settings import ViewSettings
 
 pytestmark = pytest.mark.xdist_group("real-time")
 

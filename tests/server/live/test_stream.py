@@ -23,10 +23,10 @@ from semcast.common.symbol_payload import pack_lost
 from semcast.common.trajectory import read_tum
 from semcast.common.transport import open_client, open_hub
 from semcast.common.wire import pack, unpack
-from semcast.server.export.outputs import read_ply
 from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server
-from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.settings import ServerSettings
+from semcast.server.view.settings import ViewSettings
 
 pytestmark = pytest.mark.xdist_group("real-time")
 
@@ -35,7 +35,7 @@ AGENT = "cam0"
 DEADLINE_S = 60.0
 
 
-def test_a_lossless_stream_leaves_every_promised_file_and_repeats_bit_for_bit(tmp_path, open_air):
+def test_a_lossless_stream_leaves_every_promised_file_and_repeats_bit_for_bit(tmp_path, open_air, read_ply):
     trajectories = []
     for run in ("a", "b"):
         out = tmp_path / run

@@ -225,7 +225,6 @@ def test_the_process_gives_what_inline_gives_and_survives_a_kill():
         assert result is not None
         assert np.array_equal(result.xyz, inline.xyz)
         assert runner.pid != before
-        assert runner.num_restarts >= 1
     finally:
         runner.close()
         runner.close()

@@ -9,7 +9,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.features import TrackedPoints
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.loop_closure import _LOOK_INTERVAL, Loop, LoopFinder, View, share_out
+from semcast.server.mapping.loop_closure import _LOOK_INTERVAL, Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.revisit import Revisit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -86,7 +86,7 @@ def view(room, T_true, frame_id=100):
     T_world_cam = drifted(T_true, NUM - 1)
     world.add_frame(frame_id, NUM - 1, T_world_cam)
     sight = SimpleNamespace(frame=SimpleNamespace(frame_id=frame_id))
-    return View(sight, T_world_cam, ids[known], xy[known])
+    return LoopView(sight, T_world_cam, ids[known], xy[known])
 
 
 def old_landmarks(room, T_true, rng, *, num_wrong=0, off_px=0.3):
@@ -141,7 +141,7 @@ def test_where_nothing_has_drifted_there_is_no_loop_and_none_is_looked_for(room,
     world.landmarks.xyz = room[1][world.landmarks.ids % 10_000]
     recogniser = Recogniser()
     finder = LoopFinder(CAMERA, recogniser, 0)
-    here = View(view(room, HERE).sight, HERE, *sees(HERE, room[1]))
+    here = LoopView(view(room, HERE).sight, HERE, *sees(HERE, room[1]))
     for _ in range(8):
         assert finder.look(here, world, NOISE, 0, old_landmarks(room, HERE, rng)) is None
     assert recogniser.asked == []
@@ -184,7 +184,7 @@ def test_far_from_old_keyframes_nothing_is_compared(room):
     finder = LoopFinder(CAMERA, recogniser, 0)
     away = around(NUM - 1) @ make_transform(np.eye(3), [0, 0, -30.0])
     for _ in range(6):
-        finder.look(View(view(room, HERE).sight, away, *sees(HERE, room[1])), room[0], NOISE, 0, None)
+        finder.look(LoopView(view(room, HERE).sight, away, *sees(HERE, room[1])), room[0], NOISE, 0, None)
     assert recogniser.asked == []
 
 

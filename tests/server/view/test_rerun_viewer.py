@@ -18,19 +18,20 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError
 from semcast.common.geometry import make_transform
 from semcast.server.dense.cloud import DensePatch
-from semcast.server.settings import ServerSettings, ViewSettings
+from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.scene import FrameView
+from semcast.server.view.settings import ViewSettings
 
 pytest.importorskip("rerun")
 
 import rerun as rr
 
-from semcast.server.view.choice import check_viewer, open_viewer
 from semcast.server.view.feed import ViewerFeed, check_view, resolve_view
 from semcast.server.view.live_stream import MAX_REFUSALS
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
 from semcast.server.view.rerun_viewer import SERIES, blueprint
+from semcast.server.viewing import check_viewer, open_viewer
 
 pytestmark = pytest.mark.xdist_group("real-time")
 

@@ -10,7 +10,7 @@ from semcast.common.errors import SemcastError
 from semcast.common.run_folder import FRAMES_NAME
 from semcast.common.trajectory import Trajectory
 from semcast.server.export.outputs import write_json
-from semcast.server.run_record import FrameRow, RunRecord, read_rows, summarise
+from semcast.server.frame_rows import FrameRow, FrameRows, read_rows, summarise
 from semcast.server.sent_frames import stretches
 
 
@@ -48,7 +48,7 @@ def line_trajectory(frame_ids):
 
 
 def test_rows_are_on_disk_at_once_and_a_torn_last_line_is_left_out(tmp_path):
-    record = RunRecord(tmp_path)
+    record = FrameRows(tmp_path)
     record.add(row(0))
     record.add(row(1, posed=False, psnr_db=float("nan")))
     path = tmp_path / FRAMES_NAME
@@ -61,7 +61,7 @@ def test_rows_are_on_disk_at_once_and_a_torn_last_line_is_left_out(tmp_path):
 
 def test_a_resumed_run_goes_on_behind_its_rows_and_a_new_run_does_not(tmp_path):
     for k, resume, expected in ((0, False, [0]), (1, True, [0, 1]), (1, True, [0, 1]), (1, False, [1])):
-        record = RunRecord(tmp_path, resume=resume)
+        record = FrameRows(tmp_path, resume=resume)
         record.add(row(k))
         record.close()
         record.close()
@@ -75,7 +75,7 @@ def test_damage_in_the_middle_is_an_error_with_its_line(tmp_path):
 
 
 def test_rows_tell_the_part_of_the_map_and_older_rows_count_as_the_first(tmp_path):
-    record = RunRecord(tmp_path)
+    record = FrameRows(tmp_path)
     record.add(row(0, submap=2))
     record.close()
     path = tmp_path / FRAMES_NAME
@@ -87,14 +87,14 @@ def test_rows_tell_the_part_of_the_map_and_older_rows_count_as_the_first(tmp_pat
 
 
 def test_without_a_folder_rows_stay_in_memory():
-    record = RunRecord(None)
+    record = FrameRows(None)
     record.add(row(3))
     assert [r.frame_id for r in record.rows()] == [3]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 def test_a_full_disk_does_not_stop_the_stream(tmp_path, caplog):
-    record = RunRecord(tmp_path)
+    record = FrameRows(tmp_path)
     record.add(row(0))
 
     record._file.close()

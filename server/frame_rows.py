@@ -92,7 +92,7 @@ class FrameRow:
         )
 
 
-class RunRecord:
+class FrameRows:
     """Appends rows to ``frames.jsonl``, which survives a kill; without a folder keeps the newest in memory.
 
     Args:

@@ -1,0 +1,43 @@
+"""How the frames of a recording are played: the ranges that all programs share, and the pace of its own."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Between frames, where there is but one: that of ten a second.
+_PERIOD_OF_ONE_NS = 1e8
+
+
+def check_playback(
+    *,
+    resize: float | None = None,
+    stride: int | None = None,
+    max_frames: int | None = None,
+    rate_hz: float | None = None,
+) -> None:
+    """Check what was given; None stands for nothing given.
+
+    Args:
+        resize: Factor on the image size.
+        stride: One frame of so many is used.
+        max_frames: Frames used at most.
+        rate_hz: Frames a second.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+    if resize is not None and not 0.05 <= resize <= 1.0:
+        raise ValueError(f"resize must be in [0.05, 1], got {resize:g}")
+    for name, count in (("stride", stride), ("max_frames", max_frames)):
+        if count is not None and count < 1:
+            raise ValueError(f"{name} must be at least 1, got {count}")
+    if rate_hz is not None and not 0.01 <= rate_hz <= 1000.0:
+        raise ValueError(f"rate_hz must be in [0.01, 1000], got {rate_hz:g}")
+
+
+def usual_period_ns(times_ns: NDArray[np.int64]) -> float:
+    """Return the usual time between two frames, the median; that of ten a second where there is but one.
+
+    Args:
+        times_ns: ``(N,)``, increasing.
+    """
+    return float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else _PERIOD_OF_ONE_NS
