@@ -57,7 +57,7 @@ def test_imports_go_one_way(folder):
     [
         ("geometry", {"geometry"}),
         ("mapping", {"geometry", "mapping"}),
-        ("dense", {"mapping", "dense"}),
+        ("dense", {"geometry", "mapping", "dense"}),
         ("view", {"mapping", "dense", "view"}),
         ("export", {"export", "view"}),
     ],

@@ -8,12 +8,10 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, make_transform, project_to_so3, transform_points
+from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 
 Array = NDArray[np.float64]
-
-#: Landmarks nearer than this to the camera plane (map units) have no usable projection.
-MIN_DEPTH_MAP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -78,12 +76,7 @@ def reprojection_residual(
         points_world: ``(N, 3)``.
         keypoints_xy: ``(N, 2)`` their observations.
     """
-    points_cam = transform_points(T_cam_world, points_world)
-    front = points_cam[:, 2] > MIN_DEPTH_MAP
-    z = np.where(front, points_cam[:, 2], 1.0)
-    projected = np.stack(
-        [camera.fx * points_cam[:, 0] / z + camera.cx, camera.fy * points_cam[:, 1] / z + camera.cy], axis=1
-    )
+    projected, front = project_in_front(camera, transform_points(T_cam_world, points_world))
     return np.where(front[:, None], keypoints_xy - projected, 0.0), front
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import angles_between_deg
-from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front
 
 Array = NDArray[np.float64]
 
@@ -100,11 +100,7 @@ def triangulate(
         length = np.linalg.norm(step, axis=1)
         xyz = xyz + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
     points_cam = (R @ xyz[point][:, :, None])[..., 0] + t
-    front = points_cam[:, 2] > MIN_DEPTH_MAP
-    z = np.where(front, points_cam[:, 2], 1.0)
-    projected = np.stack(
-        [camera.fx * points_cam[:, 0] / z + camera.cx, camera.fy * points_cam[:, 1] / z + camera.cy], axis=1
-    )
+    projected, front = project_in_front(camera, points_cam)
     square = ((keypoints_xy - projected) ** 2).sum(axis=1) * w
     count = np.bincount(point, minlength=num_points)
     error = np.sqrt(np.bincount(point, weights=square, minlength=num_points) / np.maximum(1, 2 * count))

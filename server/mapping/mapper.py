@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, Observations
@@ -206,8 +207,7 @@ def new_landmarks(
     T_cam_world = invert_transform(np.stack([k.T_world_cam for k in views]))
     sigma = noise.sigma_px(confidence)
     points = triangulate(camera, T_cam_world, view, point, xy, sigma, len(wanted))
-    T_seen_world = invert_transform(seen_from.T_world_cam)
-    depth = points.xyz @ T_seen_world[2, :3] + T_seen_world[2, 3]
+    depth = depths_in(invert_transform(seen_from.T_world_cam), points.xyz)
     # A fixed error in pixels is what an angle is compared with: noisy images need more parallax.
     wanted_deg = max(min_parallax_deg, float(np.degrees(2.5 * np.median(sigma) / camera.fx)))
     good = (
@@ -277,8 +277,7 @@ def median_depth_of(keyframe: Keyframe, ids: Ids, xyz: Array) -> float:
     _, row, _ = np.intersect1d(ids, keyframe.ids, assume_unique=True, return_indices=True)
     if len(row) == 0:
         return float("inf")
-    T_cam_world = invert_transform(keyframe.T_world_cam)
-    depth = xyz[row] @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    depth = depths_in(invert_transform(keyframe.T_world_cam), xyz[row])
     return float(np.median(np.maximum(depth, 1e-6)))
 
 

@@ -17,6 +17,7 @@ from semcast.server.geometry.features import (
     match_descriptors,
 )
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
+from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -253,12 +254,10 @@ def submap_similarity(
     close = square[np.arange(len(place.xy)), nearest] < radius_px**2
     if int(close.sum()) < 8:
         return None
-    T_cam_old = invert_transform(place.T_world_cam)
-    T_cam_new = invert_transform(T_world_cam_new)
     xyz_old = world.landmarks.xyz[world.landmarks.rows(place.ids[close])]
     xyz_new = world.landmarks.xyz[row_new[known][nearest[close]]]
-    depth_old = xyz_old @ T_cam_old[2, :3] + T_cam_old[2, 3]
-    depth_new = xyz_new @ T_cam_new[2, :3] + T_cam_new[2, 3]
+    depth_old = depths_in(invert_transform(place.T_world_cam), xyz_old)
+    depth_new = depths_in(invert_transform(T_world_cam_new), xyz_new)
     valid = (depth_old > 1e-6) & (depth_new > 1e-6)
     if int(valid.sum()) < 8:
         return None
