@@ -29,7 +29,7 @@ from semcast.server.geometry.epipolar import (
     rotation_residual_px,
     sampson_px,
 )
-from semcast.server.geometry.pnp import poselib_camera
+from semcast.server.geometry.lo_ransac import lo_ransac
 from semcast.server.geometry.ransac import confidence_ransac, in_front
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fit_noise
 
@@ -246,14 +246,8 @@ def _search(
         "seed": seed,
         "progressive_sampling": in_order,
     }
-    pinhole = poselib_camera(camera)
-    pose, info = poselib.estimate_relative_pose(xy0, xy1, pinhole, pinhole, options, {})
-    t = np.asarray(pose.t, dtype=np.float64)
-    length = float(np.linalg.norm(t))
-    R = np.asarray(pose.R, dtype=np.float64)
-    if info["num_inliers"] < 5 or not (np.isfinite(length) and np.isfinite(R).all()) or length == 0.0:
-        return None
-    return make_transform(project_to_so3(R), t / length)
+    found = lo_ransac(camera, xy0, xy1, options)
+    return None if found is None else make_transform(project_to_so3(found[:3, :3]), found[:3, 3])
 
 
 def _near_turning(camera: Intrinsics, xy0: Array, xy1: Array, threshold_px: float) -> list[Array]:

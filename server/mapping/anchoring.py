@@ -123,8 +123,8 @@ def _views(
     world: WorldMap, images: KeyframeImages, submap: int, count: int
 ) -> list[tuple[SeenFrom, Keyframe]]:
     """Newest kept keyframes of a submap with their images, oldest first."""
-    by_id = {k.frame_id: k for k in world.keyframes_of(submap)}
-    return [(image, by_id[image.frame_id]) for image in images.newest(count) if image.frame_id in by_id]
+    there = [(image, world.keyframe(image.frame_id)) for image in images.newest(count)]
+    return [(image, k) for image, k in there if k is not None and k.submap == submap]
 
 
 def _align(

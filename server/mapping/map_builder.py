@@ -67,9 +67,7 @@ class MapBuilder:
     def clear(self) -> None:
         """Forget the map; an adjustment under way is not applied any more."""
         s = self._settings
-        if self._bundle.busy:
-            self._bundle.take(wait=True)
-        self._version += 1
+        self._abandon_adjustment()
         self.watch.forget_frames()
         self.world = WorldMap()
         self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
@@ -79,6 +77,12 @@ class MapBuilder:
         self.enter(0)
         self.num_inliers_at_keyframe = 0
         self.images = KeyframeImages(_MAX_IMAGES)
+
+    def _abandon_adjustment(self) -> None:
+        """Free the runner before the map changes; what it was asked before does not apply any more."""
+        if self._bundle.busy:
+            self._bundle.take(wait=True)
+        self._version += 1
 
     def reference_keyframe(self) -> Keyframe | None:
         """Newest keyframe of the current submap."""
@@ -226,9 +230,7 @@ class MapBuilder:
         if found is None:
             return False
         keyframe_ids, solved = found
-        if self._bundle.busy:
-            self._bundle.take(wait=True)
-        self._version += 1
+        self._abandon_adjustment()
         self.world.bend(keyframe_ids, solved.T_world_cam, solved.scale)
         self.world.revisits[loop.keyframe_id] = loop.place.keyframe_id
         self._adjusted = None
@@ -360,9 +362,7 @@ class MapBuilder:
 
     def put_right(self, camera: Intrinsics, flows: Mapping[int, ImageFlow]) -> None:
         """Make up for a rolling shutter that was not known of, see ``put_map_right``, and adjust the map."""
-        if self._bundle.busy:
-            self._bundle.take(wait=True)
-        self._version += 1
+        self._abandon_adjustment()
         put_map_right(self.world, self.images, camera, flows)
         self._submit(start=True)
         self.collect(wait=True)
@@ -420,9 +420,7 @@ class MapBuilder:
         )
         if not may_turn(T_place_mine[:3, :3], older, newer):
             return None
-        if self._bundle.busy:
-            self._bundle.take(wait=True)
-        self._version += 1
+        self._abandon_adjustment()
         if self.submap > place.submap:
             self.world.transform_submap(self.submap, place.submap, scale, T_place_mine)
         else:

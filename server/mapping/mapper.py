@@ -347,11 +347,10 @@ def _share_left(problem: BundleProblem, known: NDArray[np.bool_]) -> Array:
 
 def _drop(world: WorldMap, problem: BundleProblem, bad: NDArray[np.bool_]) -> None:
     """Forget observations, and landmarks that are left with too few."""
-    by_id = {k.frame_id: k for k in world.keyframes}
     for k, frame_id in enumerate(problem.keyframe_ids.tolist()):
         rows = np.flatnonzero(bad & (problem.view == k))
-        if len(rows) and frame_id in by_id:
-            keyframe = by_id[frame_id]
+        keyframe = world.keyframe(frame_id) if len(rows) else None
+        if keyframe is not None:
             keyframe.drop_observations(np.isin(keyframe.ids, problem.landmark_ids[problem.point[rows]]))
     left = np.bincount(problem.point[~bad], minlength=len(problem.xyz))
     # Keyframes outside the problem saw those of long ago too: one new frame does not refute a landmark.

@@ -156,10 +156,7 @@ def _expected(
     good = seen_alike(warps, depth_now)
     points_cam = transform_points(T_cam_world, world.landmarks.xyz[row[rows]])
     xy = camera.project(np.where(good[:, None], points_cam, (0.0, 0.0, 1.0)))
-    height, width = sight.grey.shape
-    border = np.array([_BORDER_PX, _BORDER_PX])
-    good &= ((xy >= border) & (xy < np.array([width, height]) - border)).all(axis=1)
-    good &= ~sight.near_lost(xy, _BORDER_PX)
+    good &= sight.shows(xy, _BORDER_PX)
     return _Expected(keyframe, image, rows[good], xy[good], warps[good])
 
 

@@ -1,9 +1,9 @@
 """What a bundle adjustment is asked: the newest keyframes, those that hold them, and what they see.
 
-Tried without gain: tracks that are no landmarks yet as further points of an adjustment (drawn streets a
-little better, a real shelf worse), and a single fixed pose with a distance until the map outgrows the
-window (an orbit better, a drive worse). Twenty keyframes correct for longer what the start of a map got
-wrong than ten do, and cost hardly more time: what counts is the number of observations.
+Only landmarks are points of it: tracks that are none yet help where images are clean and harm where they are
+not. Two poses are fixed, for a single one and a distance hold an orbit better, but a drive worse. Twenty
+keyframes correct for longer what the start of a map got wrong than ten do, and cost hardly more time: what
+counts is the number of observations.
 """
 
 from typing import Any
