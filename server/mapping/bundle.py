@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 #: Observations share noise models: their sigmas are rounded to so many steps.
 NUM_SIGMAS = 16
 SIGMA_RANGE_PX = (0.1, 12.0)
+#: With fewer there is no window, but what is left of one.
+_MIN_OBSERVATIONS = 10
 #: Holds a fixed pose: radians and map units.
 _FIXED_SIGMA = 1e-6
 
@@ -109,7 +111,7 @@ def optimise(problem: BundleProblem) -> BundleResult:
     used = front & (count[problem.point] >= 2) & np.isfinite(problem.xy).all(axis=1)
     T_world_cam, xyz, covariance, ok = problem.T_world_cam.copy(), problem.xyz.copy(), None, False
     is_posed = bool(np.isfinite(problem.T_world_cam).all())
-    if int(used.sum()) >= 10 and problem.fixed.any() and is_posed:
+    if int(used.sum()) >= _MIN_OBSERVATIONS and problem.fixed.any() and is_posed:
         graph, values = _build(problem, used)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(problem.iterations)

@@ -45,6 +45,10 @@ _MAX_IMAGES = 150
 _ENOUGH_SHARE = 0.2
 #: Landmarks seen again may take the tracks to so many times the number that is wanted.
 _MAX_TRACKS_SHARE = 1.2
+#: The newest keyframes, which stay where older ones are thinned out: an adjustment's window is among them.
+_MAX_RECENT = 40
+#: Steps of an adjustment: a start is far from where it ends, a window was adjusted before but for its newest.
+_START_ITERATIONS, _ITERATIONS = 15, 6
 
 
 class MapBuilder:
@@ -329,7 +333,7 @@ class MapBuilder:
     def _bound(self) -> None:
         """Keep the map, and the images of its keyframes, within its size."""
         s = self._settings
-        if self.world.bound(s.max_landmarks, s.max_keyframes, recent=min(40, s.max_keyframes // 2)):
+        if self.world.bound(s.max_landmarks, s.max_keyframes, recent=min(_MAX_RECENT, s.max_keyframes // 2)):
             self.images.keep({k.frame_id for k in self.world.keyframes})
 
     def _submit(self, *, start: bool = False) -> None:
@@ -342,7 +346,7 @@ class MapBuilder:
             self.noise.model,
             self._settings.window_size,
             start=start or mine <= self._settings.window_size // 2,
-            iterations=15 if start else 6,
+            iterations=_START_ITERATIONS if start else _ITERATIONS,
             map_version=self._version,
         )
         if problem is not None:

@@ -30,6 +30,15 @@ _MIN_LEFT = 0.1
 #: Where landmarks run out, points under smaller angles do, down to this share of the usual one: a camera that
 #: turns leaves all it knows, and sees hardly anything from two sides.
 _LEAST_PARALLAX_SHARE = 0.3
+#: A pose soon rests on too little when fewer landmarks agree than this share of those right after the last
+#: keyframe, or than so many. New ones are wanted in time: when those, or tracks, are less than these shares.
+_FEW_SHARE, _FEW, _THINNED_SHARE, _SPARSE_SHARE = 0.45, 40, 0.75, 0.6
+#: A frame with less of its rows holds little, and its keyframes are the further apart (in frames).
+_DAMAGED_SHARE, _DAMAGED_APART = 0.5, 5
+#: Flow in image widths: below the first the camera stands, which brings neither parallax nor new views; from
+#: the second on, or so many frames after the last keyframe, another one says something new; beyond the third
+#: the view is another.
+_STANDING_WIDTHS, _CHANGING_WIDTHS, _APART, _MOVED_WIDTHS = 0.004, 0.02, 2, 0.045
 #: Observations in a row that disagree before a landmark is given up.
 _MAX_MISSED = 4
 
@@ -64,15 +73,15 @@ def wants_keyframe(cues: KeyframeCues) -> bool:
 
     A frame of which much is missing becomes one only in need.
     """
-    few = cues.num_inliers < 0.45 * cues.num_inliers_at_keyframe or cues.num_inliers < 40
-    if cues.usable_share < 0.5:
-        return few and cues.frames_since >= 5
-    if cues.median_flow_px < 0.004 * cues.width_px:
-        return False  # standing still brings neither parallax nor new views
-    thinned = cues.num_inliers < 0.75 * cues.num_inliers_at_keyframe
-    sparse = cues.num_visible < 0.6 * cues.max_features
-    moved = cues.median_flow_px > 0.045 * cues.width_px
-    changing = cues.frames_since >= 2 or cues.median_flow_px > 0.02 * cues.width_px
+    few = cues.num_inliers < max(_FEW_SHARE * cues.num_inliers_at_keyframe, _FEW)
+    if cues.usable_share < _DAMAGED_SHARE:
+        return few and cues.frames_since >= _DAMAGED_APART
+    if cues.median_flow_px < _STANDING_WIDTHS * cues.width_px:
+        return False
+    thinned = cues.num_inliers < _THINNED_SHARE * cues.num_inliers_at_keyframe
+    sparse = cues.num_visible < _SPARSE_SHARE * cues.max_features
+    moved = cues.median_flow_px > _MOVED_WIDTHS * cues.width_px
+    changing = cues.frames_since >= _APART or cues.median_flow_px > _CHANGING_WIDTHS * cues.width_px
     return few or moved or ((thinned or sparse) and changing)
 
 
