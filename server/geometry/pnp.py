@@ -135,11 +135,8 @@ def refine_pose(
         weighted = (rows * np.repeat(w, 2)[:, None]).T
         hessian = weighted @ rows
         gradient = weighted @ residual.ravel()
-        try:
-            step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) / 6.0 * np.eye(6), gradient)
-        except np.linalg.LinAlgError:
-            return _without_inliers(T_start, len(points_world))
-        if not np.isfinite(step).all():
+        step = _damped_step(hessian, gradient)
+        if step is None:
             return _without_inliers(T_start, len(points_world))
         T = exp_se3(step) @ T
         if iteration >= 3 and float(np.abs(step).max()) < 1e-6:
@@ -150,6 +147,15 @@ def refine_pose(
         residual = np.einsum("nij,nj->ni", whitener, residual)
     length = np.where(front, np.linalg.norm(residual, axis=1), np.inf)
     return PoseEstimate(T, length < gate_px, length, _covariance(hessian))
+
+
+def _damped_step(hessian: Array, gradient: Array) -> Array | None:
+    """Twist ``(6,)`` that solves the normal equations; None where nothing does."""
+    try:
+        step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) / 6.0 * np.eye(6), gradient)
+    except np.linalg.LinAlgError:
+        return None
+    return step if np.isfinite(step).all() else None
 
 
 def _whitener(sigma_px: Array, spread_px: Array) -> Array:
