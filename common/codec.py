@@ -23,6 +23,10 @@ DEFAULT_CODEC = "3dcsc-lite-vr"
 #: Side of the window in which keypoints are tracked, and whose displacement the keypoint confidence predicts.
 KLT_WINDOW_PX = 21
 
+#: alpha of the label pixel confidence is trained on (paper, Eq. 11): ``1 - tanh(alpha |x_hat - x|)``, with
+#: images in [0, 1].
+LABEL_SHARPNESS = 30.0
+
 #: Effective SNR given to the decoder for a slot of which nothing arrived.
 LOST_SLOT_SNR_DB = -20.0
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import (
+    LABEL_SHARPNESS,
     LOST_SLOT_SNR_DB,
     DecodedImage,
     EncodedImage,
@@ -38,7 +39,6 @@ from semcast.common.shapes import check_shape
 _GREY = 128
 #: No link is better; what is said to be is finite this way.
 _MAX_SNR_DB = 100.0
-_LABEL_SLOPE = 30.0
 #: Standard deviation of grey levels in an 8x8 window that separates the classes of activity.
 _ACTIVITY_EDGES = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 35.0)
 _NUM_CLASSES = len(_ACTIVITY_EDGES) + 1
@@ -111,7 +111,7 @@ def _activity_class(image: NDArray[np.uint8]) -> NDArray[np.intp]:
 def _confidence_table(image: NDArray[np.uint8], decoded: NDArray[np.uint8]) -> bytes:
     """Return the mean pixel label of each activity class in 1/255; empty classes give 255."""
     error = cv2.absdiff(image, decoded).astype(np.float32).mean(axis=2) / 255.0
-    label = 1.0 - np.tanh(_LABEL_SLOPE * error)
+    label = 1.0 - np.tanh(LABEL_SHARPNESS * error)
     classes = _activity_class(decoded).reshape(-1)
     count = np.bincount(classes, minlength=_NUM_CLASSES)
     total = np.bincount(classes, weights=label.reshape(-1), minlength=_NUM_CLASSES)

@@ -24,9 +24,6 @@ class AteResult:
 
     Attributes:
         rmse_m: Root mean square distance between matched camera centres, in the truth's unit.
-        mean_m: Mean distance.
-        median_m: Median distance.
-        max_m: Largest distance.
         percent: ``rmse_m`` as percentage of the truth's whole path.
         path_length_m: Length of the truth's whole path.
         scale: Metres per map unit: ``p_truth = scale * R_truth_map @ p_map + t_truth_map``.
@@ -37,9 +34,6 @@ class AteResult:
     """
 
     rmse_m: float
-    mean_m: float
-    median_m: float
-    max_m: float
     percent: float
     path_length_m: float
     scale: float
@@ -54,12 +48,10 @@ class RpeResult:
     """Relative pose error between consecutive matched poses, the estimate scaled by the Sim(3) of the ATE.
 
     Attributes:
-        trans_m: Root mean square translation error of one step.
-        trans_percent: ``trans_m`` as percentage of the root mean square true step.
+        trans_percent: Root mean square translation error of one step as percentage of the true one.
         rot_deg: Root mean square rotation error of one step in degrees.
     """
 
-    trans_m: float
     trans_percent: float
     rot_deg: float
 
@@ -117,9 +109,6 @@ def ate(estimate: Trajectory, truth: Trajectory, max_gap_s: float | None = None)
     rmse_m = float(np.sqrt(np.mean(error_m**2)))
     return AteResult(
         rmse_m=rmse_m,
-        mean_m=float(error_m.mean()),
-        median_m=float(np.median(error_m)),
-        max_m=float(error_m.max()),
         percent=100.0 * rmse_m / truth.path_length,
         path_length_m=truth.path_length,
         scale=scale,
@@ -159,7 +148,6 @@ def rpe(
     trans_m = float(np.sqrt(np.mean((error[:, :3, 3] ** 2).sum(axis=1))))
     angle_rad = _rotation_angles_rad(error[:, :3, :3])
     return RpeResult(
-        trans_m=trans_m,
         trans_percent=100.0 * trans_m / step_m,
         rot_deg=float(np.degrees(np.sqrt(np.mean(angle_rad**2)))),
     )

@@ -6,7 +6,7 @@ under every codec.
 
 import logging
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -118,6 +118,31 @@ class _Sample:
     report_db: float
 
 
+class _Stream:
+    """A codec and its link at one SNR.
+
+    All images share the link, so that traces and fading go on from image to image; every codec sees the same
+    noise, which belongs to the image's number.
+    """
+
+    def __init__(
+        self, codec: Codec, images: Mapping[str, NDArray[np.uint8]], snr_db: float, settings: CodecSettings
+    ) -> None:
+        self._codec, self._settings = codec, settings
+        self._link = Link(replace(settings.link, snr_db=snr_db), settings.seed)
+        self._reporter = LinkReporter(codec.name)
+        first = to_coded(next(iter(images.values())), settings.rate)
+        self._told_db = told_at_first(
+            codec, first, self._link, self._reporter, 0.0, perfect_csi=settings.perfect_csi
+        )
+
+    def send(self, image: NDArray[np.uint8], k: int) -> _Sample:
+        """Send the image of number ``k`` with what the receiver reported on the one before."""
+        sample = _run(self._codec, image, self._link, self._reporter, k, self._told_db, self._settings)
+        self._told_db = sample.report_db
+        return sample
+
+
 def read_images(
     folder: Path, max_images: int | None = None
 ) -> tuple[dict[str, NDArray[np.uint8]], list[str]]:
@@ -181,23 +206,11 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
     strip: list[dict[str, NDArray[np.uint8]]] = []
     results = []
     for snr_db in settings.snr_db:
-        samples: dict[str, list[_Sample]] = {label: [] for label in under_name}
-        # One link per codec for all images, so that traces and fading go on from image to image; all see the
-        # same noise, which belongs to the image's number.
-        links = {label: Link(replace(settings.link, snr_db=snr_db), settings.seed) for label in under_name}
-        reporters = {label: LinkReporter(codec.name) for label, codec in under_name.items()}
-        first = to_coded(next(iter(images.values())), settings.rate)
-        told_db = {
-            label: told_at_first(
-                codec, first, links[label], reporters[label], 0.0, perfect_csi=settings.perfect_csi
-            )
-            for label, codec in under_name.items()
-        }
+        streams = {label: _Stream(codec, images, snr_db, settings) for label, codec in under_name.items()}
+        samples: dict[str, list[_Sample]] = {label: [] for label in streams}
         for k, (name, image) in enumerate(images.items()):
-            for label, codec in under_name.items():
-                sample = _run(codec, image, links[label], reporters[label], k, told_db[label], settings)
-                samples[label].append(sample)
-                told_db[label] = sample.report_db
+            for label, stream in streams.items():
+                samples[label].append(stream.send(image, k))
             if snr_db == strip_snr_db and len(strip) < _STRIP_IMAGES:
                 strip.append(_strip_row(name, image, {n: s[-1] for n, s in samples.items()}))
         results += [_row(name, snr_db, list(images), rows) for name, rows in samples.items()]

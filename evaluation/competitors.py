@@ -1,15 +1,15 @@
 """Confidence-free relative-pose estimators, run on the same matches as ours."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import poselib
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
+from semcast.server.geometry.lo_ransac import MIN_INLIERS, lo_ransac
 from semcast.server.geometry.ransac import confidence_ransac
 
 Array = NDArray[np.float64]
@@ -96,29 +96,15 @@ def poselib_lo_ransac(
     keypoints0_xy: Array, keypoints1_xy: Array, camera: Intrinsics, settings: CompetitorSettings
 ) -> Array | None:
     """LO-RANSAC of PoseLib with its final refinement; arguments and result as ``opencv_ransac``."""
-    if len(keypoints0_xy) < 5:
+    if len(keypoints0_xy) < MIN_INLIERS:
         return None
-    values = asdict(camera)
-    pinhole = {
-        "model": "PINHOLE",
-        "width": values["width"],
-        "height": values["height"],
-        "params": [values[name] for name in ("fx", "fy", "cx", "cy")],
-    }
     options = {
         "max_epipolar_error": settings.threshold_px,
         "success_prob": settings.success_prob,
         "max_iterations": settings.max_iterations,
         "seed": settings.seed,
     }
-    pose_cam1_cam0, info = poselib.estimate_relative_pose(
-        keypoints0_xy, keypoints1_xy, pinhole, pinhole, options, {}
-    )
-    t_cam1_cam0 = np.asarray(pose_cam1_cam0.t, dtype=np.float64)
-    length = float(np.linalg.norm(t_cam1_cam0))
-    if info["num_inliers"] < 5 or not np.isfinite(length) or length == 0.0:
-        return None
-    return make_transform(pose_cam1_cam0.R, t_cam1_cam0 / length)
+    return lo_ransac(camera, keypoints0_xy, keypoints1_xy, options)
 
 
 def plain_ransac(

@@ -17,6 +17,7 @@ import numpy as np
 from semcast.common.codec import Codec
 from semcast.common.errors import ConfigError
 from semcast.common.playback import usual_period_ns
+from semcast.common.sequence import Sequence
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
 from semcast.evaluation.pipeline import (
@@ -102,17 +103,47 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
         ConfigError: The codec is unknown, or too few frames arrive.
     """
     sequence, codec = open_stream(settings, codec)
-    link = settings.link_at(settings.snr_db[0])
     chosen = select_frames(sequence, settings)
+    frames = _received(sequence, chosen.ids, codec, settings)
+    rows = _measure(frames, sequence, settings)
+    middle, last = rows[len(rows) // 2], rows[-1]
+    keys = ("frame_ms_p50", "frame_ms_p95", "landmarks", "keyframes", "memory_mb", "bundle_memory_mb")
+    report = json_ready(
+        {
+            **provenance(VERB, settings),
+            "sequence": sequence.name,
+            "image_wh": [sequence.intrinsics.width, sequence.intrinsics.height],
+            "frames_left_out": chosen.left_out,
+            "growth": {key: last[key] / middle[key] if middle[key] else None for key in keys},
+            "results": rows,
+        }
+    )
+    if settings.json is not None:
+        write_json(settings.json, report)
+    return dict(report)
+
+
+def _received(
+    sequence: Sequence, frame_ids: list[int], codec: Codec | None, settings: EnduranceSettings
+) -> list[DecodedFrame]:
+    """Frames that arrive, decoded."""
+    link = settings.link_at(settings.snr_db[0])
     frames = [
         as_received(frame)
-        for frame in FrameRun(sequence, chosen.ids, codec, link, settings.seed, cache_bytes=0)
+        for frame in FrameRun(sequence, frame_ids, codec, link, settings.seed, cache_bytes=0)
         if frame.decoded is not None
     ]
     if not frames:
         raise ConfigError(f"no frame was received at snr_db {settings.snr_db[0]:g}: there is nothing to run")
     if len(frames) < 3:
         raise ConfigError(f"max_frames must leave at least 3 frames that arrive, got {len(frames)}")
+    return frames
+
+
+def _measure(
+    frames: list[DecodedFrame], sequence: Sequence, settings: EnduranceSettings
+) -> list[dict[str, Any]]:
+    """Pass the frames back and forth; a row for every ``settings.every``."""
     interval_ns = int(usual_period_ns(np.array([f.t_source_ns for f in frames])))
     truth = sequence.groundtruth()
     rows: list[dict[str, Any]] = []
@@ -134,21 +165,7 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
                 times_ms, seen = [], []
     finally:
         reconstruction.close()
-    middle, last = rows[len(rows) // 2], rows[-1]
-    keys = ("frame_ms_p50", "frame_ms_p95", "landmarks", "keyframes", "memory_mb", "bundle_memory_mb")
-    report = json_ready(
-        {
-            **provenance(VERB, settings),
-            "sequence": sequence.name,
-            "image_wh": [sequence.intrinsics.width, sequence.intrinsics.height],
-            "frames_left_out": chosen.left_out,
-            "growth": {key: last[key] / middle[key] if middle[key] else None for key in keys},
-            "results": rows,
-        }
-    )
-    if settings.json is not None:
-        write_json(settings.json, report)
-    return dict(report)
+    return rows
 
 
 def _row(

@@ -21,6 +21,7 @@ from semcast.server.dense.neighbours import (
     num_to_confirm,
 )
 from semcast.server.dense.view import View
+from semcast.server.geometry.projection import depths_in
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -76,8 +77,7 @@ def reconstructed(
     keyframes = {}
     for k in sorted({*seen_by.tolist()} & {*poses}):
         points = np.array([place[i] for i in seen_ids[seen_by == k].tolist() if i in place]).reshape(-1, 3)
-        T_cam_world = invert_transform(poses[k])
-        depth = points @ T_cam_world[2, :3] + T_cam_world[2, 3]
+        depth = depths_in(invert_transform(poses[k]), points)
         sought = depth_range(depth[depth > 0.0])
         if sought is not None:
             keyframes[k] = DepthKeyframe(poses[k], sought)

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from itertools import product
 from pathlib import Path
@@ -165,11 +165,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
         at_snr = {variant: PairCell(methods) for variant in variants}
         for seed in settings.all_seeds:
             run = FrameRun(sequence, chosen.ids, codec, link, seed, cache_bytes=0)
-            for gap, pair_idx, frame0, frame1 in _neighbours(run, settings.gap, quality_db):
-                T_cam1_cam0 = motions[gap].get((frame0.frame_id, frame1.frame_id))
-                if T_cam1_cam0 is None:
-                    continue
-                pair = _Pair(frame0, frame1, T_cam1_cam0, sequence.intrinsics)
+            for gap, pair_idx, pair in _pairs(run, settings.gap, motions, sequence.intrinsics, quality_db):
                 for variant, outcome in _measure(pair, gap, settings, seed):
                     at_snr[variant].add(pair_idx, seed, outcome)
         cells += list(at_snr.values())
@@ -254,6 +250,20 @@ class _Pair:
     frame1: LinkedFrame
     T_cam1_cam0: Array
     camera: Intrinsics
+
+
+def _pairs(
+    run: FrameRun,
+    gaps: tuple[int, ...],
+    motions: Mapping[int, Mapping[tuple[int, int], Array]],
+    camera: Intrinsics,
+    quality_db: list[float],
+) -> Iterator[tuple[int, int, _Pair]]:
+    """Yield gap, index and pair of those neighbours whose true motion is one to measure by."""
+    for gap, idx, frame0, frame1 in _neighbours(run, gaps, quality_db):
+        T_cam1_cam0 = motions[gap].get((frame0.frame_id, frame1.frame_id))
+        if T_cam1_cam0 is not None:
+            yield gap, idx, _Pair(frame0, frame1, T_cam1_cam0, camera)
 
 
 def _measure(

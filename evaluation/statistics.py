@@ -155,6 +155,32 @@ def small_sample_factor(count: int, level: float = 0.95) -> float:
     return float(student / z * np.sqrt(count / nu))
 
 
+def _checked_pair(
+    a: ArrayLike, b: ArrayLike, level: float, block: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Check what ``paired_bootstrap`` was asked; its samples as arrays."""
+    x = np.asarray(a, dtype=np.float64)
+    y = np.asarray(b, dtype=np.float64)
+    if x.shape != y.shape or x.ndim not in (1, 2):
+        raise ValueError(f"a and b must share a shape (N,) or (N, S), got {x.shape} and {y.shape}")
+    if not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise ValueError("a and b must be finite")
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level must be in (0, 1), got {level}")
+    if block < 1:
+        raise ValueError(f"block must be at least 1, got {block}")
+    return x, y
+
+
+def _resamples(
+    num_samples: int, block: int, num_resamples: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Rows of each resample, ``(num_resamples, num_samples)``: blocks begin anywhere and go round the end."""
+    num_blocks = -(-num_samples // block)
+    starts = rng.integers(num_samples, size=(num_resamples, num_blocks, 1))
+    return ((starts + np.arange(block)) % num_samples).reshape(num_resamples, -1)[:, :num_samples]
+
+
 def paired_bootstrap(
     a: ArrayLike,
     b: ArrayLike,
@@ -184,16 +210,7 @@ def paired_bootstrap(
     Raises:
         ValueError: Shapes differ, a value is not finite, or ``level`` or ``block`` is out of range.
     """
-    x = np.asarray(a, dtype=np.float64)
-    y = np.asarray(b, dtype=np.float64)
-    if x.shape != y.shape or x.ndim not in (1, 2):
-        raise ValueError(f"a and b must share a shape (N,) or (N, S), got {x.shape} and {y.shape}")
-    if not (np.isfinite(x).all() and np.isfinite(y).all()):
-        raise ValueError("a and b must be finite")
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"level must be in (0, 1), got {level}")
-    if block < 1:
-        raise ValueError(f"block must be at least 1, got {block}")
+    x, y = _checked_pair(a, b, level, block)
     if x.size == 0:
         return None
     x, y = x.reshape(len(x), -1).mean(axis=1), y.reshape(len(y), -1).mean(axis=1)
@@ -202,9 +219,7 @@ def paired_bootstrap(
     ratio = float(x.mean() / y.mean()) if y.mean() != 0 else None
     if num_samples // block < MIN_SAMPLES:
         return PairedDifference(difference, None, None, ratio, None, None, num_samples)
-    num_blocks = -(-num_samples // block)
-    starts = rng.integers(num_samples, size=(num_resamples, num_blocks, 1))
-    idx = ((starts + np.arange(block)) % num_samples).reshape(num_resamples, -1)[:, :num_samples]
+    idx = _resamples(num_samples, block, num_resamples, rng)
     mean_x, mean_y = x[idx].mean(axis=1), y[idx].mean(axis=1)
     tails = 100 * np.array([(1 - level) / 2, (1 + level) / 2])
     widen = small_sample_factor(num_samples // block, level)

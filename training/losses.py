@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from semcast.common.codec import LABEL_SHARPNESS
 from semcast.common.nets.decoder import DecoderFeatures
 from semcast.common.nets.modulation import shrink_of
 from semcast.common.nets.transceiver import Transceiver
@@ -40,7 +41,7 @@ class LossSettings:
         default=1e-3, metadata={"help": "squared error of an image from which its weight falls; 0: none"}
     )
     confidence_sharpness: float = field(
-        default=30.0, metadata={"help": "alpha of the label 1 - tanh(alpha |error|)"}
+        default=LABEL_SHARPNESS, metadata={"help": "alpha of the label 1 - tanh(alpha |error|)"}
     )
     confidence_loss: Literal["bce", "l1"] = field(
         default="bce", metadata={"help": "bce, or l1 as in the paper"}

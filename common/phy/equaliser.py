@@ -177,6 +177,19 @@ def estimate_channel(
     )
 
 
+def _known_channel(knowledge: ChannelKnowledge, lost: NDArray[np.bool_]) -> ChannelEstimate:
+    """The true channel in place of an estimate."""
+    arrived = np.logical_not(lost)
+    floor = float(np.median(knowledge.noise_var[arrived])) if arrived.any() else 1.0
+    return ChannelEstimate(
+        h=np.where(arrived, knowledge.h, np.complex64(0)),
+        noise_var=knowledge.noise_var,
+        noise_floor=floor,
+        num_pilots=0,
+        arrived=arrived,
+    )
+
+
 def equalise(
     slots_rx: NDArray[np.complex64],
     shape_hw: tuple[int, int],
@@ -214,15 +227,7 @@ def equalise(
     else:
         check_shape(knowledge.h, f"{layout.num_slots}", "knowledge.h")
         check_shape(knowledge.noise_var, f"{layout.num_slots}", "knowledge.noise_var")
-        arrived = np.logical_not(lost)
-        floor = float(np.median(knowledge.noise_var[arrived])) if arrived.any() else 1.0
-        channel = ChannelEstimate(
-            h=np.where(arrived, knowledge.h, np.complex64(0)),
-            noise_var=knowledge.noise_var,
-            noise_floor=floor,
-            num_pilots=0,
-            arrived=arrived,
-        )
+        channel = _known_channel(knowledge, lost)
     noise_var = channel.effective_noise_var
     power = np.square(np.abs(channel.h))
     gain = np.where(channel.arrived, np.conj(channel.h) / (power + noise_var), 0).astype(np.complex64)

@@ -202,7 +202,7 @@ class DenseBuilder:
             if not is_last and not self._is_ready(frame_id, world):
                 return
             self._waiting.remove(frame_id)
-            keyframe = _keyframe(world, frame_id)
+            keyframe = world.keyframe(frame_id)
             if keyframe is None or world.pose_of_frame(frame_id) is None:
                 continue
             seen = landmark_depths(world, keyframe)
@@ -215,7 +215,7 @@ class DenseBuilder:
 
     def _is_ready(self, frame_id: int, world: WorldMap) -> bool:
         later = [k for k in self._kept if k > frame_id]
-        keyframe = _keyframe(world, frame_id)
+        keyframe = world.keyframe(frame_id)
         if len(later) >= _MAX_LATER or keyframe is None:
             return True
         sought = depth_range(landmark_depths(world, keyframe)[1])
@@ -251,7 +251,7 @@ class DenseBuilder:
 
     def _confirm(self, frame_id: int, world: WorldMap) -> None:
         """Make points of what other keyframes see too, and those before have not added yet."""
-        keyframe, view = _keyframe(world, frame_id), self._kept.get(frame_id)
+        keyframe, view = world.keyframe(frame_id), self._kept.get(frame_id)
         if keyframe is None or view is None or world.pose_of_frame(frame_id) is None:
             return
         found = self._maps[frame_id]
@@ -285,7 +285,3 @@ class DenseBuilder:
             return None
         T_other_ref = invert_transform(T_world_other) @ keyframe.T_world_cam
         return OtherDepth(found.inverse_depth, found.step, view.K, T_other_ref)
-
-
-def _keyframe(world: WorldMap, frame_id: int) -> Keyframe | None:
-    return next((k for k in reversed(world.keyframes) if k.frame_id == frame_id), None)

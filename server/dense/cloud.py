@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform
+from semcast.server.geometry.projection import depths_in
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
@@ -68,8 +69,7 @@ def landmark_depths(world: WorldMap, keyframe: Keyframe) -> tuple[Ids, Array]:
     """Return the landmarks ``(N,)`` in front of a keyframe that sees them, and their depths ``(N,)``."""
     row = world.landmarks.rows(keyframe.ids)
     ids, xyz = keyframe.ids[row >= 0], world.landmarks.xyz[row[row >= 0]]
-    T_cam_world = invert_transform(keyframe.T_world_cam)
-    depth = xyz @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    depth = depths_in(invert_transform(keyframe.T_world_cam), xyz)
     return ids[depth > 0.0], depth[depth > 0.0]
 
 
@@ -87,8 +87,7 @@ def scale_since(world: WorldMap, frame_id: int, ids: Ids, before: Array) -> floa
         return None
     row = world.landmarks.rows(ids)
     there = row >= 0
-    T_cam_world = invert_transform(T_world_cam)
-    depth = world.landmarks.xyz[row[there]] @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    depth = depths_in(invert_transform(T_world_cam), world.landmarks.xyz[row[there]])
     sound = depth > 0.0
     if sound.sum() < _MIN_LANDMARKS:
         return None

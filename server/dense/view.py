@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
+from semcast.common.codec import LABEL_SHARPNESS
 
 Array = NDArray[np.float64]
 
@@ -15,8 +16,8 @@ Array = NDArray[np.float64]
 MAX_PIXELS = 60_000
 #: Noise of an image without confidence, grey levels: that of a camera.
 CLEAN_SIGMA = 3.0
-#: The pixel target is ``1 - tanh(30 |error|)``, error in shares of white (paper, ``training/losses.py``).
-_GREY_LEVELS_PER_ATANH = 255.0 / 30.0
+#: Error that confidence stands for, by the inverse of its label: that has errors in shares of white.
+_GREY_LEVELS_PER_ATANH = 255.0 / LABEL_SHARPNESS
 #: Standard deviation over mean absolute value, of a Gaussian.
 _SD_PER_MEAN = 1.2533
 _LEAST_CONFIDENCE = 0.02

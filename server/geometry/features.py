@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import KLT_WINDOW_PX
 from semcast.server.geometry.brightness import brightness_change, with_brightness
+from semcast.server.geometry.cells import cell_keys
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -249,8 +250,8 @@ def sample_map(values: NDArray[np.float32], keypoints_xy: Array) -> Array:
 
 def deduplicate(keypoints_xy: Array, cell_px: float = 4.0) -> NDArray[np.bool_]:
     """Mark the first of all points ``(N, 2)`` that share a cell of this side, ``(N,)`` bool."""
-    key = np.floor(keypoints_xy / cell_px).astype(np.int64)
-    _, first = np.unique(key[:, 0] * 1_000_003 + key[:, 1], return_index=True)
+    cells = np.floor(keypoints_xy / cell_px).astype(np.int64)
+    _, first = np.unique(cell_keys(cells), return_index=True)
     keep = np.zeros(len(keypoints_xy), bool)
     keep[first] = True
     return keep

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import KLT_WINDOW_PX
 from semcast.server.geometry.features import Grey
-from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.geometry.projection import MIN_DEPTH_MAP
 
 Array = NDArray[np.float64]
 Values = NDArray[np.float32]

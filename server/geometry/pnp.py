@@ -8,12 +8,10 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, make_transform, project_to_so3, transform_points
+from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 
 Array = NDArray[np.float64]
-
-#: Landmarks nearer than this to the camera plane (map units) have no usable projection.
-MIN_DEPTH_MAP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -78,12 +76,7 @@ def reprojection_residual(
         points_world: ``(N, 3)``.
         keypoints_xy: ``(N, 2)`` their observations.
     """
-    points_cam = transform_points(T_cam_world, points_world)
-    front = points_cam[:, 2] > MIN_DEPTH_MAP
-    z = np.where(front, points_cam[:, 2], 1.0)
-    projected = np.stack(
-        [camera.fx * points_cam[:, 0] / z + camera.cx, camera.fy * points_cam[:, 1] / z + camera.cy], axis=1
-    )
+    projected, front = project_in_front(camera, transform_points(T_cam_world, points_world))
     return np.where(front[:, None], keypoints_xy - projected, 0.0), front
 
 
@@ -142,11 +135,8 @@ def refine_pose(
         weighted = (rows * np.repeat(w, 2)[:, None]).T
         hessian = weighted @ rows
         gradient = weighted @ residual.ravel()
-        try:
-            step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) / 6.0 * np.eye(6), gradient)
-        except np.linalg.LinAlgError:
-            return _without_inliers(T_start, len(points_world))
-        if not np.isfinite(step).all():
+        step = _damped_step(hessian, gradient)
+        if step is None:
             return _without_inliers(T_start, len(points_world))
         T = exp_se3(step) @ T
         if iteration >= 3 and float(np.abs(step).max()) < 1e-6:
@@ -157,6 +147,15 @@ def refine_pose(
         residual = np.einsum("nij,nj->ni", whitener, residual)
     length = np.where(front, np.linalg.norm(residual, axis=1), np.inf)
     return PoseEstimate(T, length < gate_px, length, _covariance(hessian))
+
+
+def _damped_step(hessian: Array, gradient: Array) -> Array | None:
+    """Twist ``(6,)`` that solves the normal equations; None where nothing does."""
+    try:
+        step = np.linalg.solve(hessian + 1e-9 * np.trace(hessian) / 6.0 * np.eye(6), gradient)
+    except np.linalg.LinAlgError:
+        return None
+    return step if np.isfinite(step).all() else None
 
 
 def _whitener(sigma_px: Array, spread_px: Array) -> Array:

@@ -28,12 +28,10 @@ class RansacResult:
     Attributes:
         T_cam1_cam0: ``(4, 4)``, translation of length 1, decomposed from the winning matrix.
         inliers: ``(N,)`` bool, ``r_i < delta_i``.
-        num_trials: Subsets drawn.
     """
 
     T_cam1_cam0: Array
     inliers: NDArray[np.bool_]
-    num_trials: int
 
 
 def draw_weighted(
@@ -117,7 +115,7 @@ def confidence_ransac(
     T_cam1_cam0 = best[1]
     inliers = algebraic_residual(essential_matrix(T_cam1_cam0), rays0, rays1) < delta
     T_cam1_cam0 = in_front(camera, T_cam1_cam0, keypoints0_xy[inliers], keypoints1_xy[inliers])
-    return RansacResult(T_cam1_cam0, inliers, num_trials)
+    return RansacResult(T_cam1_cam0, inliers)
 
 
 def in_front(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import angles_between_deg
-from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front
 
 Array = NDArray[np.float64]
 
@@ -61,50 +61,18 @@ def triangulate(
         num_points: Number of points; one without two views gets a useless position and parallax 0.
         refinements: Gauss-Newton steps.
     """
-    R = T_cam_world[view, :3, :3]
-    t = T_cam_world[view, :3, 3]
-    rays_cam = camera.unproject(keypoints_xy)
-    ray = np.einsum("mji,mj->mi", R, rays_cam)
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    centre = -np.einsum("mji,mj->mi", R, t)
-    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    R, t = T_cam_world[view, :3, :3], T_cam_world[view, :3, 3]
     w = sigma_px**-2.0
-    A = _sum_by(point, across * w[:, None, None], num_points)
-    b = _sum_by(point, np.einsum("mij,mj->mi", across, centre) * w[:, None], num_points)
-    xyz = _solve(A, b)
+    centre = -np.einsum("mji,mj->mi", R, t)
+    xyz = _nearest_to_rays(camera.unproject(keypoints_xy), R, centre, w, point, num_points)
     for _ in range(refinements):
-        points_cam = (R @ xyz[point][:, :, None])[..., 0] + t
-        z = np.maximum(points_cam[:, 2], MIN_DEPTH_MAP)
-        u, v = points_cam[:, 0] / z, points_cam[:, 1] / z
-        residual = keypoints_xy - np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1)
-        zero = np.zeros_like(z)
-        J_cam = np.stack(
-            [
-                np.stack([camera.fx / z, zero, -camera.fx * u / z], axis=1),
-                np.stack([zero, camera.fy / z, -camera.fy * v / z], axis=1),
-            ],
-            axis=1,
-        )
-        J = J_cam @ R
-        good = (points_cam[:, 2] > MIN_DEPTH_MAP) & np.isfinite(residual).all(axis=1)
-        step_w = np.where(good, w, 0.0)
-        H = _sum_by(point, np.swapaxes(J, 1, 2) @ (J * step_w[:, None, None]), num_points)
-        g = _sum_by(
-            point,
-            (np.swapaxes(J, 1, 2) @ (np.nan_to_num(residual) * step_w[:, None])[..., None])[..., 0],
-            num_points,
-        )
-        step = _solve(H, g)
+        step = _refinement_step(camera, R, t, xyz, keypoints_xy, w, point)
         # A step longer than half the distance to the cameras has left the linear range.
         reach = 0.5 * np.linalg.norm(xyz - mean_centre(centre, point, num_points), axis=1)
         length = np.linalg.norm(step, axis=1)
         xyz = xyz + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
     points_cam = (R @ xyz[point][:, :, None])[..., 0] + t
-    front = points_cam[:, 2] > MIN_DEPTH_MAP
-    z = np.where(front, points_cam[:, 2], 1.0)
-    projected = np.stack(
-        [camera.fx * points_cam[:, 0] / z + camera.cx, camera.fy * points_cam[:, 1] / z + camera.cy], axis=1
-    )
+    projected, front = project_in_front(camera, points_cam)
     square = ((keypoints_xy - projected) ** 2).sum(axis=1) * w
     count = np.bincount(point, minlength=num_points)
     error = np.sqrt(np.bincount(point, weights=square, minlength=num_points) / np.maximum(1, 2 * count))
@@ -116,6 +84,49 @@ def triangulate(
         error_sigma=np.where(good_point, error, np.inf),
         in_front=~behind & good_point,
     )
+
+
+def _nearest_to_rays(
+    rays_cam: Array, R_cam_world: Array, centre: Array, w: Array, point: NDArray[np.intp], num_points: int
+) -> Array:
+    """Points ``(P, 3)`` with the least sum of weighted squared distances to the rays that see them."""
+    ray = np.einsum("mji,mj->mi", R_cam_world, rays_cam)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    A = _sum_by(point, across * w[:, None, None], num_points)
+    b = _sum_by(point, np.einsum("mij,mj->mi", across, centre) * w[:, None], num_points)
+    return _solve(A, b)
+
+
+def _refinement_step(
+    camera: Intrinsics,
+    R_cam_world: Array,
+    t_cam_world: Array,
+    xyz: Array,
+    keypoints_xy: Array,
+    w: Array,
+    point: NDArray[np.intp],
+) -> Array:
+    """Gauss-Newton step ``(P, 3)`` of all points on the weighted reprojection error."""
+    points_cam = (R_cam_world @ xyz[point][:, :, None])[..., 0] + t_cam_world
+    z = np.maximum(points_cam[:, 2], MIN_DEPTH_MAP)
+    u, v = points_cam[:, 0] / z, points_cam[:, 1] / z
+    residual = keypoints_xy - np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1)
+    zero = np.zeros_like(z)
+    J_cam = np.stack(
+        [
+            np.stack([camera.fx / z, zero, -camera.fx * u / z], axis=1),
+            np.stack([zero, camera.fy / z, -camera.fy * v / z], axis=1),
+        ],
+        axis=1,
+    )
+    J = J_cam @ R_cam_world
+    good = (points_cam[:, 2] > MIN_DEPTH_MAP) & np.isfinite(residual).all(axis=1)
+    step_w = np.where(good, w, 0.0)
+    H = _sum_by(point, np.swapaxes(J, 1, 2) @ (J * step_w[:, None, None]), len(xyz))
+    weighted = np.nan_to_num(residual) * step_w[:, None]
+    g = _sum_by(point, (np.swapaxes(J, 1, 2) @ weighted[..., None])[..., 0], len(xyz))
+    return _solve(H, g)
 
 
 def mean_centre(centre: Array, point: NDArray[np.intp], num_points: int) -> Array:

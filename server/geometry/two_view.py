@@ -8,6 +8,7 @@ well by a large turn that the camera never made. Then comes a refinement whose w
 pair's own residuals. A misleading confidence can therefore cost time, hardly accuracy.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -29,7 +30,7 @@ from semcast.server.geometry.epipolar import (
     rotation_residual_px,
     sampson_px,
 )
-from semcast.server.geometry.pnp import poselib_camera
+from semcast.server.geometry.lo_ransac import lo_ransac
 from semcast.server.geometry.ransac import confidence_ransac, in_front
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fit_noise
 
@@ -48,6 +49,10 @@ _AGREEMENT_RANGE, _LEAST_WEIGHT = (0.1, 0.4), 0.05
 #: What turning costs a pose in the choice among several, in matches of full weight per root of a degree:
 #: frames follow one another, and where two motions explain the matches alike the smaller turn is likelier.
 _TURN_COST = 0.3
+#: A later candidate displaces the first one only by more than the score's own noise.
+_TO_DISPLACE = 1.001
+#: Confidences that differ by no more than this are all alike and give no order.
+_ALIKE = 1e-6
 #: Matches that the motions near pure turning are sought by at most, and steps of each search.
 _MAX_TURNING_MATCHES, _TURNING_STEPS = 100, 6
 #: Points near the camera have larger errors and most of the information: the fitted beta overstates what
@@ -65,8 +70,6 @@ class TwoViewResult:
     Attributes:
         T_cam1_cam0: ``(4, 4)``, translation of length 1 (of no meaning for ``rotation``).
         inliers: ``(N,)`` bool: near the epipolar geometry and in front of both cameras.
-        score: Confidence-free MSAC score of all matches, weighted by agreement except under ``paper``; 0 is
-            perfect.
         model: ``rotation`` when turning alone explains the matches, ``homography`` when the pose came from
             one plane, else ``essential``.
         parallax_deg: Median angle between the rays of inliers.
@@ -74,7 +77,6 @@ class TwoViewResult:
 
     T_cam1_cam0: Array
     inliers: NDArray[np.bool_]
-    score: float
     model: Model
     parallax_deg: float
 
@@ -113,6 +115,49 @@ def estimate_two_view(
     Raises:
         ValueError: Shapes disagree, the camera has distortion, or an argument is out of range.
     """
+    xy0, xy1 = _checked_matches(camera, keypoints0_xy, keypoints1_xy, confidence, mode, threshold_px)
+    if len(xy0) < MIN_MATCHES or not (np.isfinite(xy0).all() and np.isfinite(xy1).all()):
+        return None
+    if mode == "paper" and confidence is not None:
+        found = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
+        if found is None:
+            return None
+        return _result(camera, found.T_cam1_cam0, xy0, xy1, threshold_px, choose_model)
+    if confidence is not None and (mode == "off" or float(np.ptp(confidence)) <= _ALIKE):
+        confidence = None
+    agreement = neighbour_agreement(xy0, xy1)
+    kept = _kept(agreement)
+    how = {"seed": seed, "max_iterations": max_iterations, "min_iterations": min_iterations}
+    candidates = [
+        _search(camera, xy0[rows], xy1[rows], factor * threshold_px, in_order=in_order, **how)
+        for factor in _THRESHOLD_FACTORS
+        for rows, in_order in _orders_of_drawing(len(xy0), kept, confidence)
+    ]
+    candidates += _near_turning(camera, xy0[kept], xy1[kept], threshold_px)
+    num_searched = len(candidates)
+    if choose_model:
+        candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
+    best = _likeliest(camera, candidates, xy0, xy1, kept, _weights(agreement), threshold_px)
+    if best is None:
+        return None
+    chosen, T = best
+    trusted = None if confidence is None else confidence[kept]
+    T = _refine(camera, T, xy0[kept], xy1[kept], trusted, threshold_px)
+    result = _result(camera, T, xy0, xy1, threshold_px, choose_model)
+    if chosen >= num_searched and result.model == "essential":
+        result = replace(result, model="homography")
+    return result
+
+
+def _checked_matches(
+    camera: Intrinsics,
+    keypoints0_xy: Array,
+    keypoints1_xy: Array,
+    confidence: Array | None,
+    mode: str,
+    threshold_px: float,
+) -> tuple[Array, Array]:
+    """Check what was asked; the matches as PoseLib takes them."""
     xy0 = np.ascontiguousarray(keypoints0_xy, dtype=np.float64)
     xy1 = np.ascontiguousarray(keypoints1_xy, dtype=np.float64)
     check_shape(xy0, "N 2", "keypoints0_xy")
@@ -125,61 +170,43 @@ def estimate_two_view(
         raise ValueError(f"threshold_px must be positive, got {threshold_px:g}")
     if any(camera.distortion):
         raise ValueError(f"camera must be without distortion, got {camera.distortion}")
-    if len(xy0) < MIN_MATCHES or not (np.isfinite(xy0).all() and np.isfinite(xy1).all()):
-        return None
-    if mode == "paper" and confidence is not None:
-        found = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
-        if found is None:
-            return None
-        score = _score(camera, found.T_cam1_cam0, xy0, xy1, threshold_px)
-        return _result(camera, found.T_cam1_cam0, xy0, xy1, threshold_px, score, choose_model)
-    if confidence is not None and (mode == "off" or float(np.ptp(confidence)) <= 1e-6):
-        confidence = None
-    agreement = neighbour_agreement(xy0, xy1)
-    kept = _kept(agreement)
-    low, high = _AGREEMENT_RANGE
-    weight = np.clip((agreement - low) / (high - low), _LEAST_WEIGHT, 1.0)
-    searches: list[tuple[NDArray[np.intp], bool]] = [(np.arange(len(xy0)), False)]
-    if len(kept) < _NEARLY_ALL * len(xy0):
-        searches.append((kept, False))
+    return xy0, xy1
+
+
+def _orders_of_drawing(
+    count: int, kept: NDArray[np.intp], confidence: Array | None
+) -> list[tuple[NDArray[np.intp], bool]]:
+    """Matches of each search, and whether it draws the first of them first."""
+    orders: list[tuple[NDArray[np.intp], bool]] = [(np.arange(count), False)]
+    if len(kept) < _NEARLY_ALL * count:
+        orders.append((kept, False))
     if confidence is not None:
-        searches.append((kept[np.argsort(-confidence[kept], kind="stable")], True))
-    candidates = [
-        _search(
-            camera,
-            xy0[rows],
-            xy1[rows],
-            threshold_px=factor * threshold_px,
-            in_order=in_order,
-            seed=seed,
-            max_iterations=max_iterations,
-            min_iterations=min_iterations,
-        )
-        for factor in _THRESHOLD_FACTORS
-        for rows, in_order in searches
-    ]
-    candidates += _near_turning(camera, xy0[kept], xy1[kept], threshold_px)
-    num_searched = len(candidates)
-    if choose_model:
-        candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
-    scored: list[tuple[float, float, int, Array]] = []
+        orders.append((kept[np.argsort(-confidence[kept], kind="stable")], True))
+    return orders
+
+
+def _likeliest(
+    camera: Intrinsics,
+    candidates: Sequence[Array | None],
+    xy0: Array,
+    xy1: Array,
+    kept: NDArray[np.intp],
+    weight: Array,
+    threshold_px: float,
+) -> tuple[int, Array] | None:
+    """Which pose explains the matches best at the least turn, and that pose, in front of both cameras."""
+    judged: list[tuple[float, int, Array]] = []
     for k, candidate in enumerate(candidates):
         if candidate is None:
             continue
         T = in_front_sign(camera, candidate, xy0[kept], xy1[kept])
-        score = _score(camera, T, xy0, xy1, threshold_px, weight)
-        cost = score + _TURN_COST * float(np.sqrt(rotation_angle_deg(T[:3, :3])) / weight.sum())
-        # A later candidate must be better by more than the score's own noise to displace the first.
-        scored.append((cost if k == 0 else 1.001 * cost, score, k, T))
-    if not scored:
+        cost = _score(camera, T, xy0, xy1, threshold_px, weight)
+        cost += _TURN_COST * float(np.sqrt(rotation_angle_deg(T[:3, :3])) / weight.sum())
+        judged.append((cost if k == 0 else _TO_DISPLACE * cost, k, T))
+    if not judged:
         return None
-    _, score, chosen, T = min(scored, key=lambda item: item[:3])
-    trusted = None if confidence is None else confidence[kept]
-    T = _refine(camera, T, xy0[kept], xy1[kept], trusted, threshold_px)
-    result = _result(camera, T, xy0, xy1, threshold_px, score, choose_model)
-    if chosen >= num_searched and result.model == "essential":
-        result = replace(result, model="homography")
-    return result
+    _, chosen, T = min(judged, key=lambda item: item[:2])
+    return chosen, T
 
 
 def _kept(agreement: Array) -> NDArray[np.intp]:
@@ -190,9 +217,13 @@ def _kept(agreement: Array) -> NDArray[np.intp]:
     return kept
 
 
-def _score(
-    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float, weight: Array | None = None
-) -> float:
+def _weights(agreement: Array) -> Array:
+    """Weight of each match in the score."""
+    low, high = _AGREEMENT_RANGE
+    return np.clip((agreement - low) / (high - low), _LEAST_WEIGHT, 1.0)
+
+
+def _score(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float, weight: Array) -> float:
     """MSAC score without confidence, in which a point clearly behind a camera is an outlier.
 
     It is the mean over several thresholds, because the noise of decoded images is not known beforehand.
@@ -230,8 +261,8 @@ def _search(
     camera: Intrinsics,
     xy0: Array,
     xy1: Array,
-    *,
     threshold_px: float,
+    *,
     in_order: bool,
     seed: int,
     max_iterations: int,
@@ -246,14 +277,8 @@ def _search(
         "seed": seed,
         "progressive_sampling": in_order,
     }
-    pinhole = poselib_camera(camera)
-    pose, info = poselib.estimate_relative_pose(xy0, xy1, pinhole, pinhole, options, {})
-    t = np.asarray(pose.t, dtype=np.float64)
-    length = float(np.linalg.norm(t))
-    R = np.asarray(pose.R, dtype=np.float64)
-    if info["num_inliers"] < 5 or not (np.isfinite(length) and np.isfinite(R).all()) or length == 0.0:
-        return None
-    return make_transform(project_to_so3(R), t / length)
+    found = lo_ransac(camera, xy0, xy1, options)
+    return None if found is None else make_transform(project_to_so3(found[:3, :3]), found[:3, 3])
 
 
 def _near_turning(camera: Intrinsics, xy0: Array, xy1: Array, threshold_px: float) -> list[Array]:
@@ -318,7 +343,6 @@ def _result(
     xy0: Array,
     xy1: Array,
     threshold_px: float,
-    score: float,
     choose_model: bool,
 ) -> TwoViewResult:
     residual = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
@@ -334,7 +358,7 @@ def _result(
         if turned.mean() > 0.8:
             model = "rotation"
     parallax = float(np.median(angle[inliers])) if inliers.any() else 0.0
-    return TwoViewResult(T, inliers, score, model, parallax)
+    return TwoViewResult(T, inliers, model, parallax)
 
 
 def in_front_sign(camera: Intrinsics, T: Array, xy0: Array, xy1: Array) -> Array:

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.codec import displacement_px
+from semcast.common.codec import LABEL_SHARPNESS, displacement_px
 
 Array = NDArray[np.float64]
 
@@ -31,8 +31,6 @@ SIGMA0_RANGE_PX = (0.25, 6.0)
 #: A gate is never narrower than that of this sigma: landmarks have errors of their own, and a gate that
 #: follows the residuals it lets through would close by itself.
 _MIN_GATE_SIGMA_PX = 0.6
-#: The pixel confidence is trained on ``1 - tanh(30 |x_hat - x|)`` (paper Sec. IV-B) with images in [0, 1].
-_LABEL_SHARPNESS = 30.0
 #: What tracking errs by without a link, and the expected error from which a position is worth nothing.
 _TRACKING_PX, _MOST_PX = 0.3, 5.0
 #: Median of |x| / sigma under normal noise.
@@ -224,7 +222,7 @@ def localisation_variance_px2(cues: KeypointCues) -> Array:
     noise_grey = np.full(len(cues.gradient_grey2), 2.0)
     if cues.pixel_confidence is not None:
         doubt = 1.0 - np.clip(cues.pixel_confidence, 0.0, 1.0)
-        noise_grey = np.maximum(noise_grey, 255.0 / _LABEL_SHARPNESS * np.arctanh(np.minimum(doubt, 0.999)))
+        noise_grey = np.maximum(noise_grey, 255.0 / LABEL_SHARPNESS * np.arctanh(np.minimum(doubt, 0.999)))
     noise_grey = np.maximum(noise_grey, cues.photometric_grey)
     # Noise of decoded images is correlated over blocks: a window holds about 16 independent values.
     bound_px2 = noise_grey**2 / (16.0 * np.maximum(cues.gradient_grey2, 0.5))

@@ -21,7 +21,7 @@ from semcast.server.geometry.patch_alignment import (
     align_patches,
     seen_alike,
 )
-from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.weighting import MAD_TO_SIGMA
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.sight import Sight
@@ -123,8 +123,8 @@ def _views(
     world: WorldMap, images: KeyframeImages, submap: int, count: int
 ) -> list[tuple[SeenFrom, Keyframe]]:
     """Newest kept keyframes of a submap with their images, oldest first."""
-    by_id = {k.frame_id: k for k in world.keyframes_of(submap)}
-    return [(image, by_id[image.frame_id]) for image in images.newest(count) if image.frame_id in by_id]
+    there = [(image, world.keyframe(image.frame_id)) for image in images.newest(count)]
+    return [(image, k) for image, k in there if k is not None and k.submap == submap]
 
 
 def _align(
@@ -183,11 +183,11 @@ def _depths(world: WorldMap, keyframe: Keyframe, ids: NDArray[np.int64], xy: Arr
     That of its landmark; of a point that has none yet, or one behind the camera, the median of the inverse
     depths of the landmarks next to it, which is near enough for a warp.
     """
-    T_cam_world = invert_transform(keyframe.T_world_cam)
     landmark = world.landmarks.rows(ids)
     depth = np.zeros(len(ids))
     known = landmark >= 0
-    depth[known] = world.landmarks.xyz[landmark[known]] @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    T_keyframe_world = invert_transform(keyframe.T_world_cam)
+    depth[known] = depths_in(T_keyframe_world, world.landmarks.xyz[landmark[known]])
     known = depth > MIN_DEPTH_MAP
     depth[~known] = 0.0
     if known.sum() >= _MIN_LANDMARKS and not known.all():

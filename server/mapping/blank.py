@@ -47,5 +47,4 @@ def result_of_nothing(frame: DecodedFrame, state: TrackingState, map_epoch: int,
         submap=submap,
         keypoints_xy=np.zeros((0, 2), np.float32),
         keypoint_inlier=np.zeros(0, bool),
-        keypoint_confidence=np.zeros(0, np.float32),
     )

@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, project_to_so3
-from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.geometry.projection import project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
 from semcast.server.mapping.left_over import information
@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 #: Observations share noise models: their sigmas are rounded to so many steps.
 NUM_SIGMAS = 16
 SIGMA_RANGE_PX = (0.1, 12.0)
+#: With fewer there is no window, but what is left of one.
+_MIN_OBSERVATIONS = 10
 #: Holds a fixed pose: radians and map units.
 _FIXED_SIGMA = 1e-6
 
@@ -46,10 +48,7 @@ def residuals_px(problem: BundleProblem, T_world_cam: Array, xyz: Array) -> tupl
     """
     T_cam_world = invert_transform(T_world_cam)[problem.view]
     points_cam = np.einsum("mij,mj->mi", T_cam_world[:, :3, :3], xyz[problem.point]) + T_cam_world[:, :3, 3]
-    front = points_cam[:, 2] > MIN_DEPTH_MAP
-    z = np.where(front, points_cam[:, 2], 1.0)
-    fx, fy, cx, cy = problem.intrinsics
-    projected = np.stack([fx * points_cam[:, 0] / z + cx, fy * points_cam[:, 1] / z + cy], axis=1)
+    projected, front = project_in_front(problem.camera, points_cam)
     return np.where(front[:, None], problem.xy - projected, np.nan), front
 
 
@@ -85,8 +84,8 @@ def _build(
         values.insert(L(p), problem.xyz[p])
     sigmas, step = quantised_sigma(problem.sigma_px)
     models = [_noise_model(float(sigma), problem.huber_px) for sigma in sigmas]
-    fx, fy, cx, cy = problem.intrinsics
-    calibration = gtsam.Cal3_S2(fx, fy, 0.0, cx, cy)
+    camera = problem.camera
+    calibration = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
     factor = gtsam.GenericProjectionFactorCal3_S2
     pose_keys = [X(k) for k in range(len(problem.T_world_cam))]
     rows = np.flatnonzero(used)
@@ -112,7 +111,7 @@ def optimise(problem: BundleProblem) -> BundleResult:
     used = front & (count[problem.point] >= 2) & np.isfinite(problem.xy).all(axis=1)
     T_world_cam, xyz, covariance, ok = problem.T_world_cam.copy(), problem.xyz.copy(), None, False
     is_posed = bool(np.isfinite(problem.T_world_cam).all())
-    if int(used.sum()) >= 10 and problem.fixed.any() and is_posed:
+    if int(used.sum()) >= _MIN_OBSERVATIONS and problem.fixed.any() and is_posed:
         graph, values = _build(problem, used)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(problem.iterations)

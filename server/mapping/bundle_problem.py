@@ -34,7 +34,7 @@ class BundleProblem:
     """A window of keyframes and the landmarks they see.
 
     Attributes:
-        intrinsics: fx, fy, cx, cy in pixels.
+        camera: Pinhole; distortion is not looked at.
         keyframe_ids: ``(K,)`` int64 frame ids, in order of time.
         T_world_cam: ``(K, 4, 4)``.
         fixed: ``(K,)`` bool, poses that hold the gauge; at least one.
@@ -56,7 +56,7 @@ class BundleProblem:
         motion: Of the views, where it is wanted what the residuals say about shutter and lens.
     """
 
-    intrinsics: tuple[float, float, float, float]
+    camera: Intrinsics
     keyframe_ids: NDArray[np.int64]
     T_world_cam: Array
     fixed: NDArray[np.bool_]
@@ -138,7 +138,7 @@ def assemble_problem(
         with_covariance: The same.
     """
     return BundleProblem(
-        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+        camera=camera,
         keyframe_ids=np.array([frame.frame_id for frame in views], dtype=np.int64),
         T_world_cam=T_world_cam,
         fixed=fixed,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
+from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.ambiguity import Side
@@ -119,8 +120,7 @@ def problem_of(
         return None
     # A point that fits nowhere begins at a usual depth: the other structure may have a place for it.
     _, first = np.unique(seen.point, return_index=True)
-    T_first = T_cam_world[seen.view[first]]
-    z = np.einsum("pi,pi->p", T_first[:, 2, :3], points.xyz) + T_first[:, 2, 3]
+    z = depths_in(T_cam_world[seen.view[first]], points.xyz)
     ray = camera.unproject(seen.xy[first]) * float(np.median(z[points.in_front]))
     T = T_world_cam[seen.view[first]]
     along = np.einsum("pij,pj->pi", T[:, :3, :3], ray) + T[:, :3, 3]

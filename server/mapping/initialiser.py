@@ -13,7 +13,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import interpolate_pose, invert_transform
 from semcast.server.geometry.epipolar import fit_rotation, rotation_residual_px
 from semcast.server.geometry.triangulation import Triangulation, triangulate
-from semcast.server.geometry.two_view import TwoViewResult, estimate_two_view
+from semcast.server.geometry.two_view import MIN_MATCHES, TwoViewResult, estimate_two_view
 from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.ambiguity import Side, decide
 from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
@@ -57,6 +57,11 @@ _LEAST_AGREEING = 0.5
 _MIN_FLOW_SHARE = 0.012
 #: Median angle between the rays of the two views.
 _MIN_MEDIAN_PARALLAX_DEG = 0.7
+#: Inlier threshold of the search, in standard deviations of the noise, and its limits.
+_THRESHOLD_SIGMAS, _THRESHOLD_RANGE_PX = 2.0, (1.0, 3.0)
+#: A start takes points under half of the angle that is asked for later, and of larger errors than a landmark
+#: may have (``mapper.MAX_ERROR_SIGMA``): its views are near each other, and it is adjusted at once.
+_PARALLAX_SHARE, _MAX_ERROR_SIGMA = 0.5, 2.5
 
 
 @dataclass(frozen=True)
@@ -74,6 +79,34 @@ class Start:
     ids: Ids
     xyz: Array
     confidence: Array
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Tracks that two frames share.
+
+    Attributes:
+        ids: ``(N,)`` tracks.
+        xy0: ``(N, 2)`` in the first frame.
+        xy1: ``(N, 2)`` in the second.
+        confidence: ``(N,)`` of both ends.
+        left_out: ``(L,)`` suspects that both saw too.
+    """
+
+    ids: Ids
+    xy0: Array
+    xy1: Array
+    confidence: Array
+    left_out: Ids
+
+
+def _pair(first: Observed, second: Observed, suspect: Ids) -> _Pair:
+    """Match two frames by the ids of their tracks."""
+    ids, row0, row1 = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
+    doubtful = np.isin(ids, suspect)
+    left_out, ids, row0, row1 = ids[doubtful], ids[~doubtful], row0[~doubtful], row1[~doubtful]
+    confidence = fuse_confidence(first.confidence[row0], second.confidence[row1])
+    return _Pair(ids, first.xy[row0], second.xy[row1], confidence, left_out)
 
 
 class Initialiser:
@@ -139,40 +172,55 @@ class Initialiser:
         Returns:
             The start, or None for now. On success ``history`` still holds the frames to be posed.
         """
-        if len(observed.ids) < 8:
+        if len(observed.ids) < MIN_MATCHES:
             return None
+        self._remember(observed)
+        if is_damaged or self._reference == len(self.history) - 1:
+            return None
+        pair = _pair(self.history[self._reference], observed, suspect)
+        if len(pair.ids) < self._min_points():
+            return None
+        flow_px = float(np.median(np.linalg.norm(pair.xy1 - pair.xy0, axis=1)))
+        if flow_px < _MIN_FLOW_SHARE * self._camera.width:
+            return None
+        evidence_px = np.array([flow_px, self._relief_px(pair.xy0, pair.xy1)])
+        if not self._is_new_evidence(evidence_px):
+            return None
+        if self._reference + 1 == len(self.history) - 1 and self._is_too_short():
+            return None
+        scene = self._scene_of(pair, noise)
+        agreeing = 0.0 if scene is None else float(scene.motion.inliers.mean())
+        self._agreeing = max(_LEAST_AGREEING, agreeing)
+        if scene is None or not self._is_good(scene):
+            return None
+        if scene.is_contested and self._may_wait_for_the_other():
+            return None
+        history = [o.without(pair.left_out) for o in self.history]
+        span = [o.without(pair.ids[scene.alone]) for o in history[self._reference :]]
+        start = self._build(span, scene.motion, pair.ids[scene.motion.inliers], noise)
+        if start is not None:
+            self.history = history
+        elif self._num_undecided:
+            self._undecided_px = evidence_px
+        return start
+
+    def _remember(self, observed: Observed) -> None:
+        """Add a frame to those kept, and look whether the reference may stay."""
         self.history.append(observed)
         if len(self.history) > MAX_HISTORY:
             self.history.pop(0)
             self._reference = max(0, self._reference - 1)
         self._move_reference()
         self._forget_images()
-        if is_damaged or self._reference == len(self.history) - 1:
-            return None
-        reference = self.history[self._reference]
-        shared, row0, row1 = np.intersect1d(
-            reference.ids, observed.ids, assume_unique=True, return_indices=True
-        )
-        doubtful = np.isin(shared, suspect)
-        left_out, shared, row0, row1 = shared[doubtful], shared[~doubtful], row0[~doubtful], row1[~doubtful]
-        if len(shared) < self._min_points():
-            return None
-        xy0, xy1 = reference.xy[row0], observed.xy[row1]
-        flow_px = float(np.median(np.linalg.norm(xy1 - xy0, axis=1)))
-        if flow_px < _MIN_FLOW_SHARE * self._camera.width:
-            return None
-        evidence_px = np.array([flow_px, self._relief_px(xy0, xy1)])
-        if not self._is_new_evidence(evidence_px):
-            return None
-        if self._reference + 1 == len(self.history) - 1 and self._is_too_short():
-            return None
-        confidence = fuse_confidence(reference.confidence[row0], observed.confidence[row1])
-        threshold_px = float(np.clip(2.0 * noise.sigma0_px, 1.0, 3.0))
+
+    def _scene_of(self, pair: _Pair, noise: NoiseModel) -> SceneMotion | None:
+        """How the scene moved between two frames; None where nothing tells it."""
+        threshold_px = float(np.clip(_THRESHOLD_SIGMAS * noise.sigma0_px, *_THRESHOLD_RANGE_PX))
         found = estimate_two_view(
             self._camera,
-            xy0,
-            xy1,
-            confidence,
+            pair.xy0,
+            pair.xy1,
+            pair.confidence,
             mode=self._mode,
             threshold_px=threshold_px,
             seed=self._seed,
@@ -180,32 +228,18 @@ class Initialiser:
             max_iterations=ITERATIONS[1],
             choose_model=True,
         )
-        scene = None
-        if found is not None:
-            scene = motion_of_scene(
-                self._camera,
-                found,
-                xy0,
-                xy1,
-                confidence,
-                mode=self._mode,
-                threshold_px=threshold_px,
-                seed=self._seed,
-            )
-        agreeing = 0.0 if scene is None else float(scene.motion.inliers.mean())
-        self._agreeing = max(_LEAST_AGREEING, agreeing)
-        if scene is None or not self._is_good(scene):
+        if found is None:
             return None
-        if scene.is_contested and self._may_wait_for_the_other():
-            return None
-        history = [o.without(left_out) for o in self.history]
-        span = [o.without(shared[scene.alone]) for o in history[self._reference :]]
-        start = self._build(span, scene.motion, shared[scene.motion.inliers], noise)
-        if start is not None:
-            self.history = history
-        elif self._num_undecided:
-            self._undecided_px = evidence_px
-        return start
+        return motion_of_scene(
+            self._camera,
+            found,
+            pair.xy0,
+            pair.xy1,
+            pair.confidence,
+            mode=self._mode,
+            threshold_px=threshold_px,
+            seed=self._seed,
+        )
 
     def _relief_px(self, xy0: Array, xy1: Array) -> float:
         """Median way of tracks that turning alone does not explain: a hand turns more than it goes."""
@@ -349,8 +383,8 @@ class Initialiser:
     def _passes(self, points: Triangulation) -> NDArray[np.bool_]:
         return (
             points.in_front
-            & (points.parallax_deg > 0.5 * self._min_parallax_deg)
-            & (points.error_sigma < 2.5)
+            & (points.parallax_deg > _PARALLAX_SHARE * self._min_parallax_deg)
+            & (points.error_sigma < _MAX_ERROR_SIGMA)
         )
 
 

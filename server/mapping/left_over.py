@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
-from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.geometry.projection import MIN_DEPTH_MAP
 from semcast.server.mapping.bundle_problem import BundleProblem, ViewMotion
 
 Array = NDArray[np.float64]
@@ -59,7 +60,8 @@ def information(
     if not used.any():
         return told
     view, point, points = problem.view[used], problem.point[used], points[used]
-    by_point = by_points(problem.intrinsics, points)
+    camera = problem.camera
+    by_point = by_points(camera, points)
     by_pose = by_poses(by_point, points)
     by_xyz = by_point @ T_cam_world[used, :3, :3]
     flow = np.einsum("mij,mj->mi", by_pose, motion.velocity[view])
@@ -69,7 +71,7 @@ def information(
             residual_px[used],
             share[:, 1:] * flow,
             share[:, :1] * flow,
-            *_lens_patterns(problem.intrinsics[:2], motion.distortion, points[:, :2] / points[:, 2:]),
+            *_lens_patterns((camera.fx, camera.fy), motion.distortion, points[:, :2] / points[:, 2:]),
         ],
         axis=2,
     )
@@ -127,13 +129,12 @@ def by_poses(by_point: Array, points_cam: Array) -> Array:
     return np.concatenate([by_point @ _skews(points_cam), -by_point], axis=2)
 
 
-def by_points(intrinsics: tuple[float, float, float, float], points_cam: Array) -> Array:
+def by_points(camera: Intrinsics, points_cam: Array) -> Array:
     """Return the change of pixels with points in the camera's frame, ``(M, 2, 3)``."""
-    fx, fy, _, _ = intrinsics
     x, y, z = points_cam.T
     jacobian = np.zeros((len(points_cam), 2, 3))
-    jacobian[:, 0, 0], jacobian[:, 0, 2] = fx / z, -fx * x / z**2
-    jacobian[:, 1, 1], jacobian[:, 1, 2] = fy / z, -fy * y / z**2
+    jacobian[:, 0, 0], jacobian[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
+    jacobian[:, 1, 1], jacobian[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
     return jacobian
 
 

@@ -45,6 +45,10 @@ _MAX_IMAGES = 150
 _ENOUGH_SHARE = 0.2
 #: Landmarks seen again may take the tracks to so many times the number that is wanted.
 _MAX_TRACKS_SHARE = 1.2
+#: The newest keyframes, which stay where older ones are thinned out: an adjustment's window is among them.
+_MAX_RECENT = 40
+#: Steps of an adjustment: a start is far from where it ends, a window was adjusted before but for its newest.
+_START_ITERATIONS, _ITERATIONS = 15, 6
 
 
 class MapBuilder:
@@ -67,9 +71,7 @@ class MapBuilder:
     def clear(self) -> None:
         """Forget the map; an adjustment under way is not applied any more."""
         s = self._settings
-        if self._bundle.busy:
-            self._bundle.take(wait=True)
-        self._version += 1
+        self._abandon_adjustment()
         self.watch.forget_frames()
         self.world = WorldMap()
         self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
@@ -79,6 +81,12 @@ class MapBuilder:
         self.enter(0)
         self.num_inliers_at_keyframe = 0
         self.images = KeyframeImages(_MAX_IMAGES)
+
+    def _abandon_adjustment(self) -> None:
+        """Free the runner before the map changes; what it was asked before does not apply any more."""
+        if self._bundle.busy:
+            self._bundle.take(wait=True)
+        self._version += 1
 
     def reference_keyframe(self) -> Keyframe | None:
         """Newest keyframe of the current submap."""
@@ -226,9 +234,7 @@ class MapBuilder:
         if found is None:
             return False
         keyframe_ids, solved = found
-        if self._bundle.busy:
-            self._bundle.take(wait=True)
-        self._version += 1
+        self._abandon_adjustment()
         self.world.bend(keyframe_ids, solved.T_world_cam, solved.scale)
         self.world.revisits[loop.keyframe_id] = loop.place.keyframe_id
         self._adjusted = None
@@ -327,7 +333,7 @@ class MapBuilder:
     def _bound(self) -> None:
         """Keep the map, and the images of its keyframes, within its size."""
         s = self._settings
-        if self.world.bound(s.max_landmarks, s.max_keyframes, recent=min(40, s.max_keyframes // 2)):
+        if self.world.bound(s.max_landmarks, s.max_keyframes, recent=min(_MAX_RECENT, s.max_keyframes // 2)):
             self.images.keep({k.frame_id for k in self.world.keyframes})
 
     def _submit(self, *, start: bool = False) -> None:
@@ -340,7 +346,7 @@ class MapBuilder:
             self.noise.model,
             self._settings.window_size,
             start=start or mine <= self._settings.window_size // 2,
-            iterations=15 if start else 6,
+            iterations=_START_ITERATIONS if start else _ITERATIONS,
             map_version=self._version,
         )
         if problem is not None:
@@ -360,9 +366,7 @@ class MapBuilder:
 
     def put_right(self, camera: Intrinsics, flows: Mapping[int, ImageFlow]) -> None:
         """Make up for a rolling shutter that was not known of, see ``put_map_right``, and adjust the map."""
-        if self._bundle.busy:
-            self._bundle.take(wait=True)
-        self._version += 1
+        self._abandon_adjustment()
         put_map_right(self.world, self.images, camera, flows)
         self._submit(start=True)
         self.collect(wait=True)
@@ -420,9 +424,7 @@ class MapBuilder:
         )
         if not may_turn(T_place_mine[:3, :3], older, newer):
             return None
-        if self._bundle.busy:
-            self._bundle.take(wait=True)
-        self._version += 1
+        self._abandon_adjustment()
         if self.submap > place.submap:
             self.world.transform_submap(self.submap, place.submap, scale, T_place_mine)
         else:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, Observations
@@ -29,6 +30,15 @@ _MIN_LEFT = 0.1
 #: Where landmarks run out, points under smaller angles do, down to this share of the usual one: a camera that
 #: turns leaves all it knows, and sees hardly anything from two sides.
 _LEAST_PARALLAX_SHARE = 0.3
+#: A pose soon rests on too little when fewer landmarks agree than this share of those right after the last
+#: keyframe, or than so many. New ones are wanted in time: when those, or tracks, are less than these shares.
+_FEW_SHARE, _FEW, _THINNED_SHARE, _SPARSE_SHARE = 0.45, 40, 0.75, 0.6
+#: A frame with less of its rows holds little, and its keyframes are the further apart (in frames).
+_DAMAGED_SHARE, _DAMAGED_APART = 0.5, 5
+#: Flow in image widths: below the first the camera stands, which brings neither parallax nor new views; from
+#: the second on, or so many frames after the last keyframe, another one says something new; beyond the third
+#: the view is another.
+_STANDING_WIDTHS, _CHANGING_WIDTHS, _APART, _MOVED_WIDTHS = 0.004, 0.02, 2, 0.045
 #: Observations in a row that disagree before a landmark is given up.
 _MAX_MISSED = 4
 
@@ -63,15 +73,15 @@ def wants_keyframe(cues: KeyframeCues) -> bool:
 
     A frame of which much is missing becomes one only in need.
     """
-    few = cues.num_inliers < 0.45 * cues.num_inliers_at_keyframe or cues.num_inliers < 40
-    if cues.usable_share < 0.5:
-        return few and cues.frames_since >= 5
-    if cues.median_flow_px < 0.004 * cues.width_px:
-        return False  # standing still brings neither parallax nor new views
-    thinned = cues.num_inliers < 0.75 * cues.num_inliers_at_keyframe
-    sparse = cues.num_visible < 0.6 * cues.max_features
-    moved = cues.median_flow_px > 0.045 * cues.width_px
-    changing = cues.frames_since >= 2 or cues.median_flow_px > 0.02 * cues.width_px
+    few = cues.num_inliers < max(_FEW_SHARE * cues.num_inliers_at_keyframe, _FEW)
+    if cues.usable_share < _DAMAGED_SHARE:
+        return few and cues.frames_since >= _DAMAGED_APART
+    if cues.median_flow_px < _STANDING_WIDTHS * cues.width_px:
+        return False
+    thinned = cues.num_inliers < _THINNED_SHARE * cues.num_inliers_at_keyframe
+    sparse = cues.num_visible < _SPARSE_SHARE * cues.max_features
+    moved = cues.median_flow_px > _MOVED_WIDTHS * cues.width_px
+    changing = cues.frames_since >= _APART or cues.median_flow_px > _CHANGING_WIDTHS * cues.width_px
     return few or moved or ((thinned or sparse) and changing)
 
 
@@ -206,8 +216,7 @@ def new_landmarks(
     T_cam_world = invert_transform(np.stack([k.T_world_cam for k in views]))
     sigma = noise.sigma_px(confidence)
     points = triangulate(camera, T_cam_world, view, point, xy, sigma, len(wanted))
-    T_seen_world = invert_transform(seen_from.T_world_cam)
-    depth = points.xyz @ T_seen_world[2, :3] + T_seen_world[2, 3]
+    depth = depths_in(invert_transform(seen_from.T_world_cam), points.xyz)
     # A fixed error in pixels is what an angle is compared with: noisy images need more parallax.
     wanted_deg = max(min_parallax_deg, float(np.degrees(2.5 * np.median(sigma) / camera.fx)))
     good = (
@@ -277,8 +286,7 @@ def median_depth_of(keyframe: Keyframe, ids: Ids, xyz: Array) -> float:
     _, row, _ = np.intersect1d(ids, keyframe.ids, assume_unique=True, return_indices=True)
     if len(row) == 0:
         return float("inf")
-    T_cam_world = invert_transform(keyframe.T_world_cam)
-    depth = xyz[row] @ T_cam_world[2, :3] + T_cam_world[2, 3]
+    depth = depths_in(invert_transform(keyframe.T_world_cam), xyz[row])
     return float(np.median(np.maximum(depth, 1e-6)))
 
 
@@ -348,11 +356,10 @@ def _share_left(problem: BundleProblem, known: NDArray[np.bool_]) -> Array:
 
 def _drop(world: WorldMap, problem: BundleProblem, bad: NDArray[np.bool_]) -> None:
     """Forget observations, and landmarks that are left with too few."""
-    by_id = {k.frame_id: k for k in world.keyframes}
     for k, frame_id in enumerate(problem.keyframe_ids.tolist()):
         rows = np.flatnonzero(bad & (problem.view == k))
-        if len(rows) and frame_id in by_id:
-            keyframe = by_id[frame_id]
+        keyframe = world.keyframe(frame_id) if len(rows) else None
+        if keyframe is not None:
             keyframe.drop_observations(np.isin(keyframe.ids, problem.landmark_ids[problem.point[rows]]))
     left = np.bincount(problem.point[~bad], minlength=len(problem.xyz))
     # Keyframes outside the problem saw those of long ago too: one new frame does not refute a landmark.

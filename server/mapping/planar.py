@@ -12,7 +12,6 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics
 from semcast.common.geometry import (
     interpolate_pose,
     invert_transform,
@@ -46,20 +45,18 @@ def twin(problem: BundleProblem) -> BundleProblem | None:
     _, row0, row1 = np.intersect1d(problem.point[of_first], problem.point[of_last], return_indices=True)
     if len(row0) < _MIN_POINTS:
         return None
-    fx, fy, cx, cy = problem.intrinsics
-    camera = Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=1, height=1)  # nothing here asks for the size
     xy0, xy1 = problem.xy[of_first][row0], problem.xy[of_last][row1]
     reach_px = _CUT_SIGMAS * float(np.median(problem.sigma_px))
     H, info = poselib.estimate_homography(xy0, xy1, {"max_reproj_error": reach_px, "seed": 0}, {})
     if info["num_inliers"] < max(_MIN_POINTS, _MIN_SHARE * len(row0)) or not np.isfinite(H).all():
         return None
     flat = np.asarray(info["inliers"], dtype=bool)
-    K = camera.K
+    camera, K = problem.camera, problem.camera.K
     found = _other_pose(np.linalg.inv(K) @ np.asarray(H) @ K, problem, camera.unproject(xy0[flat]))
     if found is None:
         return None
     R_last_first, t_last_first, normal = found
-    return _on_plane(problem, camera, R_last_first, t_last_first, normal)
+    return _on_plane(problem, R_last_first, t_last_first, normal)
 
 
 def _other_pose(H: Array, problem: BundleProblem, rays: Array) -> tuple[Array, Array, Array] | None:
@@ -84,7 +81,7 @@ def _other_pose(H: Array, problem: BundleProblem, rays: Array) -> tuple[Array, A
 
 
 def _on_plane(
-    problem: BundleProblem, camera: Intrinsics, R_last_first: Array, t_last_first: Array, normal: Array
+    problem: BundleProblem, R_last_first: Array, t_last_first: Array, normal: Array
 ) -> BundleProblem:
     """Put all points on the plane and the views between where those ask for them."""
     T_world_first = problem.T_world_cam[0]
@@ -95,20 +92,20 @@ def _on_plane(
     poses = [np.eye(4)]
     # The plane is n^T X = distance in the first camera's frame; a ray meets it from any pose.
     xyz = np.full((len(problem.xyz), 3), np.nan)
-    _place(xyz, problem, camera, 0, np.eye(4), normal, distance)
+    _place(xyz, problem, 0, np.eye(4), normal, distance)
     for k in range(1, num_views):
         T = interpolate_pose(np.eye(4), T_last, k / (num_views - 1))
         if k < num_views - 1:
             rows = np.flatnonzero((problem.view == k) & np.isfinite(xyz[problem.point, 0]))
             if len(rows) >= _MIN_POINTS:
+                points, sigma = xyz[problem.point[rows]], problem.sigma_px[rows]
                 gate = np.full(len(rows), 10.0 * float(np.median(problem.sigma_px)))
                 estimate = refine_pose(
-                    camera, invert_transform(T), xyz[problem.point[rows]], problem.xy[rows],
-                    problem.sigma_px[rows], gate,
-                )  # fmt: skip
+                    problem.camera, invert_transform(T), points, problem.xy[rows], sigma, gate
+                )
                 T = invert_transform(estimate.T_cam_world)
         poses.append(T)
-        _place(xyz, problem, camera, k, T, normal, distance)
+        _place(xyz, problem, k, T, normal, distance)
     xyz = np.where(np.isfinite(xyz), xyz, normal * distance)
     return replace(
         problem,
@@ -120,7 +117,6 @@ def _on_plane(
 def _place(
     xyz: Array,
     problem: BundleProblem,
-    camera: Intrinsics,
     view: int,
     T_first_cam: Array,
     normal: Array,
@@ -128,7 +124,7 @@ def _place(
 ) -> None:
     """Give the points a view sees, and no view before it, their place on the plane."""
     rows = np.flatnonzero((problem.view == view) & ~np.isfinite(xyz[problem.point, 0]))
-    rays = camera.unproject(problem.xy[rows]) @ T_first_cam[:3, :3].T
+    rays = problem.camera.unproject(problem.xy[rows]) @ T_first_cam[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = (distance - T_first_cam[:3, 3] @ normal) / (rays @ normal)
     good = np.isfinite(depth) & (depth > 0.0)

@@ -105,22 +105,18 @@ def recall_landmarks(
         Ids of the tracks that were found.
     """
     T_cam_world = invert_transform(T_world_cam)
-    height, width = sight.grey.shape
     found = [np.zeros(0, np.int64)]
     for image in reversed(images.newest(_NUM_RECALLED)):
         if sum(map(len, found)) >= wanted:
             break
-        keyframe = next((k for k in reversed(world.keyframes) if k.frame_id == image.frame_id), None)
+        keyframe = world.keyframe(image.frame_id)
         if keyframe is None or keyframe.submap != submap:
             continue
         row = world.landmarks.rows(keyframe.ids)
         lost = np.flatnonzero((row >= 0) & ~np.isin(keyframe.ids, tracks.ids, assume_unique=True))
         points_cam = transform_points(T_cam_world, world.landmarks.xyz[row[lost]])
         expected = camera.project(points_cam)
-        border = np.array([_BORDER_PX, _BORDER_PX])
-        inside = (expected >= border) & (expected < np.array([width, height]) - border)
-        in_sight = np.asarray(inside.all(axis=1))
-        in_sight[in_sight] &= ~sight.near_lost(expected[in_sight], _BORDER_PX)
+        in_sight = sight.shows(expected, _BORDER_PX)
         lost, expected = lost[in_sight], expected[in_sight]
         if len(lost):
             seen = keyframe.ids[lost], keyframe.xy[lost]

@@ -436,7 +436,6 @@ class Reconstruction:
             submap=self._map.submap,
             keypoints_xy=self._shutter.in_image(self._tracks.xy[visible]).astype(np.float32),
             keypoint_inlier=agrees,
-            keypoint_confidence=self._tracks.confidence[visible].astype(np.float32),
             backfilled=backfilled,
             stage_ms=dict(self._stage_ms),
         )

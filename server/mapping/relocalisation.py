@@ -17,6 +17,7 @@ from semcast.server.geometry.features import (
     match_descriptors,
 )
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
+from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -47,6 +48,9 @@ _LEAST_ALIKE, _FIELDS_XY = 0.73, (12, 5)
 _OCTAVES = (0, 2, 4)
 #: Binary descriptors do not know the noise model: a match is good to about this.
 _MATCH_SIGMA_PX = 1.5
+#: Points that two submaps share at least to tell the ratio of their units, and how far ratios of depths may
+#: be from each other (median, as a logarithm): at wrong places they are of all sizes.
+_MIN_SHARED, _MAX_LOG_SPREAD = 8, 0.25
 
 
 @dataclass(frozen=True)
@@ -246,25 +250,23 @@ def submap_similarity(
     """
     row_new = world.landmarks.rows(ids_new)
     known = row_new >= 0
-    if int(known.sum()) < 8 or len(place.ids) < 8:
+    if int(known.sum()) < _MIN_SHARED or len(place.ids) < _MIN_SHARED:
         return None
     square = ((place.xy[:, None] - xy_new[known][None]) ** 2).sum(axis=2)
     nearest = square.argmin(axis=1)
     close = square[np.arange(len(place.xy)), nearest] < radius_px**2
-    if int(close.sum()) < 8:
+    if int(close.sum()) < _MIN_SHARED:
         return None
-    T_cam_old = invert_transform(place.T_world_cam)
-    T_cam_new = invert_transform(T_world_cam_new)
     xyz_old = world.landmarks.xyz[world.landmarks.rows(place.ids[close])]
     xyz_new = world.landmarks.xyz[row_new[known][nearest[close]]]
-    depth_old = xyz_old @ T_cam_old[2, :3] + T_cam_old[2, 3]
-    depth_new = xyz_new @ T_cam_new[2, :3] + T_cam_new[2, 3]
+    depth_old = depths_in(invert_transform(place.T_world_cam), xyz_old)
+    depth_new = depths_in(invert_transform(T_world_cam_new), xyz_new)
     valid = (depth_old > 1e-6) & (depth_new > 1e-6)
-    if int(valid.sum()) < 8:
+    if int(valid.sum()) < _MIN_SHARED:
         return None
     ratio = depth_old[valid] / depth_new[valid]
     scale = float(np.median(ratio))
-    if float(np.median(np.abs(np.log(ratio / scale)))) > 0.25:
+    if float(np.median(np.abs(np.log(ratio / scale)))) > _MAX_LOG_SPREAD:
         return None
     T_scaled_cam = T_world_cam_new.copy()
     T_scaled_cam[:3, 3] *= scale

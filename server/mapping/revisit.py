@@ -17,7 +17,8 @@ from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.epipolar import fundamental_matrix, sampson_px
 from semcast.server.geometry.features import TrackedPoints, track_points
 from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches, seen_alike
-from semcast.server.geometry.pnp import MIN_DEPTH_MAP, reprojection_residual
+from semcast.server.geometry.pnp import reprojection_residual
+from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.mapper import gather_observations, median_depth
@@ -149,17 +150,13 @@ def _expected(
 ) -> _Expected:
     row = world.landmarks.rows(keyframe.ids)
     rows = np.flatnonzero((row >= 0) & ~np.isin(keyframe.ids, tracked_ids, assume_unique=True))
-    T_old_world = invert_transform(keyframe.T_world_cam)
-    depth = world.landmarks.xyz[row[rows]] @ T_old_world[2, :3] + T_old_world[2, 3]
+    depth = depths_in(invert_transform(keyframe.T_world_cam), world.landmarks.xyz[row[rows]])
     rows, depth = rows[depth > MIN_DEPTH_MAP], depth[depth > MIN_DEPTH_MAP]
     warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, keyframe.xy[rows], depth)
     good = seen_alike(warps, depth_now)
     points_cam = transform_points(T_cam_world, world.landmarks.xyz[row[rows]])
     xy = camera.project(np.where(good[:, None], points_cam, (0.0, 0.0, 1.0)))
-    height, width = sight.grey.shape
-    border = np.array([_BORDER_PX, _BORDER_PX])
-    good &= ((xy >= border) & (xy < np.array([width, height]) - border)).all(axis=1)
-    good &= ~sight.near_lost(xy, _BORDER_PX)
+    good &= sight.shows(xy, _BORDER_PX)
     return _Expected(keyframe, image, rows[good], xy[good], warps[good])
 
 

@@ -52,6 +52,17 @@ class Sight:
         """Features of what arrived: found once, when first asked for."""
         return WideFeatures.of(self.grey, self.usable_pixels)
 
+    def shows(self, xy: Array, margin_px: int) -> NDArray[np.bool_]:
+        """Which points are in the image, no nearer to its border and to lost rows than a margin, ``(N,)``.
+
+        Args:
+            xy: ``(N, 2)`` pixels; NaN is nowhere.
+            margin_px: Pixels.
+        """
+        height, width = self.grey.shape
+        inside = (xy >= margin_px) & (xy < np.array([width, height]) - margin_px)
+        return np.asarray(inside.all(axis=1)) & ~self.near_lost(xy, margin_px)
+
     def near_lost(self, xy: Array, margin_px: int) -> NDArray[np.bool_]:
         """Which points have a lost row within the margin."""
         if self.usable.all():

@@ -9,6 +9,8 @@ camera that stands still moves through less than half of it.
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.server.geometry.cells import cell_keys
+
 Array = NDArray[np.float64]
 
 #: A track stands as long as it is no further from where it began to: share of the width, at least pixels.
@@ -29,8 +31,8 @@ _LEAST_MOTION_PX = 0.5
 
 def cells_of(xy: Array, width: int) -> NDArray[np.intp]:
     """Which cell of the image each of ``(N, 2)`` pixels is in, ``(N,)``; cells with none have no number."""
-    cell = np.floor(xy * (_COLUMNS / width)).astype(np.int64)
-    _, group = np.unique(cell[:, 0] * 1_000_003 + cell[:, 1], return_inverse=True)
+    cells = np.floor(xy * (_COLUMNS / width)).astype(np.int64)
+    _, group = np.unique(cell_keys(cells), return_inverse=True)
     return np.asarray(group, dtype=np.intp)
 
 

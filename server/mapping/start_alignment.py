@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import Grey
 from semcast.server.geometry.patch_alignment import ANCHOR_PATCH_PX, Templates, align_patches, seen_alike
-from semcast.server.geometry.pnp import MIN_DEPTH_MAP
+from semcast.server.geometry.projection import MIN_DEPTH_MAP
 from semcast.server.mapping.kept_frames import Observed
 
 Array = NDArray[np.float64]

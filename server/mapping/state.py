@@ -80,7 +80,6 @@ class FrameResult:
             until it meets an older one and becomes part of it.
         keypoints_xy: ``(N, 2)`` float32 pixels.
         keypoint_inlier: ``(N,)`` bool, agrees with the pose.
-        keypoint_confidence: ``(N,)`` float32 in [0, 1], the confidence its weight is made of.
         backfilled: ``(frame_id, t_source_ns, T_world_cam)`` of earlier frames that got their pose only now.
         stage_ms: Duration of each stage that ran.
     """
@@ -98,7 +97,6 @@ class FrameResult:
     submap: int
     keypoints_xy: NDArray[np.float32]
     keypoint_inlier: NDArray[np.bool_]
-    keypoint_confidence: NDArray[np.float32]
     backfilled: tuple[tuple[int, int, Array], ...] = ()
     stage_ms: Mapping[str, float] = field(default_factory=dict)
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
-from semcast.server.geometry.pnp import MIN_DEPTH_MAP, PoseEstimate, refine_pose, search_pose
+from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
+from semcast.server.geometry.projection import MIN_DEPTH_MAP
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.rays import rays_of
 from semcast.server.mapping.sight import Seen

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import KLT_WINDOW_PX
+from semcast.server.geometry.cells import cell_keys
 from semcast.server.geometry.features import (
     Grey,
     TrackedPoints,
@@ -342,10 +343,8 @@ class TrackTable:
         """Visible tracks next to ``(M, 2)`` points, ``(N,)``: in the same or a neighbouring cell."""
         around = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
         taken = (np.floor(xy / cell_px).astype(np.int64)[:, None] + around).reshape(-1, 2)
-        cell = np.floor(self.xy / cell_px).astype(np.int64)
-        return self.visible & np.isin(
-            cell[:, 0] * 1_000_003 + cell[:, 1], taken[:, 0] * 1_000_003 + taken[:, 1]
-        )
+        cells = np.floor(self.xy / cell_px).astype(np.int64)
+        return self.visible & np.isin(cell_keys(cells), cell_keys(taken))
 
     def take_up(
         self, sight: Sight, grey0: Grey, ids: Ids, xy0: Array, expected_xy: Array, reach_px: float

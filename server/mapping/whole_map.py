@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
+from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, assemble_problem
@@ -146,5 +147,4 @@ def _scales(result: BundleResult) -> Array:
 
 def _depths(problem: BundleProblem, T_world_cam: Array, xyz: Array) -> Array:
     """Depth of each observation's landmark in its view, ``(M,)`` map units."""
-    row = invert_transform(T_world_cam)[problem.view, 2]
-    return np.asarray(np.einsum("mj,mj->m", row[:, :3], xyz[problem.point]) + row[:, 3])
+    return depths_in(invert_transform(T_world_cam)[problem.view], xyz[problem.point])

@@ -84,19 +84,20 @@ class WideRecogniser:
             images: Of keyframes.
             noise: Of observations.
         """
-        by_id = {k.frame_id: k for k in world.keyframes}
-        newest = [image for image in images.newest(_NUM_KEYFRAMES) if image.frame_id in by_id][::-1]
+        there = [(image, world.keyframe(image.frame_id)) for image in images.newest(_NUM_KEYFRAMES)]
+        newest = [(image, keyframe) for image, keyframe in reversed(there) if keyframe is not None]
         if not newest:
             return None
         last_id, num_looked = self._looked_for
-        num_looked = num_looked if newest[0].frame_id == last_id else 0
+        newest_id = newest[0][1].frame_id
+        num_looked = num_looked if newest_id == last_id else 0
         if num_looked == _MAX_FRAMES:
             return None
-        self._looked_for = newest[0].frame_id, num_looked + 1
-        self._known = [(image, known) for image, known in self._known if any(image is i for i in newest)]
-        for image in newest:
+        self._looked_for = newest_id, num_looked + 1
+        self._known = [(image, known) for image, known in self._known if any(image is i for i, _ in newest)]
+        for image, keyframe in newest:
             known = self._features_of(image)
-            place = self._place(sight, world, by_id[image.frame_id], image, known, noise)
+            place = self._place(sight, world, keyframe, image, known, noise)
             if place is not None:
                 return place
         return None
@@ -142,10 +143,7 @@ class WideRecogniser:
         """Look for all landmarks of a keyframe where a pose has them."""
         depth0 = transform_points(invert_transform(keyframe.T_world_cam), xyz)[:, 2]
         expected = self._camera.project(transform_points(T_cam_world, xyz))
-        size = np.array([self._camera.width, self._camera.height])
-        inside = ((expected >= _BORDER_PX) & (expected < size - _BORDER_PX)).all(axis=1) & (depth0 > 0.0)
-        inside[inside] &= ~sight.near_lost(expected[inside], _BORDER_PX)
-        rows = np.flatnonzero(inside)
+        rows = np.flatnonzero(sight.shows(expected, _BORDER_PX) & (depth0 > 0.0))
         T_cam_keyframe = T_cam_world @ keyframe.T_world_cam
         warps, depth1 = affine_warps(self._camera, T_cam_keyframe, xy0[rows], depth0[rows])
         alike = seen_alike(warps, depth1)

@@ -1,9 +1,9 @@
 """What a bundle adjustment is asked: the newest keyframes, those that hold them, and what they see.
 
-Tried without gain: tracks that are no landmarks yet as further points of an adjustment (drawn streets a
-little better, a real shelf worse), and a single fixed pose with a distance until the map outgrows the
-window (an orbit better, a drive worse). Twenty keyframes correct for longer what the start of a map got
-wrong than ten do, and cost hardly more time: what counts is the number of observations.
+Only landmarks are points of it: tracks that are none yet help where images are clean and harm where they are
+not. Two poses are fixed, for a single one and a distance hold an orbit better, but a drive worse. Twenty
+keyframes correct for longer what the start of a map got wrong than ten do, and cost hardly more time: what
+counts is the number of observations.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.bundle_problem import BundleProblem, assemble_problem
+from semcast.server.mapping.bundle_problem import BundleProblem, Observations, assemble_problem
 from semcast.server.mapping.mapper import gather_observations, median_depth
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -21,6 +21,8 @@ Ids = NDArray[np.int64]
 
 #: Observations one adjustment takes at most; it has to be done before the next keyframe.
 MAX_OBSERVATIONS = 4500
+#: Landmarks of a window: with fewer its poses are better left as the frames found them.
+_MIN_LANDMARKS = 8
 #: Keyframes that see a landmark, from which on it matters to an adjustment as much as any other.
 _WELL_SEEN = 4
 #: Shares of the room that what the newest keyframe sees, and what older keyframes outside the window saw, get
@@ -74,15 +76,9 @@ def build_problem(
     anchors = _anchors(world, mine[:-window_size], recent, ids)
     views = [*anchors, *recent]
     seen = gather_observations(views, ids)
-    count = np.bincount(seen.point, minlength=len(ids))
-    # What ties the window to older keyframes and what the newest one sees are sure of a part of the room: the
-    # longest tracks of a scene that stays in view would take all of it. Then what several keyframes see.
-    is_anchored = np.isin(np.arange(len(ids)), seen.point[seen.view < len(anchors)])
-    is_newest = np.isin(ids, recent[-1].ids, assume_unique=True)
-    turn = _turns(ids, count, (is_newest, _NEWEST_SHARE), (is_anchored, _ANCHORED_SHARE))
-    order = -np.minimum(count, _WELL_SEEN), turn
+    order = _order_of_choice(ids, seen, recent[-1], len(anchors))
     used_points, kept, point = within_limit(ids, seen.point, *order, limit=MAX_OBSERVATIONS)
-    if len(used_points) < 8:
+    if len(used_points) < _MIN_LANDMARKS:
         return None
     held = np.bincount(seen.view[kept], minlength=len(views))[: len(anchors)] >= _MIN_SHARED
     fixed = np.zeros(len(views), bool)
@@ -103,6 +99,21 @@ def build_problem(
         num_anchors=len(anchors),
         with_covariance=True,
     )
+
+
+def _order_of_choice(
+    ids: Ids, seen: Observations, newest: Keyframe, num_anchors: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Keys ``(P,)`` by which landmarks are chosen, see ``within_limit``.
+
+    What ties the window to older keyframes and what the newest one sees are sure of a part of the room: the
+    longest tracks of a scene that stays in view would take all of it. Then what several keyframes see.
+    """
+    count = np.bincount(seen.point, minlength=len(ids))
+    is_anchored = np.isin(np.arange(len(ids)), seen.point[seen.view < num_anchors])
+    is_newest = np.isin(ids, newest.ids, assume_unique=True)
+    turn = _turns(ids, count, (is_newest, _NEWEST_SHARE), (is_anchored, _ANCHORED_SHARE))
+    return -np.minimum(count, _WELL_SEEN), turn
 
 
 def within_limit(

@@ -1,5 +1,6 @@
 """The map: landmarks as arrays, keyframes with their observations, bounded in size."""
 
+from bisect import bisect_left
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -156,7 +157,7 @@ class WorldMap:
 
     Attributes:
         landmarks: The points.
-        keyframes: In order of time, those with observations.
+        keyframes: By frame id, ascending, those with observations.
         poses: Frame id of a keyframe -> ``T_world_cam``, also of keyframes thinned out since.
         submap_of: Frame id of a keyframe -> its submap.
         frames: Of each its keyframe and ``T_keyframe_cam``.
@@ -164,6 +165,9 @@ class WorldMap:
     """
 
     def __init__(self) -> None:
+        self._clear()
+
+    def _clear(self) -> None:
         self.landmarks = Landmarks()
         self.keyframes: list[Keyframe] = []
         self.poses: dict[int, Array] = {}
@@ -175,6 +179,12 @@ class WorldMap:
         self._frames_moved = False
         self._removed: set[int] = set()
         self._withdrawn: set[int] = set()
+
+    def keyframe(self, frame_id: int) -> Keyframe | None:
+        """Keyframe with a frame id; None where there is none, or it was thinned out."""
+        at = bisect_left(self.keyframes, frame_id, key=lambda k: k.frame_id)
+        found = self.keyframes[at] if at < len(self.keyframes) else None
+        return found if found is not None and found.frame_id == frame_id else None
 
     def add_keyframe(self, keyframe: Keyframe) -> None:
         """Append a keyframe."""
@@ -215,10 +225,9 @@ class WorldMap:
         if frame_id in self.poses:
             self.poses[frame_id] = T_world_cam
             self._moved_keyframes.add(frame_id)
-            for keyframe in reversed(self.keyframes):
-                if keyframe.frame_id == frame_id:
-                    keyframe.T_world_cam = T_world_cam
-                    return
+            keyframe = self.keyframe(frame_id)
+            if keyframe is not None:
+                keyframe.T_world_cam = T_world_cam
 
     def add_frame(self, frame_id: int, keyframe_id: int, T_world_cam: Array) -> None:
         """Note a frame's pose relative to a keyframe, with which it then moves.
@@ -416,7 +425,7 @@ class WorldMap:
             ValueError: Arrays contradict each other.
         """
         check_map_arrays(arrays, _KEYFRAME_PARTS)
-        self.__init__()  # type: ignore[misc]
+        self._clear()
         self.landmarks.restore(arrays)
         for frame_id, T, submap in zip(
             arrays["poses.frame_id"].tolist(),

@@ -321,6 +321,10 @@ def test_images_of_others_are_not_written_over(tmp_path, arc_run, write_arc_run,
     assert (out / foreign).read_bytes() == b"original"
 
 
+def contents(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
 def test_exports_into_one_folder_follow_each_other(tmp_path, arc_run, write_arc_run):
     write_arc_run(tmp_path / "run", arc_run())
     out = tmp_path / "out"
@@ -328,8 +332,13 @@ def test_exports_into_one_folder_follow_each_other(tmp_path, arc_run, write_arc_
     name, image = next((p.name, p.read_bytes()) for p in read_image_paths(tmp_path / "run").values())
     (out / "images").mkdir(parents=True)
     (out / "images" / name).write_bytes(image)
+    alone = {}
+    for format_name in ("colmap", "nerfstudio"):
+        export_run(tmp_path / "run", format_name, tmp_path / format_name)
+        alone |= contents(tmp_path / format_name)
     for format_name in ("colmap", "nerfstudio", "colmap"):
         export_run(tmp_path / "run", format_name, out)
+    assert contents(out) == alone
 
 
 def test_an_export_leaves_the_images_of_the_other_formats_model_alone(tmp_path, arc_run, write_arc_run):

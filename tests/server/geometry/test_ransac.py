@@ -79,8 +79,7 @@ def test_the_same_seed_gives_the_same_model():
 def test_too_few_or_equal_matches_give_nothing():
     assert confidence_ransac(CAMERA, np.zeros((5, 2)), np.zeros((5, 2)), np.ones(5)) is None
     same = np.full((30, 2), 100.0)
-    found = confidence_ransac(CAMERA, same, same, np.ones(30), num_trials=20)
-    assert found is None or np.isfinite(found.T_cam1_cam0).all()
+    assert confidence_ransac(CAMERA, same, same, np.ones(30), num_trials=20) is None
 
 
 def test_of_the_four_poses_the_one_with_points_in_front_is_taken():

@@ -16,7 +16,7 @@ def _problem_of(camera, poses, xyz, *, noise_px=0.0, rng=None):
     clean = np.concatenate(xy)
     noise = noise_px * rng.standard_normal(clean.shape) if noise_px else 0.0
     return BundleProblem(
-        intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+        camera=camera,
         keyframe_ids=np.arange(len(poses)),
         T_world_cam=poses,
         fixed=np.arange(len(poses)) == 0,
@@ -73,8 +73,7 @@ def _direction_error_deg(found, truth):
 def _projected(problem):
     T_cam_world = invert_transform(problem.T_world_cam)[problem.view]
     seen = np.einsum("mij,mj->mi", T_cam_world[:, :3, :3], problem.xyz[problem.point]) + T_cam_world[:, :3, 3]
-    fx, fy, cx, cy = problem.intrinsics
-    return seen[:, :2] / seen[:, 2:] * [fx, fy] + [cx, cy]
+    return problem.camera.project(seen)
 
 
 @pytest.fixture(scope="session")

@@ -52,7 +52,7 @@ def adjusted(camera, noise_px=0.2, seed=0, velocities=True, radial=0.0, radial_2
         [body_velocity(pose_at(t - ms), pose_at(t), pose_at(t + ms), 2 * ms) for t in times_s]
     )
     problem = BundleProblem(
-        intrinsics=(CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy),
+        camera=CAMERA,
         keyframe_ids=np.arange(NUM_VIEWS),
         T_world_cam=poses,
         fixed=np.arange(NUM_VIEWS) == 0,

@@ -4,13 +4,14 @@ import signal
 import numpy as np
 import pytest
 
+from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.mapping import bundle
 from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.bundle_process import ProcessBundle
 
-FX, FY, CX, CY = INTRINSICS = (500.0, 480.0, 320.0, 240.0)
+CAMERA = Intrinsics(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480)
 
 
 def make_problem(seed=0, num_views=6, num_points=60, noise_px=0.3, shake=0.02, sigma_px=None, **changes):
@@ -25,14 +26,14 @@ def make_problem(seed=0, num_views=6, num_points=60, noise_px=0.3, shake=0.02, s
     xyz = rng.uniform((-2, -1.5, 5), (4, 1.5, 12), (num_points, 3))
     view, point = (a.ravel() for a in np.meshgrid(np.arange(num_views), np.arange(num_points), indexing="ij"))
     cam = np.stack([transform_points(invert_transform(T), xyz) for T in T_world_cam]).reshape(-1, 3)
-    xy = np.stack([FX * cam[:, 0] / cam[:, 2] + CX, FY * cam[:, 1] / cam[:, 2] + CY], axis=1)
+    xy = CAMERA.project(cam)
     sigma = np.full(len(xy), noise_px) if sigma_px is None else sigma_px(view, point, rng)
     xy = xy + rng.normal(0, 1, xy.shape) * sigma[:, None]
     start = np.stack(
         [T if k < 2 else T @ exp_se3(rng.normal(0, shake, 6)) for k, T in enumerate(T_world_cam)]
     )
     values = {
-        "intrinsics": INTRINSICS,
+        "camera": CAMERA,
         "keyframe_ids": np.arange(num_views),
         "T_world_cam": start,
         "fixed": np.arange(num_views) < 2,
@@ -180,7 +181,7 @@ def test_the_weight_is_outside_of_the_loss_in_the_papers_objective_and_inside_in
         "fixed": np.array([False]),
         "T_world_cam": np.eye(4)[None],
         "xyz": np.array([[0.0, 0.0, 2.0]]),
-        "xy": np.array([[CX + residual_px, CY]]),
+        "xy": np.array([[CAMERA.cx + residual_px, CAMERA.cy]]),
         "view": np.array([0]),
         "point": np.array([0]),
         "sigma_px": np.array([sigma]),

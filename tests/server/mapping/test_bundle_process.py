@@ -9,13 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from semcast.common.camera import Intrinsics
 from semcast.server import worker
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.bundle_process import GIVEN_UP, ProcessBundle
 
 #: Nothing of it is looked at: the child is killed before it has read it.
 PROBLEM = BundleProblem(
-    intrinsics=(1.0, 1.0, 0.0, 0.0),
+    camera=Intrinsics(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=1, height=1),
     keyframe_ids=np.zeros(1, np.int64),
     T_world_cam=np.eye(4)[None],
     fixed=np.ones(1, bool),

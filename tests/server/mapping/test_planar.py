@@ -72,6 +72,6 @@ def test_too_few_common_points_have_no_twin(wall):
 
 def test_a_principal_point_outside_the_image_is_no_obstacle(wall, direction_error_deg):
     truth = wall()
-    fx, fy, cx, cy = truth.intrinsics
-    shifted = replace(truth, intrinsics=(fx, fy, cx - 400.0, cy - 300.0), xy=truth.xy - [400.0, 300.0])
+    camera = replace(truth.camera, cx=truth.camera.cx - 400.0, cy=truth.camera.cy - 300.0)
+    shifted = replace(truth, camera=camera, xy=truth.xy - [400.0, 300.0])
     assert direction_error_deg(twin(shifted).T_world_cam, twin(truth).T_world_cam) < 0.1

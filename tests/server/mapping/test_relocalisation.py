@@ -94,5 +94,4 @@ def test_another_image_is_no_place():
     world = wall(relocaliser, 120)
     other = np.ascontiguousarray(GREY[::-1, ::-1])
     sight = Sight(DecodedFrame(1, 10**8, np.repeat(other[..., None], 3, axis=2)), other, np.ones(240, bool))
-    place = relocaliser.find(sight, world, NOISE)
-    assert place is None or abs(place.T_world_cam[0, 0] + 1.0) < 0.05, "the image turned by 180 degrees"
+    assert relocaliser.find(sight, world, NOISE) is None

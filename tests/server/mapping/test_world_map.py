@@ -56,6 +56,17 @@ def test_landmarks_stay_sorted_and_are_found_by_id():
     assert len(landmarks.born) == len(landmarks) == 3
 
 
+def test_a_keyframe_is_found_by_its_id_until_it_is_thinned_out():
+    world = make_world()
+    for keyframe in world.keyframes:
+        assert world.keyframe(keyframe.frame_id) is keyframe
+    assert [world.keyframe(k) for k in (-1, 3, 15, 31)] == [None] * 4
+    assert WorldMap().keyframe(0) is None
+    gone = world.keyframes.pop(1).frame_id
+    assert gone in world.poses
+    assert world.keyframe(gone) is None
+
+
 def test_frames_follow_their_keyframe():
     world = make_world()
     before = world.pose_of_frame(13)
