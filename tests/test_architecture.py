@@ -24,9 +24,8 @@ HOMES = {
     "mcap": {"common/recording_writer.py"},
     "matplotlib": {"evaluation/plots.py"},
     "poselib": {
-        *(f"server/geometry/{name}.py" for name in ("pnp", "ransac", "two_view", "wide_search")),
+        *(f"server/geometry/{name}.py" for name in ("lo_ransac", "pnp", "ransac", "two_view", "wide_search")),
         "server/mapping/planar.py",
-        "evaluation/competitors.py",
     },
     "safetensors": {"common/nets/checkpoint.py"},
     "onnxruntime": {"common/nets/onnx_encoder.py", "training/onnx_int8.py"},
