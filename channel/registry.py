@@ -1,8 +1,8 @@
 """Channel models by name. A model draws, for one frame, what happens to each of its slots.
 
 Models keep no random state: a frame's draw depends on seed, frame number and time alone, so losing a frame
-changes nothing about the others. Time counts from the first frame of a link: a restarted channel begins its
-SNR trace and its Doppler fading anew.
+changes nothing about the others. Time counts from the first frame of a link, for an SNR trace from the first
+one it is in force for: a restarted channel begins its SNR trace and its Doppler fading anew.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ class ChannelModel(Protocol):
 
         Args:
             num_slots: Slots of the frame.
-            elapsed_s: Time since the first frame.
+            elapsed_s: Time since the first frame: of the trace where there is one, else of the link.
             rng: Randomness of this frame alone.
         """
 
