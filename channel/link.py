@@ -66,6 +66,11 @@ class Link:
         """The settings in force."""
         return self._settings
 
+    @property
+    def start_snr_db(self) -> float:
+        """SNR in dB that is set for the first frame, also where a trace sets it."""
+        return self._model.snr_db(0.0)
+
     def update(self, settings: ChannelSettings) -> None:
         """Change the settings, also to another kind of channel, from the next frame on.
 

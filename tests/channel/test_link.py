@@ -180,7 +180,8 @@ def test_a_trace_begins_when_it_is_set_and_fading_goes_on(slots):
         link.transmit(slots, 13.5)
     fading = ChannelSettings(channel="rayleigh", doppler_hz=2.0)
     one, two = Link(fading, 0), Link(fading, 0)
-    one.transmit(slots, 0.0, 0), two.transmit(slots, 0.0, 0)
+    for link in (one, two):
+        link.transmit(slots, 0.0, 0)
     two.update(ramp)
     two.transmit(slots, 0.1, 1)
     two.update(replace(fading, snr_db=4.0))
