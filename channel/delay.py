@@ -11,27 +11,35 @@ from semcast.common.worker_guard import WorkerGuard
 
 #: Ten seconds of delay at 50 frames per second.
 CAPACITY = 512
+_JITTER_STREAM = 0x717
+
+
+def extra_delay_ms(mean_ms: float, seed: int, frame_id: int) -> float:
+    """Draw the jitter of a frame in ms, exponential: by its number, whatever became of the others.
+
+    Args:
+        mean_ms: At least 0.
+        seed: Of the channel.
+        frame_id: Number of the frame.
+    """
+    rng = np.random.default_rng((seed, _JITTER_STREAM, frame_id))
+    return mean_ms * float(rng.standard_exponential())
 
 
 class DelayLine:
     """Calls ``send`` for each packet when its time has come, on a thread of its own when it must wait.
 
-    Jitter is exponential. A radio link doesn't reorder: a packet leaves no sooner than the one before it.
+    A radio link doesn't reorder: a packet leaves no sooner than the one before it.
 
     Args:
         send: Gets the packet. Where it fails on the line's thread, that packet is lost and the next one sent.
-        rng: Randomness of the jitter.
         on_failure: Is told in a line what failed there.
     """
 
     def __init__(
-        self,
-        send: Callable[[bytes, bool], None],
-        rng: np.random.Generator,
-        on_failure: Callable[[str], None] | None = None,
+        self, send: Callable[[bytes, bool], None], on_failure: Callable[[str], None] | None = None
     ) -> None:
         self._send = send
-        self._rng = rng
         self._waiting: deque[tuple[float, bytes, bool]] = deque()
         self._changed = threading.Condition()
         self._sending = False
@@ -41,18 +49,17 @@ class DelayLine:
         self._thread = threading.Thread(target=self._run, name="semcast-delay", daemon=True)
         self._thread.start()
 
-    def put(self, packet: bytes, lossless: bool, delay_ms: float, jitter_ms: float) -> bool:
+    def put(self, packet: bytes, lossless: bool, delay_ms: float) -> bool:
         """Take a packet; without any delay it is sent at once, by the caller.
 
         Returns:
             False when too many packets wait already, or the line is closed; it is dropped then.
         """
-        extra_ms = float(self._rng.exponential(jitter_ms)) if jitter_ms > 0 else 0.0
-        due_s = time.monotonic() + 1e-3 * (delay_ms + extra_ms)
+        due_s = time.monotonic() + 1e-3 * delay_ms
         with self._changed:
             if self._closed:
                 return False
-            at_once = delay_ms + extra_ms == 0.0 and not self._waiting and not self._sending
+            at_once = delay_ms == 0.0 and not self._waiting and not self._sending
             if not at_once:
                 if len(self._waiting) >= CAPACITY:
                     return False

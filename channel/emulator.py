@@ -8,13 +8,11 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from semcast.channel.delay import DelayLine
+from semcast.channel.delay import DelayLine, extra_delay_ms
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.link import Link
 from semcast.channel.registry import build_channel
-from semcast.channel.settings import ChannelSettings
+from semcast.channel.settings import MAX_DOPPLER_SLOT, ChannelSettings
 from semcast.common.config import build_settings, settings_to_dict
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import channel_key, control_key, rx_key, tx_key
@@ -34,7 +32,6 @@ logger = logging.getLogger(__name__)
 ROLE = "channel"
 _POLL_S = 0.1
 _REPLAY_CAPACITY = 64
-_JITTER_STREAM = 0x717
 
 
 class Emulator:
@@ -66,8 +63,7 @@ class Emulator:
         session.answer(control_key(agent_id, ROLE), self._on_request)
         session.subscribe(tx_key(agent_id), "newest", self._on_symbols, FRAME_RING_CAPACITY)
         # Last, as it has a thread that nobody would end if one of the others failed.
-        jitter = np.random.default_rng((settings.seed, _JITTER_STREAM))
-        self._delay = DelayLine(self._send, jitter, self._on_unsent)
+        self._delay = DelayLine(self._send, self._on_unsent)
 
     @property
     def agent_epoch(self) -> int:
@@ -144,7 +140,8 @@ class Emulator:
             payload=b"" if sent.frame_lost else pack_iq(sent.slots_rx),
             slot_lost=pack_lost(sent.slot_lost),
         )
-        if self._delay.put(pack(received), frame.lossless, settings.delay_ms, settings.jitter_ms):
+        extra_ms = extra_delay_ms(settings.jitter_ms, self._settings.seed, frame.frame_id)
+        if self._delay.put(pack(received), frame.lossless, settings.delay_ms + extra_ms):
             self._metrics.count("carried_again" if again else "carried")
         else:
             self._metrics.drop("overflow")
@@ -185,7 +182,7 @@ class Emulator:
                 with self._link_lock:
                     self._link.switch(changed, model)
                 logger.info("channel set: %s", ", ".join(f"{k}={v}" for k, v in request.settings.items()))
-                warn_of_idle(changed, request.settings)
+                warn_of_settings(changed, request.settings)
             in_force = settings_to_dict(self._link.settings)
         # Given on the command line, the name of a file may be no text.
         return {k: sendable(v, 1000) if isinstance(v, str) else v for k, v in in_force.items()}
@@ -196,11 +193,23 @@ class Emulator:
         self._delay.close()
 
 
-def warn_of_idle(link: ChannelSettings, given: Collection[str]) -> None:
-    """Say which of the given values do nothing as long as the channel is what it is."""
-    idle = [name for name in link.without_effect() if name in given]
+def warn_of_settings(link: ChannelSettings, given: Collection[str] | None = None) -> None:
+    """Say which values do nothing as long as the channel is what it is, and which no real link is like.
+
+    Args:
+        link: In force.
+        given: Names of the values that somebody set just now; None takes those that are not the default.
+    """
+    idle = link.without_effect(given)
     if idle:
         logger.warning("%s: no effect on channel %s as it is set", ", ".join(idle), link.channel)
+    if link.fades_within_slots and (
+        given is None or not {"channel", "doppler_hz", "slot_ms"}.isdisjoint(given)
+    ):
+        logger.warning(
+            "doppler_hz times slot_ms should be at most %g, got %g: a real link would fade within slots",
+            *(MAX_DOPPLER_SLOT, link.doppler_hz * link.slot_ms),
+        )
 
 
 def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, Any]:
@@ -231,7 +240,7 @@ def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, 
         stack.callback(emulator.close)
         session.declare_alive(settings.agent_id, ROLE)
         logger.info("channel %s at %g dB", settings.link.channel, settings.link.snr_db)
-        warn_of_idle(settings.link, settings.link.without_effect())
+        warn_of_settings(settings.link)
         emulator.work(stop)
     return metrics.summary()
 

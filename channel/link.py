@@ -9,6 +9,7 @@ from semcast.channel.awgn import complex_noise
 from semcast.channel.power import mean_power, normalise_power
 from semcast.channel.registry import ChannelModel, build_channel
 from semcast.channel.settings import ChannelSettings
+from semcast.channel.slot_time import SlotTime
 from semcast.common.codec import EncodedImage, ReceivedImage
 from semcast.common.phy.equaliser import ChannelKnowledge, Equalised, equalise
 from semcast.common.phy.pilots import insert_pilots
@@ -56,8 +57,8 @@ class Transmission:
 class Link:
     """A channel with its settings, which may change between frames.
 
-    The randomness of a frame comes from the seed and the frame number alone, the time from ``t_s``. The time
-    of the first frame transmitted is the start of SNR traces and fading.
+    The randomness of a frame comes from the seed and the frame number alone, the time from ``t_s``. Fading
+    starts at the first frame transmitted, an SNR trace at the first one it is in force for.
     """
 
     def __init__(self, settings: ChannelSettings, seed: int = 0) -> None:
@@ -73,12 +74,19 @@ class Link:
         self._seed = seed
         self._model = build_channel(settings, seed)
         self._start_s: float | None = None
+        self._trace_start_s: float | None = None
+        self._slot_time = SlotTime()
         self._next_frame = 0
 
     @property
     def settings(self) -> ChannelSettings:
         """The settings in force."""
         return self._settings
+
+    @property
+    def start_snr_db(self) -> float:
+        """SNR in dB that is set for the first frame, also where a trace sets it."""
+        return self._model.snr_db(0.0)
 
     def update(self, settings: ChannelSettings) -> None:
         """Change the settings, also to another kind of channel, from the next frame on.
@@ -89,12 +97,18 @@ class Link:
         self.switch(settings, build_channel(settings, self._seed))
 
     def switch(self, settings: ChannelSettings, model: ChannelModel) -> None:
-        """Change to settings and the channel that was built of them: reading a trace may take long."""
+        """Change to settings and the channel that was built of them: reading a trace may take long.
+
+        A trace that is another one than before begins with the next frame.
+        """
+        if settings.trace_in_force() != self._settings.trace_in_force():
+            self._trace_start_s = None
         self._settings, self._model = settings, model
 
     def restart(self) -> None:
         """Let time begin anew with the next frame, and with it fading and SNR traces."""
-        self._start_s = None
+        self._start_s = self._trace_start_s = None
+        self._slot_time = SlotTime()
         self._next_frame = 0
 
     def transmit(self, slots: NDArray[np.complex64], t_s: float, frame_id: int | None = None) -> Transmission:
@@ -119,11 +133,16 @@ class Link:
         self._next_frame = frame_id + 1
         if self._start_s is None:
             self._start_s = t_s
+        if self._trace_start_s is None:
+            self._trace_start_s = t_s
+        start_s = self._trace_start_s if self._settings.channel == "trace" else self._start_s
+        if self._settings.fades_over_time:
+            self._slot_time.check(slots.shape[0], self._settings.slot_ms, t_s)
         sent = normalise_power(slots)
         power = mean_power(slots)
         rng = np.random.default_rng((self._seed, _FRAME_STREAM, frame_id))
         frame_lost = bool(rng.random() < self._settings.frame_loss)
-        draw = self._model.draw(slots.shape[0], t_s - self._start_s, rng)
+        draw = self._model.draw(slots.shape[0], t_s - start_s, rng)
         truth = ChannelKnowledge(h=draw.h / np.float32(np.sqrt(power)), noise_var=draw.noise_var)
         lost = np.ones_like(draw.lost) if frame_lost else draw.lost
         if frame_lost:

@@ -1,8 +1,8 @@
 """Channel models by name. A model draws, for one frame, what happens to each of its slots.
 
 Models keep no random state: a frame's draw depends on seed, frame number and time alone, so losing a frame
-changes nothing about the others. Time counts from the first frame of a link: a restarted channel begins its
-SNR trace and its Doppler fading anew.
+changes nothing about the others. Time counts from the first frame of a link, for an SNR trace from the first
+one it is in force for: a restarted channel begins its SNR trace and its Doppler fading anew.
 """
 
 from collections.abc import Callable
@@ -46,12 +46,15 @@ class SlotDraw:
 class ChannelModel(Protocol):
     """One kind of channel with its settings; it has no state but those and a seed."""
 
+    def snr_db(self, elapsed_s: float) -> float:
+        """Return the SNR in dB that is set so long after the first frame of the trace."""
+
     def draw(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> SlotDraw:
         """Draw one frame.
 
         Args:
             num_slots: Slots of the frame.
-            elapsed_s: Time since the first frame.
+            elapsed_s: Time since the first frame: of the trace where there is one, else of the link.
             rng: Randomness of this frame alone.
         """
 
@@ -63,7 +66,7 @@ class _Model:
         self._settings = settings
         self._seed = seed
 
-    def _snr_db(self, elapsed_s: float) -> float:
+    def snr_db(self, elapsed_s: float) -> float:
         del elapsed_s
         return self._settings.snr_db
 
@@ -80,7 +83,7 @@ class _Model:
         return np.zeros(num_slots, dtype=bool)
 
     def draw(self, num_slots: int, elapsed_s: float, rng: np.random.Generator) -> SlotDraw:
-        snr_db = self._snr_db(elapsed_s)
+        snr_db = self.snr_db(elapsed_s)
         return SlotDraw(
             snr_db=snr_db,
             h=self._gains(num_slots, elapsed_s, rng),
@@ -132,7 +135,7 @@ class _Trace(_Model):
             return read_trace_csv(settings.trace_file)
         return ConstantTrace(settings.snr_db)
 
-    def _snr_db(self, elapsed_s: float) -> float:
+    def snr_db(self, elapsed_s: float) -> float:
         return self._trace.snr_db(elapsed_s)
 
 

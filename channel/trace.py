@@ -1,4 +1,4 @@
-"""SNR over time: constant, ramp, random walk or a recorded CSV file. Time starts at the first frame.
+"""SNR over time: constant, ramp, random walk or a recorded CSV file. Time starts at a trace's first frame.
 
 Every trace is a plain function of time, so a lost frame doesn't move what later frames see.
 """

@@ -27,13 +27,15 @@ def _shipped_weights() -> list[str]:
 
 
 @cache
-def _conventional_names() -> dict[str, tuple[ImageFormat, bool]]:
-    """Return name to (format, adaptive) of what this OpenCV can do."""
+def _conventional_names() -> dict[str, tuple[ImageFormat, bool, bool]]:
+    """Return name to (format, adaptive, slow) of what this OpenCV can do."""
     from semcast.common.conventional_source import supported
 
     formats: tuple[ImageFormat, ...] = get_args(ImageFormat)
-    names = {f"{name}-ldpc": (name, False) for name in formats if supported(name)}
-    names.update({f"{name}-amc": (name, True) for name in formats if supported(name)})
+    usable = [name for name in formats if supported(name)]
+    names = {f"{name}-ldpc": (name, False, False) for name in usable}
+    names |= {f"{name}-amc": (name, True, False) for name in usable}
+    names |= {f"{name}-slow-amc": (name, True, True) for name in usable if name == "avif"}
     return names
 
 
@@ -167,5 +169,5 @@ def load_codec(
         raise ConfigError(f"codec {name!r} has no weights, got {weights}")
     from semcast.common.conventional import ConventionalCodec
 
-    image_format, adaptive = conventional[name]
-    return ConventionalCodec(image_format, adaptive=adaptive, modulation=modulation)
+    image_format, adaptive, slow = conventional[name]
+    return ConventionalCodec(image_format, adaptive=adaptive, slow=slow, modulation=modulation)

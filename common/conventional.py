@@ -29,7 +29,13 @@ from semcast.common.codec import (
     ReceivedImage,
     check_fixed_rate,
 )
-from semcast.common.conventional_source import ImageFormat, compress_to_fit, decompress
+from semcast.common.conventional_source import (
+    AVIF_SLOW_SPEED,
+    AVIF_SPEED,
+    ImageFormat,
+    compress_to_fit,
+    decompress,
+)
 from semcast.common.conventional_transport import Transport
 from semcast.common.phy.hashing import hash_words, hashed_qpsk
 from semcast.common.phy.qam import indices_to_symbols
@@ -123,19 +129,26 @@ class ConventionalCodec:
     """JPEG, WebP or AVIF over LDPC and QAM. One instance keeps the code of the last image size."""
 
     def __init__(
-        self, image_format: ImageFormat, *, adaptive: bool = False, modulation: Modulation = "16qam"
+        self,
+        image_format: ImageFormat,
+        *,
+        adaptive: bool = False,
+        slow: bool = False,
+        modulation: Modulation = "16qam",
     ) -> None:
         """Build the codec.
 
         Args:
             image_format: Source code.
             adaptive: Choose modulation and rate by the expected SNR instead of 16-QAM at rate 1/2.
+            slow: Take longer over an AVIF file for a better image; other formats have no such choice.
             modulation: How the symbols travel; the points are the same, ``"analog"`` sends them as I/Q
                 samples. Adaptive modulation always does, since its points are not 16-QAM alone.
         """
         self._format: ImageFormat = image_format
         self._modes = ADAPTIVE_MODES if adaptive else (FIXED_MODE,)
         self._adaptive = adaptive
+        self._slow = slow
         self._modulation: Modulation = "analog" if adaptive else modulation
         self._quality_hint = 30
         self._layout: SlotLayout | None = None
@@ -144,7 +157,7 @@ class ConventionalCodec:
     @property
     def name(self) -> str:
         """Registry name."""
-        return f"{self._format}-{'amc' if self._adaptive else 'ldpc'}"
+        return f"{self._format}{'-slow' if self._slow else ''}-{'amc' if self._adaptive else 'ldpc'}"
 
     @property
     def modulation(self) -> Modulation:
@@ -208,7 +221,10 @@ class ConventionalCodec:
 
     def _payload(self, image: NDArray[np.uint8], capacity_bytes: int) -> bytes:
         budget = capacity_bytes - _NUM_CLASSES
-        found = compress_to_fit(image, self._format, budget, self._quality_hint) if budget > 0 else None
+        speed = AVIF_SLOW_SPEED if self._slow else AVIF_SPEED
+        found = None
+        if budget > 0:
+            found = compress_to_fit(image, self._format, budget, self._quality_hint, speed)
         if found is None:
             return b""
         self._quality_hint, data = found

@@ -19,10 +19,13 @@ from semcast.common.phy.mutual_information import mutual_information, snr_db_tha
 
 #: Frames the fluctuation of slots is learned from: more follow a changing link later and choose no better.
 _MAX_FRAMES = 8
+#: Fewer don't tell a link that has changed from one whose slots fade together.
+_MIN_FRAMES = 3
 #: A frame so many standard errors off those before it is of a link that has changed.
 _JUMP = 4.0
-#: Quantile of the normal distribution.
+#: Quantiles of the normal distribution.
 _ONE_IN_TWENTY = 1.645
+_ONE_IN_THOUSAND = 3.09
 
 
 @dataclass(frozen=True)
@@ -116,30 +119,61 @@ def steady_snr_db(frames: Sequence[SlotSnrs], bits_per_symbol: int) -> float:
 
     A code that spans all slots has the mean over the slots of the mutual information of its constellation
     (mutual-information effective SNR mapping, Brueninghaus et al. 2005). One frame of twenty has
-    ``_ONE_IN_TWENTY`` standard errors less than the mean of the frames before it, not counting what the
-    estimate of each gain varies by itself: that much less is counted on, or ``MODE_MARGIN_DB`` less, which
-    the modes keep anyway. Slots are taken to differ independently: where bursts or slow fading hit many
-    together, more than one frame of twenty has less.
+    ``_ONE_IN_TWENTY`` standard errors less than what is expected of it, not counting what the estimate of
+    each gain varies by itself: that much less is counted on, or ``MODE_MARGIN_DB`` less, which the modes keep
+    anyway. Of slots that differ independently the spread over all of them tells how far frames do. Bursts and
+    fading that hit the slots of a frame together show in how far frames differ; where that is little from one
+    to the next, the newest is expected again instead of their mean. With too few frames to tell, with a
+    change of the link between two frames, or where fading is far from normal, more than one of twenty has
+    less.
 
     Args:
         frames: The newest ones, of equally many slots.
         bits_per_symbol: Of the constellation.
     """
-    carried = np.concatenate([frame.carried(bits_per_symbol) for frame in frames])
+    carried = np.array([frame.carried(bits_per_symbol) for frame in frames])
     known = float(np.mean([frame.variance_of_estimates(bits_per_symbol) for frame in frames]))
-    variance = max(float(np.var(carried)) - known, 0.0) / len(frames[0].linear)
-    error = np.sqrt(variance * (1.0 + 1.0 / len(frames)))
-    mean = float(np.mean(carried))
-    counted_on_db = snr_db_that_carries(bits_per_symbol, mean - _ONE_IN_TWENTY * error)
-    return min(snr_db_that_carries(bits_per_symbol, mean), counted_on_db + MODE_MARGIN_DB)
+    independent = max(float(np.var(carried)) - known, 0.0) / carried.shape[1]
+    common = frames[-1].common_error(bits_per_symbol) ** 2
+    variance = _variance_of_frames(carried, independent, common)
+    expected = float(np.mean(carried))
+    squared_error = variance * (1.0 + 1.0 / len(frames))
+    if variance > independent:
+        means = carried.mean(axis=1)
+        squared_step = float(np.mean(np.square(np.diff(means))))
+        if squared_step < squared_error:
+            expected, squared_error = float(means[-1]), squared_step
+    counted_on_db = snr_db_that_carries(bits_per_symbol, expected - _ONE_IN_TWENTY * np.sqrt(squared_error))
+    return min(snr_db_that_carries(bits_per_symbol, expected), counted_on_db + MODE_MARGIN_DB)
+
+
+def _variance_of_frames(carried: NDArray[np.float64], independent: float, common: float) -> float:
+    """Return the variance of what frames carry in the mean over their slots.
+
+    Args:
+        carried: ``(num_frames, num_slots)`` bits.
+        independent: Variance of the mean of slots that differ independently. It is learned from many more
+            values than how frames differ, so it stands unless chance explains less than that.
+        common: Variance of a frame's mean by the error of its noise estimate.
+    """
+    dof = len(carried) - 1
+    if dof < 1:
+        return independent
+    between = float(np.var(carried.mean(axis=1), ddof=1))
+    # Chi-square over its degrees of freedom, by Wilson and Hilferty.
+    by_chance = (1.0 - 2.0 / (9.0 * dof) + _ONE_IN_THOUSAND * np.sqrt(2.0 / (9.0 * dof))) ** 3
+    return between if between > by_chance * (independent + common) else independent
 
 
 def _has_jumped(frames: Sequence[SlotSnrs], newest: SlotSnrs) -> bool:
     """Tell whether the link is another than it was, or cut into other slots."""
     if len(newest.linear) != len(frames[0].linear):
         return True
+    if len(frames) < _MIN_FRAMES:
+        return False
     finest = ADAPTIVE_MODES[-1].bits_per_symbol
-    before, now = (np.concatenate([f.carried(finest) for f in some]) for some in (frames, [newest]))
-    variance = (np.var(before) + np.var(now)) / 2.0 / len(now) + newest.common_error(finest) ** 2
+    before, now = np.array([frame.carried(finest) for frame in frames]), newest.carried(finest)
+    common = newest.common_error(finest) ** 2
+    variance = _variance_of_frames(before, (np.var(before) + np.var(now)) / 2.0 / len(now), common) + common
     error = np.sqrt(variance * (1.0 + 1.0 / len(frames)))
     return bool(abs(np.mean(now) - np.mean(before)) > _JUMP * error)

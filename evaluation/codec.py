@@ -42,6 +42,7 @@ from semcast.evaluation.plots import plot_against_snr
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.sounding import told_at_first
 from semcast.evaluation.statistics import finite_mean, percentiles, spearman
+from semcast.evaluation.trace_snr import check_snrs, is_of_file, snr_file_label, stated_snr_db
 from semcast.evaluation.uncertainty_maps import block_means, pixel_label
 
 logger = logging.getLogger(__name__)
@@ -52,6 +53,7 @@ UNUSED_FIELDS = UNUSED_LINK_FIELDS
 LABEL_ALPHA = 30.0
 #: What a receiver shows when a whole frame is lost.
 _LOST_GREY = 128
+_SNRS_DB = (2.0, 4.0, 6.0, 8.0, 10.0, 12.0)
 _STRIP_SNR_DB = 10.0
 _STRIP_IMAGES = 2
 _FRAME_INTERVAL_S = 0.1
@@ -73,7 +75,10 @@ class CodecSettings:
         metadata={"help": "codecs by name or .safetensors file, one or more"},
     )
     snr_db: tuple[float, ...] = field(
-        default=(2.0, 4.0, 6.0, 8.0, 10.0, 12.0), metadata={"help": "SNRs in dB, one or more"}
+        default=_SNRS_DB,
+        metadata={
+            "help": "SNRs in dB, one or more; without a meaning where a file has the SNR (--trace file)"
+        },
     )
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
     runtime: Literal["torch", "onnx"] = field(
@@ -104,7 +109,15 @@ class CodecSettings:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
+        if self.snr_db != _SNRS_DB:
+            check_snrs(self.snr_db, self.link)
         check_threads(self.threads)
+
+    @property
+    def links(self) -> dict[float, ChannelSettings]:
+        """Channel settings by the SNR that is set; a trace from a file is one link."""
+        snrs_db = self.snr_db[:1] if is_of_file(self.link) else self.snr_db
+        return {snr_db: replace(self.link, snr_db=snr_db) for snr_db in snrs_db}
 
 
 @dataclass(frozen=True)
@@ -119,17 +132,21 @@ class _Sample:
 
 
 class _Stream:
-    """A codec and its link at one SNR.
+    """A codec and its link.
 
     All images share the link, so that traces and fading go on from image to image; every codec sees the same
     noise, which belongs to the image's number.
     """
 
     def __init__(
-        self, codec: Codec, images: Mapping[str, NDArray[np.uint8]], snr_db: float, settings: CodecSettings
+        self,
+        codec: Codec,
+        images: Mapping[str, NDArray[np.uint8]],
+        link: ChannelSettings,
+        settings: CodecSettings,
     ) -> None:
         self._codec, self._settings = codec, settings
-        self._link = Link(replace(settings.link, snr_db=snr_db), settings.seed)
+        self._link = Link(link, settings.seed)
         self._reporter = LinkReporter(codec.name)
         first = to_coded(next(iter(images.values())), settings.rate)
         self._told_db = told_at_first(
@@ -184,7 +201,8 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         codecs: Used instead of the codecs that ``settings.codec`` names.
 
     Returns:
-        Provenance and ``results``: one row per codec and SNR with means over the images of ``psnr_db``,
+        Provenance and ``results``: one row per codec and SNR (``snr_db``, of a trace its start, None for that
+        of a file) with means over the images of ``psnr_db``,
         ``ssim``, ``ms_ssim`` (None for images below 176 pixels) and ``cbr``, pilots included; the share
         of ``outage``; ``snr_db_estimate`` of the receiver; ``encode_ms`` and ``decode_ms`` (p50, p95);
         ``confidence`` with ``mean``, ``ece`` against the pixel label and ``spearman_blocks``; and
@@ -202,18 +220,19 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
     else:
         under_name = {codec.name: codec for codec in codecs}
     _warm_up(under_name.values(), next(iter(images.values())))
-    strip_snr_db = min(settings.snr_db, key=lambda snr_db: abs(snr_db - _STRIP_SNR_DB))
+    strip_snr_db = min(settings.links, key=lambda snr_db: abs(snr_db - _STRIP_SNR_DB))
     strip: list[dict[str, NDArray[np.uint8]]] = []
     results = []
-    for snr_db in settings.snr_db:
-        streams = {label: _Stream(codec, images, snr_db, settings) for label, codec in under_name.items()}
+    for snr_db, link in settings.links.items():
+        streams = {label: _Stream(codec, images, link, settings) for label, codec in under_name.items()}
         samples: dict[str, list[_Sample]] = {label: [] for label in streams}
         for k, (name, image) in enumerate(images.items()):
             for label, stream in streams.items():
                 samples[label].append(stream.send(image, k))
             if snr_db == strip_snr_db and len(strip) < _STRIP_IMAGES:
                 strip.append(_strip_row(name, image, {n: s[-1] for n, s in samples.items()}))
-        results += [_row(name, snr_db, list(images), rows) for name, rows in samples.items()]
+        stated_db = stated_snr_db(snr_db, link)
+        results += [_row(name, stated_db, list(images), rows) for name, rows in samples.items()]
     report = json_ready(
         {
             **provenance(VERB, settings),
@@ -225,8 +244,10 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
     if settings.json is not None:
         write_json(settings.json, report)
     if settings.out is not None:
-        _draw(settings.out, settings.snr_db, results)
-        write_picture_strip(settings.out / f"pictures_{strip_snr_db:g}db.png", strip)
+        if settings.link.channel != "trace":
+            _draw(settings.out, settings.snr_db, results)
+        label = snr_file_label(strip_snr_db, settings.link)
+        write_picture_strip(settings.out / f"pictures_{label}.png", strip)
     return dict(report)
 
 
@@ -326,7 +347,7 @@ def _grade_confidence(decoded: DecodedImage, image: NDArray[np.uint8]) -> dict[s
     }
 
 
-def _row(codec: str, snr_db: float, names: list[str], samples: list[_Sample]) -> dict[str, Any]:
+def _row(codec: str, snr_db: float | None, names: list[str], samples: list[_Sample]) -> dict[str, Any]:
     return {
         "codec": codec,
         "snr_db": snr_db,

@@ -20,6 +20,7 @@ from semcast.evaluation.pipeline import (
 from semcast.evaluation.plots import plot_reliability
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.statistics import finite_mean
+from semcast.evaluation.trace_snr import snr_label, stated_snr_db
 
 VERB = "eval confidence"
 #: Flags that have no meaning here.
@@ -76,7 +77,10 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
     if settings.json is not None:
         write_json(settings.json, report)
     if settings.out is not None:
-        tables = {f"{r['snr_db']:g} dB": r["pixel"]["reliability"] for r in report["results"]}
+        tables = {
+            snr_label(snr_db, settings.link): result["pixel"]["reliability"]
+            for snr_db, result in zip(settings.snr_db, report["results"], strict=True)
+        }
         label = f"1 - tanh({settings.pixel_alpha:g} |error|)"
         title = f"{settings.codec}, {sequence.name}"
         plot_reliability(settings.out / "reliability.png", tables, label, title)
@@ -104,9 +108,10 @@ def _grade_at(
             keypoint.add(frame.decoded, frame.original)
             slots.add(frame.decoded, frame.row_snr_db)
     if num_lost == len(frame_ids) * settings.seeds:
-        raise ConfigError(f"no frame was received at snr_db {snr_db:g}: there is no confidence to grade")
+        level = snr_label(snr_db, settings.link)
+        raise ConfigError(f"no frame was received at {level}: there is no confidence to grade")
     return {
-        "snr_db": snr_db,
+        "snr_db": stated_snr_db(snr_db, settings.link),
         "num_frames": len(frame_ids) * settings.seeds,
         "num_frames_lost": num_lost,
         "psnr_db": finite_mean(quality_db),

@@ -35,6 +35,7 @@ from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.render import SCENES, RenderSettings, SceneName, render_scene
 from semcast.evaluation.scenes.surfaces import exact_depth
 from semcast.evaluation.statistics import finite_mean
+from semcast.evaluation.trace_snr import check_snrs, is_of_file, snr_label, stated_snr_db
 from semcast.server.dense.depth_map import DepthImage
 from semcast.server.dense.view import View, view_of
 from semcast.server.export.outputs import trajectory_of
@@ -42,6 +43,7 @@ from semcast.server.mapping.settings import ReconstructionSettings
 
 VERB = "eval depth"
 UNUSED_FIELDS = UNUSED_LINK_FIELDS
+_SNRS_DB = (10.0, 2.0)
 #: Depths off by a larger share are outliers.
 _OUTLIER = 0.05
 #: Whether the codec's pixel confidence is used.
@@ -79,7 +81,7 @@ class DepthSettings:
         metadata={"help": "codecs by name or .safetensors file, one or more"},
     )
     modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
-    snr_db: tuple[float, ...] = field(default=(10.0, 2.0), metadata={"help": "SNRs in dB, one or more"})
+    snr_db: tuple[float, ...] = field(default=_SNRS_DB, metadata={"help": "SNRs in dB, one or more"})
     link: ChannelSettings = field(default=ChannelSettings(), metadata={"help": "the channel"})
     confidence: tuple[ConfidenceUse, ...] = field(
         default=("on", "off"), metadata={"help": "with or without the codec's confidence, or both: on, off"}
@@ -99,6 +101,8 @@ class DepthSettings:
         low, high = SNR_RANGE_DB
         if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
             raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
+        if self.snr_db != _SNRS_DB:
+            check_snrs(self.snr_db, self.link)
         for name in ("codec", "confidence"):
             values = getattr(self, name)
             if not values or len(set(values)) != len(values):
@@ -167,12 +171,12 @@ def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = Non
         shown = sorted(views)[len(views) // 2]
         strip = [against.pictures(shown, views[shown])]
         results = [] if scene.truth is None else [_row(CLEAN, None, "off", [against.errors(clean)], [], 0.0)]
-        for snr_db in settings.snr_db:
+        for snr_db in settings.snr_db[:1] if is_of_file(settings.link) else settings.snr_db:
             pictures = {}
             for name, codec in under_name.items():
                 rows, picture = _measured(settings, scene, against, name, codec, snr_db, shown)
                 results += rows
-                pictures[f"{name}, {snr_db:g} dB"] = picture
+                pictures[f"{name}, {snr_label(snr_db, settings.link)}"] = picture
             strip.append(pictures)
     report = json_ready(
         {
@@ -332,7 +336,8 @@ def _measured(
                 picture = against.coloured(shown, found.get(shown), size_hw)
     lost = num_lost / (len(ids) * settings.seeds)
     assert picture is not None, "there is a seed and a use of confidence"
-    return [_row(name, snr_db, use, found, psnrs_db, lost) for use, found in errors.items()], picture
+    stated_db = stated_snr_db(snr_db, settings.link)
+    return [_row(name, stated_db, use, found, psnrs_db, lost) for use, found in errors.items()], picture
 
 
 def _row(

@@ -39,6 +39,7 @@ from semcast.evaluation.plots import plot_pair_errors
 from semcast.evaluation.pose_error import relative_pose_error
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.statistics import finite_mean, percentiles
+from semcast.evaluation.trace_snr import stated_snr_db
 from semcast.server.geometry.agreement import neighbour_agreement
 from semcast.server.geometry.weighting import ConfidenceMode
 
@@ -136,8 +137,9 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
         codec: Used instead of the codec that ``settings.codec`` names.
 
     Returns:
-        Provenance and ``cells``, one per SNR, ``gap``, ``features`` and ``max_matches``: ``results`` (method
-        -> ``rot_deg_mean``, ``rot_deg_median``, ``tdir_deg_mean``, ``tdir_deg_median``, ``auc5``, ``auc10``,
+        Provenance and ``cells``, one per SNR (of a trace its start, None for that of a file), ``gap``,
+        ``features`` and ``max_matches``: ``results`` (method -> ``rot_deg_mean``,
+        ``rot_deg_median``, ``tdir_deg_mean``, ``tdir_deg_median``, ``auc5``, ``auc10``,
         ``auc20``, ``num_failed`` and ``cpu_ms``, the processor time of the estimation; ``oracle`` is PoseLib
         on the true inliers alone), ``auroc`` (kind of truth -> cue -> AUROC) with ``auroc_confidence`` for
         the codec's own confidence and epipolar truth, and ``comparisons``: paired differences to ``off`` and
@@ -170,8 +172,9 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
                     at_snr[variant].add(pair_idx, seed, outcome)
         cells += list(at_snr.values())
         psnr = finite_mean(quality_db)
+        stated_db = None if snr_db is None else stated_snr_db(snr_db, settings.link)
         entries += [
-            {"snr_db": snr_db, "psnr_db": psnr, **asdict(variant), **_entry(cell, variant, settings)}
+            {"snr_db": stated_db, "psnr_db": psnr, **asdict(variant), **_entry(cell, variant, settings)}
             for variant, cell in at_snr.items()
         ]
     merged = merge_cells(methods, cells)
@@ -190,7 +193,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
     )
     if settings.json is not None:
         write_json(settings.json, report)
-    if settings.out is not None and codec is not None:
+    if settings.out is not None and codec is not None and settings.link.channel != "trace":
         plot_pair_errors(settings.out, report)
     return dict(report)
 

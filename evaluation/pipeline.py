@@ -27,6 +27,7 @@ from semcast.common.playback import check_playback
 from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.sounding import told_at_first
+from semcast.evaluation.trace_snr import check_snrs
 
 logger = logging.getLogger(__name__)
 
@@ -74,6 +75,7 @@ class StreamSettings:
         low, high = SNR_RANGE_DB
         if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
             raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
+        check_snrs(self.snr_db, self.link)
         for name, least in (("seed", 0), ("seeds", 1), ("start", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")

@@ -4,7 +4,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from semcast.evaluation.trace_snr import snr_heading
+
 Report = Mapping[str, Any]
+#: A column that has another name, or none, where the SNR follows a trace.
+_SNR = "SNR dB"
 
 
 @dataclass(frozen=True)
@@ -49,9 +53,10 @@ def result_table(what: str, report: Report) -> ResultTable:
     layout = LAYOUTS[what]
     entries = layout.rows(report)
     columns = {
-        name: column
+        str(snr_heading(report)) if name == _SNR else name: column
         for name, column in layout.columns.items()
-        if name not in layout.optional or any(_cell(entry, *column) != "-" for entry in entries)
+        if (name != _SNR or snr_heading(report) is not None)
+        and (name not in layout.optional or any(_cell(entry, *column) != "-" for entry in entries))
     }
     rows = [[_cell(entry, *column) for column in columns.values()] for entry in entries]
     return ResultTable(list(columns), rows, layout.notes(report))
@@ -81,7 +86,7 @@ LAYOUTS: dict[str, _Layout] = {
     "trajectory": _Layout(
         lambda report: report["cells"],
         {
-            "SNR dB": ("snr_db", "g"),
+            _SNR: ("snr_db", "g"),
             "confidence": ("confidence", ""),
             "ATE m": ("ate_rmse_m", ".3f"),
             "ATE %": ("ate_percent", ".2f"),
@@ -113,7 +118,7 @@ LAYOUTS: dict[str, _Layout] = {
         lambda report: report["results"],
         {
             "codec": ("codec", ""),
-            "SNR dB": ("snr_db", "g"),
+            _SNR: ("snr_db", "g"),
             "PSNR dB": ("psnr_db", ".2f"),
             "SSIM": ("ssim", ".3f"),
             "MS-SSIM": ("ms_ssim", ".3f"),
@@ -126,7 +131,7 @@ LAYOUTS: dict[str, _Layout] = {
     "confidence": _Layout(
         lambda report: report["results"],
         {
-            "SNR dB": ("snr_db", "g"),
+            _SNR: ("snr_db", "g"),
             "frames": ("num_frames", "d"),
             "lost": ("num_frames_lost", "d"),
             "PSNR dB": ("psnr_db", ".2f"),
@@ -144,7 +149,7 @@ LAYOUTS: dict[str, _Layout] = {
         lambda report: report["results"],
         {
             "codec": ("codec", ""),
-            "SNR dB": ("snr_db", "g"),
+            _SNR: ("snr_db", "g"),
             "confidence": ("confidence", ""),
             "coverage": ("coverage", ".1%"),
             "median": ("median_error", ".2%"),

@@ -49,19 +49,20 @@ def _codec(report: Report) -> Iterator[str]:
         f"{', '.join(f'{cbr:.4f} (1/{1 / cbr:.1f})' for cbr in ratios)}.\n"
     )
     snrs = sorted({row["snr_db"] for row in rows})
+    levels = [_level(snr, report, " dB") for snr in snrs]
     for key, name, digits in (("psnr_db", "PSNR dB", 2), ("ssim", "SSIM", 3), ("ms_ssim", "MS-SSIM", 3)):
         body = []
         for codec in dict.fromkeys(row["codec"] for row in rows):
             at = {row["snr_db"]: row[key] for row in rows if row["codec"] == codec}
             body.append([codec, *(number(at.get(snr), digits) for snr in snrs)])
-        yield from table([name, *(f"{snr:g} dB" for snr in snrs)], body)
+        yield from table([name, *levels], body)
         yield ""
     for key, name in (("ece", "ECE of confidence"), ("spearman_blocks", "Spearman, 8x8 blocks")):
         body = []
         for codec in dict.fromkeys(row["codec"] for row in rows):
             at = {row["snr_db"]: row["confidence"][key] for row in rows if row["codec"] == codec}
             body.append([codec, *(number(at.get(snr), 3) for snr in snrs)])
-        yield from table([name, *(f"{snr:g} dB" for snr in snrs)], body)
+        yield from table([name, *levels], body)
         yield ""
 
 
@@ -76,7 +77,7 @@ def _trajectory(report: Report) -> Iterator[str]:
         head,
         [
             [
-                number(cell["snr_db"], 0) if cell["snr_db"] is not None else "no link",
+                _level(cell["snr_db"], report),
                 cell["confidence"],
                 number(cell["ate_rmse_m"], 3),
                 number(cell["ate_percent"], 3),
@@ -92,6 +93,13 @@ def _trajectory(report: Report) -> Iterator[str]:
     )
 
 
+def _level(snr_db: float | None, report: Report, unit: str = "") -> str:
+    """Name an SNR of a report; None is that of a trace from a file, or stands for original images."""
+    if snr_db is None:
+        return "no link" if report["settings"]["codec"] == "none" else "trace"
+    return f"{snr_db:g}{unit}"
+
+
 def _other_codec(report: Report) -> Iterator[str]:
     codec = report["settings"]["codec"]
     if codec not in ("none", DEFAULT_CODEC):
@@ -104,7 +112,7 @@ def _pairs(report: Report) -> Iterator[str]:
     yield "Mean translation-direction error in degrees; the last column is its 95 % interval.\n"
     rows = []
     for cell in report["cells"]:
-        snr = "no link" if cell["snr_db"] is None else f"{cell['snr_db']:g}"
+        snr = _level(cell["snr_db"], report)
         found = [number(cell["results"][m]["tdir_deg_mean"], 1) for m in methods]
         rows.append([snr, variant_name(cell), *found, _interval(cell)])
     yield from table(["SNR dB", "matches", *methods, f"robust - {RIVAL}"], rows)
@@ -120,7 +128,7 @@ def _interval(cell: Mapping[str, Any]) -> str:
 
 def _confidence(report: Report) -> Iterator[str]:
     for result in report["results"]:
-        yield f"{result['snr_db']:g} dB:\n"
+        yield f"{_level(result['snr_db'], report, ' dB')}:\n"
         rows = [
             [f"{target}: {name}", number(value, 3)]
             for target, grades in result.items()
@@ -381,7 +389,11 @@ def readme_table(folder: Path = RESULTS) -> str:
     for file in sorted(folder.glob("trajectory_*.json")):
         report = json.loads(file.read_text(encoding="utf-8"))
         channel = report["settings"]["link"]["channel"]
-        if report["settings"].get("gap_s") or report["settings"]["codec"] not in ("none", DEFAULT_CODEC):
+        if (
+            channel == "trace"
+            or report["settings"].get("gap_s")
+            or report["settings"]["codec"] not in ("none", DEFAULT_CODEC)
+        ):
             continue
         for cell in report["cells"]:
             link = None if cell["snr_db"] is None else (channel, cell["snr_db"])

@@ -23,8 +23,8 @@ def told_at_first(
 ) -> float:
     """Return the SNR in dB that the transmitter is told before the first picture.
 
-    A learned codec is told the SNR that is set. One that chooses a rate asks the link first: it is told what
-    the receiver reports on a frame that is not counted.
+    A learned codec is told the SNR that is set for it, by a trace where there is one. One that chooses a rate
+    asks the link first: it is told what the receiver reports on a frame that is not counted.
 
     Args:
         codec: The sending end.
@@ -35,7 +35,7 @@ def told_at_first(
         perfect_csi: See ``Link.receive``.
     """
     if not is_conventional(codec.name):
-        return link.settings.snr_db
-    encoded = codec.encode(image, link.settings.snr_db)
+        return link.start_snr_db
+    encoded = codec.encode(image, link.start_snr_db)
     sounding = link.receive(encoded, t_s, _SOUNDING_FRAME, perfect_csi=perfect_csi)
     return LOST_SLOT_SNR_DB if sounding is None else reporter.snr_db(sounding)

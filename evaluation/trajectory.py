@@ -25,6 +25,7 @@ from semcast.evaluation.plots import plot_path
 from semcast.evaluation.reconstruct import ReconstructedRun, reconstruct
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.statistics import paired_bootstrap
+from semcast.evaluation.trace_snr import snr_file_label, stated_snr_db
 from semcast.server.geometry.weighting import ConfidenceMode
 from semcast.server.mapping.settings import ReconstructionSettings
 
@@ -86,7 +87,8 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
         codec: Used instead of the codec that ``settings.codec`` names.
 
     Returns:
-        Provenance and ``cells``: one entry per SNR and mode with the median over seeds of each figure in
+        Provenance and ``cells``: one entry per SNR (``snr_db``, of a trace its start, None for that of a
+        file and without a link) and mode with the median over seeds of each figure in
         ``FIGURES``, ``num_failed`` (runs without a path), and ``runs``, the full summary of each seed.
         ``comparisons`` holds, per SNR, the paired difference in ATE of each mode to the mode ``off`` where
         that was run. ``frames_left_out`` are those that can't be read. With one cell its figures and
@@ -122,9 +124,9 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
                 run = reconstruct(frames, sequence.intrinsics, how, truth)
                 runs[mode].append(_run_entry(run, seed, gap, with_rows=settings.rows))
                 if settings.out is not None and seed == settings.seed:
-                    label = CLEAN if codec is None else f"{snr_db:g}db"
+                    label = CLEAN if codec is None else snr_file_label(snr_db, settings.link)
                     _write_files(settings.out, f"{label}_{mode}", run)
-        level = None if codec is None else snr_db
+        level = None if codec is None else stated_snr_db(snr_db, settings.link)
         has_truth = truth is not None and _measures(truth)
         cells += [_cell(level, mode, runs[mode], has_truth=has_truth) for mode in settings.confidence]
     report = {

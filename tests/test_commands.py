@@ -168,13 +168,25 @@ def test_set_is_checked_against_the_running_channel(channel, tmp_path, capsys):
 
 def test_what_does_nothing_is_said(channel, capsys, caplog):
     words = ["channel", "set", "--agent-id", "a", "--connect", channel]
-    assert main([*words, "--channel", "awgn", "--slot-loss", "0.3", "--seed", "7"]) == 0
-    assert "seed: no effect on a channel that runs" in caplog.text
-    told = [r.name for r in caplog.records if "slot_loss: no effect on channel awgn" in r.getMessage()]
-    assert len(told) == 2  # by the channel, and where the command was typed
-    caplog.clear()
+    for slot_loss in ("0.3", "0.2"):  # 0.2 is the default, and as idle
+        assert main([*words, "--channel", "awgn", "--slot-loss", slot_loss, "--seed", "7"]) == 0
+        assert "seed: no effect on a channel that runs" in caplog.text
+        told = [r.name for r in caplog.records if "slot_loss: no effect on channel awgn" in r.getMessage()]
+        assert len(told) == 2  # by the channel, and where the command was typed
+        caplog.clear()
     assert main([*words, "--channel", "erasure"]) == 0
     assert "no effect" not in caplog.text
+
+
+def test_fading_within_slots_is_said_and_not_refused(channel, capsys, caplog):
+    words = ["channel", "set", "--agent-id", "a", "--connect", channel]
+    assert main([*words, "--channel", "rayleigh", "--doppler-hz", "30"]) == 0
+    line = "doppler_hz times slot_ms should be at most 20, got 30: a real link would fade within slots"
+    assert [r.getMessage() for r in caplog.records].count(line) == 2
+    caplog.clear()
+    assert main([*words, "--snr-db", "7"]) == 0
+    assert main([*words, "--doppler-hz", "20"]) == 0
+    assert "fade within" not in caplog.text
 
 
 def test_a_trace_of_this_folder_is_found_by_a_channel_in_another(channel, tmp_path, monkeypatch, capsys):

@@ -9,6 +9,7 @@ is shrunk by exactly ``snr / (1 + snr)`` of that SNR.
 """
 
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,9 @@ from semcast.common.shapes import check_shape
 NOMINAL_SNR_DB = 10.0
 #: A slot whose noise differs from the pooled noise by more standard deviations than this keeps its own.
 OUTLIER_SIGMAS = 3.7
-_POOLING_ROUNDS = 4
-_LOWER_QUARTILE_SIGMAS = -0.6745
+_POOLING_ROUNDS = 12
+#: Estimates of so few degrees of freedom scatter by as much as bursts raise them: none of them says much.
+_FEW_DOF = 2
 
 
 @dataclass(frozen=True)
@@ -68,14 +70,17 @@ class ChannelEstimate:
     def snr_db(self) -> float:
         """Mean received power of the slots that arrived over the noise floor, in dB: the link's own SNR.
 
-        Bursts don't count as floor. The part of ``|h|^2`` that is estimation error is taken off.
+        Noisy slots count for less. Bursts are no floor as long as they leave a slot alone, or with fewer than
+        four pilots a slot most of them; where all are hit, what the bursts leave is the link's SNR. The part
+        of ``|h|^2`` that is estimation error is taken off.
         """
         if not self.arrived.any() or self.noise_floor <= 0.0:
             return LOST_SLOT_SNR_DB
-        power = float(np.mean(np.square(np.abs(self.h[self.arrived]))))
+        noise_var = self.noise_var[self.arrived].astype(np.float64)
+        power = np.square(np.abs(self.h[self.arrived]).astype(np.float64))
         if self.num_pilots:
-            power -= float(np.mean(self.noise_var[self.arrived])) / self.num_pilots
-        return _to_db(power / self.noise_floor)
+            power -= noise_var / self.num_pilots
+        return _to_db(float(np.average(power, weights=1.0 / noise_var)) / self.noise_floor)
 
 
 @dataclass(frozen=True)
@@ -102,8 +107,9 @@ def _pool_noise(per_slot: NDArray[np.float64], dof: int) -> tuple[NDArray[np.flo
     """Replace the noise estimates of all slots that agree by their mean.
 
     Each estimate is ``noise_var * Gamma(dof) / dof``. The Wilson-Hilferty cube root makes it normal, so one
-    threshold serves few pilots and many. The search starts at the lower quartile: bursts only raise noise,
-    so the quiet slots are the floor even when most slots are hit.
+    threshold serves few pilots and many. The search starts at the smallest estimate, or the lower quartile
+    where single ones say little: bursts only raise noise, so the quiet slots are the floor even when nearly
+    all slots are hit.
 
     Args:
         per_slot: ``(S,)`` unbiased estimates, S >= 1.
@@ -113,17 +119,23 @@ def _pool_noise(per_slot: NDArray[np.float64], dof: int) -> tuple[NDArray[np.flo
         ``(S,)`` variances and the pooled one.
     """
     centre, spread = 1.0 - 1.0 / (9.0 * dof), float(np.sqrt(1.0 / (9.0 * dof)))
-    quartile = max(centre + _LOWER_QUARTILE_SIGMAS * spread, 0.1)
-    floor = float(np.quantile(per_slot, 0.25)) / quartile**3
+    rising = np.sort(per_slot[per_slot > 0.0])
+    if not rising.size:
+        return per_slot, 0.0
+    rank = 0 if dof > _FEW_DOF else (rising.size - 1) // 4
+    # Where a value of this rank is expected (Blom 1958).
+    sigmas = NormalDist().inv_cdf((rank + 0.625) / (rising.size + 0.25))
+    floor = float(rising[rank]) / max(centre + sigmas * spread, 0.1) ** 3
     agrees = np.ones(per_slot.size, dtype=bool)
     for _ in range(_POOLING_ROUNDS):
-        if floor <= 0.0:
-            break
         deviation = (np.cbrt(per_slot / floor) - centre) / spread
         close = np.abs(deviation) < OUTLIER_SIGMAS
         if not close.any():
             break
+        is_same = np.array_equal(close, agrees)
         agrees, floor = close, float(per_slot[close].mean())
+        if is_same:
+            break
     return np.where(agrees, floor, per_slot), floor
 
 

@@ -4,7 +4,7 @@ import time
 import numpy as np
 import pytest
 
-from semcast.channel.delay import CAPACITY, DelayLine
+from semcast.channel.delay import CAPACITY, DelayLine, extra_delay_ms
 
 
 class Ends:
@@ -12,9 +12,7 @@ class Ends:
 
     def __init__(self):
         self.out = queue.Queue()
-        self.line = DelayLine(
-            lambda packet, lossless: self.out.put((packet, time.monotonic())), np.random.default_rng(0)
-        )
+        self.line = DelayLine(lambda packet, lossless: self.out.put((packet, time.monotonic())))
 
 
 @pytest.fixture
@@ -25,14 +23,14 @@ def ends():
 
 
 def test_without_delay_a_packet_is_sent_at_once_by_the_caller(ends):
-    assert ends.line.put(b"a", False, 0.0, 0.0)
+    assert ends.line.put(b"a", False, 0.0)
     assert ends.out.get_nowait()[0] == b"a"
 
 
 def test_a_packet_takes_as_long_as_set_and_packets_overlap(ends):
     start_s = time.monotonic()
     for k in range(10):
-        ends.line.put(bytes([k]), False, 100.0, 0.0)
+        ends.line.put(bytes([k]), False, 100.0)
     came = [ends.out.get(timeout=10) for _ in range(10)]
     assert [packet[0] for packet, _ in came] == list(range(10))
     assert came[0][1] - start_s >= 0.1
@@ -42,22 +40,32 @@ def test_a_packet_takes_as_long_as_set_and_packets_overlap(ends):
 def test_jitter_delays_but_never_reorders(ends):
     start_s = time.monotonic()
     for k in range(50):
-        ends.line.put(bytes([k]), False, 0.0, 20.0)
+        ends.line.put(bytes([k]), False, extra_delay_ms(20.0, 0, k))
     came = [ends.out.get(timeout=10) for _ in range(50)]
     assert [packet[0] for packet, _ in came] == list(range(50))
     # The largest of 50 exponential delays of mean 20 ms: 90 ms expected, below 25 ms with p = 1e-8.
     assert came[-1][1] - start_s > 0.025
 
 
+def test_jitter_belongs_to_the_frame_and_is_exponential():
+    drawn = np.array([extra_delay_ms(20.0, 3, k) for k in range(2000)])
+    assert drawn.mean() == pytest.approx(20.0, abs=4 * 20.0 / 2000**0.5)
+    assert np.median(drawn) == pytest.approx(20.0 * np.log(2), abs=2.0)
+    assert extra_delay_ms(20.0, 3, 1234) == drawn[1234]
+    assert extra_delay_ms(10.0, 3, 1234) == drawn[1234] / 2
+    assert extra_delay_ms(0.0, 3, 1234) == 0.0
+    assert extra_delay_ms(20.0, 4, 1234) != drawn[1234]
+
+
 def test_a_delay_taken_back_does_not_let_packets_overtake(ends):
-    ends.line.put(b"slow", False, 80.0, 0.0)
-    ends.line.put(b"fast", False, 0.0, 0.0)
+    ends.line.put(b"slow", False, 80.0)
+    ends.line.put(b"fast", False, 0.0)
     assert [ends.out.get(timeout=10)[0] for _ in range(2)] == [b"slow", b"fast"]
 
 
 def test_a_full_line_refuses_packets(ends):
-    assert all(ends.line.put(b"x", False, 10_000.0, 0.0) for _ in range(CAPACITY))
-    assert not ends.line.put(b"x", False, 10_000.0, 0.0)
+    assert all(ends.line.put(b"x", False, 10_000.0) for _ in range(CAPACITY))
+    assert not ends.line.put(b"x", False, 10_000.0)
     ends.line.close()
     ends.line.close()
     assert ends.out.empty()
@@ -71,10 +79,10 @@ def test_a_packet_that_can_not_be_sent_costs_itself_alone():
             raise RuntimeError("no such packet")
         sent.put(packet)
 
-    line = DelayLine(send, np.random.default_rng(0), failed.append)
+    line = DelayLine(send, failed.append)
     for packet in (b"bad", b"good"):
-        assert line.put(packet, False, 1.0, 0.0)
+        assert line.put(packet, False, 1.0)
     assert sent.get(timeout=10) == b"good"
     assert failed == ["sending a delayed packet failed: no such packet"]
     line.close()
-    assert not line.put(b"late", False, 1.0, 0.0)
+    assert not line.put(b"late", False, 1.0)

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -158,12 +159,54 @@ def test_settings_change_between_frames(slots, tmp_path):
     link.update(ChannelSettings(snr_db=4.0))
     assert link.transmit(slots, 0.1).snr_db_set == 4.0
     link.update(ChannelSettings(channel="trace", snr_db=9.0, trace_end_db=1.0, trace_s=4.0))
-    assert link.transmit(slots, 2.0).snr_db_set == pytest.approx(5.0)
+    assert link.transmit(slots, 30.0).snr_db_set == 9.0
+    assert link.transmit(slots, 32.0).snr_db_set == pytest.approx(5.0)
     missing = ChannelSettings(channel="trace", trace="file", trace_file=tmp_path / "no.csv")
     with pytest.raises(ConfigError, match="can't be read"):
         link.update(missing)
     assert link.settings.trace == "ramp"
-    assert link.transmit(slots, 4.0).snr_db_set == pytest.approx(1.0)
+    assert link.transmit(slots, 33.0).snr_db_set == pytest.approx(3.0)
+
+
+def test_a_trace_begins_when_it_is_set_and_fading_goes_on(slots):
+    ramp = ChannelSettings(channel="trace", snr_db=9.0, trace_end_db=1.0, trace_s=4.0, delay_ms=5.0)
+    link = Link(ramp, 0)
+    link.transmit(slots, 10.0)
+    link.update(replace(ramp, delay_ms=9.0, trace_step_db=3.0))  # neither belongs to a ramp
+    assert link.transmit(slots, 12.0).snr_db_set == pytest.approx(5.0)
+    for changed in ({"snr_db": 7.0}, {"trace_end_db": 3.0}, {"trace_s": 2.0}, {"trace": "walk"}):
+        link.update(replace(ramp, **changed))
+        assert link.transmit(slots, 12.5).snr_db_set == changed.get("snr_db", 9.0)
+        link.transmit(slots, 13.5)
+    fading = ChannelSettings(channel="rayleigh", doppler_hz=2.0)
+    one, two = Link(fading, 0), Link(fading, 0)
+    for link in (one, two):
+        link.transmit(slots, 0.0, 0)
+    two.update(ramp)
+    two.transmit(slots, 0.1, 1)
+    two.update(replace(fading, snr_db=4.0))
+    np.testing.assert_array_equal(two.transmit(slots, 0.2, 2).truth.h, one.transmit(slots, 0.2, 2).truth.h)
+
+
+def test_frames_that_overlap_in_time_are_told_once(slots, caplog):
+    settings = ChannelSettings(channel="rayleigh", doppler_hz=5.0, slot_ms=8.125)
+    for seed in range(3):
+        link = Link(settings, seed)
+        for k in range(4):
+            link.transmit(slots, 0.05 * k, k)
+    assert [record.getMessage() for record in caplog.records] == [
+        "a frame lasts 97.5 ms (12 slots of slot_ms 8.125) and the next began 50 ms after it: where they "
+        "overlap they have the same fading"
+    ]
+
+
+def test_frames_one_after_the_other_and_fading_without_time_are_not_told_of(slots, caplog):
+    fading = ChannelSettings(channel="rayleigh", doppler_hz=5.0, slot_ms=8.25)
+    for settings, interval_s in ((fading, 0.099), (replace(fading, doppler_hz=0.0), 0.05)):
+        link = Link(settings, 0)
+        for k in (0, 1, 1, 2, 1):  # sent again, or late
+            link.transmit(slots, interval_s * k, k)
+    assert not caplog.records
 
 
 def test_a_trace_starts_with_the_first_frame(slots):

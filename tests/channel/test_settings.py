@@ -56,6 +56,19 @@ def test_values_of_other_channels_are_named():
     assert ChannelSettings(channel="rician", doppler_hz=20.0, trace_s=3.0).without_effect() == ["trace_s"]
 
 
+def test_values_that_were_given_are_named_at_their_default_too():
+    assert ChannelSettings().without_effect(["slot_loss", "snr_db", "channel", "delay_ms"]) == ["slot_loss"]
+    assert ChannelSettings(channel="erasure").without_effect(["slot_loss", "trace_file"]) == ["trace_file"]
+    assert ChannelSettings(slot_loss=0.3).without_effect([]) == []
+
+
+def test_doppler_and_slots_that_no_constant_gain_stands_for_are_told():
+    for doppler_hz, slot_ms, within in ((20.0, 1.0, False), (21.0, 1.0, True), (100.0, 0.2, False)):
+        settings = ChannelSettings(channel="rician", doppler_hz=doppler_hz, slot_ms=slot_ms)
+        assert settings.fades_within_slots is within
+    assert not ChannelSettings(doppler_hz=500.0).fades_within_slots
+
+
 def test_values_of_other_traces_and_of_motion_are_named():
     assert ChannelSettings(channel="trace", trace="walk", trace_s=3.0).without_effect() == ["trace_s"]
     assert ChannelSettings(channel="trace", trace="ramp", trace_s=3.0).without_effect() == []

@@ -45,7 +45,7 @@ def test_symbols_fill_exactly_the_data_uses_with_16qam_points(picture):
     assert np.mean(np.abs(encoded.symbols) ** 2) == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize("name", ["jpeg-ldpc", "webp-ldpc", "avif-ldpc", "jpeg-amc"])
+@pytest.mark.parametrize("name", ["jpeg-ldpc", "webp-ldpc", "avif-ldpc", "jpeg-amc", "avif-slow-amc"])
 def test_a_good_link_delivers_the_compressed_image_unharmed(name, picture):
     if name not in available_codecs():
         pytest.skip(f"this OpenCV has no {name.split('-')[0]}")
@@ -54,6 +54,16 @@ def test_a_good_link_delivers_the_compressed_image_unharmed(name, picture):
     assert decoded.image.shape == picture.shape
     assert psnr_db(decoded.image, picture) > 22.0
     np.testing.assert_array_equal(decoded.image, through(load_codec(name), picture, 10.0, seed=9).image)
+
+
+def test_a_slow_avif_is_better_over_the_same_channel_uses_and_read_by_the_same_receiver(picture):
+    if "avif-amc" not in available_codecs():
+        pytest.skip("this OpenCV has no avif")
+    quick, slow = load_codec("avif-amc"), load_codec("avif-slow-amc")
+    assert (quick.name, slow.name, slow.digest) == ("avif-amc", "avif-slow-amc", quick.digest)
+    link = Link(ChannelSettings(snr_db=10.0), 0)
+    of_quick, of_slow = (quick.decode(link.carry(c.encode(picture, 10.0), 0.0, 0)) for c in (quick, slow))
+    assert psnr_db(of_slow.image, picture) > psnr_db(of_quick.image, picture) + 0.1
 
 
 def test_below_the_waterfall_the_frame_is_an_outage(picture):

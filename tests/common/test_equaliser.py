@@ -99,6 +99,27 @@ def test_bursts_in_most_slots_still_leave_the_quiet_floor(rng):
     assert estimate_channel(split(slots)[0]).noise_floor == pytest.approx(0.1, rel=0.3)
 
 
+@pytest.mark.parametrize("num_quiet", [1, 2, 3])
+@pytest.mark.parametrize("snr_db", [2.0, 10.0])
+def test_a_few_quiet_slots_are_enough_to_tell_the_links_own_snr(snr_db, num_quiet, rng):
+    scale = np.full(16, 100.0)
+    scale[rng.permutation(16)[:num_quiet]] = 1.0
+    channels = [
+        estimate_channel(split(make_frame(rng, (256, 320), snr_db, noise_scale=scale)[1])[0])
+        for _ in range(20)
+    ]
+    noise_var = 10 ** (-snr_db / 10)
+    assert np.mean([channel.snr_db for channel in channels]) == pytest.approx(snr_db, abs=1.5)
+    assert np.mean([channel.noise_floor for channel in channels]) == pytest.approx(noise_var, rel=0.2)
+    hit = np.array([channel.noise_var[scale > 1] for channel in channels])
+    assert hit.mean() == pytest.approx(100.0 * noise_var, rel=0.2)
+
+
+def test_a_frame_hit_in_all_slots_has_the_bursts_noise_as_floor(rng):
+    _, slots = make_frame(rng, (256, 640), 10.0, noise_scale=100.0)
+    assert estimate_channel(split(slots)[0]).noise_floor == pytest.approx(10.0, rel=0.2)
+
+
 def test_lost_slots_come_back_as_zeros_at_the_lowest_snr(rng):
     data, slots = make_frame(rng, (64, 160), 20.0)
     lost = np.array([False, True, False, False])

@@ -93,6 +93,51 @@ def test_a_link_that_changes_is_believed_at_once():
     assert after[0] == pytest.approx(6.0, abs=1.0)
 
 
+def test_few_frames_carry_less_than_was_counted_on_where_their_slots_fade_together():
+    layout = layout_for(SMALL_HW := (240, 320))
+    symbols = np.ones((layout.num_slots, layout.data_per_slot), np.complex64)
+    short, num_frames = 0, 60
+    for doppler_hz in (1.0, 5.0, 20.0):
+        fading = ChannelSettings(channel="rayleigh", snr_db=8.0, doppler_hz=doppler_hz)
+        link, reporter, counted_on_db = Link(fading, 0), LinkReporter("jpeg-amc"), None
+        for k in range(num_frames):
+            equalised = link.receive(EncodedImage(SMALL_HW, symbols, "16qam"), 0.1 * k, k)
+            if counted_on_db is not None:
+                mode = [mode for mode in ADAPTIVE_MODES if mode.min_snr_db <= counted_on_db][-1]
+                carried = SlotSnrs.of(equalised).carried(mode.bits_per_symbol).mean()
+                least_db = mode.min_snr_db - MODE_MARGIN_DB
+                short += snr_db_that_carries(mode.bits_per_symbol, carried) < least_db
+            counted_on_db = reporter.snr_db(equalised)
+    assert short < 0.15 * 3 * num_frames  # 0.4 with slots taken to fade independently
+
+
+def test_slow_fading_is_followed_from_frame_to_frame():
+    rising = frames(*[[snr] * 15 for snr in (2.0, 2.4, 2.9, 3.5, 4.2, 5.0, 6.0)])
+    assert steady_snr_db(rising, 4) > db(4.2)
+    falling = rising[::-1]
+    assert steady_snr_db(falling, 4) < db(2.0)
+
+
+def test_frames_that_differ_by_chance_leave_the_margin_of_their_slots():
+    independent = frames(*np.random.default_rng(1).exponential(5.0, (8, 32)))
+    together = frames(*[[snr] * 32 for snr in (1, 9, 2, 7, 3, 12, 4, 5)])
+    carried = np.array([frame.carried(4) for frame in independent])
+    bits = carried.mean() - 1.645 * math.sqrt(9 / 8 * carried.var() / 32)
+    expected = snr_db_that_carries(4, bits) + MODE_MARGIN_DB
+    assert steady_snr_db(independent, 4) == pytest.approx(expected)
+    assert steady_snr_db(together, 4) < db(1.0)
+
+
+def test_a_link_that_falls_while_it_fades_is_followed_within_two_frames():
+    fading = ChannelSettings(channel="rayleigh", snr_db=12.0)
+    reporter = LinkReporter("jpeg-amc")
+    before = reports(reporter, fading, range(8))
+    after = reports(reporter, ChannelSettings(channel="rayleigh", snr_db=3.0), [8, 9])
+    alone = reports(LinkReporter("jpeg-amc"), ChannelSettings(channel="rayleigh", snr_db=3.0), [8, 9])
+    assert after[1] == pytest.approx(alone[1], abs=1.0)
+    assert after[1] < before[-1] - 5.0
+
+
 def test_frames_of_another_size_begin_anew():
     reporter = LinkReporter("jpeg-amc")
     fading = ChannelSettings(channel="rayleigh", snr_db=10.0)

@@ -1,5 +1,6 @@
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from semcast.common.errors import ConfigError, SourceError
 from semcast.common.link_report import LinkReporter
 from semcast.evaluation.codec import CodecSettings, evaluate_codec, read_images
 from semcast.evaluation.picture_strip import picture_strip, write_picture_strip
+from semcast.evaluation.result_table import result_table
 from semcast.evaluation.sounding import told_at_first
 from semcast.training.onnx_export import export_encoder
 
@@ -40,6 +42,45 @@ def report(folder, tmp_path_factory):
         max_images=2,
     )
     return settings, evaluate_codec(settings)
+
+
+def trace_file(tmp_path):
+    file = tmp_path / "trace.csv"
+    file.write_text("t_s,snr_db\n0,4\n0.1,12\n")
+    return ChannelSettings(channel="trace", trace="file", trace_file=file)
+
+
+def test_several_snrs_are_refused_where_a_file_has_its_own(folder, tmp_path):
+    link = trace_file(tmp_path)
+    with pytest.raises(ValueError, match="snr_db must be a single value with --trace file, .*, got 2 8"):
+        CodecSettings(images=folder, snr_db=(2.0, 8.0), link=link)
+    assert [link.trace for link in CodecSettings(images=folder, link=link).links.values()] == ["file"]
+    CodecSettings(images=folder, snr_db=(2.0, 8.0), link=replace(link, trace="walk"))
+
+
+def test_a_trace_has_no_curve_over_snr_and_states_no_snr_it_never_had(folder, tmp_path):
+    ramp = ChannelSettings(channel="trace", trace="ramp")
+    for link, stated, heading, picture in (
+        (trace_file(tmp_path), None, [], "pictures_trace.png"),
+        (ramp, 12.0, ["start dB"], "pictures_ramp_from_12db.png"),
+    ):
+        out = tmp_path / link.trace
+        report = evaluate_codec(
+            CodecSettings(
+                images=folder, codec=("jpeg-ldpc",), snr_db=(12.0,), link=link, max_images=1, out=out
+            )
+        )
+        assert report["results"][0]["snr_db"] == stated
+        assert [path.name for path in out.iterdir()] == [picture]
+        head = result_table("codec", report).head
+        assert [name for name in head if name in ("SNR dB", "start dB")] == heading
+
+
+def test_a_learned_codec_is_told_the_snr_its_trace_starts_with(folder, tmp_path):
+    image = next(iter(read_images(folder)[0].values()))
+    link = Link(trace_file(tmp_path), 0)
+    codec = load_codec("3dcsc-lite")
+    assert told_at_first(codec, image, link, LinkReporter(codec.name), 0.0) == 4.0
 
 
 def test_an_exported_encoder_serves_the_same_decoder(folder):

@@ -91,6 +91,7 @@ def test_without_a_file_the_table_is_printed_and_it_is_said_that_nothing_else_is
     [
         (["--channel", "rayleigh", "--slot-loss", "0.5"], "slot_loss: no effect on channel rayleigh"),
         (["--channel", "trace", "--trace", "file"], "snr_db: no effect on channel trace"),
+        (["--channel", "awgn", "--slot-loss", "0.2"], "slot_loss: no effect on channel awgn"),
         (["--channel", "erasure", "--slot-loss", "0.5"], None),
     ],
 )

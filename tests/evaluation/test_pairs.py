@@ -120,6 +120,19 @@ def test_pairs_with_a_lost_frame_fail_under_every_method(room, phase_codec):
     assert report["results"]["off"]["num_pairs"] == 16
 
 
+def test_a_trace_from_a_file_is_one_link_without_an_snr_or_a_curve(room, phase_codec, tmp_path):
+    file = tmp_path / "trace.csv"
+    file.write_text("t_s,snr_db\n0,12\n")
+    link = ChannelSettings(channel="trace", trace="file", trace_file=file)
+    with pytest.raises(ValueError, match="snr_db must be a single value with --trace file"):
+        settings(room, link=link, snr_db=(2.0, 8.0))
+    out = tmp_path / "out"
+    chosen = settings(room, link=link, out=out, max_frames=5, confidence=("off",), competitors=False)
+    report = evaluate_pairs(chosen, phase_codec)
+    assert [cell["snr_db"] for cell in report["cells"]] == [None]
+    assert not out.exists()
+
+
 def test_true_motion_maps_the_first_camera_to_the_second(room):
     sequence = open_sequence(room)
     wanted = settings(room)

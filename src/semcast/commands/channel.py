@@ -5,7 +5,7 @@ import json
 import logging
 from pathlib import Path
 
-from semcast.channel.emulator import run_channel, set_channel, warn_of_idle
+from semcast.channel.emulator import run_channel, set_channel, warn_of_settings
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
@@ -47,6 +47,6 @@ def _set(arguments: argparse.Namespace) -> int:
     if "trace_file" in changes:  # the running channel has another working folder
         changes["trace_file"] = str(Path(changes["trace_file"]).absolute())
     in_force = set_channel(settings.network, settings.agent_id, changes)
-    warn_of_idle(build_settings(ChannelSettings, in_force), changes)
+    warn_of_settings(build_settings(ChannelSettings, in_force), changes)
     print(json.dumps(in_force, indent=1))
     return 0

@@ -11,9 +11,9 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from semcast.channel.emulator import warn_of_idle
+from semcast.channel.emulator import warn_of_settings
 from semcast.commands.console import plain_console
-from semcast.commands.running import add_settings, read_settings, run_until_stopped
+from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
 from semcast.common.run_folder import RUN_FILES, VIEWER_NAME
 from semcast.common.sequence import open_sequence
 from semcast.demo import DemoSettings, default_sequence, run_demo
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     With ``--json -`` the summary has stdout for itself.
     """
     settings = read_settings(DemoSettings, arguments)
-    warn_of_idle(settings.link, settings.link.without_effect())
+    warn_of_settings(settings.link, read_given(DemoSettings, arguments).get("link", {}))
     json_to_stdout = settings.json == STDOUT
     if json_to_stdout:
         settings = replace(settings, json=None)

@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,9 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from semcast.channel.emulator import warn_of_idle
+from semcast.channel.emulator import warn_of_settings
 from semcast.commands.console import plain_console
-from semcast.commands.running import add_settings, read_settings
+from semcast.commands.running import add_settings, read_given, read_settings
 from semcast.evaluation import (
     codec,
     confidence,
@@ -139,7 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
     elif settings.json is None:
         _tell("only the table will be left of this run: --json FILE keeps all figures")
     check_outputs(settings.json, out)
-    _warn_of_idle_link(settings)
+    _warn_of_link(settings, read_given(cls, arguments))
     before_ns = _write_times_ns(out)
     with talk.status(f"{text} ..."):
         report = evaluate(settings)
@@ -157,11 +157,10 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _warn_of_idle_link(settings: Any) -> None:
-    """Say which values of the channel do nothing on it, the SNRs of a trace from a file too."""
+def _warn_of_link(settings: Any, given: Mapping[str, Any]) -> None:
+    """Say which of the given values of the channel do nothing on it, the SNRs of a trace from a file too."""
     if hasattr(settings, "link"):
-        link = replace(settings.link, snr_db=settings.snr_db[0])
-        warn_of_idle(link, link.without_effect())
+        warn_of_settings(settings.link, {*given.get("link", {}), *given})
 
 
 def _tell(line: str) -> None:

@@ -1,0 +1,47 @@
+"""What an SNR that is set says about a link whose SNR follows a trace: at most where the trace starts."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from semcast.channel.settings import ChannelSettings
+
+
+def is_of_file(link: ChannelSettings) -> bool:
+    """Tell whether the SNR comes from a file alone."""
+    return link.channel == "trace" and link.trace == "file"
+
+
+def check_snrs(snr_db: Sequence[float], link: ChannelSettings) -> None:
+    """Check that no link would be measured twice under two SNRs.
+
+    Raises:
+        ValueError: There are several SNRs, and a file has its own.
+    """
+    if len(snr_db) > 1 and is_of_file(link):
+        values = " ".join(f"{value:g}" for value in snr_db)
+        raise ValueError(f"snr_db must be a single value with --trace file, which sets the SNR, got {values}")
+
+
+def stated_snr_db(snr_db: float, link: ChannelSettings) -> float | None:
+    """Return the SNR in dB that a result states: as set, None where a file sets it."""
+    return None if is_of_file(link) else snr_db
+
+
+def snr_label(snr_db: float, link: ChannelSettings) -> str:
+    """Return what stands for an SNR in a figure: ``6 dB``, ``ramp from 6 dB`` or ``trace``."""
+    if is_of_file(link):
+        return "trace"
+    return f"{link.trace} from {snr_db:g} dB" if link.channel == "trace" else f"{snr_db:g} dB"
+
+
+def snr_file_label(snr_db: float, link: ChannelSettings) -> str:
+    """Return ``snr_label`` for the name of a file: ``6db``, ``ramp_from_6db`` or ``trace``."""
+    return snr_label(snr_db, link).replace(" dB", "db").replace(" ", "_")
+
+
+def snr_heading(report: Mapping[str, Any]) -> str | None:
+    """Return the name of the column of SNRs in a table of an evaluation's result, None for no column."""
+    link = report["settings"].get("link") or {}
+    if link.get("channel") != "trace":
+        return "SNR dB"
+    return None if link.get("trace") == "file" else "start dB"
