@@ -87,6 +87,7 @@ def test_figures_by_hand():
     assert gain == ["room; klt", "1", *by_hand]
     assert "- `robust`: +4.0 of rotation and +8.0 of direction." in text
     assert "`paper` has 0.50 times that of `plain_ransac`" in text
+    assert "In 1 of them `robust` has an error larger than `poselib`'s by more than 2 %." in text
     assert "In the 1 hard cells (6 dB and below" in text
     assert "it has 0.50 times the error of `poselib`" in text
     assert "on the true inliers alone has 0.25 times it" in text
