@@ -73,6 +73,15 @@ def _named(entries: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
     return [{"name": name, **entry} for name, entry in entries.items()]
 
 
+def _trajectory_notes(report: Report) -> list[str]:
+    note = (
+        "Medians over seeds. ATE and posed are of the path after the last correction, with frames that got "
+        "their pose later."
+    )
+    is_live = any("ate_at_once_percent" in cell for cell in report["cells"])
+    return [f"{note} Live: of the poses as they were published with each frame." if is_live else note]
+
+
 def _pair_notes(report: Report) -> list[str]:
     num_pairs = max(entry["num_pairs"] for entry in report["results"].values())
     return [
@@ -87,17 +96,18 @@ LAYOUTS: dict[str, _Layout] = {
         lambda report: report["cells"],
         {
             _SNR: ("snr_db", "g"),
-            "confidence": ("confidence", ""),
+            "mode": ("confidence", ""),
             "ATE m": ("ate_rmse_m", ".3f"),
             "ATE %": ("ate_percent", ".2f"),
+            "live %": ("ate_at_once_percent", ".2f"),
             "posed": ("completeness", ".1%"),
-            "RPE %": ("rpe_trans_percent", ".2f"),
-            "RPE deg": ("rpe_rot_deg", ".3f"),
+            "posed live": ("completeness_at_once", ".1%"),
             "PSNR dB": ("psnr_db", ".2f"),
             "again": ("recovery_s", ".2f"),
             "failed": ("num_failed", "d"),
         },
-        optional=frozenset({"again"}),
+        _trajectory_notes,
+        optional=frozenset({"live %", "posed live", "again"}),
     ),
     "pairs": _Layout(
         lambda report: _named(report["results"]),

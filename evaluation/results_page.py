@@ -10,34 +10,33 @@ from pathlib import Path
 from typing import Any
 
 from semcast.common.codec import DEFAULT_CODEC
+from semcast.evaluation.depth_summary import depth_summary
 from semcast.evaluation.markdown import number, table, with_part
-from semcast.evaluation.pair_summary import RIVAL, pair_summary
+from semcast.evaluation.pair_summary import RIVAL, pair_headline, pair_summary
+from semcast.evaluation.path_tables import WORST_RATIO, readme_table, trajectory_table
 from semcast.evaluation.plots import variant_name
+from semcast.evaluation.trace_snr import level_name
 from semcast.evaluation.trajectory_summary import trajectory_summary
 
 RESULTS = Path("evaluation/results")
 PAGE = Path("docs/results.md")
 README = Path("README.md")
-#: Channel and SNR in dB, or clean images, to the column of the README's table.
-README_LINKS: dict[tuple[str, float] | None, str] = {
-    None: "clean images",
-    ("rayleigh", 6.0): "fading, 6 dB",
-    ("rayleigh", 2.0): "fading, 2 dB",
-    ("erasure", 6.0): "one slot in five lost, 6 dB",
-    ("awgn", 2.0): "noise, 2 dB",
-}
 CONFIDENCE_PAGE = Path("docs/confidence.md")
 
 Report = Mapping[str, Any]
 Tables = Callable[[Report], Iterator[str]]
 
-HEAD = """# Results
+HEAD = f"""# Results
 
 Written by `make results-page` from `evaluation/results/*.json`; each file holds the command, the seed, the
-commit and the machine. Trajectory errors are after alignment by a similarity, always with completeness (share
-of frames with a pose). In the codec tables PSNR of an outage counts the grey picture the receiver shows then
-(12.8 dB on Kodak); elsewhere PSNR is a mean over the frames that could be decoded.
-What the figures mean and what limits them is in [reading the results](reading-results.md).
+commit and the machine. Trajectory errors are after alignment by a similarity and of the path after the last
+correction, when the stream has ended. They are medians over the seeds; in brackets the worst run, where it
+errs by over {WORST_RATIO:g} times the median. Completeness is the share of the sent frames with a pose in
+that path, also where they got it later; of the runs the least. `live` means poses as they were published with
+each frame; files without such figures have no such columns. The true paths of `shelf_50` and `phone_150` are
+not exact ([references](reading-results.md#references)). In the codec tables PSNR of an outage counts the grey
+picture the receiver shows then (12.8 dB on Kodak); elsewhere PSNR is a mean over the frames that could be
+decoded. What the figures mean and what limits them is in [reading the results](reading-results.md).
 """
 
 
@@ -49,7 +48,7 @@ def _codec(report: Report) -> Iterator[str]:
         f"{', '.join(f'{cbr:.4f} (1/{1 / cbr:.1f})' for cbr in ratios)}.\n"
     )
     snrs = sorted({row["snr_db"] for row in rows})
-    levels = [_level(snr, report, " dB") for snr in snrs]
+    levels = [level_name(snr, report, " dB") for snr in snrs]
     for key, name, digits in (("psnr_db", "PSNR dB", 2), ("ssim", "SSIM", 3), ("ms_ssim", "MS-SSIM", 3)):
         body = []
         for codec in dict.fromkeys(row["codec"] for row in rows):
@@ -68,42 +67,16 @@ def _codec(report: Report) -> Iterator[str]:
 
 def _trajectory(report: Report) -> Iterator[str]:
     yield from _other_codec(report)
-    head = ["SNR dB", "confidence", "ATE m", "ATE %", "completeness", "RPE %", "RPE deg", "PSNR dB", "seeds"]
-    if gap_s := report["settings"].get("gap_s"):
-        yield f"Nothing arrives for {gap_s:g} s, at another place for each seed. `again`: from the first"
-        yield "frame after that to the first with a pose.\n"
-        head.append("again s")
-    yield from table(
-        head,
-        [
-            [
-                _level(cell["snr_db"], report),
-                cell["confidence"],
-                number(cell["ate_rmse_m"], 3),
-                number(cell["ate_percent"], 3),
-                number(cell["completeness"], 3),
-                number(cell["rpe_trans_percent"]),
-                number(cell["rpe_rot_deg"], 3),
-                number(cell["psnr_db"]),
-                str(len(cell["seeds"])),
-                *([number(cell["recovery_s"])] if gap_s else []),
-            ]
-            for cell in report["cells"]
-        ],
-    )
-
-
-def _level(snr_db: float | None, report: Report, unit: str = "") -> str:
-    """Name an SNR of a report; None is that of a trace from a file, or stands for original images."""
-    if snr_db is None:
-        return "no link" if report["settings"]["codec"] == "none" else "trace"
-    return f"{snr_db:g}{unit}"
+    yield from trajectory_table(report)
 
 
 def _other_codec(report: Report) -> Iterator[str]:
-    codec = report["settings"]["codec"]
-    if codec not in ("none", DEFAULT_CODEC):
-        yield f"Codec `{codec}`.\n"
+    if report["settings"]["codec"] not in ("none", DEFAULT_CODEC):
+        yield from _named_codec(report)
+
+
+def _named_codec(report: Report) -> Iterator[str]:
+    yield f"Codec `{report['settings']['codec']}`.\n"
 
 
 def _pairs(report: Report) -> Iterator[str]:
@@ -112,7 +85,7 @@ def _pairs(report: Report) -> Iterator[str]:
     yield "Mean translation-direction error in degrees; the last column is its 95 % interval.\n"
     rows = []
     for cell in report["cells"]:
-        snr = _level(cell["snr_db"], report)
+        snr = level_name(cell["snr_db"], report)
         found = [number(cell["results"][m]["tdir_deg_mean"], 1) for m in methods]
         rows.append([snr, variant_name(cell), *found, _interval(cell)])
     yield from table(["SNR dB", "matches", *methods, f"robust - {RIVAL}"], rows)
@@ -127,8 +100,9 @@ def _interval(cell: Mapping[str, Any]) -> str:
 
 
 def _confidence(report: Report) -> Iterator[str]:
+    yield from _named_codec(report)
     for result in report["results"]:
-        yield f"{_level(result['snr_db'], report, ' dB')}:\n"
+        yield f"{level_name(result['snr_db'], report, ' dB')}:\n"
         rows = [
             [f"{target}: {name}", number(value, 3)]
             for target, grades in result.items()
@@ -152,6 +126,7 @@ _TRUTH = {"pixel": "error of pixels", "keypoint": "displacement of keypoints"}
 
 def _latency(report: Report) -> Iterator[str]:
     width, height = report["image_wh"]
+    yield from _named_codec(report)
     yield f"{report['num_frames']} frames of {width}x{height}. Bottleneck: **{report['bottleneck']}**.\n"
     yield from table(
         ["stage", "p50 ms", "p95 ms", "runs on", "share of time"],
@@ -207,6 +182,7 @@ def _sampled(rows: Sequence[Any], count: int) -> list[Any]:
 
 
 def _endurance(report: Report) -> Iterator[str]:
+    yield from _named_codec(report)
     body = [
         [
             row["frames"],
@@ -380,39 +356,21 @@ def results_page(folder: Path = RESULTS) -> str:
     return "\n".join(lines)
 
 
-def readme_table(folder: Path = RESULTS) -> str:
-    """Return the README's short table: path errors in the default mode, recordings by links.
-
-    Recordings that were sent over most links come first. Those with a gap or another codec are not in it.
-    """
-    errors: dict[str, dict[str, str]] = {}
-    for file in sorted(folder.glob("trajectory_*.json")):
-        report = json.loads(file.read_text(encoding="utf-8"))
-        channel = report["settings"]["link"]["channel"]
-        if (
-            channel == "trace"
-            or report["settings"].get("gap_s")
-            or report["settings"]["codec"] not in ("none", DEFAULT_CODEC)
-        ):
-            continue
-        for cell in report["cells"]:
-            link = None if cell["snr_db"] is None else (channel, cell["snr_db"])
-            if cell["confidence"] == "robust" and link in README_LINKS:
-                posed = cell["completeness"]
-                share = "" if posed > 0.995 else f" ({posed:.0%} posed)"
-                errors.setdefault(report["sequence"], {})[README_LINKS[link]] = (
-                    number(cell["ate_percent"]) + share
-                )
-    links = list(README_LINKS.values())
-    ordered = sorted(errors.items(), key=lambda entry: (-len(entry[1]), entry[0]))
-    rows = [[name, *(of.get(link, "-") for link in links)] for name, of in ordered]
-    return "\n".join(table(("recording", *links), rows))
-
-
 def confidence_part(folder: Path = RESULTS) -> str:
     """Return the part of the page on confidence that is about pairs."""
     files = sorted(folder.glob("pairs_*.json"))
     return pair_summary(json.loads(file.read_text(encoding="utf-8")) for file in files)
+
+
+def headline_part(folder: Path = RESULTS) -> str:
+    """Return what the page on confidence says about pairs in short."""
+    files = sorted(folder.glob("pairs_*.json"))
+    return pair_headline(json.loads(file.read_text(encoding="utf-8")) for file in files)
+
+
+def depth_part(folder: Path = RESULTS) -> str:
+    """Return the part of the page on confidence that is about depth in the drawn room."""
+    return depth_summary(json.loads((folder / "depth_room.json").read_text(encoding="utf-8")))
 
 
 def trajectory_part(folder: Path = RESULTS) -> str:
@@ -424,8 +382,10 @@ def trajectory_part(folder: Path = RESULTS) -> str:
 if __name__ == "__main__":
     PAGE.write_text(results_page(), encoding="utf-8")
     for page, name, part in (
-        (README, "results", readme_table()),
+        (README, "results", readme_table(RESULTS)),
+        (CONFIDENCE_PAGE, "in short", headline_part()),
         (CONFIDENCE_PAGE, "pairs", confidence_part()),
+        (CONFIDENCE_PAGE, "depth", depth_part()),
         (CONFIDENCE_PAGE, "trajectories", trajectory_part()),
     ):
         page.write_text(with_part(page.read_text(encoding="utf-8"), name, part), encoding="utf-8")

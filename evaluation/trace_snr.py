@@ -45,3 +45,10 @@ def snr_heading(report: Mapping[str, Any]) -> str | None:
     if link.get("channel") != "trace":
         return "SNR dB"
     return None if link.get("trace") == "file" else "start dB"
+
+
+def level_name(snr_db: float | None, report: Mapping[str, Any], unit: str = "") -> str:
+    """Name an SNR of a report; None is that of a trace from a file, or stands for original images."""
+    if snr_db is None:
+        return "no link" if report["settings"]["codec"] == "none" else "trace"
+    return f"{snr_db:g}{unit}"

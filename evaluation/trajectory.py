@@ -37,7 +37,16 @@ UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.confidence", "reconstructi
 #: Longest gap: far beyond what any motion can bridge.
 MAX_GAP_S = 60.0
 #: Figures of a run that are summarised over seeds.
-FIGURES = ("ate_rmse_m", "ate_percent", "completeness", "rpe_trans_percent", "rpe_rot_deg", "psnr_db")
+FIGURES = (
+    "ate_rmse_m",
+    "ate_percent",
+    "ate_at_once_percent",
+    "completeness",
+    "completeness_at_once",
+    "rpe_trans_percent",
+    "rpe_rot_deg",
+    "psnr_db",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,8 +97,10 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
 
     Returns:
         Provenance and ``cells``: one entry per SNR (``snr_db``, of a trace its start, None for that of a
-        file and without a link) and mode with the median over seeds of each figure in
-        ``FIGURES``, ``num_failed`` (runs without a path), and ``runs``, the full summary of each seed.
+        file and without a link) and mode with the median over seeds of each figure in ``FIGURES``,
+        ``num_failed`` (runs without a path), and ``runs``, the full summary of each seed. Errors are of the
+        path after all corrections, but for ``ate_at_once_percent``; ``completeness`` counts frames that got
+        their pose later as well, ``completeness_at_once`` does not.
         ``comparisons`` holds, per SNR, the paired difference in ATE of each mode to the mode ``off`` where
         that was run. ``frames_left_out`` are those that can't be read. With one cell its figures and
         ``stage_ms`` also stand at the top level. With a gap, runs have ``gap``, its first and last frame and

@@ -10,7 +10,15 @@ import pytest
 
 from semcast.cli import VERBS, verb_parser
 from semcast.evaluation.markdown import with_part
-from semcast.evaluation.results_page import confidence_part, readme_table, results_page
+from semcast.evaluation.path_tables import readme_table
+from semcast.evaluation.results_page import (
+    RESULTS,
+    confidence_part,
+    depth_part,
+    headline_part,
+    results_page,
+    trajectory_part,
+)
 from semcast.reference import reference, with_messages
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -77,9 +85,16 @@ def test_the_figures_in_the_docs_are_those_of_the_result_files(monkeypatch):
     monkeypatch.chdir(ROOT)
     assert (ROOT / "docs/results.md").read_text(encoding="utf-8") == results_page(), "run make results-page"
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert readme == with_part(readme, "results", readme_table()), "run make results-page"
+    assert readme == with_part(readme, "results", readme_table(RESULTS)), "run make results-page"
     confidence = (ROOT / "docs/confidence.md").read_text(encoding="utf-8")
-    assert confidence == with_part(confidence, "pairs", confidence_part()), "run make results-page"
+    parts = {
+        "in short": headline_part,
+        "pairs": confidence_part,
+        "depth": depth_part,
+        "trajectories": trajectory_part,
+    }
+    for name, part in parts.items():
+        assert confidence == with_part(confidence, name, part()), "run make results-page"
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,10 @@
 """The masked-autoencoder baseline: few large patches, trained to fill in hidden ones, then over the link.
 
-The paper cuts 800x800 images into 16 x 16 patches of 50 x 50 pixels. Slots cover blocks of 16 pixels, so the
-patch here is the nearest whole number of blocks, 48 pixels. A patch's pixels pass a narrow layer shared by
-its blocks on their way in and out: a full linear map of 6912 values to a token would not fit into the size of
-weights that ship. Images of any size are padded to whole patches; symbols of the padding are never sent.
+A patch here has 48 x 48 pixels, three by three of the blocks that slots cover. The paper's are more and
+smaller: 50 x 50 patches in an image of 800 x 800, 16 x 16 pixels each. That is ``patch_blocks = 1``, and
+the shipped weights are not of it. A patch's pixels pass a narrow layer shared by its blocks on their way in
+and out: a full linear map of 6912 values to a token would not fit into the size of weights that ship. Images
+of any size are padded to whole patches; symbols of the padding are never sent.
 """
 
 from dataclasses import dataclass

@@ -3,8 +3,9 @@ import pytest
 
 from semcast.channel.settings import ChannelSettings
 from semcast.common.sequence import open_sequence
+from semcast.common.trajectory import Trajectory
 from semcast.evaluation.pipeline import FrameRun
-from semcast.evaluation.reconstruct import cut_to_frames, reconstruct, split_bundle
+from semcast.evaluation.reconstruct import at_once, cut_to_frames, reconstruct, split_bundle
 from semcast.server.mapping.settings import ReconstructionSettings
 
 
@@ -35,6 +36,34 @@ def test_a_clean_sequence_is_followed_from_end_to_end(sequence):
     errors = [row["error_m"] for row in run.rows if row["error_m"] is not None]
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(run.summary["ate_rmse_m"])
     assert {"track", "map", "bundle"} <= set(run.summary["stage_ms"])
+
+
+def test_poses_as_they_were_published_have_figures_of_their_own(sequence):
+    published = {}
+    run = reconstruct(
+        clean(sequence, range(14)),
+        sequence.intrinsics,
+        ReconstructionSettings(),
+        sequence.groundtruth(),
+        lambda frame, result, row, update: published.update({frame.frame_id: result.T_world_cam}),
+    )
+    posed = [k for k, T_world_cam in published.items() if T_world_cam is not None]
+    assert run.summary["completeness_at_once"] == pytest.approx(len(posed) / 14)
+    # The frames before the start of the map got their poses later.
+    assert run.summary["completeness_at_once"] < run.summary["completeness"]
+    assert run.summary["ate_at_once_percent"] != run.summary["ate_percent"]
+    assert run.summary["ate_at_once_percent"] < 5.0
+
+
+def test_an_error_of_published_poses_is_that_after_one_similarity(sequence):
+    truth = sequence.groundtruth()
+    moved = truth.T_world_cam.copy()
+    moved[:, :3, 3] = 3.0 * moved[:, :3, 3] + 1.0
+    half = Trajectory(truth.t_s[::2], moved[::2])
+    figures = at_once(half, truth, len(truth))
+    assert figures["ate_at_once_percent"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["completeness_at_once"] == pytest.approx(len(half) / len(truth))
+    assert at_once(half, None, len(truth))["ate_at_once_percent"] is None
 
 
 def test_lost_frames_count_against_completeness(sequence, phase_codec):

@@ -48,6 +48,20 @@ def test_no_name_of_a_column_is_cut_and_every_row_takes_one_line(what):
     assert all(cell != "-" for row in measured for cell in row), "every figure is found in the result"
 
 
+def test_figures_of_published_poses_fit_beside_those_of_the_corrected_path():
+    report = shipped("trajectory")
+    assert "live %" not in result_table("trajectory", report).head
+    assert "Live" not in result_table("trajectory", report).notes[0]
+    for cell in report["cells"]:
+        cell |= {"ate_at_once_percent": 12.345, "completeness_at_once": 0.9, "recovery_s": 0.1}
+    table = result_table("trajectory", report)
+    assert {"live %", "posed live", "again"} <= set(table.head)
+    assert "as they were published" in table.notes[0]
+    _, head, _, *body = lines_at_80_columns("trajectory", table)
+    assert [name.strip() for name in head.split("  ") if name.strip()] == table.head
+    assert [line.split() for line in body] == table.rows
+
+
 def test_a_long_name_takes_several_lines_and_cuts_no_other_column():
     report = shipped("codec")
     name = "checkpoints/mine/a-rather-long-name-of-weights.safetensors"

@@ -11,7 +11,9 @@ from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajector
 PROMISED = (
     "ate_rmse_m",
     "ate_percent",
+    "ate_at_once_percent",
     "completeness",
+    "completeness_at_once",
     "rpe_trans_percent",
     "rpe_rot_deg",
     "psnr_db",

@@ -7,7 +7,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.run_folder import read_run
-from semcast.server.export.outputs import EachFile, read_ply
+from semcast.server.export.outputs import EachFile
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -38,7 +38,9 @@ def test_each_result_that_can_not_be_written_is_an_error(tmp_path, reconstructio
     assert all((tmp_path / other).is_file() for other in RESULTS if other != name)
 
 
-def test_a_reconstruction_that_makes_no_sense_is_an_error_and_costs_no_other(tmp_path, reconstruction):
+def test_a_reconstruction_that_makes_no_sense_is_an_error_and_costs_no_other(
+    tmp_path, reconstruction, read_ply
+):
     poses = {0: np.full((4, 4), np.nan)}
     results = replace(results_of(reconstruction, {0: 0}), poses=poses, part_of={0: 0})
     with pytest.raises(OSError, match=r"^reconstruction.npz: T_world_cam must be finite$"):

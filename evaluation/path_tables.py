@@ -1,0 +1,122 @@
+"""Tables of path errors for ``docs/results.md`` and the README: medians over seeds, and what they would hide.
+
+The median of three runs is the same whether the third is a little worse or has lost its way. So the worst run
+stands beside it where it is clearly worse, and of the shares of frames with a pose the least one counts.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from semcast.common.codec import DEFAULT_CODEC
+from semcast.evaluation.markdown import number, table
+from semcast.evaluation.trace_snr import level_name
+
+Report = Mapping[str, Any]
+#: The worst run is told where its error is more than so many times the median. Runs of one cell that went
+#: alike mostly lie within it.
+WORST_RATIO = 1.5
+#: Channel and SNR in dB, or clean images, to the column of the README's table.
+README_LINKS: dict[tuple[str, float] | None, str] = {
+    None: "clean images",
+    ("rayleigh", 6.0): "fading, 6 dB",
+    ("rayleigh", 2.0): "fading, 2 dB",
+    ("erasure", 6.0): "one slot in five lost, 6 dB",
+    ("awgn", 2.0): "noise, 2 dB",
+}
+
+
+def median_and_worst(cell: Report, figure: str = "ate_percent", digits: int = 2) -> str:
+    """Return the median of an error over the runs of a cell as text.
+
+    In brackets stands the worst run where its error is over ``WORST_RATIO`` times the median, or how many
+    runs have no path at all.
+
+    Args:
+        cell: One of the ``cells`` of ``evaluate_trajectory``.
+        figure: Name of the error in the cell and in its runs.
+        digits: After the point.
+    """
+    median = cell[figure]
+    found = [run[figure] for run in cell["runs"]]
+    if None in found:
+        return f"{number(median, digits)} ({found.count(None)} of {len(found)} without a path)"
+    worst = max(found)
+    return number(median, digits) + (f" ({number(worst, digits)})" if worst > WORST_RATIO * median else "")
+
+
+def least_completeness(cell: Report, figure: str = "completeness") -> float:
+    """Return the least share of frames with a pose among the runs of a cell."""
+    return min(float(run[figure]) for run in cell["runs"])
+
+
+def trajectory_table(report: Report) -> Iterator[str]:
+    """Yield the lines of the table of a result of ``semcast eval trajectory``.
+
+    Figures of the poses as they were published, and of the time after a gap, have columns where the file has
+    them.
+    """
+    cells = report["cells"]
+    is_live = any("ate_at_once_percent" in cell for cell in cells)
+    gap_s = report["settings"].get("gap_s")
+    if gap_s:
+        yield f"Nothing arrives for {gap_s:g} s, at another place for each seed. `again`: from the first"
+        yield "frame after that to the first with a pose.\n"
+    head = ["SNR dB", "confidence", "ATE m", "ATE %", "least completeness"]
+    head += ["live ATE %", "least completeness, live"] if is_live else []
+    head += ["RPE %", "RPE deg", "PSNR dB", "seeds", *(["again s"] if gap_s else [])]
+    yield from table(
+        head,
+        [
+            [
+                level_name(cell["snr_db"], report),
+                cell["confidence"],
+                number(cell["ate_rmse_m"], 3),
+                median_and_worst(cell, digits=3),
+                number(least_completeness(cell), 3),
+                *(_live(cell) if is_live else []),
+                number(cell["rpe_trans_percent"]),
+                number(cell["rpe_rot_deg"], 3),
+                number(cell["psnr_db"]),
+                str(len(cell["seeds"])),
+                *([number(cell["recovery_s"])] if gap_s else []),
+            ]
+            for cell in cells
+        ],
+    )
+
+
+def _live(cell: Report) -> list[str]:
+    if "ate_at_once_percent" not in cell:
+        return ["-", "-"]
+    posed = least_completeness(cell, "completeness_at_once")
+    return [median_and_worst(cell, "ate_at_once_percent", 3), number(posed, 3)]
+
+
+def readme_table(folder: Path) -> str:
+    """Return the README's short table: path errors in the default mode, recordings by links.
+
+    Recordings that were sent over most links come first. Those with a gap or another codec are not in it.
+    """
+    errors: dict[str, dict[str, str]] = {}
+    for file in sorted(folder.glob("trajectory_*.json")):
+        report = json.loads(file.read_text(encoding="utf-8"))
+        channel = report["settings"]["link"]["channel"]
+        # The SNR of a trace is but its start.
+        if channel == "trace" or report["settings"].get("gap_s"):
+            continue
+        if report["settings"]["codec"] not in ("none", DEFAULT_CODEC):
+            continue
+        for cell in report["cells"]:
+            link = None if cell["snr_db"] is None else (channel, cell["snr_db"])
+            if cell["confidence"] == "robust" and link in README_LINKS:
+                posed = least_completeness(cell)
+                # Rounded down: a share that is not all of them must not read 100.0%.
+                share = "" if posed == 1.0 else f", {int(1000 * posed) / 10:.1f}% posed"
+                of = errors.setdefault(report["sequence"], {})
+                of[README_LINKS[link]] = median_and_worst(cell) + share
+    links = list(README_LINKS.values())
+    ordered = sorted(errors.items(), key=lambda entry: (-len(entry[1]), entry[0]))
+    rows = [[name, *(of.get(link, "-") for link in links)] for name, of in ordered]
+    return "\n".join(table(("recording", *links), rows))

@@ -1,0 +1,24 @@
+"""Tables of the results page say which codec they are of."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from semcast.common.codec import DEFAULT_CODEC
+from semcast.evaluation.results_page import results_page
+
+RESULTS = Path(__file__).resolve().parents[2] / "evaluation" / "results"
+
+
+@pytest.mark.parametrize(
+    "file", ["confidence_awgn_kitti_06", "latency_kitti_06", "endurance_parking_synth_60"]
+)
+@pytest.mark.parametrize("codec", [DEFAULT_CODEC, "3dcsc-lite"])
+def test_a_table_names_its_codec_be_it_the_default(tmp_path, file, codec):
+    shutil.copy(RESULTS / f"{file}.json", tmp_path)
+    report = json.loads((tmp_path / f"{file}.json").read_text(encoding="utf-8"))
+    report["settings"]["codec"] = codec
+    (tmp_path / f"{file}.json").write_text(json.dumps(report), encoding="utf-8")
+    assert f"\nCodec `{codec}`.\n" in results_page(tmp_path)
