@@ -41,6 +41,8 @@ _CAMERA_TIMEOUT_S = 0.5
 _CAMERA_PAUSE_S = 0.05
 _KEPT_REPORTS = 256
 _KEPT_CAMERAS = 16
+#: Different texts about one thing that are logged: nonsense without end must not hide what helps.
+_MAX_TOLD = 10
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,9 @@ class Receiver:
         self._metrics = metrics
         self._max_age_ms = max_age_ms
         self._lock = threading.Lock()
-        self._arrivals = Arrivals(lossless=mode == "replay", drop=metrics.drop)
+        self._arrivals = Arrivals(
+            lossless=mode == "replay", drop=metrics.drop, tell=lambda text: self._tell("ahead", text)
+        )
         self._box: Backlog[tuple[SymbolFrame, int]] | Mailbox[tuple[SymbolFrame, int]] = (
             Backlog() if mode == "live" else Mailbox(4 * WINDOW, "newest")
         )
@@ -123,7 +127,7 @@ class Receiver:
         self._num_superseded = self._num_given_way = 0
         self._reporter: tuple[tuple[int, str], LinkReporter] | None = None
         self._roles: set[str] = set()
-        self._told: set[str] = set()
+        self._told: dict[str, set[str]] = {}
         self._link = session.publisher(link_key(agent_id), "newest")
         self._flow = session.publisher(flow_key(agent_id), "newest")
         self._stopping = threading.Event()
@@ -163,9 +167,12 @@ class Receiver:
                 arrived_seq = self._arrivals.arrived_seq if agent_epoch == self._arrivals.epoch else 0
             self._metrics.drop("missing", max(0, num_sent - arrived_seq))
 
-    def _tell_once(self, text: str) -> None:
-        if text not in self._told and len(self._told) < 100:
-            self._told.add(text)
+    def _tell(self, about: str, text: str) -> None:
+        """Show in the status what is wrong with what arrives, and log it the first time."""
+        self._metrics.error(text)
+        told = self._told.setdefault(about, set())
+        if text not in told and len(told) < _MAX_TOLD:
+            told.add(text)
             logger.warning("%s", text)
 
     def _on_alive(self, role: str, alive: bool) -> None:
@@ -202,7 +209,7 @@ class Receiver:
     def _refuse(self, err: WireError) -> None:
         self._metrics.drop("protocol")
         self._metrics.count(f"protocol_{err.reason}")
-        self._tell_once(f"a message was refused: {err}")
+        self._tell(err.reason, f"a message was refused: {err}")
 
     def _on_symbols(self, payload: bytes) -> None:
         arrival_ns = time.perf_counter_ns()
@@ -216,8 +223,8 @@ class Receiver:
         if frame.lossless != (self._mode == "replay"):
             self._metrics.drop("mode")
             there = "replay" if frame.lossless else "live"
-            self._tell_once(
-                f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
+            self._tell(
+                "mode", f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
             )
         else:
             self._sort(frame, arrival_ns)
@@ -226,7 +233,8 @@ class Receiver:
     def _sort(self, frame: SymbolFrame, arrival_ns: int) -> None:
         with self._lock:
             new_epoch = frame.agent_epoch != self._arrivals.epoch
-            taken = self._arrivals.accept(frame, arrival_ns)
+            camera = self._cameras.get(frame.agent_epoch)
+            taken = self._arrivals.accept(frame, arrival_ns, camera.frame_step if camera is not None else 1)
             if taken and new_epoch:
                 dropped = self._box.clear()
                 self._metrics.drop("epoch", dropped)
@@ -314,7 +322,7 @@ class Receiver:
             return None
         camera = self._camera_of(message.agent_epoch)
         if camera is None:
-            self._tell_once("frames arrive, but the agent does not say what its camera is")
+            self._tell("camera", "frames arrive, but the agent does not say what its camera is")
             if live:
                 self._metrics.drop("camera")
             else:
@@ -325,8 +333,9 @@ class Receiver:
             self._metrics.count("lost_on_air")
         elif not belongs_to(message.image_hw, camera.intrinsics.shape_hw):
             self._metrics.drop("protocol")
-            self._tell_once(
-                f"frames are {message.image_hw}, no coded size of the camera's {camera.intrinsics.shape_hw}"
+            self._tell(
+                "size",
+                f"frames are {message.image_hw}, no coded size of the camera's {camera.intrinsics.shape_hw}",
             )
             self.done(message)
             return None
