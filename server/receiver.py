@@ -94,7 +94,7 @@ class Receiver:
         agent_id: Whose frames.
         mode: Service.
         metrics: Where to count.
-        max_age_ms: Live frames older than this are dropped, but for a source's last one.
+        max_age_ms: Live frames older than this are dropped, but for a source's last one, see ``is_too_old``.
     """
 
     def __init__(
@@ -314,16 +314,23 @@ class Receiver:
             return None
         return held
 
-    def _prepare(self, message: SymbolFrame, arrival_ns: int) -> ReceivedFrame | None:
+    def is_too_old(self, message: SymbolFrame) -> bool:
+        """Tell whether a frame is older than live frames may be, and count it as dropped if so."""
         age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
-        live = self._mode == "live"
-        if live and age_ms > self._max_age_ms and not message.final:  # the final one ends the stream
+        # The final one ends the stream.
+        too_old = self._mode == "live" and age_ms > self._max_age_ms and not message.final
+        if too_old:
             self._metrics.drop("too_old")
+        return too_old
+
+    def _prepare(self, message: SymbolFrame, arrival_ns: int) -> ReceivedFrame | None:
+        if self.is_too_old(message):
             return None
+        age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
         camera = self._camera_of(message.agent_epoch)
         if camera is None:
             self._tell("camera", "frames arrive, but the agent does not say what its camera is")
-            if live:
+            if self._mode == "live":
                 self._metrics.drop("camera")
             else:
                 self._held = (message, arrival_ns)

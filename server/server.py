@@ -110,7 +110,12 @@ class Server:
             self._make_ready()
             session.subscribe(camera_key(self._agent_id), "every", self._on_camera)
             self._ask_for_camera(session)
-            self._ahead = DecodeAhead(self._receiver.next, self._decoder.decode, self._on_failure)
+            self._ahead = DecodeAhead(
+                self._receiver.next,
+                self._decoder.decode,
+                self._on_failure,
+                lambda decoded: self._receiver.is_too_old(decoded.arrival.message),
+            )
             stack.callback(self._ahead.close)
             session.declare_alive(self._agent_id, "server")
             self._resources = stack.pop_all()
