@@ -93,7 +93,8 @@ class Server:
             stack.callback(self._desk.close)
             stack.enter_context(output_folder(settings.out))
             if settings.record is not None:
-                stack.enter_context(recording(session, self._agent_id, settings.record, to_toml(settings)))
+                record, told = settings.record, self._metrics.error
+                stack.enter_context(recording(session, self._agent_id, record, to_toml(settings), told))
             self._receiver = stack.enter_context(
                 Receiver(session, self._agent_id, settings.mode, self._metrics, settings.max_age_ms)
             )
@@ -379,7 +380,7 @@ class Server:
         out = self._settings.out
         bundle = self._spare_bundle or new_bundle(self._settings, self._metrics.error)
         self._spare_bundle = None
-        new = functools.partial(Session, self._settings, identity, on_give_up=self._metrics.error)
+        new = functools.partial(Session, self._settings, identity, on_error=self._metrics.error)
         try:
             return new(out, self._reference, bundle)
         except (OSError, SemcastError) as err:

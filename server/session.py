@@ -18,6 +18,7 @@ from semcast.common.errors import CheckpointError
 from semcast.common.run_folder import (
     CHECKPOINT_NAME,
     DENSE_NAME,
+    FRAMES_NAME,
     IMAGES_NAME,
     RECORD_FILES,
     RESULT_FILES,
@@ -100,11 +101,12 @@ class Session:
         reference: Originals and truth, or None.
         bundle: A runner made ahead by ``new_bundle``, which the session closes; None makes one.
         program: Settings of the program for the run's records; None takes ``settings``.
-        on_give_up: Is told why, when the dense cloud will not grow any more.
+        on_error: Is told in a line what the stream goes on without: rows or checkpoints that can't be
+            written, or more of the dense cloud.
 
     Raises:
         OSError: The folder can't be made.
-        SemcastError: It can't be written into, or rows in it can't be read.
+        SemcastError: It can't be written into.
     """
 
     def __init__(
@@ -115,16 +117,17 @@ class Session:
         reference: Reference | None,
         bundle: BundleRunner | None = None,
         program: Any = None,
-        on_give_up: Callable[[str], None] | None = None,
+        on_error: Callable[[str], None] | None = None,
     ) -> None:
         self._settings = settings
         self._program = program if program is not None else settings
         self.identity = identity
         self._folder = folder
+        self._on_error = on_error
         self._reference = reference
         bundle = bundle if bundle is not None else new_bundle(settings)
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
-        self._cloud = SessionCloud(settings, identity.camera, self._reconstruction, on_give_up)
+        self._cloud = SessionCloud(settings, identity.camera, self._reconstruction, on_error)
         self._t_source_ns: dict[int, int] = {}
         self._numbers: dict[int, int | None] = {}
         self._num_frames = identity.num_frames
@@ -155,8 +158,8 @@ class Session:
         self.resumed = settings.resume and self._restore(folder / CHECKPOINT_NAME)
         if not self.resumed:
             set_aside(folder)
-        self._record = RunRecord(folder, resume=self.resumed)
-        self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME)
+        self._record = RunRecord(folder, resume=self.resumed, on_error=self._on_error)
+        self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME, self._on_error)
         if settings.save_images != "none":
             self._images = ImageWriter(folder, lossless=settings.mode == "replay")
 
@@ -362,7 +365,7 @@ class Session:
         complete: bool,
         num_sent: int | None = None,
     ) -> dict[str, Any]:
-        """Write trajectory, map, reconstruction and summary, and return the summary.
+        """Write trajectory, map, reconstruction and summary, rows that still wait, and return the summary.
 
         Args:
             folder: Where to, or None to only make the summary.
@@ -375,6 +378,8 @@ class Session:
             SemcastError: The rows of the run can't be read back.
         """
         with EachFile() as each:
+            with each.attempt(Path(FRAMES_NAME)):
+                self._record.finish()
             results = self._write_results(folder, each)
             summary = self._summary(results, drops, complete, num_sent)
             if folder is not None:
