@@ -127,6 +127,7 @@ class Receiver:
         self._num_superseded = self._num_given_way = 0
         self._reporter: tuple[tuple[int, str], LinkReporter] | None = None
         self._roles: set[str] = set()
+        self._missing_behind = (0, 0)  # epoch, and what was counted of it by ``count_missing``
         self._told: dict[str, set[str]] = {}
         self._link = session.publisher(link_key(agent_id), "newest")
         self._flow = session.publisher(flow_key(agent_id), "newest")
@@ -161,11 +162,17 @@ class Receiver:
             return self._arrivals.epoch
 
     def count_missing(self, agent_epoch: int, num_sent: int | None) -> None:
-        """Count the frames behind the newest that never came, of so many that were sent; None: not known."""
-        if num_sent is not None and self._mode == "live":
-            with self._lock:
-                arrived_seq = self._arrivals.arrived_seq if agent_epoch == self._arrivals.epoch else 0
-            self._metrics.drop("missing", max(0, num_sent - arrived_seq))
+        """Count the frames behind the newest that never came, of so many that were sent; None: not known.
+
+        If some come all the same, it can be done again.
+        """
+        if num_sent is None or self._mode != "live":
+            return
+        with self._lock:
+            arrived_seq = self._arrivals.arrived_seq if agent_epoch == self._arrivals.epoch else 0
+            counted = self._missing_behind[1] if self._missing_behind[0] == agent_epoch else 0
+            self._missing_behind = agent_epoch, max(0, num_sent - arrived_seq)
+            self._metrics.drop("missing", self._missing_behind[1] - counted)
 
     def _tell(self, about: str, text: str) -> None:
         """Show in the status what is wrong with what arrives, and log it the first time."""

@@ -134,6 +134,7 @@ class Session:
         self._map_epoch = 0
         self._last_frame_id = -1
         self._state = TrackingState.INITIALIZING
+        self._is_concluded = False
         self._last_checkpoint_s = time.monotonic()
         self._checkpoints: CheckpointWriter | None = None
         self._images: ImageWriter | None = None
@@ -214,6 +215,7 @@ class Session:
             arrival: What else is known about it.
             on_pose: Is told what the tracker found, once, as soon as it is known; the map is extended after.
         """
+        self._is_concluded = False
         quality = (
             self._reference.psnr_db(frame.frame_id, frame.image) if self._reference is not None else None
         )
@@ -327,7 +329,13 @@ class Session:
         self._cloud.reset()
 
     def conclude(self) -> MapUpdate | None:
-        """Adjust the whole map, as the settings want it, now that the stream has ended; what that changed."""
+        """Adjust the whole map, as the settings want it, now that the stream has ended; what that changed.
+
+        A second time without a frame in between there is nothing to do.
+        """
+        if self._is_concluded:
+            return None
+        self._is_concluded = True
         since = time.monotonic()
         try:
             num_adjusted = self._reconstruction.conclude()
@@ -339,9 +347,14 @@ class Session:
         return update
 
     @property
+    def is_concluded(self) -> bool:
+        """No frame was processed since ``conclude``."""
+        return self._is_concluded
+
+    @property
     def num_to_adjust(self) -> int:
         """Keyframes that ``conclude`` will adjust."""
-        wanted = self._settings.reconstruction.final_adjustment
+        wanted = self._settings.reconstruction.final_adjustment and not self._is_concluded
         return len(self._reconstruction.world.keyframes) if wanted else 0
 
     @property

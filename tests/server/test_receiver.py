@@ -415,6 +415,18 @@ def test_replay_drops_a_frame_whose_agent_was_restarted_before_its_camera_was_kn
     assert e.metrics.drops == {"epoch": 2}
 
 
+def test_frames_that_come_after_they_were_counted_as_missing_are_missing_no_longer(ends, make):
+    e = ends()
+    e.put(*(make(k) for k in range(5)))
+    until(lambda: e.receiver._arrivals.arrived_seq == 5)
+    e.receiver.count_missing(EPOCH, 10)
+    assert e.metrics.drops == {"missing": 5}
+    e.put(make(7))
+    until(lambda: e.receiver._arrivals.arrived_seq == 8)
+    e.receiver.count_missing(EPOCH, 10)
+    assert e.metrics.drops == {"missing": 4}, "5, 6, 8 and 9"
+
+
 def test_presence_of_the_others_is_known(ends):
     e = ends()
     e.client.declare_alive("a", "agent")
