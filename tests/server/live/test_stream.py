@@ -26,6 +26,7 @@ from semcast.common.wire import pack, unpack
 from semcast.server.export.outputs import read_ply
 from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server
+from semcast.server.session import Session
 from semcast.server.settings import ServerSettings, ViewSettings
 
 pytestmark = pytest.mark.xdist_group("real-time")
@@ -129,6 +130,34 @@ def test_bad_frames_are_counted_and_never_stop_the_stream(air):
     assert summary["drops"]["codec"] == 1
     assert summary["drops"]["outage"] == 1
     assert (summary["frames"]["tracked"], summary["frames"]["sent"]) == (5, 7)
+
+
+def test_a_frame_that_waited_too_long_for_the_tracker_is_dropped(air, monkeypatch):
+    process, begun, go_on = Session.process, threading.Event(), threading.Event()
+
+    def hold_up(session, frame, *rest):
+        if frame.frame_id == 1:
+            begun.set()
+            assert go_on.wait(DEADLINE_S)
+        return process(session, frame, *rest)
+
+    monkeypatch.setattr(Session, "process", hold_up)
+    running = air.serve(max_age_ms=200.0)
+    radio = air.agent(100)
+    radio.stream([0])
+    radio.send(1)
+    assert begun.wait(DEADLINE_S)
+    radio.send(2)
+    deadline_s = time.monotonic() + DEADLINE_S
+    while running.server._ahead._slot is None:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+    time.sleep(0.3)
+    go_on.set()
+    running.wait_for_drop("too_old")
+    radio.stream([3])
+    assert 2 not in radio.posed_ids()
+    running.finish(stop=True)
 
 
 def test_a_bundle_adjustment_that_gave_up_is_in_the_status(air):
