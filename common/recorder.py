@@ -6,7 +6,7 @@ import struct
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from semcast.common.errors import SourceError
@@ -32,14 +32,23 @@ class Recorder:
             and no folder made for it.
         header: See ``recording_metadata``.
         queue_bytes: Payload that may wait for the disk.
+        on_error: Is told in a line why recording ended before it was closed.
 
     Raises:
         SourceError: The file can't be opened.
     """
 
-    def __init__(self, path: Path, header: Mapping[str, str], *, queue_bytes: int = QUEUE_BYTES) -> None:
+    def __init__(
+        self,
+        path: Path,
+        header: Mapping[str, str],
+        *,
+        queue_bytes: int = QUEUE_BYTES,
+        on_error: Callable[[str], None] | None = None,
+    ) -> None:
         self._path = path
         self._limit_bytes = queue_bytes
+        self._on_error = on_error
         self._queue: deque[tuple[str, str, int, int, bytes] | tuple[str, Mapping[str, str]]] = deque()
         self._queued_bytes = 0
         self._sequence: Counter[str] = Counter()
@@ -125,15 +134,18 @@ class Recorder:
 
     def _fail(self, err: Exception) -> None:
         """Say once that recording ended; what was written up to here stays readable."""
+        why = str(err) or type(err).__name__
+        text = f"recording into {self._path} ended: {why}"
         logger.error(
-            "recording into %s ended: %s; the stream goes on, %d messages were recorded",
-            self._path,
-            err,
+            "%s; the stream goes on, %d messages were recorded",
+            text,
             self.num_written,
             exc_info=None if isinstance(err, _EXPECTED) else err,
         )
+        if self._on_error is not None:
+            self._on_error(text)
         with self._condition:
-            self.error = str(err) or type(err).__name__
+            self.error = why
             self.drops["disk"] += self._num_taken - self.num_written
             self._queue.clear()
             self._queued_bytes = 0

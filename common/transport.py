@@ -397,7 +397,7 @@ def open_session(
 def _why_not_met(endpoint: str) -> str:
     return (
         f"something answers at {endpoint}, but not as a server of semcast would: is the protocol right (tcp, "
-        "tls), and are certificates and users what both ends expect (--zenoh-config)?"
+        "tls), and are certificates and users what both ends expect (--zenoh-config)? Or it hangs"
     )
 
 

@@ -8,10 +8,13 @@ from semcast.common.messages import SymbolFrame
 #: An agent that was silent this long may come back with a clock set to the past.
 SILENCE_NS = 3_000_000_000
 _OFFSET_WINDOW_NS = 10_000_000_000
+#: A frame that was captured so much later than others, by their arrival, has a wrong time.
+_MAX_LEAD_NS = 1_000_000_000
 _REMEMBERED = 256
 #: A live agent sends fewer frames a second, and no more between two that arrive without a break.
 _MAX_RATE_HZ, _MAX_GAP = 1000.0, 1000
-#: Frames in a row whose numbers rise, and follow on nothing, before they are taken for the stream.
+#: Frames in a row whose numbers rise, or whose times are ahead, and follow on nothing, before they are taken
+#: for the stream.
 _BELIEVED = 3
 
 
@@ -19,17 +22,26 @@ class CaptureAge:
     """How old frames are, without a common clock.
 
     The offset between the two clocks plus the fastest way is the smallest ``arrival - capture`` of the last
-    10 to 20 seconds; what a frame took more than that is its age.
+    10 to 20 seconds; what a frame took more than that is its age. One frame from the future would make all
+    others too old, so an offset far below is believed only of several in a row, with which all begins anew.
     """
 
     def __init__(self) -> None:
         self._current_ns: int | None = None
         self._previous_ns: int | None = None
         self._since_ns = 0
+        self._num_ahead = 0
 
     def arrived(self, t_capture_ns: int, t_arrival_ns: int) -> None:
         """Learn from a frame."""
         offset_ns = t_arrival_ns - t_capture_ns
+        smallest_ns = self._smallest_ns()
+        if smallest_ns is not None and offset_ns < smallest_ns - _MAX_LEAD_NS:
+            self._num_ahead += 1
+            if self._num_ahead < _BELIEVED:
+                return
+            self._current_ns = self._previous_ns = None
+        self._num_ahead = 0
         if self._current_ns is None or t_arrival_ns - self._since_ns > _OFFSET_WINDOW_NS:
             # After a longer silence all is older: an agent that was suspended has its clock stand still.
             is_recent = t_arrival_ns - self._since_ns <= 2 * _OFFSET_WINDOW_NS
@@ -37,10 +49,14 @@ class CaptureAge:
             self._since_ns = t_arrival_ns
         self._current_ns = min(self._current_ns, offset_ns)
 
+    def _smallest_ns(self) -> int | None:
+        known = (self._current_ns, self._previous_ns)
+        return min((offset_ns for offset_ns in known if offset_ns is not None), default=None)
+
     def age_ms(self, t_capture_ns: int, now_ns: int) -> float:
-        """Return the age of a frame; 0 before anything arrived."""
-        known = [offset for offset in (self._current_ns, self._previous_ns) if offset is not None]
-        return max(0.0, (now_ns - t_capture_ns - min(known)) * 1e-6) if known else 0.0
+        """Return the age of a frame; 0 before anything arrived, and for one from the future."""
+        smallest_ns = self._smallest_ns()
+        return max(0.0, (now_ns - t_capture_ns - smallest_ns) * 1e-6) if smallest_ns is not None else 0.0
 
 
 class Arrivals:
@@ -48,15 +64,17 @@ class Arrivals:
 
     Live: the newest frame seen sets the pace. Reasons of drops: ``duplicate``, ``stale`` (older than one that
     came before it), ``epoch`` (of an agent that was restarted since), ``missing`` (never arrived: seen by the
-    gap in ``seq``; taken back if the frame turns up late), ``ahead`` (numbered as no agent can have got to).
-    When nothing else comes for three seconds, the numbering of what is refused is the one that holds.
+    gap in ``seq``; taken back if the frame turns up late), ``ahead`` (numbered, or with a ``frame_id``, as no
+    agent can have got to). When nothing else comes for three seconds, the numbering of what is refused is the
+    one that holds.
 
-    Lossless: only the frame that follows the last one is taken. Reasons: ``duplicate``, ``epoch``, ``gap``
-    (one before it is missing; the agent will send both again).
+    Lossless: only the frame that follows the last one is taken. Reasons: ``duplicate``, ``epoch``, ``ahead``
+    (of its ``frame_id``), ``gap`` (one before it is missing; the agent will send both again).
 
     Args:
         lossless: Which of the two.
         drop: Is told reason and count.
+        tell: Is told in a line why a frame is ``ahead``.
 
     Attributes:
         epoch: Of the newest agent, 0 before the first frame.
@@ -64,22 +82,37 @@ class Arrivals:
         next_seq: Lossless: first frame the consumer is not done with.
     """
 
-    def __init__(self, *, lossless: bool, drop: Callable[[str, int], None]) -> None:
+    def __init__(
+        self,
+        *,
+        lossless: bool,
+        drop: Callable[[str, int], None],
+        tell: Callable[[str], None] = lambda text: None,
+    ) -> None:
         self.epoch = 0
         self.arrived_seq = 0
         self.next_seq = 0
         self._lossless = lossless
         self._drop = drop
+        self._tell = tell
         self._last_ns = 0
         self._taken_ns = 0
         self._odd_in_order, self._odd_seq = 0, 0
+        self._frame_id: int | None = None  # of the newest frame taken
+        self._leaps_in_order, self._leap_id = 0, 0
         self._recent: deque[int] = deque()
         self._forgotten_seq = 0  # the newest one that may have come without being remembered
         self._done_early: set[int] = set()
         self._age = CaptureAge()
 
-    def accept(self, frame: SymbolFrame, arrival_ns: int) -> bool:
-        """Tell whether a frame counts, and count it under its reason where it does not."""
+    def accept(self, frame: SymbolFrame, arrival_ns: int, frame_step: int = 1) -> bool:
+        """Tell whether a frame counts, and count it under its reason where it does not.
+
+        Args:
+            frame: That arrived.
+            arrival_ns: When.
+            frame_step: Usual difference of the ids of two frames, see ``CameraInfo.frame_step``.
+        """
         if frame.agent_epoch != self.epoch:
             silent = arrival_ns - self._last_ns > SILENCE_NS
             if frame.agent_epoch < self.epoch and not silent:
@@ -99,15 +132,22 @@ class Arrivals:
             self._drop("duplicate", 1)
             return False
         elif self._is_odd(frame, arrival_ns):
-            if self._odd_in_order < _BELIEVED or arrival_ns - self._taken_ns <= SILENCE_NS:
+            if not self._is_believed(self._odd_in_order, arrival_ns):
                 self._refuse(frame)
                 return False
             # One message with a number out of nowhere must not shut out all others for good.
             self._start(frame)
-        else:
-            self._drop("missing", frame.seq - self.arrived_seq)
-        self._odd_in_order = 0
+        if self._leaps(frame, arrival_ns, frame_step) and not self._is_believed(
+            self._leaps_in_order, arrival_ns
+        ):
+            # Once tracked, it would make frames of all ids below it count as tracked too.
+            self._drop("ahead", 1)
+            self._tell(f"frame {frame.frame_id} is left out: it can't follow frame {self._frame_id}")
+            return False
+        self._drop("missing", frame.seq - self.arrived_seq)
+        self._odd_in_order = self._leaps_in_order = 0
         self.arrived_seq = frame.seq + 1
+        self._frame_id = frame.frame_id
         self._taken_ns = arrival_ns
         self._remember(frame.seq)
         self._age.arrived(frame.t_capture_ns, arrival_ns)
@@ -115,16 +155,36 @@ class Arrivals:
 
     def _is_odd(self, frame: SymbolFrame, arrival_ns: int) -> bool:
         """Tell whether a live frame's number is not one that can follow; count those that rise."""
-        since_s = (arrival_ns - self._taken_ns) * 1e-9
-        if 0 <= frame.seq - self.arrived_seq <= _MAX_GAP + since_s * _MAX_RATE_HZ:
+        if 0 <= frame.seq - self.arrived_seq <= self._farthest(arrival_ns):
             return False
         self._odd_in_order = self._odd_in_order + 1 if frame.seq > self._odd_seq else 1
         self._odd_seq = frame.seq
         return True
 
+    def _leaps(self, frame: SymbolFrame, arrival_ns: int, frame_step: int) -> bool:
+        """Tell whether a frame's id is above all that can follow; count those that do not fall.
+
+        Where it falls, the frame is one that was tracked before, and the consumer's business.
+        """
+        if self._frame_id is None:
+            return False
+        if frame.frame_id - self._frame_id <= frame_step * (1 + self._farthest(arrival_ns)):
+            return False
+        self._leaps_in_order = self._leaps_in_order + 1 if frame.frame_id >= self._leap_id else 1
+        self._leap_id = frame.frame_id
+        return True
+
+    def _farthest(self, arrival_ns: int) -> float:
+        """Return how many frames an agent can have gone on since the newest that was taken."""
+        return _MAX_GAP + (arrival_ns - self._taken_ns) * 1e-9 * _MAX_RATE_HZ
+
+    def _is_believed(self, num_in_order: int, arrival_ns: int) -> bool:
+        return num_in_order >= _BELIEVED and arrival_ns - self._taken_ns > SILENCE_NS
+
     def _refuse(self, frame: SymbolFrame) -> None:
         if frame.seq > self.arrived_seq:
             self._drop("ahead", 1)
+            self._tell(f"a frame is left out: number {frame.seq} can't follow number {self.arrived_seq - 1}")
             return
         # It was counted as missing when a later one came, unless that was before this receiver's time, or it
         # came and is no longer remembered.
@@ -144,6 +204,7 @@ class Arrivals:
         self.arrived_seq = frame.base_seq if self._lossless else frame.seq
         self.next_seq = self.arrived_seq
         self._forgotten_seq = self.arrived_seq
+        self._frame_id = None
         self._recent.clear()
         self._done_early.clear()
         self._age = CaptureAge()

@@ -5,7 +5,7 @@ One uncompressed ``.npz`` (a zip of plain arrays with a CRC each, read without p
 
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -115,14 +115,17 @@ def mismatch(header: CheckpointHeader, wanted: Mapping[str, Any]) -> str | None:
 class CheckpointWriter:
     """Writes checkpoints on its own thread; of several waiting only the newest is written.
 
-    One that can't be written is counted in ``num_failed``, the first is reported, and the next one is tried.
+    One that can't be written is counted in ``num_failed``, and the next one is tried. Of several in a row the
+    first is logged.
 
     Args:
         path: The checkpoint file.
+        on_error: Is told in a line, each time, that it can't be written.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, on_error: Callable[[str], None] | None = None) -> None:
         self._path = path
+        self._on_error = on_error
         self._box: Mailbox[Checkpoint] = Mailbox(1, "newest")
         self.num_written = 0
         self.num_failed = 0
@@ -134,18 +137,30 @@ class CheckpointWriter:
         self._box.put(checkpoint)
 
     def _run(self) -> None:
+        is_failing = False
         while (checkpoint := self._box.get()) is not None:
             try:
                 save_checkpoint(self._path, checkpoint)
-                self.num_written += 1
             except Exception as err:
-                self.num_failed += 1
-                if self.num_failed == 1:
-                    logger.warning(
-                        "%s; the stream goes on without checkpoints",
-                        str(err) or type(err).__name__,
-                        exc_info=not isinstance(err, CheckpointError),
-                    )
+                self._fail(err, is_first=not is_failing)
+                is_failing = True
+                continue
+            self.num_written += 1
+            if is_failing:
+                logger.warning("checkpoints are written again")
+            is_failing = False
+
+    def _fail(self, err: Exception, *, is_first: bool) -> None:
+        self.num_failed += 1
+        text = str(err) or type(err).__name__
+        if is_first:
+            logger.warning(
+                "%s; the stream goes on, and the next checkpoint is tried",
+                text,
+                exc_info=None if isinstance(err, CheckpointError) else err,
+            )
+        if self._on_error is not None:
+            self._on_error(f"no checkpoint: {text}")
 
     def close(self, deadline_s: float = 10.0) -> None:
         """Write what waits and end the thread. Idempotent."""

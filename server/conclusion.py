@@ -21,6 +21,7 @@ def conclude(
     show: Callable[[MapUpdate | None, Sequence[DensePatch]], None],
     tell: Callable[[str], None],
     depth_budget_s: float | None = None,
+    gives_way: Callable[[], bool] = lambda: False,
 ) -> None:
     """Adjust the whole map of a stream that has ended, and complete its dense cloud.
 
@@ -29,6 +30,7 @@ def conclude(
         show: Takes what changed in the map and in the cloud, as it does.
         tell: Takes what is going on in a few words, before each step.
         depth_budget_s: Depth that is still missing by then is left out; None waits for all.
+        gives_way: Tells, after each depth, that the rest is left for later.
     """
     if num_keyframes := session.num_to_adjust:
         tell(f"last adjustment of {num_keyframes} keyframes")
@@ -50,4 +52,6 @@ def conclude(
         if time.monotonic() - logged_s > _LOG_INTERVAL_S:
             logged_s = time.monotonic()
             logger.info("%s", how_far)
+        if gives_way():
+            break
     tell("writing results")

@@ -20,7 +20,8 @@ class DecodeAhead(Generic[In, Out]):
     """One slot between decoder and tracker.
 
     The next message is taken only when the slot is free: while the tracker is busy, frames wait (or are
-    superseded) where they arrive, and a decoded one never waits longer than the tracker's last frame took.
+    superseded) where they arrive, and a decoded one never waits longer than the tracker's last frame took. In
+    an overload that is long.
 
     Args:
         take: Waits up to the given seconds for a message; None when there was none. Where it fails, that is
@@ -28,6 +29,8 @@ class DecodeAhead(Generic[In, Out]):
         decode: Turns a message into what the tracker takes.
         on_failure: Is told the message and ``codec`` (the sender uses another codec or a message makes no
             sense) or ``decode`` (the decoder failed); the stream goes on.
+        is_stale: Tells of a decoded one that waited, when the tracker comes for it, that it is not wanted any
+            more, and counts it. One that the tracker waited for is as new as can be, and not asked about.
     """
 
     def __init__(
@@ -35,10 +38,12 @@ class DecodeAhead(Generic[In, Out]):
         take: Callable[[float], In | None],
         decode: Callable[[In], Out],
         on_failure: Callable[[In, str], None],
+        is_stale: Callable[[Out], bool] = lambda decoded: False,
     ) -> None:
         self._take = take
         self._decode = decode
         self._on_failure = on_failure
+        self._is_stale = is_stale
         self._slot: Out | None = None
         #: A message was taken and is not decoded yet.
         self.is_busy = False
@@ -86,6 +91,9 @@ class DecodeAhead(Generic[In, Out]):
     def get(self, timeout_s: float) -> Out | None:
         """Return the next decoded frame, None when there was none in time."""
         with self._condition:
+            if self._slot is not None and self._is_stale(self._slot):
+                self._slot = None
+                self._condition.notify_all()
             self._condition.wait_for(lambda: self._slot is not None, timeout_s)
             decoded, self._slot = self._slot, None
             self._condition.notify_all()

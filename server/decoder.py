@@ -1,6 +1,7 @@
 """From equalised symbols to an image with confidence, by the codec each message names."""
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -22,6 +23,10 @@ from semcast.server.receiver import ReceivedFrame
 logger = logging.getLogger(__name__)
 
 CodecLoader = Callable[[str, Modulation], Codec]
+
+#: Pixels a codec is warmed up with at most. A camera says itself how large its images are, and what it says
+#: must not cost a minute and gigabytes before it has sent any.
+MAX_WARM_UP_PX = 1920 * 1080
 
 
 def codec_loader(
@@ -168,10 +173,14 @@ class FrameDecoder:
     def warm_up(self, name: str, modulation: Modulation, digest: str, shape_hw: tuple[int, int]) -> None:
         """Load a stream's codec and run it once on nothing, which is slower than all later frames.
 
+        An image of more than ``MAX_WARM_UP_PX`` pixels is stood for by a smaller one.
+
         Raises:
             CheckpointError: See ``codec_for``.
             ConfigError: See ``codec_for``.
         """
+        scale = min(1.0, math.sqrt(MAX_WARM_UP_PX / math.prod(shape_hw)))
+        shape_hw = (max(1, math.floor(scale * shape_hw[0])), max(1, math.floor(scale * shape_hw[1])))
         layout = layout_for(shape_hw)
         nothing = ReceivedImage(
             shape_hw=shape_hw,

@@ -3,11 +3,13 @@
 import contextlib
 import json
 import logging
+import os
+import time
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -24,6 +26,8 @@ from semcast.server.sent_frames import Stretch, unposed_ranges
 logger = logging.getLogger(__name__)
 
 MAX_ROWS_IN_MEMORY = 20_000
+#: How long rows wait for a file that could not be written before it is tried again.
+RETRY_S = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,44 +99,119 @@ class FrameRow:
 class FrameRows:
     """Appends rows to ``frames.jsonl``, which survives a kill; without a folder keeps the newest in memory.
 
+    Rows that the file does not take, as on a full disk, wait in memory until it does.
+
     Args:
         folder: Where the file goes, or None.
-        resume: Go on behind the rows that are there; otherwise they are replaced.
+        resume: Go on behind the rows that are there, without lines that are none; otherwise they are
+            replaced.
+        on_error: Is told in a line, each time, that the file can't be written.
+        clock: Returns seconds.
 
     Raises:
-        SemcastError: The file can't be written, or what is there can't be read.
+        SemcastError: The file can't be written.
     """
 
-    def __init__(self, folder: Path | None, *, resume: bool = False) -> None:
-        self._memory: deque[FrameRow] = deque(maxlen=MAX_ROWS_IN_MEMORY)
+    def __init__(
+        self,
+        folder: Path | None,
+        *,
+        resume: bool = False,
+        on_error: Callable[[str], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._waiting: deque[FrameRow] = deque(maxlen=MAX_ROWS_IN_MEMORY)
+        self._num_forgotten = 0
         self._path = folder / FRAMES_NAME if folder is not None else None
-        self._file: TextIO | None = None
+        self._file: BinaryIO | None = None
+        self._on_error = on_error
+        self._clock = clock
+        self._failed_s: float | None = None
+        self._num_bytes = 0  # of the file, up to the end of its last whole row
         if self._path is None:
             return
         try:
-            kept = read_rows(self._path) if resume else []
+            kept = _rows_to_resume(self._path) if resume else []
             with whole_file(self._path) as file:
-                file.writelines(_line(row).encode() for row in kept)
-            self._file = self._path.open("a", encoding="utf-8")
+                file.writelines(_line(row) for row in kept)
+                self._num_bytes = file.tell()
+            self._open(self._path)
         except OSError as err:
             raise SemcastError(f"{self._path} can't be written: {err}") from err
 
     def add(self, row: FrameRow) -> None:
-        """Append a row. A full disk is reported once; later rows stay in memory and the stream goes on."""
-        if self._file is not None:
+        """Append a row. Where the file can't be written, it is tried again later and the stream goes on."""
+        self._num_forgotten += len(self._waiting) == MAX_ROWS_IN_MEMORY
+        self._waiting.append(row)
+        if self._path is None or (self._failed_s is not None and self._clock() - self._failed_s < RETRY_S):
+            return
+        try:
+            self._write(self._path)
+        except OSError as err:
+            self._fail(err)
+
+    def _open(self, path: Path) -> None:
+        """Open the file behind its last whole row: of one on a full disk a part may be there."""
+        self._file = path.open("ab", buffering=0)
+        size = self._file.seek(0, os.SEEK_END)
+        if size > self._num_bytes:
+            self._file.truncate(self._num_bytes)
+        self._num_bytes = min(size, self._num_bytes)
+
+    def _write(self, path: Path) -> None:
+        """Let the file take all that waits.
+
+        Raises:
+            OSError: It does not; the rest waits.
+        """
+        if self._file is None:
+            self._open(path)
+        assert self._file is not None
+        while self._waiting:
+            line = memoryview(_line(self._waiting[0]))
+            num_bytes = len(line)
+            while line:
+                line = line[self._file.write(line) :]
+            self._num_bytes += num_bytes
+            self._waiting.popleft()
+        if self._failed_s is not None:
+            self._failed_s = None
+            logger.warning("%s is written again%s", path, self._loss())
+
+    def _loss(self) -> str:
+        number = self._num_forgotten
+        return f", but {number} rows that waited for it are lost" if number else ", with the rows that waited"
+
+    def _fail(self, err: OSError) -> None:
+        text = f"{self._path} can't be written: {err}"
+        if self._failed_s is None:
+            logger.warning("%s; rows wait in memory, and it is tried again every %g s", text, RETRY_S)
+        if self._on_error is not None:
+            self._on_error(text)
+        self._failed_s = self._clock()
+        self.close()
+
+    def finish(self) -> None:
+        """Let the file take the rows that still wait, for nothing more comes.
+
+        Raises:
+            OSError: It does not take them, or some waited for so long that they are lost.
+        """
+        if self._path is None:
+            return
+        if self._waiting:
             try:
-                self._file.write(_line(row))
-                self._file.flush()
-                return
-            except OSError as err:
-                logger.warning("%s can't be written: %s; rows are kept in memory now", self._path, err)
+                self._write(self._path)
+            except OSError:
                 self.close()
-        self._memory.append(row)
+                raise
+        if self._num_forgotten:
+            raise OSError(f"{self._num_forgotten} rows are lost")
 
     def rows(self) -> list[FrameRow]:
         """Return all rows, also those of a run this one resumed."""
         on_disk = read_rows(self._path) if self._path is not None else []
-        return [*on_disk, *self._memory]
+        return [*on_disk, *self._waiting]
 
     def close(self) -> None:
         """Close the file. Idempotent."""
@@ -142,8 +221,33 @@ class FrameRows:
                 file.close()
 
 
-def _line(row: FrameRow) -> str:
-    return json.dumps(plain(asdict(row)), allow_nan=False) + "\n"
+def _line(row: FrameRow) -> bytes:
+    return (json.dumps(plain(asdict(row)), allow_nan=False) + "\n").encode()
+
+
+def _rows_to_resume(path: Path) -> list[FrameRow]:
+    """Read the rows of a run that goes on; it must not end for good with a damaged line."""
+    rows, bad = _read(path)
+    if bad:
+        logger.warning("%s: %d lines are no frame rows and are left out: %s", path, len(bad), bad[0])
+    return rows
+
+
+def _read(path: Path) -> tuple[list[FrameRow], list[str]]:
+    """Return the rows of a file and what is wrong with lines that are none, but for the last one."""
+    if not path.exists():
+        return [], []
+    rows: dict[int, FrameRow] = {}
+    bad: list[str] = []
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
+    for number, line in enumerate(lines, start=1):
+        try:
+            row = FrameRow(**json.loads(line))
+            rows[row.frame_id] = row
+        except (ValueError, TypeError) as err:
+            if number < len(lines):
+                bad.append(f"{path}:{number} is not a frame row: {err}")
+    return list(rows.values()), bad
 
 
 def read_rows(path: Path) -> list[FrameRow]:
@@ -154,19 +258,10 @@ def read_rows(path: Path) -> list[FrameRow]:
     Raises:
         SemcastError: A line before the last one is not a row.
     """
-    if not path.exists():
-        return []
-    rows: dict[int, FrameRow] = {}
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
-    for number, line in enumerate(lines, start=1):
-        try:
-            row = FrameRow(**json.loads(line))
-            rows[row.frame_id] = row
-        except (ValueError, TypeError) as err:
-            if number == len(lines):
-                break
-            raise SemcastError(f"{path}:{number} is not a frame row: {err}") from err
-    return list(rows.values())
+    rows, bad = _read(path)
+    if bad:
+        raise SemcastError(bad[0])
+    return rows
 
 
 def summarise(

@@ -37,6 +37,8 @@ FLOW_INTERVAL_S = 0.2
 _CAMERA_PAUSE_S = 0.05
 _KEPT_REPORTS = 256
 _KEPT_CAMERAS = 16
+#: Different texts about one thing that are logged: nonsense without end must not hide what helps.
+_MAX_TOLD = 10
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class Receiver:
         agent_id: Whose frames.
         mode: Service.
         metrics: Where to count.
-        max_age_ms: Live frames older than this are dropped, but for a source's last one.
+        max_age_ms: Live frames older than this are dropped, but for a source's last one, see ``is_too_old``.
     """
 
     def __init__(
@@ -109,7 +111,9 @@ class Receiver:
         self._metrics = metrics
         self._max_age_ms = max_age_ms
         self._lock = threading.Lock()
-        self._arrivals = Arrivals(lossless=mode == "replay", drop=metrics.drop)
+        self._arrivals = Arrivals(
+            lossless=mode == "replay", drop=metrics.drop, tell=lambda text: self._tell("ahead", text)
+        )
         self._box: Backlog[tuple[SymbolFrame, int]] | Mailbox[tuple[SymbolFrame, int]] = (
             Backlog() if mode == "live" else Mailbox(4 * WINDOW, "newest")
         )
@@ -119,7 +123,8 @@ class Receiver:
         self._num_superseded = self._num_given_way = 0
         self._reporter: tuple[tuple[int, str], LinkReporter] | None = None
         self._roles: set[str] = set()
-        self._told: set[str] = set()
+        self._missing_behind = (0, 0)  # epoch, and what was counted of it by ``count_missing``
+        self._told: dict[str, set[str]] = {}
         self._link = session.publisher(link_key(agent_id), "newest")
         self._flow = session.publisher(flow_key(agent_id), "newest")
         self._stopping = threading.Event()
@@ -153,15 +158,24 @@ class Receiver:
             return self._arrivals.epoch
 
     def count_missing(self, agent_epoch: int, num_sent: int | None) -> None:
-        """Count the frames behind the newest that never came, of so many that were sent; None: not known."""
-        if num_sent is not None and self._mode == "live":
-            with self._lock:
-                arrived_seq = self._arrivals.arrived_seq if agent_epoch == self._arrivals.epoch else 0
-            self._metrics.drop("missing", max(0, num_sent - arrived_seq))
+        """Count the frames behind the newest that never came, of so many that were sent; None: not known.
 
-    def _tell_once(self, text: str) -> None:
-        if text not in self._told and len(self._told) < 100:
-            self._told.add(text)
+        If some come all the same, it can be done again.
+        """
+        if num_sent is None or self._mode != "live":
+            return
+        with self._lock:
+            arrived_seq = self._arrivals.arrived_seq if agent_epoch == self._arrivals.epoch else 0
+            counted = self._missing_behind[1] if self._missing_behind[0] == agent_epoch else 0
+            self._missing_behind = agent_epoch, max(0, num_sent - arrived_seq)
+            self._metrics.drop("missing", self._missing_behind[1] - counted)
+
+    def _tell(self, about: str, text: str) -> None:
+        """Show in the status what is wrong with what arrives, and log it the first time."""
+        self._metrics.error(text)
+        told = self._told.setdefault(about, set())
+        if text not in told and len(told) < _MAX_TOLD:
+            told.add(text)
             logger.warning("%s", text)
 
     def _on_alive(self, role: str, alive: bool) -> None:
@@ -198,7 +212,7 @@ class Receiver:
     def _refuse(self, err: WireError) -> None:
         self._metrics.drop("protocol")
         self._metrics.count(f"protocol_{err.reason}")
-        self._tell_once(f"a message was refused: {err}")
+        self._tell(err.reason, f"a message was refused: {err}")
 
     def _on_symbols(self, payload: bytes) -> None:
         arrival_ns = time.perf_counter_ns()
@@ -212,8 +226,8 @@ class Receiver:
         if frame.lossless != (self._mode == "replay"):
             self._metrics.drop("mode")
             there = "replay" if frame.lossless else "live"
-            self._tell_once(
-                f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
+            self._tell(
+                "mode", f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
             )
         else:
             self._sort(frame, arrival_ns)
@@ -222,7 +236,8 @@ class Receiver:
     def _sort(self, frame: SymbolFrame, arrival_ns: int) -> None:
         with self._lock:
             new_epoch = frame.agent_epoch != self._arrivals.epoch
-            taken = self._arrivals.accept(frame, arrival_ns)
+            camera = self._cameras.get(frame.agent_epoch)
+            taken = self._arrivals.accept(frame, arrival_ns, camera.frame_step if camera is not None else 1)
             if taken and new_epoch:
                 dropped = self._box.clear()
                 self._metrics.drop("epoch", dropped)
@@ -302,16 +317,23 @@ class Receiver:
             return None
         return held
 
-    def _prepare(self, message: SymbolFrame, arrival_ns: int) -> ReceivedFrame | None:
+    def is_too_old(self, message: SymbolFrame) -> bool:
+        """Tell whether a frame is older than live frames may be, and count it as dropped if so."""
         age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
-        live = self._mode == "live"
-        if live and age_ms > self._max_age_ms and not message.final:  # the final one ends the stream
+        # The final one ends the stream.
+        too_old = self._mode == "live" and age_ms > self._max_age_ms and not message.final
+        if too_old:
             self._metrics.drop("too_old")
+        return too_old
+
+    def _prepare(self, message: SymbolFrame, arrival_ns: int) -> ReceivedFrame | None:
+        if self.is_too_old(message):
             return None
+        age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
         camera = self._camera_of(message.agent_epoch)
         if camera is None:
-            self._tell_once("frames arrive, but the agent does not say what its camera is")
-            if live:
+            self._tell("camera", "frames arrive, but the agent does not say what its camera is")
+            if self._mode == "live":
                 self._metrics.drop("camera")
             else:
                 self._held = (message, arrival_ns)
@@ -321,8 +343,9 @@ class Receiver:
             self._metrics.count("lost_on_air")
         elif not belongs_to(message.image_hw, camera.intrinsics.shape_hw):
             self._metrics.drop("protocol")
-            self._tell_once(
-                f"frames are {message.image_hw}, no coded size of the camera's {camera.intrinsics.shape_hw}"
+            self._tell(
+                "size",
+                f"frames are {message.image_hw}, no coded size of the camera's {camera.intrinsics.shape_hw}",
             )
             self.done(message)
             return None

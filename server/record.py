@@ -111,7 +111,13 @@ class StreamNotes:
 
 
 @contextlib.contextmanager
-def recording(session: Session, agent_id: str, file: Path, settings_toml: str) -> Iterator[Recorder]:
+def recording(
+    session: Session,
+    agent_id: str,
+    file: Path,
+    settings_toml: str,
+    on_error: Callable[[str], None] | None = None,
+) -> Iterator[Recorder]:
     """Record all that is sent about one agent while the context lasts.
 
     Args:
@@ -119,12 +125,13 @@ def recording(session: Session, agent_id: str, file: Path, settings_toml: str) -
         agent_id: Whose stream.
         file: Recording to write; one that is there is kept under another name.
         settings_toml: Resolved settings of the program, kept in the recording.
+        on_error: Is told at once, in a line, why the file can't be written any more.
 
     Raises:
         SourceError: The file can't be written, said before anything else; or it could not be written to its
             end, said when the context ends.
     """
-    with Recorder(file, recording_metadata(settings_toml, __version__)) as recorder:
+    with Recorder(file, recording_metadata(settings_toml, __version__), on_error=on_error) as recorder:
 
         def ask(key: str) -> bytes | None:
             with contextlib.suppress(TransportError):  # the session ends while we are at it

@@ -13,7 +13,7 @@ from semcast.common.codec import Codec, Modulation
 from semcast.common.codecs import named_weights
 from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError
-from semcast.common.keys import CAMERA_TIMEOUT_S, camera_key, control_key, map_key
+from semcast.common.keys import control_key, map_key
 from semcast.common.message_fields import sendable
 from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
 from semcast.common.metrics import Metrics
@@ -22,11 +22,13 @@ from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
 from semcast.common.transport import open_session
 from semcast.common.wire import WireError, pack, unpack
+from semcast.server.announcement import Announcement
 from semcast.server.conclusion import conclude
 from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import Arrival, DecodedArrival, FrameDecoder, codec_loader
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.former_run import free_folder, output_folder
+from semcast.server.former_starts import FormerStarts
 from semcast.server.frame_views import missing_view
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.state import MapUpdate
@@ -45,8 +47,6 @@ logger = logging.getLogger(__name__)
 
 POLL_S = 0.1
 WARM_UP_SHAPE_HW = (256, 384)
-#: How long after a restart of the agent its former start's frames may still come: above any channel's delay.
-STRAGGLER_NS = 20_000_000_000
 #: Time for depth that is still missing where another stream waits, and where the server was stopped.
 _IN_A_HURRY_S, _STOPPED_S = 2.0, 12.0
 #: How long a control request waits to be served; a busy server answers that it is not done yet.
@@ -59,6 +59,8 @@ class Server:
     A restarted agent begins a new map in the same folder; what the former one left is moved to
     ``previous-<n>/``. A restarted server goes on with the map of its checkpoint if the agent is the same.
     Files that can't be written are reported and the stream goes on; they are an error at the end of ``run``.
+
+    One that keeps running writes the outputs of a stream when it ends and waits for the next one.
 
     Args:
         settings: What to do.
@@ -84,11 +86,8 @@ class Server:
         self._session: Session | None = None
         self._views = SuccessiveViews(settings)
         self._reference: Reference | None = None
-        self._former_epochs: set[int] = set()
-        self._begun_ns = 0
+        self._former_starts = FormerStarts()
         self._desk = RequestDesk()
-        self._announced: CameraInfo | None = None
-        self._inbox_lock = threading.Lock()
         self._drops_before: dict[str, int] = {}
         self._spare_bundle: BundleRunner | None = None
         self._new_map = False
@@ -97,7 +96,8 @@ class Server:
             stack.callback(self._desk.close)
             stack.enter_context(output_folder(settings.out))
             if settings.record is not None:
-                stack.enter_context(recording(session, self._agent_id, settings.record, to_toml(settings)))
+                record, told = settings.record, self._metrics.error
+                stack.enter_context(recording(session, self._agent_id, record, to_toml(settings), told))
             self._receiver = stack.enter_context(
                 Receiver(session, self._agent_id, settings.mode, self._metrics, settings.max_age_ms)
             )
@@ -112,9 +112,13 @@ class Server:
             session.answer(map_key(self._agent_id), self._answer_map)
             stack.callback(self._close_spare)
             self._make_ready()
-            session.subscribe(camera_key(self._agent_id), "every", self._on_camera)
-            self._ask_for_camera(session)
-            self._ahead = DecodeAhead(self._receiver.next, self._decoder.decode, self._on_failure)
+            self._announced = Announcement(session, self._agent_id)
+            self._ahead = DecodeAhead(
+                self._receiver.next,
+                self._decoder.decode,
+                self._on_failure,
+                lambda decoded: self._receiver.is_too_old(decoded.arrival.message),
+            )
             stack.callback(self._ahead.close)
             session.declare_alive(self._agent_id, "server")
             self._resources = stack.pop_all()
@@ -134,21 +138,6 @@ class Server:
         bundle, self._spare_bundle = self._spare_bundle, None
         if bundle is not None:
             bundle.close()
-
-    def _ask_for_camera(self, session: NetworkSession) -> None:
-        """Learn at once of an agent that is already there."""
-        if "agent" in session.alive_roles(self._agent_id, CAMERA_TIMEOUT_S):
-            answer = session.request(camera_key(self._agent_id), b"", CAMERA_TIMEOUT_S)
-            if answer is not None:
-                self._on_camera(answer)
-
-    def _on_camera(self, payload: bytes) -> None:
-        """Note an announced stream; the receiver counts and reports what is not valid."""
-        with contextlib.suppress(WireError):
-            camera = unpack(payload, CameraInfo)
-            with self._inbox_lock:
-                if self._announced is None or camera.agent_epoch > self._announced.agent_epoch:
-                    self._announced = camera
 
     def _on_failure(self, arrival: ReceivedFrame, reason: str) -> None:
         self._metrics.drop(reason)
@@ -198,7 +187,9 @@ class Server:
                     self._take(decoded)
                     self._receiver.done(decoded.arrival.message)
                 elif self._ended(now_s - last_frame_s):
-                    break
+                    if not self._settings.keep_running:
+                        break
+                    self._write_between()
                 if self._settings.duration_s is not None and now_s - started_s >= self._settings.duration_s:
                     break
         finally:
@@ -207,15 +198,31 @@ class Server:
         return summary
 
     def _ended(self, idle_s: float) -> bool:
-        """Tell whether nothing more is to come, after a pause of ``idle_s``."""
-        if self._session is None or self._settings.keep_running:
+        """Tell whether nothing more is to come, after a pause of ``idle_s``; of one stream only once."""
+        if self._session is None or self._session.is_concluded:
             return False
         epoch, is_there = self._session.identity.agent_epoch, "agent" in self._receiver.roles_alive
         if self._end_of.has_come(epoch, idle_s, agent_is_there=is_there, is_busy=self._ahead.is_busy):
             self._receiver.count_missing(epoch, self._end_of.num_sent(epoch))
             return True
         limit_s = self._settings.idle_timeout_s
-        return limit_s is not None and idle_s >= limit_s
+        return limit_s is not None and idle_s >= limit_s and not self._settings.keep_running
+
+    def _write_between(self) -> None:
+        """Write what the stream that has ended leaves, and go on: frames of it may come all the same."""
+        session, out = self._session, self._settings.out
+        assert session is not None
+        # Depth that is missing when the agent was started again is given a little time then.
+        epoch = session.identity.agent_epoch
+        self._conclude(session, None, lambda: self._announced.is_newer(epoch))
+        try:
+            self._write(session, out)
+        except (OSError, SemcastError) as err:
+            self._tell_not_written(out, err)
+        else:
+            if out is not None:
+                logger.info("outputs are in %s, waiting for the next stream", out)
+        self._be_at("")
 
     def _serve_requests(self) -> None:
         serve = {"reset": self._reset, "save": self._save, "map": self._whole_map}
@@ -252,8 +259,7 @@ class Server:
 
     def _prepare(self) -> None:
         """Begin on an announced stream, so that codec, viewer and map are ready for its first frame."""
-        with self._inbox_lock:
-            camera, self._announced = self._announced, None
+        camera = self._announced.take()
         if camera is None or (
             self._session is not None and camera.agent_epoch <= self._session.identity.agent_epoch
         ):
@@ -275,7 +281,8 @@ class Server:
         """Track one frame, send and show what came of it. One bad frame never stops the stream."""
         message = decoded.arrival.message
         session = self._session
-        if self._is_straggler(decoded.arrival):
+        is_first = session is not None and session.last_frame_id < 0
+        if is_first and self._former_starts.is_straggler(message.agent_epoch, decoded.arrival.t_arrival_ns):
             self._metrics.drop("epoch")
             return
         if session is None or session.identity.agent_epoch != message.agent_epoch:
@@ -301,20 +308,6 @@ class Server:
             self._metrics.error(f"frame {message.frame_id}: {err}")
             return
         self._spread(decoded, outcome)
-
-    def _is_straggler(self, arrival: ReceivedFrame) -> bool:
-        """Tell whether a frame is of a former start of the agent, while there is none of the present one yet.
-
-        Such a frame was decoded, or on its way, when the present start was announced. If frames of the former
-        one keep coming, it is the one that lives.
-        """
-        session = self._session
-        return (
-            session is not None
-            and session.last_frame_id < 0
-            and arrival.message.agent_epoch in self._former_epochs
-            and arrival.t_arrival_ns - self._begun_ns < STRAGGLER_NS
-        )
 
     def _spread(self, decoded: DecodedArrival, outcome: Outcome) -> None:
         """Publish what a frame did to the map, show and count what it led to; its pose is on its way."""
@@ -342,7 +335,6 @@ class Server:
             self._views.end_stream()
             self._end_former(former)
             self._be_at("")
-        self._former_epochs.discard(identity.agent_epoch)
         self._end_of.begin()
         other_camera = former is not None and former.identity.camera != identity.camera
         if other_camera and self._reference is not None:
@@ -353,7 +345,7 @@ class Server:
                 self._settings.reference, identity.camera, self._settings.camera
             )
         self._session = self._new_session(identity, goes_on=former is not None)
-        self._begun_ns = time.perf_counter_ns()
+        self._former_starts.begin(identity.agent_epoch)
         self._drops_before = self._metrics.drops if former is not None else {}
         self._show(identity, self._session.resumed, goes_on=former is not None)
         logger.info(
@@ -367,7 +359,7 @@ class Server:
         out = self._settings.out
         bundle = self._spare_bundle or new_bundle(self._settings, self._metrics.error)
         self._spare_bundle = None
-        new = functools.partial(Session, self._settings, identity, on_give_up=self._metrics.error)
+        new = functools.partial(Session, self._settings, identity, on_error=self._metrics.error)
         try:
             return new(out, self._reference, bundle)
         except (OSError, SemcastError) as err:
@@ -386,7 +378,9 @@ class Server:
             logger.error("the new stream is not shown: %s", err)
             self._metrics.error(str(err))
 
-    def _conclude(self, session: Session, depth_budget_s: float | None) -> None:
+    def _conclude(
+        self, session: Session, depth_budget_s: float | None, gives_way: Callable[[], bool] = lambda: False
+    ) -> None:
         """Adjust the whole map of a stream that has ended, and tell who follows it."""
         self._save(session)  # the adjustment takes seconds, and the server may be stopped or killed meanwhile
 
@@ -395,7 +389,7 @@ class Server:
                 self._outbox.put_map(session.identity.agent_epoch, update)
             self._views.submit(None, update, patches)
 
-        conclude(session, show, self._be_at, depth_budget_s)
+        conclude(session, show, self._be_at, depth_budget_s, gives_way)
 
     def _be_at(self, activity: str) -> None:
         """Let the status say at once what the server is at; see ``Metrics.be_at``."""
@@ -409,9 +403,7 @@ class Server:
 
     def _end_former(self, former: Session) -> None:
         """Write what the agent's start before leaves behind; that it can't be written ends no stream."""
-        if former.last_frame_id >= 0:
-            self._former_epochs.clear()
-        self._former_epochs.add(former.identity.agent_epoch)
+        self._former_starts.end(former.identity.agent_epoch, had_frames=former.last_frame_id >= 0)
         out = self._settings.out
         folder = free_folder(out) if out is not None else None
         try:
@@ -422,14 +414,17 @@ class Server:
     def _end(self, session: Session, folder: Path | None) -> dict[str, Any]:
         """Write what a stream leaves behind into a folder and release it."""
         try:
-            complete, num_sent = self._end_of.complete, self._end_of.num_sent(session.identity.agent_epoch)
-            if not complete:
-                session.save_checkpoint()
-            return session.write_outputs(folder, self._drops(), complete=complete, num_sent=num_sent)
+            return self._write(session, folder)
         finally:
             session.close()
             if folder is not None and folder != self._settings.out:
                 session.move_records(folder)
+
+    def _write(self, session: Session, folder: Path | None) -> dict[str, Any]:
+        complete, num_sent = self._end_of.complete, self._end_of.num_sent(session.identity.agent_epoch)
+        if not complete:
+            session.save_checkpoint()
+        return session.write_outputs(folder, self._drops(), complete=complete, num_sent=num_sent)
 
     def _finish(self) -> dict[str, Any]:
         """End the present stream; a server that heard of none has an empty summary."""

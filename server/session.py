@@ -18,6 +18,7 @@ from semcast.common.errors import CheckpointError
 from semcast.common.run_folder import (
     CHECKPOINT_NAME,
     DENSE_NAME,
+    FRAMES_NAME,
     IMAGES_NAME,
     RECORD_FILES,
     RESULT_FILES,
@@ -80,11 +81,12 @@ class Session:
         reference: Originals and truth, or None.
         bundle: A runner made ahead by ``new_bundle``, which the session closes; None makes one.
         program: Settings of the program for the run's records; None takes ``settings``.
-        on_give_up: Is told why, when the dense cloud will not grow any more.
+        on_error: Is told in a line what the stream goes on without: rows or checkpoints that can't be
+            written, or more of the dense cloud.
 
     Raises:
         OSError: The folder can't be made.
-        SemcastError: It can't be written into, or rows in it can't be read.
+        SemcastError: It can't be written into.
     """
 
     def __init__(
@@ -95,22 +97,24 @@ class Session:
         reference: Reference | None,
         bundle: BundleRunner | None = None,
         program: Any = None,
-        on_give_up: Callable[[str], None] | None = None,
+        on_error: Callable[[str], None] | None = None,
     ) -> None:
         self._settings = settings
         self._program = program if program is not None else settings
         self.identity = identity
         self._folder = folder
+        self._on_error = on_error
         self._reference = reference
         bundle = bundle if bundle is not None else new_bundle(settings)
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
-        self._cloud = SessionCloud(settings, identity.camera, self._reconstruction, on_give_up)
+        self._cloud = SessionCloud(settings, identity.camera, self._reconstruction, on_error)
         self._t_source_ns: dict[int, int] = {}
         self._numbers: dict[int, int | None] = {}
         self._num_frames = identity.num_frames
         self._map_epoch = 0
         self._last_frame_id = -1
         self._state = TrackingState.INITIALIZING
+        self._is_concluded = False
         self._last_checkpoint_s = time.monotonic()
         self._checkpoints: CheckpointWriter | None = None
         self._images: ImageWriter | None = None
@@ -135,8 +139,8 @@ class Session:
         self.resumed = settings.resume and self._restore(folder / CHECKPOINT_NAME)
         if not self.resumed:
             set_aside(folder)
-        self._record = FrameRows(folder, resume=self.resumed)
-        self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME)
+        self._record = FrameRows(folder, resume=self.resumed, on_error=self._on_error)
+        self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME, self._on_error)
         if settings.save_images != "none":
             self._images = ImageWriter(folder, lossless=settings.mode == "replay")
 
@@ -191,6 +195,7 @@ class Session:
             arrival: What else is known about it.
             on_pose: Is told what the tracker found, once, as soon as it is known; the map is extended after.
         """
+        self._is_concluded = False
         quality = (
             self._reference.psnr_db(frame.frame_id, frame.image) if self._reference is not None else None
         )
@@ -304,7 +309,13 @@ class Session:
         self._cloud.reset()
 
     def conclude(self) -> MapUpdate | None:
-        """Adjust the whole map, as the settings want it, now that the stream has ended; what that changed."""
+        """Adjust the whole map, as the settings want it, now that the stream has ended; what that changed.
+
+        A second time without a frame in between there is nothing to do.
+        """
+        if self._is_concluded:
+            return None
+        self._is_concluded = True
         since = time.monotonic()
         try:
             num_adjusted = self._reconstruction.conclude()
@@ -316,9 +327,14 @@ class Session:
         return update
 
     @property
+    def is_concluded(self) -> bool:
+        """No frame was processed since ``conclude``."""
+        return self._is_concluded
+
+    @property
     def num_to_adjust(self) -> int:
         """Keyframes that ``conclude`` will adjust."""
-        wanted = self._settings.reconstruction.final_adjustment
+        wanted = self._settings.reconstruction.final_adjustment and not self._is_concluded
         return len(self._reconstruction.world.keyframes) if wanted else 0
 
     @property
@@ -342,7 +358,7 @@ class Session:
         complete: bool,
         num_sent: int | None = None,
     ) -> dict[str, Any]:
-        """Write trajectory, map, reconstruction and summary, and return the summary.
+        """Write trajectory, map, reconstruction and summary, rows that still wait, and return the summary.
 
         Args:
             folder: Where to, or None to only make the summary.
@@ -355,6 +371,8 @@ class Session:
             SemcastError: The rows of the run can't be read back.
         """
         with EachFile() as each:
+            with each.attempt(Path(FRAMES_NAME)):
+                self._record.finish()
             results = self._write_results(folder, each)
             summary = self._summary(results, drops, complete, num_sent)
             if folder is not None:

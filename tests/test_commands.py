@@ -268,9 +268,28 @@ print([finding.verdict for finding in check_weights() if finding.what == "codec 
     assert done.stdout == "['good']\n", done.stderr
 
 
-def test_doctor_does_not_pass_over_a_configuration_of_no_system(tmp_path, capsys):
-    assert main(["doctor", "--zenoh-config", str(tmp_path / "nowhere")]) == 1
-    assert "is of the system that --connect names" in capsys.readouterr().err
+@pytest.mark.parametrize("words", [["--zenoh-config", "nowhere"], ["--require", "server"]])
+def test_doctor_does_not_pass_over_what_is_of_no_system(words, capsys):
+    assert main(["doctor", *words]) == 1
+    assert f"{words[0]} is of the system that --connect names" in capsys.readouterr().err
+
+
+def test_doctor_tells_by_its_exit_code_whether_required_roles_are_alive(capsys, monkeypatch):
+    monkeypatch.setattr("semcast.commands.doctor.check_weights", pytest.fail)
+    hub, endpoint = open_hub()
+    with hub:
+        hub.declare_alive("cam0", "server")
+        words = ["doctor", "--connect", endpoint, "--agent-id", "cam0", "--require"]
+        assert main([*words, "server"]) == 0
+        assert capsys.readouterr().out == "alive (cam0): server\n"
+        assert main([*words, "server,agent,channel"]) == 1
+        assert capsys.readouterr().out == (
+            "agent (cam0) is not seen: start it with 'semcast agent'\n"
+            "channel (cam0) is not seen: start it with 'semcast channel'\n"
+        )
+        with pytest.raises(SystemExit):
+            main([*words, "server,camera"])
+        assert "must be some of agent,channel,server, got 'server,camera'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

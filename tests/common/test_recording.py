@@ -394,8 +394,10 @@ def test_whatever_ends_a_recording_is_told(tmp_path, monkeypatch, caplog):
         raise MemoryError
 
     monkeypatch.setattr("semcast.common.recorder.RecordingWriter.add", broken)
-    with Recorder(tmp_path / "a.mcap", HEADER) as recorder:
+    told = []
+    with Recorder(tmp_path / "a.mcap", HEADER, on_error=told.append) as recorder:
         recorder.put("a/tx/symbols", "symbols", b"data")
     assert recorder.error == "MemoryError"
+    assert told == [f"recording into {tmp_path / 'a.mcap'} ended: MemoryError"]
     assert recorder.drops["disk"] == 1
     assert "the stream goes on, 0 messages were recorded" in caplog.text

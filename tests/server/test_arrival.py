@@ -68,6 +68,41 @@ def test_a_stream_that_begins_with_a_wrong_number_is_taken_up_after_a_while(metr
     assert metrics.drops == {"stale": 31}
 
 
+@pytest.mark.parametrize("lossless", [False, True])
+def test_one_frame_id_out_of_nowhere_is_left_out_and_told(metrics, lossless):
+    told = []
+    arrivals = Arrivals(lossless=lossless, drop=metrics.drop, tell=told.append)
+    frames = [frame(k, lossless=lossless) for k in range(5)]
+    frames.insert(2, replace(frames[2], frame_id=2**62))
+    assert accepted(arrivals, frames) == [0, 1, 2, 3, 4]
+    assert metrics.drops == {"ahead": 1}
+    assert told == [f"frame {2**62} is left out: it can't follow frame 1"]
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_a_stream_whose_frame_ids_went_far_on_is_taken_up_after_a_while(metrics, lossless):
+    arrivals = Arrivals(lossless=lossless, drop=metrics.drop)
+    assert arrivals.accept(frame(0, lossless=lossless), 0)
+    far = 10**7
+    taken_s = []
+    for k in range(50):
+        later = replace(frame(1 if lossless else k + 1, lossless=lossless), frame_id=far + 1)
+        if arrivals.accept(later, k * 100 * MS):
+            taken_s.append(k * 0.1)
+            break
+    assert taken_s == [pytest.approx(3.1)]
+    assert metrics.drops["ahead"] == 31
+
+
+def test_frame_ids_go_in_steps_of_the_source_and_on_during_a_break(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    ids = [0, 5000, 10_000, 1_000_000]
+    times_ns = [0, 100 * MS, 200 * MS, 60_000 * MS]
+    for k, (frame_id, t_ns) in enumerate(zip(ids, times_ns, strict=True)):
+        assert arrivals.accept(replace(frame(k), frame_id=frame_id), t_ns, frame_step=5000)
+    assert metrics.drops == {}
+
+
 def test_after_a_long_break_of_the_link_the_numbering_goes_on(metrics):
     arrivals = Arrivals(lossless=False, drop=metrics.drop)
     assert arrivals.accept(frame(0), 0)
@@ -194,3 +229,19 @@ def test_age_adapts_to_a_link_that_became_slower():
         way_ms = 2 if k < 100 else 700
         age.arrived(k * 100 * MS, k * 100 * MS + way_ms * MS)
     assert age.age_ms(40_000 * MS, 40_700 * MS) == pytest.approx(0.0)
+
+
+def test_one_frame_from_the_future_makes_no_other_too_old():
+    age = CaptureAge()
+    for k in range(300):
+        lead_ms = 3_600_000 if k in (50, 120) else 0
+        age.arrived((k * 100 + lead_ms) * MS, (k * 100 + 5) * MS)
+        assert age.age_ms(k * 100 * MS, (k * 100 + 15) * MS) == pytest.approx(10.0)
+
+
+def test_a_way_that_became_much_shorter_is_believed_after_some_frames():
+    age = CaptureAge()
+    for k in range(20):
+        way_ms = 4000 if k < 10 else 5
+        age.arrived(k * 100 * MS, (k * 100 + way_ms) * MS)
+    assert age.age_ms(2000 * MS, 2025 * MS) == pytest.approx(20.0)

@@ -128,16 +128,23 @@ def test_the_writer_keeps_the_newest_and_ends(tmp_path):
     assert 1 <= writer.num_written <= 20
 
 
-def test_the_writer_survives_a_full_disk(tmp_path):
+def test_the_writer_survives_a_full_disk_says_so_each_time_and_when_it_is_over(tmp_path, caplog):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
-    writer = CheckpointWriter(blocked / "map.npz")
-    writer.submit(checkpoint())
+    told = []
+    writer = CheckpointWriter(blocked / "map.npz", told.append)
     deadline = time.monotonic() + 10
-    while writer.num_failed == 0 and time.monotonic() < deadline:
-        time.sleep(0.01)
+    for k in (1, 2):
+        writer.submit(checkpoint())
+        while writer.num_failed < k and time.monotonic() < deadline:
+            time.sleep(0.01)
+    blocked.unlink()
+    writer.submit(checkpoint())
     writer.close()
-    assert writer.num_failed == 1
+    assert (writer.num_failed, writer.num_written) == (2, 1)
+    assert [text.startswith(f"no checkpoint: {blocked}") for text in told] == [True, True]
+    assert caplog.text.count("the stream goes on, and the next checkpoint is tried") == 1
+    assert caplog.text.count("checkpoints are written again") == 1
 
 
 def test_the_writer_survives_what_nobody_expected(tmp_path, monkeypatch, caplog):
@@ -156,4 +163,4 @@ def test_the_writer_survives_what_nobody_expected(tmp_path, monkeypatch, caplog)
     writer.close()
     assert (writer.num_failed, writer.num_written) == (1, 1)
     assert load_checkpoint(path).header.frame_id == 2
-    assert "MemoryError; the stream goes on without checkpoints" in caplog.text
+    assert "MemoryError; the stream goes on, and the next checkpoint is tried" in caplog.text

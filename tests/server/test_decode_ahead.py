@@ -104,3 +104,20 @@ def test_a_frame_that_can_not_even_be_left_out_never_stops_the_stream(caplog):
     assert drain(ahead, 2) == [2, 3]
     ahead.close()
     assert caplog.text.count("leaving a frame out failed: nobody wants to know") == 1
+
+
+def test_one_that_got_stale_while_it_waited_is_left_out_and_one_that_was_waited_for_is_not():
+    asked, taken = [], Inbox(5)
+
+    def is_stale(x):
+        asked.append(x)
+        return True
+
+    ahead = DecodeAhead(taken.take, lambda x: x, lambda m, r: None, is_stale)
+    deadline = time.monotonic() + 10
+    while ahead._slot is None:  # the tracker is busy
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+    assert ahead.get(10.0) == 1
+    assert asked == [0]
+    ahead.close()

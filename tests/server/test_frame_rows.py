@@ -1,7 +1,8 @@
 """Rows survive a kill, and the summary says what happened."""
 
+import errno
+import io
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from semcast.common.errors import SemcastError
 from semcast.common.run_folder import FRAMES_NAME
 from semcast.common.trajectory import Trajectory
+from semcast.server import frame_rows
 from semcast.server.export.outputs import write_json
 from semcast.server.frame_rows import FrameRow, FrameRows, read_rows, summarise
 from semcast.server.sent_frames import stretches
@@ -92,18 +94,89 @@ def test_without_a_folder_rows_stay_in_memory():
     assert [r.frame_id for r in record.rows()] == [3]
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_full_disk_does_not_stop_the_stream(tmp_path, caplog):
-    record = FrameRows(tmp_path)
-    record.add(row(0))
+class FullDisk(io.RawIOBase):
+    """Takes half of the next row, and then nothing."""
 
-    record._file.close()
-    record._file = Path("/dev/full").open("w")  # noqa: SIM115
-    with caplog.at_level("WARNING"):
-        record.add(row(1))
-        record.add(row(2))
+    def __init__(self, file):
+        self.file, self.is_full = file, False
+
+    def write(self, data):
+        if self.is_full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self.is_full = True
+        return self.file.write(data[: len(data) // 2])
+
+    def close(self):
+        self.file.close()
+        super().close()
+
+
+def ids_in(folder):
+    return [r.frame_id for r in read_rows(folder / FRAMES_NAME)]
+
+
+def test_rows_a_full_disk_did_not_take_are_written_when_it_has_room_again(tmp_path, caplog):
+    now_s, told = 0.0, []
+    record = FrameRows(tmp_path, on_error=told.append, clock=lambda: now_s)
+    record.add(row(0))
+    record._file = FullDisk(record._file)
+    for k in (1, 2, 3):
+        record.add(row(k))
+        now_s += 2.0
+    assert (tmp_path / FRAMES_NAME).read_bytes()[-1:] != b"\n", "a part of row 1 is there"
+    assert [r.frame_id for r in record.rows()] == [0, 1, 2, 3]
+    assert told == [f"{tmp_path / FRAMES_NAME} can't be written: [Errno 28] No space left on device"]
     assert caplog.text.count("No space left") == 1
-    assert [r.frame_id for r in record.rows()] == [0, 1, 2]
+    record.add(row(4))
+    assert ids_in(tmp_path) == [0, 1, 2, 3, 4]
+    assert "is written again, with the rows that waited" in caplog.text
+    record.add(row(5))
+    record.close()
+    assert ids_in(tmp_path) == [r.frame_id for r in record.rows()] == [0, 1, 2, 3, 4, 5]
+
+
+def test_rows_that_wait_at_the_end_are_written_then(tmp_path):
+    record = FrameRows(tmp_path)
+    record._file = FullDisk(record._file)
+    for k in range(3):
+        record.add(row(k))
+    record.finish()
+    record.close()
+    assert ids_in(tmp_path) == [0, 1, 2]
+
+
+def test_rows_that_can_not_be_written_at_the_end_are_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr(frame_rows, "MAX_ROWS_IN_MEMORY", 2)
+    record = FrameRows(tmp_path)
+    record._file = FullDisk(record._file)
+    for k in range(3):
+        record.add(row(k))
+    record._path = tmp_path / "gone" / FRAMES_NAME
+    with pytest.raises(FileNotFoundError):
+        record.finish()
+    record._path = tmp_path / FRAMES_NAME
+    with pytest.raises(OSError, match="1 rows are lost"):
+        record.finish()
+    record.close()
+    assert ids_in(tmp_path) == [1, 2]
+
+
+def test_a_damaged_line_does_not_keep_a_run_from_going_on(tmp_path, caplog):
+    record = FrameRows(tmp_path)
+    for k in range(5):
+        record.add(row(k))
+    record.close()
+    path = tmp_path / FRAMES_NAME
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([lines[0], b"\0" * 40 + b"\n", b"[]\n", *lines[3:], b'{"frame_id": 5, "t_sou']))
+    record = FrameRows(tmp_path, resume=True)
+    assert [r.getMessage() for r in caplog.records if r.levelname == "WARNING"] == [
+        f"{path}: 2 lines are no frame rows and are left out: {path}:2 is not a frame row: "
+        "Expecting value: line 1 column 1 (char 0)"
+    ]
+    record.add(row(5))
+    record.close()
+    assert ids_in(tmp_path) == [0, 3, 4, 5]
 
 
 def test_the_summary_has_the_promised_keys_and_values(tmp_path):

@@ -317,6 +317,30 @@ def test_bad_messages_are_counted_and_do_no_harm(ends, make):
     assert {k for k in e.metrics.counts if k.startswith("protocol_")} == {"protocol_syntax", "protocol_kind"}
 
 
+def test_a_flood_of_nonsense_does_not_hide_what_is_wrong(ends, make, caplog):
+    e = ends()
+    for k in range(120):
+        e.rx.put(b"junk %d" % k)
+        until(lambda k=k: e.metrics.drops.get("protocol") == k + 1)
+    assert "not a message" in e.metrics.status(0).last_error
+    assert len(caplog.records) <= 10
+    values = {**msgpack.unpackb(pack(make(0))), "version": 2}
+    e.rx.put(msgpack.packb(values))
+    until(lambda: e.metrics.drops.get("protocol") == 121)
+    refused = "a message was refused: protocol version must be 1, got 2"
+    assert refused in caplog.text
+    assert e.metrics.status(0).last_error == refused
+
+
+def test_a_frame_id_out_of_nowhere_is_in_the_status(ends, make):
+    e = ends()
+    e.answer_camera(camera())
+    e.put(make(0), make(1, frame_id=2**62), make(1))
+    assert [e.receiver.next(5).message.frame_id for _ in range(2)] == [0, 2]
+    assert e.metrics.drops == {"ahead": 1}
+    assert e.metrics.status(0).last_error == f"frame {2**62} is left out: it can't follow frame 0"
+
+
 def replace_tx(frame):
     return replace(
         frame, direction="tx", slot_lost=b"", payload_format="qam16", payload=bytes(4 * 47 * 8 // 2)
@@ -389,6 +413,18 @@ def test_replay_drops_a_frame_whose_agent_was_restarted_before_its_camera_was_kn
     e.put(make(0, epoch=EPOCH + 1, lossless=True))
     assert e.receiver.next(5).message.agent_epoch == EPOCH + 1
     assert e.metrics.drops == {"epoch": 2}
+
+
+def test_frames_that_come_after_they_were_counted_as_missing_are_missing_no_longer(ends, make):
+    e = ends()
+    e.put(*(make(k) for k in range(5)))
+    until(lambda: e.receiver._arrivals.arrived_seq == 5)
+    e.receiver.count_missing(EPOCH, 10)
+    assert e.metrics.drops == {"missing": 5}
+    e.put(make(7))
+    until(lambda: e.receiver._arrivals.arrived_seq == 8)
+    e.receiver.count_missing(EPOCH, 10)
+    assert e.metrics.drops == {"missing": 4}, "5, 6, 8 and 9"
 
 
 def test_presence_of_the_others_is_known(ends):

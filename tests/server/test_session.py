@@ -77,6 +77,23 @@ def test_a_slow_reference_holds_only_the_frame_up_that_asked_it(process, monkeyp
     assert asked == [0, last]
 
 
+def test_rows_that_are_not_in_their_file_at_the_end_are_an_error_and_cost_no_other_file(tmp_path):
+    told = []
+    settings = ServerSettings(bundle="inline")
+    session = Session(settings, IDENTITY, tmp_path / "run", None, on_error=told.append)
+    with contextlib.closing(session):
+        session._record._file.close()
+        session._record._file = None
+        (tmp_path / "run").rename(tmp_path / "elsewhere")
+        now_ns = time.perf_counter_ns()
+        session.process(DecodedFrame(0, 0, IMAGE, None), Arrival(None, None, now_ns, now_ns, {}, {}))
+        with pytest.raises(OSError, match=r"frames\.jsonl: No such file or directory"):
+            session.write_outputs(tmp_path / "elsewhere", {}, complete=True)
+    (text,) = told
+    assert text.startswith(f"{tmp_path / 'run' / FRAMES_NAME} can't be written: [Errno 2] No such file")
+    assert json.loads((tmp_path / "elsewhere" / "summary.json").read_text())["frames"]["tracked"] == 1
+
+
 def test_in_replay_every_frame_waits_for_its_psnr(process):
     one = process(Reference(lambda frame_id: IMAGE), mode="replay")
     assert [one(k) for k in range(3)] == [100.0] * 3

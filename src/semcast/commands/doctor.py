@@ -1,4 +1,7 @@
-"""``semcast doctor``: check this machine and, if asked, a running system; every finding says what to do."""
+"""``semcast doctor``: check this machine and, if asked, a running system; every finding says what to do.
+
+With ``--require`` it asks the system alone and answers in seconds, for what looks after services.
+"""
 
 import argparse
 import importlib.metadata
@@ -7,7 +10,7 @@ import platform
 import shutil
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,6 +22,7 @@ from semcast.commands.console import plain_console
 from semcast.commands.paths import named_path
 from semcast.common.cores import usable_cores
 from semcast.common.errors import ConfigError
+from semcast.common.messages import ROLES
 from semcast.server.view.process import window_display
 
 Verdict = Literal["good", "note", "bad"]
@@ -159,13 +163,44 @@ def check_system(connect: str, agent_id: str, zenoh_config: Path | None = None) 
     except TransportError as err:
         yield Finding(f"system at {connect}", "bad", str(err))
         return
-    for role in ("agent", "channel", "server"):
+    for role in ROLES:
         alive = role in roles
         yield Finding(
             f"{role} ({agent_id})",
             "good" if alive else "note",
             "alive" if alive else f"not seen: start it with 'semcast {role}'",
         )
+
+
+def print_required(connect: str, agent_id: str, required: Iterable[str], zenoh_config: Path | None) -> int:
+    """Print each role that is required and not alive, else those that are; exit code 1 where one is missing.
+
+    Raises:
+        TransportError: Nothing answers there.
+    """
+    from semcast.common.transport import alive_roles
+
+    roles = alive_roles(connect, agent_id, zenoh_config)
+    missing = [role for role in required if role not in roles]
+    for role in missing:
+        plain_console().print(
+            f"{role} ({agent_id}) is not seen: start it with 'semcast {role}'", soft_wrap=True
+        )
+    if not missing:
+        plain_console().print(f"alive ({agent_id}): {', '.join(required)}", soft_wrap=True)
+    return 1 if missing else 0
+
+
+def required_roles(text: str) -> tuple[str, ...]:
+    """Take the names of roles for argparse.
+
+    Raises:
+        argparse.ArgumentTypeError: One is no role.
+    """
+    roles = tuple(text.split(","))
+    if not set(roles) <= set(ROLES):
+        raise argparse.ArgumentTypeError(f"must be some of {','.join(ROLES)}, got {text!r}")
+    return roles
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -177,6 +212,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--agent-id", default="agent0", metavar="NAME", help="whose roles to look for (default agent0)"
     )
     parser.add_argument(
+        "--require",
+        type=required_roles,
+        metavar="ROLES",
+        help=f"only check that these of {','.join(ROLES)} are alive there; exit code 1 where one is not",
+    )
+    parser.add_argument(
         "--zenoh-config",
         type=named_path,
         metavar="PATH",
@@ -185,9 +226,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print all findings; exit code 1 when one is bad."""
-    if arguments.zenoh_config is not None and arguments.connect is None:
-        raise ConfigError("--zenoh-config is of the system that --connect names, and there is none")
+    """Print all findings, or only whether required roles are alive; exit code 1 when one is bad."""
+    if arguments.connect is None:
+        for flag, value in (("--zenoh-config", arguments.zenoh_config), ("--require", arguments.require)):
+            if value is not None:
+                raise ConfigError(f"{flag} is of the system that --connect names, and there is none")
+    elif arguments.require is not None:
+        return print_required(
+            arguments.connect, arguments.agent_id, arguments.require, arguments.zenoh_config
+        )
     checks = [
         check_python(),
         check_packages(),

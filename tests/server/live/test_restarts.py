@@ -1,12 +1,15 @@
 """Agents and servers that are started again, in the middle of a stream."""
 
+import contextlib
 import json
+import time
 
 import numpy as np
 import pytest
 
 from semcast.common.errors import ConfigError
 from semcast.common.recording_reader import RecordingReader
+from semcast.common.run_folder import read_run
 from semcast.server.export.outputs import write_ply
 from semcast.server.receiver import WINDOW
 from semcast.server.recorded_streams import recorded_streams
@@ -14,6 +17,8 @@ from semcast.server.view.rerun_viewer import RerunStream
 from semcast.server.view.settings import ViewSettings
 
 pytestmark = pytest.mark.xdist_group("real-time")
+
+DEADLINE_S = 60.0
 
 
 def centre(pose):
@@ -33,6 +38,39 @@ def test_a_restarted_agent_begins_a_new_map_and_the_former_run_is_kept(tmp_path,
     assert former["frames"]["tracked"] == 8
     assert len((tmp_path / "previous-1" / "frames.jsonl").read_text().splitlines()) == 8
     assert len((tmp_path / "frames.jsonl").read_text().splitlines()) == 4
+
+
+def test_a_server_that_keeps_running_writes_what_a_stream_leaves_when_it_ends(tmp_path, air):
+    running = air.serve(out=tmp_path, keep_running=True)
+
+    def until_tracked(number):
+        deadline_s = time.monotonic() + DEADLINE_S
+        while True:
+            with contextlib.suppress(OSError):
+                summary = json.loads((tmp_path / "summary.json").read_text())
+                if summary["frames"]["tracked"] == number:
+                    return summary
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+
+    radio = air.agent(100)
+    radio.stream(range(10))
+    radio.stream([10], final=True)
+    radio.close()
+    ended = until_tracked(11)
+    assert ended["num_posed"] == len(read_run(tmp_path).frame_ids) >= 8
+    written = (tmp_path / "summary.json").stat().st_mtime_ns
+    again = air.agent(100)
+    again.stream(range(11, 13))
+    assert (tmp_path / "summary.json").stat().st_mtime_ns == written, "once, and while nothing more comes"
+    again.stream([13], final=True)
+    again.close()
+    until_tracked(14)
+    second = air.agent(200)
+    second.stream(range(3))
+    former = json.loads((tmp_path / "previous-1" / "summary.json").read_text())
+    assert (former["frames"]["tracked"], former["drops"]) == (14, {})
+    assert running.finish(stop=True)["frames"]["tracked"] == 3
 
 
 def test_what_was_saved_of_a_former_start_is_not_taken_for_the_new_one(tmp_path, air):
@@ -201,7 +239,7 @@ def test_a_late_frame_of_the_former_start_does_not_end_the_new_one(tmp_path, air
 
 
 def test_a_former_start_that_goes_on_sending_is_taken_up_again(air, monkeypatch):
-    monkeypatch.setattr("semcast.server.server.STRAGGLER_NS", 0)
+    monkeypatch.setattr("semcast.server.former_starts.STRAGGLER_NS", 0)
     running = air.serve()
     first = air.agent(100)
     first.stream(range(4))

@@ -25,6 +25,7 @@ from semcast.common.transport import open_client, open_hub
 from semcast.common.wire import pack, unpack
 from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server
+from semcast.server.session import Session
 from semcast.server.settings import ServerSettings
 from semcast.server.view.settings import ViewSettings
 
@@ -131,6 +132,34 @@ def test_bad_frames_are_counted_and_never_stop_the_stream(air):
     assert (summary["frames"]["tracked"], summary["frames"]["sent"]) == (5, 7)
 
 
+def test_a_frame_that_waited_too_long_for_the_tracker_is_dropped(air, monkeypatch):
+    process, begun, go_on = Session.process, threading.Event(), threading.Event()
+
+    def hold_up(session, frame, *rest):
+        if frame.frame_id == 1:
+            begun.set()
+            assert go_on.wait(DEADLINE_S)
+        return process(session, frame, *rest)
+
+    monkeypatch.setattr(Session, "process", hold_up)
+    running = air.serve(max_age_ms=200.0)
+    radio = air.agent(100)
+    radio.stream([0])
+    radio.send(1)
+    assert begun.wait(DEADLINE_S)
+    radio.send(2)
+    deadline_s = time.monotonic() + DEADLINE_S
+    while running.server._ahead._slot is None:
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+    time.sleep(0.3)
+    go_on.set()
+    running.wait_for_drop("too_old")
+    radio.stream([3])
+    assert 2 not in radio.posed_ids()
+    running.finish(stop=True)
+
+
 def test_a_bundle_adjustment_that_gave_up_is_in_the_status(air):
     running = air.serve(bundle="process", duration_s=0.1)
     running.server._spare_bundle._give_up()
@@ -176,6 +205,8 @@ def test_a_recording_that_breaks_off_leaves_the_results_and_is_an_error_at_the_e
     radio.stream(range(3))
     with pytest.raises(SourceError, match=r"run\.mcap is not complete: .*No space left"):
         running.finish(stop=True)
+    status = running.server._metrics.status(0)
+    assert status.last_error.endswith("run.mcap ended: [Errno 28] No space left on device")
     assert running.summary["frames"]["tracked"] == 3
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"]["tracked"] == 3
 

@@ -1,0 +1,46 @@
+"""Streams that agents announce, handed from the network's threads to the one that begins on them."""
+
+import contextlib
+import threading
+
+from semcast.common.keys import CAMERA_TIMEOUT_S, camera_key
+from semcast.common.messages import CameraInfo
+from semcast.common.transport import Session
+from semcast.common.wire import WireError, unpack
+
+
+class Announcement:
+    """The newest stream that was announced and not begun on yet.
+
+    Args:
+        session: Where agents announce themselves; one that is there already is asked.
+        agent_id: Whose streams.
+    """
+
+    def __init__(self, session: Session, agent_id: str) -> None:
+        self._lock = threading.Lock()
+        self._newest: CameraInfo | None = None
+        session.subscribe(camera_key(agent_id), "every", self._hear)
+        if "agent" in session.alive_roles(agent_id, CAMERA_TIMEOUT_S):
+            answer = session.request(camera_key(agent_id), b"", CAMERA_TIMEOUT_S)
+            if answer is not None:
+                self._hear(answer)
+
+    def _hear(self, payload: bytes) -> None:
+        """Note an announced stream; the receiver counts and reports what is not valid."""
+        with contextlib.suppress(WireError):
+            camera = unpack(payload, CameraInfo)
+            with self._lock:
+                if self._newest is None or camera.agent_epoch > self._newest.agent_epoch:
+                    self._newest = camera
+
+    def is_newer(self, agent_epoch: int) -> bool:
+        """Tell whether a stream was announced that began after this one."""
+        with self._lock:
+            return self._newest is not None and self._newest.agent_epoch > agent_epoch
+
+    def take(self) -> CameraInfo | None:
+        """Return the stream and forget it; None where none was announced since."""
+        with self._lock:
+            camera, self._newest = self._newest, None
+        return camera
