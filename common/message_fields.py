@@ -50,7 +50,7 @@ class Number:
 
     def load(self, value: Any) -> float:
         """Return the value as received."""
-        # A number of numpy's is a float too; a bool is an int, but no number.
+        # NumPy's float64 is a float too; a bool is an int, but no number.
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise FieldError("type", f"must be a number, got {_short(value)}")
         try:

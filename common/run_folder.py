@@ -23,7 +23,7 @@ import contextlib
 import logging
 import threading
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -235,15 +235,25 @@ class ImageWriter:
         lossless: Wait when the queue is full; otherwise the image is dropped and counted.
         quality: JPEG quality.
         capacity: Images that may wait.
+        on_error: Is told in a line why the run goes on without images.
 
     Raises:
         SourceError: The folder can't be made.
     """
 
-    def __init__(self, folder: Path, *, lossless: bool, quality: int = 95, capacity: int = 8) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        lossless: bool,
+        quality: int = 95,
+        capacity: int = 8,
+        on_error: Callable[[str], None] | None = None,
+    ) -> None:
         self._images = folder / IMAGES_NAME
         self._wait_s = None if lossless else 0.0
         self._quality = quality
+        self._on_error = on_error
         self._box: Mailbox[_Image] = Mailbox(capacity, "all")
         #: What is kept of the provisional images written so far; not in the queue, which may be full.
         self._settled: deque[tuple[int, frozenset[int]]] = deque()
@@ -295,12 +305,14 @@ class ImageWriter:
             except Exception as err:
                 self._num_failed += 1
                 self._remove(item.frame_id)  # a part of it may be there
+                text = f"{self._images} can't be written: {str(err) or type(err).__name__}"
                 logger.warning(
-                    "%s can't be written: %s; the run goes on without images",
-                    self._images,
-                    str(err) or type(err).__name__,
+                    "%s; the run goes on without images",
+                    text,
                     exc_info=not isinstance(err, (OSError, cv2.error)),
                 )
+                if self._on_error is not None:
+                    self._on_error(text)
         while self._settled:
             self._drop_provisional(self._settled.popleft()[1])
         self._drop_provisional(frozenset())

@@ -83,8 +83,10 @@ def _matrices(frames: list[dict[str, Any]]) -> NDArray[np.float64]:
     Raises:
         ValueError: One has another shape or a number that is not finite.
     """
+    if not frames:
+        return np.zeros((0, 4, 4))
     matrices = np.array([frame["transform_matrix"] for frame in frames], dtype=np.float64)
-    if frames and matrices.shape[1:] not in ((4, 4), (3, 4)):
+    if matrices.shape[1:] not in ((4, 4), (3, 4)):
         raise ValueError(f"transform_matrix must be 4x4 or 3x4, got {'x'.join(map(str, matrices.shape[1:]))}")
     if not np.isfinite(matrices).all():
         raise ValueError("transform_matrix must be finite")

@@ -15,24 +15,20 @@ class WorkerGuard:
     """Goes around one round of a worker's loop, and around one at a time.
 
     An exception ends the round and not the thread: it is logged with its traceback, once where it comes again
-    and again, and counted. Without that the thread would be dead, and who waits for it wait for ever.
+    and again. Without that the thread would be dead, and who waits for it wait for ever.
 
     Args:
         what: What a round does, for the log: "sending the status".
-        on_failure: Is told in a line what failed, each time, and brings the worker into a state from which it
-            goes on.
-
-    Attributes:
-        num_failed: Rounds that failed.
+        on_failure: Is told in a line what failed, each time: it counts, and brings the worker into a state
+            from which it goes on.
 
     Example:
-        >>> guard = WorkerGuard("dividing")
+        >>> guard = WorkerGuard("dividing", on_failure=print)
         >>> for divisor in (1, 0, 2):
         ...     with guard:
         ...         print(2 // divisor)
         2
-        1
-        >>> guard.num_failed
+        dividing failed: integer division or modulo by zero
         1
     """
 
@@ -40,7 +36,6 @@ class WorkerGuard:
         self._what = what
         self._on_failure = on_failure
         self._logged: set[str] = set()
-        self.num_failed = 0
 
     def __enter__(self) -> Self:
         return self
@@ -50,7 +45,6 @@ class WorkerGuard:
     ) -> bool:
         if not isinstance(error, Exception):
             return False
-        self.num_failed += 1
         text = f"{self._what} failed: {str(error) or type(error).__name__}"
         if text not in self._logged and len(self._logged) < MAX_LOGGED:
             self._logged.add(text)

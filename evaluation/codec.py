@@ -19,6 +19,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.codec import (
     DEFAULT_CODEC,
+    LABEL_SHARPNESS,
     Codec,
     DecodedImage,
     EncodedImage,
@@ -49,8 +50,6 @@ logger = logging.getLogger(__name__)
 
 VERB = "eval codec"
 UNUSED_FIELDS = UNUSED_LINK_FIELDS
-#: Sensitivity of the pixel label that confidence is trained on.
-LABEL_ALPHA = 30.0
 #: What a receiver shows when a whole frame is lost.
 _LOST_GREY = 128
 _SNRS_DB = (2.0, 4.0, 6.0, 8.0, 10.0, 12.0)
@@ -338,7 +337,7 @@ def _run(
 
 
 def _grade_confidence(decoded: DecodedImage, image: NDArray[np.uint8]) -> dict[str, float | None]:
-    label = pixel_label(decoded.image, image, LABEL_ALPHA)
+    label = pixel_label(decoded.image, image, LABEL_SHARPNESS)
     step = np.s_[1::_PIXEL_STEP, 1::_PIXEL_STEP]
     return {
         "mean": float(decoded.confidence.mean()),

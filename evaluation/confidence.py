@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from semcast.common.codec import Codec
+from semcast.common.codec import LABEL_SHARPNESS, Codec
 from semcast.common.errors import ConfigError
 from semcast.common.image import psnr_db
 from semcast.common.sequence import Sequence as RecordedSequence
@@ -36,7 +36,8 @@ class ConfidenceSettings(StreamSettings):
     """
 
     pixel_alpha: float = field(
-        default=30.0, metadata={"help": "alpha of the label 1 - tanh(alpha |error|) the codec was trained on"}
+        default=LABEL_SHARPNESS,
+        metadata={"help": "alpha of the label 1 - tanh(alpha |error|) the codec was trained on"},
     )
     out: Path | None = field(
         default=None, metadata={"help": "folder for reliability diagrams and, without --json, result.json"}

@@ -29,6 +29,7 @@ from semcast.evaluation.pipeline import (
 )
 from semcast.evaluation.reconstruct import as_received, cut_to_frames
 from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.trace_snr import snr_label
 from semcast.server.export.outputs import trajectory_of
 from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.reconstruction import Reconstruction
@@ -134,7 +135,8 @@ def _received(
         if frame.decoded is not None
     ]
     if not frames:
-        raise ConfigError(f"no frame was received at snr_db {settings.snr_db[0]:g}: there is nothing to run")
+        level = snr_label(settings.snr_db[0], settings.link)
+        raise ConfigError(f"no frame was received at {level}: there is nothing to run")
     if len(frames) < 3:
         raise ConfigError(f"max_frames must leave at least 3 frames that arrive, got {len(frames)}")
     return frames

@@ -21,6 +21,7 @@ from semcast.evaluation.pipeline import (
 )
 from semcast.evaluation.reconstruct import reconstruct
 from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.trace_snr import snr_label
 from semcast.server.frame_rows import FrameRow
 from semcast.server.frame_views import frame_view
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -159,7 +160,8 @@ def evaluate_latency(settings: LatencySettings, codec: Codec | None = None) -> d
             view.close()
     rows = run.rows[settings.warmup :]
     if not run.rows:
-        raise ConfigError(f"no frame was received at snr_db {settings.snr_db[0]:g}: there is nothing to time")
+        level = snr_label(settings.snr_db[0], settings.link)
+        raise ConfigError(f"no frame was received at {level}: there is nothing to time")
     if not rows:
         raise ConfigError(f"warmup must leave frames to time, got {settings.warmup} of {len(run.rows)}")
     report = json_ready(

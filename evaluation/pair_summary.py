@@ -10,6 +10,7 @@ import textwrap
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import number, table
+from semcast.evaluation.pair_suite import RECORDINGS
+from semcast.evaluation.pipeline import CLEAN
 from semcast.evaluation.statistics import MIN_SAMPLES, small_sample_factor
 
 Array = NDArray[np.float64]
@@ -38,7 +41,7 @@ _METHODS = ("plain_ransac", "opencv_ransac", "opencv_magsac", "poselib", "paper"
 _HARD_DEG = 3.0
 _MISLEADING = ("constant", "shuffled", "inverted")
 #: Names that reports give the recordings of ``pair_suite`` which were left out of all tuning.
-HELD_OUT = frozenset({"parking_synth_60", "phone_150"})
+HELD_OUT = frozenset(Path(recording.path).name for recording in RECORDINGS.values() if recording.held_out)
 #: Modes and what they are compared with to tell what confidence gives.
 _RATIOS = (
     ("robust", RIVAL),
@@ -94,12 +97,16 @@ def is_silent(cell: Cell) -> bool:
 
 
 def cells_of(reports: Iterable[Mapping[str, Any]], *, clean: bool = False) -> list[Cell]:
-    """Return all cells of reports of ``semcast eval pairs``: those behind a link, or of clean images."""
+    """Return all cells of reports of ``semcast eval pairs``: those behind a link, or of clean images.
+
+    A trace has no SNR that a table could state, and is left out.
+    """
     return [
-        Cell(report["sequence"], report["settings"]["link"]["channel"], report["settings"]["codec"], values)
+        Cell(report["sequence"], settings["link"]["channel"], settings["codec"], values)
         for report in reports
+        if ((settings := report["settings"])["codec"] == CLEAN) == clean
+        and (clean or settings["link"]["channel"] != "trace")
         for values in report["cells"]
-        if (values["snr_db"] is None) == clean
     ]
 
 

@@ -46,9 +46,14 @@ class Pairing:
 def pairings_of(
     reports: Iterable[Mapping[str, Any]], ours: str = "robust", theirs: str = "off"
 ) -> list[Pairing]:
-    """Return all cells of reports of ``semcast eval trajectory`` that have both modes and enough seeds."""
+    """Return all cells of reports of ``semcast eval trajectory`` that have both modes and enough seeds.
+
+    Those over a trace are left out: their SNR is but its start.
+    """
     found = []
     for report in reports:
+        if report["settings"]["link"]["channel"] == "trace":
+            continue
         runs: dict[float, dict[str, dict[int, Mapping[str, Any]]]] = {}
         for cell in report["cells"]:
             if cell["snr_db"] is not None:

@@ -23,7 +23,8 @@ class CaptureAge:
 
     The offset between the two clocks plus the fastest way is the smallest ``arrival - capture`` of the last
     10 to 20 seconds; what a frame took more than that is its age. One frame from the future would make all
-    others too old, so an offset far below is believed only of several in a row, with which all begins anew.
+    others too old, so an offset far below is believed only of several in a row, with which all begins anew;
+    there is nothing to judge the first frame by.
     """
 
     def __init__(self) -> None:
@@ -66,7 +67,7 @@ class Arrivals:
     came before it), ``epoch`` (of an agent that was restarted since), ``missing`` (never arrived: seen by the
     gap in ``seq``; taken back if the frame turns up late), ``ahead`` (numbered, or with a ``frame_id``, as no
     agent can have got to). When nothing else comes for three seconds, the numbering of what is refused is the
-    one that holds.
+    one that holds. There is nothing to judge the first frame of an epoch by.
 
     Lossless: only the frame that follows the last one is taken. Reasons: ``duplicate``, ``epoch``, ``ahead``
     (of its ``frame_id``), ``gap`` (one before it is missing; the agent will send both again).
@@ -100,6 +101,7 @@ class Arrivals:
         self._odd_in_order, self._odd_seq = 0, 0
         self._frame_id: int | None = None  # of the newest frame taken
         self._leaps_in_order, self._leap_id = 0, 0
+        self._left_out: set[int] = set()  # numbers, not passed yet, of frames with an id that leaps
         self._recent: deque[int] = deque()
         self._forgotten_seq = 0  # the newest one that may have come without being remembered
         self._done_early: set[int] = set()
@@ -141,10 +143,11 @@ class Arrivals:
             self._leaps_in_order, arrival_ns
         ):
             # Once tracked, it would make frames of all ids below it count as tracked too.
+            self._left_out.add(frame.seq)
             self._drop("ahead", 1)
             self._tell(f"frame {frame.frame_id} is left out: it can't follow frame {self._frame_id}")
             return False
-        self._drop("missing", frame.seq - self.arrived_seq)
+        self._pass_over(frame.seq)
         self._odd_in_order = self._leaps_in_order = 0
         self.arrived_seq = frame.seq + 1
         self._frame_id = frame.frame_id
@@ -152,6 +155,14 @@ class Arrivals:
         self._remember(frame.seq)
         self._age.arrived(frame.t_capture_ns, arrival_ns)
         return True
+
+    def _pass_over(self, seq: int) -> None:
+        """Count the frames before the next one as missing, but for those that came and were left out."""
+        left_out = {k for k in self._left_out if self.arrived_seq <= k < seq}
+        self._drop("missing", seq - self.arrived_seq - len(left_out))
+        for k in left_out:
+            self._remember(k)
+        self._left_out.clear()
 
     def _is_odd(self, frame: SymbolFrame, arrival_ns: int) -> bool:
         """Tell whether a live frame's number is not one that can follow; count those that rise."""
@@ -205,6 +216,7 @@ class Arrivals:
         self.next_seq = self.arrived_seq
         self._forgotten_seq = self.arrived_seq
         self._frame_id = None
+        self._left_out.clear()
         self._recent.clear()
         self._done_early.clear()
         self._age = CaptureAge()

@@ -123,7 +123,8 @@ class Receiver:
         self._num_superseded = self._num_given_way = 0
         self._reporter: tuple[tuple[int, str], LinkReporter] | None = None
         self._roles: set[str] = set()
-        self._missing_behind = (0, 0)  # epoch, and what was counted of it by ``count_missing``
+        #: Of a stream that has ended: epoch, frames sent, and how many behind the newest count as missing.
+        self._end = (0, 0, 0)
         self._told: dict[str, set[str]] = {}
         self._link = session.publisher(link_key(agent_id), "newest")
         self._flow = session.publisher(flow_key(agent_id), "newest")
@@ -160,15 +161,22 @@ class Receiver:
     def count_missing(self, agent_epoch: int, num_sent: int | None) -> None:
         """Count the frames behind the newest that never came, of so many that were sent; None: not known.
 
-        If some come all the same, it can be done again.
+        Those that come all the same are taken off again.
         """
         if num_sent is None or self._mode != "live":
             return
         with self._lock:
-            arrived_seq = self._arrivals.arrived_seq if agent_epoch == self._arrivals.epoch else 0
-            counted = self._missing_behind[1] if self._missing_behind[0] == agent_epoch else 0
-            self._missing_behind = agent_epoch, max(0, num_sent - arrived_seq)
-            self._metrics.drop("missing", self._missing_behind[1] - counted)
+            counted = self._end[2] if self._end[0] == agent_epoch else 0
+            self._end = agent_epoch, num_sent, counted
+            self._count_behind()
+
+    def _count_behind(self) -> None:
+        """Bring the count of frames missing behind the newest up to date; the lock is held."""
+        agent_epoch, num_sent, counted = self._end
+        arrived_seq = self._arrivals.arrived_seq if agent_epoch == self._arrivals.epoch else 0
+        behind = max(0, num_sent - arrived_seq)
+        self._metrics.drop("missing", behind - counted)
+        self._end = agent_epoch, num_sent, behind
 
     def _tell(self, about: str, text: str) -> None:
         """Show in the status what is wrong with what arrives, and log it the first time."""
@@ -242,6 +250,8 @@ class Receiver:
                 dropped = self._box.clear()
                 self._metrics.drop("epoch", dropped)
                 self._num_superseded = 0
+            if taken and frame.agent_epoch == self._end[0]:
+                self._count_behind()
             if taken:
                 self._box.put((frame, arrival_ns))
                 self._count_superseded()

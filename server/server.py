@@ -189,12 +189,12 @@ class Server:
                 elif self._ended(now_s - last_frame_s):
                     if not self._settings.keep_running:
                         break
-                    self._write_between()
+                    self._write_between(stop)
                 if self._settings.duration_s is not None and now_s - started_s >= self._settings.duration_s:
                     break
         finally:
             self._desk.close()
-            summary = self._finish()
+            summary = self._finish(is_stopped=stop.is_set())
         return summary
 
     def _ended(self, idle_s: float) -> bool:
@@ -208,13 +208,13 @@ class Server:
         limit_s = self._settings.idle_timeout_s
         return limit_s is not None and idle_s >= limit_s and not self._settings.keep_running
 
-    def _write_between(self) -> None:
+    def _write_between(self, stop: threading.Event) -> None:
         """Write what the stream that has ended leaves, and go on: frames of it may come all the same."""
         session, out = self._session, self._settings.out
         assert session is not None
-        # Depth that is missing when the agent was started again is given a little time then.
+        # Depth missing when the agent is started again, or the server stopped, gets a little time then.
         epoch = session.identity.agent_epoch
-        self._conclude(session, None, lambda: self._announced.is_newer(epoch))
+        self._conclude(session, None, lambda: stop.is_set() or self._announced.is_newer(epoch))
         try:
             self._write(session, out)
         except (OSError, SemcastError) as err:
@@ -426,13 +426,13 @@ class Server:
             session.save_checkpoint()
         return session.write_outputs(folder, self._drops(), complete=complete, num_sent=num_sent)
 
-    def _finish(self) -> dict[str, Any]:
+    def _finish(self, *, is_stopped: bool) -> dict[str, Any]:
         """End the present stream; a server that heard of none has an empty summary."""
         session, self._session = self._session, None
         if session is None:
             return {}
         try:
-            self._conclude(session, None if self._end_of.complete else _STOPPED_S)
+            self._conclude(session, _STOPPED_S if is_stopped or not self._end_of.complete else None)
             summary = self._end(session, self._settings.out)
         except OSError as err:
             raise SemcastError(_not_written(self._settings.out, err)) from err

@@ -81,7 +81,7 @@ class Session:
         reference: Originals and truth, or None.
         bundle: A runner made ahead by ``new_bundle``, which the session closes; None makes one.
         program: Settings of the program for the run's records; None takes ``settings``.
-        on_error: Is told in a line what the stream goes on without: rows or checkpoints that can't be
+        on_error: Is told in a line what the stream goes on without: rows, checkpoints or images that can't be
             written, or more of the dense cloud.
 
     Raises:
@@ -142,7 +142,8 @@ class Session:
         self._record = FrameRows(folder, resume=self.resumed, on_error=self._on_error)
         self._checkpoints = CheckpointWriter(folder / CHECKPOINT_NAME, self._on_error)
         if settings.save_images != "none":
-            self._images = ImageWriter(folder, lossless=settings.mode == "replay")
+            lossless = settings.mode == "replay"
+            self._images = ImageWriter(folder, lossless=lossless, on_error=self._on_error)
 
     @property
     def last_frame_id(self) -> int:

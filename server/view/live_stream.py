@@ -10,7 +10,8 @@ from semcast.server.view.scene import Changes, Cursor
 logger = logging.getLogger(__name__)
 
 FLUSH_TIMEOUT_S = 1.0
-#: After so many connections in a row that took nothing, what listens is left alone until it no longer does.
+#: After so many connections in a row that took nothing, or could not be served, what listens is left alone
+#: until it no longer does.
 MAX_REFUSALS = 5
 
 
@@ -69,7 +70,7 @@ class LiveStream:
             self._num_refusals = 0
         if delivery is Delivery.SEVERED:
             logger.info("viewer is gone, the stream goes on")
-            self.let_go()
+            self._end(f"what listens on port {self._port} is no viewer, nothing is shown: see --viewer-port")
         elif (delivery is Delivery.STALLED) != self._is_stalled:
             self._is_stalled = not self._is_stalled
             logger.info(
@@ -77,14 +78,15 @@ class LiveStream:
             )
 
     def let_go(self) -> None:
-        """End the connection; the next one gets the whole scene again."""
+        """End a connection that could not be served; the next one gets the whole scene again."""
+        self._end(f"showing the run failed {MAX_REFUSALS} times in a row, nothing more is shown")
+
+    def _end(self, why_no_more: str) -> None:
         stream, self._stream = self._stream, None
         self._is_stalled = False
         self._num_refusals += 1
         if self._num_refusals == MAX_REFUSALS:
-            logger.warning(
-                "what listens on port %d is no viewer, nothing is shown: see --viewer-port", self._port
-            )
+            logger.warning("%s", why_no_more)
         if stream is not None:
             stream.close()
 

@@ -163,6 +163,17 @@ def test_provisional_images_stay_when_they_are_settled_for(tmp_path):
     assert list(read_image_paths(tmp_path)) == [0, 3, 5]
 
 
+def test_images_that_can_not_be_written_are_told_once(tmp_path):
+    told = []
+    with ImageWriter(tmp_path, lossless=True, on_error=told.append) as writer:
+        (tmp_path / "images" / "000000.jpg").mkdir()
+        for k in range(3):
+            writer.put(k, picture(k))
+    assert len(told) == 1
+    assert told[0].startswith(f"{tmp_path / 'images'} can't be written: ")
+    assert writer.num_dropped == 3
+
+
 def test_only_the_newest_provisional_images_wait(tmp_path, monkeypatch):
     monkeypatch.setattr("semcast.common.run_folder.MAX_PROVISIONAL", 3)
     with ImageWriter(tmp_path, lossless=True) as writer:

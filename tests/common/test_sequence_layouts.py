@@ -236,6 +236,12 @@ def test_a_transforms_file_may_leave_out_the_last_row_of_its_matrices(tmp_path, 
     assert found[0].shape == (5, 4, 4)
 
 
+def test_a_transforms_file_without_frames_has_no_images(tmp_path):
+    (tmp_path / "transforms.json").write_text('{"camera_angle_x": 0.8, "frames": []}')
+    with pytest.raises(SourceError, match="no images in"):
+        open_sequence(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("focal_px", "message"),
     [((30.0, 30.1), None), ((30.0, 45.0), "fl_x must be the same for all frames .*, got 30 to 45")],

@@ -73,7 +73,7 @@ def test_settings_that_give_no_run_are_refused(room, phase_codec):
     with pytest.raises(ValueError, match=r"every must be in \[1, 10\], got 11"):
         EnduranceSettings(sequence=room, frames=10, every=11)
     lost = ChannelSettings(frame_loss=1.0)
-    with pytest.raises(ConfigError, match="no frame was received at snr_db 10: there is nothing to run"):
+    with pytest.raises(ConfigError, match="no frame was received at 10 dB: there is nothing to run"):
         evaluate_endurance(
             EnduranceSettings(sequence=room, codec="phase", link=lost, frames=5, every=5), phase_codec
         )

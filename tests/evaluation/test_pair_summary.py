@@ -1,10 +1,7 @@
-from pathlib import Path
-
 import pytest
 
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import table, with_part
-from semcast.evaluation.pair_suite import RECORDINGS
 from semcast.evaluation.pair_summary import HELD_OUT, cells_of, pair_headline, pair_summary
 
 
@@ -34,8 +31,8 @@ def cell(snr_db, errors_deg, interval=(-1.0, 1.0), **values):
     }
 
 
-def report(*cells):
-    settings = {"codec": DEFAULT_CODEC, "link": {"channel": "awgn"}}
+def report(*cells, codec=DEFAULT_CODEC, channel="awgn"):
+    settings = {"codec": codec, "link": {"channel": channel}}
     return {"sequence": "room", "settings": settings, "cells": list(cells)}
 
 
@@ -143,19 +140,22 @@ def test_a_ratio_of_few_cells_has_no_interval():
 
 
 def test_the_recordings_left_out_of_tuning_are_those_of_the_suite():
-    assert {Path(r.path).name for r in RECORDINGS.values() if r.held_out} == HELD_OUT
+    assert {"parking_synth_60", "phone_150"} == HELD_OUT
 
 
 def test_original_images_have_a_table_of_their_own():
     clean = cell(None, {**ERRORS, "robust": 0.5})
-    text = pair_summary([report(cell(2.0, ERRORS), clean)])
+    text = pair_summary([report(cell(2.0, ERRORS)), report(clean, codec="none")])
     (row,) = rows_of(text[text.index("**Original images**") : text.index("**What confidence")], "room")
     assert row[8] == "0.5"
     assert "Original images" not in pair_summary([report(cell(2.0, ERRORS))])
 
 
-def test_cells_without_a_link_are_left_out():
-    assert cells_of([report(cell(None, ERRORS))]) == []
+def test_cells_without_a_link_and_over_traces_are_left_out():
+    assert cells_of([report(cell(None, ERRORS), codec="none")]) == []
+    for snr_db in (None, 6.0):
+        over_trace = [report(cell(snr_db, ERRORS), channel="trace")]
+        assert cells_of(over_trace) == cells_of(over_trace, clean=True) == []
     assert pair_summary([]) == ""
 
 

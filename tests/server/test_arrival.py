@@ -79,6 +79,14 @@ def test_one_frame_id_out_of_nowhere_is_left_out_and_told(metrics, lossless):
     assert told == [f"frame {2**62} is left out: it can't follow frame 1"]
 
 
+def test_a_frame_that_is_left_out_for_its_id_does_not_count_as_missing_too(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    frames = [frame(k) for k in range(5)]
+    frames[2] = replace(frames[2], frame_id=2**62)
+    assert accepted(arrivals, [*frames, frame(2)]) == [0, 1, 3, 4]
+    assert metrics.drops == {"ahead": 1, "duplicate": 1}
+
+
 @pytest.mark.parametrize("lossless", [False, True])
 def test_a_stream_whose_frame_ids_went_far_on_is_taken_up_after_a_while(metrics, lossless):
     arrivals = Arrivals(lossless=lossless, drop=metrics.drop)
