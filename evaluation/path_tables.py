@@ -97,14 +97,16 @@ def _live(cell: Report) -> list[str]:
 def readme_table(folder: Path) -> str:
     """Return the README's short table: path errors in the default mode, recordings by links.
 
-    Recordings that were sent over most links come first. Those with a gap or another codec are not in it.
+    Recordings that were sent over most links come first. Those with a gap, Doppler or another codec are not
+    in it.
     """
     errors: dict[str, dict[str, str]] = {}
     for file in sorted(folder.glob("trajectory_*.json")):
         report = json.loads(file.read_text(encoding="utf-8"))
         channel = report["settings"]["link"]["channel"]
-        # The SNR of a trace is but its start.
-        if channel == "trace" or report["settings"].get("gap_s"):
+        # The SNR of a trace is but its start, and fading with Doppler is another link than without.
+        is_other = channel == "trace" or report["settings"]["link"].get("doppler_hz")
+        if is_other or report["settings"].get("gap_s"):
             continue
         if report["settings"]["codec"] not in ("none", DEFAULT_CODEC):
             continue

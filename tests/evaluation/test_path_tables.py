@@ -36,8 +36,16 @@ def report(codec, ate_percent, **settings):
     }
 
 
-@pytest.mark.parametrize("other", [report("3dcsc-vr", 7.77), report(DEFAULT_CODEC, 7.77, gap_s=1.0)])
-def test_other_codecs_and_gaps_are_not_in_it(tmp_path, other):
+@pytest.mark.parametrize(
+    "other",
+    [
+        report("3dcsc-vr", 7.77),
+        report(DEFAULT_CODEC, 7.77, gap_s=1.0),
+        report(DEFAULT_CODEC, 7.77, link={"channel": "rayleigh", "doppler_hz": 5.0}),
+        report(DEFAULT_CODEC, 7.77, link={"channel": "trace"}),
+    ],
+)
+def test_other_codecs_and_links_are_not_in_it(tmp_path, other):
     (tmp_path / "trajectory_a.json").write_text(json.dumps(report(DEFAULT_CODEC, 0.25)))
     (tmp_path / "trajectory_b.json").write_text(json.dumps(other))
     rows = readme_table(tmp_path)

@@ -50,6 +50,9 @@ def test_no_name_of_a_column_is_cut_and_every_row_takes_one_line(what):
 
 def test_figures_of_published_poses_fit_beside_those_of_the_corrected_path():
     report = shipped("trajectory")
+    for cell in report["cells"]:
+        for figure in ("ate_at_once_percent", "completeness_at_once"):
+            cell.pop(figure, None)
     assert "live %" not in result_table("trajectory", report).head
     assert "Live" not in result_table("trajectory", report).notes[0]
     for cell in report["cells"]:
