@@ -27,6 +27,10 @@ README_LINKS: dict[tuple[str, float] | None, str] = {
 }
 
 
+#: Link of which the table also has the errors of poses as they were published, and the name of that column.
+_LIVE_LINK, _LIVE = ("rayleigh", 6.0), "the same, live"
+
+
 def median_and_worst(cell: Report, figure: str = "ate_percent", digits: int = 2) -> str:
     """Return the median of an error over the runs of a cell as text.
 
@@ -101,6 +105,7 @@ def readme_table(folder: Path) -> str:
     in it.
     """
     errors: dict[str, dict[str, str]] = {}
+    live: dict[str, str] = {}
     for file in sorted(folder.glob("trajectory_*.json")):
         report = json.loads(file.read_text(encoding="utf-8"))
         channel = report["settings"]["link"]["channel"]
@@ -118,7 +123,12 @@ def readme_table(folder: Path) -> str:
                 share = "" if posed == 1.0 else f", {int(1000 * posed) / 10:.1f}% posed"
                 of = errors.setdefault(report["sequence"], {})
                 of[README_LINKS[link]] = median_and_worst(cell) + share
+                if link == _LIVE_LINK and "ate_at_once_percent" in cell:
+                    live[report["sequence"]] = median_and_worst(cell, "ate_at_once_percent")
     links = list(README_LINKS.values())
     ordered = sorted(errors.items(), key=lambda entry: (-len(entry[1]), entry[0]))
+    for name, of in ordered:
+        of[_LIVE] = live.get(name, "-")
+    links.insert(links.index(README_LINKS[_LIVE_LINK]) + 1, _LIVE)
     rows = [[name, *(of.get(link, "-") for link in links)] for name, of in ordered]
     return "\n".join(table(("recording", *links), rows))

@@ -69,10 +69,19 @@ def test_of_the_shares_of_frames_with_a_pose_the_least_one_is_told(tmp_path):
     shown = report(DEFAULT_CODEC, 0.25)
     shown["cells"] = [cell_of([0.25, 0.25, 0.9], (1.0, 0.9996, 1.0))]
     (tmp_path / "trajectory_a.json").write_text(json.dumps(shown))
-    assert "| drive | - | 0.25 (0.90), 99.9% posed |" in readme_table(tmp_path)
+    assert "| drive | - | 0.25 (0.90), 99.9% posed | - |" in readme_table(tmp_path)
     shown["cells"] = [cell_of([0.25, 0.25, 0.3], (1.0, 0.5, 1.0))]
     (row,) = list(trajectory_table(shown))[2:]
     assert re.search(r"\| 0.250 \| 0.500 \|", row)
+
+
+def test_errors_of_poses_as_published_stand_beside_those_of_one_link(tmp_path):
+    shown = report(DEFAULT_CODEC, 0.25)
+    shown["cells"][0]["ate_at_once_percent"] = shown["cells"][0]["runs"][0]["ate_at_once_percent"] = 0.5
+    (tmp_path / "trajectory_a.json").write_text(json.dumps(shown))
+    head, _, row = readme_table(tmp_path).splitlines()
+    assert head.startswith("| recording | clean images | fading, 6 dB | the same, live |")
+    assert row.startswith("| drive | - | 0.25 | 0.50 |")
 
 
 def test_figures_of_published_poses_have_columns_where_a_file_has_them():
