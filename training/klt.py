@@ -12,7 +12,6 @@ from semcast.common.errors import ConfigError
 from semcast.common.nets.decoder import Decoder
 from semcast.common.nets.encoder import Encoder
 from semcast.common.nets.linear import BlockAnalysis, BlockSynthesis
-from semcast.common.nets.mae import MaeDecoder, MaeEncoder
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.nets.vit import VitDecoder, VitEncoder
 from semcast.common.phy.slots import BLOCK_PX, BLOCK_VALUES, LATENT_CHANNELS
@@ -124,9 +123,6 @@ def start_from_klt(model: Transceiver, images: list[NDArray[np.uint8]], generato
             _start_linear(encoder.linear, decoder.linear, linear_link(images, model.channels, mixed))
         elif isinstance(encoder, VitEncoder) and isinstance(decoder, VitDecoder):
             _start_vit(encoder, decoder, linear_link(images, LATENT_CHANNELS, generator))
-        elif isinstance(encoder, MaeEncoder) and isinstance(decoder, MaeDecoder):
-            per_block = encoder.gather.out_channels // encoder.patch_blocks**2
-            _start_mae(encoder, decoder, linear_link(images, min(per_block, LATENT_CHANNELS), generator))
         else:
             raise ConfigError(
                 "start must be 'random' for an architecture that is not linear anywhere, got 'klt'"
@@ -168,28 +164,3 @@ def _start_vit(encoder: VitEncoder, decoder: VitDecoder, link: LinearLink) -> No
     decoder.head.weight.zero_()
     _set(decoder.head.weight[:, :count], link.synthesis * link.wiener(_START_SNR_DB))
     _set(_bias(decoder.head), link.mean)
-
-
-def _start_mae(encoder: MaeEncoder, decoder: MaeDecoder, link: LinearLink) -> None:
-    """As ``_start_vit``; a token holds as many coefficients of each of its blocks as it has room for."""
-    count = link.power.size
-    _set(encoder.stem.weight[:count], link.analysis)
-    _set(_bias(encoder.stem)[:count], -link.analysis @ link.mean)
-    decoder.head.weight.zero_()
-    _set(decoder.head.weight[:, :count], link.synthesis * link.wiener(_START_SNR_DB))
-    _set(_bias(decoder.head), link.mean)
-    used = count * encoder.patch_blocks**2
-    for weight in (encoder.gather.weight, decoder.stem.weight):
-        weight[:used].zero_()
-    for layer in (encoder.gather, decoder.stem):
-        _bias(layer)[:used].zero_()
-    for spread in (encoder.head, decoder.spread):
-        spread.weight.zero_()
-        _bias(spread).zero_()
-    for block in range(encoder.patch_blocks**2):
-        own = slice(block * count, (block + 1) * count)
-        place = divmod(block, encoder.patch_blocks)
-        _set(encoder.gather.weight[own, :count, *place], np.eye(count))
-        _set(encoder.head.weight[own, :, *place], link.mix.T)
-        _set(decoder.stem.weight[own, :LATENT_CHANNELS, *place], link.unmix)
-        _set(decoder.spread.weight[own, :count, *place], np.eye(count))

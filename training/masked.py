@@ -4,8 +4,10 @@ import torch
 from torch import Tensor
 
 from semcast.common.errors import ConfigError
-from semcast.common.nets.mae import MaeDecoder, MaeEncoder
+from semcast.common.nets.mae import MaeDecoder
 from semcast.common.nets.transceiver import Transceiver
+from semcast.common.nets.vit import VitEncoder
+from semcast.common.phy.slots import BLOCK_PX
 
 
 def masked_image_loss(
@@ -26,7 +28,7 @@ def masked_image_loss(
         ConfigError: The transceiver is of another architecture.
     """
     encoder, decoder = model.encoder, model.decoder
-    if not isinstance(encoder, MaeEncoder) or not isinstance(decoder, MaeDecoder):
+    if not isinstance(encoder, VitEncoder) or not isinstance(decoder, MaeDecoder):
         raise ConfigError("pretrain_share must be 0 for an architecture other than mae")
     f = encoder.embed(x)
     batch, dim, rows, columns = f.shape
@@ -39,12 +41,10 @@ def masked_image_loss(
     full = decoder.mask_token.to(visible.dtype).expand(batch, count, dim).scatter(1, kept, visible)
     grid = full.transpose(1, 2).reshape(batch, dim, rows, columns)
     tokens = decoder.trunk.refine(*decoder.trunk.place(grid))
-    pixels, _ = decoder.pixels(tokens.transpose(1, 2).reshape(batch, dim, rows, columns))
+    pixels = decoder.pixels(tokens.transpose(1, 2).reshape(batch, dim, rows, columns))
     is_hidden = torch.ones(batch, count, device=x.device).scatter(1, order[:, :num_kept], 0.0)
-    height, width = x.shape[2:]
-    side = pixels.shape[2] // rows
     weight = is_hidden.view(batch, 1, rows, columns)
-    weight = weight.repeat_interleave(side, dim=2).repeat_interleave(side, dim=3)[:, :, :height, :width]
-    error = (pixels[:, :, :height, :width] + 0.5 - x).square()
+    weight = weight.repeat_interleave(BLOCK_PX, dim=2).repeat_interleave(BLOCK_PX, dim=3)
+    error = (pixels + 0.5 - x).square()
     loss = (error * weight).sum() / (3.0 * weight.sum()).clamp_min(1.0)
     return loss, {"mse": loss.detach(), "masked": loss.detach()}

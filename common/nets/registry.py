@@ -7,7 +7,7 @@ from typing import Any
 from semcast.common.config import near_match
 from semcast.common.errors import CheckpointError
 from semcast.common.nets.cnn import CnnSizes, build_cnn
-from semcast.common.nets.mae import MaeSizes, build_mae
+from semcast.common.nets.mae import build_mae
 from semcast.common.nets.transceiver import Sizes, Transceiver, build_3dcsc, build_variable_3dcsc
 from semcast.common.nets.vit import VitSizes, build_vit
 
@@ -40,7 +40,7 @@ def _entries() -> tuple[Architecture, ...]:
         Architecture("3dcsc-lite-vr", lite, build_variable_3dcsc),
         Architecture("cnn", CnnSizes(), build_cnn),
         Architecture("vit", VitSizes(), build_vit),
-        Architecture("mae", MaeSizes(), build_mae),
+        Architecture("mae", VitSizes(), build_mae),
     )
 
 

@@ -150,9 +150,14 @@ class VitEncoder(nn.Module):
         self.trunk = Trunk(sizes.dim, sizes.heads, sizes.encoder_depth, sizes.window)
         self.head = nn.Conv2d(sizes.dim, LATENT_CHANNELS, 1)
 
+    def embed(self, x: Tensor) -> Tensor:
+        """Map ``(B, 3, H, W)`` in [0, 1] to tokens ``(B, dim, H/16, W/16)`` before the trunk."""
+        tokens: Tensor = self.stem(self.fold(x - 0.5))
+        return tokens
+
     def forward(self, x: Tensor, snr_db: Tensor) -> Tensor:
         """Map ``(B, 3, H, W)`` in [0, 1] to the latent ``(B, 94, H/16, W/16)`` before modulation."""
-        f = self.trunk(self.stem(self.fold(x - 0.5)), condition_vector(snr_db))
+        f = self.trunk(self.embed(x), condition_vector(snr_db))
         latent: Tensor = self.head(f).float()
         return latent
 
@@ -168,13 +173,18 @@ class VitDecoder(nn.Module):
         self.unfold = nn.PixelShuffle(BLOCK_PX)
         self.fold8, self.fold4 = nn.PixelUnshuffle(8), nn.PixelUnshuffle(4)
 
+    def pixels(self, tokens: Tensor) -> Tensor:
+        """Map tokens ``(B, dim, h, w)`` behind the trunk to an image ``(B, 3, 16 h, 16 w)`` around 0."""
+        image: Tensor = self.unfold(self.head(tokens)).float()
+        return image
+
     def forward(
         self, y: Tensor, snr_db: Tensor, shrink: Tensor, scale: Tensor
     ) -> tuple[Tensor, DecoderFeatures]:
         """Map the received latent to ``(B, 3, 16 h, 16 w)``; finer features are the patches themselves."""
         received = torch.cat((y, normalise_snr_db(snr_db), shrink), dim=1)
         f = self.trunk(self.stem(received), condition_vector(snr_db.mean(dim=(1, 2, 3))))
-        pixels = self.unfold(self.head(f)).float()
+        pixels = self.pixels(f)
         return pixels + 0.5, DecoderFeatures(received, f, self.fold8(pixels), self.fold4(pixels))
 
 

@@ -43,7 +43,7 @@ def test_images_without_a_block_are_refused():
         (lambda: build_3dcsc(TINY), 20.0),
         (lambda: build_variable_3dcsc(TINY), 20.0),
         (lambda: build("vit"), 20.0),
-        (lambda: build("mae"), 18.0),
+        (lambda: build("mae"), 20.0),
     ],
     ids=["3dcsc", "3dcsc-vr", "vit", "mae"],
 )

@@ -18,9 +18,10 @@ from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.codec import NeuralCodec
-from semcast.common.nets.mae import MaeSizes, build_mae
+from semcast.common.nets.mae import build_mae
 from semcast.common.nets.registry import architectures
 from semcast.common.nets.transceiver import Sizes, build_3dcsc, build_variable_3dcsc
+from semcast.common.nets.vit import VitSizes
 from semcast.training.channel import LinkDrawSettings
 from semcast.training.data import CropSettings
 from semcast.training.loop import train
@@ -168,9 +169,7 @@ def test_a_run_can_begin_with_analog_links(tiny_network, photos, tmp_path):
 
 
 def test_a_masked_autoencoder_is_pre_trained_before_it_is_sent(photos, tmp_path, monkeypatch):
-    small = MaeSizes(
-        dim=16, heads=2, encoder_depth=1, decoder_depth=1, block_channels=8, confidence_channels=8
-    )
+    small = VitSizes(dim=16, heads=2, encoder_depth=1, decoder_depth=1, confidence_channels=8)
     monkeypatch.setattr(registry, "_entries", lambda: (registry.Architecture("mae", small, build_mae),))
     crop = CropSettings(size_px=96)
     train(
