@@ -1,4 +1,4 @@
-"""The masked-autoencoder baseline: the transformer of ``vit``, trained to fill in hidden patches before its link.
+"""The masked-autoencoder baseline: the transformer of ``vit``, which learns to fill in hidden patches first.
 
 Patches have 16 x 16 pixels, as the paper's: 50 x 50 of them in an image of 800 x 800.
 """

@@ -1,4 +1,9 @@
-"""Two-view geometry: residuals of a relative pose, cheirality, and refinement."""
+"""Two-view geometry: residuals of a relative pose, cheirality, and refinement.
+
+What both cameras see lies on one half of its epipolar line, which begins where the point would be if it were
+infinitely far away. The Sampson distance knows the whole line: with it alone a pose fits as well whose
+translation is turned round and whose rotation makes up for some of that, and a refinement ends there.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +14,7 @@ from semcast.server.geometry.weighting import HUBER_K
 
 Array = NDArray[np.float64]
 
+_HALF_ROOT = 0.5**0.5
 #: Derivatives of a rotation at the identity, ``(3, 3, 3)``.
 _GENERATORS = np.stack([skew(axis) for axis in np.eye(3)])
 
@@ -42,6 +48,71 @@ def sampson_px(F: Array, keypoints0_xy: Array, keypoints1_xy: Array) -> Array:
     algebraic = (x1 * line1).sum(axis=-1)
     square = line1[..., 0] ** 2 + line1[..., 1] ** 2 + line0[..., 0] ** 2 + line0[..., 1] ** 2
     return np.asarray(algebraic / np.sqrt(np.maximum(square, 1e-18)))
+
+
+def half_line_px(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
+    """Distance in pixels of matches to the half of their epipolar line that is in front of the cameras, ``(N,)``.
+
+    It is the Sampson distance, and for a point behind the cameras also the way along the line to where its
+    image would be at infinity, scaled alike.
+
+    Args:
+        camera: Of both images.
+        T_cam1_cam0: ``(4, 4)`` relative pose.
+        xy0: ``(N, 2)`` pixels.
+        xy1: ``(N, 2)`` pixels, matched row by row.
+    """
+    across = sampson_px(fundamental_matrix(camera, T_cam1_cam0), xy0, xy1)
+    return np.hypot(across, beyond_infinity_px(camera, T_cam1_cam0, xy0, xy1))
+
+
+def beyond_infinity_px(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
+    """How far matches lie beyond infinity along their epipolar lines, ``(N,)``: 0 in front, else negative.
+
+    Pixels are divided by the root of 2, as the Sampson distance shares an error between two images. Arguments
+    as ``half_line_px``.
+    """
+    return np.minimum(_from_infinity(camera, T_cam1_cam0, xy0, xy1)[0], 0.0)
+
+
+def beyond_infinity_jacobian(
+    camera: Intrinsics, T_cam1_cam0: Array, tangent: Array, xy0: Array, xy1: Array
+) -> tuple[Array, Array]:
+    """``beyond_infinity_px`` and how it changes with the pose, ``(N, 5)``; the same as ``sampson_jacobian``."""
+    along, way, length, offset, x, y = _from_infinity(camera, T_cam1_cam0, xy0, xy1)
+    focal_px = np.array([camera.fx, camera.fy])
+    # As the pose changes, the point at infinity moves, and the way turns by what it then lies to the side.
+    side = (_HALF_ROOT * offset - along[:, None] * way) / length[:, None]
+    pull = (_HALF_ROOT * way + T_cam1_cam0[2, 3] * side) * focal_px
+    J = np.empty((len(x), 5))
+    J[:, 0] = pull[:, 0] * x * y + pull[:, 1] * (1.0 + y * y)
+    J[:, 1] = -pull[:, 0] * (1.0 + x * x) - pull[:, 1] * x * y
+    J[:, 2] = pull[:, 0] * y - pull[:, 1] * x
+    side *= focal_px
+    J[:, 3:] = side @ tangent[:, :2].T - (side[:, :1] * x[:, None] + side[:, 1:] * y[:, None]) * tangent[:, 2]
+    is_behind = along < 0.0
+    return np.where(is_behind, along, 0.0), np.where(is_behind[:, None], J, 0.0)
+
+
+def _from_infinity(
+    camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Where matches lie on their epipolar lines, seen from the point at infinity.
+
+    Returns:
+        Pixels over the root of 2 along the line, positive towards a near point ``(N,)``; the unit vector
+        ``(N, 2)`` of that way; how long it is for a unit of inverse depth; pixels from infinity ``(N, 2)``; and
+        the turned rays at a depth of 1, ``(N,)`` each.
+    """
+    ray = camera.unproject(xy0) @ T_cam1_cam0[:3, :3].T
+    z = np.maximum(ray[:, 2], 1e-6)
+    x, y = ray[:, 0] / z, ray[:, 1] / z
+    t = T_cam1_cam0[:3, 3]
+    way = np.stack([camera.fx * (t[0] - x * t[2]), camera.fy * (t[1] - y * t[2])], axis=1)
+    length = np.maximum(np.sqrt((way * way).sum(axis=1)), 1e-9)
+    way /= length[:, None]
+    offset = xy1 - np.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], axis=1)
+    return _HALF_ROOT * (offset * way).sum(axis=1), way, length, offset, x, y
 
 
 def msac_score(residual_px: Array, threshold_px: float, weight: Array | None = None) -> float:
@@ -182,14 +253,14 @@ def refine_relative_pose(
     cut_sigmas: float = 4.0,
     iterations: int = 10,
 ) -> Array:
-    """Minimise the weighted Sampson distance over rotation and translation direction.
+    """Minimise the weighted distance to epipolar half lines over rotation and translation direction.
 
     Args:
         camera: Of both images.
         T_cam1_cam0: Start, translation of length 1.
         xy0: ``(N, 2)``.
         xy1: ``(N, 2)``.
-        sigma_px: ``(N,)`` standard deviation of each match's Sampson distance.
+        sigma_px: ``(N,)`` standard deviation of each match's distance.
         cut_sigmas: Residuals beyond it pull no longer (Huber up to there).
         iterations: Gauss-Newton steps at most.
 
@@ -197,24 +268,25 @@ def refine_relative_pose(
         The refined pose; the start where it got no better.
     """
 
-    def residual_of(T: Array) -> Array:
-        return sampson_px(fundamental_matrix(camera, T), xy0, xy1) / sigma_px
-
-    def cost_of(r: Array) -> float:
-        a = np.minimum(np.abs(r), cut_sigmas)
-        return float(np.where(a < HUBER_K, 0.5 * a * a, HUBER_K * (a - 0.5 * HUBER_K)).sum())
+    def linearised(T: Array) -> tuple[float, Array, Array, Array]:
+        """Cost, tangent of the translation, and the normal equations of a step."""
+        tangent = _tangent(T[:3, 3])
+        across, J = sampson_jacobian(camera, T, tangent, xy0, xy1)
+        beyond, J_beyond = beyond_infinity_jacobian(camera, T, tangent, xy0, xy1)
+        size = np.hypot(across, beyond) / sigma_px
+        a = np.minimum(size, cut_sigmas)
+        cost = float(np.where(a < HUBER_K, 0.5 * a * a, HUBER_K * (a - 0.5 * HUBER_K)).sum())
+        w = np.where(size < cut_sigmas, np.minimum(1.0, HUBER_K / np.maximum(size, 1e-9)), 0.0)
+        w /= sigma_px * sigma_px
+        J_w, J_beyond_w = J * w[:, None], J_beyond * w[:, None]
+        H = J_w.T @ J + J_beyond_w.T @ J_beyond
+        g = -J_w.T @ across - J_beyond_w.T @ beyond
+        return cost, tangent, H, g
 
     T = T_cam1_cam0.copy()
-    cost = cost_of(residual_of(T))
+    cost, tangent, H, g = linearised(T)
     damping = 1e-4
     for _ in range(iterations):
-        tangent = _tangent(T[:3, 3])
-        residual, J = sampson_jacobian(camera, T, tangent, xy0, xy1)
-        residual, J = residual / sigma_px, J / sigma_px[:, None]
-        size = np.abs(residual)
-        w = np.where(size < cut_sigmas, np.minimum(1.0, HUBER_K / np.maximum(size, 1e-9)), 0.0)
-        H = (J * w[:, None]).T @ J
-        g = -(J * w[:, None]).T @ residual
         try:
             step = np.linalg.solve(H + damping * np.diag(np.diag(H)) + 1e-12 * np.eye(5), g)
         except np.linalg.LinAlgError:
@@ -222,10 +294,11 @@ def refine_relative_pose(
         if not np.isfinite(step).all() or float(np.abs(step).max()) > 1.0:
             break
         candidate = _moved(T, np.asarray(step), tangent)
-        new_cost = cost_of(residual_of(candidate))
-        if new_cost < cost:
-            gain = cost - new_cost
-            T, cost, damping = candidate, new_cost, damping * 0.3
+        at_candidate = linearised(candidate)
+        if at_candidate[0] < cost:
+            gain = cost - at_candidate[0]
+            T, damping = candidate, damping * 0.3
+            cost, tangent, H, g = at_candidate
             if gain < 1e-6 * cost:
                 break
         else:

@@ -24,6 +24,7 @@ from semcast.server.geometry.epipolar import (
     depths,
     fit_rotation,
     fundamental_matrix,
+    half_line_px,
     msac_score,
     rays_angle_deg,
     refine_relative_pose,
@@ -137,7 +138,7 @@ def estimate_two_view(
     num_searched = len(candidates)
     if choose_model:
         candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
-    best = _likeliest(camera, candidates, xy0, xy1, kept, _weights(agreement), threshold_px)
+    best = _likeliest(camera, candidates, xy0, xy1, _weights(agreement), threshold_px)
     if best is None:
         return None
     chosen, T = best
@@ -190,19 +191,19 @@ def _likeliest(
     candidates: Sequence[Array | None],
     xy0: Array,
     xy1: Array,
-    kept: NDArray[np.intp],
     weight: Array,
     threshold_px: float,
 ) -> tuple[int, Array] | None:
-    """Which pose explains the matches best at the least turn, and that pose, in front of both cameras."""
+    """Which pose explains the matches best at the least turn, and that pose, its translation either way."""
     judged: list[tuple[float, int, Array]] = []
     for k, candidate in enumerate(candidates):
         if candidate is None:
             continue
-        T = in_front_sign(camera, candidate, xy0[kept], xy1[kept])
-        cost = _score(camera, T, xy0, xy1, threshold_px, weight)
-        cost += _TURN_COST * float(np.sqrt(rotation_angle_deg(T[:3, :3])) / weight.sum())
-        judged.append((cost if k == 0 else _TO_DISPLACE * cost, k, T))
+        turn_cost = _TURN_COST * float(np.sqrt(rotation_angle_deg(candidate[:3, :3])) / weight.sum())
+        for way in (1.0, -1.0):  # a search tells the translation up to its sign
+            T = make_transform(candidate[:3, :3], way * candidate[:3, 3])
+            cost = _score(camera, T, xy0, xy1, threshold_px, weight) + turn_cost
+            judged.append((cost if k == 0 else _TO_DISPLACE * cost, k, T))
     if not judged:
         return None
     _, chosen, T = min(judged, key=lambda item: item[:2])
@@ -224,13 +225,12 @@ def _weights(agreement: Array) -> Array:
 
 
 def _score(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float, weight: Array) -> float:
-    """MSAC score without confidence, in which a point clearly behind a camera is an outlier.
+    """MSAC score without confidence over the distances to epipolar half lines.
 
     It is the mean over several thresholds, because the noise of decoded images is not known beforehand.
-    The depths tell the two poses of a plane apart, which fit the epipolar constraint equally well.
+    Which half tells the two poses of a plane apart, which fit the epipolar constraint equally well.
     """
-    residual = sampson_px(fundamental_matrix(camera, T), xy0, xy1)
-    residual = np.where(_behind(camera, T, xy0, xy1, threshold_px), np.inf, residual)
+    residual = half_line_px(camera, T, xy0, xy1)
     return float(np.mean([msac_score(residual, factor * threshold_px, weight) for factor in _SCORE_FACTORS]))
 
 
@@ -282,14 +282,14 @@ def _search(
 
 
 def _near_turning(camera: Intrinsics, xy0: Array, xy1: Array, threshold_px: float) -> list[Array]:
-    """Poses near the turn that explains the matches best, with a translation from each axis on."""
+    """Poses near the turn that explains the matches best, with a translation from each axis on, both ways."""
     rows = np.linspace(0, len(xy0) - 1, min(len(xy0), _MAX_TURNING_MATCHES)).astype(np.intp)
     xy0, xy1 = xy0[rows], xy1[rows]
     R = fit_rotation(camera, xy0, xy1)
     sigma_px = np.full(len(rows), 2.0 * threshold_px)
     return [
         refine_relative_pose(camera, make_transform(R, axis), xy0, xy1, sigma_px, iterations=_TURNING_STEPS)
-        for axis in np.eye(3)
+        for axis in (*np.eye(3), *-np.eye(3))
     ]
 
 
@@ -323,7 +323,7 @@ def _refine(
     camera: Intrinsics, T: Array, xy0: Array, xy1: Array, confidence: Array | None, threshold_px: float
 ) -> Array:
     """Refine with the noise fitted to this pair; with equal weights where confidence tells nothing."""
-    residual = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
+    residual = half_line_px(camera, T, xy0, xy1)
     near = residual < 3.0 * threshold_px
     if int(near.sum()) < MIN_MATCHES:
         return T

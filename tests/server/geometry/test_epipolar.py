@@ -10,10 +10,13 @@ from semcast.common.geometry import (
     transform_points,
 )
 from semcast.server.geometry.epipolar import (
+    beyond_infinity_jacobian,
+    beyond_infinity_px,
     depths,
     essential_matrix,
     fit_rotation,
     fundamental_matrix,
+    half_line_px,
     msac_score,
     rays_angle_deg,
     refine_relative_pose,
@@ -76,6 +79,45 @@ def test_the_derivative_of_sampson_is_that_of_small_steps():
             turned = t + step[3:] @ tangent
             pose = make_transform(exp_so3(step[:3]) @ T[:3, :3], turned / np.linalg.norm(turned))
             return sampson_px(fundamental_matrix(CAMERA, pose), xy0, xy1)
+
+        assert np.allclose(J[:, k], (moved(step) - moved(-step)) / 2e-6, rtol=1e-4, atol=1e-3)
+
+
+def test_half_of_an_epipolar_line_is_in_front_of_the_cameras():
+    # Camera 1 sits 1 to the left: a point 5 ahead moves 100 px to the right, never to the left.
+    T = make_transform(np.eye(3), (1, 0, 0))
+    square = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
+    xy0 = np.full((3, 2), (300.0, 200.0))
+    xy1 = np.array([[400.0, 200], [300, 200], [280, 203]])
+    assert np.allclose(beyond_infinity_px(square, T, xy0, xy1), [0, 0, -20 / np.sqrt(2)])
+    assert np.allclose(half_line_px(square, T, xy0, xy1), [0, 0, np.hypot(20, 3) / np.sqrt(2)])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_point_of_an_exact_pair_is_beyond_infinity_and_turned_round_all_are(seed):
+    T, _, xy0, xy1 = make_pair(np.random.default_rng(seed))
+    assert np.abs(beyond_infinity_px(CAMERA, T, xy0, xy1)).max() < 1e-9
+    turned = make_transform(T[:3, :3], -T[:3, 3])
+    assert (beyond_infinity_px(CAMERA, turned, xy0, xy1) < 0).all()
+
+
+def test_the_derivative_of_what_is_beyond_infinity_is_that_of_small_steps():
+    rng = np.random.default_rng(7)
+    T, _, xy0, xy1 = make_pair(rng, num=40, noise_px=3.0)
+    T[:3, 3] *= -1.0
+    t = T[:3, 3]
+    across = np.cross(t, (0.3, -0.5, 0.8))
+    tangent = np.stack([across, np.cross(t, across)]) / np.linalg.norm(across)
+    beyond, J = beyond_infinity_jacobian(CAMERA, T, tangent, xy0, xy1)
+    assert np.allclose(beyond, beyond_infinity_px(CAMERA, T, xy0, xy1), atol=1e-12)
+    assert (beyond < 0).sum() > 30
+    for k in range(5):
+        step = 1e-6 * np.eye(5)[k]
+
+        def moved(step):
+            turned = t + step[3:] @ tangent
+            pose = make_transform(exp_so3(step[:3]) @ T[:3, :3], turned / np.linalg.norm(turned))
+            return beyond_infinity_px(CAMERA, pose, xy0, xy1)
 
         assert np.allclose(J[:, k], (moved(step) - moved(-step)) / 2e-6, rtol=1e-4, atol=1e-3)
 
