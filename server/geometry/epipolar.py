@@ -51,7 +51,7 @@ def sampson_px(F: Array, keypoints0_xy: Array, keypoints1_xy: Array) -> Array:
 
 
 def half_line_px(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
-    """Distance in pixels of matches to the half of their epipolar line that is in front of the cameras, ``(N,)``.
+    """Distance in pixels of matches to the half of their epipolar line in front of the cameras, ``(N,)``.
 
     It is the Sampson distance, and for a point behind the cameras also the way along the line to where its
     image would be at infinity, scaled alike.
@@ -78,7 +78,7 @@ def beyond_infinity_px(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: 
 def beyond_infinity_jacobian(
     camera: Intrinsics, T_cam1_cam0: Array, tangent: Array, xy0: Array, xy1: Array
 ) -> tuple[Array, Array]:
-    """``beyond_infinity_px`` and how it changes with the pose, ``(N, 5)``; the same as ``sampson_jacobian``."""
+    """``beyond_infinity_px`` and its derivatives by the pose, ``(N, 5)``: those of ``sampson_jacobian``."""
     along, way, length, offset, x, y = _from_infinity(camera, T_cam1_cam0, xy0, xy1)
     focal_px = np.array([camera.fx, camera.fy])
     # As the pose changes, the point at infinity moves, and the way turns by what it then lies to the side.
@@ -100,8 +100,8 @@ def _from_infinity(
     """Where matches lie on their epipolar lines, seen from the point at infinity.
 
     Returns:
-        Pixels over the root of 2 along the line, positive towards a near point ``(N,)``; the unit vector
-        ``(N, 2)`` of that way; how long it is for a unit of inverse depth; pixels from infinity ``(N, 2)``; and
+        Pixels over the root of 2 along the line, ``(N,)``, positive towards a near point; the unit vector of
+        that way, ``(N, 2)``; how long it is for a unit of inverse depth; pixels from infinity ``(N, 2)``; and
         the turned rays at a depth of 1, ``(N,)`` each.
     """
     ray = camera.unproject(xy0) @ T_cam1_cam0[:3, :3].T
