@@ -260,11 +260,25 @@ def is_camera_number(text: str) -> bool:
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
+def is_camera_device(text: str) -> bool:
+    """Tell whether this is a camera's file on Linux, such as ``/dev/video0``, plugged in or not."""
+    path = Path(text)
+    in_dev = text.startswith("/dev/") and not text.startswith("/dev/shm/")
+    return in_dev and not (path.is_file() or path.is_dir())
+
+
+def is_live(text: str) -> bool:
+    """Tell whether a source is a camera: by its address, number or device.
+
+    A number is one unless a folder or file has that name.
+    """
+    return "://" in text or (is_camera_number(text) and not Path(text).exists()) or is_camera_device(text)
+
+
 def open_source(settings: SourceSettings) -> Source:
     """Open what ``settings.source`` names.
 
-    Something with ``://`` is an address, a folder or ``.json`` file a recording, any other file a video. A
-    number is a camera unless a folder or file has that name.
+    What ``is_live`` is a camera, a folder or ``.json`` file a recording, any other file a video.
 
     Raises:
         SourceError: It can't be opened, or its camera is unknown.
@@ -284,7 +298,7 @@ def _opened(settings: SourceSettings) -> Source:
 
     text = settings.source
     path = Path(text)
-    if "://" in text or (is_camera_number(text) and not path.exists()):
+    if is_live(text):
         return LiveSource(settings)
     if path.is_file() and path.suffix.lower() != ".json":
         return VideoSource(settings)

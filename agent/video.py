@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.agent.source import Pacer, SourceFrame, is_camera_number
+from semcast.agent.source import Pacer, SourceFrame, is_camera_device, is_camera_number
 from semcast.agent.source_settings import SourceSettings
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import HOW_TO_GIVE
@@ -47,19 +47,21 @@ def public_name(source: str) -> str:
 
 
 def open_capture(source: str, *, live: bool) -> cv2.VideoCapture:
-    """Open a video file, or a camera by its number or address.
+    """Open a video file, or a camera by its number, device or address.
 
     Args:
-        source: File, number or address.
+        source: File, number, device or address.
         live: It is a camera.
 
     Raises:
-        SourceError: It can't be opened; a camera is waited for for five seconds.
+        SourceError: It can't be opened; one at an address is waited for for five seconds.
     """
     if not live:
         capture = cv2.VideoCapture(source)
     elif is_camera_number(source):
         capture = cv2.VideoCapture(int(source))
+    elif is_camera_device(source):
+        capture = cv2.VideoCapture(source, cv2.CAP_V4L2)
     else:
         # Without limits a camera that is switched off holds the thread for half a minute.
         limits = [
@@ -292,7 +294,7 @@ class LiveSource(_Captured):
 
     @property
     def name(self) -> str:
-        """Camera number, or the address without a password."""
+        """Camera number or device, or the address without a password."""
         text = self._settings.source
         return public_name(text) if "://" in text else f"camera {text}"
 
