@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -32,15 +33,22 @@ class SourceFrame:
         frame_id: Index in the recording, or count of frames grabbed; strictly increasing.
         t_source_ns: Recorded time; that of capture for live cameras.
         t_capture_ns: ``time.monotonic_ns`` when it was due or grabbed.
-        image: ``(H, W, 3)`` uint8 RGB, undistorted and resized.
+        stored: ``(H, W, 3)`` uint8 RGB, as it came where there is ``rectify``.
         final: Last frame of a finite source.
+        rectify: Undistorts and resizes what is stored; None where that was done.
     """
 
     frame_id: int
     t_source_ns: int
     t_capture_ns: int
-    image: NDArray[np.uint8]
+    stored: NDArray[np.uint8]
     final: bool = False
+    rectify: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None
+
+    @cached_property
+    def image(self) -> NDArray[np.uint8]:
+        """``(H, W, 3)`` uint8 RGB, undistorted and resized when it is first asked for: not all are sent."""
+        return self.stored if self.rectify is None else self.rectify(self.stored)
 
 
 class Source(Protocol):

@@ -338,7 +338,7 @@ class LiveSource(_Captured):
             # On the beat, or where that was missed from now on: nothing is made up for in a burst.
             due_ns = due_ns + interval_ns if now_ns - due_ns < interval_ns else now_ns + interval_ns
             sent += 1
-            yield SourceFrame(grabbed, now_ns, now_ns, self._rectify(image), sent == most)
+            yield SourceFrame(grabbed, now_ns, now_ns, image, sent == most, self._rectify)
 
     def _skip_what_waited(self) -> None:
         """Throw away images that waited in the driver while nobody took them: their time is not known.
