@@ -76,6 +76,9 @@ def open_capture(source: str, *, live: bool) -> cv2.VideoCapture:
         what = "camera" if live else "video"
         way = ": 'semcast replay' takes recordings of a stream" if source.endswith(".mcap") else ""
         raise SourceError(f"{what} {public_name(source)} can't be opened{way}")
+    if live:
+        # The driver's queue only makes frames older.
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     return capture
 
 
@@ -287,8 +290,6 @@ class LiveSource(_Captured):
     def __init__(self, settings: SourceSettings) -> None:
         super().__init__(settings, live=True, beside=None)
         assert self._capture is not None
-        # The driver's queue only makes frames older.
-        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._fps = _stated_hz(self._capture, 30.0)
         self._trouble = ""  # why no image can be sent, as far as it was said
 
