@@ -307,7 +307,8 @@ def run_agent(
             _wait_for_peers(session, settings.agent_id, stop)
             if not sending.lossless:
                 _wait_until_ready(session, settings.agent_id, agent_epoch, stop)
-        logger.info("sending %s with %s, %s", source.name, codec.name, settings.mode)
+        if not stop.is_set():
+            logger.info("sending %s with %s, %s", source.name, codec.name, settings.mode)
         capture = Capture(source, "all" if sending.lossless else "newest", metrics, sending.wants)
         stack.callback(capture.close)
         unread.pop_all()  # from now on it is the capture's, which frees it when nobody reads from it

@@ -52,6 +52,7 @@ class Capture:
                 if not (frame.final or self._wants is None or self._wants(frame)):
                     self._metrics.drop("thinned")
                     continue
+                _ = frame.image  # made on this thread, beside the encoder, and of frames that are sent alone
                 self._metrics.drop("superseded", self._box.put(frame) or 0)
                 if self._stopping.is_set():
                     return

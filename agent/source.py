@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -32,15 +33,22 @@ class SourceFrame:
         frame_id: Index in the recording, or count of frames grabbed; strictly increasing.
         t_source_ns: Recorded time; that of capture for live cameras.
         t_capture_ns: ``time.monotonic_ns`` when it was due or grabbed.
-        image: ``(H, W, 3)`` uint8 RGB, undistorted and resized.
+        stored: ``(H, W, 3)`` uint8 RGB, as it came where there is ``rectify``.
         final: Last frame of a finite source.
+        rectify: Undistorts and resizes what is stored; None where that was done.
     """
 
     frame_id: int
     t_source_ns: int
     t_capture_ns: int
-    image: NDArray[np.uint8]
+    stored: NDArray[np.uint8]
     final: bool = False
+    rectify: Callable[[NDArray[np.uint8]], NDArray[np.uint8]] | None = None
+
+    @cached_property
+    def image(self) -> NDArray[np.uint8]:
+        """``(H, W, 3)`` uint8 RGB, undistorted and resized when it is first asked for: not all are sent."""
+        return self.stored if self.rectify is None else self.rectify(self.stored)
 
 
 class Source(Protocol):
@@ -260,11 +268,25 @@ def is_camera_number(text: str) -> bool:
     return text.isascii() and text.isdecimal() and len(text) < 10
 
 
+def is_camera_device(text: str) -> bool:
+    """Tell whether this is a camera's file on Linux, such as ``/dev/video0``, plugged in or not."""
+    path = Path(text)
+    in_dev = text.startswith("/dev/") and not text.startswith("/dev/shm/")
+    return in_dev and not (path.is_file() or path.is_dir())
+
+
+def is_live(text: str) -> bool:
+    """Tell whether a source is a camera: by its address, number or device.
+
+    A number is one unless a folder or file has that name.
+    """
+    return "://" in text or (is_camera_number(text) and not Path(text).exists()) or is_camera_device(text)
+
+
 def open_source(settings: SourceSettings) -> Source:
     """Open what ``settings.source`` names.
 
-    Something with ``://`` is an address, a folder or ``.json`` file a recording, any other file a video. A
-    number is a camera unless a folder or file has that name.
+    What ``is_live`` is a camera, a folder or ``.json`` file a recording, any other file a video.
 
     Raises:
         SourceError: It can't be opened, or its camera is unknown.
@@ -284,7 +306,7 @@ def _opened(settings: SourceSettings) -> Source:
 
     text = settings.source
     path = Path(text)
-    if "://" in text or (is_camera_number(text) and not path.exists()):
+    if is_live(text):
         return LiveSource(settings)
     if path.is_file() and path.suffix.lower() != ".json":
         return VideoSource(settings)

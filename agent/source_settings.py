@@ -21,8 +21,8 @@ class SourceSettings:
 
     source: str = field(
         metadata={
-            "help": "folder of a recorded sequence or of images, video file, number of a camera, "
-            "or address of a network camera such as rtsp://host/stream"
+            "help": "folder of a recorded sequence or of images, video file, number or device (/dev/video0) "
+            "of a camera, or address of a network camera such as rtsp://host/stream"
         }
     )
     layout: Layout = field(

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.agent.source import Pacer, SourceFrame, is_camera_number
+from semcast.agent.source import Pacer, SourceFrame, is_camera_device, is_camera_number
 from semcast.agent.source_settings import SourceSettings
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import HOW_TO_GIVE
@@ -47,19 +47,21 @@ def public_name(source: str) -> str:
 
 
 def open_capture(source: str, *, live: bool) -> cv2.VideoCapture:
-    """Open a video file, or a camera by its number or address.
+    """Open a video file, or a camera by its number, device or address.
 
     Args:
-        source: File, number or address.
+        source: File, number, device or address.
         live: It is a camera.
 
     Raises:
-        SourceError: It can't be opened; a camera is waited for for five seconds.
+        SourceError: It can't be opened; one at an address is waited for for five seconds.
     """
     if not live:
         capture = cv2.VideoCapture(source)
     elif is_camera_number(source):
         capture = cv2.VideoCapture(int(source))
+    elif is_camera_device(source):
+        capture = cv2.VideoCapture(source, cv2.CAP_V4L2)
     else:
         # Without limits a camera that is switched off holds the thread for half a minute.
         limits = [
@@ -74,6 +76,9 @@ def open_capture(source: str, *, live: bool) -> cv2.VideoCapture:
         what = "camera" if live else "video"
         way = ": 'semcast replay' takes recordings of a stream" if source.endswith(".mcap") else ""
         raise SourceError(f"{what} {public_name(source)} can't be opened{way}")
+    if live:
+        # The driver's queue only makes frames older.
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     return capture
 
 
@@ -285,14 +290,12 @@ class LiveSource(_Captured):
     def __init__(self, settings: SourceSettings) -> None:
         super().__init__(settings, live=True, beside=None)
         assert self._capture is not None
-        # The driver's queue only makes frames older.
-        self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._fps = _stated_hz(self._capture, 30.0)
         self._trouble = ""  # why no image can be sent, as far as it was said
 
     @property
     def name(self) -> str:
-        """Camera number, or the address without a password."""
+        """Camera number or device, or the address without a password."""
         text = self._settings.source
         return public_name(text) if "://" in text else f"camera {text}"
 
@@ -336,7 +339,7 @@ class LiveSource(_Captured):
             # On the beat, or where that was missed from now on: nothing is made up for in a burst.
             due_ns = due_ns + interval_ns if now_ns - due_ns < interval_ns else now_ns + interval_ns
             sent += 1
-            yield SourceFrame(grabbed, now_ns, now_ns, self._rectify(image), sent == most)
+            yield SourceFrame(grabbed, now_ns, now_ns, image, sent == most, self._rectify)
 
     def _skip_what_waited(self) -> None:
         """Throw away images that waited in the driver while nobody took them: their time is not known.

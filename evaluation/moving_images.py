@@ -52,8 +52,8 @@ class ImagesSettings:
     source: str = field(
         metadata={
             "positional": True,
-            "help": "video, folder of a recorded sequence or of images, or number of a camera, which is then "
-            "to be moved and turned",
+            "help": "video, folder of a recorded sequence or of images, or number or device of a camera, "
+            "which is then to be moved and turned",
         }
     )
     layout: Layout = field(

@@ -27,6 +27,18 @@ def test_help_lists_every_verb_and_answers_at_once():
     assert elapsed_s < 1.5  # 0.5 s is the aim on an idle machine; tests may share it
 
 
+@pytest.mark.parametrize(
+    ("verb", "given", "threads"),
+    [("agent", {}, "1"), ("agent", {"OPENBLAS_NUM_THREADS": "3"}, "3"), ("info", {}, None)],
+)
+def test_an_agent_leaves_the_other_cores_alone_unless_told(monkeypatch, capsys, verb, given, threads):
+    own = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    monkeypatch.setattr(os, "environ", own | given)
+    with pytest.raises(SystemExit):
+        main([verb, "--help"])
+    assert os.environ.get("OPENBLAS_NUM_THREADS") == threads
+
+
 def test_the_overview_imports_nothing_heavy():
     code = (
         "import sys; from semcast.cli import main\n"

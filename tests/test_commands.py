@@ -348,6 +348,11 @@ def test_the_doctor_tells_what_makes_bfloat16_fast(monkeypatch, flags, verdict, 
     assert text in found.text
 
 
+def test_the_doctor_says_nothing_of_bfloat16_where_nothing_uses_it(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert [finding.what for finding in check_processor()] == ["cores"]
+
+
 def raise_and_wait(number):
     def work(stop):
         signal.raise_signal(number)

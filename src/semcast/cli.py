@@ -118,6 +118,16 @@ def _quieten_libraries() -> None:
     os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error")
 
 
+def _compute_in_one_thread() -> None:
+    """Let numpy's matrix products be computed in the thread that asks for them; before numpy is imported.
+
+    OpenBLAS would share those of images wider than 950 pixels among all cores, whose threads wait for each
+    other by spinning: what takes a millisecond then takes tens of them on all cores of a machine that has
+    other work. Networks have threads of their own. What the user has set holds.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 def _show_all_names() -> None:
     """Let stdout show names of files that are no text, or not in its encoding, by escapes: it would fail."""
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
@@ -184,6 +194,8 @@ def _run(words: list[str]) -> int:
     handler = _configure_logging(debug)
     if not debug:
         _quieten_libraries()
+    if verb == "agent":
+        _compute_in_one_thread()
     try:
         parser = verb_parser(verb)
         arguments = parser.parse_args(arguments_last(parser, words[1:]))

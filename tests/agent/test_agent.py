@@ -76,6 +76,18 @@ def test_an_agent_that_fails_to_start_closes_its_source_and_ends_its_threads(
     assert {thread.name for thread in set(threading.enumerate()) - before} == set()
 
 
+def test_an_agent_that_is_stopped_while_it_waits_does_not_say_that_it_sends(
+    recording, codec, monkeypatch, caplog
+):
+    caplog.set_level("INFO", "semcast")
+    monkeypatch.setattr(agent, "open_session", lambda network, stop: FailingSession(None))
+    stop = threading.Event()
+    stop.set()
+    run_agent(AgentSettings(source=SourceSettings(source=str(recording)), wait=False), stop, codec)
+    assert "0 frames sent" in caplog.text
+    assert "sending" not in caplog.text
+
+
 def test_an_agent_without_weights_closes_its_source(recording, tmp_path, opened):
     settings = AgentSettings(
         source=SourceSettings(source=str(recording)), weights=tmp_path / "missing.safetensors"

@@ -2,8 +2,10 @@
 
 import shutil
 
+import numpy as np
+
 from semcast.agent.capture import Capture
-from semcast.agent.source import open_source
+from semcast.agent.source import SourceFrame, open_source
 from semcast.agent.source_settings import SourceSettings
 from semcast.common.metrics import Metrics
 
@@ -24,3 +26,37 @@ def test_images_that_can_not_be_read_are_counted_wherever_they_are(recording, tm
     assert taken == [0, 1, 2, 3, 6, 7, 8, 9, 10]
     assert metrics.drops == {"unreadable": 3}
     assert metrics.closing_line("captured") == "9 frames captured; dropped: 3 unreadable"
+
+
+class Counting:
+    """Nine frames of grey k, which notes the ones that were undistorted."""
+
+    num_unreadable = 0
+
+    def __init__(self):
+        self.rectified = []
+
+    def _rectify(self, stored):
+        self.rectified.append(int(stored[0, 0, 0]))
+        return stored[::2, ::2]
+
+    def frames(self, stop):
+        for k in range(9):
+            yield SourceFrame(k, k, k, np.full((4, 4, 3), k, np.uint8), k == 8, self._rectify)
+
+    def close(self):
+        pass
+
+
+def test_frames_that_are_not_sent_are_not_undistorted():
+    source, metrics = Counting(), Metrics("agent")
+    capture = Capture(source, "all", metrics, lambda frame: frame.frame_id % 3 == 0)
+    taken = []
+    while not capture.ended:
+        frame = capture.get(1.0)
+        taken += [] if frame is None else [frame]
+    capture.close()
+    assert source.rectified == [0, 3, 6, 8] == [frame.frame_id for frame in taken]
+    assert all(frame.image.shape == (2, 2, 3) and (frame.image == frame.frame_id).all() for frame in taken)
+    assert source.rectified == [0, 3, 6, 8]  # once each
+    assert metrics.drops == {"thinned": 5}

@@ -122,6 +122,41 @@ def test_a_camera_that_comes_back_with_another_size_is_said_once_and_waited_for(
     assert said[-1] == "gives images again"
 
 
+class Driver:
+    """What OpenCV makes of a webcam that is unplugged after five images."""
+
+    def __init__(self):
+        self.settings, self.left = {}, 5
+
+    def isOpened(self):
+        return True
+
+    def set(self, what, value):
+        self.settings[what] = value
+
+    def get(self, what):
+        return 0.0
+
+    def grab(self):
+        return False
+
+    def read(self):
+        self.left -= 1
+        return self.left >= 0, np.zeros((48, 64, 3), np.uint8)
+
+    def release(self):
+        pass
+
+
+def test_a_camera_that_is_plugged_in_again_has_no_queue_that_makes_frames_old_either(monkeypatch):
+    monkeypatch.setattr("semcast.agent.video._REOPEN_AFTER_S", 0.01)
+    opened = []
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: opened.append(Driver()) or opened[-1])
+    source = open_source(SourceSettings(source="99", camera=PINHOLE, max_frames=8))
+    assert len(list(source.frames(threading.Event()))) == 8
+    assert [driver.settings for driver in opened] == 2 * [{cv2.CAP_PROP_BUFFERSIZE: 1}]
+
+
 def test_images_that_waited_before_the_start_are_thrown_away(make_camera):
     camera = make_camera(40, 8, 0.1)
     source = open_source(SourceSettings(source=camera.address, camera=PINHOLE, max_frames=1))

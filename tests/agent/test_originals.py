@@ -18,7 +18,7 @@ from semcast.common.wire import unpack
 def frame(frame_id, shape_hw=(48, 64)):
     ramp = np.linspace(0, 255, shape_hw[1])[None, :, None] * np.array([1.0, 0.5, 0.1])
     image = np.broadcast_to(ramp, (*shape_hw, 3)).astype(np.uint8)
-    return SourceFrame(frame_id=frame_id, t_source_ns=0, t_capture_ns=0, image=image, final=False)
+    return SourceFrame(frame_id=frame_id, t_source_ns=0, t_capture_ns=0, stored=image)
 
 
 @pytest.mark.parametrize(("image_format", "largest"), [("png", 0), ("jpeg", 24)])

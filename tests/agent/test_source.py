@@ -6,7 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from semcast.agent.source import MAX_BAD_IN_A_ROW, Pacer, is_camera_number, open_source, playback_order
+from semcast.agent.source import (
+    MAX_BAD_IN_A_ROW,
+    Pacer,
+    is_camera_number,
+    is_live,
+    open_source,
+    playback_order,
+)
 from semcast.agent.source_settings import SourceSettings
 from semcast.agent.video import public_name
 from semcast.common.camera_settings import CameraSettings
@@ -374,6 +381,16 @@ def test_what_only_looks_like_a_camera_number_is_a_folder(text):
     assert not is_camera_number(text)
     with pytest.raises(SourceError, match=f"no sequence at {text}: there is no such file or folder"):
         open_source(fast(text))
+
+
+def test_a_device_is_a_camera_whether_it_is_plugged_in_or_not(tmp_path):
+    assert is_live("/dev/video0")
+    assert is_live("/dev/v4l/by-id/usb-none")
+    with pytest.raises(SourceError, match="camera /dev/video99 can't be opened"):
+        open_source(fast("/dev/video99", camera=PINHOLE))
+    # A folder in memory is none, and neither is what is missing there.
+    assert not is_live("/dev/shm")
+    assert not is_live("/dev/shm/none")
 
 
 def test_an_address_is_shown_without_its_password():

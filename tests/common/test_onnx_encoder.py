@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -72,6 +73,22 @@ def test_the_expected_snr_is_heard(exported):
     # Outside the trained range it is clipped, and what is no number counts as the worst link.
     np.testing.assert_array_equal(codec.encode(image, 99.0).symbols, codec.encode(image, 14.0).symbols)
     np.testing.assert_array_equal(codec.encode(image, np.nan).symbols, codec.encode(image, 0.0).symbols)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads its memory from /proc")
+def test_memory_is_not_planned_ahead_for_every_size_of_images():
+    code = (
+        "import numpy as np\n"
+        "from semcast.common.codecs import load_codec\n"
+        "codec = load_codec('3dcsc-lite-vr', runtime='onnx', num_threads=1)\n"
+        "def peak_kb(): return int(open('/proc/self/status').read().partition('VmHWM:')[2].split()[0])\n"
+        "before_kb = peak_kb()\n"
+        "for rows in (640, 640, 672, 672):\n"
+        "    codec.encode(np.zeros((rows, 1024, 3), np.uint8), 8.0)\n"
+        "print((peak_kb() - before_kb) // 1024)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 90
 
 
 def test_any_size_is_padded_to_whole_blocks(exported):

@@ -95,9 +95,7 @@ def write_originals(path, images):
         for frame_id, image in images:
             data = image
             if not isinstance(image, bytes):
-                frame = SourceFrame(
-                    frame_id=frame_id, t_source_ns=0, t_capture_ns=0, image=image, final=False
-                )
+                frame = SourceFrame(frame_id=frame_id, t_source_ns=0, t_capture_ns=0, stored=image)
                 data = pack(source_image(frame, CAMERA.agent_epoch, "png"))
             recorder.put(source_key("a"), "source", data)
     return RecordingReader(path)

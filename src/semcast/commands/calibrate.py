@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "images", type=named_path, nargs="*", metavar="PATH", help="pictures of the board, or folders of them"
     )
-    parser.add_argument("--camera", metavar="N|URL", help="take views from this live camera instead")
+    parser.add_argument("--camera", metavar="N|DEVICE|URL", help="take views from this live camera instead")
     parser.add_argument(
         "--board",
         default="9x6",
@@ -124,10 +124,10 @@ def camera_pictures(camera: str) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
     import cv2
     import numpy as np
 
-    from semcast.agent.source import is_camera_number
+    from semcast.agent.source import is_camera_number, is_live
     from semcast.agent.video import open_capture, public_name
 
-    capture = open_capture(camera, live=is_camera_number(camera) or "://" in camera)
+    capture = open_capture(camera, live=is_live(camera) or is_camera_number(camera))
     try:
         for number in range(sys.maxsize):
             if not capture.grab():

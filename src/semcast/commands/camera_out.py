@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from semcast.agent.source import is_camera_number
+from semcast.agent.source import is_live
 from semcast.commands.paths import named_path
 from semcast.commands.running import add_settings, read_settings
 from semcast.common.camera import Intrinsics
@@ -36,7 +36,7 @@ def images_of(arguments: argparse.Namespace) -> ImagesSettings:
     settings = read_settings(ImagesSettings, arguments)
     _check_file(arguments.out, "out")
     _check_file(settings.json, "json")
-    if "://" in settings.source or is_camera_number(settings.source):
+    if is_live(settings.source):
         print(f"taking {settings.frames} images: move the camera, and turn it to and fro", file=sys.stderr)
     return settings
 
