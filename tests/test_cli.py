@@ -27,6 +27,13 @@ def test_help_lists_every_verb_and_answers_at_once():
     assert elapsed_s < 1.5  # 0.5 s is the aim on an idle machine; tests may share it
 
 
+@pytest.mark.parametrize("columns", [60, 80, 120])
+def test_the_overview_fits_the_terminal(columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    assert main([]) == 0
+    assert max(len(line) for line in capsys.readouterr().out.splitlines()) <= columns
+
+
 def test_the_overview_imports_nothing_heavy():
     code = (
         "import sys; from semcast.cli import main\n"
