@@ -26,6 +26,7 @@ def test_verbs_print_through_no_other_console():
 
 
 @pytest.mark.parametrize("words", [["calibrate"], ["train", "--data"]])
-def test_a_verb_that_can_not_begin_says_one_line(words, tmp_path, capfd):
+def test_a_verb_that_can_not_begin_says_one_line(words, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)  # for what it may write before
     assert main([*words, str(tmp_path)]) == 1
     assert len(capfd.readouterr().err.splitlines()) == 1
