@@ -164,7 +164,10 @@ class Sequence:
         if self._stored_camera is not None:
             same = self.intrinsics.scaled_to(camera.width, camera.height)
             if not np.allclose(same.K, camera.K, rtol=0.01, atol=1.0):
-                raise ValueError(f"camera must be {self.name}'s own at another size, {same}, got {camera}")
+                raise ValueError(
+                    f"the camera must be that of {self.name} at another size, {_in_words(same)}, "
+                    f"got {_in_words(camera)}"
+                )
         return resized(image, (camera.width, camera.height))
 
     def refused_images(self, most_decoded: int = 100) -> tuple[list[str], int]:
@@ -225,6 +228,13 @@ class Sequence:
         Times are exactly ``times_ns * 1e-9`` of the frames; frames without a true pose nearby are absent.
         """
         return self._truth
+
+
+def _in_words(camera: Intrinsics) -> str:
+    return (
+        f"fx {camera.fx:.1f} fy {camera.fy:.1f} cx {camera.cx:.1f} cy {camera.cy:.1f} px "
+        f"for {camera.width}x{camera.height}"
+    )
 
 
 def _truth_of(files: SequenceFiles, times_ns: NDArray[np.int64]) -> Trajectory | None:

@@ -5,6 +5,7 @@ Images are not opened here. Poses are brought to ``T_world_cam`` of the camera w
 
 import logging
 import re
+import shlex
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -176,9 +177,9 @@ def _short_s(time_ns: int) -> str:
 def _check_there(path: Path) -> None:
     if path.is_file():
         if path.suffix.lower() != ".json":
-            way = f"videos go through 'semcast agent --source {path}'"
+            way = f"videos go through: {shlex.join(('semcast', 'agent', '--source', str(path)))}"
             if path.suffix.lower() == ".mcap":
-                way = f"recordings of a stream go through 'semcast replay {path}'"
+                way = f"recordings of a stream go through: {shlex.join(('semcast', 'replay', str(path)))}"
             raise SourceError(
                 f"a sequence must be a folder or a transforms .json file, got the file {path}: {way}"
             )

@@ -132,18 +132,14 @@ def plot_run(run: RunToPlot, out: Path, image_format: str = "png") -> list[Path]
 def _plot_path(run: RunToPlot, path: Path) -> Path:
     on_the_way = run.truth_on_the_way
     result = ate(run.trajectory, on_the_way) if on_the_way is not None else None
-    estimate = run.trajectory.positions
-    unit = "map units"
-    if result is not None:
-        estimate = result.scale * estimate @ result.R_truth_map.T + result.t_truth_map
-        unit = "m"
+    estimate, truth = _in_camera_axes(run, result)
+    unit = "map units" if result is None else "m"
     doubt = time_span_doubt(run.trajectory, run.truth, run.missing_s) if run.truth is not None else None
     if doubt is not None:
         logger.warning("%s: %s", run.name, doubt)
     figure, grid = new_grid(1 if result is None else 2, 2, 9.0, 4.2 if result is None else 6.4)
-    truth = run.truth.positions if result is not None and run.truth is not None else None
     for axes, (first, second), view in zip(
-        grid[0], (("x", "z"), ("z", "y")), ("above", "the side"), strict=True
+        grid[0], (("x", "z"), ("z", "y")), ("above the first camera", "its side"), strict=True
     ):
         columns = ["xyz".index(first), "xyz".index(second)]
         if truth is not None:
@@ -164,6 +160,18 @@ def _plot_path(run: RunToPlot, path: Path) -> Path:
     figure.suptitle(title)
     save_figure(figure, path)
     return path
+
+
+def _in_camera_axes(run: RunToPlot, result: AteResult | None) -> tuple[Array, Array | None]:
+    """Return ``(N, 3)`` estimated and ``(M, 3)`` true positions in the axes of the first camera.
+
+    These are x right, y down, z forward. What is up in a truth's own world is not known: in TUM's and ROS's
+    it is z, in KITTI's -y.
+    """
+    estimate = run.trajectory.positions
+    if result is None or run.truth is None:
+        return estimate, None
+    return result.scale * estimate, (run.truth.positions - result.t_truth_map) @ result.R_truth_map
 
 
 def path_title(run: RunToPlot, result: AteResult | None) -> str:

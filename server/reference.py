@@ -73,7 +73,7 @@ class Reference:
             return psnr_db(original, x_hat) if original is not None else None
         except (SourceError, ValueError, IndexError, cv2.error) as err:
             if not self._failed:
-                logger.warning("no PSNR: %s", err)
+                logger.warning("no PSNR; is the reference what was sent? %s", err)
             self._failed = True
             return None
 

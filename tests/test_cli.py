@@ -39,6 +39,13 @@ def test_an_agent_leaves_the_other_cores_alone_unless_told(monkeypatch, capsys, 
     assert os.environ.get("OPENBLAS_NUM_THREADS") == threads
 
 
+@pytest.mark.parametrize("columns", [60, 80, 120])
+def test_the_overview_fits_the_terminal(columns, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    assert main([]) == 0
+    assert max(len(line) for line in capsys.readouterr().out.splitlines()) <= columns
+
+
 def test_the_overview_imports_nothing_heavy():
     code = (
         "import sys; from semcast.cli import main\n"

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 import semcast
+from semcast.cli import main
 from semcast.commands.console import plain_console
 
 
@@ -22,3 +23,10 @@ def test_verbs_print_through_no_other_console():
         file.name for file in commands.glob("*.py") if "rich.console" in file.read_text(encoding="utf-8")
     ]
     assert others == ["console.py"]
+
+
+@pytest.mark.parametrize("words", [["calibrate"], ["train", "--data"]])
+def test_a_verb_that_can_not_begin_says_one_line(words, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)  # for what it may write before
+    assert main([*words, str(tmp_path)]) == 1
+    assert len(capfd.readouterr().err.splitlines()) == 1

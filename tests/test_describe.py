@@ -240,12 +240,14 @@ def test_what_weights_of_ones_own_reached_is_told_with_digits_that_count(tiny_we
 
 @pytest.mark.parametrize("content", [b"hello", None])
 def test_what_it_does_not_know_is_one_clear_error(tmp_path, content):
-    path = tmp_path / "x.txt"
+    path = tmp_path / "my x.txt"
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(SemcastError, match="must be a recording") as refused:
         describe(path)
-    assert ("a video is read by 'semcast agent --source" in str(refused.value)) == (content is not None)
+    assert (f"a video is read by: semcast agent --source '{path}'" in str(refused.value)) == (
+        content is not None
+    )
 
 
 def test_what_is_not_there_is_said_to_be_neither_file_nor_folder_nor_codec(tmp_path):

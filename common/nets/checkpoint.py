@@ -74,6 +74,8 @@ def weights_path(name_or_path: str | Path) -> Path:
     shipped = folder / f"{name_or_path}.safetensors"
     if not shipped.is_file():
         known = sorted(p.stem for p in folder.glob("*.safetensors"))
+        if path.is_file():
+            raise CheckpointError(f"weights must be a .safetensors file, got {path}")
         raise CheckpointError(
             f"no trained weights for {str(name_or_path)!r}; shipped are: {', '.join(known) or 'none'}"
         )

@@ -10,7 +10,9 @@ import importlib
 import io
 import logging
 import os
+import shutil
 import sys
+import textwrap
 import traceback
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
@@ -72,13 +74,21 @@ class _Parser(argparse.ArgumentParser):
 
 def _overview() -> argparse.ArgumentParser:
     width = max(len(verb) for verb in VERBS) + 2
-    rows = "\n".join(f"  {verb:<{width}}{text}" for verb, (_, text) in VERBS.items())
+    columns = shutil.get_terminal_size().columns - 2  # argparse's own margin
+    rows = "\n".join(
+        textwrap.fill(text, columns, initial_indent=f"  {verb:<{width}}", subsequent_indent=" " * (width + 2))
+        for verb, (_, text) in VERBS.items()
+    )
+    end = textwrap.fill(
+        "'semcast VERB --help' lists the options of a verb. Exit codes: 0 good, 1 an error said in one line, "
+        "2 wrong usage, 130 stopped by Ctrl-C.",
+        columns,
+    )
     parser = _Parser(
         prog="semcast",
         usage="semcast VERB [options]",
         description="Live 3D reconstruction over a link too poor for video.",
-        epilog=f"verbs:\n{rows}\n\n'semcast VERB --help' lists the options of a verb. Exit codes: 0 good, "
-        "1 an error said in one line, 2 wrong usage, 130 stopped by Ctrl-C.",
+        epilog=f"verbs:\n{rows}\n\n{end}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"semcast {__version__}")

@@ -2,6 +2,7 @@
 
 import datetime
 import json
+import shlex
 import tomllib
 from importlib.util import find_spec
 from pathlib import Path
@@ -54,11 +55,11 @@ def describe(path: Path) -> list[Section]:
             if file.read(5) == b"\x89MCAP":
                 return describe_recording(path)
     known = (
-        "it must be a recording (.mcap), a folder that --out wrote, a sequence folder or transforms .json, "
+        "it must be a recording (.mcap), a folder that --out wrote, a sequence folder or transforms.json, "
         "or weights (.safetensors, .onnx or a shipped name)"
     )
     if path.exists():
-        way = f"a video is read by 'semcast agent --source {path}'"
+        way = f"a video is read by: {shlex.join(('semcast', 'agent', '--source', str(path)))}"
         raise SourceError(f"{path} is another kind of file: {known}; {way}")
     raise SourceError(f"there is no file or folder {path}: {known}")
 

@@ -211,6 +211,9 @@ def test_missing_weights_say_what_is_shipped(tmp_path):
         weights_path("nonsense")
     with pytest.raises(CheckpointError, match="no trained weights for '3dcsc-huge'"):
         NeuralCodec.load("3dcsc-huge")
+    (tmp_path / "mine.pt").write_bytes(b"weights")
+    with pytest.raises(CheckpointError, match="weights must be a .safetensors file, got .*mine.pt"):
+        weights_path(str(tmp_path / "mine.pt"))
     with pytest.raises(CheckpointError, match="do not exist"):
         weights_path(tmp_path / "none.safetensors")
 

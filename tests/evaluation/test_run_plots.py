@@ -219,3 +219,21 @@ def test_a_run_without_a_decoded_frame_has_nothing_to_plot(tmp_path):
         RunToPlot.read(tmp_path / "other", None)
     with pytest.raises(SourceError, match="is not a folder"):
         RunToPlot.read(tmp_path / "missing", None)
+
+
+def test_from_above_is_from_above_also_where_the_true_world_has_z_up(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(run_plots, "save_figure", lambda figure, path: drawn.append(figure))
+    trajectory = line(range(8))
+    trajectory.T_world_cam[:, 0, 3] = np.sin(np.arange(8))
+    T_truth_map = np.eye(4)
+    T_truth_map[:3, :3] = [
+        [1, 0, 0],
+        [0, 0, 1],
+        [0, -1, 0],
+    ]  # x right, z forward becomes y, y down becomes -z
+    T_truth_map[:3, 3] = 1.0, 2.0, 3.0
+    truth = Trajectory(trajectory.t_s, T_truth_map @ trajectory.T_world_cam)
+    plot_run(RunToPlot(name="run", trajectory=trajectory, rows=[], truth=truth), tmp_path)
+    for curve in drawn[0].axes[0].lines[:2]:  # true and estimated
+        np.testing.assert_allclose(curve.get_xydata(), trajectory.positions[:, [0, 2]], atol=1e-9)

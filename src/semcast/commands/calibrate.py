@@ -150,7 +150,9 @@ def _collect(
     views: list[BoardView] = []
     sample = None
     num_seen = 0
-    with Progress(console=plain_console(stderr=True), transient=True) as progress:
+    talk = plain_console(stderr=True)
+    # Where nobody watches, all that a bar leaves behind is an empty line.
+    with Progress(console=talk, transient=True, disable=not talk.is_interactive) as progress:
         if arguments.camera is not None:
             total, pictures = arguments.views, camera_pictures(arguments.camera)
             what = "show the board from all sides, tilted too (Ctrl-C: enough)"

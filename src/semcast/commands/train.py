@@ -35,7 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             result = train(settings, show, stop.is_set)
         finally:
-            bar.stop()
+            if bar.live.is_started:  # else it would print an empty line
+                bar.stop()
         print(f"{result.weights}: {result.steps} steps in {result.elapsed_s / 60:.0f} min")
 
     return run_until_stopped(work)
