@@ -28,6 +28,7 @@ from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
 
 #: Keyframes that are looked at, the newest ones, and frames after which a camera that was not found with them
 #: is somewhere else: a look takes as long as everything else of a frame.
@@ -47,16 +48,46 @@ _SEARCH_ITERATIONS = 400
 
 
 @dataclass(frozen=True)
+class _View:
+    """A keyframe and the landmarks it saw.
+
+    Attributes:
+        keyframe: Itself.
+        image: Its image.
+        ids: ``(N,)`` landmarks.
+        xy: ``(N, 2)`` where it saw them.
+        xyz: ``(N, 3)`` where they are.
+    """
+
+    keyframe: Keyframe
+    image: SeenFrom
+    ids: Ids
+    xy: Array
+    xyz: Array
+
+    @staticmethod
+    def of(image: SeenFrom, keyframe: Keyframe, world: WorldMap) -> "_View":
+        """Gather what a keyframe saw of the map."""
+        row = world.landmarks.rows(keyframe.ids)
+        known = row >= 0
+        return _View(
+            keyframe, image, keyframe.ids[known], keyframe.xy[known], world.landmarks.xyz[row[known]]
+        )
+
+
+@dataclass(frozen=True)
 class _Aligned:
     """Landmarks of a keyframe that were found.
 
     Attributes:
-        rows: ``(N,)`` of them.
-        xy: ``(N, 2)`` where.
+        ids: ``(N,)`` of them.
+        xyz: ``(N, 3)`` where they are in the world.
+        xy: ``(N, 2)`` and in the image.
         num_looked_for: Of all of them.
     """
 
-    rows: NDArray[np.intp]
+    ids: Ids
+    xyz: Array
     xy: Array
     num_looked_for: int
 
@@ -95,11 +126,11 @@ class WideRecogniser:
             return None
         self._looked_for = newest_id, num_looked + 1
         self._known = [(image, known) for image, known in self._known if any(image is i for i, _ in newest)]
-        for image, keyframe in newest:
-            known = self._features_of(image)
-            place = self._place(sight, world, keyframe, image, known, noise)
-            if place is not None:
-                return place
+        views = [_View.of(image, keyframe, world) for image, keyframe in newest]
+        for view in views:
+            found = self._proved(sight, view, self._search(sight, view, noise), noise)
+            if found is not None:
+                return self._place(sight, view, views, found, noise)
         return None
 
     def _features_of(self, image: SeenFrom) -> WideFeatures:
@@ -110,57 +141,68 @@ class WideRecogniser:
             self._known.append((image, known))
         return known
 
-    def _place(
-        self,
-        sight: Sight,
-        world: WorldMap,
-        keyframe: Keyframe,
-        image: SeenFrom,
-        known: WideFeatures,
-        noise: NoiseModel,
-    ) -> Place | None:
-        row = world.landmarks.rows(keyframe.ids)
-        ids, xy0, xyz = keyframe.ids[row >= 0], keyframe.xy[row >= 0], world.landmarks.xyz[row[row >= 0]]
-        rows, carried = match_wide(known, sight.wide_features, _MAX_RATIO).carry(xy0, _MAX_OFFSET_PX)
+    def _search(self, sight: Sight, view: _View, noise: NoiseModel) -> PoseEstimate | None:
+        """Rough pose, by landmarks next to matches."""
+        matches = match_wide(self._features_of(view.image), sight.wide_features, _MAX_RATIO)
+        rows, carried = matches.carry(view.xy, _MAX_OFFSET_PX)
         sigma = np.full(len(rows), max(_CARRIED_SIGMA_PX, noise.sigma0_px))
-        gate = GATE_SIGMAS * sigma
         how = {"seed": self._seed, "min_inliers": _MIN_FIRST, "max_iterations": _SEARCH_ITERATIONS}
-        found = search_pose(self._camera, xyz[rows], carried, sigma, gate, **how)
+        return search_pose(self._camera, view.xyz[rows], carried, sigma, GATE_SIGMAS * sigma, **how)
+
+    def _proved(
+        self, sight: Sight, view: _View, found: PoseEstimate | None, noise: NoiseModel
+    ) -> PoseEstimate | None:
+        """Pose of landmarks that look as a keyframe saw them, None where those are too few."""
         for least_share in _LEAST_SHARES:
             if found is None:
                 return None
-            aligned = self._aligned(sight, keyframe, image, xy0, xyz, found.T_cam_world)
-            found = self._pose(found, xyz, aligned, noise, least_share)
-        if found is None:
-            return None
-        good = aligned.rows[found.inliers]
-        T_world_cam = invert_transform(found.T_cam_world)
-        return Place(T_world_cam, keyframe.frame_id, ids[good], aligned.xy[found.inliers], keyframe.submap)
+            aligned = self._aligned(sight, view, found.T_cam_world)
+            if len(aligned.ids) < max(_MIN_FIRST, least_share * aligned.num_looked_for):
+                return None
+            found = self._refined(found, aligned.xyz, aligned.xy, noise)
+            if found.num_inliers < max(_MIN_FIRST, _MIN_AGREEING_SHARE * len(aligned.ids)):
+                return None
+        return found
 
-    def _aligned(
-        self, sight: Sight, keyframe: Keyframe, image: SeenFrom, xy0: Array, xyz: Array, T_cam_world: Array
-    ) -> _Aligned:
+    def _place(
+        self, sight: Sight, proved: _View, views: list[_View], found: PoseEstimate, noise: NoiseModel
+    ) -> Place:
+        """Look for the landmarks of all views: a pose from far off rests on few of any single one.
+
+        Args:
+            sight: The image.
+            proved: The view that was recognised.
+            views: All of them.
+            found: The pose.
+            noise: Of observations.
+        """
+        submap = proved.keyframe.submap
+        mine = [proved, *(v for v in views if v is not proved and v.keyframe.submap == submap)]
+        each = [self._aligned(sight, view, found.T_cam_world) for view in mine]
+        # Where several saw a landmark, the place is that of the first: the view that was recognised.
+        ids, first = np.unique(np.concatenate([a.ids for a in each]), return_index=True)
+        xyz, xy = (np.concatenate([getattr(a, name) for a in each])[first] for name in ("xyz", "xy"))
+        pose = self._refined(found, xyz, xy, noise)
+        good, keyframe = pose.inliers, proved.keyframe
+        T_world_cam = invert_transform(pose.T_cam_world)
+        return Place(T_world_cam, keyframe.frame_id, ids[good], xy[good], keyframe.submap)
+
+    def _aligned(self, sight: Sight, view: _View, T_cam_world: Array) -> _Aligned:
         """Look for all landmarks of a keyframe where a pose has them."""
-        depth0 = transform_points(invert_transform(keyframe.T_world_cam), xyz)[:, 2]
-        expected = self._camera.project(transform_points(T_cam_world, xyz))
+        depth0 = transform_points(invert_transform(view.keyframe.T_world_cam), view.xyz)[:, 2]
+        expected = self._camera.project(transform_points(T_cam_world, view.xyz))
         rows = np.flatnonzero(sight.shows(expected, _BORDER_PX) & (depth0 > 0.0))
-        T_cam_keyframe = T_cam_world @ keyframe.T_world_cam
-        warps, depth1 = affine_warps(self._camera, T_cam_keyframe, xy0[rows], depth0[rows])
+        T_cam_keyframe = T_cam_world @ view.keyframe.T_world_cam
+        warps, depth1 = affine_warps(self._camera, T_cam_keyframe, view.xy[rows], depth0[rows])
         alike = seen_alike(warps, depth1)
         rows, warps = rows[alike], warps[alike]
-        templates = Templates.cut(image.grey, xy0[rows], ANCHOR_PATCH_PX)
+        templates = Templates.cut(view.image.grey, view.xy[rows], ANCHOR_PATCH_PX)
         patches = align_patches(templates, sight.grey, expected[rows], warps)
         fits = patches.fits(expected[rows])
-        return _Aligned(rows[fits], patches.xy[fits], len(rows))
+        kept = rows[fits]
+        return _Aligned(view.ids[kept], view.xyz[kept], patches.xy[fits], len(rows))
 
-    def _pose(
-        self, found: PoseEstimate, xyz: Array, aligned: _Aligned, noise: NoiseModel, least_share: float
-    ) -> PoseEstimate | None:
-        """Pose of landmarks that look as they did, None where those are too few."""
-        enough = max(_MIN_FIRST, least_share * aligned.num_looked_for)
-        if len(aligned.rows) < enough:
-            return None
-        sigma = np.full(len(aligned.rows), max(_ALIGNED_SIGMA_PX, noise.sigma0_px))
-        points = xyz[aligned.rows]
-        pose = refine_pose(self._camera, found.T_cam_world, points, aligned.xy, sigma, GATE_SIGMAS * sigma)
-        return pose if pose.num_inliers >= max(_MIN_FIRST, _MIN_AGREEING_SHARE * len(points)) else None
+    def _refined(self, found: PoseEstimate, xyz: Array, xy: Array, noise: NoiseModel) -> PoseEstimate:
+        """Pose of landmarks that were found."""
+        sigma = np.full(len(xyz), max(_ALIGNED_SIGMA_PX, noise.sigma0_px))
+        return refine_pose(self._camera, found.T_cam_world, xyz, xy, sigma, GATE_SIGMAS * sigma)

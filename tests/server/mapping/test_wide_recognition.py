@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from semcast.common.geometry import invert_transform, rotation_angle_deg
+from semcast.common.geometry import invert_transform, rotation_angle_deg, transform_points
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.scenes.render import RenderSettings, render_scene
 from semcast.server.geometry.features import to_grey
@@ -63,6 +63,19 @@ def test_the_place_is_found_from_20_degrees_on(mapped, num_lost_rows):
     T = invert_transform(place.T_world_cam)
     xyz = world.landmarks.xyz[world.landmarks.rows(place.ids)] @ T[:3, :3].T + T[:3, 3]
     assert np.median(np.linalg.norm(camera.project(xyz) - place.xy, axis=1)) < 1.5
+
+
+def test_landmarks_that_only_other_keyframes_saw_are_found_too(mapped):
+    sequence, reconstruction = mapped
+    k = NUM_MAPPED + 5
+    place = find(mapped, sight_of(sequence.image(k), k))
+    recognised = reconstruction.world.keyframe(place.keyframe_id)
+    elsewhere = ~np.isin(place.ids, recognised.ids)
+    assert elsewhere.sum() >= 5
+    T_cam_world, camera = invert_transform(place.T_world_cam), sequence.intrinsics
+    landmarks = reconstruction.world.landmarks
+    xyz = transform_points(T_cam_world, landmarks.xyz[landmarks.rows(place.ids[elsewhere])])
+    assert np.linalg.norm(camera.project(xyz) - place.xy[elsewhere], axis=1).max() < 3.0
 
 
 def test_another_place_is_not_taken_for_it(mapped):
