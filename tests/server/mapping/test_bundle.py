@@ -6,6 +6,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
+from semcast.server.geometry.pnp import project_with_jacobian
 from semcast.server.mapping import bundle
 from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
@@ -102,6 +103,26 @@ def test_residuals_show_the_outlier():
     size = np.linalg.norm(result.residual_px, axis=1)
     assert int(np.nanargmax(size)) == 7
     assert np.median(size) < 0.6
+
+
+def test_covariance_is_the_inverse_of_the_information_where_points_are_free_and_two_poses_are_not():
+    sigma = float(quantised_sigma(np.ones(1))[0][8])
+    problem, T_world_cam, xyz = make_problem(
+        num_views=4, num_points=20, noise_px=0.0, shake=0.0, iterations=1
+    )
+    result = optimise(BundleProblem(**{**vars(problem), "sigma_px": np.full(len(problem.xy), sigma)}))
+    # Unknowns: poses 2 and 3, each moved in its own frame, and the points.
+    jacobian = np.zeros((len(problem.xy), 2, 12 + 3 * 20))
+    for row, (k, p) in enumerate(zip(problem.view, problem.point, strict=True)):
+        T_cam_world = invert_transform(T_world_cam[k])
+        _, J = project_with_jacobian(CAMERA, transform_points(T_cam_world, xyz[p][None]))
+        if k >= 2:
+            jacobian[row, :, 6 * k - 12 : 6 * k - 6] = J[0]
+        jacobian[row, :, 12 + 3 * p : 15 + 3 * p] = J[0][:, 3:] @ T_cam_world[:3, :3]
+    rows = jacobian.reshape(-1, jacobian.shape[-1]) / sigma
+    expected = np.linalg.inv(rows.T @ rows)[6:12, 6:12]
+    scale = np.sqrt(np.diag(expected))
+    assert np.allclose(result.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-3)
 
 
 def test_covariance_is_that_of_the_last_pose():
