@@ -122,7 +122,9 @@ def test_covariance_is_the_inverse_of_the_information_where_points_are_free_and_
     rows = jacobian.reshape(-1, jacobian.shape[-1]) / sigma
     expected = np.linalg.inv(rows.T @ rows)[6:12, 6:12]
     scale = np.sqrt(np.diag(expected))
-    assert np.allclose(result.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-3)
+    assert np.allclose(
+        result.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-3
+    )
 
 
 def test_covariance_is_that_of_the_last_pose():
