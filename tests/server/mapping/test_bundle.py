@@ -151,6 +151,17 @@ def test_a_point_behind_a_camera_is_left_out():
     assert np.array_equal(result.xyz[0], xyz[0])
 
 
+def test_a_point_takes_part_from_its_second_view_on():
+    problem, _, xyz = make_problem(noise_px=0.0)
+    kept = ~((problem.point == 0) & (problem.view > 1)) & ~((problem.point == 1) & (problem.view != 5))
+    of_kept = {name: vars(problem)[name][kept] for name in ("view", "point", "xy", "sigma_px", "confidence")}
+    result = optimise(BundleProblem(**{**vars(problem), **of_kept}))
+    assert np.allclose(result.xyz[0], xyz[0], atol=1e-3), "seen by two"
+    assert np.isfinite(result.residual_px[of_kept["point"] == 0]).all()
+    assert np.array_equal(result.xyz[1], problem.xyz[1]), "seen by one, left out"
+    assert np.isnan(result.residual_px[of_kept["point"] == 1]).all()
+
+
 @pytest.mark.parametrize(
     "changes",
     [
