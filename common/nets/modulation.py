@@ -66,7 +66,7 @@ def carrier_pattern(like: Tensor) -> Tensor:
 def _pattern(channels: int, rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
         channel = torch.arange(channels, device=device)
-        # A quadratic phase has no short period, so no smooth set of channels looks like the carrier.
+        # Signs + - - + over and over: what changes little from channel to channel does not look like it.
         sign_c = 1.0 - 2.0 * ((channel * (channel + 1) // 2) % 2).to(dtype)
         row = torch.arange(rows, device=device).view(-1, 1)
         column = torch.arange(columns, device=device).view(1, -1)

@@ -39,3 +39,9 @@ def test_variance_may_differ_per_slot(rng):
 def test_bad_variance_is_refused(bad, rng):
     with pytest.raises(ValueError, match="noise_var must be finite and at least 0"):
         complex_noise((4,), bad, rng)
+    with pytest.raises(ValueError, match="noise_var must be finite and at least 0"):
+        complex_noise((2, 4), np.array([[1.0], [bad]], np.float32), rng)
+
+
+def test_without_variance_there_is_no_noise(rng):
+    assert not complex_noise((4,), 0.0, rng).any()

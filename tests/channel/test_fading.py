@@ -26,6 +26,12 @@ def test_rician_amplitude_meets_its_distribution(k_factor_db, rng):
     assert np.mean(np.abs(gains) ** 2) == pytest.approx(1.0, abs=0.04)
 
 
+def test_rician_gains_by_hand():
+    # K = 3: three quarters of the power in sight, at a right angle, and a quarter scattered.
+    gains = rician_gains(np.array([0, 2, 2j], np.complex64), 10 * math.log10(3), np.pi / 2)
+    np.testing.assert_allclose(gains, 1j * math.sqrt(0.75) + np.array([0, 1, 1j]), atol=1e-6)
+
+
 def test_clarke_gains_have_mean_power_one_and_bessel_autocorrelation():
     doppler_hz, step_s = 20.0, 0.002
     lags = np.array([0, 5, 9, 19])

@@ -1,6 +1,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from semcast.channel.registry import build_channel, channel_names
@@ -45,9 +46,34 @@ def test_settings_are_read_from_toml_values():
         build_settings(ChannelSettings, {"snr": 3.0})
 
 
-def test_every_channel_name_builds_a_model():
-    for name in channel_names():
-        build_channel(ChannelSettings(channel=name), 0)
+def draw_of(num_slots=4000, elapsed_s=0.0, seed=0, **values):
+    model = build_channel(ChannelSettings(snr_db=10.0, **values), seed)
+    return model.draw(num_slots, elapsed_s, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("name", channel_names())
+def test_a_channel_has_the_gains_the_noise_and_the_losses_of_its_name(name):
+    draw = draw_of(channel=name, slot_loss=0.25, burst_slots=2.0, burst_noise_db=20.0)
+    noisy = draw.noise_var > 0.2
+    assert draw.snr_db == 10.0
+    np.testing.assert_allclose(draw.noise_var[~noisy], 0.1, rtol=1e-6)
+    np.testing.assert_allclose(draw.noise_var[noisy], 10.0, rtol=1e-6)
+    assert noisy.mean() == pytest.approx(0.25 if name == "burst" else 0.0, abs=0.04)
+    assert draw.lost.mean() == pytest.approx(0.25 if name == "erasure" else 0.0, abs=0.03)
+    power = np.abs(draw.h) ** 2
+    assert power.mean() == pytest.approx(1.0, abs=0.07)
+    # Rayleigh's power has a standard deviation of 1; Rice's sqrt(1 + 2 K) / (1 + K), K = 6 dB by default.
+    k = 10**0.6
+    spread = {"rayleigh": 1.0, "rician": math.sqrt(1 + 2 * k) / (1 + k)}.get(name, 0.0)
+    assert power.std() == pytest.approx(spread, abs=0.06)
+
+
+def test_slots_of_a_fading_link_follow_each_other_in_time():
+    # Slot 5 of a frame that began 10 ms later is slot 15 of the first, with slots of 1 ms.
+    fading = {"channel": "rayleigh", "doppler_hz": 30.0, "slot_ms": 1.0}
+    first, later = draw_of(20, **fading), draw_of(10, elapsed_s=0.01, **fading)
+    np.testing.assert_allclose(later.h, first.h[10:], atol=1e-5)
+    assert abs(draw_of(20, seed=1, **fading).h[0] - first.h[0]) > 0.01
 
 
 def test_values_of_other_channels_are_named():

@@ -106,6 +106,24 @@ def test_codes_of_other_frames_are_refused(code):
         Allocation.from_code(code, (3, 4))
 
 
+def test_a_frame_may_be_filled_to_the_last_value():
+    def taken(levels):
+        allocation = Allocation(np.array([levels], np.uint8))
+        return allocation.num_values + allocation.num_values_of_code
+
+    grids = np.stack(np.meshgrid(*[np.arange(len(LEVELS))] * 4), axis=-1).reshape(-1, 4)
+    full = [levels for levels in grids if taken(levels) == 94 * 4]
+    over = [levels for levels in grids if taken(levels) == 94 * 4 + 2]
+    assert full
+    assert over
+    for levels in full:
+        code = Allocation(levels[None].astype(np.uint8)).code
+        np.testing.assert_array_equal(Allocation.from_code(code, (1, 4)).levels[0], levels)
+    for levels in over:
+        with pytest.raises(ValueError, match="take at most 376 values"):
+            Allocation.from_code(Allocation(levels[None].astype(np.uint8)).code, (1, 4))
+
+
 def test_levels_that_were_read_can_not_be_changed():
     code = Allocation(np.zeros((3, 4), np.uint8)).code
     with pytest.raises(ValueError, match="read-only"):

@@ -13,7 +13,9 @@ CAMERA = Intrinsics(fx=500.0, fy=510.0, cx=319.5, cy=239.5, width=640, height=48
 
 
 def test_the_principal_ray_projects_to_the_principal_point():
-    np.testing.assert_allclose(CAMERA.project([[0, 0, 2.0], [1.0, 0, 2.0]]), [[319.5, 239.5], [569.5, 239.5]])
+    np.testing.assert_allclose(
+        CAMERA.project([[0, 0, 2.0], [1.0, -0.5, 2.0]]), [[319.5, 239.5], [569.5, 112.0]]
+    )
 
 
 def test_unproject_inverts_project(rng):
@@ -34,6 +36,13 @@ def test_resizing_moves_pixels_and_intrinsics_alike():
     half = cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA)
     ys, xs = np.nonzero(half > 0.5)
     np.testing.assert_allclose(CAMERA.scaled_to(320, 240).project(ray), [[xs.mean(), ys.mean()]], atol=1e-6)
+
+
+def test_resizing_each_side_by_its_own_factor():
+    # Pixel centres are integers: the middle of the image stays its middle, (w - 1) / 2.
+    small = CAMERA.scaled_to(320, 120)
+    assert (small.fx, small.fy, small.cx, small.cy) == (250.0, 127.5, 159.5, 59.5)
+    assert (small.width, small.height) == (320, 120)
 
 
 def test_json_round_trip(tmp_path):

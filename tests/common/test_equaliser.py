@@ -6,13 +6,14 @@ import pytest
 from semcast.common.codec import LOST_SLOT_SNR_DB
 from semcast.common.phy.equaliser import (
     NOMINAL_SNR_DB,
+    ChannelEstimate,
     ChannelKnowledge,
     equalise,
     estimate_channel,
 )
-from semcast.common.phy.pilots import insert_pilots, split
+from semcast.common.phy.pilots import insert_pilots, pilot_symbols, split
 from semcast.common.phy.qam import indices_to_symbols
-from semcast.common.phy.slots import layout_for
+from semcast.common.phy.slots import SlotLayout, layout_for
 
 
 def make_frame(rng, shape_hw, snr_db, h=1.0, noise_scale=1.0):
@@ -166,6 +167,33 @@ def test_perfect_knowledge_is_used_as_it_is(rng):
     out = equalise(slots, (32, 64), "16qam", knowledge=knowledge)
     np.testing.assert_allclose(out.received.effective_snr_db, [10.0, 10 - 20 * math.log10(2)], atol=1e-4)
     assert out.snr_db == pytest.approx(10 * math.log10((1 + 0.25) / 2 / 0.1), abs=1e-4)
+
+
+def test_the_links_snr_by_hand():
+    # Powers 1.0 and 0.25, of which a fifth of the noise is the gain's own error; the quiet slot counts twice.
+    channel = ChannelEstimate(
+        h=np.array([1.0, 0.5j, 9.0], np.complex64),
+        noise_var=np.array([0.1, 0.2, 1.0], np.float32),
+        noise_floor=0.1,
+        num_pilots=5,
+        arrived=np.array([True, True, False]),
+    )
+    power = (2 * (1.0 - 0.02) + (0.25 - 0.04)) / 3
+    assert channel.snr_db == pytest.approx(10 * math.log10(power / 0.1), abs=1e-5)
+    np.testing.assert_allclose(channel.effective_noise_var, [0.12, 0.24, 1.2], rtol=1e-6)
+
+
+def test_noise_by_hand():
+    # With one pilot a slot, half the mean squared difference of neighbouring gains 1, 1.4, 1.
+    gains = np.array([1.0, 1.4, 1.0])[:, None]
+    pilots = pilot_symbols(SlotLayout(num_slots=3, blocks_per_slot=1))
+    channel = estimate_channel((gains * pilots).astype(np.complex64))
+    np.testing.assert_allclose(channel.noise_var, 0.5 * 0.4**2, rtol=1e-5)
+    # With two, what their mean does not explain: 0.2 to either side, over one degree of freedom.
+    pilots = pilot_symbols(SlotLayout(num_slots=1, blocks_per_slot=2))
+    channel = estimate_channel((np.array([[1.2, 0.8]]) * pilots).astype(np.complex64))
+    assert channel.h[0] == pytest.approx(1.0, abs=1e-6)
+    assert channel.noise_var[0] == pytest.approx(2 * 0.2**2, rel=1e-5)
 
 
 def test_wrong_sizes_are_named():

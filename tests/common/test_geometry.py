@@ -93,10 +93,10 @@ def test_a_quaternion_without_length_is_refused():
         g.rotation_from_quat_wxyz([0, 0, 0, 0])
 
 
-def test_a_pose_between_two_is_on_the_straight_way_and_the_shortest_turn():
-    a = g.make_transform(g.exp_so3([0.0, 0.0, 0.3]), [1.0, 2.0, 3.0])
-    b = g.make_transform(g.exp_so3([0.0, 0.0, 0.9]), [3.0, 2.0, -1.0])
+def test_a_pose_between_two_is_on_the_straight_way_and_the_shortest_turn(rng):
+    R_a, turn = g.exp_so3(rng.normal(size=3)), np.array([0.6, -0.3, 0.9])
+    a, b = g.make_transform(R_a, [1.0, 2.0, 3.0]), g.make_transform(R_a @ g.exp_so3(turn), [3.0, 2.0, -1.0])
     np.testing.assert_allclose(g.interpolate_pose(a, b, 0.0), a, atol=1e-12)
     np.testing.assert_allclose(g.interpolate_pose(a, b, 1.0), b, atol=1e-12)
-    quarter = g.make_transform(g.exp_so3([0.0, 0.0, 0.45]), [1.5, 2.0, 2.0])
+    quarter = g.make_transform(R_a @ g.exp_so3(0.25 * turn), [1.5, 2.0, 2.0])
     np.testing.assert_allclose(g.interpolate_pose(a, b, 0.25), quarter, atol=1e-12)

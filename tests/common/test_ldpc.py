@@ -36,6 +36,38 @@ def test_lifting_sets(lifting, expected):
     assert lifting_set(lifting) == expected
 
 
+@pytest.mark.parametrize(
+    ("num_info", "num_sent", "columns"),
+    [
+        (292, 300, 10),
+        (293, 300, 22),
+        (670, 1000, 10),
+        (671, 1000, 22),
+        (3824, 7648, 10),
+        (3825, 7650, 22),
+        (4000, 16000, 10),
+        (4000, 15999, 22),
+    ],
+)
+def test_the_base_graph_is_that_of_the_standard(num_info, num_sent, columns):
+    # TS 38.212, 7.2.2: graph 2 up to 292 bits, up to 3824 at a rate of 0.67 or less, and up to a rate of 1/4.
+    assert plan_blocks(num_info, num_sent).graph.num_info_columns == columns
+
+
+@pytest.mark.parametrize(
+    ("num_info", "num_sent", "num_blocks"),
+    [(8448, 10000, 1), (8449, 10000, 2), (3840, 16000, 1), (3841, 16000, 2)],
+)
+def test_a_block_is_as_long_as_the_standard_allows(num_info, num_sent, num_blocks):
+    assert plan_blocks(num_info, num_sent).num_blocks == num_blocks
+
+
+@pytest.mark.parametrize(("num_info", "lifting"), [(192, 32), (193, 26), (560, 72), (561, 64), (641, 72)])
+def test_lifting_sizes_of_the_second_graph(num_info, lifting):
+    # K_b is 6, 8, 9 or 10: 193 / 8 = 24.1, and the next size is 26.
+    assert plan_blocks(num_info, 2 * num_info).graph.lifting == lifting
+
+
 @pytest.mark.parametrize(("num_info", "num_sent"), [(60, 200), (250, 640), (600, 900), (900, 1400)])
 def test_code_words_satisfy_every_check(num_info, num_sent, rng):
     plan = plan_blocks(num_info, num_sent)
@@ -130,6 +162,17 @@ def test_a_good_block_is_not_held_up_by_a_bad_one(rng):
     np.testing.assert_array_equal(decoded.bits[:8000], bits[:8000])
     assert (decoded.bits[8000:] != bits[8000:]).any()
     assert decoded.iterations == 5
+
+
+def test_one_iteration_is_allowed_and_tells_what_it_got_to(rng):
+    plan = plan_blocks(1000, 2000)
+    bits = np.ones(plan.num_info, np.uint8)
+    llr = (8.0 - 16.0 * ldpc.encode(plan, bits)).astype(np.float32)
+    assert ldpc.decode(plan, llr, max_iterations=1).bits.all()
+    llr[rng.permutation(plan.num_sent)[:160]] *= -1.0
+    wrong = 1 - ldpc.decode(plan, llr, max_iterations=1).bits.astype(int)
+    assert set(wrong.tolist()) == {0, 1}
+    assert wrong.mean() < 0.3
 
 
 def test_bad_input_is_named():

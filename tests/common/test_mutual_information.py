@@ -37,6 +37,14 @@ def test_it_can_be_inverted():
         assert snr_db_that_carries(4, bits) == pytest.approx(snr_db, abs=0.01)
 
 
+def test_it_can_be_inverted_where_the_constellation_is_full_and_beyond_what_it_carries():
+    full = float(mutual_information(2, np.array(100.0)))
+    assert full == pytest.approx(2.0, abs=1e-6)
+    assert snr_db_that_carries(2, full) == pytest.approx(20.0, abs=0.01)
+    assert snr_db_that_carries(2, 2.1) == pytest.approx(30.0)
+    assert snr_db_that_carries(2, -0.1) == -20.0
+
+
 def test_constellations_that_are_not_there_are_refused():
     with pytest.raises(ValueError, match="bits_per_symbol must be in"):
         mutual_information(3, np.array([1.0]))

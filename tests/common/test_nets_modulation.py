@@ -17,7 +17,7 @@ from semcast.common.nets.modulation import (
     unspread,
 )
 from semcast.common.nets.modulation_numpy import CARRIER_AMPLITUDE
-from semcast.common.nets.rounding import CLIP, LOADING, rounded_snr_db
+from semcast.common.nets.rounding import CLIP, LOADING, mixing, rounded_snr_db
 from semcast.common.phy.qam import SHAPED_SPACING, pam_levels
 
 
@@ -35,6 +35,8 @@ def test_every_value_goes_to_its_nearest_level():
 
 
 def test_gradient_is_the_identity_inside_and_only_pulls_inward_outside():
+    # Two steps out: as far beyond the outer level as values inside are off at most.
+    assert pytest.approx(4 / math.sqrt(10) * SHAPED_SPACING) == CLIP
     y = torch.tensor([0.1, -0.5, 2 * CLIP, 2 * CLIP], requires_grad=True)
     nearest_level(y).backward(torch.tensor([1.0, -2.0, 3.0, -3.0]))
     torch.testing.assert_close(y.grad, torch.tensor([1.0, -2.0, 3.0, 0.0]))
@@ -78,6 +80,34 @@ def test_a_frame_of_which_nothing_arrived_stays_finite():
 
 def gaussian(*shape, seed=0):
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def test_the_carrier_is_fixed_for_all_time():
+    # Weights were trained with it, and both ends, of whatever version, must agree.
+    pattern = carrier_pattern(torch.zeros(1, 94, 2, 3))
+    assert pattern[0, :8, 0, 0].tolist() == [1, -1, -1, 1, 1, -1, -1, 1]
+    assert pattern[0, 0].tolist() == [[1, -1, 1], [-1, 1, -1]]
+    signs = pattern[0, :, 0, 0]
+    torch.testing.assert_close(pattern[0], signs[:, None, None] * pattern[0, 0])
+
+
+def test_the_mixing_is_fixed_for_all_time():
+    def murmur3(x):
+        for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+            x = (x ^ x >> shift) * factor & 0xFFFFFFFF
+        return x ^ x >> 16
+
+    of, places = mixing(94, 3), range(1, 94 * 3 + 1)
+    first = [murmur3(place) for place in places]
+    assert of.order.tolist() == sorted(range(94 * 3), key=first.__getitem__)
+    signs = [
+        1 - 2 * (murmur3(hashed + place & 0xFFFFFFFF) & 1)
+        for hashed, place in zip(first, places, strict=True)
+    ]
+    assert of.signs.ravel().tolist() == signs
+    # Fourth frequency of a cosine transform of 94, at its third place.
+    assert of.channels[4, 2] == pytest.approx(math.sqrt(2 / 94) * math.cos(math.pi * 2.5 * 4 / 94), abs=1e-6)
+    assert of.columns[0, 1] == pytest.approx(math.sqrt(1 / 3), abs=1e-6)
 
 
 def test_mixing_keeps_all_and_gives_every_symbol_the_power_of_its_slot():

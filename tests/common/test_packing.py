@@ -86,5 +86,6 @@ def test_blocks_in_two_slots_are_brought_to_one_factor():
     third = (82 * 0.9 + 12 * 0.5) / 94  # values 201 to 294
     assert float(of_block[0, 0, 0, 2]) == pytest.approx(third)
     assert float(snr_db[0, 0, 1, 2]) == pytest.approx(0.0, abs=1e-4)
+    assert float(snr_db[0, 0, 0, 2]) == pytest.approx(10.0 * np.log10(third / (1.0 - third)), abs=1e-4)
     carrier = CARRIER_AMPLITUDE * carrier_pattern(symbols) * sent
     torch.testing.assert_close((y / of_block + carrier) / scale, symbols, rtol=1e-3, atol=1e-3)

@@ -61,3 +61,7 @@ def test_bad_widths_are_named():
         ValueError, match=r"slots must have shape \(slots >= 1, multiple of 48\), got \(2, 47\)"
     ):
         split(np.zeros((2, 47), np.complex64))
+    with pytest.raises(ValueError, match=r"data must have shape \(slots, symbols\), got \(94,\)"):
+        insert_pilots(np.zeros(94, np.complex64))
+    with pytest.raises(ValueError, match=r"slots must have shape \(slots, uses\), got \(96,\)"):
+        split(np.zeros(96, np.complex64))

@@ -112,6 +112,14 @@ def test_infinite_noise_gives_zero_llr_and_high_snr_stays_finite():
     assert np.isfinite(qam.soft_demap(symbols, 1e-6)).all()
 
 
+def test_llr_far_from_all_points_is_the_difference_of_squared_distances_up_to_a_bound():
+    # QPSK levels -a and a, a = 1 / sqrt(2): both likelihoods of 6, exp(-93) and exp(-150), are below 1e-37.
+    llr = qam.soft_demap(np.array([6 - 6j], np.complex64), 0.3, 2)
+    np.testing.assert_allclose(llr, 4 * 6 * math.sqrt(0.5) / 0.3 * np.array([-1, 1]), rtol=1e-5)
+    bounded = qam.soft_demap(np.array([6 - 6j], np.complex64), 0.01, 2)
+    np.testing.assert_allclose(bounded, math.log(1e37) * np.array([-1, 1]), rtol=1e-5)
+
+
 @pytest.mark.parametrize("snr_db", [4.0, 8.0, 12.0])
 def test_uncoded_bit_error_rate_meets_the_closed_form(snr_db, rng):
     # Gray 16-QAM: P = (3 Q(a) + 2 Q(3a) - Q(5a)) / 4 with a = sqrt(snr / 5).

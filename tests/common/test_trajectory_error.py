@@ -148,6 +148,26 @@ def test_completeness_counts_frames_and_refuses_nonsense():
         completeness(5, 4)
 
 
+def test_the_figures_of_a_run_are_in_metres_of_the_truth():
+    # A map of half the size that zigzags by h map units; what no similarity removes is as in the test above.
+    h, truth = 0.05, line([0.0, 1.0, 2.0, 3.0])
+    summary = trajectory_summary(line([0.0, 0.5, 1.0, 1.5], [h, -h, -h, h]), truth, num_frames=5)
+    scale = 2.5 / (1.25 + 4 * h * h)
+    x = np.array([-1.5, -0.5, 0.5, 1.5])
+    rmse_m = np.sqrt(np.mean((scale * x / 2 - x) ** 2 + (scale * h) ** 2))
+    step_m = np.sqrt((3 * (scale / 2 - 1) ** 2 + 2 * (2 * scale * h) ** 2) / 3)
+    assert summary == {
+        "ate_rmse_m": pytest.approx(rmse_m),
+        "ate_percent": pytest.approx(100 * rmse_m / 3.0),
+        "path_length_m": 3.0,
+        "completeness": 0.8,
+        "rpe_trans_percent": pytest.approx(100 * step_m),
+        "rpe_rot_deg": 0.0,
+        "num_posed": 4,
+        "num_matched": 4,
+    }
+
+
 def test_without_truth_only_counts_remain():
     summary = trajectory_summary(wandering(5, 3), None, num_frames=10)
     assert summary["completeness"] == 0.5

@@ -4,7 +4,7 @@ import pytest
 
 from semcast.common.codec import DecodedImage, confidence_from_displacement_px
 from semcast.evaluation.confidence_grades import KeypointGrader, PixelGrader, SlotGrader
-from semcast.evaluation.uncertainty_maps import pixel_label
+from semcast.evaluation.uncertainty_maps import lambda_min, pixel_label
 
 
 @pytest.fixture
@@ -61,6 +61,22 @@ def test_keypoint_grade_rewards_the_map_that_knows_the_displacement(original):
     predicted, observed = (result["calibration"][k] for k in ("predicted_px", "observed_px"))
     assert predicted[0] == pytest.approx(0.0, abs=1e-6)
     assert observed[-1] == pytest.approx(2.0, abs=0.2)
+
+
+def test_uncertainty_over_the_structure_is_that_of_the_localisation_bound(original, rng):
+    # Confidence such that (1 - c)^2 / lambda_min is what the keypoint head says: both maps grade alike.
+    moved = np.roll(original, 1, axis=1)
+    told = rng.uniform(0.1, 2.0, original.shape[:2])
+    share = lambda_min(moved) * told
+    uncertain = np.sqrt(0.9 * share / share.max()).astype(np.float32)
+    grader = KeypointGrader()
+    grader.add(DecodedImage(moved, 1 - uncertain, confidence_from_displacement_px(told)), original)
+    result = grader.result()
+    by_head, by_bound = (result["maps"][k] for k in ("keypoint_confidence", "confidence_over_lambda_min"))
+    assert by_bound == pytest.approx(by_head, abs=0.02)
+    assert by_bound != pytest.approx(result["maps"]["confidence"], abs=0.02)
+    assert result["displacement_px_median"] == pytest.approx(1.0, abs=0.02)
+    assert result["lost_share"] < 0.1
 
 
 def test_codecs_without_keypoint_head_have_no_keypoint_grade(original):

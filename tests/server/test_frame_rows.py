@@ -1,8 +1,8 @@
 """Rows survive a kill, and the summary says what happened."""
 
-import errno
-import io
+import contextlib
 import json
+import resource
 
 import numpy as np
 import pytest
@@ -94,21 +94,19 @@ def test_without_a_folder_rows_stay_in_memory():
     assert [r.frame_id for r in record.rows()] == [3]
 
 
-class FullDisk(io.RawIOBase):
-    """Takes half of the next row, and then nothing."""
+@contextlib.contextmanager
+def full_disk(room_bytes):
+    """Let no file grow beyond so many bytes, as on a disk that is full: of the row at its end a part fits."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
-    def __init__(self, file):
-        self.file, self.is_full = file, False
 
-    def write(self, data):
-        if self.is_full:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        self.is_full = True
-        return self.file.write(data[: len(data) // 2])
-
-    def close(self):
-        self.file.close()
-        super().close()
+def half_a_row_more(folder):
+    return (folder / FRAMES_NAME).stat().st_size + 100
 
 
 def ids_in(folder):
@@ -119,14 +117,14 @@ def test_rows_a_full_disk_did_not_take_are_written_when_it_has_room_again(tmp_pa
     now_s, told = 0.0, []
     record = FrameRows(tmp_path, on_error=told.append, clock=lambda: now_s)
     record.add(row(0))
-    record._file = FullDisk(record._file)
-    for k in (1, 2, 3):
-        record.add(row(k))
-        now_s += 2.0
+    with full_disk(half_a_row_more(tmp_path)):
+        for k in (1, 2, 3):
+            record.add(row(k))
+            now_s += 2.0
     assert (tmp_path / FRAMES_NAME).read_bytes()[-1:] != b"\n", "a part of row 1 is there"
     assert [r.frame_id for r in record.rows()] == [0, 1, 2, 3]
-    assert told == [f"{tmp_path / FRAMES_NAME} can't be written: [Errno 28] No space left on device"]
-    assert caplog.text.count("No space left") == 1
+    assert told == [f"{tmp_path / FRAMES_NAME} can't be written: [Errno 27] File too large"]
+    assert caplog.text.count("File too large") == 1
     record.add(row(4))
     assert ids_in(tmp_path) == [0, 1, 2, 3, 4]
     assert "is written again, with the rows that waited" in caplog.text
@@ -137,9 +135,9 @@ def test_rows_a_full_disk_did_not_take_are_written_when_it_has_room_again(tmp_pa
 
 def test_rows_that_wait_at_the_end_are_written_then(tmp_path):
     record = FrameRows(tmp_path)
-    record._file = FullDisk(record._file)
-    for k in range(3):
-        record.add(row(k))
+    with full_disk(half_a_row_more(tmp_path)):
+        for k in range(3):
+            record.add(row(k))
     record.finish()
     record.close()
     assert ids_in(tmp_path) == [0, 1, 2]
@@ -148,13 +146,11 @@ def test_rows_that_wait_at_the_end_are_written_then(tmp_path):
 def test_rows_that_can_not_be_written_at_the_end_are_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr(frame_rows, "MAX_ROWS_IN_MEMORY", 2)
     record = FrameRows(tmp_path)
-    record._file = FullDisk(record._file)
-    for k in range(3):
-        record.add(row(k))
-    record._path = tmp_path / "gone" / FRAMES_NAME
-    with pytest.raises(FileNotFoundError):
-        record.finish()
-    record._path = tmp_path / FRAMES_NAME
+    with full_disk(half_a_row_more(tmp_path)):
+        for k in range(3):
+            record.add(row(k))
+        with pytest.raises(OSError, match="File too large"):
+            record.finish()
     with pytest.raises(OSError, match="1 rows are lost"):
         record.finish()
     record.close()

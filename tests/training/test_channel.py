@@ -61,6 +61,16 @@ def test_without_fading_and_loss_every_slot_has_gain_one():
     assert (draw_links(settings, 50, 8, torch.Generator().manual_seed(0)).gain == 1).all()
 
 
+def test_images_lose_up_to_the_largest_share_of_their_slots():
+    settings = LinkDrawSettings(share_faded=0.0, share_lossy=0.5, lost_max=0.4)
+    lost = draw_links(settings, 2000, 100, torch.Generator().manual_seed(0)).gain == 0.0
+    share = lost.float().mean(dim=(1, 2, 3))
+    # Half of the images lose none, the others 0 to 40 %, all shares alike.
+    assert share.mean().item() == pytest.approx(0.5 * 0.2, abs=0.01)
+    assert 0.4 < share.max().item() < 0.55
+    assert (share > 0.3).float().mean().item() == pytest.approx(0.5 * 0.25, abs=0.03)
+
+
 def test_shares_and_ranges_are_checked():
     with pytest.raises(ValueError, match=r"share_lossy must be in \[0, 1\], got 1.5"):
         LinkDrawSettings(share_lossy=1.5)

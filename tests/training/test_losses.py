@@ -65,6 +65,27 @@ def test_the_displacement_likelihood_is_least_at_the_mean():
     assert losses[1] == min(losses)
 
 
+def test_displacements_count_by_their_corners_strength():
+    # Strengths 9 and 1 are 1.8 and 0.2 times their mean, and 0.05 is added; the scale has 0.02 px more.
+    labels, strength = (torch.tensor(v).view(1, 1, 1, 2) for v in ([0.5, 2.0], [9.0, 1.0]))
+    each = [math.log(1.0) + 0.5, math.log(1.0) + 2.0]
+    expected = (1.85 * each[0] + 0.25 * each[1]) / 2.1
+    found = displacement_loss(torch.full_like(labels, 0.98), labels, strength)
+    assert found.item() == pytest.approx(expected, rel=1e-5)
+    # A single strong corner among many counts for no more than eight.
+    one = torch.zeros(1, 1, 1, 100)
+    one[..., 0] = 1.0
+    labels = torch.where(one > 0, 2.0, 0.0)
+    found = displacement_loss(torch.full_like(one, 0.98), labels, one)
+    assert found.item() == pytest.approx(8.05 * 2.0 / (8.05 + 99 * 0.05), rel=1e-5)
+
+
+def test_confidence_losses_by_hand():
+    logit, label = torch.zeros(1, 1, 1, 2), torch.tensor([0.7, 0.1]).view(1, 1, 1, 2)
+    assert confidence_loss(logit, label, "bce").item() == pytest.approx(math.log(2.0))
+    assert confidence_loss(logit, label, "l1").item() == pytest.approx(0.3)
+
+
 def test_equal_images_have_equal_descriptors_and_contrast_does_not_matter():
     x = texture()
     assert descriptor_loss(x, x).item() == pytest.approx(0.0, abs=1e-10)
@@ -94,7 +115,7 @@ def run_loss(settings, with_heads=True):
     noise = torch.randn(2, 94, 2, 2, generator=generator)
     loss, logs = transceiver_loss(model, x, draw, noise, settings, with_heads)
     loss.backward()
-    return model, logs
+    return model, {**logs, "loss": loss.detach()}
 
 
 def test_heads_never_change_the_image_path():
@@ -116,6 +137,15 @@ def test_each_term_can_be_switched_on():
     assert described["descriptor"] > 0
     assert {"pixel", "keypoint"} <= set(plain)
     assert not {"pixel", "keypoint"} & set(bare)
+
+
+def test_the_loss_is_the_weighted_sum_of_its_terms():
+    _, logs = run_loss(LossSettings(mse=3.0, descriptor=0.1, confidence=0.2, mse_knee=0.0))
+    heads = logs["pixel"] + 0.5 * logs["keypoint"]
+    expected = 3.0 * logs["mse"] + 0.1 * logs["descriptor"] + 0.2 * heads
+    assert logs["loss"].item() == pytest.approx(expected.item(), rel=1e-5)
+    _, bare = run_loss(LossSettings(mse=3.0, mse_knee=0.0), with_heads=False)
+    assert bare["loss"].item() == pytest.approx(3.0 * bare["mse"].item(), rel=1e-5)
 
 
 def test_bad_weights_are_refused():

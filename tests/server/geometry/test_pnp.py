@@ -49,6 +49,14 @@ def test_outliers_do_not_move_the_pose():
     assert not found.inliers[:45].any()
 
 
+def test_covariance_of_proposition_1_is_the_inverse_of_the_information():
+    T, points, exact = make_view(2, num=20)
+    sigma = np.linspace(0.2, 1.5, 20)
+    _, J = project_with_jacobian(CAMERA, transform_points(T, points))
+    information = sum(j.T @ j / s**2 for j, s in zip(J, sigma, strict=True))
+    assert np.allclose(refine(T, points, exact, sigma).covariance @ information, np.eye(6), atol=1e-4)
+
+
 def test_covariance_of_proposition_1_by_monte_carlo():
     T, points, exact = make_view(2, num=60)
     rng = np.random.default_rng(2)

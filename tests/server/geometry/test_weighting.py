@@ -101,6 +101,17 @@ def test_fit_withstands_outliers():
     assert fitted.beta == pytest.approx(3.0, abs=0.7)
 
 
+@pytest.mark.parametrize(("slope", "beta"), [(1.8, 0.0), (2.0, 2.0), (20.0, 8.0)])
+def test_a_slope_counts_from_two_of_its_standard_errors_on(slope, beta):
+    # Three groups of 12 at c = 1, 0.5, 0, each without spread: se = 2.33 / sqrt(12 * (0.25 + 0.25)) = 0.951.
+    c = np.repeat([1.0, 0.5, 0.0], 12)
+    fitted = fit_noise(c, 0.6 * np.exp(0.5 * slope * (1.0 - c)), num_bins=3)
+    assert fitted is not None
+    assert fitted.beta == pytest.approx(beta)
+    if beta == slope:
+        assert fitted.sigma0_px == pytest.approx(0.6 / 0.67449)
+
+
 def test_fit_needs_residuals():
     assert fit_noise(np.ones(3), np.ones(3)) is None
     flat = fit_noise(np.ones(100), np.ones(100))
@@ -151,6 +162,9 @@ def test_fit_can_be_switched_off():
 def test_localisation_variance_by_hand():
     # 2 grey levels of noise, 16 independent values of gradient energy 100: variance 4 / 1600 = 0.05^2.
     assert np.allclose(localisation_variance_px2(cues(forward_backward_px=np.full(4, 0.12))), 0.13**2)
+    # The codec's confidence 1 - tanh(30 * 0.04) stands for errors of 0.04 * 255 grey levels.
+    doubted = cues(pixel_confidence=np.full(4, 1.0 - np.tanh(1.2)), gradient_grey2=np.full(4, 25.0))
+    assert np.allclose(localisation_variance_px2(doubted), 10.2**2 / (16 * 25))
     # The displacement head alone says 3 px.
     sure = cues(keypoint_confidence=np.full(4, 0.25), gradient_grey2=np.full(4, 1e12))
     assert np.allclose(localisation_variance_px2(sure), 9.0, atol=1e-5)

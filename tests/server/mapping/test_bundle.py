@@ -6,6 +6,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
+from semcast.server.geometry.pnp import project_with_jacobian
 from semcast.server.mapping import bundle
 from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
@@ -64,23 +65,27 @@ def test_an_exact_window_is_recovered():
     assert np.array_equal(result.T_world_cam[:2], problem.T_world_cam[:2])
 
 
-def test_one_fixed_pose_and_the_baseline_hold_the_gauge():
-    problem, T_world_cam, _ = make_problem(noise_px=0.0)
-    exact = T_world_cam[[0, -1]]
-    start = problem.T_world_cam.copy()
-    start[-1] = exact[-1] @ exp_se3([0.01, -0.01, 0.01, 0, 0, 0])
-    problem = BundleProblem(
-        **{
-            **vars(problem),
-            "T_world_cam": start,
-            "fixed": np.arange(6) < 1,
-            "keep_baseline": True,
-            "iterations": 30,
-        }
-    )
-    result = optimise(problem)
+@pytest.mark.parametrize("order", [[0, 1, 2, 3, 4, 5], [0, 3, 5, 4, 2, 1]], ids=["away", "and back"])
+def test_one_fixed_pose_and_the_longest_baseline_hold_the_gauge(order):
+    problem, T_world_cam, xyz = make_problem(noise_px=0.0, shake=0.0)
+    truth = T_world_cam[order]
+    # All but the view furthest away begins a tenth too far from the first, whose pose is fixed.
+    start, furthest = truth.copy(), order.index(5)
+    start[:, :3, 3] += 0.1 * (truth[:, :3, 3] - truth[0, :3, 3])
+    start[furthest] = truth[furthest]
+    changes = {
+        "T_world_cam": start,
+        "xyz": xyz + 0.1 * (xyz - truth[0, :3, 3]),
+        "view": np.argsort(order)[problem.view],
+        "fixed": np.arange(6) < 1,
+        "keep_baseline": True,
+        "iterations": 30,
+    }
+    result = optimise(BundleProblem(**{**vars(problem), **changes}))
     assert result.ok
-    assert pose_error(result, T_world_cam) < 1e-2
+    assert pose_error(result, truth) < 1e-3
+    free = optimise(BundleProblem(**{**vars(problem), **changes, "keep_baseline": False}))
+    assert pose_error(free, truth) > 0.02, "where nothing holds it, the scale is that of most views"
 
 
 def test_right_weights_give_smaller_errors_than_equal_ones():
@@ -104,6 +109,28 @@ def test_residuals_show_the_outlier():
     assert np.median(size) < 0.6
 
 
+def test_covariance_is_the_inverse_of_the_information_where_points_are_free_and_two_poses_are_not():
+    sigma = float(quantised_sigma(np.ones(1))[0][8])
+    problem, T_world_cam, xyz = make_problem(
+        num_views=4, num_points=20, noise_px=0.0, shake=0.0, iterations=1
+    )
+    result = optimise(BundleProblem(**{**vars(problem), "sigma_px": np.full(len(problem.xy), sigma)}))
+    # Unknowns: poses 2 and 3, each moved in its own frame, and the points.
+    jacobian = np.zeros((len(problem.xy), 2, 12 + 3 * 20))
+    for row, (k, p) in enumerate(zip(problem.view, problem.point, strict=True)):
+        T_cam_world = invert_transform(T_world_cam[k])
+        _, J = project_with_jacobian(CAMERA, transform_points(T_cam_world, xyz[p][None]))
+        if k >= 2:
+            jacobian[row, :, 6 * k - 12 : 6 * k - 6] = J[0]
+        jacobian[row, :, 12 + 3 * p : 15 + 3 * p] = J[0][:, 3:] @ T_cam_world[:3, :3]
+    rows = jacobian.reshape(-1, jacobian.shape[-1]) / sigma
+    expected = np.linalg.inv(rows.T @ rows)[6:12, 6:12]
+    scale = np.sqrt(np.diag(expected))
+    assert np.allclose(
+        result.covariance / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-3
+    )
+
+
 def test_covariance_is_that_of_the_last_pose():
     tight, loose = (optimise(make_problem(noise_px=s)[0]) for s in (0.2, 0.8))
     assert tight.covariance is not None
@@ -122,6 +149,17 @@ def test_a_point_behind_a_camera_is_left_out():
     assert pose_error(result, T_world_cam) < 0.05
     assert np.isnan(result.residual_px[problem.point == 0]).all()
     assert np.array_equal(result.xyz[0], xyz[0])
+
+
+def test_a_point_takes_part_from_its_second_view_on():
+    problem, _, xyz = make_problem(noise_px=0.0)
+    kept = ~((problem.point == 0) & (problem.view > 1)) & ~((problem.point == 1) & (problem.view != 5))
+    of_kept = {name: vars(problem)[name][kept] for name in ("view", "point", "xy", "sigma_px", "confidence")}
+    result = optimise(BundleProblem(**{**vars(problem), **of_kept}))
+    assert np.allclose(result.xyz[0], xyz[0], atol=1e-3), "seen by two"
+    assert np.isfinite(result.residual_px[of_kept["point"] == 0]).all()
+    assert np.array_equal(result.xyz[1], problem.xyz[1]), "seen by one, left out"
+    assert np.isnan(result.residual_px[of_kept["point"] == 1]).all()
 
 
 @pytest.mark.parametrize(
