@@ -245,7 +245,8 @@ class Receiver:
         with self._lock:
             new_epoch = frame.agent_epoch != self._arrivals.epoch
             camera = self._cameras.get(frame.agent_epoch)
-            taken = self._arrivals.accept(frame, arrival_ns, camera.frame_step if camera is not None else 1)
+            step = camera.frame_step if camera is not None else 1
+            taken = self._arrivals.accept(frame, arrival_ns, step, is_announced=camera is not None)
             if taken and new_epoch:
                 dropped = self._box.clear()
                 self._metrics.drop("epoch", dropped)
