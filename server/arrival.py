@@ -140,8 +140,7 @@ class Arrivals:
                 self._drop("epoch", 1)
                 return False
             self._start(frame)
-            self._is_announced = False
-        self._is_announced |= is_announced
+            self._is_announced = is_announced
         self._last_ns = arrival_ns
         if not self._lossless and frame.seq in self._recent:
             self._drop("duplicate", 1)
@@ -172,13 +171,23 @@ class Arrivals:
         self._age.arrived(frame.t_capture_ns, arrival_ns)
         return True
 
+    def announced(self, agent_epoch: int) -> None:
+        """Note that it is known from now on what the camera of an epoch is."""
+        self._is_announced |= agent_epoch == self.epoch
+
+    def waits_for_camera(self, frame: SymbolFrame, arrival_ns: int) -> bool:
+        """Tell whether a frame would count if it were known what the camera of its epoch is."""
+        return (
+            frame.agent_epoch != self.epoch
+            and self._takes_over(frame, arrival_ns, is_announced=True)
+            and not self._takes_over(frame, arrival_ns, is_announced=False)
+        )
+
     def _takes_over(self, frame: SymbolFrame, arrival_ns: int, *, is_announced: bool) -> bool:
         """Tell whether a frame of another epoch ends the present one."""
         if self.epoch == 0 or arrival_ns - self._last_ns > SILENCE_NS:
             return True
         if is_announced != self._is_announced:
-            if not is_announced and frame.agent_epoch > self.epoch:
-                self._tell("a frame is left out: nobody says what the camera of its agent is")
             return is_announced
         return frame.agent_epoch > self.epoch
 

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import ReceivedImage
 from semcast.common.errors import TransportError
-from semcast.common.keys import CAMERA_TIMEOUT_S, camera_key, channel_key, flow_key, link_key, rx_key
+from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.link_report import LinkReporter
 from semcast.common.mailbox import Mailbox
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
@@ -23,6 +23,7 @@ from semcast.common.symbol_payload import equalise_frame
 from semcast.common.transport import FRAME_RING_CAPACITY, Session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.common.worker_guard import WorkerGuard
+from semcast.server.announcement import answered_camera
 from semcast.server.arrival import Arrivals
 from semcast.server.backlog import Backlog
 
@@ -119,6 +120,7 @@ class Receiver:
         )
         self._held: tuple[SymbolFrame, int] | None = None
         self._cameras: dict[int, CameraInfo] = {}
+        self._early: deque[tuple[SymbolFrame, int]] = deque()
         self._snr_set: OrderedDict[tuple[int, int], float] = OrderedDict()
         self._num_superseded = self._num_given_way = 0
         self._reporter: tuple[tuple[int, str], LinkReporter] | None = None
@@ -199,12 +201,20 @@ class Receiver:
         except WireError as err:
             self._refuse(err)
             return
+        self._keep(camera)
+
+    def _keep(self, camera: CameraInfo) -> None:
         with self._lock:
             # The one announced last stays: that of an agent whose clock was set back has the lowest epoch.
             self._cameras.pop(camera.agent_epoch, None)
             self._cameras[camera.agent_epoch] = camera
             while len(self._cameras) > _KEPT_CAMERAS:
                 del self._cameras[next(iter(self._cameras))]
+            self._arrivals.announced(camera.agent_epoch)
+            early = [entry for entry in self._early if entry[0].agent_epoch == camera.agent_epoch]
+            self._early = deque(entry for entry in self._early if entry not in early)
+        for frame, arrival_ns in early:
+            self._sort(frame, arrival_ns)
 
     def _on_report(self, payload: bytes) -> None:
         try:
@@ -245,6 +255,9 @@ class Receiver:
         with self._lock:
             new_epoch = frame.agent_epoch != self._arrivals.epoch
             camera = self._cameras.get(frame.agent_epoch)
+            if camera is None and self._arrivals.waits_for_camera(frame, arrival_ns):
+                self._keep_early(frame, arrival_ns)
+                return
             step = camera.frame_step if camera is not None else 1
             taken = self._arrivals.accept(frame, arrival_ns, step, is_announced=camera is not None)
             if taken and new_epoch:
@@ -258,6 +271,14 @@ class Receiver:
                 self._count_superseded()
         if self._mode == "replay":
             self._send_flow()
+
+    def _keep_early(self, frame: SymbolFrame, arrival_ns: int) -> None:
+        """Keep a frame that overtook what its agent says about itself; the lock is held."""
+        self._early.append((frame, arrival_ns))
+        if len(self._early) > FRAME_RING_CAPACITY:
+            self._early.popleft()
+            self._metrics.drop("camera")
+            self._tell("early", "frames arrive of an agent that does not say what its camera is")
 
     def _count_superseded(self) -> None:
         """Count what gave way to newer frames since the last time; the lock is held."""
@@ -398,13 +419,12 @@ class Receiver:
         if camera is not None:
             return camera
         try:
-            answer = self._session.request(camera_key(self._agent_id), b"", CAMERA_TIMEOUT_S)
+            camera = answered_camera(self._session, self._agent_id, epoch)
         except TransportError:
             return None
-        if answer is not None:
-            self._on_camera(answer)
-        with self._lock:
-            return self._cameras.get(epoch)
+        if camera is not None:
+            self._keep(camera)
+        return camera
 
     def _reporter_of(self, message: SymbolFrame) -> LinkReporter:
         stream = (message.agent_epoch, message.codec)
