@@ -4,6 +4,7 @@ import contextlib
 import logging
 import math
 import threading
+from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
@@ -32,6 +33,10 @@ logger = logging.getLogger(__name__)
 ROLE = "channel"
 _POLL_S = 0.1
 _REPLAY_CAPACITY = 64
+#: Frames that an agent may send again: more than it ever has under way.
+_REMEMBERED = 1024
+#: A frame numbered so far ahead of the newest one is believed when another follows on it.
+_MAX_GAP = 1000
 
 
 class Emulator:
@@ -53,9 +58,10 @@ class Emulator:
         self._control_lock = threading.Lock()  # one change after the other, while frames pass
         self._box: Mailbox[SymbolFrame] = Mailbox(1, "newest")
         self._epoch = 0
-        self._carried_seq = -1
+        self._carried: deque[int] = deque(maxlen=_REMEMBERED)
         self._arrived_epoch = 0
         self._arrived_seq = 0
+        self._far_seq = 0
         agent_id = settings.agent_id
         self._live = session.publisher(rx_key(agent_id), "newest")
         self._lossless = session.publisher(rx_key(agent_id), "every")
@@ -90,7 +96,13 @@ class Emulator:
         """Count the frames before this one that never came; what is sent again opens no gap."""
         if frame.agent_epoch != self._arrived_epoch:
             self._arrived_epoch, self._arrived_seq = frame.agent_epoch, frame.seq
-        self._metrics.drop("missing", max(0, frame.seq - self._arrived_seq))
+        num_missing = max(0, frame.seq - self._arrived_seq)
+        before_seq, self._far_seq = self._far_seq, frame.seq
+        if num_missing > _MAX_GAP:
+            if not 0 < frame.seq - before_seq <= _MAX_GAP:
+                return
+            num_missing -= 1  # the one before came
+        self._metrics.drop("missing", num_missing)
         self._arrived_seq = max(self._arrived_seq, frame.seq + 1)
 
     def work(self, stop: threading.Event) -> None:
@@ -127,8 +139,9 @@ class Emulator:
             )
         )
         # What is sent again meets the same fate, which is counted once.
-        again = frame.seq <= self._carried_seq
-        self._carried_seq = max(self._carried_seq, frame.seq)
+        again = frame.seq in self._carried
+        if not again:
+            self._carried.append(frame.seq)
         if sent.frame_lost:
             self._metrics.drop("lost", 0 if again else 1)
             if not frame.lossless:
@@ -150,7 +163,7 @@ class Emulator:
         """Start anew for a restarted agent."""
         if frame.agent_epoch != self._epoch:
             self._epoch = frame.agent_epoch
-            self._carried_seq = -1
+            self._carried.clear()
             with self._link_lock:
                 self._link.restart()
 

@@ -217,6 +217,17 @@ def test_replay_loses_nothing_even_in_a_burst_and_live_counts_what_it_drops(ends
     assert 2 <= sum(f.agent_epoch == 2 for f in e.received) <= carried
 
 
+def test_a_number_out_of_nowhere_opens_no_gap_and_a_long_break_of_the_link_does(ends, make):
+    e = ends()
+    for seq in (0, 1, 2**62, 2, 4):
+        e.pass_one(make(seq, t_source_ns=0))
+    for seq in (5000, 5001):
+        e.pass_one(make(seq))
+    e.close()
+    assert e.summary["drops"] == {"missing": 1 + 4995}
+    assert e.summary["counts"]["carried"] == 7
+
+
 def test_frames_that_are_sent_again_are_not_taken_for_gaps(ends, make):
     e = ends()
     for seq in (0, 1, 2, 3, 1, 2, 4, 5, 8):
