@@ -14,6 +14,7 @@ from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.link import Link
 from semcast.channel.registry import build_channel
 from semcast.channel.settings import MAX_DOPPLER_SLOT, ChannelSettings
+from semcast.common.complaints import Complaints
 from semcast.common.config import build_settings, settings_to_dict
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import channel_key, control_key, rx_key, tx_key
@@ -53,6 +54,7 @@ class Emulator:
     def __init__(self, session: Session, settings: EmulatorSettings, metrics: Metrics) -> None:
         self._settings = settings
         self._metrics = metrics
+        self._complaints = Complaints(metrics)
         self._link = Link(settings.link, settings.seed)
         self._link_lock = threading.Lock()
         self._control_lock = threading.Lock()  # one change after the other, while frames pass
@@ -82,9 +84,7 @@ class Emulator:
             if frame.direction != "tx":
                 raise WireError("kind", f"frame must be tx, got {frame.direction}")
         except WireError as err:
-            self._metrics.drop("protocol")
-            self._metrics.count(f"protocol_{err.reason}")
-            self._metrics.error(str(err))
+            self._complaints.refuse(err)
             return
         self._metrics.count("received")
         self._count_missing(frame)
@@ -116,8 +116,7 @@ class Emulator:
                     self._carry(frame)
             except (ValueError, SemcastError) as err:
                 self._metrics.drop("protocol")
-                self._metrics.error(f"frame {frame.frame_id}: {err}")
-                logger.debug("frame %d left out: %s", frame.frame_id, err)
+                self._complaints.tell("frame", f"frame {frame.frame_id} is left out: {err}")
 
     def _carry(self, frame: SymbolFrame) -> None:
         self._follow(frame)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import ReceivedImage
+from semcast.common.complaints import Complaints
 from semcast.common.errors import TransportError
 from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.link_report import LinkReporter
@@ -38,8 +39,6 @@ FLOW_INTERVAL_S = 0.2
 _CAMERA_PAUSE_S = 0.05
 _KEPT_REPORTS = 256
 _KEPT_CAMERAS = 16
-#: Different texts about one thing that are logged: nonsense without end must not hide what helps.
-_MAX_TOLD = 10
 
 
 @dataclass(frozen=True)
@@ -111,9 +110,12 @@ class Receiver:
         self._mode = mode
         self._metrics = metrics
         self._max_age_ms = max_age_ms
+        self._complaints = Complaints(metrics)
         self._lock = threading.Lock()
         self._arrivals = Arrivals(
-            lossless=mode == "replay", drop=metrics.drop, tell=lambda text: self._tell("ahead", text)
+            lossless=mode == "replay",
+            drop=metrics.drop,
+            tell=lambda text: self._complaints.tell("ahead", text),
         )
         self._box: Backlog[tuple[SymbolFrame, int]] | Mailbox[tuple[SymbolFrame, int]] = (
             Backlog() if mode == "live" else Mailbox(4 * WINDOW, "newest")
@@ -127,7 +129,6 @@ class Receiver:
         self._roles: set[str] = set()
         #: Of a stream that has ended: epoch, frames sent, and how many behind the newest count as missing.
         self._end = (0, 0, 0)
-        self._told: dict[str, set[str]] = {}
         self._link = session.publisher(link_key(agent_id), "newest")
         self._flow = session.publisher(flow_key(agent_id), "newest")
         self._stopping = threading.Event()
@@ -180,14 +181,6 @@ class Receiver:
         self._metrics.drop("missing", behind - counted)
         self._end = agent_epoch, num_sent, behind
 
-    def _tell(self, about: str, text: str) -> None:
-        """Show in the status what is wrong with what arrives, and log it the first time."""
-        self._metrics.error(text)
-        told = self._told.setdefault(about, set())
-        if text not in told and len(told) < _MAX_TOLD:
-            told.add(text)
-            logger.warning("%s", text)
-
     def _on_alive(self, role: str, alive: bool) -> None:
         with self._lock:
             known = role in self._roles
@@ -199,7 +192,7 @@ class Receiver:
         try:
             camera = unpack(payload, CameraInfo)
         except WireError as err:
-            self._refuse(err)
+            self._complaints.refuse(err)
             return
         self._keep(camera)
 
@@ -220,17 +213,12 @@ class Receiver:
         try:
             report = unpack(payload, ChannelReport)
         except WireError as err:
-            self._refuse(err)
+            self._complaints.refuse(err)
             return
         with self._lock:
             self._snr_set[(report.agent_epoch, report.frame_id)] = report.snr_db_set
             while len(self._snr_set) > _KEPT_REPORTS:
                 self._snr_set.popitem(last=False)
-
-    def _refuse(self, err: WireError) -> None:
-        self._metrics.drop("protocol")
-        self._metrics.count(f"protocol_{err.reason}")
-        self._tell(err.reason, f"a message was refused: {err}")
 
     def _on_symbols(self, payload: bytes) -> None:
         arrival_ns = time.perf_counter_ns()
@@ -239,12 +227,12 @@ class Receiver:
             if frame.direction != "rx":
                 raise WireError("kind", f"frame must be rx, got {frame.direction}")
         except WireError as err:
-            self._refuse(err)
+            self._complaints.refuse(err)
             return
         if frame.lossless != (self._mode == "replay"):
             self._metrics.drop("mode")
             there = "replay" if frame.lossless else "live"
-            self._tell(
+            self._complaints.tell(
                 "mode", f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
             )
         else:
@@ -278,7 +266,7 @@ class Receiver:
         if len(self._early) > FRAME_RING_CAPACITY:
             self._early.popleft()
             self._metrics.drop("camera")
-            self._tell("early", "frames arrive of an agent that does not say what its camera is")
+            self._complaints.tell("early", "frames arrive of an agent that does not say what its camera is")
 
     def _count_superseded(self) -> None:
         """Count what gave way to newer frames since the last time; the lock is held."""
@@ -364,7 +352,7 @@ class Receiver:
         age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
         camera = self._camera_of(message.agent_epoch)
         if camera is None:
-            self._tell("camera", "frames arrive, but the agent does not say what its camera is")
+            self._complaints.tell("camera", "frames arrive, but the agent does not say what its camera is")
             if self._mode == "live":
                 self._metrics.drop("camera")
             else:
@@ -375,7 +363,7 @@ class Receiver:
             self._metrics.count("lost_on_air")
         elif not belongs_to(message.image_hw, camera.intrinsics.shape_hw):
             self._metrics.drop("protocol")
-            self._tell(
+            self._complaints.tell(
                 "size",
                 f"frames are {message.image_hw}, no coded size of the camera's {camera.intrinsics.shape_hw}",
             )

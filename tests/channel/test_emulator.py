@@ -256,12 +256,14 @@ def test_delay_is_added(ends, make):
     assert 0.15 <= time.monotonic() - started_s < 2.0
 
 
-def test_bad_messages_are_counted_and_do_no_harm(ends, make):
+def test_bad_messages_are_counted_and_told_and_do_no_harm(ends, make, caplog):
     e = ends()
     nan = make(0, payload_format="iq16", payload=b"\x00\x7e" * (2 * 4 * 47 * 8))
     for bad in (b"", b"junk", pack(make(0))[:-2], pack(nan)):
         e.tx.put(bad)
     until(lambda: e.status and e.status[-1].drops.get("protocol") == 4)
+    assert "a message was refused: bytes are not a message" in caplog.text
+    assert "frame 0 is left out: symbols must be finite" in caplog.text
     silent = make(1, epoch=3, payload_format="iq16", payload=bytes(4 * 4 * 47 * 8))
     e.pass_one(silent)
     e.pass_one(make(0, epoch=4))
