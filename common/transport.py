@@ -260,7 +260,8 @@ class Session:
             TransportError: The session is closed.
         """
         try:
-            for reply in self._session.get(key, payload=payload, timeout=timeout_s):
+            each = zenoh.ConsolidationMode.NONE  # by default one answer stands for those of all
+            for reply in self._session.get(key, payload=payload, timeout=timeout_s, consolidation=each):
                 if reply.ok is not None and is_wanted(answer := bytes(reply.ok.payload.to_bytes())):
                     return answer
         except zenoh.ZError as err:

@@ -9,8 +9,11 @@ from semcast.common.messages import CameraInfo
 from semcast.common.transport import Session
 from semcast.common.wire import WireError, unpack
 
+#: How long an agent may take to say again what it announced, over a slow network; no other thread waits.
+_STAND_BY_S = 2.0
 
-def unpack_or_none(payload: bytes) -> CameraInfo | None:
+
+def _unpack_or_none(payload: bytes) -> CameraInfo | None:
     """Return what is announced, None where that is not valid."""
     try:
         return unpack(payload, CameraInfo)
@@ -18,7 +21,9 @@ def unpack_or_none(payload: bytes) -> CameraInfo | None:
         return None
 
 
-def answered_camera(session: Session, agent_id: str, agent_epoch: int) -> CameraInfo | None:
+def answered_camera(
+    session: Session, agent_id: str, agent_epoch: int, timeout_s: float = CAMERA_TIMEOUT_S
+) -> CameraInfo | None:
     """Ask for the camera of one start of an agent; None where nobody answers: two may have one name.
 
     Raises:
@@ -26,11 +31,11 @@ def answered_camera(session: Session, agent_id: str, agent_epoch: int) -> Camera
     """
 
     def is_wanted(answer: bytes) -> bool:
-        camera = unpack_or_none(answer)
+        camera = _unpack_or_none(answer)
         return camera is not None and camera.agent_epoch == agent_epoch
 
-    answer = session.request(camera_key(agent_id), b"", CAMERA_TIMEOUT_S, is_wanted)
-    return unpack_or_none(answer) if answer is not None else None
+    answer = session.request(camera_key(agent_id), b"", timeout_s, is_wanted)
+    return _unpack_or_none(answer) if answer is not None else None
 
 
 class Announcement:
@@ -50,7 +55,7 @@ class Announcement:
         if "agent" in session.alive_roles(agent_id, CAMERA_TIMEOUT_S):
             answer = session.request(camera_key(agent_id), b"", CAMERA_TIMEOUT_S)
             if answer is not None:
-                self._note(unpack_or_none(answer))
+                self._note(_unpack_or_none(answer))
 
     def _hear(self, payload: bytes) -> None:
         """Note an announced stream; the receiver counts and reports what is not valid.
@@ -58,10 +63,10 @@ class Announcement:
         A map ends with it, so the agent must be there and say the same. One that can't is begun on with its
         first frame.
         """
-        camera = unpack_or_none(payload)
+        camera = _unpack_or_none(payload)
         with contextlib.suppress(TransportError):
-            if camera is not None and answered_camera(self._session, self._agent_id, camera.agent_epoch):
-                self._note(camera)
+            if camera is not None:
+                self._note(answered_camera(self._session, self._agent_id, camera.agent_epoch, _STAND_BY_S))
 
     def _note(self, camera: CameraInfo | None) -> None:
         with self._lock:
