@@ -16,6 +16,7 @@ from semcast.agent.settings import AgentSettings
 from semcast.agent.source import Source, SourceFrame, open_source
 from semcast.common.codec import Codec
 from semcast.common.codecs import load_codec
+from semcast.common.complaints import Complaints
 from semcast.common.errors import SourceError, TransportError
 from semcast.common.keys import camera_key, flow_key, link_key, tx_key
 from semcast.common.message_fields import sendable
@@ -79,6 +80,7 @@ class _Sending:
     ) -> None:
         self.agent_epoch = agent_epoch
         self.metrics = metrics
+        self.complaints = Complaints(metrics)
         self.lossless = settings.mode == "replay"
         self.feedback = LinkFeedback(self.agent_epoch, settings.snr_db, settings.feedback_max_age_s)
         follows = settings.follow_server and not self.lossless
@@ -105,23 +107,17 @@ class _Sending:
         try:
             report = unpack(payload, LinkReport)
         except WireError as err:
-            self.refuse(err)
+            self.complaints.refuse(err)
             return
         if report.agent_epoch == self.agent_epoch and report.frame_id > self._last_frame_id:
             # Believed, it would be the newest for good.
-            self.refuse(
-                WireError("range", f"a report must be of a frame that was sent, got {report.frame_id}")
-            )
+            text = f"a report must be of a frame that was sent, got {report.frame_id}"
+            self.complaints.refuse(WireError("range", text))
             return
         self.feedback.update(report)
         if self._pace is not None:
             self._pace.on_report(report)
         self.metrics.count("link_reports")
-
-    def refuse(self, err: WireError) -> None:
-        """Count a message that is not valid."""
-        self.metrics.drop("protocol")
-        self.metrics.error(str(err))
 
     def wants(self, frame: SourceFrame) -> bool:
         """Tell whether a frame of the source is to be sent; in replay all are."""
@@ -190,7 +186,7 @@ def _send_lossless(
         try:
             flow = unpack(payload, FlowMessage)
         except WireError as err:
-            sending.refuse(err)
+            sending.complaints.refuse(err)
             return
         with changed:
             window.on_flow(flow)

@@ -4,6 +4,7 @@ import contextlib
 import logging
 import math
 import threading
+from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
@@ -13,6 +14,7 @@ from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.link import Link
 from semcast.channel.registry import build_channel
 from semcast.channel.settings import MAX_DOPPLER_SLOT, ChannelSettings
+from semcast.common.complaints import Complaints
 from semcast.common.config import build_settings, settings_to_dict
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import channel_key, control_key, rx_key, tx_key
@@ -32,6 +34,10 @@ logger = logging.getLogger(__name__)
 ROLE = "channel"
 _POLL_S = 0.1
 _REPLAY_CAPACITY = 64
+#: Frames that an agent may send again: more than it ever has under way.
+_REMEMBERED = 1024
+#: A frame numbered so far ahead of the newest one is believed when another follows on it.
+_MAX_GAP = 1000
 
 
 class Emulator:
@@ -48,14 +54,16 @@ class Emulator:
     def __init__(self, session: Session, settings: EmulatorSettings, metrics: Metrics) -> None:
         self._settings = settings
         self._metrics = metrics
+        self._complaints = Complaints(metrics)
         self._link = Link(settings.link, settings.seed)
         self._link_lock = threading.Lock()
         self._control_lock = threading.Lock()  # one change after the other, while frames pass
         self._box: Mailbox[SymbolFrame] = Mailbox(1, "newest")
         self._epoch = 0
-        self._carried_seq = -1
+        self._carried: deque[int] = deque(maxlen=_REMEMBERED)
         self._arrived_epoch = 0
         self._arrived_seq = 0
+        self._far_seq = 0
         agent_id = settings.agent_id
         self._live = session.publisher(rx_key(agent_id), "newest")
         self._lossless = session.publisher(rx_key(agent_id), "every")
@@ -76,9 +84,7 @@ class Emulator:
             if frame.direction != "tx":
                 raise WireError("kind", f"frame must be tx, got {frame.direction}")
         except WireError as err:
-            self._metrics.drop("protocol")
-            self._metrics.count(f"protocol_{err.reason}")
-            self._metrics.error(str(err))
+            self._complaints.refuse(err)
             return
         self._metrics.count("received")
         self._count_missing(frame)
@@ -90,7 +96,13 @@ class Emulator:
         """Count the frames before this one that never came; what is sent again opens no gap."""
         if frame.agent_epoch != self._arrived_epoch:
             self._arrived_epoch, self._arrived_seq = frame.agent_epoch, frame.seq
-        self._metrics.drop("missing", max(0, frame.seq - self._arrived_seq))
+        num_missing = max(0, frame.seq - self._arrived_seq)
+        before_seq, self._far_seq = self._far_seq, frame.seq
+        if num_missing > _MAX_GAP:
+            if not 0 < frame.seq - before_seq <= _MAX_GAP:
+                return
+            num_missing -= 1  # the one before came
+        self._metrics.drop("missing", num_missing)
         self._arrived_seq = max(self._arrived_seq, frame.seq + 1)
 
     def work(self, stop: threading.Event) -> None:
@@ -104,8 +116,7 @@ class Emulator:
                     self._carry(frame)
             except (ValueError, SemcastError) as err:
                 self._metrics.drop("protocol")
-                self._metrics.error(f"frame {frame.frame_id}: {err}")
-                logger.debug("frame %d left out: %s", frame.frame_id, err)
+                self._complaints.tell("frame", f"frame {frame.frame_id} is left out: {err}")
 
     def _carry(self, frame: SymbolFrame) -> None:
         self._follow(frame)
@@ -127,8 +138,9 @@ class Emulator:
             )
         )
         # What is sent again meets the same fate, which is counted once.
-        again = frame.seq <= self._carried_seq
-        self._carried_seq = max(self._carried_seq, frame.seq)
+        again = frame.seq in self._carried
+        if not again:
+            self._carried.append(frame.seq)
         if sent.frame_lost:
             self._metrics.drop("lost", 0 if again else 1)
             if not frame.lossless:
@@ -150,7 +162,7 @@ class Emulator:
         """Start anew for a restarted agent."""
         if frame.agent_epoch != self._epoch:
             self._epoch = frame.agent_epoch
-            self._carried_seq = -1
+            self._carried.clear()
             with self._link_lock:
                 self._link.restart()
 

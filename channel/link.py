@@ -108,7 +108,7 @@ class Link:
     def restart(self) -> None:
         """Let time begin anew with the next frame, and with it fading and SNR traces."""
         self._start_s = self._trace_start_s = None
-        self._slot_time = SlotTime()
+        self._slot_time.restart()
         self._next_frame = 0
 
     def transmit(self, slots: NDArray[np.complex64], t_s: float, frame_id: int | None = None) -> Transmission:

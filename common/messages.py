@@ -195,11 +195,15 @@ class SymbolFrame:
         return layout_for(self.image_hw)
 
     def consistent(self) -> None:
-        """Check that levels rise, grid, payload and losses belong together, and received samples can be sent.
+        """Check that numbers and levels rise, and that grid, payload and losses belong together.
+
+        Received samples must be few enough to be sent.
 
         Raises:
             FieldError: They don't.
         """
+        if self.base_seq > self.seq:
+            raise FieldError("range", f"base_seq must be at most seq {self.seq}, got {self.base_seq}")
         if len(self.levels) not in (2, 4):
             raise FieldError("shape", f"levels must have 2 or 4 elements, got {len(self.levels)}")
         low, high, *knee = self.levels

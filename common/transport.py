@@ -247,16 +247,23 @@ class Session:
         )
         self._add(_Pump(declared, reply, f"answer-{key.rsplit('/', 1)[-1]}"))
 
-    def request(self, key: str, payload: bytes, timeout_s: float) -> bytes | None:
-        """Return the first answer to a request, None when nobody answered in time.
+    def request(
+        self,
+        key: str,
+        payload: bytes,
+        timeout_s: float,
+        is_wanted: Callable[[bytes], bool] = lambda answer: True,
+    ) -> bytes | None:
+        """Return the first answer to a request that is wanted, None when there was none in time.
 
         Raises:
             TransportError: The session is closed.
         """
         try:
-            for reply in self._session.get(key, payload=payload, timeout=timeout_s):
-                if reply.ok is not None:
-                    return bytes(reply.ok.payload.to_bytes())
+            each = zenoh.ConsolidationMode.NONE  # by default one answer stands for those of all
+            for reply in self._session.get(key, payload=payload, timeout=timeout_s, consolidation=each):
+                if reply.ok is not None and is_wanted(answer := bytes(reply.ok.payload.to_bytes())):
+                    return answer
         except zenoh.ZError as err:
             raise TransportError(f"request to {key} failed: {err}") from err
         return None

@@ -3,10 +3,39 @@
 import contextlib
 import threading
 
+from semcast.common.errors import TransportError
 from semcast.common.keys import CAMERA_TIMEOUT_S, camera_key
 from semcast.common.messages import CameraInfo
 from semcast.common.transport import Session
 from semcast.common.wire import WireError, unpack
+
+#: How long an agent may take to say again what it announced, over a slow network; no other thread waits.
+_STAND_BY_S = 2.0
+
+
+def _unpack_or_none(payload: bytes) -> CameraInfo | None:
+    """Return what is announced, None where that is not valid."""
+    try:
+        return unpack(payload, CameraInfo)
+    except WireError:
+        return None
+
+
+def answered_camera(
+    session: Session, agent_id: str, agent_epoch: int, timeout_s: float = CAMERA_TIMEOUT_S
+) -> CameraInfo | None:
+    """Ask for the camera of one start of an agent; None where nobody answers: two may have one name.
+
+    Raises:
+        TransportError: The session is closed.
+    """
+
+    def is_wanted(answer: bytes) -> bool:
+        camera = _unpack_or_none(answer)
+        return camera is not None and camera.agent_epoch == agent_epoch
+
+    answer = session.request(camera_key(agent_id), b"", timeout_s, is_wanted)
+    return _unpack_or_none(answer) if answer is not None else None
 
 
 class Announcement:
@@ -18,21 +47,31 @@ class Announcement:
     """
 
     def __init__(self, session: Session, agent_id: str) -> None:
+        self._session = session
+        self._agent_id = agent_id
         self._lock = threading.Lock()
         self._newest: CameraInfo | None = None
         session.subscribe(camera_key(agent_id), "every", self._hear)
         if "agent" in session.alive_roles(agent_id, CAMERA_TIMEOUT_S):
             answer = session.request(camera_key(agent_id), b"", CAMERA_TIMEOUT_S)
             if answer is not None:
-                self._hear(answer)
+                self._note(_unpack_or_none(answer))
 
     def _hear(self, payload: bytes) -> None:
-        """Note an announced stream; the receiver counts and reports what is not valid."""
-        with contextlib.suppress(WireError):
-            camera = unpack(payload, CameraInfo)
-            with self._lock:
-                if self._newest is None or camera.agent_epoch > self._newest.agent_epoch:
-                    self._newest = camera
+        """Note an announced stream; the receiver counts and reports what is not valid.
+
+        A map ends with it, so the agent must be there and say the same. One that can't is begun on with its
+        first frame.
+        """
+        camera = _unpack_or_none(payload)
+        with contextlib.suppress(TransportError):
+            if camera is not None:
+                self._note(answered_camera(self._session, self._agent_id, camera.agent_epoch, _STAND_BY_S))
+
+    def _note(self, camera: CameraInfo | None) -> None:
+        with self._lock:
+            if camera is not None and (self._newest is None or camera.agent_epoch > self._newest.agent_epoch):
+                self._newest = camera
 
     def is_newer(self, agent_epoch: int) -> bool:
         """Tell whether a stream was announced that began after this one."""

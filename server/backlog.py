@@ -48,18 +48,17 @@ class Backlog(BoundedQueue[_Waiting[T]], Generic[T]):
         self._took_s: deque[tuple[float, float]] = deque()  # when it was done, how long it took
         self._taken_s: float | None = None
 
-    def put(self, item: T) -> int | None:
-        """Add an item; return how many gave way to newer ones by now, None when the queue is closed."""
+    def put(self, item: T) -> None:
+        """Add an item, also where older ones give way to it; a closed queue takes none."""
         with self._changed:
             if self._closed:
-                return None
+                return
             now_s = self._clock()
             self._began_s = min(self._began_s, now_s)
             self._came_s.append(now_s)
             self._items.append(_Waiting(item, now_s))
-            gave_way = self._thin_out(now_s)
+            self._thin_out(now_s)
             self._changed.notify_all()
-            return gave_way
 
     def get(self, timeout_s: float | None = None) -> T | None:
         """Take the oldest item; None when there was none in time, or the queue is closed and empty."""
@@ -95,23 +94,20 @@ class Backlog(BoundedQueue[_Waiting[T]], Generic[T]):
         each_s = sum(took_s for _, took_s in self._took_s) / len(self._took_s)
         return each_s * len(self._came_s) <= KEEPS_UP_SHARE * (now_s - max(since_s, self._began_s))
 
-    def _thin_out(self, now_s: float) -> int:
-        """Let older items give way, as it is time, and return how many did; the newest stays."""
+    def _thin_out(self, now_s: float) -> None:
+        """Let older items give way, as it is time; the newest stays."""
         if self._keeps_up(now_s):
             self._newest_only = False
         elif self._behind_since_s is not None and now_s - self._behind_since_s > CATCH_UP_S:
             self._newest_only, self._last_drop_s = True, now_s
         elif now_s - self._last_drop_s > RECOVERY_S:
             self._newest_only = False
-        gave_way = 0
         while len(self._items) > 1 and (
             self._newest_only or now_s - self._items[0].since_s > MAX_WAIT_S or len(self._items) > MAX_WAITING
         ):
             self._items.popleft()
-            gave_way += 1
+            self._dropped += 1
             self._last_drop_s = now_s
-        self._dropped += gave_way
-        return gave_way
 
     def clear(self) -> int:
         """Throw everything away and return how many items that were; they don't count as ``dropped``."""

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal, Self
@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import ReceivedImage
+from semcast.common.complaints import Complaints
 from semcast.common.errors import TransportError
-from semcast.common.keys import CAMERA_TIMEOUT_S, camera_key, channel_key, flow_key, link_key, rx_key
+from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.link_report import LinkReporter
 from semcast.common.mailbox import Mailbox
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
@@ -23,6 +24,7 @@ from semcast.common.symbol_payload import equalise_frame
 from semcast.common.transport import FRAME_RING_CAPACITY, Session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.common.worker_guard import WorkerGuard
+from semcast.server.announcement import answered_camera
 from semcast.server.arrival import Arrivals
 from semcast.server.backlog import Backlog
 
@@ -37,8 +39,6 @@ FLOW_INTERVAL_S = 0.2
 _CAMERA_PAUSE_S = 0.05
 _KEPT_REPORTS = 256
 _KEPT_CAMERAS = 16
-#: Different texts about one thing that are logged: nonsense without end must not hide what helps.
-_MAX_TOLD = 10
 
 
 @dataclass(frozen=True)
@@ -110,22 +110,25 @@ class Receiver:
         self._mode = mode
         self._metrics = metrics
         self._max_age_ms = max_age_ms
+        self._complaints = Complaints(metrics)
         self._lock = threading.Lock()
         self._arrivals = Arrivals(
-            lossless=mode == "replay", drop=metrics.drop, tell=lambda text: self._tell("ahead", text)
+            lossless=mode == "replay",
+            drop=metrics.drop,
+            tell=lambda text: self._complaints.tell("ahead", text),
         )
         self._box: Backlog[tuple[SymbolFrame, int]] | Mailbox[tuple[SymbolFrame, int]] = (
             Backlog() if mode == "live" else Mailbox(4 * WINDOW, "newest")
         )
         self._held: tuple[SymbolFrame, int] | None = None
         self._cameras: dict[int, CameraInfo] = {}
+        self._early: deque[tuple[SymbolFrame, int]] = deque()
         self._snr_set: OrderedDict[tuple[int, int], float] = OrderedDict()
         self._num_superseded = self._num_given_way = 0
         self._reporter: tuple[tuple[int, str], LinkReporter] | None = None
         self._roles: set[str] = set()
         #: Of a stream that has ended: epoch, frames sent, and how many behind the newest count as missing.
         self._end = (0, 0, 0)
-        self._told: dict[str, set[str]] = {}
         self._link = session.publisher(link_key(agent_id), "newest")
         self._flow = session.publisher(flow_key(agent_id), "newest")
         self._stopping = threading.Event()
@@ -178,14 +181,6 @@ class Receiver:
         self._metrics.drop("missing", behind - counted)
         self._end = agent_epoch, num_sent, behind
 
-    def _tell(self, about: str, text: str) -> None:
-        """Show in the status what is wrong with what arrives, and log it the first time."""
-        self._metrics.error(text)
-        told = self._told.setdefault(about, set())
-        if text not in told and len(told) < _MAX_TOLD:
-            told.add(text)
-            logger.warning("%s", text)
-
     def _on_alive(self, role: str, alive: bool) -> None:
         with self._lock:
             known = role in self._roles
@@ -197,30 +192,33 @@ class Receiver:
         try:
             camera = unpack(payload, CameraInfo)
         except WireError as err:
-            self._refuse(err)
+            self._complaints.refuse(err)
             return
+        self._keep(camera)
+
+    def _keep(self, camera: CameraInfo) -> None:
         with self._lock:
             # The one announced last stays: that of an agent whose clock was set back has the lowest epoch.
             self._cameras.pop(camera.agent_epoch, None)
             self._cameras[camera.agent_epoch] = camera
             while len(self._cameras) > _KEPT_CAMERAS:
                 del self._cameras[next(iter(self._cameras))]
+            self._arrivals.announced(camera.agent_epoch)
+            early = [entry for entry in self._early if entry[0].agent_epoch == camera.agent_epoch]
+            self._early = deque(entry for entry in self._early if entry not in early)
+        for frame, arrival_ns in early:
+            self._sort(frame, arrival_ns)
 
     def _on_report(self, payload: bytes) -> None:
         try:
             report = unpack(payload, ChannelReport)
         except WireError as err:
-            self._refuse(err)
+            self._complaints.refuse(err)
             return
         with self._lock:
             self._snr_set[(report.agent_epoch, report.frame_id)] = report.snr_db_set
             while len(self._snr_set) > _KEPT_REPORTS:
                 self._snr_set.popitem(last=False)
-
-    def _refuse(self, err: WireError) -> None:
-        self._metrics.drop("protocol")
-        self._metrics.count(f"protocol_{err.reason}")
-        self._tell(err.reason, f"a message was refused: {err}")
 
     def _on_symbols(self, payload: bytes) -> None:
         arrival_ns = time.perf_counter_ns()
@@ -229,12 +227,12 @@ class Receiver:
             if frame.direction != "rx":
                 raise WireError("kind", f"frame must be rx, got {frame.direction}")
         except WireError as err:
-            self._refuse(err)
+            self._complaints.refuse(err)
             return
         if frame.lossless != (self._mode == "replay"):
             self._metrics.drop("mode")
             there = "replay" if frame.lossless else "live"
-            self._tell(
+            self._complaints.tell(
                 "mode", f"the agent runs in {there} mode, this server in {self._mode}: give both one --mode"
             )
         else:
@@ -245,7 +243,11 @@ class Receiver:
         with self._lock:
             new_epoch = frame.agent_epoch != self._arrivals.epoch
             camera = self._cameras.get(frame.agent_epoch)
-            taken = self._arrivals.accept(frame, arrival_ns, camera.frame_step if camera is not None else 1)
+            if camera is None and self._arrivals.waits_for_camera(frame, arrival_ns):
+                self._keep_early(frame, arrival_ns)
+                return
+            step = camera.frame_step if camera is not None else 1
+            taken = self._arrivals.accept(frame, arrival_ns, step, is_announced=camera is not None)
             if taken and new_epoch:
                 dropped = self._box.clear()
                 self._metrics.drop("epoch", dropped)
@@ -257,6 +259,14 @@ class Receiver:
                 self._count_superseded()
         if self._mode == "replay":
             self._send_flow()
+
+    def _keep_early(self, frame: SymbolFrame, arrival_ns: int) -> None:
+        """Keep a frame that overtook what its agent says about itself; the lock is held."""
+        self._early.append((frame, arrival_ns))
+        if len(self._early) > FRAME_RING_CAPACITY:
+            self._early.popleft()
+            self._metrics.drop("camera")
+            self._complaints.tell("early", "frames arrive of an agent that does not say what its camera is")
 
     def _count_superseded(self) -> None:
         """Count what gave way to newer frames since the last time; the lock is held."""
@@ -342,7 +352,7 @@ class Receiver:
         age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
         camera = self._camera_of(message.agent_epoch)
         if camera is None:
-            self._tell("camera", "frames arrive, but the agent does not say what its camera is")
+            self._complaints.tell("camera", "frames arrive, but the agent does not say what its camera is")
             if self._mode == "live":
                 self._metrics.drop("camera")
             else:
@@ -353,7 +363,7 @@ class Receiver:
             self._metrics.count("lost_on_air")
         elif not belongs_to(message.image_hw, camera.intrinsics.shape_hw):
             self._metrics.drop("protocol")
-            self._tell(
+            self._complaints.tell(
                 "size",
                 f"frames are {message.image_hw}, no coded size of the camera's {camera.intrinsics.shape_hw}",
             )
@@ -397,13 +407,12 @@ class Receiver:
         if camera is not None:
             return camera
         try:
-            answer = self._session.request(camera_key(self._agent_id), b"", CAMERA_TIMEOUT_S)
+            camera = answered_camera(self._session, self._agent_id, epoch)
         except TransportError:
             return None
-        if answer is not None:
-            self._on_camera(answer)
-        with self._lock:
-            return self._cameras.get(epoch)
+        if camera is not None:
+            self._keep(camera)
+        return camera
 
     def _reporter_of(self, message: SymbolFrame) -> LinkReporter:
         stream = (message.agent_epoch, message.codec)

@@ -30,6 +30,7 @@ from semcast.server.former_run import output_folder
 from semcast.server.frame_views import missing_view
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.receiver import ReceivedFrame
+from semcast.server.recorded_order import in_order
 from semcast.server.recorded_streams import RecordedStream, choose_stream
 from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Session
@@ -290,9 +291,18 @@ def _frames(
     reader: RecordingReader, stream: RecordedStream, settings: ReplaySettings
 ) -> Iterator[tuple[float, SymbolFrame]]:
     """Yield the frames of the stream in order, each once, with its time in seconds since the first one."""
+    first_ns = None
+    for frame in in_order(_recorded(reader, stream, settings), lambda frame: frame.frame_id):
+        first_ns = frame.t_source_ns if first_ns is None else first_ns
+        yield (frame.t_source_ns - first_ns) * 1e-9, frame
+
+
+def _recorded(
+    reader: RecordingReader, stream: RecordedStream, settings: ReplaySettings
+) -> Iterator[SymbolFrame]:
+    """Yield the frames of the stream as they were recorded; those that can't be read are told."""
     camera = stream.camera
     direction = "rx" if settings.source == "received" else "tx"
-    last_id, first_ns = -1, None
     for message in reader.messages(frozenset({"symbols"})):
         try:
             frame = unpack(message.data, SymbolFrame)
@@ -303,7 +313,6 @@ def _frames(
             agent_of(message.topic) != stream.agent_id
             or frame.direction != direction
             or frame.agent_epoch != camera.agent_epoch
-            or frame.frame_id <= last_id
         ):
             continue
         if frame.payload_format != "lost" and not belongs_to(frame.image_hw, camera.intrinsics.shape_hw):
@@ -314,9 +323,7 @@ def _frames(
                 frame.image_hw,
             )
             continue
-        last_id = frame.frame_id
-        first_ns = frame.t_source_ns if first_ns is None else first_ns
-        yield (frame.t_source_ns - first_ns) * 1e-9, frame
+        yield frame
 
 
 def _arrivals(

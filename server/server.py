@@ -27,6 +27,7 @@ from semcast.server.conclusion import conclude
 from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import Arrival, DecodedArrival, FrameDecoder, codec_loader
 from semcast.server.dense.cloud import DensePatch
+from semcast.server.false_start import FalseStart
 from semcast.server.former_run import free_folder, output_folder
 from semcast.server.former_starts import FormerStarts
 from semcast.server.frame_views import missing_view
@@ -87,6 +88,7 @@ class Server:
         self._views = SuccessiveViews(settings)
         self._reference: Reference | None = None
         self._former_starts = FormerStarts()
+        self._false_start = FalseStart()
         self._desk = RequestDesk()
         self._drops_before: dict[str, int] = {}
         self._spare_bundle: BundleRunner | None = None
@@ -252,7 +254,10 @@ class Server:
 
     def _tell_not_written(self, folder: Path | None, err: Exception) -> str:
         """Report outputs that the stream goes on without."""
-        text = _not_written(folder, err)
+        return self._tell(_not_written(folder, err))
+
+    def _tell(self, text: str) -> str:
+        """Log what the stream goes on in spite of, and show it in the status."""
         logger.error("%s", text)
         self._metrics.error(text)
         return text
@@ -287,6 +292,7 @@ class Server:
             return
         if session is None or session.identity.agent_epoch != message.agent_epoch:
             session = self._begin(decoded.arrival.camera)
+        newest_seq = session.last_seq
         session.note_arrival(message.frame_id, message.seq, final=message.final)
         self._end_of.note(message, decoded.arrival.camera)
         if decoded.frame is None:
@@ -295,7 +301,12 @@ class Server:
             return
         if message.frame_id <= session.last_frame_id:
             self._metrics.drop("processed")
-            return
+            if not self._false_start.is_shown_by(message.frame_id, message.seq, newest_seq):
+                return
+            self._tell(f"frame {session.last_frame_id} was wrong: the stream is at {message.frame_id}")
+            session = self._begin(decoded.arrival.camera)
+            session.note_arrival(message.frame_id, message.seq, final=message.final)
+        self._false_start.note_followed()
         try:
             outcome = session.process(
                 decoded.frame,
@@ -330,7 +341,8 @@ class Server:
         identity = StreamIdentity.of(self._agent_id, camera)
         former, self._session = self._session, None
         if former is not None:
-            logger.info("the agent was started again: a new map is begun")
+            is_restart = former.identity.agent_epoch != identity.agent_epoch
+            logger.info("%sa new map is begun", "the agent was started again: " if is_restart else "")
             self._conclude(former, _IN_A_HURRY_S)
             self._views.end_stream()
             self._end_former(former)
@@ -375,8 +387,7 @@ class Server:
         except ConfigError as err:
             if not goes_on:
                 raise
-            logger.error("the new stream is not shown: %s", err)
-            self._metrics.error(str(err))
+            self._tell(f"the new stream is not shown: {err}")
 
     def _conclude(
         self, session: Session, depth_budget_s: float | None, gives_way: Callable[[], bool] = lambda: False

@@ -150,6 +150,11 @@ class Session:
         """Newest frame that was processed, -1 before the first."""
         return self._last_frame_id
 
+    @property
+    def last_seq(self) -> int | None:
+        """Its number among the frames that were sent, None where it is not known."""
+        return self._numbers.get(self._last_frame_id)
+
     def _restore(self, path: Path) -> bool:
         """Take the map of a checkpoint that belongs to this stream; say so when there is none."""
         if not path.exists():

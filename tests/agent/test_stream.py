@@ -157,7 +157,7 @@ def test_images_cross_the_link_and_feedback_comes_back(bench):
     assert (agent.result["source"], agent.result["complete"]) == ("steps", False)
 
 
-def test_a_report_of_a_frame_that_was_never_sent_is_not_believed(bench, until):
+def test_a_report_of_a_frame_that_was_never_sent_is_not_believed(bench, caplog):
     bench.channel(snr_db=20.0)
     receiver, agent = bench.receiver(), bench.agent(source={"repeat": "loop"})
     message = take(receiver, count=1)[0].message
@@ -167,6 +167,7 @@ def test_a_report_of_a_frame_that_was_never_sent_is_not_believed(bench, until):
     take(receiver, count=20)
     agent.end()
     assert agent.result["drops"]["protocol"] == 1
+    assert "a report must be of a frame that was sent" in caplog.text
     assert np.median(bench.codec.snrs_db[-10:]) == pytest.approx(20.0, abs=3.0)
 
 

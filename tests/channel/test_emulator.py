@@ -217,6 +217,17 @@ def test_replay_loses_nothing_even_in_a_burst_and_live_counts_what_it_drops(ends
     assert 2 <= sum(f.agent_epoch == 2 for f in e.received) <= carried
 
 
+def test_a_number_out_of_nowhere_opens_no_gap_and_a_long_break_of_the_link_does(ends, make):
+    e = ends()
+    for seq in (0, 1, 2**62, 2, 4):
+        e.pass_one(make(seq, t_source_ns=0))
+    for seq in (5000, 5001):
+        e.pass_one(make(seq))
+    e.close()
+    assert e.summary["drops"] == {"missing": 1 + 4995}
+    assert e.summary["counts"]["carried"] == 7
+
+
 def test_frames_that_are_sent_again_are_not_taken_for_gaps(ends, make):
     e = ends()
     for seq in (0, 1, 2, 3, 1, 2, 4, 5, 8):
@@ -245,12 +256,14 @@ def test_delay_is_added(ends, make):
     assert 0.15 <= time.monotonic() - started_s < 2.0
 
 
-def test_bad_messages_are_counted_and_do_no_harm(ends, make):
+def test_bad_messages_are_counted_and_told_and_do_no_harm(ends, make, caplog):
     e = ends()
     nan = make(0, payload_format="iq16", payload=b"\x00\x7e" * (2 * 4 * 47 * 8))
     for bad in (b"", b"junk", pack(make(0))[:-2], pack(nan)):
         e.tx.put(bad)
     until(lambda: e.status and e.status[-1].drops.get("protocol") == 4)
+    assert "a message was refused: bytes are not a message" in caplog.text
+    assert "frame 0 is left out: symbols must be finite" in caplog.text
     silent = make(1, epoch=3, payload_format="iq16", payload=bytes(4 * 4 * 47 * 8))
     e.pass_one(silent)
     e.pass_one(make(0, epoch=4))

@@ -188,12 +188,12 @@ def test_a_trace_begins_when_it_is_set_and_fading_goes_on(slots):
     np.testing.assert_array_equal(two.transmit(slots, 0.2, 2).truth.h, one.transmit(slots, 0.2, 2).truth.h)
 
 
-def test_frames_that_overlap_in_time_are_told_once(slots, caplog):
-    settings = ChannelSettings(channel="rayleigh", doppler_hz=5.0, slot_ms=8.125)
-    for seed in range(3):
-        link = Link(settings, seed)
+def test_frames_that_overlap_in_time_are_told_once_a_link_also_after_a_restart(slots, caplog):
+    link = Link(ChannelSettings(channel="rayleigh", doppler_hz=5.0, slot_ms=8.125), 0)
+    for _ in range(3):
         for k in range(4):
             link.transmit(slots, 0.05 * k, k)
+        link.restart()
     assert [record.getMessage() for record in caplog.records] == [
         "a frame lasts 97.5 ms (12 slots of slot_ms 8.125) and the next began 50 ms after it: where they "
         "overlap they have the same fading"

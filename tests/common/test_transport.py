@@ -408,3 +408,18 @@ def test_a_bad_configuration_of_zenoh_is_one_clear_line(tmp_path, content, messa
     with pytest.raises(ConfigError, match=rf"zenoh_config .*z\.json5.* {message}") as raised:
         zenoh_config(NetworkSettings(zenoh_config=path))
     assert "\n" not in str(raised.value)
+
+
+def test_of_two_that_answer_a_request_each_can_be_heard():
+    hub, endpoint = open_hub()
+    with hub, contextlib.ExitStack() as stack:
+        for answer in (b"0", b"1"):
+            client = stack.enter_context(open_client(NetworkSettings(connect=(endpoint,)), 5))
+            client.answer("semcast/a/camera", lambda request, answer=answer: answer)
+            deadline_s = time.monotonic() + 10.0
+            while hub.request("semcast/a/camera", b"", 1.0, lambda got, answer=answer: got == answer) is None:
+                assert time.monotonic() < deadline_s
+        for answer in (b"0", b"1"):
+            assert (
+                hub.request("semcast/a/camera", b"", 5.0, lambda got, answer=answer: got == answer) == answer
+            )

@@ -59,13 +59,58 @@ def test_one_number_out_of_nowhere_does_not_shut_out_the_stream(metrics):
     assert metrics.drops == {"ahead": 1, "missing": 1}
 
 
-def test_a_stream_that_begins_with_a_wrong_number_is_taken_up_after_a_while(metrics):
+def test_a_stream_that_begins_with_a_wrong_number_is_taken_up_at_once(metrics):
     arrivals = Arrivals(lossless=False, drop=metrics.drop)
-    times_ns = [k * 100 * MS for k in range(60)]
-    assert arrivals.accept(frame(MAX_COUNT - 2), 0)
-    taken = [k for k, t_ns in enumerate(times_ns) if arrivals.accept(frame(k), t_ns)]
-    assert taken == list(range(31, 60))
-    assert metrics.drops == {"stale": 31}
+    assert accepted(arrivals, [frame(MAX_COUNT - 2), *map(frame, range(60))])[1:] == list(range(2, 60))
+    assert metrics.drops == {"stale": 2}
+
+
+def test_a_lossless_stream_that_begins_with_a_wrong_number_is_taken_up_at_once(metrics):
+    arrivals = Arrivals(lossless=True, drop=metrics.drop)
+    far = frame(MAX_COUNT - 2, base_seq=MAX_COUNT - 2, lossless=True)
+    frames = [frame(k, base_seq=0, lossless=True) for k in (0, 1, 2, 0, 1, 2, 3)]
+    assert accepted(arrivals, [far, *frames]) == [MAX_COUNT - 2, 0, 1, 2, 3]
+    assert metrics.drops == {"duplicate": 2, "gap": 1}
+
+
+def test_one_confirmation_out_of_nowhere_does_not_end_a_lossless_stream(metrics):
+    arrivals = Arrivals(lossless=True, drop=metrics.drop)
+    frames = [frame(k, lossless=True) for k in range(6)]
+    frames.insert(3, replace(frames[3], seq=2**62, base_seq=2**62))
+    assert accepted(arrivals, frames) == [0, 1, 2, 3, 4, 5]
+    assert metrics.drops == {"ahead": 1}
+
+
+def test_what_another_receiver_confirmed_is_missing_here(metrics):
+    arrivals = Arrivals(lossless=True, drop=metrics.drop)
+    frames = [frame(0, lossless=True), frame(4, base_seq=3, lossless=True)]
+    frames += [frame(k, base_seq=3, lossless=True) for k in (3, 4)]
+    assert accepted(arrivals, frames) == [0, 3, 4]
+    assert metrics.drops == {"missing": 2, "gap": 1}
+
+
+@pytest.mark.parametrize("epoch", [5, MAX_COUNT])
+def test_an_epoch_that_nobody_announced_does_not_interrupt_a_stream(metrics, epoch):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    for k in range(10):
+        assert arrivals.accept(frame(k, epoch=3), k * 100 * MS)
+        assert arrivals.waits_for_camera(frame(k, epoch=epoch), k * 100 * MS + 1)
+        assert not arrivals.accept(frame(k, epoch=epoch), k * 100 * MS + 1, is_announced=False)
+    assert arrivals.accept(frame(10, epoch=3), 5000 * MS)
+    assert arrivals.accept(frame(0, epoch=epoch), 9000 * MS, is_announced=False), (
+        "after a silence it is taken"
+    )
+    assert arrivals.accept(frame(11, epoch=3), 9001 * MS), "one with a camera is preferred"
+    assert metrics.drops == {"epoch": 10}
+
+
+def test_an_epoch_whose_camera_is_learned_later_is_kept(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    assert arrivals.accept(frame(0, epoch=5), 0, is_announced=False)
+    arrivals.announced(5)
+    assert not arrivals.accept(frame(0, epoch=4), 2)
+    assert not arrivals.accept(frame(0, epoch=6), 2, is_announced=False)
+    assert arrivals.accept(frame(0, epoch=6), 3)
 
 
 @pytest.mark.parametrize("lossless", [False, True])
@@ -89,17 +134,20 @@ def test_a_frame_that_is_left_out_for_its_id_does_not_count_as_missing_too(metri
 
 @pytest.mark.parametrize("lossless", [False, True])
 def test_a_stream_whose_frame_ids_went_far_on_is_taken_up_after_a_while(metrics, lossless):
-    arrivals = Arrivals(lossless=lossless, drop=metrics.drop)
-    assert arrivals.accept(frame(0, lossless=lossless), 0)
-    far = 10**7
-    taken_s = []
-    for k in range(50):
-        later = replace(frame(1 if lossless else k + 1, lossless=lossless), frame_id=far + 1)
-        if arrivals.accept(later, k * 100 * MS):
-            taken_s.append(k * 0.1)
-            break
-    assert taken_s == [pytest.approx(3.1)]
-    assert metrics.drops["ahead"] == 31
+    for num_before, after_s in ((1, 0.2), (2, 3.1)):  # a single one may itself be what is wrong
+        arrivals = Arrivals(lossless=lossless, drop=metrics.drop)
+        assert (
+            len(accepted(arrivals, [frame(k, lossless=lossless) for k in range(num_before)], 0)) == num_before
+        )
+        far = 10**7
+        taken_s = []
+        for k in range(50):
+            later = frame(num_before + (0 if lossless else k), lossless=lossless)
+            if arrivals.accept(replace(later, frame_id=far + 1), k * 100 * MS):
+                taken_s.append(k * 0.1)
+                break
+        assert taken_s == [pytest.approx(after_s)]
+    assert metrics.drops["ahead"] == 2 + 31
 
 
 def test_frame_ids_go_in_steps_of_the_source_and_on_during_a_break(metrics):
@@ -245,6 +293,15 @@ def test_one_frame_from_the_future_makes_no_other_too_old():
         lead_ms = 3_600_000 if k in (50, 120) else 0
         age.arrived((k * 100 + lead_ms) * MS, (k * 100 + 5) * MS)
         assert age.age_ms(k * 100 * MS, (k * 100 + 15) * MS) == pytest.approx(10.0)
+
+
+def test_a_first_frame_from_the_future_makes_three_others_too_old_and_no_more():
+    age = CaptureAge()
+    age.arrived(3_600_000 * MS, 0)
+    for k in range(1, 50):
+        age.arrived(k * 100 * MS, (k * 100 + 5) * MS)
+        is_old = age.age_ms(k * 100 * MS, (k * 100 + 15) * MS) > 1000.0
+        assert is_old == (k < 3)
 
 
 def test_a_way_that_became_much_shorter_is_believed_after_some_frames():

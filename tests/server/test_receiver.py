@@ -396,7 +396,7 @@ def test_replay_keeps_a_frame_until_the_camera_is_known(ends, make):
 def test_a_camera_that_nobody_knows_is_asked_for_a_few_times_a_second(ends, make, monkeypatch):
     e = ends("replay")
     asked = []
-    monkeypatch.setattr(e.hub, "request", lambda key, payload, timeout_s: asked.append(key))
+    monkeypatch.setattr(e.hub, "request", lambda key, *rest: asked.append(key))
     e.put(make(0, lossless=True))
     until(lambda: e.metrics.counts.get("received") == 1)
     assert e.receiver.next(0.2) is None
@@ -453,3 +453,28 @@ def test_a_receiver_that_fails_to_say_how_far_it_is_says_it_the_next_time(ends, 
     came = threading.Event()
     both.client.subscribe(flow_key("a"), "newest", lambda payload: came.set())
     assert came.wait(10)
+
+
+def test_a_frame_that_overtakes_the_camera_of_a_new_start_waits_for_it(ends, make):
+    e = ends()
+    e.answer_camera(camera())
+    e.put(make(0))
+    assert e.receiver.next(5).message.seq == 0
+    e.put(make(0, epoch=EPOCH + 1))
+    until(lambda: len(e.receiver._early) == 1)
+    assert e.receiver.agent_epoch == EPOCH
+    e.receiver._on_camera(pack(camera(EPOCH + 1)))
+    assert e.receiver.next(5).message.agent_epoch == EPOCH + 1
+
+
+def test_starts_that_nobody_announced_do_not_interrupt_a_stream(ends, make):
+    e = ends()
+    e.answer_camera(camera())
+    for k in range(30):
+        e.put(make(k))
+        assert e.receiver.next(5).message.seq == k
+        e.put(make(0, epoch=2**62 + k))
+    until(lambda: e.metrics.counts.get("received") == 60 or e.metrics.drops.get("camera") == 14)
+    assert e.metrics.drops == {"camera": 14}
+    assert len(e.receiver._early) == 16
+    assert "does not say what its camera is" in e.metrics.status(0).last_error

@@ -320,6 +320,23 @@ def test_a_frame_that_was_sent_again_counts_once(recording, tmp_path):
     assert recorded_streams(RecordingReader(path)) == recorded_streams(RecordingReader(recording))
 
 
+def test_a_forged_frame_id_costs_its_frame_alone(recording, tmp_path, caplog):
+    path = tmp_path / "forged.mcap"
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, recording_metadata("", "0"))
+        for m in RecordingReader(recording).messages():
+            data = m.data
+            if m.topic.endswith("rx/symbols") and m.sequence == 0:
+                data = pack(replace(unpack(data, SymbolFrame), frame_id=2**62, t_source_ns=2**62))
+            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, data)
+        writer.finish()
+    frames = [[], []]
+    for seen, file in zip(frames, (recording, path), strict=True):
+        replay(ReplaySettings(file=file, end_s=0.6), None, seen.append)
+    assert set(frames[0]) - set(frames[1]) == {frames[0][0]}
+    assert f"frame {2**62} is left out" in caplog.text
+
+
 def test_an_unreadable_message_costs_its_frame_alone(recording, tmp_path, caplog):
     path = tmp_path / "damaged.mcap"
     damaged = 0

@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import logging
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import pytest
 from semcast.common.errors import ConfigError
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.run_folder import read_run
+from semcast.common.wire import pack
 from semcast.server.export.outputs import write_ply
 from semcast.server.receiver import WINDOW
 from semcast.server.recorded_streams import recorded_streams
@@ -268,3 +271,37 @@ def test_a_server_that_comes_after_the_agent_records_its_camera_too(tmp_path, ai
     (stream,) = recorded_streams(RecordingReader(tmp_path / "run.mcap"))
     assert stream.camera == radio.camera
     assert "semcast.stream.100" in RecordingReader(tmp_path / "run.mcap").info().metadata
+
+
+@pytest.mark.parametrize("is_restarted", [False, True])
+def test_a_first_frame_from_far_ahead_costs_two_others_and_not_the_stream(
+    tmp_path, open_air, caplog, is_restarted
+):
+    caplog.set_level(logging.INFO)
+    with contextlib.ExitStack() as stack:
+        air = stack.enter_context(open_air())
+        running, radio = air.serve(out=tmp_path), air.agent(100)
+        radio.send(0, frame_id=2**62)
+        radio.wait(lambda: radio.posed_ids() == [2**62], "an answer to the wrong frame")
+        if is_restarted:
+            stack.close()
+            air = stack.enter_context(open_air())
+            running, radio = air.serve(out=tmp_path), air.agent(100)
+        for k in (1, 2):
+            radio.send(k)
+        radio.stream(range(3, 12))
+        summary = running.finish(stop=True)
+    assert summary["frames"]["tracked"] == 9
+    assert summary["frames"]["posed"] == 9
+    assert summary["resumed"] is False
+    assert f"frame {2**62} was wrong: the stream is at 3" in caplog.text
+    assert is_restarted == ("map restored from the checkpoint" in caplog.text)
+
+
+def test_an_announcement_that_no_agent_stands_by_does_not_end_a_map(air):
+    running = air.serve()
+    radio = air.agent(100)
+    radio.stream(range(4))
+    radio._announce.put(pack(replace(radio.camera, agent_epoch=2**62)))
+    radio.stream(range(4, 8))
+    assert running.finish(stop=True)["frames"]["tracked"] == 8
