@@ -28,7 +28,8 @@ class Recording:
         path: Below the data folder.
         values: Settings of its pairs.
         thorough: True for the recordings with a curve over the SNR; the others have few SNRs.
-        held_out: Left out of all tuning; the estimator was tuned on parts of the others.
+        held_out: No constant of the estimator was chosen by it; those were tuned on parts of the others. The
+            half lines of ``epipolar`` came from looking at what failed on all.
     """
 
     path: str

@@ -143,7 +143,7 @@ def pair_headline(reports: Iterable[Mapping[str, Any]]) -> str:
     held_out = [c for c in cells if c.recording in HELD_OUT]
     tracks, matches = (ratio_text(_of_features(cells, f), "robust", "shuffled") for f in ("klt", "sift"))
     rest = (
-        f" On the recordings left out of tuning ({len(held_out)} cells) `robust` has "
+        f" On the recordings by which no constant was chosen ({len(held_out)} cells) `robust` has "
         f"{_ratio(held_out, 'robust', RIVAL):.2f} times the error of PoseLib, "
         f"{_ratio(held_out, 'robust', 'off'):.2f} that of `off` and "
         f"{_ratio(held_out, 'robust', 'shuffled'):.2f} that of `shuffled` "
@@ -245,7 +245,7 @@ def _what_confidence_gives(cells: Sequence[Cell]) -> Iterator[str]:
         "descriptor matches (sift)": _of_features(cells, "sift"),
         f"{BAD_LINK_DB:g} dB and below": [c for c in cells if _is_bad_link(c)],
         "recordings tuned on": [c for c in cells if c.recording not in HELD_OUT],
-        "recordings left out of tuning": held_out,
+        "recordings by which no constant was chosen": held_out,
         "of these tracks": _of_features(held_out, "klt"),
         "of these descriptor matches": _of_features(held_out, "sift"),
     }

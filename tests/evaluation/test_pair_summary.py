@@ -126,7 +126,7 @@ def test_what_confidence_gives_is_told_apart_from_what_the_additional_search_giv
     text = pair_summary(reports)
     (tracks,) = rows_of(text, "tracks")
     assert tracks[1:] == ["5", *("0.50 (0.50 .. 0.50)",) * 3, "0.75 (0.75 .. 0.75)", "1.00 (1.00 .. 1.00)"]
-    (left_out,) = rows_of(text, "recordings left out")
+    (left_out,) = rows_of(text, "recordings by which")
     assert (left_out[1], left_out[-1]) == ("5", "0.75 (0.75 .. 0.75)")
     (everything,) = [row for row in rows_of(text, "all |") if len(row) == 7]
     assert everything[-1].startswith("0.87 (")
@@ -134,7 +134,7 @@ def test_what_confidence_gives_is_told_apart_from_what_the_additional_search_giv
     assert (
         "against `shuffled`: 1.00 (1.00 .. 1.00) times the error on tracks and 0.75 (0.75 .. 0.75)" in short
     )
-    assert "left out of tuning (5 cells) `robust` has 0.38 times the error of PoseLib" in short
+    assert "no constant was chosen (5 cells) `robust` has 0.38 times the error of PoseLib" in short
 
 
 def test_a_ratio_of_few_cells_has_no_interval():
