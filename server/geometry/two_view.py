@@ -124,7 +124,11 @@ def estimate_two_view(
         found = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
         if found is None:
             return None
-        return _result(camera, found.T_cam1_cam0, xy0, xy1, threshold_px, choose_model)
+        near = (
+            np.abs(sampson_px(fundamental_matrix(camera, found.T_cam1_cam0), xy0, xy1)) < 2.0 * threshold_px
+        )
+        T = _in_front_sign(camera, found.T_cam1_cam0, xy0[near], xy1[near])
+        return _result(camera, T, xy0, xy1, threshold_px, choose_model)
     if confidence is not None and (mode == "off" or float(np.ptp(confidence)) <= _ALIKE):
         confidence = None
     agreement = neighbour_agreement(xy0, xy1)
@@ -348,7 +352,6 @@ def _result(
 ) -> TwoViewResult:
     residual = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
     near = residual < 2.0 * threshold_px
-    T = in_front_sign(camera, T, xy0[near], xy1[near])
     depth0, depth1 = depths(camera, T, xy0, xy1)
     inliers = near & (depth0 > 0) & (depth1 > 0)
     angle = rays_angle_deg(camera, T, xy0, xy1)
@@ -362,7 +365,7 @@ def _result(
     return TwoViewResult(T, inliers, model, parallax)
 
 
-def in_front_sign(camera: Intrinsics, T: Array, xy0: Array, xy1: Array) -> Array:
+def _in_front_sign(camera: Intrinsics, T: Array, xy0: Array, xy1: Array) -> Array:
     """Turn the translation of ``T_cam1_cam0`` round when that puts more points in front of both cameras.
 
     Args:

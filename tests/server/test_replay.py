@@ -1,6 +1,5 @@
 """A recording replays to the same poses every time; through another channel it does not."""
 
-import dataclasses
 import errno
 import itertools
 import json
@@ -320,16 +319,25 @@ def test_a_frame_that_was_sent_again_counts_once(recording, tmp_path):
     assert recorded_streams(RecordingReader(path)) == recorded_streams(RecordingReader(recording))
 
 
-def test_a_forged_frame_id_costs_its_frame_alone(recording, tmp_path, caplog):
-    path = tmp_path / "forged.mcap"
+def with_changed_frame(recording, path, sequence, change):
+    """Write a recording again with one received frame's message changed."""
+    num_changed = 0
     with path.open("wb") as stream:
         writer = RecordingWriter(stream, recording_metadata("", "0"))
         for m in RecordingReader(recording).messages():
-            data = m.data
-            if m.topic.endswith("rx/symbols") and m.sequence == 0:
-                data = pack(replace(unpack(data, SymbolFrame), frame_id=2**62, t_source_ns=2**62))
-            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, data)
+            is_hit = m.topic.endswith("rx/symbols") and m.sequence == sequence
+            num_changed += is_hit
+            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, change(m.data) if is_hit else m.data)
         writer.finish()
+    assert num_changed == 1
+    return path
+
+
+def test_a_forged_frame_id_costs_its_frame_alone(recording, tmp_path, caplog):
+    def forge(data):
+        return pack(replace(unpack(data, SymbolFrame), frame_id=2**62, t_source_ns=2**62))
+
+    path = with_changed_frame(recording, tmp_path / "forged.mcap", 0, forge)
     frames = [[], []]
     for seen, file in zip(frames, (recording, path), strict=True):
         replay(ReplaySettings(file=file, end_s=0.6), None, seen.append)
@@ -338,16 +346,7 @@ def test_a_forged_frame_id_costs_its_frame_alone(recording, tmp_path, caplog):
 
 
 def test_an_unreadable_message_costs_its_frame_alone(recording, tmp_path, caplog):
-    path = tmp_path / "damaged.mcap"
-    damaged = 0
-    with path.open("wb") as stream:
-        writer = RecordingWriter(stream, recording_metadata("", "0"))
-        for m in RecordingReader(recording).messages():
-            is_hit = m.topic.endswith("rx/symbols") and m.sequence == 2
-            damaged += is_hit
-            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, m.data[:-9] if is_hit else m.data)
-        writer.finish()
-    assert damaged == 1
+    path = with_changed_frame(recording, tmp_path / "damaged.mcap", 2, lambda data: data[:-9])
     frames = [[], []]
     for seen, file in zip(frames, (recording, path), strict=True):
         replay(ReplaySettings(file=file), None, seen.append)
@@ -356,15 +355,10 @@ def test_an_unreadable_message_costs_its_frame_alone(recording, tmp_path, caplog
 
 
 def test_a_frame_of_another_codec_costs_itself_alone(recording, tmp_path, caplog):
-    path = tmp_path / "mixed.mcap"
-    with path.open("wb") as stream:
-        writer = RecordingWriter(stream, recording_metadata("", "0"))
-        for m in RecordingReader(recording).messages():
-            data = m.data
-            if m.topic.endswith("rx/symbols") and m.sequence == 2:
-                data = pack(dataclasses.replace(unpack(data, SymbolFrame), digest="0123"))
-            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, data)
-        writer.finish()
+    def of_another(data):
+        return pack(replace(unpack(data, SymbolFrame), digest="0123"))
+
+    path = with_changed_frame(recording, tmp_path / "mixed.mcap", 2, of_another)
     whole, mixed = (replay(ReplaySettings(file=file)) for file in (recording, path))
     assert mixed["drops"] == {**whole["drops"], "codec": 1}
     assert mixed["frames"]["tracked"] == whole["frames"]["tracked"] - 1

@@ -125,6 +125,7 @@ def test_the_derivative_of_what_is_beyond_infinity_is_that_of_small_steps():
 def test_msac_by_hand():
     assert msac_score(np.array([0.0, 1.0, 5.0, -2.0]), 2.0) == pytest.approx((0 + 0.25 + 1 + 1) / 4)
     assert msac_score(np.zeros(0), 1.0) == 1.0
+    assert msac_score(np.array([0.0, 4.0]), 2.0, np.array([3.0, 1.0])) == pytest.approx(0.25)
 
 
 def test_parallax_of_a_point_ahead():
