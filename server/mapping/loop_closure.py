@@ -47,6 +47,9 @@ _STEP_RAD, _STEP_TURN, _STEP_WAY, _STEP_DEPTH, _STEP_SCALE = 0.002, 0.02, 0.02, 
 _MIN_SHARED, _GAP_RAD, _GAP_SCALE = 8, 0.5, 0.5
 #: How well a recognised place is known: radians, depths, logarithm of the scale.
 _PLACE_RAD, _PLACE_DEPTH, _PLACE_SCALE = 0.004, 0.02, 0.03
+#: Half the squared error in standard deviations that a loop may leave: seven errors of five deviations. What
+#: takes more is no drift, but a wrong place: landmarks of poor depth have been agreed with from 30 degrees off.
+_MAX_COST = 0.5 * 7 * 5.0**2
 
 
 @dataclass(frozen=True)
@@ -233,7 +236,8 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
         loop: What was recognised.
 
     Returns:
-        Frame ids of the submap's keyframes, ascending, and where they go; None where there is no solution.
+        Frame ids of the submap's keyframes, ascending, and where they go; None where there is no solution, or
+        none that drift explains.
     """
     mine = world.keyframes_of(submap)
     row = {k.frame_id: i for i, k in enumerate(mine)}
@@ -244,7 +248,7 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
     old, new = row[loop.place.keyframe_id], row[loop.keyframe_id]
     edges.append(_tie(world, mine, old, new, loop.moved(mine[new].T_world_cam), loop.scale))
     solved = solve_graph(np.stack([k.T_world_cam for k in mine]), edges)
-    if solved is None:
+    if solved is None or solved.cost > _MAX_COST:
         return None
     return np.array([k.frame_id for k in mine], dtype=np.int64), solved
 

@@ -236,6 +236,16 @@ def test_a_gap_takes_most_of_what_has_to_be_shared_out(room, rng):
     assert moved[29] < 0.1 * moved[30]
 
 
+@pytest.mark.parametrize(("turn_deg", "is_drift"), [(2.0, True), (30.0, False)])
+def test_a_loop_that_no_drift_explains_is_none(room, turn_deg, is_drift):
+    world, _ = room
+    newest, old_id = world.keyframes[-1], NUM // 2 + 5  # no gap between them, which would explain anything
+    T_world_new = newest.T_world_cam @ make_transform(exp_so3(np.radians([turn_deg, 0.0, 0.0])), np.zeros(3))
+    place = Place(T_world_new, old_id, np.zeros(0, np.int64), np.zeros((0, 2)), 0)
+    loop = Loop(newest.frame_id, place, 1.0, T_world_new @ invert_transform(newest.T_world_cam))
+    assert (share_out(world, 0, loop) is not None) == is_drift
+
+
 def test_ties_made_before_hold(room, rng):
     world, _ = room
     loop = look(LoopFinder(CAMERA, Recogniser(), 0), room, old_landmarks(room, HERE, rng))
