@@ -48,7 +48,7 @@ _MIN_SHARED, _GAP_RAD, _GAP_SCALE = 8, 0.5, 0.5
 #: How well a recognised place is known: radians, depths, logarithm of the scale.
 _PLACE_RAD, _PLACE_DEPTH, _PLACE_SCALE = 0.004, 0.02, 0.03
 #: Half the squared error in standard deviations that a loop may leave: seven errors of five deviations. What
-#: takes more is no drift, but a wrong place: landmarks of poor depth have been agreed with from 30 degrees off.
+#: takes more is no drift but a wrong place: landmarks of poor depth may be agreed with from 30 degrees off.
 _MAX_COST = 0.5 * 7 * 5.0**2
 
 
