@@ -7,6 +7,7 @@ import sys
 import time
 
 import pytest
+from waiting import until
 
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
@@ -36,7 +37,7 @@ print("ended", flush=True)
 """
 
 
-def test_real_processes_survive_each_others_death_in_any_order(recording, until):
+def test_real_processes_survive_each_others_death_in_any_order(recording):
     endpoint = free_endpoint()
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     running = {}

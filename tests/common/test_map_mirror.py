@@ -3,6 +3,7 @@ import time
 
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.common.keys import map_key
 from semcast.common.map_mirror import MapMirror
@@ -27,13 +28,6 @@ def message(ids, *, removed=(), keyframes=(), offset=0.0, agent_epoch=7, map_epo
         keyframe_ids=np.array(keyframes, np.int64),
         keyframe_poses=np.array([np.eye(4) * (k + offset) for k in keyframes]).reshape(-1, 4, 4),
     )
-
-
-def until(condition):
-    deadline_s = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
 
 
 @pytest.fixture

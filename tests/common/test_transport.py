@@ -9,6 +9,7 @@ import threading
 import time
 
 import pytest
+from waiting import until
 
 from semcast.common.errors import ConfigError, TransportError
 from semcast.common.network_settings import HubSettings, NetworkSettings, is_loopback
@@ -32,15 +33,6 @@ session = open_session(NetworkSettings(listen=(sys.argv[1],), connect=()))
 print("up", flush=True)
 threading.Event().wait()
 """
-
-
-def until(condition, deadline_s=10.0):
-    """Wait for a condition; the interval only bounds how late it is noticed."""
-    end_s = time.monotonic() + deadline_s
-    tick = threading.Event()
-    while not condition():
-        assert time.monotonic() < end_s, "the condition did not come true in time"
-        tick.wait(0.005)
 
 
 @pytest.fixture

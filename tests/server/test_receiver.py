@@ -5,6 +5,7 @@ from dataclasses import replace
 import msgpack
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.channel.awgn import complex_noise
 from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
@@ -23,14 +24,6 @@ from semcast.server.receiver import WINDOW, Receiver
 
 HW = (64, 128)
 EPOCH = 10**18
-
-
-def until(condition, deadline_s=10.0):
-    end_s = time.monotonic() + deadline_s
-    tick = threading.Event()
-    while not condition():
-        assert time.monotonic() < end_s, "the condition did not come true in time"
-        tick.wait(0.005)
 
 
 def camera(epoch=EPOCH, lossless=False):

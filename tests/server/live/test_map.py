@@ -1,9 +1,8 @@
 """The map over the network, for who comes late."""
 
-import time
-
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.common.map_mirror import MapMirror
 from semcast.common.network_settings import NetworkSettings
@@ -15,13 +14,6 @@ pytestmark = pytest.mark.xdist_group("real-time")
 
 AGENT = "cam0"
 DEADLINE_S = 60.0
-
-
-def until(condition, what):
-    deadline_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline_s, f"not within {DEADLINE_S} s: {what}"
-        time.sleep(0.01)
 
 
 def test_who_comes_late_has_the_whole_map_and_follows_it(tmp_path, air, monkeypatch, read_ply):
