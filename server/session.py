@@ -51,7 +51,7 @@ from semcast.server.sent_frames import stretches
 from semcast.server.session_cloud import SessionCloud
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
-from semcast.server.view.scene import FrameView
+from semcast.server.view.frame_view import FrameView
 
 logger = logging.getLogger(__name__)
 

@@ -22,10 +22,12 @@ from semcast.common.trajectory import Trajectory
 from semcast.common.worker_guard import WorkerGuard
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.mapping.state import MapUpdate
+from semcast.server.view.frame_view import FrameView
 from semcast.server.view.live_stream import FLUSH_TIMEOUT_S, LiveStream
+from semcast.server.view.picture import compress_picture
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary, window_display
 from semcast.server.view.rerun_viewer import RerunStream
-from semcast.server.view.scene import Changes, Cursor, FrameView, Scene, compress_picture
+from semcast.server.view.scene import Changes, Cursor, Scene
 from semcast.server.view.settings import ViewSettings
 
 logger = logging.getLogger(__name__)

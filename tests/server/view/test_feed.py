@@ -11,7 +11,8 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.settings import ViewSettings
-from semcast.server.view.scene import Cursor, FrameView
+from semcast.server.view.frame_view import FrameView
+from semcast.server.view.scene import Cursor
 
 pytest.importorskip("rerun")
 

@@ -20,7 +20,7 @@ from semcast.common.geometry import make_transform
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
-from semcast.server.view.scene import FrameView
+from semcast.server.view.frame_view import FrameView
 from semcast.server.view.settings import ViewSettings
 
 pytest.importorskip("rerun")
