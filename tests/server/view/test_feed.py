@@ -65,27 +65,28 @@ def held(monkeypatch):
 
 
 def seen(feed):
-    """Return frames, landmarks and poses that a viewer would be shown now."""
-    changes = feed._scene.changes_since(Cursor())
+    """Return frames, landmarks and path that a viewer would be shown now."""
+    changes = feed.changes_since(Cursor())
+    path = np.concatenate([strip for strips in changes.segments.values() for strip in strips])
     points = np.concatenate([np.zeros((0, 3)), *(chunk.xyz for chunk in changes.chunks)])
-    return [row.frame_id for row in changes.rows], sorted(points[:, 0].tolist()), feed._scene.poses()
+    return [row.frame_id for row in changes.rows], sorted(points[:, 0].tolist()), path
 
 
 def test_a_scene_that_is_far_behind_misses_nothing(held):
     feed, may_go_on = held
     for k in range(40):
         feed.submit(frame(k), update(k))
-    assert len(feed._pending) <= 5
+    assert feed.num_pending <= 5
     may_go_on.set()
     feed.close()
     in_time = ViewerFeed(ViewSettings(view="none"), CAMERA, "in time")
     for k in range(40):
         in_time.submit(frame(k), update(k))
     in_time.close()
-    frames, landmarks, poses = seen(feed)
+    frames, landmarks, path = seen(feed)
     assert frames == list(range(40))
     assert landmarks == list(range(40))
-    np.testing.assert_array_equal(poses, seen(in_time)[2])
+    np.testing.assert_array_equal(path, seen(in_time)[2])
 
 
 def test_an_update_that_makes_no_sense_costs_itself_alone(held, caplog):
