@@ -27,8 +27,8 @@ from semcast.commands.running import read_given, read_settings, run_until_stoppe
 from semcast.common.argument_order import arguments_last
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.common.config import to_toml
+from semcast.common.loopback import free_endpoint, open_hub
 from semcast.common.network_settings import NetworkSettings
-from semcast.common.transport import free_endpoint, open_hub
 from semcast.demo import DemoSettings
 from semcast.server.record import RecordSettings
 from semcast.server.replay import ReplaySettings

@@ -9,9 +9,10 @@ import time
 import pytest
 from waiting import until
 
+from semcast.common.loopback import free_endpoint
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
-from semcast.common.transport import free_endpoint, open_session
+from semcast.common.transport import open_session
 from semcast.server.receiver import Receiver
 from tests.agent.test_stream import take
 

@@ -20,11 +20,12 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.keys import link_key, status_key
+from semcast.common.loopback import free_endpoint, open_hub
 from semcast.common.messages import CameraInfo, LinkReport, StatusMessage
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.sequence import open_sequence
-from semcast.common.transport import free_endpoint, open_hub, open_session
+from semcast.common.transport import open_session
 from semcast.common.wire import pack, unpack
 from semcast.server.receiver import Receiver
 

@@ -16,12 +16,12 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import EncodedImage
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import channel_key, rx_key, status_key, tx_key
+from semcast.common.loopback import open_hub
 from semcast.common.messages import ChannelReport, StatusMessage, SymbolFrame
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.phy.qam import constellation
 from semcast.common.symbol_payload import lost_slots_of, pack_data_symbols, slots_of
-from semcast.common.transport import open_hub
 from semcast.common.wire import pack, unpack
 
 pytestmark = pytest.mark.xdist_group("real-time")

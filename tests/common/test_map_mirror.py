@@ -6,10 +6,11 @@ import pytest
 from waiting import until
 
 from semcast.common.keys import map_key
+from semcast.common.loopback import open_hub
 from semcast.common.map_mirror import MapMirror
 from semcast.common.messages import MapMessage
 from semcast.common.network_settings import NetworkSettings
-from semcast.common.transport import open_client, open_hub
+from semcast.common.transport import open_client
 from semcast.common.wire import pack
 
 AGENT = "cam0"

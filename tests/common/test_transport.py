@@ -12,16 +12,9 @@ import pytest
 from waiting import until
 
 from semcast.common.errors import ConfigError, TransportError
+from semcast.common.loopback import free_endpoint, loopback_round_trip_ms, open_hub
 from semcast.common.network_settings import HubSettings, NetworkSettings, is_loopback
-from semcast.common.transport import (
-    alive_roles,
-    free_endpoint,
-    loopback_round_trip_ms,
-    open_client,
-    open_hub,
-    open_session,
-    zenoh_config,
-)
+from semcast.common.transport import alive_roles, open_client, open_session, zenoh_config
 
 pytestmark = pytest.mark.xdist_group("real-time")
 
@@ -270,7 +263,7 @@ def test_only_an_address_in_use_is_said_to_be_in_use(tmp_path):
 
 def test_a_program_that_forgets_to_close_still_ends_cleanly():
     program = (
-        "from semcast.common.transport import open_hub\n"
+        "from semcast.common.loopback import open_hub\n"
         "session, _ = open_hub()\n"
         "session.subscribe('semcast/a/pose', 'every', print)\n"
         "session.watch_alive('a', print)\n"

@@ -10,6 +10,7 @@ from waiting import until
 from semcast.channel.awgn import complex_noise
 from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.levels import Levels
+from semcast.common.loopback import open_hub
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
@@ -17,7 +18,7 @@ from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.phy.qam import constellation
 from semcast.common.symbol_payload import pack_iq, pack_lost
-from semcast.common.transport import open_client, open_hub
+from semcast.common.transport import open_client
 from semcast.common.wire import pack, unpack
 from semcast.server import backlog
 from semcast.server.receiver import WINDOW, Receiver

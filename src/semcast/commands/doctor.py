@@ -147,7 +147,7 @@ def check_port(port: int) -> Iterator[Finding]:
 def check_loopback() -> Iterator[Finding]:
     """Send one message through a real Zenoh session pair on loopback."""
     from semcast import TransportError
-    from semcast.common.transport import loopback_round_trip_ms
+    from semcast.common.loopback import loopback_round_trip_ms
 
     try:
         yield Finding("zenoh loopback", "good", f"{loopback_round_trip_ms():.1f} ms there and back")
