@@ -306,6 +306,37 @@ def test_an_agent_says_when_the_channel_is_gone_and_when_it_is_back(bench, caplo
     until(lambda: told() == ["channel is gone", "channel is there"])
 
 
+def test_an_agent_encodes_nothing_while_nobody_takes_frames(bench):
+    channel = bench.channel()
+    receiver = bench.receiver()
+    statuses = []
+    key = status_key("agent0", "agent")
+    bench.hub.subscribe(key, "newest", lambda p: statuses.append(unpack(p, StatusMessage)))
+    agent = bench.agent(source={"repeat": "loop"})
+    before = take(receiver, count=1)[-1].message
+    channel.end()
+    until(lambda: statuses and statuses[-1].drops.get("unheard"))
+    num_encoded, num_unheard = len(bench.codec.snrs_db), statuses[-1].drops["unheard"]
+    until(lambda: statuses[-1].drops["unheard"] > num_unheard)
+    assert len(bench.codec.snrs_db) == num_encoded
+    bench.channel()
+    until(lambda: take(receiver, count=1)[-1].message.frame_id > before.frame_id + num_unheard)
+    agent.end()
+    assert agent.result["counts"]["sent"] == len(bench.codec.snrs_db) > num_encoded
+
+
+def test_the_last_frame_is_sent_and_repeated_though_nobody_takes_it_yet(bench):
+    channel = bench.channel()
+    receiver = bench.receiver()
+    agent = bench.agent(source={"pace": "rate", "rate_hz": 8.0})
+    take(receiver, count=1)
+    channel.end()
+    agent.join(60)
+    assert agent.result["complete"]
+    assert agent.result["drops"]["unheard"] > 0
+    assert agent.result["counts"]["sent_again"] > 0
+
+
 def test_status_comes_once_a_second_and_at_the_end(bench):
     statuses = []
     bench.hub.subscribe(
