@@ -433,20 +433,3 @@ def open_client(network: NetworkSettings, deadline_s: float) -> Session:
     session = open_session(network, deadline_s=deadline_s)
     assert session is not None, "without a stop event there is a session or an error"
     return session
-
-
-def alive_roles(
-    connect: str, agent_id: str, zenoh_config: Path | None = None, timeout_s: float = 2.0
-) -> set[str]:
-    """Connect to a hub and return which of agent, channel and server are alive.
-
-    Raises:
-        TransportError: Nothing answers there.
-        ConfigError: Zenoh's configuration file is not usable.
-    """
-    try:
-        network = NetworkSettings(connect=(connect,), zenoh_config=zenoh_config)
-    except ValueError as err:
-        raise TransportError(str(err)) from err
-    with open_client(network, timeout_s) as session:
-        return session.alive_roles(agent_id, timeout_s)

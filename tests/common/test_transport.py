@@ -14,7 +14,7 @@ from waiting import until
 from semcast.common.errors import ConfigError, TransportError
 from semcast.common.loopback import free_endpoint, loopback_round_trip_ms, open_hub
 from semcast.common.network_settings import HubSettings, NetworkSettings, is_loopback
-from semcast.common.transport import alive_roles, open_client, open_session, zenoh_config
+from semcast.common.transport import open_client, open_session, zenoh_config
 
 pytestmark = pytest.mark.xdist_group("real-time")
 
@@ -26,6 +26,11 @@ session = open_session(NetworkSettings(listen=(sys.argv[1],), connect=()))
 print("up", flush=True)
 threading.Event().wait()
 """
+
+
+def alive_roles(endpoint, agent_id, zenoh_config=None):
+    with open_client(NetworkSettings(connect=(endpoint,), zenoh_config=zenoh_config), 2.0) as session:
+        return session.alive_roles(agent_id)
 
 
 @pytest.fixture
