@@ -154,19 +154,20 @@ class Server:
             SourceError: The reference can't be read.
             SemcastError: The outputs can't be written.
         """
-        started_s = last_frame_s = time.monotonic()
+        started_s = active_s = time.monotonic()
         try:
             while not stop.is_set():
                 decoded = self._ahead.get(POLL_S)
                 now_s = time.monotonic()
                 self._serve_requests()
-                self._prepare()
+                if self._prepare():
+                    active_s = now_s = time.monotonic()
                 self._say_ready()
                 if decoded is not None:
-                    last_frame_s = now_s
+                    active_s = now_s
                     self._take(decoded)
                     self._receiver.done(decoded.arrival.message)
-                elif self._ended(now_s - last_frame_s):
+                elif self._ended(now_s - active_s):
                     if not self._settings.keep_running:
                         break
                     self._write_between(stop)
@@ -178,7 +179,7 @@ class Server:
         return summary
 
     def _ended(self, idle_s: float) -> bool:
-        """Tell whether nothing more is to come, after a pause of ``idle_s``; of one stream only once."""
+        """Tell whether nothing more is to come, ``idle_s`` after a stream's beginning or last frame; once."""
         if self._session is None or self._session.is_concluded:
             return False
         epoch, is_there = self._session.identity.agent_epoch, "agent" in self._receiver.roles_alive
@@ -186,7 +187,9 @@ class Server:
             self._receiver.count_missing(epoch, self._end_of.num_sent(epoch))
             return True
         limit_s = self._settings.idle_timeout_s
-        return limit_s is not None and idle_s >= limit_s and not self._settings.keep_running
+        if limit_s is None or self._settings.keep_running or not self._end_of.has_begun:
+            return False
+        return idle_s >= limit_s
 
     def _write_between(self, stop: threading.Event) -> None:
         """Write what the stream that has ended leaves, and go on: frames of it may come all the same."""
@@ -244,19 +247,20 @@ class Server:
         self.metrics.error(text)
         return text
 
-    def _prepare(self) -> None:
-        """Begin on an announced stream, so that codec, viewer and map are ready for its first frame."""
+    def _prepare(self) -> bool:
+        """Begin on an announced stream, so that all is ready for its first frame; tell if there was one."""
         camera = self._announced.take()
         if camera is None or (
             self._session is not None and camera.agent_epoch <= self._session.identity.agent_epoch
         ):
-            return
+            return False
         self._begin(camera)
         width, height = camera.image_wh
         try:
             self._decoder.warm_up(camera.codec, camera.modulation, camera.digest, (height, width))
         except SemcastError as err:
             logger.warning("%s", err)
+        return True
 
     def _say_ready(self) -> None:
         """Let a live agent begin once all is prepared; repeated until its first frame is there."""

@@ -181,6 +181,17 @@ def test_a_silent_stream_ends_with_the_idle_limit_and_its_outputs(tmp_path, air)
     assert (tmp_path / "summary.json").exists()
 
 
+def test_the_idle_limit_counts_from_the_first_frame_however_long_ago_the_server_was_started(air):
+    running = air.serve(idle_timeout_s=0.3)
+    assert not running.stop.wait(0.4)
+    radio = air.agent(100)
+    radio.wait(lambda: radio.allowed > 0, "word that the server is ready")
+    assert not running.stop.wait(0.4)
+    assert running.thread.is_alive()
+    radio.stream(range(3))
+    assert running.finish()["frames"]["tracked"] == 3
+
+
 def test_a_server_decodes_with_weights_of_ones_own(tiny_weights):
     hub, _ = open_hub()
     own = load_codec(str(tiny_weights))
