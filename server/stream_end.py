@@ -60,7 +60,7 @@ class StreamEnd:
             agent_epoch: Of the stream.
             idle_s: Since its last frame.
             agent_is_there: An agent of this name is alive.
-            is_busy: A frame is being decoded.
+            is_busy: A frame is being decoded, or waits to be tracked.
         """
         if self.complete:
             return idle_s >= (ANOTHER_AGENT_S if agent_is_there else FINAL_IDLE_S)
