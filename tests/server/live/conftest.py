@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.agent.agent import camera_info
 from semcast.agent.settings import AgentSettings
@@ -173,10 +174,7 @@ class Running:
             self.error = err
 
     def wait_for_drop(self, reason):
-        deadline_s = time.monotonic() + DEADLINE_S
-        while not self.server.metrics.drops.get(reason):
-            assert time.monotonic() < deadline_s, f"no {reason} within {DEADLINE_S} s"
-            self.stop.wait(0.01)
+        until(lambda: self.server.metrics.drops.get(reason), f"a drop by reason {reason}")
 
     def end(self):
         self.stop.set()

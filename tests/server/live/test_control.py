@@ -1,9 +1,9 @@
 """What other processes ask of a server."""
 
 import os
-import time
 
 import pytest
+from waiting import until
 
 from semcast.common.errors import SemcastError
 
@@ -22,10 +22,7 @@ def test_control_requests_reset_and_save(tmp_path, air, monkeypatch):
     assert radio.ask("get").settings["mode"] == "live"
     assert not radio.ask("explode").ok
     assert radio.ask("save").ok
-    deadline = time.monotonic() + DEADLINE_S
-    while not (tmp_path / "map.ply").exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    until((tmp_path / "map.ply").exists)
     assert not (tmp_path / "summary.json").exists()
     assert radio.ask("reset").ok
     radio.stream(range(10, 14))

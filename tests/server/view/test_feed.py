@@ -1,11 +1,11 @@
 """What is submitted comes into the scene, all of it and in order, whatever fails on the way."""
 
 import threading
-import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
@@ -136,9 +136,7 @@ def test_a_viewer_that_fails_is_connected_to_anew_and_gets_everything(monkeypatc
     monkeypatch.setattr(ViewerFeed, "_open_stream", lambda self, file: viewer.open(file))
     feed = ViewerFeed(ViewSettings(view="web", image_rate_hz=60), CAMERA, "anew", process=viewer)
     feed.submit(frame(0), update(0))
-    deadline_s = time.monotonic() + 30
-    while not viewer.rows and time.monotonic() < deadline_s:
-        time.sleep(0.005)
+    until(lambda: viewer.rows)
     feed.submit(frame(1), update(1))
     feed.close()
     assert viewer.rows == [0, 1]
