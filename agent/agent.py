@@ -119,6 +119,11 @@ class _Sending:
             self._pace.on_report(report)
         self.metrics.count("link_reports")
 
+    @property
+    def is_heard(self) -> bool:
+        """Whether anybody takes frames now, a channel or a recorder; told not to wait, it is not asked."""
+        return not self._settings.wait or self._symbols.has_receiver
+
     def wants(self, frame: SourceFrame) -> bool:
         """Tell whether a frame of the source is to be sent; in replay all are."""
         return self._pace is None or self._pace.wants(frame.t_capture_ns)
@@ -150,18 +155,25 @@ class _Sending:
 
 
 def _send_live(sending: _Sending, capture: Capture, stop: threading.Event) -> None:
-    """Send the newest frame, over and over."""
+    """Send the newest frame, over and over; while nobody takes it none is encoded, but a source's last one.
+
+    That one is repeated, so whoever comes in time has it.
+    """
     last: SymbolFrame | None = None
     while not stop.is_set() and not capture.ended:
         frame = capture.get(_POLL_S)
-        if frame is not None:
-            try:
-                last = sending.encode(frame)
-                sending.send(last)
-            except (ValueError, WireError) as err:
-                sending.metrics.drop("encode")
-                sending.metrics.error(f"frame {frame.frame_id} left out: {err}")
-                logger.warning("frame %d is left out: %s", frame.frame_id, err)
+        if frame is None:
+            continue
+        if not frame.final and not sending.is_heard:
+            sending.metrics.drop("unheard")
+            continue
+        try:
+            last = sending.encode(frame)
+            sending.send(last)
+        except (ValueError, WireError) as err:
+            sending.metrics.drop("encode")
+            sending.metrics.error(f"frame {frame.frame_id} left out: {err}")
+            logger.warning("frame %d is left out: %s", frame.frame_id, err)
     if last is None or not last.final:
         return
     until_s = time.monotonic() + _FAREWELL_S
@@ -229,7 +241,7 @@ def _wait_for_peers(session: Session, agent_id: str, stop: threading.Event) -> N
         if role not in _PEERS or alive == (role not in missing):
             return
         (missing.discard if alive else missing.add)(role)
-        if both.is_set():  # frames are sent all the same, and live ones are lost
+        if both.is_set():  # live frames are lost, or not even encoded
             logger.info("%s %s", role, "is there" if alive else "is gone")
         elif not missing:
             both.set()

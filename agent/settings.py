@@ -68,7 +68,13 @@ class AgentSettings:
             "begins at about 12 a second"
         },
     )
-    wait: bool = field(default=True, metadata={"help": "wait for channel and server before the first frame"})
+    wait: bool = field(
+        default=True,
+        metadata={
+            "help": "wait for channel and server before the first frame; live: encode none while nobody "
+            "takes them"
+        },
+    )
     network: NetworkSettings = field(default=NetworkSettings(), metadata={"help": "where the hub is"})
 
     def __post_init__(self) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from semcast.agent.source import Pacer, SourceFrame, is_camera_device, is_camera_number
 from semcast.agent.source_settings import SourceSettings
+from semcast.agent.video_times import VideoTimes
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import HOW_TO_GIVE
 from semcast.common.errors import SourceError
@@ -27,9 +28,6 @@ _REOPEN_AFTER_S = 1.0
 #: Longest time to throw old images away before a camera's first is sent.
 _SKIP_S = 2.0
 _OPEN_TIMEOUT_MS = 5000
-#: Stamps of a constant frame rate are off by the rounding of their container: Matroska's to whole ms,
-#: and that of the first frame comes on top.
-_STAMP_ROUNDING_NS = 1_000_000
 #: What a camera takes as a password in its query or path: ``pwd=``, ``loginpas=``, ``password=``, ``token=``.
 _SECRET = re.compile(r"([?&;/]\w*(?:pas|pwd|token|secret|key)\w*=)[^&;#]*", re.IGNORECASE)
 
@@ -205,45 +203,27 @@ class VideoSource(_Captured):
         return self._settings.paced_hz(self._fps / self._settings.stride)
 
     def _one_pass(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield what is left in the file, each image with its time in ns since the first one.
-
-        Phones and screen recorders vary their frame rate: the file's own stamps count, where they go on.
-        """
+        """Yield what is left in the file, each image with its time in ns since the first one."""
         image, self._first = self._first, None
-        count, t_ns, began_ns, ahead_ns = 0, -1, 0, 0
+        times = VideoTimes(self._fps)
         while self._capture is not None:
             if image is None:
                 image = _read(self._capture)
             if image is None:
-                self._warn_if_cut(count, t_ns)
+                self._warn_if_cut(times)
                 return
-            stamp_ns = round(float(np.nan_to_num(self._capture.get(cv2.CAP_PROP_POS_MSEC))) * 1e6)
-            began_ns = stamp_ns if count == 0 else began_ns
-            nominal_ns = round(count * 1e9 / self._fps)
-            stamp_ns -= began_ns
-            if abs(stamp_ns - nominal_ns) <= _STAMP_ROUNDING_NS:
-                ahead_ns = 0
-            elif stamp_ns > t_ns:
-                ahead_ns = stamp_ns - nominal_ns
-            # A frame without a time of its own is a usual period after the one before.
-            t_ns = max(t_ns + 1, nominal_ns + ahead_ns)
-            count += 1
-            yield t_ns, image
+            yield times.next_ns(float(self._capture.get(cv2.CAP_PROP_POS_MSEC))), image
             image = None
 
-    def _warn_if_cut(self, count: int, last_ns: int) -> None:
-        """Containers count frames roughly; a good deal fewer are a sign of damage, said once.
-
-        Phones trim by an edit list that hides frames, which are counted all the same. Matroska counts none:
-        OpenCV makes a number of duration and usual rate, which a varying rate need not reach before its end.
-        """
+    def _warn_if_cut(self, times: VideoTimes) -> None:
+        """Say once that a good deal fewer frames could be read than the file has: a sign of damage."""
         stored = self._stored_frames
-        reached = max(count, last_ns * 1e-9 * self._fps + 1)
-        if stored is None or self._is_cut or reached >= min(0.98 * stored, stored - 3):
+        if stored is None or self._is_cut or not times.is_cut(stored):
             return
         self._is_cut = True
         logger.warning(
-            "%s: %d of its %d frames could be read; it may be damaged or trimmed", self.name, count, stored
+            "%s: %d of its %d frames could be read; it may be damaged or trimmed",
+            *(self.name, times.num_frames, stored),
         )
 
     def _images(self) -> Iterator[tuple[int, int, NDArray[np.uint8]]]:

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -16,6 +16,12 @@ from semcast.common.messages import StatusMessage
 WINDOW = 512
 RATE_WINDOW_S = 5.0
 STATUS_INTERVAL_S = 1.0
+
+
+def frames_in_words(event: str, count: int, drops: Mapping[str, int]) -> str:
+    """Say to how many frames something happened, and how many were dropped for which reason."""
+    dropped = ", ".join(f"{number} {reason}" for reason, number in sorted(drops.items()) if number)
+    return f"{count} frames {event}; dropped: {dropped or 'none'}"
 
 
 class Metrics:
@@ -98,8 +104,7 @@ class Metrics:
 
     def closing_line(self, event: str) -> str:
         """Say how often something happened and what was dropped, for the end of a process."""
-        drops = ", ".join(f"{number} {reason}" for reason, number in sorted(self.drops.items()) if number)
-        return f"{self.counts.get(event, 0)} frames {event}; dropped: {drops or 'none'}"
+        return frames_in_words(event, self.counts.get(event, 0), self.drops)
 
     @staticmethod
     def _forget(times_ns: deque[int], now_ns: int) -> None:

@@ -15,30 +15,20 @@
 
 The server fills ``RunData`` from ``Reconstruction``: intrinsics of decoded (undistorted) images, frame ids,
 times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks()``, ``observations()`` as
-(landmark id, keyframe id, x, y), and the parts of the map that frames and landmarks are in. It calls
-``write_run`` once at the end and feeds an ``ImageWriter``.
+(landmark id, keyframe id, x, y), and the parts of the map that frames and landmarks are in.
 """
 
-import contextlib
-import logging
-import threading
-from collections import deque
-from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
-from semcast.common.mailbox import Mailbox
 from semcast.common.npz_file import read_npz, write_npz
 from semcast.common.shapes import check_shape
-
-logger = logging.getLogger(__name__)
 
 TRAJECTORY_NAME = "trajectory.tum"
 MAP_NAME = "map.ply"
@@ -60,8 +50,6 @@ RECORD_FILES = (FRAMES_NAME, VIEWER_NAME, CHECKPOINT_NAME)
 RUN_FILES = (*RESULT_FILES, DEMO_SETTINGS_NAME, *RECORD_FILES)
 
 FORMAT = 1
-#: Frames that may wait for a map to begin, whose start can make keyframes of them.
-MAX_PROVISIONAL = 300
 MAX_UNPACKED_BYTES = 4 * 1024**3
 
 
@@ -215,140 +203,3 @@ def read_image_paths(folder: Path) -> dict[int, Path]:
     if not images.is_dir():
         return {}
     return {int(p.stem): p for p in sorted(images.glob("*.jpg")) if p.stem.isdecimal()}
-
-
-@dataclass(frozen=True)
-class _Image:
-    frame_id: int
-    image: NDArray[np.uint8]
-    provisional: bool
-
-
-class ImageWriter:
-    """Writes decoded images into ``images/`` on its own thread, so that tracking does not wait for the disk.
-
-    A full disk, or whatever else keeps an image from being written, is reported once; the stream goes on
-    without images, which are counted as dropped.
-
-    Args:
-        folder: The run folder.
-        lossless: Wait when the queue is full; otherwise the image is dropped and counted.
-        quality: JPEG quality.
-        capacity: Images that may wait.
-        on_error: Is told in a line why the run goes on without images.
-
-    Raises:
-        SourceError: The folder can't be made.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        lossless: bool,
-        quality: int = 95,
-        capacity: int = 8,
-        on_error: Callable[[str], None] | None = None,
-    ) -> None:
-        self._images = folder / IMAGES_NAME
-        self._wait_s = None if lossless else 0.0
-        self._quality = quality
-        self._on_error = on_error
-        self._box: Mailbox[_Image] = Mailbox(capacity, "all")
-        #: What is kept of the provisional images written so far; not in the queue, which may be full.
-        self._settled: deque[tuple[int, frozenset[int]]] = deque()
-        self._num_put = 0
-        self.num_written = 0
-        # Each belongs to one thread: that of the caller, and that of the writer.
-        self._num_refused = self._num_failed = 0
-        try:
-            self._images.mkdir(parents=True, exist_ok=True)
-        except OSError as err:
-            raise SourceError(f"{self._images} can't be written: {err}") from err
-        self._provisional: deque[int] = deque()
-        self._thread = threading.Thread(target=self._run, name="semcast-images", daemon=True)
-        self._thread.start()
-
-    @property
-    def num_dropped(self) -> int:
-        """Images that found no room in the queue, or could not be written."""
-        return self._num_refused + self._num_failed
-
-    def put(self, frame_id: int, image: NDArray[np.uint8], *, provisional: bool = False) -> None:
-        """Queue one image; the caller must not change it afterwards. After ``close`` it is ignored.
-
-        Args:
-            frame_id: Names the file.
-            image: ``(H, W, 3)`` uint8 RGB.
-            provisional: ``settle`` will say whether it is kept; of many only the newest are.
-        """
-        if self._box.put(_Image(frame_id, image, provisional), self._wait_s) is not None:
-            self._num_put += 1
-        elif not self._box.closed:
-            self._num_refused += 1
-
-    def settle(self, kept: Collection[int]) -> None:
-        """Remove the provisional images of all other frames put so far. Returns at once."""
-        self._settled.append((self._num_put, frozenset(kept)))
-
-    def _run(self) -> None:
-        num_taken = 0
-        while (item := self._box.get()) is not None:
-            while self._settled and self._settled[0][0] <= num_taken:
-                self._drop_provisional(self._settled.popleft()[1])
-            num_taken += 1
-            if self._num_failed:
-                self._num_failed += 1
-                continue
-            try:
-                self._write(item)
-            except Exception as err:
-                self._num_failed += 1
-                self._remove(item.frame_id)  # a part of it may be there
-                text = f"{self._images} can't be written: {str(err) or type(err).__name__}"
-                logger.warning(
-                    "%s; the run goes on without images",
-                    text,
-                    exc_info=not isinstance(err, (OSError, cv2.error)),
-                )
-                if self._on_error is not None:
-                    self._on_error(text)
-        while self._settled:
-            self._drop_provisional(self._settled.popleft()[1])
-        self._drop_provisional(frozenset())
-
-    def _write(self, item: _Image) -> None:
-        bgr = cv2.cvtColor(item.image, cv2.COLOR_RGB2BGR)
-        good, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])
-        if not good:
-            raise OSError("OpenCV could not encode the image")
-        (self._images / image_name(item.frame_id)).write_bytes(data.tobytes())
-        self.num_written += 1
-        if item.provisional:
-            self._provisional.append(item.frame_id)
-            if len(self._provisional) > MAX_PROVISIONAL:
-                self._remove(self._provisional.popleft())
-
-    def _drop_provisional(self, kept: Collection[int]) -> None:
-        for frame_id in self._provisional:
-            if frame_id not in kept:
-                self._remove(frame_id)
-        self._provisional.clear()
-
-    def _remove(self, frame_id: int) -> None:
-        with contextlib.suppress(OSError):
-            (self._images / image_name(frame_id)).unlink()
-
-    def close(self, deadline_s: float = 30.0) -> None:
-        """Write what waits and end the thread; what is not written by the deadline is dropped. Idempotent."""
-        self._box.close()
-        self._thread.join(deadline_s)
-        if num_left := self._box.clear():
-            self._num_refused += num_left
-            logger.warning("%d images are not written: the disk is too slow", num_left)
-
-    def __enter__(self) -> "ImageWriter":
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()

@@ -1,14 +1,15 @@
-"""Sends a process's status once a second."""
+"""Sends a process's status once a second, and hears those of others."""
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from semcast.common.errors import SemcastError
 from semcast.common.keys import status_key
+from semcast.common.messages import StatusMessage
 from semcast.common.metrics import STATUS_INTERVAL_S, Metrics
 from semcast.common.transport import Session
-from semcast.common.wire import pack
+from semcast.common.wire import WireError, pack, unpack
 from semcast.common.worker_guard import WorkerGuard
 
 logger = logging.getLogger(__name__)
@@ -54,3 +55,31 @@ class StatusBeat:
             self._stopping.set()
             self._thread.join(2.0)
             self.send()
+
+
+def hear_statuses(
+    session: Session, agent_id: str, roles: Collection[str], wait_s: float = 2.5 * STATUS_INTERVAL_S
+) -> dict[str, StatusMessage]:
+    """Return the next status of each of some roles; those that send none in time are not in it.
+
+    Raises:
+        TransportError: The session is closed.
+    """
+    heard: dict[str, StatusMessage] = {}
+    changed = threading.Condition()
+
+    def hear(payload: bytes) -> None:
+        try:
+            status = unpack(payload, StatusMessage)
+        except WireError as err:
+            logger.debug("a status can't be read: %s", err)
+            return
+        with changed:
+            heard[status.role] = status
+            changed.notify_all()
+
+    for role in roles:
+        session.subscribe(status_key(agent_id, role), "newest", hear)
+    with changed:
+        changed.wait_for(lambda: set(roles) <= heard.keys(), wait_s)
+        return {role: heard[role] for role in roles if role in heard}

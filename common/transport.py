@@ -10,7 +10,6 @@ import contextlib
 import errno
 import json
 import logging
-import socket
 import threading
 import time
 from collections.abc import Callable
@@ -425,32 +424,6 @@ def _in_a_line(err: Exception) -> str:
     return line + "]" * (line.count("[") - line.count("]"))  # the cut may have taken the end of a list
 
 
-def free_endpoint() -> str:
-    """Return a loopback endpoint with a port that was free a moment ago, for tests and demonstrations."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-def open_hub(attempts: int = 5) -> tuple[Session, str]:
-    """Open a hub on a free loopback port, and return it with its endpoint.
-
-    Raises:
-        TransportError: No port could be opened.
-    """
-    for attempt in range(attempts):
-        endpoint = free_endpoint()
-        try:
-            session = open_session(NetworkSettings(listen=(endpoint,), connect=()))
-        except TransportError:
-            if attempt == attempts - 1:
-                raise
-            continue
-        assert session is not None, "a hub does not wait"
-        return session, endpoint
-    raise TransportError(f"attempts must be at least 1, got {attempts}")
-
-
 def open_client(network: NetworkSettings, deadline_s: float) -> Session:
     """Open a session that connects to a hub, for a short errand.
 
@@ -460,41 +433,3 @@ def open_client(network: NetworkSettings, deadline_s: float) -> Session:
     session = open_session(network, deadline_s=deadline_s)
     assert session is not None, "without a stop event there is a session or an error"
     return session
-
-
-def loopback_round_trip_ms(timeout_s: float = 3.0) -> float:
-    """Send a request through a hub and back, all in this process, and return how long it took.
-
-    Raises:
-        TransportError: It did not come back.
-    """
-    hub, endpoint = open_hub()
-    with hub:
-        network = NetworkSettings(connect=(endpoint,))
-        asking = open_client(network, timeout_s)
-        answering = open_client(network, timeout_s)
-        with asking, answering:
-            answering.answer("semcast/doctor/echo", lambda payload: payload)
-            deadline_s = time.monotonic() + timeout_s
-            while time.monotonic() < deadline_s:
-                started_ns = time.perf_counter_ns()
-                if asking.request("semcast/doctor/echo", b"there and back", 0.5) == b"there and back":
-                    return (time.perf_counter_ns() - started_ns) * 1e-6
-    raise TransportError(f"a request over loopback did not come back within {timeout_s:g} s")
-
-
-def alive_roles(
-    connect: str, agent_id: str, zenoh_config: Path | None = None, timeout_s: float = 2.0
-) -> set[str]:
-    """Connect to a hub and return which of agent, channel and server are alive.
-
-    Raises:
-        TransportError: Nothing answers there.
-        ConfigError: Zenoh's configuration file is not usable.
-    """
-    try:
-        network = NetworkSettings(connect=(connect,), zenoh_config=zenoh_config)
-    except ValueError as err:
-        raise TransportError(str(err)) from err
-    with open_client(network, timeout_s) as session:
-        return session.alive_roles(agent_id, timeout_s)

@@ -26,8 +26,9 @@ from semcast.server.frame_rows import FrameRow
 from semcast.server.frame_views import frame_view
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
+from semcast.server.view.picture import compress_picture
 from semcast.server.view.rerun_viewer import RerunStream
-from semcast.server.view.scene import Cursor, Scene, compress_picture
+from semcast.server.view.scene import Cursor, Scene
 from semcast.server.view.settings import ViewSettings
 
 VERB = "eval latency"

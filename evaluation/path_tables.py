@@ -1,7 +1,8 @@
 """Tables of path errors for ``docs/results.md`` and the README: medians over seeds, and what they would hide.
 
 The median of three runs is the same whether the third is a little worse or has lost its way. So the worst run
-stands beside it where it is clearly worse, and of the shares of frames with a pose the least one counts.
+stands beside it where it is clearly worse; of the shares of frames with a pose the least one counts, of the
+numbers of parts of the map the largest.
 """
 
 import json
@@ -55,20 +56,27 @@ def least_completeness(cell: Report, figure: str = "completeness") -> float:
     return min(float(run[figure]) for run in cell["runs"])
 
 
+def most_parts(cell: Report) -> int:
+    """Return into how many parts the map fell in the run in which these are the most."""
+    return max(len(run["parts"]) for run in cell["runs"])
+
+
 def trajectory_table(report: Report) -> Iterator[str]:
     """Yield the lines of the table of a result of ``semcast eval trajectory``.
 
     Figures of the poses as they were published, and of the time after a gap, have columns where the file has
-    them.
+    them; parts of the map where there is more than one.
     """
     cells = report["cells"]
     is_live = any("ate_at_once_percent" in cell for cell in cells)
+    in_parts = any(most_parts(cell) > 1 for cell in cells)
     gap_s = report["settings"].get("gap_s")
     if gap_s:
         yield f"Nothing arrives for {gap_s:g} s, at another place for each seed. `again`: from the first"
         yield "frame after that to the first with a pose.\n"
     head = ["SNR dB", "confidence", "ATE m", "ATE %", "least completeness"]
     head += ["live ATE %", "least completeness, live"] if is_live else []
+    head += ["most parts"] if in_parts else []
     head += ["RPE %", "RPE deg", "PSNR dB", "seeds", *(["again s"] if gap_s else [])]
     yield from table(
         head,
@@ -80,6 +88,7 @@ def trajectory_table(report: Report) -> Iterator[str]:
                 median_and_worst(cell, digits=3),
                 number(least_completeness(cell), 3),
                 *(_live(cell) if is_live else []),
+                *([str(most_parts(cell))] if in_parts else []),
                 number(cell["rpe_trans_percent"]),
                 number(cell["rpe_rot_deg"], 3),
                 number(cell["psnr_db"]),
@@ -122,7 +131,8 @@ def readme_table(folder: Path) -> str:
                 # Rounded down: a share that is not all of them must not read 100.0%.
                 share = "" if posed == 1.0 else f", {int(1000 * posed) / 10:.1f}% posed"
                 of = errors.setdefault(report["sequence"], {})
-                of[README_LINKS[link]] = median_and_worst(cell) + share
+                parts = f", {num} parts" if (num := most_parts(cell)) > 1 else ""
+                of[README_LINKS[link]] = median_and_worst(cell) + share + parts
                 if link == _LIVE_LINK and "ate_at_once_percent" in cell:
                     live[report["sequence"]] = median_and_worst(cell, "ate_at_once_percent")
     links = list(README_LINKS.values())

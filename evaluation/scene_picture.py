@@ -16,7 +16,7 @@ from semcast.common.codec import DEFAULT_CODEC
 from semcast.common.codecs import load_codec
 from semcast.evaluation.picture_strip import write_picture
 from semcast.evaluation.scenes.render import SCENES, SceneName, frame_of
-from semcast.server.view.scene import confidence_colours
+from semcast.server.view.picture import confidence_colours
 
 Image = NDArray[np.uint8]
 

@@ -45,14 +45,19 @@ class DecodeAhead(Generic[In, Out]):
         self._on_failure = on_failure
         self._is_stale = is_stale
         self._slot: Out | None = None
-        #: A message was taken and is not decoded yet.
-        self.is_busy = False
+        self._is_decoding = False
         self._condition = threading.Condition()
         self._stopping = threading.Event()
         self._reported: set[str] = set()
         self._guard = WorkerGuard("leaving a frame out")
         self._thread = threading.Thread(target=self._run, name="semcast-decode", daemon=True)
         self._thread.start()
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a message was taken that the tracker has not got yet."""
+        with self._condition:
+            return self._is_decoding or self._slot is not None
 
     def _run(self) -> None:
         while not self._stopping.is_set():
@@ -67,7 +72,8 @@ class DecodeAhead(Generic[In, Out]):
                 continue
             if message is None:
                 continue
-            self.is_busy = True
+            self._is_decoding = True
+            decoded = None
             try:
                 decoded = self._decode(message)
             except SemcastError as err:
@@ -76,16 +82,12 @@ class DecodeAhead(Generic[In, Out]):
                     logger.warning("%s", err)
                 with self._guard:
                     self._on_failure(message, "codec")
-                continue
             except Exception:
                 logger.exception("a frame could not be decoded and is left out")
                 with self._guard:
                     self._on_failure(message, "decode")
-                continue
-            finally:
-                self.is_busy = False
-            with self._condition:
-                self._slot = decoded
+            with self._condition:  # at once, or nobody had the frame for a moment
+                self._slot, self._is_decoding = decoded, False
                 self._condition.notify_all()
 
     def get(self, timeout_s: float) -> Out | None:

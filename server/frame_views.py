@@ -7,7 +7,7 @@ import numpy as np
 from semcast.server.decoder import DecodedArrival
 from semcast.server.frame_rows import FrameRow
 from semcast.server.mapping.state import DecodedFrame, FrameResult
-from semcast.server.view.scene import MISSING, FrameView
+from semcast.server.view.frame_view import MISSING, FrameView
 
 #: Stages in the viewer's plot; all of them are in ``frames.jsonl`` and the summary.
 PLOTTED_STAGES = ("decode", "track", "map", "bundle")

@@ -13,17 +13,16 @@ from semcast.common.codec import Codec, Modulation
 from semcast.common.codecs import named_weights
 from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError
-from semcast.common.keys import control_key, map_key
-from semcast.common.message_fields import sendable
-from semcast.common.messages import CameraInfo, ControlReply, ControlRequest
+from semcast.common.messages import CameraInfo
 from semcast.common.metrics import Metrics
 from semcast.common.sequence import open_sequence
 from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
 from semcast.common.transport import open_session
-from semcast.common.wire import WireError, pack, unpack
+from semcast.common.wire import pack
 from semcast.server.announcement import Announcement
 from semcast.server.conclusion import conclude
+from semcast.server.control import Control
 from semcast.server.decode_ahead import DecodeAhead
 from semcast.server.decoder import Arrival, DecodedArrival, FrameDecoder, codec_loader
 from semcast.server.dense.cloud import DensePatch
@@ -37,7 +36,6 @@ from semcast.server.outbox import Outbox, map_message
 from semcast.server.receiver import ReceivedFrame, Receiver
 from semcast.server.record import recording
 from semcast.server.reference import Reference, sequence_reference
-from semcast.server.requests import RequestDesk
 from semcast.server.session import Outcome, Session, new_bundle
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_end import StreamEnd
@@ -50,8 +48,6 @@ POLL_S = 0.1
 WARM_UP_SHAPE_HW = (256, 384)
 #: Time for depth that is still missing where another stream waits, and where the server was stopped.
 _IN_A_HURRY_S, _STOPPED_S = 2.0, 12.0
-#: How long a control request waits to be served; a busy server answers that it is not done yet.
-SERVE_WAIT_S = 2.0
 
 
 class Server:
@@ -67,6 +63,9 @@ class Server:
         settings: What to do.
         session: An open network session, which the server declares itself on.
         load: Returns a codec by name and modulation; None takes the installed ones.
+
+    Attributes:
+        metrics: What it counts about itself.
     """
 
     def __init__(
@@ -77,7 +76,7 @@ class Server:
     ) -> None:
         self._settings = settings
         self._agent_id = settings.agent_id
-        self._metrics = Metrics("server")
+        self.metrics = Metrics("server")
         self._codec: str | None = None
         own: Path | None = None
         if settings.codec is not None:
@@ -89,29 +88,27 @@ class Server:
         self._reference: Reference | None = None
         self._former_starts = FormerStarts()
         self._false_start = FalseStart()
-        self._desk = RequestDesk()
         self._drops_before: dict[str, int] = {}
         self._spare_bundle: BundleRunner | None = None
         self._new_map = False
         self._resources = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
-            stack.callback(self._desk.close)
             stack.enter_context(output_folder(settings.out))
             if settings.record is not None:
-                record, told = settings.record, self._metrics.error
+                record, told = settings.record, self.metrics.error
                 stack.enter_context(recording(session, self._agent_id, record, to_toml(settings), told))
             self._receiver = stack.enter_context(
-                Receiver(session, self._agent_id, settings.mode, self._metrics, settings.max_age_ms)
+                Receiver(session, self._agent_id, settings.mode, self.metrics, settings.max_age_ms)
             )
             self._end_of = StreamEnd(session, self._agent_id)
-            self._outbox = Outbox(session, self._agent_id, self._metrics)
+            self._outbox = Outbox(session, self._agent_id, self.metrics)
             stack.callback(self._outbox.close)
             self._beat = StatusBeat(
-                session, self._agent_id, "server", self._metrics, lambda: self._receiver.agent_epoch
+                session, self._agent_id, "server", self.metrics, lambda: self._receiver.agent_epoch
             )
             stack.callback(self._beat.close)
-            session.answer(control_key(self._agent_id, "server"), self._answer)
-            session.answer(map_key(self._agent_id), self._answer_map)
+            self._control = Control(session, settings)
+            stack.callback(self._control.close)
             stack.callback(self._close_spare)
             self._make_ready()
             self._announced = Announcement(session, self._agent_id)
@@ -130,7 +127,7 @@ class Server:
         settings = self._settings
         if settings.reference is not None:
             open_sequence(settings.reference, settings.camera)
-        self._spare_bundle = new_bundle(self._settings, self._metrics.error)
+        self._spare_bundle = new_bundle(self._settings, self.metrics.error)
         check_viewer(settings)
         if self._codec is not None:
             codec = self._decoder.load(self._codec, settings.modulation)
@@ -142,28 +139,9 @@ class Server:
             bundle.close()
 
     def _on_failure(self, arrival: ReceivedFrame, reason: str) -> None:
-        self._metrics.drop(reason)
-        self._metrics.error(f"frame {arrival.message.frame_id} dropped: {reason}")
+        self.metrics.drop(reason)
+        self.metrics.error(f"frame {arrival.message.frame_id} dropped: {reason}")
         self._receiver.done(arrival.message)
-
-    def _answer(self, payload: bytes) -> bytes:
-        """Answer a control request: ``reset`` begins a new map, ``save`` writes what there is."""
-        try:
-            request = unpack(payload, ControlRequest)
-        except WireError as err:
-            return pack(ControlReply(ok=False, error=str(err)))
-        if request.op not in ("get", "reset", "save"):
-            return pack(ControlReply(ok=False, error=f"op must be get, reset or save, got {request.op}"))
-        error = self._desk.error_of(request.op, SERVE_WAIT_S) if request.op != "get" else ""
-        values = {"mode": self._settings.mode, "view": self._settings.view.view}
-        return pack(ControlReply(ok=not error, error=sendable(error, 1000), settings=values))
-
-    def _answer_map(self, _payload: bytes) -> bytes | None:
-        """Give the whole map to who comes late; who gets none asks again when the map has changed."""
-        whole: bytes | None = None
-        with contextlib.suppress(SemcastError):
-            whole = self._desk.ask("map", SERVE_WAIT_S)
-        return whole
 
     def run(self, stop: threading.Event) -> dict[str, Any]:
         """Serve until the source ends, ``stop`` is set or a time limit passes; outputs are always written.
@@ -176,31 +154,32 @@ class Server:
             SourceError: The reference can't be read.
             SemcastError: The outputs can't be written.
         """
-        started_s = last_frame_s = time.monotonic()
+        started_s = active_s = time.monotonic()
         try:
             while not stop.is_set():
                 decoded = self._ahead.get(POLL_S)
                 now_s = time.monotonic()
                 self._serve_requests()
-                self._prepare()
+                if self._prepare():
+                    active_s = now_s = time.monotonic()
                 self._say_ready()
                 if decoded is not None:
-                    last_frame_s = now_s
+                    active_s = now_s
                     self._take(decoded)
                     self._receiver.done(decoded.arrival.message)
-                elif self._ended(now_s - last_frame_s):
+                elif self._ended(now_s - active_s):
                     if not self._settings.keep_running:
                         break
                     self._write_between(stop)
                 if self._settings.duration_s is not None and now_s - started_s >= self._settings.duration_s:
                     break
         finally:
-            self._desk.close()
+            self._control.close()
             summary = self._finish(is_stopped=stop.is_set())
         return summary
 
     def _ended(self, idle_s: float) -> bool:
-        """Tell whether nothing more is to come, after a pause of ``idle_s``; of one stream only once."""
+        """Tell whether nothing more is to come, ``idle_s`` after a stream's beginning or last frame; once."""
         if self._session is None or self._session.is_concluded:
             return False
         epoch, is_there = self._session.identity.agent_epoch, "agent" in self._receiver.roles_alive
@@ -208,7 +187,9 @@ class Server:
             self._receiver.count_missing(epoch, self._end_of.num_sent(epoch))
             return True
         limit_s = self._settings.idle_timeout_s
-        return limit_s is not None and idle_s >= limit_s and not self._settings.keep_running
+        if limit_s is None or self._settings.keep_running or not self._end_of.has_begun:
+            return False
+        return idle_s >= limit_s
 
     def _write_between(self, stop: threading.Event) -> None:
         """Write what the stream that has ended leaves, and go on: frames of it may come all the same."""
@@ -227,8 +208,12 @@ class Server:
         self._be_at("")
 
     def _serve_requests(self) -> None:
-        serve = {"reset": self._reset, "save": self._save, "map": self._whole_map}
-        self._desk.serve({what: functools.partial(handle, self._session) for what, handle in serve.items()})
+        session = self._session
+        self._control.serve(
+            reset=lambda: self._reset(session),
+            save=lambda: self._save(session),
+            whole_map=lambda: self._whole_map(session),
+        )
 
     def _reset(self, session: Session | None) -> str:
         if session is None:
@@ -259,22 +244,23 @@ class Server:
     def _tell(self, text: str) -> str:
         """Log what the stream goes on in spite of, and show it in the status."""
         logger.error("%s", text)
-        self._metrics.error(text)
+        self.metrics.error(text)
         return text
 
-    def _prepare(self) -> None:
-        """Begin on an announced stream, so that codec, viewer and map are ready for its first frame."""
+    def _prepare(self) -> bool:
+        """Begin on an announced stream, so that all is ready for its first frame; tell if there was one."""
         camera = self._announced.take()
         if camera is None or (
             self._session is not None and camera.agent_epoch <= self._session.identity.agent_epoch
         ):
-            return
+            return False
         self._begin(camera)
         width, height = camera.image_wh
         try:
             self._decoder.warm_up(camera.codec, camera.modulation, camera.digest, (height, width))
         except SemcastError as err:
             logger.warning("%s", err)
+        return True
 
     def _say_ready(self) -> None:
         """Let a live agent begin once all is prepared; repeated until its first frame is there."""
@@ -288,7 +274,7 @@ class Server:
         session = self._session
         is_first = session is not None and session.last_frame_id < 0
         if is_first and self._former_starts.is_straggler(message.agent_epoch, decoded.arrival.t_arrival_ns):
-            self._metrics.drop("epoch")
+            self.metrics.drop("epoch")
             return
         if session is None or session.identity.agent_epoch != message.agent_epoch:
             session = self._begin(decoded.arrival.camera)
@@ -296,11 +282,11 @@ class Server:
         session.note_arrival(message.frame_id, message.seq, final=message.final)
         self._end_of.note(message, decoded.arrival.camera)
         if decoded.frame is None:
-            self._metrics.drop("lost_on_air" if decoded.arrival.received is None else "outage")
-            self._views.submit(missing_view(decoded, self._metrics.drops))
+            self.metrics.drop("lost_on_air" if decoded.arrival.received is None else "outage")
+            self._views.submit(missing_view(decoded, self.metrics.drops))
             return
         if message.frame_id <= session.last_frame_id:
-            self._metrics.drop("processed")
+            self.metrics.drop("processed")
             if not self._false_start.is_shown_by(message.frame_id, message.seq, newest_seq):
                 return
             self._tell(f"frame {session.last_frame_id} was wrong: the stream is at {message.frame_id}")
@@ -310,13 +296,13 @@ class Server:
         try:
             outcome = session.process(
                 decoded.frame,
-                Arrival.of(decoded, self._metrics.drops),
+                Arrival.of(decoded, self.metrics.drops),
                 lambda found: self._outbox.put_pose(decoded.arrival, found),
             )
         except Exception as err:
             logger.exception("frame %d could not be tracked and is left out", message.frame_id)
-            self._metrics.drop("track")
-            self._metrics.error(f"frame {message.frame_id}: {err}")
+            self.metrics.drop("track")
+            self.metrics.error(f"frame {message.frame_id}: {err}")
             return
         self._spread(decoded, outcome)
 
@@ -325,15 +311,15 @@ class Server:
         result = outcome.result
         if outcome.update is not None:
             self._outbox.put_map(decoded.arrival.message.agent_epoch, outcome.update)
-        self._metrics.count("tracked")
+        self.metrics.count("tracked")
         if result.T_world_cam is not None:
-            self._metrics.count("posed")
+            self.metrics.count("posed")
         for stage, duration_ms in (("decode", decoded.decode_ms), *result.stage_ms.items()):
-            self._metrics.observe(stage, duration_ms)
+            self.metrics.observe(stage, duration_ms)
         if self._views.is_shown:
             started_ns = time.perf_counter_ns()
             self._views.submit(outcome.view, outcome.update, outcome.patches, new_map=self._new_map)
-            self._metrics.observe("view", (time.perf_counter_ns() - started_ns) * 1e-6)
+            self.metrics.observe("view", (time.perf_counter_ns() - started_ns) * 1e-6)
         self._new_map = False
 
     def _begin(self, camera: CameraInfo) -> Session:
@@ -358,7 +344,7 @@ class Server:
             )
         self._session = self._new_session(identity, goes_on=former is not None)
         self._former_starts.begin(identity.agent_epoch)
-        self._drops_before = self._metrics.drops if former is not None else {}
+        self._drops_before = self.metrics.drops if former is not None else {}
         self._show(identity, self._session.resumed, goes_on=former is not None)
         logger.info(
             "stream of %s (%s): %dx%d, codec %s, %s mode",
@@ -369,16 +355,16 @@ class Server:
     def _new_session(self, identity: StreamIdentity, *, goes_on: bool) -> Session:
         """Return the session of a stream; a server that ``goes_on`` keeps it in memory if need be."""
         out = self._settings.out
-        bundle = self._spare_bundle or new_bundle(self._settings, self._metrics.error)
+        bundle = self._spare_bundle or new_bundle(self._settings, self.metrics.error)
         self._spare_bundle = None
-        new = functools.partial(Session, self._settings, identity, on_error=self._metrics.error)
+        new = functools.partial(Session, self._settings, identity, on_error=self.metrics.error)
         try:
             return new(out, self._reference, bundle)
         except (OSError, SemcastError) as err:
             if not goes_on:
                 raise
             self._tell_not_written(out, err)
-        return new(None, self._reference, new_bundle(self._settings, self._metrics.error))
+        return new(None, self._reference, new_bundle(self._settings, self.metrics.error))
 
     def _show(self, identity: StreamIdentity, resumed: bool, *, goes_on: bool) -> None:
         """Show the stream; a server that ``goes_on`` tracks it unseen if need be."""
@@ -404,12 +390,12 @@ class Server:
 
     def _be_at(self, activity: str) -> None:
         """Let the status say at once what the server is at; see ``Metrics.be_at``."""
-        self._metrics.be_at(activity)
+        self.metrics.be_at(activity)
         self._beat.send()
 
     def _drops(self) -> dict[str, int]:
         """Drops since the present stream began."""
-        now = self._metrics.drops
+        now = self.metrics.drops
         return {reason: n for reason in now if (n := now[reason] - self._drops_before.get(reason, 0)) > 0}
 
     def _end_former(self, former: Session) -> None:

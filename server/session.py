@@ -24,7 +24,6 @@ from semcast.common.run_folder import (
     RESULT_FILES,
     SETTINGS_NAME,
     SUMMARY_NAME,
-    ImageWriter,
 )
 from semcast.common.whole_file import write_whole
 from semcast.server.checkpoint import (
@@ -40,6 +39,7 @@ from semcast.server.export.outputs import EachFile, versions, write_json, write_
 from semcast.server.former_run import set_aside
 from semcast.server.frame_rows import FrameRow, FrameRows, run_line, summarise
 from semcast.server.frame_views import frame_view
+from semcast.server.image_writer import ImageWriter
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.bundle_process import ProcessBundle
@@ -51,7 +51,7 @@ from semcast.server.sent_frames import stretches
 from semcast.server.session_cloud import SessionCloud
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
-from semcast.server.view.scene import FrameView
+from semcast.server.view.frame_view import FrameView
 
 logger = logging.getLogger(__name__)
 

@@ -23,12 +23,12 @@ class StreamEnd:
     """Notes what tells the end of a stream. Used from one thread, but for what the agent says itself.
 
     Attributes:
+        has_begun: A frame of the stream came.
         complete: The source came to its end.
     """
 
     def __init__(self, session: Session, agent_id: str) -> None:
-        self.complete = False
-        self._is_near = False
+        self.has_begun = self.complete = self._is_near = False
         self._num_sent: dict[int, int] = {}
         session.subscribe(status_key(agent_id, "agent"), "newest", self._on_status)
 
@@ -42,11 +42,11 @@ class StreamEnd:
 
     def begin(self) -> None:
         """Begin on another stream."""
-        self.complete = self._is_near = False
+        self.has_begun = self.complete = self._is_near = False
 
     def note(self, message: SymbolFrame, camera: CameraInfo) -> None:
         """Take a frame that was decoded."""
-        self.complete = message.final
+        self.has_begun, self.complete = True, message.final
         self._is_near = is_nearly_final(message.frame_id, camera)
 
     def num_sent(self, agent_epoch: int) -> int | None:
@@ -60,7 +60,7 @@ class StreamEnd:
             agent_epoch: Of the stream.
             idle_s: Since its last frame.
             agent_is_there: An agent of this name is alive.
-            is_busy: A frame is being decoded.
+            is_busy: A frame is being decoded, or waits to be tracked.
         """
         if self.complete:
             return idle_s >= (ANOTHER_AGENT_S if agent_is_there else FINAL_IDLE_S)

@@ -12,7 +12,7 @@ from semcast.server.mapping.state import MapUpdate
 from semcast.server.reference import Reference
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
-from semcast.server.view.scene import FrameView
+from semcast.server.view.frame_view import FrameView
 
 if TYPE_CHECKING:
     from semcast.server.view.feed import ViewerFeed

@@ -1,9 +1,11 @@
 """What each verb makes of its arguments, and what it says when it can't."""
 
 import argparse
+import contextlib
 import importlib.metadata
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -21,14 +23,16 @@ from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.cli import main, verb_parser
 from semcast.commands.agent import settings_of
-from semcast.commands.doctor import check_packages, check_processor
+from semcast.commands.doctor import check_packages, check_processor, check_system
 from semcast.commands.evaluate import EVALUATIONS
 from semcast.commands.running import read_given, read_settings, run_until_stopped
 from semcast.common.argument_order import arguments_last
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.common.config import to_toml
+from semcast.common.loopback import free_endpoint, open_hub
+from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
-from semcast.common.transport import free_endpoint, open_hub
+from semcast.common.status_beat import StatusBeat
 from semcast.demo import DemoSettings
 from semcast.server.record import RecordSettings
 from semcast.server.replay import ReplaySettings
@@ -290,6 +294,31 @@ def test_doctor_tells_by_its_exit_code_whether_required_roles_are_alive(capsys, 
         with pytest.raises(SystemExit):
             main([*words, "server,camera"])
         assert "must be some of agent,channel,server, got 'server,camera'" in capsys.readouterr().err
+
+
+def test_doctor_tells_what_a_running_system_says_of_itself():
+    hub, endpoint = open_hub()
+    metrics = Metrics("agent")
+    metrics.count("sent", 40)
+    metrics.drop("thinned", 3)
+    with hub, contextlib.closing(StatusBeat(hub, "cam0", "agent", metrics, lambda: 1)):
+        for role in ("agent", "channel"):
+            hub.declare_alive("cam0", role)
+        agent, channel, server = check_system(endpoint, "cam0")
+        assert agent.verdict == "good"
+        words = r"alive for \d+ s, \d+\.\d frames a second, 40 frames sent; dropped: 3 thinned"
+        assert re.fullmatch(words, agent.text)
+        assert channel.verdict == "note"
+        assert channel.text.startswith("alive, but says nothing of itself")
+        assert "start it with 'semcast server'" in server.text
+        metrics.be_at("waiting")
+        metrics.error("the disk is full")
+        agent = next(check_system(endpoint, "cam0"))
+        assert agent.verdict == "note"
+        assert agent.text.endswith("; is at: waiting; last error: the disk is full")
+    (finding,) = check_system("nowhere", "cam0")
+    assert finding.verdict == "bad"
+    assert finding.text.startswith("connect must be an endpoint")
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,10 @@ from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import ConfigError, SemcastError
+from semcast.common.loopback import free_endpoint
 from semcast.common.metrics import Metrics
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
-from semcast.common.transport import free_endpoint
 from semcast.common.wire import pack
 from semcast.demo import (
     Alive,

@@ -10,8 +10,10 @@ import numpy as np
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.run_folder import VIEWER_NAME, RunData
 from semcast.common.whole_file import whole_file
+from semcast.server.view.frame_view import FrameView
+from semcast.server.view.picture import compress_picture
 from semcast.server.view.rerun_viewer import Delivery, RerunStream
-from semcast.server.view.scene import Cursor, FrameView, Scene, compress_picture
+from semcast.server.view.scene import Cursor, Scene
 
 JPEG_QUALITY = 80
 CLOSE_DEADLINE_S = 30.0

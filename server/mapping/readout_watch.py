@@ -137,7 +137,7 @@ class ReadoutWatch:
         wrong = []
         if abs(fit.focal) >= max(_LEAST_FOCAL, _LEAST_SIGMAS * fit.sigma_focal):
             way = "short" if fit.focal > 0.0 else "long"
-            wrong.append(f"the focal length seems {100.0 * abs(fit.focal):.1f} % too {way}")
+            wrong.append(f"the focal length seems about {100.0 * abs(fit.focal):.0f} % too {way}")
         is_sure = any(
             abs(k) >= _LEAST_SIGMAS * s > 0.0 for k, s in zip(fit.radial, fit.sigma_radial, strict=True)
         )

@@ -22,10 +22,12 @@ from semcast.common.trajectory import Trajectory
 from semcast.common.worker_guard import WorkerGuard
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.mapping.state import MapUpdate
+from semcast.server.view.frame_view import FrameView
 from semcast.server.view.live_stream import FLUSH_TIMEOUT_S, LiveStream
+from semcast.server.view.picture import compress_picture
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary, window_display
 from semcast.server.view.rerun_viewer import RerunStream
-from semcast.server.view.scene import Changes, Cursor, FrameView, Scene, compress_picture
+from semcast.server.view.scene import Changes, Cursor, Scene
 from semcast.server.view.settings import ViewSettings
 
 logger = logging.getLogger(__name__)
@@ -148,7 +150,7 @@ class ViewerFeed:
         self._threads = [threading.Thread(target=self._run_scene, name="semcast-scene", daemon=True)]
         if self._process is not None:
             self._process.start()
-            self._live = LiveStream(lambda: self._open_stream(None), self._changes_since, settings.port)
+            self._live = LiveStream(lambda: self._open_stream(None), self.changes_since, settings.port)
             self._threads.append(threading.Thread(target=self._run_live, name="semcast-viewer", daemon=True))
         for thread in self._threads:
             thread.start()
@@ -162,6 +164,17 @@ class ViewerFeed:
     def url(self) -> str | None:
         """Where the live viewer is, None without one."""
         return self._process.url if self._process is not None else None
+
+    @property
+    def num_pending(self) -> int:
+        """Updates that wait for the scene's thread."""
+        with self._queue_lock:
+            return len(self._pending)
+
+    def changes_since(self, cursor: Cursor) -> Changes:
+        """Return what a viewer has not seen of what is in the scene by now, and move its cursor on."""
+        with self._scene_lock:
+            return self._scene.changes_since(cursor)
 
     def submit(
         self,
@@ -203,10 +216,6 @@ class ViewerFeed:
                 _apply(self._scene, item)
         return count
 
-    def _changes_since(self, cursor: Cursor) -> Changes:
-        with self._scene_lock:
-            return self._scene.changes_since(cursor)
-
     def _open_stream(self, file: Path | None) -> RerunStream:
         return RerunStream(
             recording_id=self._recording_id,
@@ -236,7 +245,7 @@ class ViewerFeed:
             with guard:
                 self._take_pending(last_round)
                 if self._file is not None:
-                    self._file.write(self._changes_since(cursor))
+                    self._file.write(self.changes_since(cursor))
                     if time.monotonic() - last_flush_s > FILE_FLUSH_INTERVAL_S:
                         self._file.flush(FLUSH_TIMEOUT_S)
                         last_flush_s = time.monotonic()

@@ -12,7 +12,8 @@ import rerun.blueprint as rrb
 
 from semcast.common.camera import Intrinsics
 from semcast.server.view.patch_table import PlacedPatch
-from semcast.server.view.scene import Changes, Picture, PointChunk, Row, confidence_colours
+from semcast.server.view.picture import Picture, confidence_colours
+from semcast.server.view.scene import Changes, PointChunk, Row
 
 logger = logging.getLogger(__name__)
 

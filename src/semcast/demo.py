@@ -23,13 +23,14 @@ from semcast.common.codecs import check_codec, named_weights
 from semcast.common.config import to_toml
 from semcast.common.errors import ConfigError, SemcastError, SourceError, TransportError
 from semcast.common.keys import status_key
+from semcast.common.loopback import free_endpoint
 from semcast.common.messages import StatusMessage
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.playback import check_playback, usual_period_ns
 from semcast.common.rate import NATIVE_RATE, RateChoice
 from semcast.common.run_folder import DEMO_SETTINGS_NAME, FRAMES_NAME, SUMMARY_NAME
 from semcast.common.sequence import Sequence, open_sequence
-from semcast.common.transport import Session, free_endpoint, open_session
+from semcast.common.transport import Session, open_session
 from semcast.common.whole_file import check_writable, write_whole
 from semcast.common.wire import WireError, unpack
 from semcast.real_time import plan_for

@@ -1,6 +1,3 @@
-import threading
-import time
-
 import cv2
 import numpy as np
 import pytest
@@ -70,15 +67,3 @@ def video(tmp_path_factory):
         writer.write(np.full((SIZE_WH[1], SIZE_WH[0], 3), 20 * k, np.uint8))
     writer.release()
     return path
-
-
-@pytest.fixture
-def until():
-    def wait(condition, deadline_s=15.0):
-        end_s = time.monotonic() + deadline_s
-        tick = threading.Event()
-        while not condition():
-            assert time.monotonic() < end_s, "the condition did not come true in time"
-            tick.wait(0.005)
-
-    return wait

@@ -7,10 +7,12 @@ import sys
 import time
 
 import pytest
+from waiting import until
 
+from semcast.common.loopback import free_endpoint
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
-from semcast.common.transport import free_endpoint, open_session
+from semcast.common.transport import open_session
 from semcast.server.receiver import Receiver
 from tests.agent.test_stream import take
 
@@ -36,7 +38,7 @@ print("ended", flush=True)
 """
 
 
-def test_real_processes_survive_each_others_death_in_any_order(recording, until):
+def test_real_processes_survive_each_others_death_in_any_order(recording):
     endpoint = free_endpoint()
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     running = {}

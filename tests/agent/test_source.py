@@ -234,45 +234,6 @@ def test_a_video_can_be_cut_and_repeated(video):
         open_source(fast(video, camera=PINHOLE, repeat="swing"))
 
 
-class Stamped:
-    """A capture whose file says when its images were taken."""
-
-    def __init__(self, capture, stamps_ms):
-        self._capture, self._stamps_ms, self._read = capture, stamps_ms, 0
-
-    def read(self):
-        self._read += 1
-        return self._capture.read()
-
-    def get(self, name):
-        return self._stamps_ms[self._read] if name == cv2.CAP_PROP_POS_MSEC else self._capture.get(name)
-
-    def release(self):
-        self._capture.release()
-
-
-@pytest.mark.parametrize(
-    ("stamps_ms", "times_ms"),
-    [
-        ([7, 107, 117, 127, 327, 337, 347, 357, 367, 377], [0, 100, 110, 120, 320, 330, 340, 350, 360, 370]),
-        ([0.0] * 10, [20 * k for k in range(10)]),
-        ([20.0001 * k for k in range(10)], [20 * k for k in range(10)]),
-        ([0, 20.9, 40, 59.1, 80, 100, 120, 140, 160, 180], [20 * k for k in range(10)]),
-        ([0, 100, 110, 110, 310, 320, 330, 340, 350, 360], [0, 100, 110, 130, 310, 320, 330, 340, 350, 360]),
-        ([0, 100, 90, 80, 310, np.nan, 340, 350, 360, 370], [0, 100, 120, 140, 310, 330, 340, 350, 360, 370]),
-    ],
-)
-def test_times_of_a_video_are_its_own_where_it_has_some(video, stamps_ms, times_ms):
-    source = open_source(fast(video, camera=PINHOLE))
-    assert source._fps == 50.0
-    source._capture = Stamped(source._capture, stamps_ms)
-    times_ns = [f.t_source_ns for f in source.frames(threading.Event())]
-    source.close()
-    assert times_ns[0] == 0
-    assert times_ns == [1_000_000 * t for t in times_ms[: len(times_ns)]]
-    assert len(times_ns) >= 9
-
-
 @pytest.fixture(scope="module")
 def uneven_video(tmp_path_factory):
     """Nine images at 0, 1, 2, 3, 6, 9 ... times 40 ms, or a skip where OpenCV can't write Matroska."""
@@ -322,18 +283,6 @@ def test_a_damaged_video_says_how_much_of_it_can_be_read(tmp_path, caplog):
     caplog.clear()
     play(fast(cut, camera=PINHOLE, max_frames=5))
     assert not caplog.text, "an end that was asked for is none"
-
-
-@pytest.mark.parametrize(("period_ms", "is_damaged"), [(20, True), (30, False)])
-def test_a_video_of_varying_rate_is_not_damaged_where_it_lasts_to_its_end(
-    video, period_ms, is_damaged, caplog
-):
-    source = open_source(fast(video, camera=PINHOLE))
-    source._capture = Stamped(source._capture, [period_ms * k for k in range(11)])
-    source._stored_frames = 14  # 280 ms at its usual rate, as counted of a container that says no number
-    assert len(list(source.frames(threading.Event()))) in (9, 10)
-    source.close()
-    assert ("may be damaged" in caplog.text) == is_damaged
 
 
 def test_a_video_needs_a_camera_that_fits(video, tmp_path):

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.agent.agent import camera_info, run_agent
 from semcast.agent.settings import AgentSettings
@@ -19,11 +20,12 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.keys import link_key, status_key
+from semcast.common.loopback import free_endpoint, open_hub
 from semcast.common.messages import CameraInfo, LinkReport, StatusMessage
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.sequence import open_sequence
-from semcast.common.transport import free_endpoint, open_hub, open_session
+from semcast.common.transport import open_session
 from semcast.common.wire import pack, unpack
 from semcast.server.receiver import Receiver
 
@@ -208,7 +210,7 @@ def test_replay_delivers_every_frame_to_a_slow_consumer(bench, caplog):
     assert "no server asks for frames" not in caplog.text
 
 
-def test_a_live_server_that_takes_no_replay_is_told_of(bench, until, caplog, monkeypatch):
+def test_a_live_server_that_takes_no_replay_is_told_of(bench, caplog, monkeypatch):
     monkeypatch.setattr("semcast.agent.agent._READY_S", 0.3)
     bench.channel()
     bench.receiver("live")
@@ -254,7 +256,7 @@ def test_replay_goes_on_without_a_gap_when_channel_or_server_are_restarted(bench
     assert agent.result["complete"]
 
 
-def test_a_restarted_agent_is_followed_at_once(bench, until):
+def test_a_restarted_agent_is_followed_at_once(bench):
     bench.channel()
     receiver = bench.receiver()
     first = bench.agent(source={"repeat": "loop"})
@@ -269,7 +271,7 @@ def test_a_restarted_agent_is_followed_at_once(bench, until):
     assert second.result["agent_epoch"] == after[0].message.agent_epoch
 
 
-def test_an_agent_waits_for_the_others_unless_told_not_to(bench, until, caplog):
+def test_an_agent_waits_for_the_others_unless_told_not_to(bench, caplog):
     caplog.set_level("INFO")
     waiting = bench.agent(source={"repeat": "loop"})
     until(lambda: "waiting for channel and server of 'agent0' (another --agent-id?)" in caplog.text)
@@ -287,7 +289,7 @@ def test_an_agent_waits_for_the_others_unless_told_not_to(bench, until, caplog):
     eager.end()
 
 
-def test_an_agent_says_when_the_channel_is_gone_and_when_it_is_back(bench, until, caplog):
+def test_an_agent_says_when_the_channel_is_gone_and_when_it_is_back(bench, caplog):
     caplog.set_level("INFO", "semcast.agent.agent")
 
     def told():  # the receiver says so too
@@ -304,7 +306,38 @@ def test_an_agent_says_when_the_channel_is_gone_and_when_it_is_back(bench, until
     until(lambda: told() == ["channel is gone", "channel is there"])
 
 
-def test_status_comes_once_a_second_and_at_the_end(bench, until):
+def test_an_agent_encodes_nothing_while_nobody_takes_frames(bench):
+    channel = bench.channel()
+    receiver = bench.receiver()
+    statuses = []
+    key = status_key("agent0", "agent")
+    bench.hub.subscribe(key, "newest", lambda p: statuses.append(unpack(p, StatusMessage)))
+    agent = bench.agent(source={"repeat": "loop"})
+    before = take(receiver, count=1)[-1].message
+    channel.end()
+    until(lambda: statuses and statuses[-1].drops.get("unheard"))
+    num_encoded, num_unheard = len(bench.codec.snrs_db), statuses[-1].drops["unheard"]
+    until(lambda: statuses[-1].drops["unheard"] > num_unheard)
+    assert len(bench.codec.snrs_db) == num_encoded
+    bench.channel()
+    until(lambda: take(receiver, count=1)[-1].message.frame_id > before.frame_id + num_unheard)
+    agent.end()
+    assert agent.result["counts"]["sent"] == len(bench.codec.snrs_db) > num_encoded
+
+
+def test_the_last_frame_is_sent_and_repeated_though_nobody_takes_it_yet(bench):
+    channel = bench.channel()
+    receiver = bench.receiver()
+    agent = bench.agent(source={"pace": "rate", "rate_hz": 8.0})
+    take(receiver, count=1)
+    channel.end()
+    agent.join(60)
+    assert agent.result["complete"]
+    assert agent.result["drops"]["unheard"] > 0
+    assert agent.result["counts"]["sent_again"] > 0
+
+
+def test_status_comes_once_a_second_and_at_the_end(bench):
     statuses = []
     bench.hub.subscribe(
         status_key("agent0", "agent"), "every", lambda p: statuses.append(unpack(p, StatusMessage))
@@ -387,23 +420,21 @@ def test_the_camera_s_shutter_is_told(recording, codec, tmp_path):
 class AfterTheSource:
     """Encodes nothing before the source has ended."""
 
-    def __init__(self, codec, until):
+    def __init__(self, codec):
         self.name, self.digest, self.modulation = codec.name, codec.digest, codec.modulation
-        self._codec, self._until = codec, until
+        self._codec = codec
 
     def encode(self, image, snr_db):
-        self._until(lambda: all(thread.name != "semcast-capture" for thread in threading.enumerate()))
+        until(lambda: all(thread.name != "semcast-capture" for thread in threading.enumerate()))
         return self._codec.encode(image, snr_db)
 
 
 @pytest.mark.parametrize("mode", ["live", "replay"])
-def test_a_source_that_fails_while_a_frame_is_encoded_is_no_end_of_it(
-    bench, recording, tmp_path, until, mode
-):
+def test_a_source_that_fails_while_a_frame_is_encoded_is_no_end_of_it(bench, recording, tmp_path, mode):
     bench.recording = shutil.copytree(recording, tmp_path / "damaged")
     for k in range(2, 12):
         (bench.recording / "images" / f"{k:06d}.png").write_bytes(b"")
-    bench.codec = AfterTheSource(bench.codec, until)
+    bench.codec = AfterTheSource(bench.codec)
     statuses = []
     bench.hub.subscribe(
         status_key("agent0", "agent"), "every", lambda p: statuses.append(unpack(p, StatusMessage))

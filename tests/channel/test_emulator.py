@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from waiting import came_true, until
 
 from semcast.channel.emulator import run_channel, set_channel
 from semcast.channel.emulator_settings import EmulatorSettings
@@ -15,12 +16,12 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import EncodedImage
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import channel_key, rx_key, status_key, tx_key
+from semcast.common.loopback import open_hub
 from semcast.common.messages import ChannelReport, StatusMessage, SymbolFrame
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.phy.qam import constellation
 from semcast.common.symbol_payload import lost_slots_of, pack_data_symbols, slots_of
-from semcast.common.transport import open_hub
 from semcast.common.wire import pack, unpack
 
 pytestmark = pytest.mark.xdist_group("real-time")
@@ -36,20 +37,6 @@ signal.signal(signal.SIGTERM, lambda *_: stop.set())
 summary = run_channel(EmulatorSettings(agent_id="a", network=NetworkSettings(connect=(sys.argv[1],))), stop)
 print(summary["counts"].get("carried", 0))
 """
-
-
-def came(condition, deadline_s):
-    end_s = time.monotonic() + deadline_s
-    tick = threading.Event()
-    while not condition():
-        if time.monotonic() > end_s:
-            return False
-        tick.wait(0.005)
-    return True
-
-
-def until(condition, deadline_s=15.0):
-    assert came(condition, deadline_s), "the condition did not come true in time"
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +194,7 @@ def test_replay_loses_nothing_even_in_a_burst_and_live_counts_what_it_drops(ends
         e.tx.put(pack(make(k, epoch=2)))
     sent = 200
     # Live frames may also be dropped behind the channel, even the last of the burst: then one more is sent.
-    while not came(lambda last=sent - 1: e.received[-1].seq == last, 1.0):
+    while not came_true(lambda last=sent - 1: e.received[-1].seq == last, 1.0):
         assert sent < 220
         e.tx.put(pack(make(sent, epoch=2)))
         sent += 1

@@ -93,13 +93,21 @@ def test_a_link_that_changes_is_believed_at_once():
     assert after[0] == pytest.approx(6.0, abs=1.0)
 
 
-def test_few_frames_carry_less_than_was_counted_on_where_their_slots_fade_together():
+@pytest.mark.parametrize(
+    "links",
+    [
+        [{"channel": "rayleigh", "doppler_hz": doppler_hz} for doppler_hz in (1.0, 5.0, 20.0)],
+        [{"channel": "burst", "burst_slots": slots} for slots in (2.0, 4.0, 16.0)],
+    ],
+    ids=["fading", "bursts"],
+)
+def test_where_slots_fade_together_few_frames_carry_less_than_was_counted_on(links):
     layout = layout_for(SMALL_HW := (240, 320))
     symbols = np.ones((layout.num_slots, layout.data_per_slot), np.complex64)
     short, num_frames = 0, 60
-    for doppler_hz in (1.0, 5.0, 20.0):
-        fading = ChannelSettings(channel="rayleigh", snr_db=8.0, doppler_hz=doppler_hz)
-        link, reporter, counted_on_db = Link(fading, 0), LinkReporter("jpeg-amc"), None
+    for settings in links:
+        link, reporter = Link(ChannelSettings(snr_db=8.0, **settings), 0), LinkReporter("jpeg-amc")
+        counted_on_db = None
         for k in range(num_frames):
             equalised = link.receive(EncodedImage(SMALL_HW, symbols, "16qam"), 0.1 * k, k)
             if counted_on_db is not None:

@@ -3,12 +3,14 @@ import time
 
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.common.keys import map_key
+from semcast.common.loopback import open_hub
 from semcast.common.map_mirror import MapMirror
 from semcast.common.messages import MapMessage
 from semcast.common.network_settings import NetworkSettings
-from semcast.common.transport import open_client, open_hub
+from semcast.common.transport import open_client
 from semcast.common.wire import pack
 
 AGENT = "cam0"
@@ -27,13 +29,6 @@ def message(ids, *, removed=(), keyframes=(), offset=0.0, agent_epoch=7, map_epo
         keyframe_ids=np.array(keyframes, np.int64),
         keyframe_poses=np.array([np.eye(4) * (k + offset) for k in keyframes]).reshape(-1, 4, 4),
     )
-
-
-def until(condition):
-    deadline_s = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
 
 
 @pytest.fixture

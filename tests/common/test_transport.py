@@ -9,18 +9,12 @@ import threading
 import time
 
 import pytest
+from waiting import until
 
 from semcast.common.errors import ConfigError, TransportError
+from semcast.common.loopback import free_endpoint, loopback_round_trip_ms, open_hub
 from semcast.common.network_settings import HubSettings, NetworkSettings, is_loopback
-from semcast.common.transport import (
-    alive_roles,
-    free_endpoint,
-    loopback_round_trip_ms,
-    open_client,
-    open_hub,
-    open_session,
-    zenoh_config,
-)
+from semcast.common.transport import open_client, open_session, zenoh_config
 
 pytestmark = pytest.mark.xdist_group("real-time")
 
@@ -34,13 +28,9 @@ threading.Event().wait()
 """
 
 
-def until(condition, deadline_s=10.0):
-    """Wait for a condition; the interval only bounds how late it is noticed."""
-    end_s = time.monotonic() + deadline_s
-    tick = threading.Event()
-    while not condition():
-        assert time.monotonic() < end_s, "the condition did not come true in time"
-        tick.wait(0.005)
+def alive_roles(endpoint, agent_id, zenoh_config=None):
+    with open_client(NetworkSettings(connect=(endpoint,), zenoh_config=zenoh_config), 2.0) as session:
+        return session.alive_roles(agent_id)
 
 
 @pytest.fixture
@@ -278,7 +268,7 @@ def test_only_an_address_in_use_is_said_to_be_in_use(tmp_path):
 
 def test_a_program_that_forgets_to_close_still_ends_cleanly():
     program = (
-        "from semcast.common.transport import open_hub\n"
+        "from semcast.common.loopback import open_hub\n"
         "session, _ = open_hub()\n"
         "session.subscribe('semcast/a/pose', 'every', print)\n"
         "session.watch_alive('a', print)\n"

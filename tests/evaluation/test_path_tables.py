@@ -11,7 +11,10 @@ from semcast.evaluation.path_tables import median_and_worst, readme_table, traje
 
 def cell_of(errors_percent, posed=(1.0,), **figures):
     known = sorted(e for e in errors_percent if e is not None)
-    runs = [{"ate_percent": e, "completeness": p} for e, p in zip(errors_percent, posed, strict=True)]
+    runs = [
+        {"ate_percent": e, "completeness": p, "parts": [{"submap": 0, "num_posed": 40}]}
+        for e, p in zip(errors_percent, posed, strict=True)
+    ]
     return {
         "snr_db": 6.0,
         "confidence": "robust",
@@ -73,6 +76,18 @@ def test_of_the_shares_of_frames_with_a_pose_the_least_one_is_told(tmp_path):
     shown["cells"] = [cell_of([0.25, 0.25, 0.3], (1.0, 0.5, 1.0))]
     (row,) = list(trajectory_table(shown))[2:]
     assert re.search(r"\| 0.250 \| 0.500 \|", row)
+
+
+def test_maps_that_fell_into_parts_are_told_of(tmp_path):
+    shown = report(DEFAULT_CODEC, 0.25)
+    (one_part,) = list(trajectory_table(shown))[2:]
+    shown["cells"] = [cell_of([0.25, 0.25, 0.3], (1.0,) * 3)]
+    shown["cells"][0]["runs"][1]["parts"].append({"submap": 3, "num_posed": 20})
+    (tmp_path / "trajectory_a.json").write_text(json.dumps(shown))
+    assert "| drive | - | 0.25, 2 parts | - |" in readme_table(tmp_path)
+    head, _, row = trajectory_table(shown)
+    assert row.split("|")[head.split("|").index(" most parts ")] == " 2 "
+    assert one_part.count("|") == row.count("|") - 1, "it has a column only where there are parts"
 
 
 def test_errors_of_poses_as_published_stand_beside_those_of_one_link(tmp_path):

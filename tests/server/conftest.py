@@ -5,8 +5,9 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
-from semcast.common.run_folder import ImageWriter, RunData, write_run
+from semcast.common.run_folder import RunData, write_run
 from semcast.server.export.outputs import PLY_VERTEX
+from semcast.server.image_writer import ImageWriter
 
 
 def make_arc_run(num_frames=9, num_points=60, noise_px=0.0, seed=0):

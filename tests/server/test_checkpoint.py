@@ -1,10 +1,10 @@
 """Checkpoints are whole or refused."""
 
 import os
-import time
 
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import CheckpointError
@@ -133,11 +133,9 @@ def test_the_writer_survives_a_full_disk_says_so_each_time_and_when_it_is_over(t
     blocked.write_text("not a folder")
     told = []
     writer = CheckpointWriter(blocked / "map.npz", told.append)
-    deadline = time.monotonic() + 10
     for k in (1, 2):
         writer.submit(checkpoint())
-        while writer.num_failed < k and time.monotonic() < deadline:
-            time.sleep(0.01)
+        until(lambda k=k: writer.num_failed == k)
     blocked.unlink()
     writer.submit(checkpoint())
     writer.close()
@@ -156,9 +154,7 @@ def test_the_writer_survives_what_nobody_expected(tmp_path, monkeypatch, caplog)
     with monkeypatch.context() as patch:
         patch.setattr("semcast.server.checkpoint.save_checkpoint", broken)
         writer.submit(checkpoint(1))
-        deadline = time.monotonic() + 10
-        while writer.num_failed == 0 and time.monotonic() < deadline:
-            time.sleep(0.01)
+        until(lambda: writer.num_failed)
     writer.submit(checkpoint(2))
     writer.close()
     assert (writer.num_failed, writer.num_written) == (1, 1)

@@ -3,6 +3,8 @@
 import threading
 import time
 
+from waiting import came_true, until
+
 from semcast.common.errors import ProtocolError
 from semcast.server.decode_ahead import DecodeAhead
 
@@ -54,6 +56,24 @@ def test_no_more_than_one_frame_is_taken_ahead_of_the_tracker():
     deadline = time.monotonic() + 0.3
     while time.monotonic() < deadline:
         assert inbox.taken <= 2
+    ahead.close()
+
+
+def test_it_is_busy_until_the_tracker_has_what_was_taken():
+    inbox, may_decode = Inbox(2), threading.Event()
+
+    def decode(x):
+        may_decode.wait(10)
+        if x == 1:
+            raise ProtocolError("the samples don't fit")
+        return (x,)
+
+    ahead = DecodeAhead(inbox.take, decode, lambda m, r: None)
+    until(lambda: ahead.is_busy)
+    may_decode.set()
+    assert not came_true(lambda: not ahead.is_busy, 0.1), "decoded, it still waits for the tracker"
+    assert ahead.get(10.0) == (0,)
+    until(lambda: inbox.taken == 2 and not ahead.is_busy)
     ahead.close()
 
 

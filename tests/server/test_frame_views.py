@@ -7,7 +7,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.server.decoder import DecodedArrival
 from semcast.server.frame_views import missing_view
-from semcast.server.view.scene import MISSING
+from semcast.server.view.frame_view import MISSING
 
 CAMERA = Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
 

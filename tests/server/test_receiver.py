@@ -5,10 +5,12 @@ from dataclasses import replace
 import msgpack
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.channel.awgn import complex_noise
 from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.levels import Levels
+from semcast.common.loopback import open_hub
 from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
@@ -16,21 +18,13 @@ from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.phy.qam import constellation
 from semcast.common.symbol_payload import pack_iq, pack_lost
-from semcast.common.transport import open_client, open_hub
+from semcast.common.transport import open_client
 from semcast.common.wire import pack, unpack
 from semcast.server import backlog
 from semcast.server.receiver import WINDOW, Receiver
 
 HW = (64, 128)
 EPOCH = 10**18
-
-
-def until(condition, deadline_s=10.0):
-    end_s = time.monotonic() + deadline_s
-    tick = threading.Event()
-    while not condition():
-        assert time.monotonic() < end_s, "the condition did not come true in time"
-        tick.wait(0.005)
 
 
 def camera(epoch=EPOCH, lossless=False):

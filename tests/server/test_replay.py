@@ -22,6 +22,7 @@ from semcast.cli import main
 from semcast.common.codecs import load_codec
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import ConfigError, SemcastError, SourceError
+from semcast.common.loopback import open_hub
 from semcast.common.messages import CameraInfo, SymbolFrame
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
@@ -29,7 +30,6 @@ from semcast.common.recording_reader import RecordingReader
 from semcast.common.recording_writer import RecordingWriter, recording_metadata, recover_file
 from semcast.common.run_folder import read_run
 from semcast.common.sequence import open_sequence
-from semcast.common.transport import open_hub
 from semcast.common.wire import pack, unpack
 from semcast.describe import describe_recording
 from semcast.server.record import RecordSettings, StreamNotes, kind_of_key, run_record

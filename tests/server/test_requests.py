@@ -1,8 +1,8 @@
 import functools
 import threading
-import time
 
 import pytest
+from waiting import until
 
 from semcast.common.errors import SemcastError
 from semcast.server.requests import RequestDesk
@@ -21,10 +21,12 @@ def test_requests_for_the_same_thing_are_served_once_and_in_the_order_of_the_han
         served.append(what)
         return f"{what} done"
 
-    deadline_s = time.monotonic() + 60.0
-    while len(answers) < 3 and time.monotonic() < deadline_s:
-        if served or len(desk._waiting) == 2:  # from when both are asked for
+    def all_answered():
+        if served or len(desk.waiting) == 2:  # from when both are asked for
             desk.serve({what: functools.partial(serve, what) for what in ("reset", "save")})
+        return len(answers) == 3
+
+    until(all_answered)
     assert served[:2] == ["reset", "save"]
     assert sorted(answers) == [("reset", "reset done"), ("save", "save done"), ("save", "save done")]
 
@@ -55,18 +57,14 @@ def test_who_asks_for_what_fails_is_told_so_and_the_rest_is_served(error):
 
     asking = threading.Thread(target=ask)
     asking.start()
-    deadline_s = time.monotonic() + 60.0
-    while not desk._waiting and time.monotonic() < deadline_s:
-        time.sleep(0.001)
+    until(lambda: desk.waiting == {"save"})
     served = []
     threading.Thread(target=lambda: served.append(desk.ask("map", 60.0))).start()
-    while len(desk._waiting) < 2 and time.monotonic() < deadline_s:
-        time.sleep(0.001)
+    until(lambda: desk.waiting == {"save", "map"})
     desk.serve({"save": fail, "map": lambda: "map"})
     asking.join(60.0)
     assert told
-    while not served and time.monotonic() < deadline_s:
-        time.sleep(0.001)
+    until(lambda: served)
     assert served == ["map"]
 
 
@@ -81,9 +79,7 @@ def test_what_went_wrong_is_told_in_words():
             target=lambda desk=desk, told=told: told.append(desk.error_of("save", 60.0))
         )
         asking.start()
-        deadline_s = time.monotonic() + 60.0
-        while not desk._waiting and time.monotonic() < deadline_s:
-            time.sleep(0.001)
+        until(lambda desk=desk: desk.waiting == {"save"})
         desk.serve({"save": handle})
         asking.join(60.0)
         assert words in told[0]
@@ -94,9 +90,7 @@ def test_a_desk_that_is_closed_refuses_what_waits_and_what_comes():
     desk, told = RequestDesk(), []
     asking = threading.Thread(target=lambda: told.append(desk.error_of("save", 60.0)))
     asking.start()
-    deadline_s = time.monotonic() + 60.0
-    while not desk._waiting and time.monotonic() < deadline_s:
-        time.sleep(0.001)
+    until(lambda: desk.waiting == {"save"})
     desk.close()
     desk.close()
     asking.join(60.0)

@@ -13,10 +13,10 @@ from semcast.cli import verb_parser
 from semcast.commands.running import read_settings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import CheckpointError, ConfigError, SourceError
+from semcast.common.loopback import open_hub
 from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import HubSettings
 from semcast.common.sequence import open_sequence
-from semcast.common.transport import open_hub
 from semcast.server.server import Server
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import is_nearly_final

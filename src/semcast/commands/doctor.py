@@ -21,8 +21,10 @@ from rich.text import Text
 from semcast.commands.console import plain_console
 from semcast.commands.paths import named_path
 from semcast.common.cores import usable_cores
-from semcast.common.errors import ConfigError
-from semcast.common.messages import ROLES
+from semcast.common.errors import ConfigError, TransportError
+from semcast.common.messages import ROLES, StatusMessage
+from semcast.common.metrics import frames_in_words
+from semcast.common.network_settings import NetworkSettings
 from semcast.server.view.process import window_display
 
 Verdict = Literal["good", "note", "bad"]
@@ -40,6 +42,11 @@ _PACKAGES = {
     "rerun-sdk": "no viewer (extra 'server')",
     "poselib": "no two-view start, so no server (extra 'server')",
 }
+
+#: How long a system may take to answer.
+_CONNECT_S = 2.0
+#: role -> what it does to a frame, as it counts.
+_EVENTS = {"agent": "sent", "channel": "carried", "server": "tracked"}
 
 
 @dataclass(frozen=True)
@@ -146,8 +153,7 @@ def check_port(port: int) -> Iterator[Finding]:
 
 def check_loopback() -> Iterator[Finding]:
     """Send one message through a real Zenoh session pair on loopback."""
-    from semcast import TransportError
-    from semcast.common.transport import loopback_round_trip_ms
+    from semcast.common.loopback import loopback_round_trip_ms
 
     try:
         yield Finding("zenoh loopback", "good", f"{loopback_round_trip_ms():.1f} ms there and back")
@@ -156,22 +162,47 @@ def check_loopback() -> Iterator[Finding]:
 
 
 def check_system(connect: str, agent_id: str, zenoh_config: Path | None = None) -> Iterator[Finding]:
-    """Ask a running system which roles are alive."""
-    from semcast import TransportError
-    from semcast.common.transport import alive_roles
+    """Ask a running system which roles are alive, and what these say of themselves."""
+    from semcast.common.status_beat import hear_statuses
+    from semcast.common.transport import open_client
 
     try:
-        roles = alive_roles(connect, agent_id, zenoh_config)
+        with open_client(_network(connect, zenoh_config), _CONNECT_S) as session:
+            roles = session.alive_roles(agent_id, _CONNECT_S)
+            statuses = hear_statuses(session, agent_id, roles)
     except TransportError as err:
         yield Finding(f"system at {connect}", "bad", str(err))
         return
     for role in ROLES:
-        alive = role in roles
-        yield Finding(
-            f"{role} ({agent_id})",
-            "good" if alive else "note",
-            "alive" if alive else f"not seen: start it with 'semcast {role}'",
-        )
+        what = f"{role} ({agent_id})"
+        if role in statuses:
+            yield Finding(what, "note" if statuses[role].last_error else "good", _in_words(statuses[role]))
+        elif role in roles:
+            yield Finding(what, "note", "alive, but says nothing of itself: it hangs, or is just ending")
+        else:
+            yield Finding(what, "note", f"not seen: start it with 'semcast {role}'")
+
+
+def _in_words(status: StatusMessage) -> str:
+    """Say what a role says of itself, its last error included."""
+    event = _EVENTS[status.role]
+    frames = frames_in_words(event, status.counts.get(event, 0), status.drops)
+    rate_hz = status.rates_hz.get(event, 0.0)
+    text = f"alive for {status.uptime_s:.0f} s, {rate_hz:.1f} frames a second, {frames}"
+    text += f"; is at: {status.activity}" if status.activity else ""
+    return text + (f"; last error: {status.last_error}" if status.last_error else "")
+
+
+def _network(connect: str, zenoh_config: Path | None) -> NetworkSettings:
+    """Return the way to a hub.
+
+    Raises:
+        TransportError: It is none.
+    """
+    try:
+        return NetworkSettings(connect=(connect,), zenoh_config=zenoh_config)
+    except ValueError as err:
+        raise TransportError(str(err)) from err
 
 
 def print_required(connect: str, agent_id: str, required: Iterable[str], zenoh_config: Path | None) -> int:
@@ -180,9 +211,10 @@ def print_required(connect: str, agent_id: str, required: Iterable[str], zenoh_c
     Raises:
         TransportError: Nothing answers there.
     """
-    from semcast.common.transport import alive_roles
+    from semcast.common.transport import open_client
 
-    roles = alive_roles(connect, agent_id, zenoh_config)
+    with open_client(_network(connect, zenoh_config), _CONNECT_S) as session:
+        roles = session.alive_roles(agent_id, _CONNECT_S)
     missing = [role for role in required if role not in roles]
     for role in missing:
         plain_console().print(
@@ -208,7 +240,9 @@ def required_roles(text: str) -> tuple[str, ...]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "--connect", metavar="ENDPOINT", help="also check a running system, such as tcp/127.0.0.1:7447"
+        "--connect",
+        metavar="ENDPOINT",
+        help="also check a running system, such as tcp/127.0.0.1:7447: what its roles count, and last errors",
     )
     parser.add_argument(
         "--agent-id", default="agent0", metavar="NAME", help="whose roles to look for (default agent0)"

@@ -1,9 +1,9 @@
 """What other processes ask of a server."""
 
 import os
-import time
 
 import pytest
+from waiting import until
 
 from semcast.common.errors import SemcastError
 
@@ -13,7 +13,7 @@ DEADLINE_S = 60.0
 
 
 def test_control_requests_reset_and_save(tmp_path, air, monkeypatch):
-    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
+    monkeypatch.setattr("semcast.server.control.SERVE_WAIT_S", DEADLINE_S)
     running = air.serve(out=tmp_path)
     radio = air.agent(100)
     radio.stream(range(10))
@@ -22,10 +22,7 @@ def test_control_requests_reset_and_save(tmp_path, air, monkeypatch):
     assert radio.ask("get").settings["mode"] == "live"
     assert not radio.ask("explode").ok
     assert radio.ask("save").ok
-    deadline = time.monotonic() + DEADLINE_S
-    while not (tmp_path / "map.ply").exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    until((tmp_path / "map.ply").exists)
     assert not (tmp_path / "summary.json").exists()
     assert radio.ask("reset").ok
     radio.stream(range(10, 14))
@@ -34,7 +31,7 @@ def test_control_requests_reset_and_save(tmp_path, air, monkeypatch):
 
 
 def test_a_save_that_fails_is_answered_and_the_stream_goes_on(tmp_path, air, caplog, monkeypatch):
-    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
+    monkeypatch.setattr("semcast.server.control.SERVE_WAIT_S", DEADLINE_S)
     (tmp_path / "map.ply").mkdir()
     running = air.serve(out=tmp_path)
     radio = air.agent(100)
@@ -44,14 +41,14 @@ def test_a_save_that_fails_is_answered_and_the_stream_goes_on(tmp_path, air, cap
     assert reply.error.startswith(f"outputs can't be written to {tmp_path}: ")
     assert "map.ply" in reply.error
     assert reply.error in caplog.text
-    assert running.server._metrics.status(100).last_error == reply.error
+    assert running.server.metrics.status(100).last_error == reply.error
     radio.stream([2, 3])
     with pytest.raises(SemcastError, match="map.ply"):
         running.finish(stop=True)
 
 
 def test_a_save_that_fails_in_a_folder_whose_name_is_no_text_is_answered(tmp_path, air, monkeypatch):
-    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
+    monkeypatch.setattr("semcast.server.control.SERVE_WAIT_S", DEADLINE_S)
     folder = tmp_path / os.fsdecode(b"out\xff")
     (folder / "map.ply").mkdir(parents=True)
     running = air.serve(out=folder)

@@ -1,9 +1,8 @@
 """The map over the network, for who comes late."""
 
-import time
-
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.common.map_mirror import MapMirror
 from semcast.common.network_settings import NetworkSettings
@@ -17,15 +16,8 @@ AGENT = "cam0"
 DEADLINE_S = 60.0
 
 
-def until(condition, what):
-    deadline_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline_s, f"not within {DEADLINE_S} s: {what}"
-        time.sleep(0.01)
-
-
 def test_who_comes_late_has_the_whole_map_and_follows_it(tmp_path, air, monkeypatch, read_ply):
-    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
+    monkeypatch.setattr("semcast.server.control.SERVE_WAIT_S", DEADLINE_S)
     running = air.serve(out=tmp_path)
     radio = air.agent(100)
     with open_client(NetworkSettings(connect=(air.endpoint,)), DEADLINE_S) as client:
@@ -77,7 +69,7 @@ def test_a_server_without_a_map_has_no_answer(air):
 
 
 def test_a_map_of_many_hours_is_sent_and_one_that_cannot_be_ends_no_stream(air, monkeypatch, caplog):
-    monkeypatch.setattr("semcast.server.server.SERVE_WAIT_S", DEADLINE_S)
+    monkeypatch.setattr("semcast.server.control.SERVE_WAIT_S", DEADLINE_S)
     running = air.serve()
     radio = air.agent(100)
     radio.stream(range(8))

@@ -208,7 +208,7 @@ def test_a_former_start_that_cannot_be_written_does_not_stop_the_new_one(tmp_pat
     assert json.loads((former / "summary.json").read_text())["frames"]["tracked"] == 6
     assert len((former / "frames.jsonl").read_text().splitlines()) == 6, "what was written is kept"
     assert len((tmp_path / "frames.jsonl").read_text().splitlines()) == 4
-    assert running.server._metrics.counts["errors"] == 1
+    assert running.server.metrics.counts["errors"] == 1
 
 
 def test_a_new_start_that_cannot_be_written_is_kept_in_memory(tmp_path, air, caplog):

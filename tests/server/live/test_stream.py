@@ -14,6 +14,7 @@ import pytest
 from semcast.common.codecs import load_codec
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.keys import status_key
+from semcast.common.loopback import open_hub
 from semcast.common.messages import StatusMessage
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
@@ -21,7 +22,7 @@ from semcast.common.phy.slots import layout_for
 from semcast.common.run_folder import read_run
 from semcast.common.symbol_payload import pack_lost
 from semcast.common.trajectory import read_tum
-from semcast.common.transport import open_client, open_hub
+from semcast.common.transport import open_client
 from semcast.common.wire import pack, unpack
 from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server
@@ -163,7 +164,7 @@ def test_a_frame_that_waited_too_long_for_the_tracker_is_dropped(air, monkeypatc
 def test_a_bundle_adjustment_that_gave_up_is_in_the_status(air):
     running = air.serve(bundle="process", duration_s=0.1)
     running.server._spare_bundle._give_up()
-    assert running.server._metrics.status(0).last_error == GIVEN_UP
+    assert running.server.metrics.status(0).last_error == GIVEN_UP
     running.finish()
 
 
@@ -178,6 +179,17 @@ def test_a_silent_stream_ends_with_the_idle_limit_and_its_outputs(tmp_path, air)
     radio.stream(range(3))
     assert running.finish()["frames"]["tracked"] == 3
     assert (tmp_path / "summary.json").exists()
+
+
+def test_the_idle_limit_counts_from_the_first_frame_however_long_ago_the_server_was_started(air):
+    running = air.serve(idle_timeout_s=0.3)
+    assert not running.stop.wait(0.4)
+    radio = air.agent(100)
+    radio.wait(lambda: radio.allowed > 0, "word that the server is ready")
+    assert not running.stop.wait(0.4)
+    assert running.thread.is_alive()
+    radio.stream(range(3))
+    assert running.finish()["frames"]["tracked"] == 3
 
 
 def test_a_server_decodes_with_weights_of_ones_own(tiny_weights):
@@ -205,7 +217,7 @@ def test_a_recording_that_breaks_off_leaves_the_results_and_is_an_error_at_the_e
     radio.stream(range(3))
     with pytest.raises(SourceError, match=r"run\.mcap is not complete: .*No space left"):
         running.finish(stop=True)
-    status = running.server._metrics.status(0)
+    status = running.server.metrics.status(0)
     assert status.last_error.endswith("run.mcap ended: [Errno 28] No space left on device")
     assert running.summary["frames"]["tracked"] == 3
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"]["tracked"] == 3
@@ -245,4 +257,4 @@ def test_an_agent_that_was_there_before_goes_on_when_one_of_the_same_name_has_en
         k += 1
         time.sleep(0.2)
     running.finish(stop=True)
-    assert running.server._metrics.drops["epoch"] > 0, "while the second was sending"
+    assert running.server.metrics.drops["epoch"] > 0, "while the second was sending"

@@ -1,6 +1,7 @@
 """A rolling shutter that nobody told of is found while the map grows, and made up for."""
 
 import logging
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -105,7 +106,7 @@ def test_a_lens_that_is_clearly_another_one_is_told_once(caplog):
     assert "semcast lens" not in told(1.0)
     text = told(1.06)
     assert text.count("the focal length seems") == 1
-    assert "% too short for what is seen: semcast lens measures it" in text
+    assert re.search(r"about [567] % too short for what is seen: semcast lens measures it", text)
     text = told(1.0, radial=-0.1)
     assert text.count("the distortion seems off (k1 -0.1") == 1
     assert "focal length" not in text

@@ -1,17 +1,18 @@
 """What is submitted comes into the scene, all of it and in order, whatever fails on the way."""
 
 import threading
-import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.settings import ViewSettings
-from semcast.server.view.scene import Cursor, FrameView
+from semcast.server.view.frame_view import FrameView
+from semcast.server.view.scene import Cursor
 
 pytest.importorskip("rerun")
 
@@ -64,27 +65,28 @@ def held(monkeypatch):
 
 
 def seen(feed):
-    """Return frames, landmarks and poses that a viewer would be shown now."""
-    changes = feed._scene.changes_since(Cursor())
+    """Return frames, landmarks and path that a viewer would be shown now."""
+    changes = feed.changes_since(Cursor())
+    path = np.concatenate([strip for strips in changes.segments.values() for strip in strips])
     points = np.concatenate([np.zeros((0, 3)), *(chunk.xyz for chunk in changes.chunks)])
-    return [row.frame_id for row in changes.rows], sorted(points[:, 0].tolist()), feed._scene.poses()
+    return [row.frame_id for row in changes.rows], sorted(points[:, 0].tolist()), path
 
 
 def test_a_scene_that_is_far_behind_misses_nothing(held):
     feed, may_go_on = held
     for k in range(40):
         feed.submit(frame(k), update(k))
-    assert len(feed._pending) <= 5
+    assert feed.num_pending <= 5
     may_go_on.set()
     feed.close()
     in_time = ViewerFeed(ViewSettings(view="none"), CAMERA, "in time")
     for k in range(40):
         in_time.submit(frame(k), update(k))
     in_time.close()
-    frames, landmarks, poses = seen(feed)
+    frames, landmarks, path = seen(feed)
     assert frames == list(range(40))
     assert landmarks == list(range(40))
-    np.testing.assert_array_equal(poses, seen(in_time)[2])
+    np.testing.assert_array_equal(path, seen(in_time)[2])
 
 
 def test_an_update_that_makes_no_sense_costs_itself_alone(held, caplog):
@@ -134,9 +136,7 @@ def test_a_viewer_that_fails_is_connected_to_anew_and_gets_everything(monkeypatc
     monkeypatch.setattr(ViewerFeed, "_open_stream", lambda self, file: viewer.open(file))
     feed = ViewerFeed(ViewSettings(view="web", image_rate_hz=60), CAMERA, "anew", process=viewer)
     feed.submit(frame(0), update(0))
-    deadline_s = time.monotonic() + 30
-    while not viewer.rows and time.monotonic() < deadline_s:
-        time.sleep(0.005)
+    until(lambda: viewer.rows)
     feed.submit(frame(1), update(1))
     feed.close()
     assert viewer.rows == [0, 1]

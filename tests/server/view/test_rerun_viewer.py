@@ -13,6 +13,7 @@ from threading import Thread
 
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError
@@ -20,7 +21,7 @@ from semcast.common.geometry import make_transform
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
-from semcast.server.view.scene import FrameView
+from semcast.server.view.frame_view import FrameView
 from semcast.server.view.settings import ViewSettings
 
 pytest.importorskip("rerun")
@@ -43,13 +44,6 @@ def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
-
-
-def wait_until(condition, what):
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"not within {DEADLINE_S} s: {what}"
-        time.sleep(0.01)
 
 
 def frame(k):
@@ -195,7 +189,7 @@ def test_what_listens_and_is_no_viewer_is_left_alone(caplog):
         Thread(target=other.serve_forever, daemon=True).start()
         feed = ViewerFeed(ViewSettings(view="web", port=other.server_port, web_port=free_port()), CAMERA, "r")
         feed.submit(frame(0))
-        wait_until(lambda: "is no viewer, nothing is shown" in caplog.text, "it is told")
+        until(lambda: "is no viewer, nothing is shown" in caplog.text, "it is told")
         time.sleep(1.0)
         feed.close()
         other.shutdown()
@@ -204,7 +198,7 @@ def test_what_listens_and_is_no_viewer_is_left_alone(caplog):
 
 def test_a_killed_viewer_is_back_soon_and_gets_the_stream_again(feed_and_proxy):
     feed, process, _ = feed_and_proxy
-    wait_until(lambda: feed.num_connections == 1, "first connection")
+    until(lambda: feed.num_connections == 1, "first connection")
     feed.submit(frame(0))
     first = process.pid
     os.kill(first, signal.SIGKILL)
@@ -221,7 +215,7 @@ def test_a_killed_viewer_is_back_soon_and_gets_the_stream_again(feed_and_proxy):
 
 def test_a_frozen_viewer_never_holds_up_the_tracker(feed_and_proxy):
     feed, process, _ = feed_and_proxy
-    wait_until(lambda: feed.num_connections == 1, "first connection")
+    until(lambda: feed.num_connections == 1, "first connection")
     os.kill(process.pid, signal.SIGSTOP)
     slowest_s = 0.0
     started_s = time.monotonic()
@@ -258,9 +252,9 @@ def test_a_viewer_opened_by_hand_later_gets_the_whole_scene(tmp_path):
         stderr=subprocess.DEVNULL,
     )
     try:
-        wait_until(lambda: feed.num_connections == 1, "the late viewer")
+        until(lambda: feed.num_connections == 1, "the late viewer")
         feed.submit(frame(1), Update(1))
-        wait_until(lambda: saved.exists() and b"map_confidence" in saved.read_bytes(), "scene at the viewer")
+        until(lambda: saved.exists() and b"map_confidence" in saved.read_bytes(), "scene at the viewer")
     finally:
         feed.close()
         assert late.poll() is None, "a viewer that is not ours was ended"
@@ -270,15 +264,15 @@ def test_a_viewer_opened_by_hand_later_gets_the_whole_scene(tmp_path):
 
 def test_a_viewer_shows_the_next_run_as_well(feed_and_proxy):
     feed, process, port = feed_and_proxy
-    wait_until(lambda: feed.num_connections == 1, "the viewer")
+    until(lambda: feed.num_connections == 1, "the viewer")
     feed.submit(frame(0), Update(0))
     child = process.pid
     assert feed.hand_over() is process
     following = ViewerFeed(ViewSettings(view="web", port=port), CAMERA, "test-next", process=process)
-    wait_until(lambda: following.num_connections == 1, "the viewer again")
+    until(lambda: following.num_connections == 1, "the viewer again")
     assert process.pid == child is not None
     os.killpg(child, signal.SIGKILL)
-    wait_until(lambda: process.pid not in (None, child), "a viewer that is still looked after")
+    until(lambda: process.pid not in (None, child), "a viewer that is still looked after")
     following.close()
     assert process.pid is None
 
@@ -305,7 +299,7 @@ def test_a_viewer_that_cannot_start_is_given_up_with_its_last_words(caplog):
 def test_a_window_the_user_closed_stays_closed():
     process = ViewerProcess("native", free_port(), 1, "1GB", command=(sys.executable, "-c", ""))
     process.start()
-    wait_until(lambda: process.supervise() or process.pid is None, "the end of the child")
+    until(lambda: process.supervise() or process.pid is None, "the end of the child")
     process.supervise()
     assert process.pid is None
     process.close()
@@ -356,5 +350,5 @@ def test_closing_takes_the_whole_process_group():
             return True
         return False
 
-    wait_until(gone, "end of the group")
+    until(gone, "end of the group")
     process.close()

@@ -7,17 +7,11 @@ import pytest
 
 from semcast.common.geometry import exp_se3, exp_so3, make_transform
 from semcast.common.trajectory import Trajectory
+from semcast.server.view.frame_view import MISSING, FrameView
 from semcast.server.view.landmark_table import CHUNK_LANDMARKS, LandmarkTable
-from semcast.server.view.scene import (
-    MISSING,
-    SEGMENT_POSES,
-    Cursor,
-    FrameView,
-    Scene,
-    align_poses,
-    compress_picture,
-    confidence_colours,
-)
+from semcast.server.view.path_table import SEGMENT_POSES
+from semcast.server.view.picture import compress_picture, confidence_colours
+from semcast.server.view.scene import Cursor, Scene, align_poses
 from semcast.server.view.spectator import Spectator, look_at
 
 
