@@ -1,7 +1,7 @@
 """Landmarks that are in sight but have lost their track are looked for again, where the pose expects them.
 
 Rows that did not arrive, a blur or a jerk end tracks; their landmarks are still in the map. They are followed
-from keyframes they were seen in not long ago, whose images are kept.
+from the newest keyframes they were seen in, whose images are kept.
 """
 
 from collections.abc import Iterator
@@ -19,9 +19,8 @@ from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
 
-#: Keyframes that landmarks are followed from, the newest of so many that have so many to look for: when
-#: something hid the view, the newest of all saw little more than what is seen now.
-_NUM_RECALLED, _NUM_CONSIDERED, _LEAST_LOST = 3, 12, 10
+#: Keyframes that are looked at here, the newest ones.
+_NUM_RECALLED = 3
 #: A point is looked for no nearer to the border than this.
 _BORDER_PX = 8
 
@@ -106,9 +105,9 @@ def recall_landmarks(
         Ids of the tracks that were found.
     """
     T_cam_world = invert_transform(T_world_cam)
-    found: list[NDArray[np.int64]] = []
-    for image in reversed(images.newest(_NUM_CONSIDERED)):
-        if len(found) == _NUM_RECALLED or sum(map(len, found)) >= wanted:
+    found = [np.zeros(0, np.int64)]
+    for image in reversed(images.newest(_NUM_RECALLED)):
+        if sum(map(len, found)) >= wanted:
             break
         keyframe = world.keyframe(image.frame_id)
         if keyframe is None or keyframe.submap != submap:
@@ -119,7 +118,7 @@ def recall_landmarks(
         expected = camera.project(points_cam)
         in_sight = sight.shows(expected, _BORDER_PX)
         lost, expected = lost[in_sight], expected[in_sight]
-        if len(lost) >= _LEAST_LOST:
+        if len(lost):
             seen = keyframe.ids[lost], keyframe.xy[lost]
             found.append(tracks.take_up(sight, image.grey, *seen, expected, reach_px))
-    return np.concatenate([np.zeros(0, np.int64), *found])
+    return np.concatenate(found)

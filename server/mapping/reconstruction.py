@@ -45,6 +45,8 @@ _FEW_INLIERS_SHARE = 0.2
 _REACH_PX, _REACH_BLIND_PX = 6.0, 20.0
 #: Share of the landmarks in sight that must agree with a pose found without a prior.
 _MIN_SHARE_WHEN_LOST = 0.5
+#: Landmarks a camera that was hidden is posed by: the first strip that comes into sight tells little.
+_LEAST_UNHIDDEN = 30
 #: Of a keypoint by which a place was recognised, until it is followed.
 _RECOGNISED_CONFIDENCE = 0.5
 
@@ -347,7 +349,7 @@ class Reconstruction:
         """Pose of a camera that rested and lost sight of everything, by what can be seen again from there."""
         T_world_cam = self._last_pose() if self._motion.rests else None
         pose = None if T_world_cam is None else self._with_more(sight, None, T_world_cam)
-        if pose is None or self._resembles(sight, pose):
+        if pose is None or (pose.num_inliers >= _LEAST_UNHIDDEN and self._resembles(sight, pose)):
             return pose
         self._tracks.keep(self._map.world.landmarks.rows(self._tracks.ids) < 0)
         return None
