@@ -30,6 +30,9 @@ MAX_READOUT_MS = 100.0
 _MOST_OFF_CENTRE = 0.25
 #: Side of an image in focal lengths at most: a view of 2 atan(6), 161 degrees.
 _MAX_SIZE_PER_FOCAL = 12.0
+#: Focal lengths per longer side from which a view (3 degrees, 690 mm on a 35 mm camera) is hardly meant, and
+#: ratio of the two focal lengths: 4:3 taken for 16:9 makes it 1.33, pixels that are not square seldom 1.1.
+_MOST_FOCALS_PER_SIZE, _MOST_OBLONG = 19.0, 1.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +84,8 @@ class Intrinsics:
     def check_possible(self, name: str) -> None:
         """Check that a camera can be like that, for those who read what a user gave.
 
-        A principal point far from the middle is warned of: it is what a calibration for larger images gives.
+        A principal point far from the middle is warned of, for a calibration for larger images gives one, and
+        so are focal lengths that are very long or very different from each other.
 
         Args:
             name: What the intrinsics belong to, for the message.
@@ -106,6 +110,18 @@ class Intrinsics:
                     f"{wrong}: {axis} must be at least {least_px:.1f} for images of {self.width}x"
                     f"{self.height} (a view of 160 degrees), got {focal_px:g}; focal lengths are in pixels"
                 )
+        if max(self.fx, self.fy) > _MOST_FOCALS_PER_SIZE * max(self.width, self.height):
+            logger.warning(
+                "%s: fx %g and fy %g are a view of less than 3 degrees in images of %dx%d: focal lengths are "
+                "in pixels of these",
+                *(name, self.fx, self.fy, self.width, self.height),
+            )
+        if max(self.fx / self.fy, self.fy / self.fx) > _MOST_OBLONG:
+            logger.warning(
+                "%s: fx is %g and fy %g, as of pixels that are far from square: is the calibration for "
+                "images of another shape?",
+                *(name, self.fx, self.fy),
+            )
 
     @property
     def K(self) -> Array:

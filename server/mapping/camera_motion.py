@@ -6,6 +6,8 @@ tell such an image from a camera that stopped at once. The next one that differs
 sets off from where it stood, one that went on is where it would have got to by then.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +31,9 @@ _SAME_DIRECTION = 0.5
 _SHORT_STAY = 2
 #: Points must lie so far in front of the camera, as share of their usual depth.
 _LEAST_DEPTH_SHARE = 0.05
+#: A camera rests when the image has moved by no more than this share of its width for so long. A hand that
+#: rests sways by less.
+_REST_NS, _REST_SHARE = 1_000_000_000, 0.03
 #: A frame that comes after so many intervals of those before it comes after a gap.
 _GAP_INTERVALS = 3.0
 _S_PER_NS = 1e-9
@@ -53,6 +58,16 @@ class CameraMotion:
         self._still: list[int] = []
         self._still_ns = 0
         self._has_gap = False
+        self._recent: list[tuple[int, Array]] = []
+        self._rests = False
+
+    @property
+    def rests(self) -> bool:
+        """Whether the camera rested when it was seen last: what it saw goes out of sight by being hidden.
+
+        One that stopped at once may have gone on.
+        """
+        return self._rests and not self._still
 
     @property
     def speed_map_per_s(self) -> float:
@@ -105,6 +120,7 @@ class CameraMotion:
             Earlier frames whose poses are of another time: their image was an older one.
         """
         self._has_gap = False
+        self._note_rest(t_source_ns, T_world_cam, xyz)
         T_world_go = self._motion.predict(t_source_ns)
         if self._moving is None or T_world_go is None:
             self._go_on(t_source_ns, T_world_cam)
@@ -143,12 +159,21 @@ class CameraMotion:
         withdrawn, self._still = self._still, []
         return withdrawn
 
+    def _note_rest(self, t_source_ns: int, T_world_cam: Array, xyz: Array) -> None:
+        """Compare with the pose of a while ago; none is remembered that is older than need be."""
+        self._recent.append((t_source_ns, T_world_cam.copy()))
+        while len(self._recent) > 2 and t_source_ns - self._recent[1][0] >= _REST_NS:
+            del self._recent[0]
+        since_ns, T_world_then = self._recent[0]
+        moved_px = _median_length(self._displacements(T_world_then, [T_world_cam], xyz)[0])
+        self._rests = t_source_ns - since_ns >= _REST_NS and moved_px <= _REST_SHARE * self._camera.width
+
     def _go_on(self, t_source_ns: int, T_world_cam: Array) -> None:
         self._motion.observe(t_source_ns, T_world_cam)
         self._moving = (t_source_ns, T_world_cam.copy())
         self._still = []
 
-    def _displacements(self, T_world_from: Array, to: tuple[Array, Array], xyz: Array) -> list[Array]:
+    def _displacements(self, T_world_from: Array, to: Sequence[Array], xyz: Array) -> list[Array]:
         """How points move in the image from one pose to others, ``(M, 2)`` each: of those in front in all."""
         in_cam = [transform_points(invert_transform(T), xyz) for T in (T_world_from, *to)]
         depth = np.median(in_cam[0][:, 2]) if len(xyz) else 0.0

@@ -25,13 +25,7 @@ from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
-from semcast.server.mapping.tracker import (
-    MIN_INLIERS,
-    Believing,
-    TrackedPose,
-    expected_positions,
-    track_pose,
-)
+from semcast.server.mapping.tracker import MIN_INLIERS, Believing, TrackedPose, expected_positions, track_pose
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import WorldMap
 
@@ -51,6 +45,8 @@ _FEW_INLIERS_SHARE = 0.2
 _REACH_PX, _REACH_BLIND_PX = 6.0, 20.0
 #: Share of the landmarks in sight that must agree with a pose found without a prior.
 _MIN_SHARE_WHEN_LOST = 0.5
+#: Landmarks a camera that was hidden is posed by: the first strip that comes into sight tells little.
+_LEAST_UNHIDDEN = 30
 #: Of a keypoint by which a place was recognised, until it is followed.
 _RECOGNISED_CONFIDENCE = 0.5
 
@@ -245,10 +241,13 @@ class Reconstruction:
 
     def _if_alike(self, sight: Sight, pose: TrackedPose) -> TrackedPose | None:
         """Return a pose whose tracks look as they did; of others nothing that was found is kept."""
-        if self._map.resembles(self._tracks, sight, pose.T_world_cam, pose.ids[pose.inliers]):
+        if self._resembles(sight, pose):
             return pose
         self._tracks.clear()
         return None
+
+    def _resembles(self, sight: Sight, pose: TrackedPose) -> bool:
+        return self._map.resembles(self._tracks, sight, pose.T_world_cam, pose.ids[pose.inliers])
 
     def _accept(self, sight: Sight, pose: TrackedPose) -> FrameResult:
         """Take a pose: note it, weed out tracks that slipped, and make a keyframe where one is due."""
@@ -306,7 +305,7 @@ class Reconstruction:
         if self._state is TrackingState.LOST:
             # An empty image is no sign of another place: only frames that a map could begin with count.
             self._lost_ns += [frame.t_source_ns] if len(tracks) >= MIN_POINTS else []
-            if self._settings.gives_up(self._lost_ns):
+            if self._settings.gives_up(self._lost_ns, rested=self._motion.rests):
                 logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
                 self._state = TrackingState.INITIALIZING
                 self._map.world.forget_frames(self._motion.give_up())
@@ -342,9 +341,18 @@ class Reconstruction:
         is_lost = self._state is TrackingState.LOST
         pose = self._pose(None, min_share=_MIN_SHARE_WHEN_LOST) if is_lost else None
         if pose is None:
-            pose = self._recognise(sight)
+            pose = (self._unhidden(sight) if is_lost else None) or self._recognise(sight)
         self._lap("relocalise", since)
         return pose
+
+    def _unhidden(self, sight: Sight) -> TrackedPose | None:
+        """Pose of a camera that rested and lost sight of everything, by what can be seen again from there."""
+        T_world_cam = self._last_pose() if self._motion.rests else None
+        pose = None if T_world_cam is None else self._with_more(sight, None, T_world_cam)
+        if pose is None or (pose.num_inliers >= _LEAST_UNHIDDEN and self._resembles(sight, pose)):
+            return pose
+        self._tracks.keep(self._map.world.landmarks.rows(self._tracks.ids) < 0)
+        return None
 
     def _recognise(self, sight: Sight) -> TrackedPose | None:
         place = self._map.recognise(sight)
@@ -367,14 +375,8 @@ class Reconstruction:
         grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
         T_world_ref, scale = self._map.bridge(self._motion, start, grown)
         self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, history)
-        backfilled = backfill(
-            self._camera,
-            self._map.world,
-            grown.keyframes,
-            history[:-1],
-            self._map.noise.model,
-            self._settings.seed,
-        )
+        noise, seed = self._map.noise.model, self._settings.seed
+        backfilled = backfill(self._camera, self._map.world, grown.keyframes, history[:-1], noise, seed)
         self._motion.reset()
         for posed in backfilled:
             self._moves_to(*posed, grown.ids)

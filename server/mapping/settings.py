@@ -9,6 +9,8 @@ from semcast.server.geometry.weighting import ConfidenceMode
 
 #: A place gets as many chances to be recognised, however far apart frames are.
 _LEAST_LOST_FRAMES = 3
+#: What hides everything from a camera at rest, as a bus before a car that waits, may take so long to pass.
+_HIDDEN_S = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +64,9 @@ class ReconstructionSettings:
     )
     lost_after_s: float = field(
         default=0.4,
-        metadata={"help": "seconds a lost camera is searched for before a new map is begun"},
+        metadata={
+            "help": "seconds a lost camera is searched for before a new map is begun, 3 at least if it rested"
+        },
     )
 
     def __post_init__(self) -> None:
@@ -89,14 +93,16 @@ class ReconstructionSettings:
             "top" if self.readout_from is None else self.readout_from,
         )
 
-    def gives_up(self, lost_ns: Sequence[int]) -> bool:
+    def gives_up(self, lost_ns: Sequence[int], *, rested: bool = False) -> bool:
         """Whether the map is not in sight any more.
 
         Args:
             lost_ns: Source times of the frames without a pose that show enough to begin a new one with.
+            rested: The camera rested before: its map is hidden, and a new one would be of what hides it.
         """
+        least_s = max(self.lost_after_s, _HIDDEN_S) if rested else self.lost_after_s
         enough = len(lost_ns) >= _LEAST_LOST_FRAMES
-        return enough and (lost_ns[-1] - lost_ns[0]) * 1e-9 >= self.lost_after_s
+        return enough and (lost_ns[-1] - lost_ns[0]) * 1e-9 >= least_s
 
     def watches_readout(self, camera: Intrinsics) -> bool:
         """Whether nobody says what readout the camera has."""

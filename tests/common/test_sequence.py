@@ -197,6 +197,25 @@ def test_a_calibration_for_larger_images_is_warned_of(native, scale, is_warned_o
     ) is is_warned_of
 
 
+@pytest.mark.parametrize(
+    ("factors", "warning"),
+    [
+        ((1.0, 1.0), ""),
+        ((1.0, 1.15), ""),
+        ((1.0, 1.33), "pixels that are far from square: is the calibration for images of another shape?"),
+        ((1.33, 1.0), "pixels that are far from square"),
+        ((100.0, 100.0), "a view of less than 3 degrees in images of"),
+    ],
+)
+def test_focal_lengths_that_are_hardly_meant_are_warned_of(native, factors, warning, caplog):
+    focal_px = CAMERA.width * np.array(factors)
+    values = {**CAMERA.to_dict(), "fx": focal_px[0], "fy": focal_px[1]}
+    (native / "intrinsics.json").write_text(json.dumps(values))
+    open_sequence(native)
+    assert warning in caplog.text
+    assert bool(warning) == bool(caplog.text)
+
+
 def test_a_wide_camera_with_its_principal_point_in_a_corner_is_taken(native):
     given = CameraSettings(fx=2.7, fy=2.0, cx=-0.5, cy=23.5)
     sequence = open_sequence(native, given, resize=0.5)

@@ -173,3 +173,21 @@ def test_an_image_is_looked_at_again_from_where_the_camera_would_have_got_to():
     was = xy[np.searchsorted(ids, tracks.ids[tracks.visible])]
     assert len(was) > 150
     assert np.median(np.abs(tracks.xy[tracks.visible] - (was - way))) < 0.1
+
+
+def test_a_camera_rests_when_the_image_has_hardly_moved_for_a_second():
+    motion = CameraMotion(CAMERA)
+    brakes = [*np.linspace(0.0, 5.0, 11), *(5.0 + 0.5 * (1 - 0.5 ** np.arange(1, 4)))]
+    go(motion, brakes)
+    go(motion, [5.5 + 0.01 * (-1) ** k for k in range(6)], first=14)
+    assert not motion.rests, "not for long"
+    go(motion, [5.5 + 0.01 * (-1) ** k for k in range(8)], first=20)
+    assert motion.rests, "it sways"
+    go(motion, [6.0, 6.5], first=28)
+    assert not motion.rests
+
+
+def test_a_camera_whose_image_stopped_at_once_may_have_gone_on_and_does_not_rest():
+    motion = CameraMotion(CAMERA)
+    go(motion, [*np.linspace(0.0, 2.0, 11), *[2.0] * 30])
+    assert not motion.rests

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from drawn_boards import CAMERA, FRAME_NS, ate_percent, frame_of, make, render
+from drawn_boards import CAMERA, FRAME_NS, ate_percent, board_texture, frame_of, make, render
 
 import semcast.server.mapping.map_builder as map_builder
 from semcast.common.geometry import (
@@ -45,6 +45,24 @@ def test_a_frame_counts_towards_a_new_map_that_one_could_begin_with(room):
     assert all(MIN_POINTS <= r.num_tracked < 50 for r in results[-5:])
     assert results[0].state is TrackingState.LOST
     assert results[-1].state is TrackingState.INITIALIZING
+
+
+def test_what_passes_before_a_camera_at_rest_begins_no_map():
+    """A bus passes before a car that waits: the image is full of it for a second, then shows more."""
+    x = [*np.linspace(0.0, 1.4, 15), *(1.6 - 0.2 * 0.6 ** np.arange(1, 35)), *np.linspace(1.7, 2.6, 10)]
+    truth = [make_transform(np.eye(3), (v, 0.05 * np.sin(4 * v), 0.0)) for v in x]
+    bus = board_texture(9, 1536)[300:540]
+    core, results = make(), []
+    for k, T in enumerate(truth):
+        image = render(T)
+        left = int(np.clip(320 - 60 * (k - 28), 0, 320))
+        right = int(np.clip(320 - 60 * (k - 40), 0, 320))
+        image[:, left:right] = bus[:, 25 * (k - 24) :][:, left:right, None] if left < right else 0
+        results.append(core.process(frame_of(k, image)))
+    assert all(r.T_world_cam is None for r in results[36:40]), "nothing but the bus is in sight"
+    assert {r.submap for r in results} == {0}
+    assert all(r.T_world_cam is not None for r in results[44:]), "as soon as some is seen again"
+    assert ate_percent(core.final_trajectory(), truth) < 0.5
 
 
 def test_the_unit_of_a_new_part_is_told_by_its_start_alone(monkeypatch):

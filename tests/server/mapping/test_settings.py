@@ -31,3 +31,12 @@ def test_a_map_is_given_up_after_a_time_and_not_before_some_frames():
     assert settings.gives_up(at[:5])
     assert not settings.gives_up([0, 10**10]), "two frames are too few chances, however long they took"
     assert ReconstructionSettings(lost_after_s=0.0).gives_up(at[:3])
+
+
+def test_a_map_of_a_camera_that_rested_is_given_up_later():
+    at = [k * 10**8 for k in range(32)]
+    settings = ReconstructionSettings(lost_after_s=0.4)
+    assert settings.gives_up(at[:30])
+    assert not settings.gives_up(at[:30], rested=True)
+    assert settings.gives_up(at[:31], rested=True)
+    assert not ReconstructionSettings(lost_after_s=5.0).gives_up(at, rested=True)
