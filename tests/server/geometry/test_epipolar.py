@@ -147,7 +147,7 @@ def test_rotation_alone_is_found():
 
 
 def test_of_two_angles_the_one_counts_more_where_pixels_are_smaller():
-    # Rays of lengths 1 and the root of 2; the second turned by 3 mrad about y: weights 1 and 2, 2 mrad in all.
+    # Rays of lengths 1 and the root of 2, the second turned by 3 mrad about y: weights 1 and 2, so 2 mrad.
     square = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
     xy0 = square.project([[0.0, 0, 1], [1, 0, 1]])
     xy1 = square.project([[0.0, 0, 1], exp_so3((0, 3e-3, 0)) @ (1, 0, 1)])
