@@ -45,12 +45,7 @@ def gilbert_elliott(
             f"mean_burst must be at least {least:g} for a share of {bad_share}, got {mean_burst}"
         )
     draws = rng.random(num)
-    bad = np.empty(num, dtype=bool)
-    state = False
-    for k in range(num):
-        if k == 0:
-            state = bool(draws[0] < bad_share)
-        else:
-            state = bool(draws[k] >= leave_bad) if state else bool(draws[k] < leave_good)
-        bad[k] = state
+    bad = draws < bad_share  # holds for the first one; each of the others depends on the one before it
+    for k in range(1, num):
+        bad[k] = draws[k] >= leave_bad if bad[k - 1] else draws[k] < leave_good
     return bad

@@ -1,8 +1,12 @@
 """How the tests run side by side, and shared fixtures."""
 
+import functools
 import os
+import re
 import signal
 from collections.abc import Generator
+from pathlib import Path
+from typing import Any
 
 # Threads of several processes that wait for each other by spinning cost a factor of three on two cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -22,12 +26,26 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep a file's tests in one process, for its fixtures, and those marked "real-time" in one: in turn."""
-    for item in items:
-        if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Keep a file's tests in one process, for its fixtures, and those marked "real-time" in one: in turn.
+
+    xdist's own groups are names appended to a test's id, which pytest forgets from 9.2 on.
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return group_of(config.rootpath / nodeid.split("::")[0])
+
+    return ByFile(config, log) if config.getoption("dist") == "loadgroup" else None
+
+
+@functools.cache
+def group_of(file: Path) -> str:
+    """Return the group a file is marked for, or its own."""
+    marked = re.search(r"^pytestmark = pytest\.mark\.xdist_group\(\"(.+)\"\)$", file.read_text("utf-8"), re.M)
+    return marked[1] if marked else str(file)
 
 
 @pytest.hookimpl(wrapper=True)

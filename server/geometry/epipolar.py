@@ -184,9 +184,8 @@ def fit_rotation(camera: Intrinsics, xy0: Array, xy1: Array, iterations: int = 8
     Returns:
         ``(3, 3)``; the identity without matches.
     """
+    # Rays keep their length: a pixel is a smaller angle away from the middle, and so such matches count more.
     ray0, ray1 = camera.unproject(xy0), camera.unproject(xy1)
-    ray0 /= np.linalg.norm(ray0, axis=1, keepdims=True)
-    ray1 /= np.linalg.norm(ray1, axis=1, keepdims=True)
     weight = np.ones(len(ray0))
     R = np.eye(3)
     for _ in range(iterations):

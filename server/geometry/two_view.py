@@ -10,8 +10,8 @@ pair's own residuals. A misleading confidence can therefore cost time, hardly ac
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import poselib
@@ -62,7 +62,6 @@ _MAX_TURNING_MATCHES, _TURNING_STEPS = 100, 6
 _BETA_SHARE = 0.5
 _CUT_SIGMAS = 2.5
 _MIN_SIGMA_PX = 0.1
-Model = Literal["essential", "homography", "rotation"]
 
 
 @dataclass(frozen=True)
@@ -70,16 +69,16 @@ class TwoViewResult:
     """Relative pose of two images.
 
     Attributes:
-        T_cam1_cam0: ``(4, 4)``, translation of length 1 (of no meaning for ``rotation``).
+        T_cam1_cam0: ``(4, 4)``, translation of length 1.
         inliers: ``(N,)`` bool: near the epipolar geometry and in front of both cameras.
-        model: ``rotation`` when turning alone explains the matches, ``homography`` when the pose came from
-            one plane, else ``essential``.
+        is_rotation: Turning alone explains the matches, and the translation has no meaning; False where
+            that was not asked.
         parallax_deg: Median angle between the rays of inliers.
     """
 
     T_cam1_cam0: Array
     inliers: NDArray[np.bool_]
-    model: Model
+    is_rotation: bool
     parallax_deg: float
 
 
@@ -140,19 +139,14 @@ def estimate_two_view(
         for rows, in_order in _orders_of_drawing(len(xy0), kept, confidence)
     ]
     candidates += _near_turning(camera, xy0[kept], xy1[kept], threshold_px)
-    num_searched = len(candidates)
     if choose_model:
         candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
-    best = _likeliest(camera, candidates, xy0, xy1, _weights(agreement), threshold_px)
-    if best is None:
+    T_found = _likeliest(camera, candidates, xy0, xy1, _weights(agreement), threshold_px)
+    if T_found is None:
         return None
-    chosen, T = best
     trusted = None if confidence is None else confidence[kept]
-    T = _refine(camera, T, xy0[kept], xy1[kept], trusted, threshold_px)
-    result = _result(camera, T, xy0, xy1, threshold_px, choose_model)
-    if chosen >= num_searched and result.model == "essential":
-        result = replace(result, model="homography")
-    return result
+    T = _refine(camera, T_found, xy0[kept], xy1[kept], trusted, threshold_px)
+    return _result(camera, T, xy0, xy1, threshold_px, choose_model)
 
 
 def _checked_matches(
@@ -198,8 +192,8 @@ def _likeliest(
     xy1: Array,
     weight: Array,
     threshold_px: float,
-) -> tuple[int, Array] | None:
-    """Which pose explains the matches best at the least turn, and that pose, its translation either way."""
+) -> Array | None:
+    """The pose that explains the matches best at the least turn, its translation either way."""
     judged: list[tuple[float, int, Array]] = []
     for k, candidate in enumerate(candidates):
         if candidate is None:
@@ -211,8 +205,7 @@ def _likeliest(
             judged.append((cost if k == 0 else _TO_DISPLACE * cost, k, T))
     if not judged:
         return None
-    _, chosen, T = min(judged, key=lambda item: item[:2])
-    return chosen, T
+    return min(judged, key=lambda item: item[:2])[2]
 
 
 def _kept(agreement: Array) -> NDArray[np.intp]:
@@ -355,14 +348,13 @@ def _result(
     depth0, depth1 = depths(camera, T, xy0, xy1)
     inliers = near & (depth0 > 0) & (depth1 > 0)
     angle = rays_angle_deg(camera, T, xy0, xy1)
-    model: Model = "essential"
+    is_rotation = False
     if choose_model and near.any():
         R = fit_rotation(camera, xy0[near], xy1[near])
         turned = rotation_residual_px(camera, R, xy0[near], xy1[near]) < 3.0 * threshold_px
-        if turned.mean() > 0.8:
-            model = "rotation"
+        is_rotation = bool(turned.mean() > 0.8)
     parallax = float(np.median(angle[inliers])) if inliers.any() else 0.0
-    return TwoViewResult(T, inliers, model, parallax)
+    return TwoViewResult(T, inliers, is_rotation, parallax)
 
 
 def _in_front_sign(camera: Intrinsics, T: Array, xy0: Array, xy1: Array) -> Array:

@@ -278,7 +278,7 @@ class Initialiser:
         enough = max(self._min_points(), _LEAST_AGREEING * int((~scene.alone).sum()))
         return (
             int(found.inliers.sum()) >= enough
-            and found.model != "rotation"
+            and not found.is_rotation
             and found.parallax_deg > _MIN_MEDIAN_PARALLAX_DEG
         )
 

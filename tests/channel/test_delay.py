@@ -1,4 +1,5 @@
 import queue
+import threading
 import time
 
 import numpy as np
@@ -61,6 +62,32 @@ def test_a_delay_taken_back_does_not_let_packets_overtake(ends):
     ends.line.put(b"slow", False, 80.0)
     ends.line.put(b"fast", False, 0.0)
     assert [ends.out.get(timeout=10)[0] for _ in range(2)] == [b"slow", b"fast"]
+
+
+def test_a_packet_without_delay_waits_for_one_that_is_being_sent_and_for_no_other():
+    began, may_end, sent = threading.Event(), threading.Event(), queue.Queue()
+
+    def send(packet, lossless):
+        if packet == b"slow":
+            began.set()
+            assert may_end.wait(10)
+        sent.put((packet, threading.current_thread()))
+
+    line = DelayLine(send)
+    line.put(b"slow", False, 1.0)
+    assert began.wait(10)
+    line.put(b"fast", False, 0.0)
+    may_end.set()
+    assert [sent.get(timeout=10)[0] for _ in range(2)] == [b"slow", b"fast"]
+    # Once the thread has seen that nothing is left, the caller sends again.
+    deadline_s = time.monotonic() + 10
+    sender = None
+    while sender is not threading.current_thread() and time.monotonic() < deadline_s:
+        line.put(b"later", False, 0.0)
+        sender = sent.get(timeout=10)[1]
+    assert sender is threading.current_thread()
+    line.close()
+    assert not line._thread.is_alive(), "a line where nothing waits ends too"
 
 
 def test_a_full_line_refuses_packets(ends):

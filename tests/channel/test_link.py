@@ -141,6 +141,9 @@ def test_carry_returns_symbols_and_honest_snr(encoded):
     assert received.shape_hw == encoded.shape_hw
     assert received.modulation == "16qam"
     np.testing.assert_allclose(received.effective_snr_db, 12.0, atol=1.5)
+    sent = Link(ChannelSettings(snr_db=12.0), 0).transmit(insert_pilots(encoded.symbols), 0.0)
+    by_pilots = sent.equalise(encoded).received
+    np.testing.assert_array_equal(by_pilots.symbols, received.symbols, "the truth is used where asked only")
     perfect = Link(ChannelSettings(snr_db=12.0), 0).carry(encoded, 0.0, perfect_csi=True)
     power = np.mean(np.abs(insert_pilots(encoded.symbols)) ** 2)
     np.testing.assert_allclose(perfect.effective_snr_db, 12.0 - 10 * np.log10(power), atol=1e-3)

@@ -37,6 +37,7 @@ def test_a_walk_steps_by_its_deviation_and_stays_in_range():
     walk = RandomWalkTrace(10.0, 0.5, 1)
     values = np.array([walk.snr_db(0.5 * k) for k in range(4000)])
     assert np.std(np.diff(values)) == pytest.approx(0.5, rel=0.06)
+    assert walk.snr_db(1.125) == pytest.approx(0.75 * values[2] + 0.25 * values[3])
     assert np.abs(np.diff(values)).max() < 5 * 0.5
     # Thrown back at either end and not held there, a walk is everywhere alike often.
     narrow = RandomWalkTrace(5.0, 0.5, 1, range_db=(4.0, 7.0))

@@ -12,6 +12,7 @@ from semcast.common.errors import ConfigError
 from semcast.common.image import psnr_db
 from semcast.common.phy.slots import layout_for
 from semcast.common.rate import (
+    NATIVE_RATE,
     RATES,
     RateControl,
     belongs_to,
@@ -41,6 +42,15 @@ def test_no_more_uses_than_the_rate_allows_and_hardly_fewer(shape_hw, rate):
     aspect = coded[1] / coded[0] / (shape_hw[1] / shape_hw[0])
     assert 0.65 < aspect < 1.4 if min(shape_hw) < 200 else 0.9 < aspect < 1.1
     assert belongs_to(coded, shape_hw)
+
+
+def test_an_image_is_made_smaller_by_averaging_and_at_the_native_rate_it_stays():
+    noise = np.random.default_rng(0).integers(0, 256, (96, 96, 3)).astype(np.uint8)
+    assert to_coded(noise, NATIVE_RATE) is noise
+    small = to_coded(noise, "1/48")
+    assert small.shape[:2] == coded_shape((96, 96), "1/48")
+    # The mean over three pixels has 1 / sqrt(3) of the noise; interpolated pixels keep nearly all of it.
+    assert small.std() < 0.65 * noise.std()
 
 
 def test_only_sizes_of_a_rate_belong_to_a_camera():

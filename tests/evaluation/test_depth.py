@@ -6,8 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.sequence import open_sequence
+from semcast.evaluation import depth
 from semcast.evaluation.depth import DepthSettings, evaluate_depth
 from semcast.evaluation.keyframe_depth import DepthKeyframe, confirmed_depths, reconstructed
 from semcast.evaluation.pipeline import run_frames
@@ -46,7 +48,14 @@ def test_a_recording_is_measured_against_its_originals(room, phase_codec, tmp_pa
 
 def test_a_drawn_scene_is_measured_against_its_exact_depth(phase_codec):
     settings = DepthSettings(
-        scene="orbit", seconds=0.8, poses="true", codec=("phase",), snr_db=(20.0,), confidence=("off",)
+        scene="orbit",
+        scene_seed=1,
+        pace="fast",
+        seconds=0.8,
+        poses="true",
+        codec=("phase",),
+        snr_db=(20.0,),
+        confidence=("off",),
     )
     report = evaluate_depth(settings, [phase_codec])
     assert report["reference"] == "exact"
@@ -55,6 +64,48 @@ def test_a_drawn_scene_is_measured_against_its_exact_depth(phase_codec):
     assert clean["coverage"] > 0.3
     assert clean["median_error"] < 0.01
     assert clean["coverage"] > decoded["coverage"]
+
+
+def drawn(truth, metres):
+    """One keyframe, 1 to 4 units of depth, whose view has four pixels with these depths in metres."""
+    image = np.full((2, 2, 3), 90, np.uint8)
+    camera = Intrinsics(fx=2, fy=2, cx=0.5, cy=0.5, width=2, height=2)
+    keyframe = DepthKeyframe(np.eye(4), DepthRange(1.0, 2.0, 4.0))
+    scene = depth._Scene(None, {5: keyframe}, metres, {5: np.asarray(truth, np.float32)})
+    return depth._Reference(scene, {5: view_of(5, image, None, camera)}, {})
+
+
+def test_errors_and_their_figures_by_hand():
+    against = drawn([[2.0, 4.0], [8.0, np.inf]], metres=2.0)
+    # Inverse depths of map units: 2.5 m where 2 m are, nothing, 8 m where 8 m are, and a depth of the sky.
+    errors, num_pixels = against.errors({5: np.array([[0.8, np.nan], [0.25, 0.1]], np.float32)})
+    assert errors.tolist() == pytest.approx([0.25, 0.0, np.inf])
+    assert num_pixels == 3
+    lost = against.errors({})
+    assert (lost[0].tolist(), lost[1]) == ([], 3)
+    row = depth._row("x", 6.0, "on", [(errors, num_pixels), lost], [20.0, None, 30.0], 0.5)
+    assert row["coverage"] == pytest.approx(2 / 6)
+    assert row["median_error"] == pytest.approx(0.125)
+    assert row["outlier_share"] == pytest.approx(2 / 3)
+    assert (row["psnr_db"], row["lost"]) == (25.0, 0.5)
+    nothing = depth._row("x", 6.0, "on", [lost], [None], 1.0)
+    assert (nothing["coverage"], nothing["median_error"], nothing["outlier_share"]) == (0.0, None, None)
+
+
+def test_near_is_red_far_is_blue_and_what_is_not_known_is_black():
+    against = drawn(np.ones((2, 2)), metres=1.0)
+    (near, far), (nothing, unknown) = against.coloured(5, np.array([[1.0, 0.25], [0.0, np.nan]]))
+    assert near[0] > 2 * near[2]
+    assert far[2] > far[0]
+    assert nothing.tolist() == unknown.tolist() == [0, 0, 0]
+    assert against.coloured(5, None, (3, 4)).shape == (3, 4, 3)
+
+
+def test_depth_of_a_smaller_image_is_that_at_the_centres_of_its_pixels():
+    depth_map = np.arange(54, dtype=np.float32).reshape(6, 9)
+    # Of three pixels in a row the middle one.
+    assert depth._at_centres(depth_map, (2, 3)).tolist() == [[10, 13, 16], [37, 40, 43]]
+    np.testing.assert_array_equal(depth._at_centres(depth_map, (6, 9)), depth_map)
 
 
 def test_wrong_poses_confirm_next_to_nothing(room):
@@ -66,7 +117,7 @@ def test_wrong_poses_confirm_next_to_nothing(room):
     place = {k: DepthKeyframe(truth.T_world_cam[k], DepthRange(2.0, 5.0, 9.0)) for k in ids}
     swapped = {k: place[(7 * k + 4) % 24] for k in ids}
     right, wrong = (
-        np.mean([np.isfinite(depth).mean() for depth in confirmed_depths(frames, views).values()])
+        np.mean([np.isfinite(found).mean() for found in confirmed_depths(frames, views).values()])
         for frames in (place, swapped)
     )
     assert right > 0.5
@@ -82,7 +133,7 @@ def test_keyframes_know_between_which_depths_their_landmarks_are(room):
         assert 0 < frame.sought.nearest < frame.sought.median < frame.sought.farthest
     k, frame = next(iter(keyframes.items()))
     moved = frame.with_poses_of(np.eye(4), 2.0)
-    assert moved.sought == pytest.approx([2 * depth for depth in frame.sought])
+    assert moved.sought == pytest.approx([2 * near for near in frame.sought])
     np.testing.assert_array_equal(frame.T_world_cam, poses[k])
 
 

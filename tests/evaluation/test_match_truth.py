@@ -35,8 +35,15 @@ def test_true_matches_lie_on_their_epipolar_lines(rng):
 def test_epipolar_distance_by_hand():
     # sideways motion: epipolar lines are rows; 4 px off in y is 4 / sqrt(2) when both images share it
     T_cam1_cam0 = make_transform(np.eye(3), [1.0, 0.0, 0.0])
-    distance = epipolar_distance_px(np.array([[100.0, 50.0]]), np.array([[80.0, 54.0]]), T_cam1_cam0, CAMERA)
-    assert distance == pytest.approx([4 / np.sqrt(2)])
+    xy0, xy1 = np.array([[100.0, 50.0], [30.0, 90.0]]), np.array([[80.0, 54.0], [10.0, 89.0]])
+    distance = epipolar_distance_px(xy0, xy1, T_cam1_cam0, CAMERA)
+    assert distance == pytest.approx([4 / np.sqrt(2), 1 / np.sqrt(2)])
+
+
+def test_turning_alone_has_no_lines_and_all_is_infinitely_far_from_them():
+    T_cam1_cam0 = make_transform(exp_so3([0.0, 0.1, 0.0]), np.zeros(3))
+    xy = np.array([[100.0, 50.0], [320.0, 240.0]])
+    assert epipolar_distance_px(xy, xy, T_cam1_cam0, CAMERA).tolist() == [np.inf, np.inf]
 
 
 def test_points_follow_a_shift(texture):

@@ -1,8 +1,11 @@
+import re
+
+import numpy as np
 import pytest
 
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import table, with_part
-from semcast.evaluation.pair_summary import HELD_OUT, cells_of, pair_headline, pair_summary
+from semcast.evaluation.pair_summary import HELD_OUT, cells_of, pair_headline, pair_summary, ratio_text
 
 
 def cell(snr_db, errors_deg, interval=(-1.0, 1.0), **values):
@@ -92,6 +95,7 @@ def test_figures_by_hand():
     assert rows_of(text, "inverted |") == [["inverted", "-2.0", "-2.0"]]
     assert rows_of(text, "robust |") == [["robust", "-6.0", "-12.0"]]
     assert rows_of(text, "confidence |")[-1] == ["confidence", "0.25"]
+    assert text.rstrip().endswith("| 7.0 | 7.0 | 7.0 | 7.0 | 7.0 | 7.0 | 7.0 |")
 
 
 def test_a_cell_is_in_the_row_of_its_recording_of_its_link_of_its_number_of_matches_and_of_all():
@@ -114,8 +118,10 @@ def test_the_claim_of_the_paper_is_held_against_the_same_estimator_without_confi
     text = pair_summary([report(cell(2.0, {**ERRORS, "paper": 19.0}))])
     assert "Not reproduced.\n`robust` gains +0.0 of rotation and +0.0 of direction over `off`" in text
     assert "`paper` gains +0.5 of rotation and +1.0 of direction over `plain_ransac`" in text
-    # 5 degrees of rotation and 10 of direction are what the paper claims and more
-    assert "Not reproduced" not in pair_summary([report(cell(2.0, ERRORS))])
+    # Without confidence 20 degrees of direction and 10 of rotation: a degree of either is 19 or 9.
+    for paper, is_reproduced in ((18.2, False), (18.0, True), (10.0, True)):
+        text = pair_summary([report(cell(2.0, {**ERRORS, "paper": paper}))])
+        assert ("Not reproduced" not in text) == is_reproduced
 
 
 def test_what_confidence_gives_is_told_apart_from_what_the_additional_search_gives():
@@ -142,6 +148,17 @@ def test_a_ratio_of_few_cells_has_no_interval():
     assert rows_of(text, "tracks")[0][-1] == "1.00"
 
 
+def test_the_interval_of_a_ratio_is_two_standard_errors_to_either_side():
+    # Of 40 log ratios +-0.693 the mean is 0 and its standard error 0.111 with 39 degrees of freedom.
+    errors = [cell(2.0, {**ERRORS, "robust": ours, "off": 4.0}) for ours in (2.0, 8.0)] * 20
+    ratio, low, high = re.match(
+        r"(.*) \((.*) \.\. (.*)\)", ratio_text(cells_of([report(*errors)]), "robust", "off")
+    ).groups()
+    assert float(ratio) == 1.0
+    assert float(low) == pytest.approx(np.exp(-2.02 * 0.111), abs=0.03)
+    assert float(high) == pytest.approx(np.exp(2.02 * 0.111), abs=0.03)
+
+
 def test_the_recordings_left_out_of_tuning_are_those_of_the_suite():
     assert {"parking_synth_60", "phone_150"} == HELD_OUT
 
@@ -149,8 +166,8 @@ def test_the_recordings_left_out_of_tuning_are_those_of_the_suite():
 def test_original_images_have_a_table_of_their_own():
     clean = cell(None, {**ERRORS, "robust": 0.5})
     text = pair_summary([report(cell(2.0, ERRORS)), report(clean, codec="none")])
-    (row,) = rows_of(text[text.index("**Original images**") : text.index("**What confidence")], "room")
-    assert row[8] == "0.5"
+    _, row = rows_of(text[text.index("**Original images**") : text.index("**What confidence")], "")
+    assert (row[0], row[8]) == ("room; klt", "0.5")
     assert "Original images" not in pair_summary([report(cell(2.0, ERRORS))])
 
 

@@ -65,6 +65,13 @@ def test_a_stream_that_begins_with_a_wrong_number_is_taken_up_at_once(metrics):
     assert metrics.drops == {"stale": 2}
 
 
+def test_the_stream_of_a_restarted_agent_that_begins_with_a_wrong_number_is_taken_up_at_once_too(metrics):
+    arrivals = Arrivals(lossless=False, drop=metrics.drop)
+    former = [frame(k) for k in range(5)]
+    new = [frame(k, epoch=2) for k in (MAX_COUNT - 2, *range(10))]
+    assert accepted(arrivals, [*former, *new])[5:] == [MAX_COUNT - 2, *range(2, 10)]
+
+
 def test_a_lossless_stream_that_begins_with_a_wrong_number_is_taken_up_at_once(metrics):
     arrivals = Arrivals(lossless=True, drop=metrics.drop)
     far = frame(MAX_COUNT - 2, base_seq=MAX_COUNT - 2, lossless=True)

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 
@@ -28,6 +29,15 @@ def test_the_blocks_of_a_batch_share_one_budget():
 def test_without_an_exponent_all_blocks_are_alike():
     values = draw(exponent_min=0.0, exponent_max=0.0, block_sd=0.0, budget_sd=0.0, budget=94.0)
     assert (values == 94).all()
+
+
+def test_budgets_and_blocks_scatter_by_the_powers_of_two_that_are_set():
+    alike = {"exponent_min": 0.0, "exponent_max": 0.0, "budget": 50.0}
+    budgets = [float(draw(seed, **alike, block_sd=0.0, budget_sd=0.3).float().mean()) for seed in range(300)]
+    assert float(np.log2(budgets).mean()) == pytest.approx(np.log2(50.0), abs=4 * 0.3 / np.sqrt(300))
+    assert float(np.log2(budgets).std()) == pytest.approx(0.3, rel=0.2)
+    blocks = torch.cat([draw(seed, **alike, block_sd=0.4, budget_sd=0.0).flatten() for seed in range(20)])
+    assert float(blocks.double().log2().std()) == pytest.approx(0.4, rel=0.2)
 
 
 def test_what_is_behind_the_cut_of_a_row_is_in_the_next_slot():

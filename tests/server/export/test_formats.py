@@ -1,6 +1,7 @@
 """Every export is read back by the tool it is for, or by a parser written from that tool's specification."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -147,6 +148,7 @@ def test_nerfstudio_poses_and_points_project_onto_the_keypoints(tmp_path, arc_ru
     write_nerfstudio(tmp_path / "ns", data, images)
     content = json.loads((tmp_path / "ns" / "transforms.json").read_text())
     assert [f["file_path"] for f in content["frames"]] == [f"images/{k:06d}.jpg" for k in data.frame_ids]
+    assert [content[name] for name in ("k1", "k2", "p1", "p2")] == [0.0] * 4, "its images have no distortion"
     assert all((tmp_path / "ns" / f["file_path"]).is_file() for f in content["frames"])
     ply = read_ply(tmp_path / "ns" / content["ply_file_path"])
     points_up = np.stack([ply[a] for a in "xyz"], axis=1).astype(float)
@@ -235,6 +237,30 @@ def test_the_servers_own_rerun_recording_is_copied(tmp_path, arc_run, write_arc_
     (tmp_path / "run" / "run.rrd").write_bytes(b"as the server wrote it")
     export_run(tmp_path / "run", "rrd", tmp_path / "copy.rrd")
     assert (tmp_path / "copy.rrd").read_bytes() == b"as the server wrote it"
+    export_run(tmp_path / "run", "rrd", tmp_path / "part.rrd", part="0")
+    assert (tmp_path / "part.rrd").read_bytes() == b"as the server wrote it", "there is no other part"
+
+
+def test_of_a_map_of_several_parts_the_servers_own_recording_is_no_single_one(
+    tmp_path, arc_run, write_arc_run
+):
+    data = arc_run()
+    parts = np.where(np.arange(len(data.frame_ids)) < 4, 1, 0)
+    write_arc_run(tmp_path / "run", replace(data, frame_submap=parts), "all")
+    (tmp_path / "run" / "run.rrd").write_bytes(b"as the server wrote it")
+    for part, is_copy in (("all", True), ("0", False)):
+        export_run(tmp_path / "run", "rrd", tmp_path / f"{part}.rrd", part=part)
+        assert ((tmp_path / f"{part}.rrd").read_bytes() == b"as the server wrote it") == is_copy
+
+
+def test_a_run_without_a_posed_frame_has_nothing_to_export(tmp_path, arc_run, write_arc_run):
+    data = arc_run()
+    of_frames = ("frame_ids", "t_source_ns", "T_world_cam", "frame_submap", "keyframe_ids")
+    observed = ("observed_landmark_ids", "observed_keyframe_ids", "observed_xy")
+    nothing = {name: getattr(data, name)[:0] for name in (*of_frames, *observed)}
+    write_arc_run(tmp_path / "run", replace(data, **nothing), "all")
+    with pytest.raises(SourceError, match="has no posed frame, so there is nothing to export"):
+        export_run(tmp_path / "run", "tum", tmp_path / "poses.tum")
 
 
 def test_without_one_a_rerun_recording_is_made_of_poses_images_and_points(tmp_path, arc_run, write_arc_run):

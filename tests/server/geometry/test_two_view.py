@@ -12,7 +12,7 @@ from semcast.common.geometry import (
     transform_points,
 )
 from semcast.server.geometry import two_view
-from semcast.server.geometry.two_view import estimate_two_view
+from semcast.server.geometry.two_view import estimate_two_view, follows
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
 FAST = {"min_iterations": 100, "max_iterations": 1000}
@@ -88,14 +88,16 @@ def test_right_confidence_helps_where_matches_are_few_and_unequal():
 def test_turning_on_the_spot_is_recognised():
     _, xy0, xy1, _ = make_matches(0, t=(0.0, 0.0, 0.0), outlier_share=0.1)
     found = estimate_two_view(CAMERA, xy0, xy1, choose_model=True, **FAST)
-    assert found is None or found.model == "rotation"
+    assert found is not None
+    assert found.is_rotation
 
 
 def test_standing_still_is_a_rotation_by_nothing():
     _, xy0, _, _ = make_matches(0)
     noise = np.random.default_rng(0).normal(0, 0.2, xy0.shape)
     found = estimate_two_view(CAMERA, xy0, xy0 + noise, choose_model=True, **FAST)
-    assert found is None or found.model == "rotation"
+    assert found is not None
+    assert found.is_rotation
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -103,7 +105,7 @@ def test_a_plane_gives_a_pose_with_its_points_in_front(seed):
     T, xy0, xy1, _ = make_matches(seed, t=(0.8, 0.1, 0.1), plane=True, outlier_share=0.1)
     found = estimate_two_view(CAMERA, xy0, xy1, choose_model=True, seed=seed, **FAST)
     assert found is not None
-    assert found.model != "rotation"
+    assert not found.is_rotation
     assert found.inliers.mean() > 0.7
     rotation, direction = errors_deg(found, T)
     assert rotation < 3
@@ -145,6 +147,33 @@ def test_a_motion_near_pure_turning_is_found_without_a_search(seed):
     assert rotation_angle_deg(poses[best][:3, :3] @ T[:3, :3].T) < 0.2
 
 
+def test_a_plane_leads_to_the_true_pose_and_no_plane_to_none():
+    T, xy0, xy1, _ = make_matches(0, t=(0.8, 0.1, 0.1), plane=True, outlier_share=0.0, noise_px=0.0)
+    errors = [
+        rotation_angle_deg(pose[:3, :3] @ T[:3, :3].T) + angle_between_deg(pose[:3, 3], T[:3, 3])
+        for pose in two_view._from_plane(CAMERA, xy0, xy1, 1.0, 0)
+    ]
+    assert min(errors) < 0.01
+    _, xy0, xy1, _ = make_matches(0, t=(3.0, 0.1, 0.1))
+    assert two_view._from_plane(CAMERA, xy0, xy1, 1.0, 0) == []
+
+
+def test_matches_without_like_neighbours_are_left_out_unless_too_few_remain():
+    assert two_view._kept(np.array([0.9] * 8 + [0.2, 0.0])).tolist() == list(range(8))
+    # Seven agree: the better half is kept, which is ten here, and eight of ten matches.
+    assert two_view._kept(np.array([0.0] * 10 + [0.1] * 3 + [0.9] * 7)).tolist() == list(range(10, 20))
+    assert two_view._kept(np.array([0.9] * 7 + [0.0, 0.2, 0.0])).tolist() == [0, 1, 2, 3, 4, 5, 6, 8]
+    assert np.allclose(two_view._weights(np.array([0.0, 0.1, 0.25, 0.4, 1.0])), [0.05, 0.05, 0.5, 1, 1])
+
+
+def test_a_pose_explains_what_is_on_its_half_line_or_too_far_away_to_tell():
+    # Camera 1 sits 1 to the left: a point moves to the right by 500 px over its depth, a far one hardly.
+    T = make_transform(np.eye(3), (1.0, 0.0, 0.0))
+    xy0 = np.full((5, 2), (300.0, 200.0))
+    way = np.array([[50.0, 0], [50, 4], [-1, 0], [-3, 0], [50, 2]])
+    assert follows(CAMERA, T, xy0, xy0 + way, 1.0).tolist() == [True, False, True, False, True]
+
+
 def test_degenerate_matches_give_none_or_a_finite_pose():
     assert estimate_two_view(CAMERA, np.zeros((4, 2)), np.zeros((4, 2))) is None
     assert estimate_two_view(CAMERA, np.full((20, 2), np.nan), np.zeros((20, 2))) is None
@@ -156,6 +185,34 @@ def test_degenerate_matches_give_none_or_a_finite_pose():
                 CAMERA, xy, xy + 1.0, np.linspace(0.1, 1, 30), mode=mode, choose_model=True, **FAST
             )
             assert found is None or np.isfinite(found.T_cam1_cam0).all()
+
+
+def test_a_single_match_that_is_not_finite_is_enough_for_none():
+    _, xy0, xy1, _ = make_matches(0)
+    for k in range(2):
+        given = [xy0.copy(), xy1.copy()]
+        given[k][7, 1] = np.nan
+        assert estimate_two_view(CAMERA, *given, **FAST) is None
+
+
+@pytest.mark.parametrize(("mode", "spread"), [("off", 0.5), ("robust", 0.0), ("robust", 1e-7)])
+def test_confidence_that_is_off_or_all_alike_is_none(mode, spread):
+    _, xy0, xy1, is_outlier = make_matches(1)
+    confidence = 0.4 + spread * ~is_outlier
+    a = estimate_two_view(CAMERA, xy0, xy1, confidence, mode=mode, **FAST)
+    b = estimate_two_view(CAMERA, xy0, xy1, **FAST)
+    assert np.array_equal(a.T_cam1_cam0, b.T_cam1_cam0)
+
+
+def test_matches_are_drawn_from_all_from_those_that_agree_and_in_order_of_confidence():
+    kept = np.array([0, 2, 3])
+    every, among, ordered = two_view._orders_of_drawing(4, kept, np.array([0.1, 1.0, 0.5, 0.9]))
+    assert (every[0].tolist(), every[1]) == ([0, 1, 2, 3], False)
+    assert (among[0].tolist(), among[1]) == ([0, 2, 3], False)
+    assert (ordered[0].tolist(), ordered[1]) == ([3, 2, 0], True)
+    # Nine of ten are nearly all: a search among these would be the first one over again.
+    assert len(two_view._orders_of_drawing(10, np.arange(9), None)) == 1
+    assert len(two_view._orders_of_drawing(11, np.arange(9), None)) == 2
 
 
 def test_the_same_seed_gives_the_same_result():

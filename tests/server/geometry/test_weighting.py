@@ -112,6 +112,17 @@ def test_a_slope_counts_from_two_of_its_standard_errors_on(slope, beta):
         assert fitted.sigma0_px == pytest.approx(0.6 / 0.67449)
 
 
+@pytest.mark.parametrize(("middle", "beta"), [(2.5, 3.0), (3.0, 0.0)])
+def test_groups_beside_the_line_make_its_slope_less_certain(middle, beta):
+    # Log variances 0, middle, 3 at c = 1, 0.5, 0: with k = 2 middle - 3 the line of slope 3 misses them by
+    # k/6, k/3, k/6. One degree of freedom is left, so the misfit is 12 / 2.33^2 * k^2 / 6 = 0.368 k^2. By its
+    # root two standard errors of 0.951 grow: to 2.31 for k = 2 and to 3.46 for k = 3.
+    c = np.repeat([1.0, 0.5, 0.0], 12)
+    fitted = fit_noise(c, 0.6 * np.exp(0.5 * np.repeat([0.0, middle, 3.0], 12)), num_bins=3)
+    assert fitted is not None
+    assert fitted.beta == pytest.approx(beta)
+
+
 def test_fit_needs_residuals():
     assert fit_noise(np.ones(3), np.ones(3)) is None
     flat = fit_noise(np.ones(100), np.ones(100))

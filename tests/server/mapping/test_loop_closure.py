@@ -9,7 +9,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.features import TrackedPoints
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.loop_closure import _LOOK_INTERVAL, Loop, LoopFinder, LoopView, share_out
+from semcast.server.mapping.loop_closure import _LOOK_INTERVAL, Loop, LoopFinder, LoopView, _step, share_out
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.revisit import Revisit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -141,10 +141,13 @@ def test_where_nothing_has_drifted_there_is_no_loop_and_none_is_looked_for(room,
     world.landmarks.xyz = room[1][world.landmarks.ids % 10_000]
     recogniser = Recogniser()
     finder = LoopFinder(CAMERA, recogniser, 0)
-    here = LoopView(view(room, HERE).sight, HERE, *sees(HERE, room[1]))
-    for _ in range(8):
-        assert finder.look(here, world, NOISE, 0, old_landmarks(room, HERE, rng)) is None
+    of_newest = view(room, HERE)
+    here = LoopView(of_newest.sight, HERE, of_newest.ids, of_newest.xy)
+    assert finder.look(here, world, NOISE, 0, old_landmarks(room, HERE, rng)) is None
+    assert all(finder.look(here, world, NOISE, 0, None) is None for _ in range(19))
     assert recogniser.asked == []
+    finder.look(here, world, NOISE, 0, None)
+    assert len(recogniser.asked) == 1, "after twenty keyframes something may have drifted"
 
 
 def place(room, T_true, rng):
@@ -222,6 +225,29 @@ def test_drift_is_shared_out_along_the_way(room, rng):
     assert np.linalg.norm(world.pose_of_frame(100)[:3, 3] - HERE[:3, 3]) < 0.1
 
 
+@pytest.mark.parametrize(
+    ("num_shared", "sigma"),
+    [
+        # Turned by 0.1 rad, half a unit on, points at a depth of 5.
+        (8, (0.002 + 0.02 * 0.1, 0.02 * 0.5 + 0.002 * 5.0, 0.01)),
+        (7, (0.5, 0.5 + 5.0, 0.5)),
+    ],
+)
+def test_how_well_a_step_is_known_by_hand(num_shared, sigma):
+    world, none = WorldMap(), (np.zeros(0, np.int64), np.zeros((0, 32), np.uint8))
+    before = make_transform(exp_so3([0.0, 0.0, 0.3]), [1.0, 2.0, 0.0])
+    now = before @ make_transform(exp_so3([0.0, 0.0, 0.1]), [0.3, 0.4, 0.0])
+    ids = np.arange(10)
+    for k, (T, seen) in enumerate(((before, ids + 10 - num_shared), (now, ids))):
+        world.add_keyframe(Keyframe(k, k, T, 0, seen, np.zeros((10, 2)), np.ones(10), *none))
+    xyz = np.column_stack((np.arange(10.0), np.zeros(10), np.full(10, 5.0)))
+    world.add_landmarks(ids, xyz, np.zeros((10, 3), np.uint8), np.ones(10), 0, 1)
+    edge = _step(world, *world.keyframes, 4)
+    assert (edge.first, edge.second, edge.scale) == (3, 4, 1.0)
+    np.testing.assert_allclose(edge.T_first_second, invert_transform(before) @ now, atol=1e-12)
+    assert edge.sigma == pytest.approx(sigma)
+
+
 def test_a_gap_takes_most_of_what_has_to_be_shared_out(room, rng):
     world, _ = room
     for keyframe in world.keyframes[30:]:
@@ -250,7 +276,7 @@ def test_ties_made_before_hold(room, rng):
     world, _ = room
     loop = look(LoopFinder(CAMERA, Recogniser(), 0), room, old_landmarks(room, HERE, rng))
     _, free = share_out(world, 0, loop)
-    world.revisits[30] = 0
+    world.revisits |= {30: 0, 7: NUM + 5, NUM + 6: 3}  # and two with keyframes of another part
     _, tied = share_out(world, 0, loop)
 
     def moved(solved):

@@ -207,7 +207,7 @@ def test_noise_of_every_kind_is_survived(room):
             )
         )
         assert np.isfinite(result.keypoints_xy).all()
-    assert all(np.isfinite(T).all() for T in reconstruction.final_trajectory().values())
+    assert reconstruction.final_trajectory() == {}, "nothing of it shows a movement"
 
 
 def test_map_updates_add_up_to_the_map(room):

@@ -116,6 +116,7 @@ def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch
                 scales.append(None)
     assert "a new map is begun" in caplog.text
     assert "submaps are joined" in caplog.text
+    assert None in scales, "what is told before and after the join was compared"
     trajectory = reconstruction.final_trajectory()
     assert len(trajectory) >= len(x) - 3
     assert ate_percent(trajectory, truth) < 1.0

@@ -259,9 +259,9 @@ def test_landmarks_that_are_tracked_are_not_looked_for(mapped):
 
 def test_the_newest_keyframes_are_no_revisit(mapped):
     world, _ = mapped
-    newest = world.keyframes[-1].T_world_cam
-    found = look(mapped, newest)
-    assert found is None or found.keyframe_id <= world.keyframes[-1 - NUM_RECENT].frame_id
+    assert look(mapped, world.keyframes[-1].T_world_cam) is None
+    found = look(mapped, world.keyframes[-NUM_RECENT].T_world_cam)
+    assert found.keyframe_id == world.keyframes[-NUM_RECENT - 1].frame_id, "the last one before them"
 
 
 def test_recognised_keyframes_and_those_around_them_hold_the_window(mapped):

@@ -10,7 +10,7 @@ from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
-from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter
+from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter, RowTimes
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable
@@ -110,6 +110,29 @@ def test_a_point_is_shown_where_it_is_in_the_image_as_received():
     late_s = 1e-3 * READOUT_MS * (there[:, 1] / 239 - 0.5)
     np.testing.assert_allclose(there - xy, late_s[:, None] * offset_px_s, atol=0.15)
     assert np.abs(there - xy).max() > 1.5
+
+
+def test_a_point_that_flees_the_shutter_is_met_later_by_hand():
+    # Rows are read at 12 000 px/s, and catch up with what moves down at 4 000 by 8 000: half as long again.
+    camera = replace(CAMERA, readout_ms=1e3 * 239 / 12_000, readout_from="top")
+    rows, flow = RowTimes(camera), ImageFlow(camera, np.array([0.0, 0, 0, 4000 / 250, 0, 0, 0, 0]))
+    xy = np.array([[100.0, 119.5], [100.0, 131.5], [100.0, 107.5]])
+    there = np.array([[100.0, 119.5], [100.0, 137.5], [100.0, 101.5]])
+    np.testing.assert_allclose(rows.as_received(flow, xy), there)
+    np.testing.assert_allclose(rows.put_right(flow, there), xy)
+
+
+def test_images_without_confidence_are_put_right_too():
+    shutter, tracks = shutter_of(READOUT_MS), TrackTable("robust", 200, 0)
+    for frame_id in range(3):
+        frame = replace(seen((300.0, 0.0), frame_id), confidence=None, keypoint_confidence=None)
+        sight = shutter.see(frame)
+        tracks.follow(sight, tracks.xy + tracks.velocity) if len(tracks) else tracks.remember(sight)
+        sight, _ = shutter.settle(frame, sight, tracks)
+        tracks.refill(sight)
+    assert sight.frame is not frame
+    assert sight.frame.confidence is None
+    assert sight.frame.keypoint_confidence is None
 
 
 def test_a_global_shutter_is_left_as_it_is():
