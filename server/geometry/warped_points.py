@@ -61,7 +61,7 @@ def _aligned(grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, warps: Arra
         Templates.cut(grey0, xy0, ANCHOR_PATCH_PX), grey1, guess1_xy, warps, iterations=_ITERATIONS
     )
     templates = Templates.cut(grey1, there.xy, ANCHOR_PATCH_PX)
-    back = align_patches(templates, grey0, xy0, np.linalg.inv(warps))
+    back = align_patches(templates, grey0, xy0, np.asarray(np.linalg.inv(warps), np.float64))
     distance = np.linalg.norm(back.xy - xy0, axis=1)
     inside = ((there.xy >= 1) & (there.xy < np.array(grey1.shape[::-1]) - 2)).all(axis=1)
     alike = (there.correlation > _MIN_CORRELATION) & (distance < _MAX_FORWARD_BACKWARD_PX)
