@@ -24,6 +24,9 @@ _NUM_FEATURES, _MIN_CONTRAST = 2000, 0.015
 _MAX_RATIO = 0.8
 _EPIPOLAR_PX = 3.0
 _NEIGHBOURS = 7
+#: The warp around a point is fitted to so many matches next to it; those within the distance count alike.
+#: A share of their spread holds it near the turns of the features: they may lie on a line.
+_FITTED, _ALIKE_PX, _HELD_SHARE = 6, 30.0, 0.2
 _FREE_FLOW_PX = 15.0
 #: Matches that agree, at least; fewer prove nothing.
 _MIN_AGREEING = 15
@@ -48,11 +51,14 @@ class WideFeatures:
     descriptors: NDArray[np.float32]
 
     @staticmethod
-    def of(grey: Grey, usable: NDArray[np.bool_] | None = None) -> "WideFeatures":
-        """Find the features of an ``(H, W)`` image, where ``usable (H, W)`` is True."""
+    def of(grey: Grey, usable: NDArray[np.bool_] | None = None, *, fine: bool = False) -> "WideFeatures":
+        """Find the features of an ``(H, W)`` image, where ``usable (H, W)`` is True.
+
+        With ``fine`` they are looked for at full width: three times as many, and three times the time.
+        """
         sift = cv2.SIFT.create(nfeatures=_NUM_FEATURES, contrastThreshold=_MIN_CONTRAST)
         height, width = grey.shape
-        reduction = 2 if min(grey.shape) >= _MIN_REDUCED_PX else 1
+        reduction = 2 if min(grey.shape) >= _MIN_REDUCED_PX and not fine else 1
         size = (width // reduction, height // reduction)
         reduced = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         mask = None
@@ -127,7 +133,22 @@ def match_wide(
     return WideMatches(features0.xy[row0], features1.xy[row1], turns)
 
 
-def search_wide(features0: WideFeatures, features1: WideFeatures, xy0: Array) -> Array | None:
+@dataclass(frozen=True)
+class Carried:
+    """Where points of one image are in another, roughly, and how what is around them was warped.
+
+    Attributes:
+        xy: ``(N, 2)`` pixels in the second image.
+        warps: ``(N, 2, 2)`` derivatives of pixels there by those in the first image.
+        num_matches: That say so, of the whole image.
+    """
+
+    xy: Array
+    warps: Array
+    num_matches: int
+
+
+def search_wide(features0: WideFeatures, features1: WideFeatures, xy0: Array) -> Carried | None:
     """Find where points of one image are in another, however far they moved.
 
     Args:
@@ -136,8 +157,7 @@ def search_wide(features0: WideFeatures, features1: WideFeatures, xy0: Array) ->
         xy0: ``(N, 2)`` pixels in the first image.
 
     Returns:
-        ``(N, 2)`` places in the second to start Lucas-Kanade from: each point goes with the match next to it.
-        None where too few matches agree.
+        Places to look at, as the matches next to each point say. None where too few matches agree.
     """
     matches = match_wide(features0, features1)
     from_xy, flow = matches.from_xy, matches.to_xy - matches.from_xy
@@ -150,9 +170,28 @@ def search_wide(features0: WideFeatures, features1: WideFeatures, xy0: Array) ->
     agrees &= _moves_like_its_neighbours(from_xy, flow, agrees)
     if int(agrees.sum()) < _MIN_AGREEING:
         return None
-    square = ((xy0[:, None] - from_xy[agrees][None]) ** 2).sum(axis=2)
-    there: Array = xy0 + flow[agrees][square.argmin(axis=1)]
-    return there
+    return _carried(WideMatches(from_xy[agrees], matches.to_xy[agrees], matches.turns[agrees]), xy0)
+
+
+def _carried(matches: WideMatches, xy0: Array) -> Carried:
+    """Fit an affine warp around each point ``(N, 2)`` to the matches next to it.
+
+    A turning camera sees a surface beside it get narrower: where matches are says that, and a feature's own
+    turn and scale don't.
+    """
+    square = ((xy0[:, None] - matches.from_xy[None]) ** 2).sum(axis=2)
+    near = np.argsort(square, axis=1, kind="stable")[:, :_FITTED]
+    weight = 1.0 / (np.take_along_axis(square, near, axis=1) + _ALIKE_PX**2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    from_xy, to_xy = matches.from_xy[near], matches.to_xy[near]
+    from_middle, to_middle = (np.einsum("nk,nki->ni", weight, xy) for xy in (from_xy, to_xy))
+    from_offset, to_offset = from_xy - from_middle[:, None], to_xy - to_middle[:, None]
+    spread = np.einsum("nk,nki,nkj->nij", weight, from_offset, from_offset)
+    both = np.einsum("nk,nki,nkj->nij", weight, to_offset, from_offset)
+    held = np.maximum(_HELD_SHARE * np.trace(spread, axis1=1, axis2=2), 1.0)[:, None, None]
+    turn = np.median(matches.turns[near], axis=1)
+    warps = (both + held * turn) @ np.linalg.inv(spread + held * np.eye(2))
+    return Carried(to_middle + np.einsum("nij,nj->ni", warps, xy0 - from_middle), warps, len(matches.from_xy))
 
 
 def epipolar_inliers(from_xy: Array, to_xy: Array) -> NDArray[np.bool_] | None:

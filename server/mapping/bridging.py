@@ -36,7 +36,7 @@ def bridge(
         start: The new submap. It alone tells the unit: before it, the camera may have stood still.
         grown: The same and what came before.
         last_ns: Time of the newest keyframe of the map, None where there is none.
-        depth: Median of what that sees.
+        depth: How far things were, in the map's unit.
 
     Returns:
         ``T_world_cam (4, 4)`` of the first camera of ``grown``, and world units per unit of the start.

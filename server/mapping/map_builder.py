@@ -323,12 +323,14 @@ class MapBuilder:
         if recognised is not None and recognised not in {k.frame_id for k in window}:
             self.world.revisits.setdefault(frame_id, recognised)
 
+    @property
+    def _enough(self) -> int:
+        """Landmarks that a keyframe has enough with."""
+        return round(_ENOUGH_SHARE * self._settings.max_features)
+
     def _add_landmarks(self, image: NDArray[np.uint8]) -> None:
-        s = self._settings
-        enough = round(_ENOUGH_SHARE * s.max_features)
-        mapper.add_landmarks(
-            self.world, self._camera, self.noise.model, image, s.min_parallax_deg, enough=enough
-        )
+        parallax_deg, noise = self._settings.min_parallax_deg, self.noise.model
+        mapper.add_landmarks(self.world, self._camera, noise, image, parallax_deg, enough=self._enough)
 
     def _bound(self) -> None:
         """Keep the map, and the images of its keyframes, within its size."""
@@ -384,14 +386,9 @@ class MapBuilder:
 
     def bridge(self, motion: CameraMotion, start: Start, grown: Start) -> tuple[Array, float]:
         """Where a new submap begins and its unit, see ``bridging.bridge``."""
-        before = self.reference_before()
-        depth = 1.0 if before is None else mapper.median_depth(self.world, before)
-        last_ns = None if before is None else before.t_source_ns
-        return bridge(motion, start, grown, last_ns, depth if np.isfinite(depth) else 1.0)
-
-    def reference_before(self) -> Keyframe | None:
-        """Newest keyframe of any submap."""
-        return self.world.keyframes[-1] if self.world.keyframes else None
+        keyframes = self.world.keyframes
+        last_ns = keyframes[-1].t_source_ns if keyframes else None
+        return bridge(motion, start, grown, last_ns, mapper.usual_depth(self.world, self._enough))
 
     def join(
         self,

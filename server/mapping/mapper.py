@@ -281,6 +281,18 @@ def median_depth(world: WorldMap, keyframe: Keyframe) -> float:
     return median_depth_of(keyframe, world.landmarks.ids, world.landmarks.xyz)
 
 
+def usual_depth(world: WorldMap, enough: int) -> float:
+    """Median depth of what the newest keyframe sees that sees ``enough`` landmarks.
+
+    The last ones before a loss see few, and those a camera that turned made under the smallest angles: their
+    depth is anything. Where none sees enough, it is that of the newest; 1 without any landmark.
+    """
+    newest = world.keyframes[::-1]
+    seen = (k for k in newest if (world.landmarks.rows(k.ids) >= 0).sum() >= enough)
+    depth = median_depth(world, next(seen, newest[0])) if newest else 1.0
+    return depth if np.isfinite(depth) else 1.0
+
+
 def median_depth_of(keyframe: Keyframe, ids: Ids, xyz: Array) -> float:
     """Return the same for points ``ids (P,)``, ascending, at ``xyz (P, 3)``."""
     _, row, _ = np.intersect1d(ids, keyframe.ids, assume_unique=True, return_indices=True)

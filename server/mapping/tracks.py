@@ -17,6 +17,7 @@ from semcast.server.geometry.features import (
     sample_map,
     track_points,
 )
+from semcast.server.geometry.warped_points import MAX_FROM_GUESS_PX, track_warped
 from semcast.server.geometry.weighting import (
     ConfidenceMode,
     KeypointCues,
@@ -24,7 +25,7 @@ from semcast.server.geometry.weighting import (
     observation_confidence,
     variance_confidence,
 )
-from semcast.server.geometry.wide_search import WideFeatures, search_wide
+from semcast.server.geometry.wide_search import Carried, WideFeatures, search_wide
 from semcast.server.mapping.found import Found
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood
@@ -41,8 +42,10 @@ _LOST_MARGIN_PX = 1
 _NEIGHBOURS, _MIN_NEIGHBOURS = 5, 8
 #: Share of tracks that must be found again; below, the frame counts as damaged and all tracks coast.
 _MIN_FOUND_SHARE = 0.35
-#: After a jump a point is looked for no further than this from where descriptors put it.
-_MAX_FROM_JUMP_PX = 25.0
+#: So many matches tell how what is around most tracks was warped.
+_PLENTY_OF_MATCHES = 80
+#: A track this far from where descriptors lead to has found something else.
+_REFUTED_PX = 3.0
 #: What a track has, by attribute of ``TrackTable``.
 _MOTION = ("ids", "xy", "velocity", "confidence", "variance_px2", "drift_px2", "age", "missed")
 _COLUMNS = (*_MOTION, "anchor_xy", "stood_widths")
@@ -261,10 +264,13 @@ class TrackTable:
         after = {name: getattr(self, name) for name in _COLUMNS}
         self._take_back()
         found = Found.nothing(self.xy)
+        row = np.searchsorted(self.ids, after["ids"])
+        found.ok[row], found.xy[row] = after["missed"] == 0, after["xy"]
+        found.ok &= self.missed == 0
         jumped = self._jump(sight, found)
         hidden = self._hidden(sight, found, self.xy)
         self.remember(sight)
-        if not jumped or found.ok.sum() <= (after["missed"] == 0).sum():
+        if not jumped:
             for name, values in after.items():
                 setattr(self, name, values)
             return False
@@ -278,18 +284,33 @@ class TrackTable:
         return hidden
 
     def _jump(self, sight: Sight, found: Found) -> bool:
-        """Find tracks of the last image by descriptors, where that finds more; whether it did."""
+        """Find tracks of the last image by descriptors; whether that found more.
+
+        Of those found before, the ones elsewhere than descriptors say don't count: Lucas-Kanade finds
+        something near any guess.
+        """
         rows = np.flatnonzero(self.missed == 0)
-        jump = search_wide(WideFeatures.of(self._greys[-1]), sight.wide_features, self.xy[rows])
+        jump = self._search_jump(sight, self.xy[rows])
         if jump is None:
             return False
-        points = track_points(self._greys[-1], sight.grey, self.xy[rows], jump, max_level=1)
-        # Points that left the image were clipped to its border and found something else there.
-        near = np.linalg.norm(points.xy - jump, axis=1) < _MAX_FROM_JUMP_PX
-        if (points.ok & near).sum() <= found.ok[rows].sum():
+        points = track_warped(self._greys[-1], sight.grey, self.xy[rows], jump.xy, jump.warps)
+        refuted = np.linalg.norm(found.xy[rows] - jump.xy, axis=1) > MAX_FROM_GUESS_PX
+        refuted |= points.ok & (np.linalg.norm(found.xy[rows] - points.xy, axis=1) > _REFUTED_PX)
+        shown = points.ok & ~sight.near_lost(points.xy, _LOST_MARGIN_PX)
+        if shown.sum() <= (found.ok[rows] & ~refuted).sum():
             return False
-        found.take(rows, replace(points, ok=points.ok & near))
+        found.take(rows, points)
         return True
+
+    def _search_jump(self, sight: Sight, xy: Array) -> Carried | None:
+        """Where points ``(N, 2)`` of the last image are now, by descriptors: finer ones where few match."""
+        grey = self._greys[-1]
+        jump = search_wide(WideFeatures.of(grey), sight.wide_features, xy)
+        if jump is None or jump.num_matches >= _PLENTY_OF_MATCHES:
+            return jump
+        now = WideFeatures.of(sight.grey, sight.usable_pixels, fine=True)
+        fine = search_wide(WideFeatures.of(grey, fine=True), now, xy)
+        return fine if fine is not None and fine.num_matches > jump.num_matches else jump
 
     def _settle(self, sight: Sight, found: Found, coasting: NDArray[np.bool_]) -> None:
         """Move tracks to where they were found, and forget those that neither were nor coast."""

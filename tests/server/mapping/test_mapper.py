@@ -11,6 +11,7 @@ from semcast.server.mapping.mapper import (
     add_landmarks,
     apply_result,
     note_sight,
+    usual_depth,
     wants_keyframe,
 )
 from semcast.server.mapping.window import build_problem
@@ -299,3 +300,17 @@ def test_of_many_keyframes_before_the_window_some_hold_it_evenly():
     for keyframe in world.keyframes[:30]:
         keyframe.drop_observations(keyframe.ids >= 5)
     assert build_problem(world, CAMERA, NOISE, 10).num_anchors == 0, "five landmarks in common say little"
+
+
+def test_the_usual_depth_is_not_that_of_the_last_few_landmarks_before_a_loss():
+    world, points, truth = make_world(num_keyframes=3, num_points=80)
+    put_landmarks(world, points)
+    usual = usual_depth(world, 50)
+    assert 6.0 < usual < 9.0
+    newest = world.keyframes[-1]
+    newest.ids, newest.xy, newest.confidence = (a[:5] for a in (newest.ids, newest.xy, newest.confidence))
+    near = transform_points(truth[-1], CAMERA.unproject(newest.xy) * 0.5)
+    world.move_landmarks(newest.ids, near)
+    assert usual_depth(world, 50) == pytest.approx(usual, rel=0.2)
+    assert usual_depth(world, 81) == pytest.approx(0.5, rel=0.1), "none sees enough: that of the newest"
+    assert usual_depth(WorldMap(), 50) == 1.0

@@ -1,0 +1,69 @@
+"""Points followed between two images that see what is around them turned, scaled or sheared.
+
+Lucas-Kanade takes a window for moved and no more; of one that was turned by twenty degrees it finds something
+like it nearby. Where matches around a point tell the warp, its window is warped before it is looked for.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.server.geometry.features import (
+    Grey,
+    TrackedPoints,
+    corner_strength,
+    sample_map,
+    track_points,
+)
+from semcast.server.geometry.patch_alignment import ANCHOR_PATCH_PX, Templates, align_patches
+
+Array = NDArray[np.float64]
+
+#: A point further from its guess than this is another one.
+MAX_FROM_GUESS_PX = 25.0
+#: So is a warped window that looks less alike, or whose way back ends elsewhere.
+_MIN_CORRELATION, _MAX_FORWARD_BACKWARD_PX = 0.7, 1.5
+#: Guesses are rough: the search takes more steps than one that begins within a pixel or two.
+_ITERATIONS = 15
+#: A window that is seen at less than this share of its area, or more than its inverse, has other details.
+_MIN_AREA_RATIO = 0.25
+#: Where a warp moves nothing in a window by more than this share of its offset, Lucas-Kanade holds.
+_HARDLY_WARPED = 0.15
+
+
+def track_warped(grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, warps: Array) -> TrackedPoints:
+    """Follow points whose windows are warped in a known way, there and back.
+
+    Where the warp is small, Lucas-Kanade goes first: it looks further, and matches tell a warp to a tenth.
+
+    Args:
+        grey0: Image the points are known in.
+        grey1: Image they are looked for in.
+        xy0: ``(N, 2)`` pixels in ``grey0``.
+        guess1_xy: ``(N, 2)`` where they are expected in ``grey1``.
+        warps: ``(N, 2, 2)`` derivatives of pixels in ``grey1`` by those in ``grey0``.
+    """
+    moved = track_points(grey0, grey1, xy0, guess1_xy, max_level=1)
+    aligned = _aligned(grey0, grey1, xy0, guess1_xy, warps)
+    hardly = np.linalg.norm(warps - np.eye(2), ord=2, axis=(1, 2)) < _HARDLY_WARPED
+    found = moved.where(hardly & moved.ok, aligned)
+    # Points that left the image were clipped to its border and found something else there.
+    near = np.linalg.norm(found.xy - guess1_xy, axis=1) < MAX_FROM_GUESS_PX
+    return replace(found, ok=found.ok & near)
+
+
+def _aligned(grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, warps: Array) -> TrackedPoints:
+    area = np.linalg.det(warps)
+    sound = (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
+    warps = np.where(sound[:, None, None], warps, np.eye(2))
+    there = align_patches(
+        Templates.cut(grey0, xy0, ANCHOR_PATCH_PX), grey1, guess1_xy, warps, iterations=_ITERATIONS
+    )
+    templates = Templates.cut(grey1, there.xy, ANCHOR_PATCH_PX)
+    back = align_patches(templates, grey0, xy0, np.asarray(np.linalg.inv(warps), np.float64))
+    distance = np.linalg.norm(back.xy - xy0, axis=1)
+    inside = ((there.xy >= 1) & (there.xy < np.array(grey1.shape[::-1]) - 2)).all(axis=1)
+    alike = (there.correlation > _MIN_CORRELATION) & (distance < _MAX_FORWARD_BACKWARD_PX)
+    gradient = sample_map(corner_strength(grey1), there.xy)
+    return TrackedPoints(there.xy, sound & inside & alike, distance, np.zeros(len(xy0)), gradient)
