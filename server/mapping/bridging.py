@@ -15,6 +15,9 @@ _MAX_BRIDGE_S = 5.0
 _LEAST_WAY = 0.02
 #: and its unit makes things no more than so many times as far or near as they were.
 _MOST_FARTHER = 5.0
+#: What two guesses of the unit err by, as standard deviations of the logarithm: that things are as far away as
+#: they were, and that the camera goes on at its old speed. In a hand it changes by so many depths a second too.
+_DEPTH_SIGMA, _SPEED_SIGMA, _SPEED_CHANGE_DEPTHS_S = 0.5, 0.1, 0.03
 #: How the camera moves after a gap is told from so long a time: the shorter, the noisier.
 _LATER_NS = 500_000_000
 #: A submap turned from where it was put by more than this, and so much more for each second of the gap before
@@ -27,9 +30,10 @@ def bridge(
 ) -> tuple[Array, float]:
     """Lay a way from what is known to where a new submap begins.
 
-    Its unit makes the camera go on at its old speed, or, where it stood or too long ago, makes things as far
-    away as they were. It begins where the camera got to: turning and moving change evenly from what they were
-    to what the submap says, or, where its unit isn't told by the speed, go on as they were.
+    Its unit makes the camera go on at its old speed; the slower that was, the more things are as far away as
+    they were, and where it stood, or too long ago, they are just that. It begins where the camera got to:
+    turning and moving change evenly from what they were to what the submap says, or, where its unit isn't
+    told by the speed, go on as they were.
 
     Args:
         motion: Of the camera so far.
@@ -52,9 +56,11 @@ def bridge(
     gone = motion.speed_map_per_s * elapsed_s
     if since_s >= _MAX_BRIDGE_S or way <= 0.0 or gone <= _LEAST_WAY * depth:
         return T_world_guess, depth
-    scale = gone / way
-    if not depth / _MOST_FARTHER < scale < _MOST_FARTHER * depth:
+    if not depth / _MOST_FARTHER < gone / way < _MOST_FARTHER * depth:
         return T_world_guess, depth
+    changed = _SPEED_CHANGE_DEPTHS_S * depth / motion.speed_map_per_s
+    weights = _DEPTH_SIGMA**-2, 1.0 / (_SPEED_SIGMA**2 + changed**2)
+    scale = float(np.exp(np.average(np.log((depth, gone / way)), weights=weights)))
     # Of a source that gives two images one time, the second tells no speed.
     later = [k for k in grown.keyframes if k.t_source_ns > at_ns]
     soon = ([k for k in later if k.t_source_ns - at_ns <= _LATER_NS] or later[:1])[-1]

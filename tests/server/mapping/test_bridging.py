@@ -39,14 +39,27 @@ def start_at(first, num=3, turn_deg=0.0, step=0.05):
 
 def test_speed_tells_the_unit_and_how_far_the_camera_got():
     start = start_at(12)
-    T, scale = bridge(moved(), start, start, 2 * FRAME_NS, 8.0)
+    T, scale = bridge(moved(), start, start, 2 * FRAME_NS, 4.0)
     assert np.isclose(scale, 0.2 / 0.05)
     np.testing.assert_allclose(T, make_transform(np.eye(3), (0, 0, 0.4 + 2.0)), atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("speed", "by_depth"),
+    [
+        (8.0, 4.0 / (4.0 + 1.0 / (0.1**2 + 0.03**2))),  # a depth a second
+        (0.9, 4.0 / (4.0 + 1.0 / (0.1**2 + (0.03 / 0.1125) ** 2))),
+    ],
+)
+def test_the_slower_a_camera_was_the_more_its_surroundings_tell_the_unit(speed, by_depth):
+    start = start_at(12, step=0.1 * speed / 4.0)
+    _, scale = bridge(moved(speed), start, start, 2 * FRAME_NS, 8.0)
+    assert np.log2(scale / 4.0) == pytest.approx(by_depth), "4 by the speed, twice that by the depth"
+
+
 def test_half_of_a_bend_was_driven_out_of_sight():
     start = start_at(12, turn_deg=4.0)
-    T, _ = bridge(moved(), start, start, 2 * FRAME_NS, 8.0)
+    T, _ = bridge(moved(), start, start, 2 * FRAME_NS, 4.0)
     turned_deg = np.degrees(np.arctan2(T[0, 2], T[2, 2]))
     assert turned_deg == pytest.approx(20.0, abs=0.5), "from 0 to 40 degrees per second, in a second"
     assert T[0, 3] > 0.1
@@ -55,7 +68,7 @@ def test_half_of_a_bend_was_driven_out_of_sight():
 
 def test_what_is_seen_of_the_time_before_the_start_is_where_it_begins():
     start, grown = start_at(14), start_at(12, num=5)
-    T, scale = bridge(moved(), start, grown, 2 * FRAME_NS, 8.0)
+    T, scale = bridge(moved(), start, grown, 2 * FRAME_NS, 4.0)
     np.testing.assert_allclose(T[:3, 3], (0, 0, 2.4), atol=1e-9)
     assert np.isclose(scale, 4.0)
 
@@ -64,7 +77,7 @@ def test_two_images_of_one_time_tell_no_speed():
     start = start_at(12, num=4)
     for keyframe, frames_later in zip(start.keyframes, (0, 0, 6, 7), strict=True):
         keyframe.t_source_ns = (12 + frames_later) * FRAME_NS
-    T, scale = bridge(moved(), start, start, 2 * FRAME_NS, 8.0)
+    T, scale = bridge(moved(), start, start, 2 * FRAME_NS, 1.4 / 0.15)
     assert np.isclose(scale, 1.4 / 0.15)
     later_per_s = 0.1 * scale / 0.6
     np.testing.assert_allclose(T[:3, 3], (0, 0, 0.4 + 0.5 * (2.0 + later_per_s)), atol=1e-9)
