@@ -30,12 +30,14 @@ _ITERATIONS = 15
 _MIN_AREA_RATIO = 0.25
 #: Where a warp moves nothing in a window by more than this share of its offset, Lucas-Kanade holds.
 _HARDLY_WARPED = 0.15
+#: Mean size of a Gaussian value in standard deviations.
+_MEAN_OF_SIGMA = float(np.sqrt(2.0 / np.pi))
 
 
 def track_warped(grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, warps: Array) -> TrackedPoints:
     """Follow points whose windows are warped in a known way, there and back.
 
-    Where the warp is small, Lucas-Kanade goes first: it looks further, and matches tell a warp to a tenth.
+    Where the warp is small, Lucas-Kanade does: it looks further, and matches tell a warp to a tenth.
 
     Args:
         grey0: Image the points are known in.
@@ -47,7 +49,7 @@ def track_warped(grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, warps: 
     moved = track_points(grey0, grey1, xy0, guess1_xy, max_level=1)
     aligned = _aligned(grey0, grey1, xy0, guess1_xy, warps)
     hardly = np.linalg.norm(warps - np.eye(2), ord=2, axis=(1, 2)) < _HARDLY_WARPED
-    found = moved.where(hardly & moved.ok, aligned)
+    found = moved.where(hardly, aligned)
     # Points that left the image were clipped to its border and found something else there.
     near = np.linalg.norm(found.xy - guess1_xy, axis=1) < MAX_FROM_GUESS_PX
     return replace(found, ok=found.ok & near)
@@ -57,13 +59,14 @@ def _aligned(grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, warps: Arra
     area = np.linalg.det(warps)
     sound = (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
     warps = np.where(sound[:, None, None], warps, np.eye(2))
-    there = align_patches(
-        Templates.cut(grey0, xy0, ANCHOR_PATCH_PX), grey1, guess1_xy, warps, iterations=_ITERATIONS
-    )
-    templates = Templates.cut(grey1, there.xy, ANCHOR_PATCH_PX)
-    back = align_patches(templates, grey0, xy0, np.asarray(np.linalg.inv(warps), np.float64))
+    before = Templates.cut(grey0, xy0, ANCHOR_PATCH_PX)
+    there = align_patches(before, grey1, guess1_xy, warps, iterations=_ITERATIONS)
+    after = Templates.cut(grey1, there.xy, ANCHOR_PATCH_PX)
+    back = align_patches(after, grey0, xy0, np.asarray(np.linalg.inv(warps), np.float64))
     distance = np.linalg.norm(back.xy - xy0, axis=1)
     inside = ((there.xy >= 1) & (there.xy < np.array(grey1.shape[::-1]) - 2)).all(axis=1)
     alike = (there.correlation > _MIN_CORRELATION) & (distance < _MAX_FORWARD_BACKWARD_PX)
+    unexplained = np.maximum(1.0 - there.correlation**2, 0.0) * np.square(before.values).mean(axis=1)
+    photometric = _MEAN_OF_SIGMA * np.sqrt(unexplained)
     gradient = sample_map(corner_strength(grey1), there.xy)
-    return TrackedPoints(there.xy, sound & inside & alike, distance, np.zeros(len(xy0)), gradient)
+    return TrackedPoints(there.xy, sound & inside & alike, distance, photometric, gradient)

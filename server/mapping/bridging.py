@@ -17,7 +17,7 @@ _LEAST_WAY = 0.02
 _MOST_FARTHER = 5.0
 #: Standard deviations of the logarithm of two guesses of the unit: that things are as far away as they were,
 #: and that the camera goes on at its old speed; that may change by so many depths a second too, as in a hand.
-_DEPTH_SIGMA, _SPEED_SIGMA, _SPEED_CHANGE_DEPTHS_S = 0.5, 0.1, 0.03
+_DEPTH_SIGMA, _SPEED_SIGMA, _SPEED_CHANGE_DEPTHS_S = 0.5, 0.03, 0.03
 #: How the camera moves after a gap is told from so long a time: the shorter, the noisier.
 _LATER_NS = 500_000_000
 #: A submap turned from where it was put by more than this, and so much more for each second of the gap before

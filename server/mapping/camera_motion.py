@@ -65,9 +65,9 @@ class CameraMotion:
     def rests(self) -> bool:
         """Whether the camera rested when it was seen last: what it saw goes out of sight by being hidden.
 
-        One that stopped at once may have gone on.
+        One that stopped at once may have gone on, and so may one of which frames are missing since.
         """
-        return self._rests and not self._still
+        return self._rests and not self._still and not self._has_gap
 
     @property
     def speed_map_per_s(self) -> float:

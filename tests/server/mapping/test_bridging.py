@@ -47,8 +47,8 @@ def test_speed_tells_the_unit_and_how_far_the_camera_got():
 @pytest.mark.parametrize(
     ("speed", "by_depth"),
     [
-        (8.0, 4.0 / (4.0 + 1.0 / (0.1**2 + 0.03**2))),  # a depth a second
-        (0.9, 4.0 / (4.0 + 1.0 / (0.1**2 + (0.03 / 0.1125) ** 2))),
+        (8.0, 4.0 / (4.0 + 1.0 / (0.03**2 + 0.03**2))),  # a depth a second
+        (0.9, 4.0 / (4.0 + 1.0 / (0.03**2 + (0.03 / 0.1125) ** 2))),
     ],
 )
 def test_the_slower_a_camera_was_the_more_its_surroundings_tell_the_unit(speed, by_depth):

@@ -191,3 +191,13 @@ def test_a_camera_whose_image_stopped_at_once_may_have_gone_on_and_does_not_rest
     motion = CameraMotion(CAMERA)
     go(motion, [*np.linspace(0.0, 2.0, 11), *[2.0] * 30])
     assert not motion.rests
+
+
+def test_a_camera_of_which_frames_are_missing_may_have_gone_on_and_does_not_rest():
+    motion = CameraMotion(CAMERA)
+    go(motion, [5.5 + 0.01 * (-1) ** k for k in range(14)])
+    for k in (12, 13, 14):
+        motion.comes_after_gap(k * FRAME_NS)
+    assert motion.rests
+    motion.comes_after_gap(24 * FRAME_NS)
+    assert not motion.rests
