@@ -16,6 +16,7 @@ from semcast.agent.source_settings import SourceSettings
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.playback import usual_period_ns
+from semcast.common.ros_bag_files import check_no_ros_bag
 from semcast.common.sequence import Sequence, open_sequence
 from semcast.common.trajectory import Trajectory
 
@@ -308,6 +309,7 @@ def _opened(settings: SourceSettings) -> Source:
     path = Path(text)
     if is_live(text):
         return LiveSource(settings)
+    check_no_ros_bag(path)
     if path.is_file() and path.suffix.lower() != ".json":
         return VideoSource(settings)
     # How fast a recording is played says nothing of when its images were taken.

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from semcast.common.errors import SourceError
+from semcast.common.ros_bag_files import check_no_ros_bag
 
 logger = logging.getLogger(__name__)
 
@@ -266,6 +267,7 @@ class RecordingReader:
     """
 
     def __init__(self, path: Path) -> None:
+        check_no_ros_bag(path)
         self.path = path
         self.metadata: dict[str, dict[str, str]] = {}
         with self._open() as stream:

@@ -20,6 +20,7 @@ from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transfor
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
 from semcast.common.numbered_images import lines_of_images, numbers_in_names
+from semcast.common.ros_bag_files import check_no_ros_bag
 from semcast.common.trajectory import Trajectory, read_tum, seconds_of
 from semcast.common.transforms_file import read_transforms_json
 
@@ -175,6 +176,7 @@ def _short_s(time_ns: int) -> str:
 
 
 def _check_there(path: Path) -> None:
+    check_no_ros_bag(path)
     if path.is_file():
         if path.suffix.lower() != ".json":
             way = f"videos go through: {shlex.join(('semcast', 'agent', '--source', str(path)))}"

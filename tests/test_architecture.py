@@ -27,6 +27,7 @@ HOMES = {
         *(f"server/geometry/{name}.py" for name in ("lo_ransac", "pnp", "ransac", "two_view", "wide_search")),
         "server/mapping/planar.py",
     },
+    "rosbags": {"agent/ros_bag.py"},
     "safetensors": {"common/nets/checkpoint.py"},
     "onnxruntime": {"common/nets/onnx_encoder.py", "training/onnx_int8.py"},
     "onnx": {"training/onnx_export.py"},

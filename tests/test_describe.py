@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from bags import SECOND, BagMaker
 
 from semcast.cli import main
 from semcast.common.camera import Intrinsics
@@ -212,6 +213,35 @@ def test_a_transforms_file_is_described_like_its_folder(tmp_path):
     text = text_of(tmp_path / "transforms_test.json")
     assert "images: 2, 64x48 px" in text
     assert text.splitlines()[1:] == text_of(tmp_path).splitlines()[1:]
+
+
+def ros_bag(folder):
+    bag = BagMaker()
+    for k in range(3):
+        bag.image("/cam/image_raw", np.zeros((48, 64, 3), np.uint8), "bgr8", (2 + k) * SECOND)
+    bag.pose("/mocap", "room", (0.0, 0.0, 0.0), 2 * SECOND)
+    bag.transform("/tf_static", "base", "cam", (0.0, 0.0, 0.0), 2 * SECOND)
+    return bag.write(folder)
+
+
+def test_a_ros_bag_is_described_by_what_a_sequence_can_be_made_of(tmp_path):
+    text = text_of(ros_bag(tmp_path))
+    for line in ("time: 2.0 s", "frames of /tf: base, cam", "/cam/image_raw:      3", "/mocap:      1"):
+        assert line in text
+
+
+def test_a_ros_bag_is_told_where_nothing_can_read_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("semcast.describe.find_spec", lambda name: None)
+    assert "semcast[ros]" in text_of(ros_bag(tmp_path))
+
+
+def test_a_bag_unpacked_is_a_sequence(tmp_path, capsys):
+    folder = tmp_path / "sequence"
+    assert main(["unpack", str(ros_bag(tmp_path)), "--out", str(folder), "--truth", "/mocap"]) == 0
+    said = capsys.readouterr()
+    assert said.out == f"{folder}\n", "a script can go on with it"
+    assert "3 images of /cam/image_raw, camera unknown, 1 true poses" in said.err
+    assert "images: 3, 64x48 px" in text_of(folder)
 
 
 def test_an_exported_encoder_is_described(tmp_path):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.lens import DISTORTION_COUNTS
+from semcast.common.new_folder import new_folder
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.whole_file import write_whole
 from semcast.evaluation.scenes.block import Block
@@ -167,10 +168,9 @@ def render_scene(settings: RenderSettings) -> int:
     scene = SCENES[settings.scene](settings.seed, settings.pace)
     scene.camera = replace(scene.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
     Optics.of(scene.camera)  # refuses before anything is written
+    new_folder(folder)
     try:
-        if folder.exists() and any(folder.iterdir()):
-            raise SourceError(f"out must be a new or an empty folder, {folder} has files in it")
-        (folder / "images").mkdir(parents=True, exist_ok=True)
+        (folder / "images").mkdir()
         return _draw_into(folder, settings, scene)
     except OSError as err:
         raise SourceError(f"can't write to {folder}: {err.strerror}") from err

@@ -36,7 +36,8 @@ VERBS: dict[str, tuple[str, str]] = {
     "recover": ("recover", "make a recording that was cut off whole again"),
     "export": ("export", "write a run in the format of COLMAP, nerfstudio, evo, Rerun or as points"),
     "plot": ("plot", "draw a run: its path against the truth, and what happened over time"),
-    "info": ("info", "say what a recording, run, sequence or weights file is, in a screenful"),
+    "info": ("info", "say what a recording, run, sequence, ROS bag or weights file is, in a screenful"),
+    "unpack": ("unpack", "turn a ROS bag into a sequence: images, times, camera, true path"),
     "calibrate": ("calibrate", "find a camera's intrinsics from pictures of a chessboard or live"),
     "lens": ("lens", "find a camera's intrinsics from a video or live, without a chessboard"),
     "shutter": ("shutter", "find how long a camera's rolling shutter takes, from a video or live"),
@@ -51,7 +52,7 @@ VERBS: dict[str, tuple[str, str]] = {
 }
 
 #: verb -> extra of the package with all it needs; of verbs that are not named it is ``server``.
-_EXTRAS = {"agent": "agent", "train": "train", "onnx": "train"}
+_EXTRAS = {"agent": "agent", "unpack": "ros", "train": "train", "onnx": "train"}
 
 EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 

@@ -11,6 +11,7 @@ from typing import Any
 from semcast.common.camera_settings import HOW_TO_GIVE
 from semcast.common.errors import CheckpointError, SourceError
 from semcast.common.recording_reader import RECORDING_METADATA, RecordingReader
+from semcast.common.ros_bag_files import is_ros_bag
 from semcast.common.run_folder import (
     FRAMES_NAME,
     RECONSTRUCTION_NAME,
@@ -31,13 +32,15 @@ def describe(path: Path) -> list[Section]:
     """Say what a path holds.
 
     Args:
-        path: A recording (``.mcap``), a run folder, a sequence folder, a transforms ``.json`` file, or
-            weights (``.safetensors``, an exported encoder ``.onnx`` or a shipped name such as
+        path: A recording (``.mcap``), a run folder, a sequence folder, a transforms ``.json`` file, a ROS
+            bag, or weights (``.safetensors``, an exported encoder ``.onnx`` or a shipped name such as
             ``3dcsc-lite``).
 
     Raises:
         SemcastError: It is none of these, or damaged.
     """
+    if is_ros_bag(path):
+        return describe_bag(path)
     if path.is_dir():
         if any((path / name).exists() for name in (RECONSTRUCTION_NAME, FRAMES_NAME, SUMMARY_NAME)):
             return describe_run(path)
@@ -56,12 +59,30 @@ def describe(path: Path) -> list[Section]:
                 return describe_recording(path)
     known = (
         "it must be a recording (.mcap), a folder that --out wrote, a sequence folder or transforms.json, "
-        "or weights (.safetensors, .onnx or a shipped name)"
+        "a ROS bag, or weights (.safetensors, .onnx or a shipped name)"
     )
     if path.exists():
         way = f"a video is read by: {shlex.join(('semcast', 'agent', '--source', str(path)))}"
         raise SourceError(f"{path} is another kind of file: {known}; {way}")
     raise SourceError(f"there is no file or folder {path}: {known}")
+
+
+def describe_bag(path: Path) -> list[Section]:
+    """Say what of a ROS bag can be made a sequence."""
+    if find_spec("rosbags") is None:
+        return [
+            (f"ROS bag {path}", [("topics", "can't be read: install semcast with the extra 'semcast[ros]'")])
+        ]
+    from semcast.agent.ros_bag import RosBag
+
+    with RosBag(path) as bag:
+        facts = [("time", f"{bag.span_s:.1f} s")]
+        images = [(topic, f"{count:>6}") for topic, count in bag.counts("image").items()]
+        poses = [(topic, f"{count:>6}") for topic, count in bag.counts("pose").items()]
+        frames = sorted({name for said in bag.transforms() for name in (said.parent, said.child)})
+    facts.append(("frames of /tf", ", ".join(frames) or "none"))
+    facts.append(("a sequence is made of it by", f"semcast unpack {shlex.quote(str(path))} --out FOLDER"))
+    return [(f"ROS bag {path}", facts), ("topics of images", images), ("topics of poses", poses)]
 
 
 def _is_bare_name(path: Path) -> bool:

@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=named_path,
         metavar="PATH",
         help="recording (.mcap), folder that --out wrote, sequence folder or transforms.json, "
-        "weights (.safetensors, .onnx) or the name of shipped weights",
+        "ROS bag, weights (.safetensors, .onnx) or the name of shipped weights",
     )
 
 

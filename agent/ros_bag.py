@@ -1,0 +1,232 @@
+"""ROS bags, versions 1 and 2: their images, cameras and transforms, read without ROS (by ``rosbags``)."""
+
+import contextlib
+import logging
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import ReaderError as Reader1Error
+from rosbags.rosbag2 import ReaderError as Reader2Error
+from rosbags.typesys import Stores, get_typestore
+
+from semcast.agent.frame_tree import StampedTransform, plain_name
+from semcast.agent.ros_image import compressed_image_file, raw_image_file
+from semcast.common.camera import Intrinsics
+from semcast.common.errors import SourceError
+from semcast.common.geometry import make_transform, rotation_from_quat_wxyz
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+_RAW, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+#: Topics of tf, and whether what they say holds for all times.
+_TF_TOPICS = {"/tf": False, "/tf_static": True}
+#: Message with a pose -> where in it the pose is.
+_POSES = {
+    "geometry_msgs/msg/PoseStamped": "pose",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
+    "nav_msgs/msg/Odometry": "pose.pose",
+    "geometry_msgs/msg/TransformStamped": "transform",
+}
+
+
+@dataclass(frozen=True)
+class BagImage:
+    """An image of a bag.
+
+    Attributes:
+        time_ns: When it was taken, as its header says; when it was recorded where that says nothing.
+        frame: Coordinate frame of its camera, "" where it says none.
+        suffix: Of an image file, with the point.
+        content: Of that file.
+        problem: Why there is no content, else "".
+    """
+
+    time_ns: int
+    frame: str
+    suffix: str
+    content: bytes
+    problem: str = ""
+
+
+class RosBag:
+    """A bag that is open.
+
+    Args:
+        path: ``.bag`` of ROS 1, folder with ``metadata.yaml``, ``.mcap`` or ``.db3`` of ROS 2.
+
+    Raises:
+        SourceError: There is no bag that can be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        if not path.exists():
+            raise SourceError(f"there is no file or folder {path}")
+        with self._said():
+            # Bags of ROS 2 before Iron don't hold the definitions of their messages.
+            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+            self._reader.open()
+
+    def __enter__(self) -> "RosBag":
+        return self
+
+    def __exit__(self, *exc_info: object) -> None:
+        self._reader.close()
+
+    @contextlib.contextmanager
+    def _said(self) -> Iterator[None]:
+        """Turn what the library says of a damaged bag into an error of ours."""
+        try:
+            yield
+        except (AnyReaderError, Reader1Error, Reader2Error, OSError) as err:
+            raise SourceError(f"{self._path} can't be read as a ROS bag: {err}") from err
+
+    @property
+    def span_s(self) -> float:
+        """Time from the first message to the last."""
+        return self._reader.duration * 1e-9 if self._reader.message_count else 0.0
+
+    def counts(self, *kinds: str) -> dict[str, int]:
+        """Return topic -> number of messages, of topics of a kind: ``image``, ``pose``."""
+        types = {"image": (_RAW, _COMPRESSED), "pose": tuple(_POSES)}
+        wanted = {name for kind in kinds for name in types[kind]}
+        counts: dict[str, int] = {}
+        for connection in self._reader.connections:
+            if connection.msgtype in wanted:
+                counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+        return dict(sorted(counts.items()))
+
+    def _messages(
+        self, topics: set[str], since_ns: int | None = None, until_ns: int | None = None
+    ) -> Iterator[tuple[Connection, int, Any]]:
+        connections = [c for c in self._reader.connections if c.topic in topics]
+        if not connections:
+            return
+        with self._said():
+            for connection, time_ns, raw in self._reader.messages(connections, since_ns, until_ns):
+                yield connection, time_ns, self._reader.deserialize(raw, connection.msgtype)
+
+    def images(self, topic: str, start_s: float = 0.0, seconds: float | None = None) -> Iterator[BagImage]:
+        """Yield the images of a topic in the order in which they were recorded.
+
+        Args:
+            topic: Of images.
+            start_s: From so long after the bag's beginning on.
+            seconds: For so long; None to the end.
+        """
+        since_ns = self._reader.start_time + round(start_s * 1e9)
+        until_ns = None if seconds is None else since_ns + round(seconds * 1e9)
+        for connection, recorded_ns, message in self._messages({topic}, since_ns, until_ns):
+            time_ns = _stamp_ns(message.header) or recorded_ns
+            frame = plain_name(message.header.frame_id)
+            is_raw = connection.msgtype == _RAW
+            try:
+                suffix, content = raw_image_file(message) if is_raw else compressed_image_file(message)
+            except SourceError as err:
+                yield BagImage(time_ns, frame, "", b"", str(err))
+            else:
+                yield BagImage(time_ns, frame, suffix, content)
+
+    def camera(self, image_topic: str, info_topic: str | None = None) -> Intrinsics | None:
+        """Return the camera of an image topic, None where the bag says nothing of it or it wasn't calibrated.
+
+        Rectified images (``image_rect``...) have the projection that rectifies to, without distortion.
+
+        Args:
+            image_topic: Topic of its images.
+            info_topic: Topic of its ``CameraInfo``; None takes the ``camera_info`` beside the images.
+
+        Raises:
+            SourceError: It is none of a pinhole, or the topic that was named is not there.
+        """
+        base = re.sub(r"/(compressed|ffmpeg|theora)$", "", image_topic)
+        folder, _, name = base.rpartition("/")
+        topic = info_topic or f"{folder}/camera_info"
+        is_info = {c.topic for c in self._reader.connections if c.msgtype == _CAMERA_INFO}
+        if topic not in is_info:
+            if info_topic is None:
+                return None
+            raise SourceError(
+                f"camera_info_topic must be one of {', '.join(sorted(is_info)) or 'none'}, got {topic}"
+            )
+        info = next((message for _, _, message in self._messages({topic})), None)
+        if info is None or not any(info.K if hasattr(info, "K") else info.k):
+            logger.warning("%s says nothing: its camera was not calibrated", topic)
+            return None
+        try:
+            return _intrinsics(info, is_rectified=name.startswith("image_rect"))
+        except SourceError as err:
+            raise SourceError(f"{topic}: {err}") from err
+
+    def poses(self, topic: str) -> Iterator[StampedTransform]:
+        """Yield the poses of a topic; ``child`` is "" where they don't say whose they are."""
+        for connection, recorded_ns, message in self._messages({topic}):
+            pose: Any = message
+            for part in _POSES[connection.msgtype].split("."):
+                pose = getattr(pose, part)
+            time_ns = _stamp_ns(message.header) or recorded_ns
+            child = plain_name(getattr(message, "child_frame_id", ""))
+            yield StampedTransform(plain_name(message.header.frame_id), child, time_ns, _matrix(pose))
+
+    def transforms(self) -> Iterator[StampedTransform]:
+        """Yield what ``/tf`` and ``/tf_static`` say."""
+        for connection, recorded_ns, message in self._messages(set(_TF_TOPICS)):
+            if connection.msgtype not in _TF_TYPES:
+                continue
+            for said in message.transforms:
+                is_fixed = _TF_TOPICS[connection.topic]
+                time_ns = None if is_fixed else _stamp_ns(said.header) or recorded_ns
+                parent, child = plain_name(said.header.frame_id), plain_name(said.child_frame_id)
+                yield StampedTransform(parent, child, time_ns, _matrix(said.transform))
+
+
+def _stamp_ns(header: Any) -> int:
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def _matrix(pose: Any) -> Array:
+    """Return the 4x4 matrix of a ``Pose`` or a ``Transform``.
+
+    Raises:
+        SourceError: Its numbers are none of a pose.
+    """
+    at = pose.position if hasattr(pose, "position") else pose.translation
+    turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
+    t = np.array([at.x, at.y, at.z], dtype=np.float64)
+    try:
+        R = rotation_from_quat_wxyz((turn.w, turn.x, turn.y, turn.z))
+    except ValueError as err:
+        raise SourceError(f"a pose of the bag is none: {err}") from err
+    if not np.isfinite(t).all():
+        raise SourceError(f"a pose of the bag must be finite, got position {t.tolist()}")
+    return make_transform(R, t)
+
+
+def _intrinsics(info: Any, *, is_rectified: bool) -> Intrinsics:
+    """Return the camera of a ``CameraInfo``; ROS 1 writes its fields in capitals."""
+    K, D, P = (
+        np.asarray(getattr(info, n if hasattr(info, n) else n.lower()), dtype=np.float64) for n in "KDP"
+    )
+    matrix = P.reshape(3, 4)[:, :3] if is_rectified else K.reshape(3, 3)
+    return Intrinsics.from_dict(
+        {
+            "fx": float(matrix[0, 0]),
+            "fy": float(matrix[1, 1]),
+            "cx": float(matrix[0, 2]),
+            "cy": float(matrix[1, 2]),
+            "width": int(info.width),
+            "height": int(info.height),
+            **({} if is_rectified else {"distortion_model": info.distortion_model, "distortion": D.tolist()}),
+        }
+    )

@@ -1,0 +1,44 @@
+"""Tells ROS bags by how they look, without reading them."""
+
+import shlex
+import struct
+from pathlib import Path
+
+from semcast.common.errors import SourceError
+
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+#: After the magic: opcode of the header and its length, then the length of the profile's name.
+_MCAP_HEAD = struct.Struct("<BQI")
+
+
+def is_ros_bag(path: Path) -> bool:
+    """Tell whether a path is a bag: ``.bag``, ``.db3``, an ``.mcap`` of ROS, or a folder of ROS 2's."""
+    try:
+        if path.is_dir():
+            return b"rosbag2_bagfile_information" in _start_of(path / "metadata.yaml")
+        if not path.is_file():
+            return False
+        start = _start_of(path)
+    except OSError:
+        return False
+    if start.startswith(_MCAP_MAGIC) and len(start) >= len(_MCAP_MAGIC) + _MCAP_HEAD.size:
+        _, _, length = _MCAP_HEAD.unpack_from(start, len(_MCAP_MAGIC))
+        begin = len(_MCAP_MAGIC) + _MCAP_HEAD.size
+        return start[begin : begin + length] in (b"ros1", b"ros2")
+    return path.suffix.lower() in (".bag", ".db3")
+
+
+def check_no_ros_bag(path: Path) -> None:
+    """Refuse a bag where something else is read.
+
+    Raises:
+        SourceError: It is one; the message says what to do with it.
+    """
+    if is_ros_bag(path):
+        way = shlex.join(("semcast", "unpack", str(path), "--out", "FOLDER"))
+        raise SourceError(f"{path} is a ROS bag: a sequence is made of it by: {way}")
+
+
+def _start_of(path: Path, size: int = 4096) -> bytes:
+    with path.open("rb") as file:
+        return file.read(size)

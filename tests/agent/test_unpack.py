@@ -1,0 +1,263 @@
+import logging
+
+import cv2
+import numpy as np
+import pytest
+from bags import CONTAINERS, SECOND, BagMaker
+
+from semcast.agent.unpack import UnpackSettings, unpack
+from semcast.common.errors import SourceError
+from semcast.common.sequence import open_sequence
+
+#: A time at which seconds as a float have no single nanoseconds any more.
+START = 1_700_000_000 * SECOND + 1
+STEP = SECOND // 10
+K = (50.0, 0.0, 31.5, 0.0, 51.0, 23.5, 0.0, 0.0, 1.0)
+P = (40.0, 0.0, 30.5, 0.0, 0.0, 41.0, 22.5, 0.0, 0.0, 0.0, 1.0, 0.0)
+D = (0.1, -0.2, 0.001, 0.002, 0.003)
+WH = (64, 48)
+
+
+def picture(k):
+    return np.full((WH[1], WH[0], 3), 10 * k, np.uint8)
+
+
+def add_images(bag, topic="/cam/image_raw", count=5, frame="cam"):
+    for k in range(count):
+        bag.image(topic, picture(k), "bgr8", START + k * STEP, frame)
+
+
+def settings(bag, tmp_path, **options):
+    return UnpackSettings(bag=bag.write(tmp_path), out=tmp_path / "out", **options)
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_a_bag_becomes_a_sequence_with_camera_and_path(container, tmp_path):
+    bag = BagMaker(container)
+    add_images(bag)
+    bag.camera_info("/cam/camera_info", K, D, P, WH, time_ns=START)
+    for k in range(5):
+        bag.transform("/tf", "/world", "/base", (0.5 * k, 0.0, 0.0), START + k * STEP)
+    bag.transform("/tf_static", "/base", "/cam", (0.0, 0.0, 1.0), START)
+    found = unpack(settings(bag, tmp_path, truth="world"))
+    assert (found.num_images, found.num_left_out, found.num_poses) == (5, 0, 5)
+    sequence = open_sequence(tmp_path / "out")
+    assert sequence.times_ns.tolist() == [START + k * STEP for k in range(5)]
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "out" / "images" / "000003.png")), picture(3))
+    camera = sequence.stored_camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50.0, 51.0, 31.5, 23.5)
+    assert (camera.width, camera.height, camera.distortion) == (*WH, D)
+    positions = sequence.groundtruth().positions
+    np.testing.assert_allclose(positions, [(0.5 * k, 0.0, 1.0) for k in range(5)], atol=1e-9)
+
+
+def test_a_file_of_a_folder_and_the_folder_are_the_same_bag(tmp_path):
+    bag = BagMaker("mcap")
+    add_images(bag)
+    file = bag.write(tmp_path)
+    for path, name in ((file, "a"), (file.parent, "b")):
+        assert unpack(UnpackSettings(bag=path, out=tmp_path / name)).num_images == 5
+
+
+def test_compressed_images_stay_what_they_are(tmp_path):
+    bag = BagMaker()
+    _, jpeg = cv2.imencode(".jpg", picture(7))
+    bag.compressed("/cam/image_raw/compressed", jpeg.tobytes(), "jpeg", START)
+    bag.camera_info("/cam/camera_info", K, D, P, WH, time_ns=START)
+    found = unpack(settings(bag, tmp_path))
+    assert (tmp_path / "out" / "images" / "000000.jpg").read_bytes() == jpeg.tobytes()
+    assert found.camera is not None, "the camera_info beside /cam/image_raw is that of its compressed images"
+
+
+def test_rectified_images_have_the_rectified_camera(tmp_path):
+    bag = BagMaker()
+    add_images(bag, "/cam/image_rect_color")
+    bag.camera_info("/cam/camera_info", K, D, P, WH, time_ns=START)
+    camera = unpack(settings(bag, tmp_path)).camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (40.0, 41.0, 30.5, 22.5, ())
+
+
+def test_a_camera_that_was_not_calibrated_is_unknown(tmp_path, caplog):
+    bag = BagMaker()
+    add_images(bag)
+    bag.camera_info("/cam/camera_info", np.zeros(9), [], np.zeros(12), WH, time_ns=START)
+    assert unpack(settings(bag, tmp_path)).camera is None
+    assert "was not calibrated" in caplog.text
+    assert not (tmp_path / "out" / "intrinsics.json").exists()
+
+
+def test_a_fisheye_is_refused_before_anything_is_written(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    bag.camera_info("/cam/camera_info", K, D[:4], P, WH, model="equidistant", time_ns=START)
+    with pytest.raises(SourceError, match="/cam/camera_info: .*pinhole.*'equidistant'"):
+        unpack(settings(bag, tmp_path))
+    assert not (tmp_path / "out").exists()
+
+
+def test_of_several_topics_one_must_be_named(tmp_path):
+    bag = BagMaker()
+    add_images(bag, "/left/image_raw", 5)
+    add_images(bag, "/right/image_raw", 3)
+    with pytest.raises(SourceError, match=r"they are: /left/image_raw \(5\), /right/image_raw \(3\)"):
+        unpack(settings(bag, tmp_path))
+
+
+def test_the_topic_that_was_named_is_taken(tmp_path):
+    bag = BagMaker()
+    add_images(bag, "/left/image_raw", 5)
+    add_images(bag, "/right/image_raw", 3)
+    assert unpack(settings(bag, tmp_path, image_topic="/right/image_raw")).num_images == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("image_topic", "must be one of those with images, "), ("camera_info_topic", "must be one of none")],
+)
+def test_a_topic_that_is_not_there_is_refused(name, told, tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    with pytest.raises(SourceError, match=rf"{name} {told}.*got /nowhere"):
+        unpack(settings(bag, tmp_path, **{name: "/nowhere"}))
+
+
+def test_poses_without_a_frame_of_their_own_are_the_cameras(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    for k in (0, 2, 4):
+        bag.pose("/mocap", "room", (1.0 * k, 0.0, 0.0), START + k * STEP)
+    assert unpack(settings(bag, tmp_path, truth="/mocap")).num_poses == 5
+    positions = open_sequence(tmp_path / "out").groundtruth().positions
+    np.testing.assert_allclose(positions[:, 0], [0.0, 1.0, 2.0, 3.0, 4.0], atol=1e-9)
+
+
+def test_poses_of_a_body_reach_the_camera_by_tf_and_win_over_it(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    for k in range(5):
+        bag.odometry("/odom", "odom", "base", (1.0 * k, 0.0, 0.0), START + k * STEP)
+        bag.transform("/tf", "map", "base", (99.0, 0.0, 0.0), START + k * STEP)
+    bag.transform("/tf_static", "base", "cam", (0.0, 2.0, 0.0), START)
+    unpack(settings(bag, tmp_path, truth="/odom"))
+    positions = open_sequence(tmp_path / "out").groundtruth().positions
+    np.testing.assert_allclose(positions, [(1.0 * k, 2.0, 0.0) for k in range(5)], atol=1e-9)
+
+
+def test_images_without_a_pose_have_none(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    for k in range(3):
+        bag.pose("/mocap", "room", (1.0 * k, 0.0, 0.0), START + k * STEP)
+    assert unpack(settings(bag, tmp_path, truth="/mocap")).num_poses == 3
+
+
+def test_a_path_of_another_time_is_told(tmp_path, caplog):
+    bag = BagMaker()
+    add_images(bag)
+    bag.pose("/mocap", "room", (0.0, 0.0, 0.0), SECOND)
+    assert unpack(settings(bag, tmp_path, truth="/mocap")).num_poses is None
+    assert "no true pose at the time of any image" in caplog.text
+
+
+def test_a_truth_that_is_neither_topic_nor_frame_is_refused_before_anything_is_written(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    bag.pose("/mocap", "room", (0.0, 0.0, 0.0), START)
+    bag.transform("/tf_static", "base", "cam", (0.0, 2.0, 0.0), START)
+    with pytest.raises(
+        SourceError, match=r"topic of poses \(/mocap\) or a frame of /tf \(base, cam\), got map"
+    ):
+        unpack(settings(bag, tmp_path, truth="map"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_images_that_name_no_frame_need_one_for_the_truth(tmp_path):
+    bag = BagMaker()
+    add_images(bag, frame="")
+    bag.transform("/tf_static", "base", "cam", (0.0, 2.0, 0.0), START)
+    wanted = settings(bag, tmp_path, truth="base")
+    with pytest.raises(SourceError, match="camera_frame must be given"):
+        unpack(wanted)
+    named = UnpackSettings(bag=wanted.bag, out=wanted.out, truth="base", camera_frame="cam")
+    assert unpack(named).num_poses == 5
+
+
+def test_bad_images_are_left_out_and_counted(tmp_path, caplog):
+    bag = BagMaker()
+    for k in (0, 1, 3):
+        bag.image("/cam/image_raw", picture(k), "bgr8", START + k * STEP)
+    bag.image("/cam/image_raw", picture(2)[..., 0], "32FC1", START + 2 * STEP)
+    # Recorded last, but taken at the time of the second.
+    bag.image("/cam/image_raw", picture(4), "bgr8", START + STEP, recorded_ns=START + 4 * STEP)
+    with caplog.at_level(logging.WARNING):
+        found = unpack(settings(bag, tmp_path))
+    assert (found.num_images, found.num_left_out) == (3, 2)
+    assert "image 3 is left out: encoding must be one of" in caplog.text
+    assert open_sequence(tmp_path / "out").times_ns.tolist() == [START + k * STEP for k in (0, 1, 3)]
+
+
+def test_a_bag_of_bad_images_is_an_error(tmp_path):
+    bag = BagMaker()
+    bag.image("/depth/image_raw", np.zeros(WH[::-1], np.uint16), "16UC1", START)
+    with pytest.raises(SourceError, match="no image of /depth/image_raw: none of its 1 can be used"):
+        unpack(settings(bag, tmp_path))
+
+
+def test_a_header_without_a_time_leaves_that_of_the_recording(tmp_path):
+    bag = BagMaker()
+    bag.image("/cam/image_raw", picture(0), "bgr8", 0, recorded_ns=START)
+    unpack(settings(bag, tmp_path))
+    assert open_sequence(tmp_path / "out").times_ns.tolist() == [START]
+
+
+def test_a_part_of_a_bag_can_be_taken(tmp_path):
+    bag = BagMaker()
+    add_images(bag, count=10)
+    unpack(settings(bag, tmp_path, start_s=0.2, seconds=0.3))
+    assert open_sequence(tmp_path / "out").times_ns.tolist() == [START + k * STEP for k in (2, 3, 4)]
+
+
+def test_a_time_without_images_is_an_error(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    with pytest.raises(SourceError, match="none in the time asked for"):
+        unpack(settings(bag, tmp_path, start_s=60.0))
+
+
+def test_a_folder_with_files_is_left_alone(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    wanted = settings(bag, tmp_path)
+    wanted.out.mkdir()
+    (wanted.out / "mine.txt").write_text("mine")
+    with pytest.raises(SourceError, match="must be a new or an empty folder"):
+        unpack(wanted)
+    assert [p.name for p in wanted.out.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("none.bag", None), ("bad.bag", b"no bag at all"), ("bad.db3", b"SQLite format 3\0bad")],
+)
+def test_a_file_that_is_no_bag_is_an_error_in_a_line(name, content, tmp_path):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SourceError) as caught:
+        unpack(UnpackSettings(bag=path, out=tmp_path / "out"))
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "value"), [("start_s", -0.1), ("start_s", float("nan")), ("seconds", 0.0)])
+def test_ranges_are_checked(name, value, tmp_path):
+    with pytest.raises(ValueError, match=name):
+        UnpackSettings(bag=tmp_path / "a.bag", out=tmp_path / "out", **{name: value})
+
+
+def test_progress_is_told(tmp_path):
+    bag = BagMaker()
+    add_images(bag, count=3)
+    told = []
+    unpack(settings(bag, tmp_path), lambda taken, total: told.append((taken, total)))
+    assert told == [(1, 3), (2, 3), (3, 3)]
