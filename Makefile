@@ -53,7 +53,7 @@ $(BIN)/python:
 
 $(VENV)/.ready-run: $(BIN)/python pyproject.toml constraints.txt
 	@echo "installing semcast into $(VENV) (once, about a minute)"
-	$(PIP_INSTALL) --editable '.[agent,server]'
+	$(PIP_INSTALL) --editable '.[agent,ros,server]'
 	@touch $@
 
 $(VENV)/.ready-dev: $(BIN)/python pyproject.toml constraints.txt
