@@ -63,7 +63,7 @@ class LiveStream:
             return
         if not self._is_stalled:
             changes = self._changes_since(self._cursor)
-            if not changes.empty:
+            if not changes.empty or self._stream.is_holding:
                 self._stream.write(changes)
         delivery = self._stream.flush(FLUSH_TIMEOUT_S)
         if delivery is Delivery.DONE:

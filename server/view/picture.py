@@ -1,5 +1,6 @@
 """The newest image as viewers get it: compressed once for all of them, with its confidence in colours."""
 
+import functools
 from dataclasses import dataclass
 
 import cv2
@@ -58,8 +59,12 @@ def confidence_colours(confidence: NDArray[np.float32]) -> NDArray[np.uint8]:
         uint8 RGB with one more axis, of length 3.
     """
     levels = (np.clip(np.nan_to_num(confidence, nan=0.0), 0.0, 1.0) * 255.0).astype(np.uint8)
+    return np.take(_colour_table(), levels, axis=0)
+
+
+@functools.cache
+def _colour_table() -> NDArray[np.uint8]:
+    """Return the colour of each of 256 levels, ``(256, 3)`` RGB."""
     stops = np.linspace(0.0, 255.0, len(CONFIDENCE_COLOURS))
-    table = np.stack(
-        [np.interp(np.arange(256), stops, channel) for channel in np.transpose(CONFIDENCE_COLOURS)], axis=1
-    )
-    return np.asarray(np.rint(table).astype(np.uint8)[levels], dtype=np.uint8)
+    channels = [np.interp(np.arange(256), stops, channel) for channel in np.transpose(CONFIDENCE_COLOURS)]
+    return np.rint(np.stack(channels, axis=1)).astype(np.uint8)

@@ -29,6 +29,8 @@ OTHER_COLOUR = (240, 120, 70)
 DENSE = "world/dense"
 DENSE_POINT_SIZE = 1.3
 
+#: Plot values are sent when there are those of so many frames, or after so long.
+_HELD_ROWS, _HELD_S = 4, 0.3
 #: Plot path to (name in the legend, colour); other paths get a colour of Rerun's choice.
 SERIES = {
     "link/snr_set_db": ("SNR set", (130, 140, 160)),
@@ -135,6 +137,8 @@ class RerunStream:
     ) -> None:
         self._camera = camera
         self._named: set[str] = set()
+        self._held: list[Row] = []
+        self._held_since_s = 0.0
         self._stream: rr.RecordingStream | None = rr.RecordingStream(
             APPLICATION_ID, recording_id=recording_id
         )
@@ -174,8 +178,13 @@ class RerunStream:
             raise ValueError("the stream is closed")
         return self._stream
 
+    @property
+    def is_holding(self) -> bool:
+        """Whether plot values wait for the next ``write``."""
+        return bool(self._held)
+
     def write(self, changes: Changes) -> None:
-        """Log what changed; returns before it has arrived."""
+        """Log what changed, plot values a little later; returns before it has arrived."""
         stream = self._open()
         if changes.cleared:
             for path in (
@@ -192,7 +201,8 @@ class RerunStream:
             last = changes.rows[-1]
             stream.set_time("frame", sequence=last.frame_id)
             stream.set_time("source_time", duration=last.t_source_ns * 1e-9)
-            self._write_rows(changes.rows)
+            self._write_poses(changes.rows)
+        self._plot(changes.rows)
         for idx, strips in changes.segments.items():
             stream.log(
                 f"world/trajectory/{idx:04d}",
@@ -210,30 +220,42 @@ class RerunStream:
         if changes.picture is not None:
             self._write_picture(changes.picture)
 
-    def _write_rows(self, rows: list[Row]) -> None:
-        """Send poses and plot values as columns, each at its own frame and time."""
+    def _write_poses(self, rows: list[Row]) -> None:
+        """Send poses as columns, each at its own frame and time."""
         posed = [row for row in rows if row.T_world_cam is not None]
-        if posed:
-            T_world_cam = np.array([row.T_world_cam for row in posed])
-            times = _time_columns(posed)
-            T_world_eye = np.array([row.T_world_eye for row in posed])
-            for path, T in (("world/camera", T_world_cam), ("world/spectator", T_world_eye)):
-                columns = rr.Transform3D.columns(translation=T[:, :3, 3], mat3x3=T[:, :3, :3])
-                self._open().send_columns(path, indexes=times, columns=columns)
+        if not posed:
+            return
+        T_world_cam = np.array([row.T_world_cam for row in posed])
+        times = _time_columns(posed)
+        T_world_eye = np.array([row.T_world_eye for row in posed])
+        for path, T in (("world/camera", T_world_cam), ("world/spectator", T_world_eye)):
+            columns = rr.Transform3D.columns(translation=T[:, :3, 3], mat3x3=T[:, :3, :3])
+            self._open().send_columns(path, indexes=times, columns=columns)
+
+    def _plot(self, rows: list[Row]) -> None:
+        """Send plot values when there are some: a dozen curves cost as much for one frame as for ten."""
+        if rows and not self._held:
+            self._held_since_s = time.monotonic()
+        self._held += rows
+        if len(self._held) >= _HELD_ROWS or time.monotonic() - self._held_since_s >= _HELD_S:
+            self._send_held(self._open())
+
+    def _send_held(self, stream: rr.RecordingStream) -> None:
+        rows, self._held = self._held, []
         for path in sorted({path for row in rows for path in row.scalars}):
             having = [row for row in rows if path in row.scalars]
-            self._name_series(path)
+            self._name_series(stream, path)
             values = [row.scalars[path] for row in having]
-            self._open().send_columns(
+            stream.send_columns(
                 f"plots/{path}", indexes=_time_columns(having), columns=rr.Scalars.columns(scalars=values)
             )
 
-    def _name_series(self, path: str) -> None:
+    def _name_series(self, stream: rr.RecordingStream, path: str) -> None:
         if path in self._named:
             return
         self._named.add(path)
         name, colour = SERIES.get(path, (path.split("/")[-1].removesuffix("_ms").replace("_", " "), None))
-        self._open().log(f"plots/{path}", rr.SeriesLines(names=name, colors=colour, widths=1.8), static=True)
+        stream.log(f"plots/{path}", rr.SeriesLines(names=name, colors=colour, widths=1.8), static=True)
 
     def _write_points(self, chunk: PointChunk) -> None:
         radius = rr.Radius.ui_points(2.2)
@@ -296,6 +318,7 @@ class RerunStream:
         self._stream = None
 
         def drop() -> None:
+            self._send_held(box[0])
             box[0].disconnect()
             box.clear()
 

@@ -102,7 +102,7 @@ def test_an_update_that_makes_no_sense_costs_itself_alone(held, caplog):
 class Viewer:
     """A viewer that fails at the first change, and all streams to it."""
 
-    kind, url = "web", None
+    kind, url, is_holding = "web", None, False
     opened = 0
 
     def __init__(self):

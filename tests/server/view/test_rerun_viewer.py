@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -31,7 +32,8 @@ import rerun as rr
 from semcast.server.view.feed import ViewerFeed, check_view, resolve_view
 from semcast.server.view.live_stream import MAX_REFUSALS
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
-from semcast.server.view.rerun_viewer import SERIES, blueprint
+from semcast.server.view.rerun_viewer import SERIES, RerunStream, blueprint
+from semcast.server.view.scene import Cursor, Scene
 from semcast.server.viewing import check_viewer, open_viewer
 
 pytestmark = pytest.mark.xdist_group("real-time")
@@ -126,6 +128,35 @@ def test_the_file_can_be_read_back_and_holds_everything(tmp_path):
         "/plots/drops/stale",
     ):
         assert entity in text, entity
+
+
+def test_plot_values_go_out_together_and_none_is_lost(tmp_path):
+    file = tmp_path / "run.rrd"
+    stream = RerunStream(recording_id="plots", camera=CAMERA, has_truth=False, has_confidence=True, file=file)
+    scene, cursor = Scene(None), Cursor()
+    for k in range(10):
+        scene.add_frame(frame(k).without_image())
+        stream.write(scene.changes_since(cursor))
+    assert stream.is_holding, "the last ones wait for more"
+    assert stream.close()
+    text = rerun_output("rrd", "print", "-vvv", "--entity", "/plots/link/psnr_db", str(file))
+    assert re.findall(r"\[(2\d\.0)\]", text) == [f"{20 + k}.0" for k in range(10)]
+    assert re.findall(r"with (\d+) rows? .*- \[?/?plots/link/psnr_db", text).count("4") == 2
+
+
+def test_plot_values_of_a_stream_that_rests_go_out_all_the_same(tmp_path):
+    stream = RerunStream(
+        recording_id="rest", camera=CAMERA, has_truth=False, has_confidence=True, file=tmp_path / "run.rrd"
+    )
+    scene, cursor = Scene(None), Cursor()
+    scene.add_frame(frame(0).without_image())
+
+    def is_out():
+        stream.write(scene.changes_since(cursor))
+        return not stream.is_holding
+
+    until(is_out, "nothing waits")
+    stream.close()
 
 
 def test_a_plot_has_a_legend_where_it_has_several_curves():
