@@ -56,7 +56,7 @@ def _aligned(
     """Refine a rotation by Gauss and Newton's method; it, and how the images correlate."""
     height, width = small0.shape
     scale = width / camera.width
-    slopes = [cv2.Sobel(small1, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0)]
+    slopes = [_slope(small1, dx) for dx in (1, 0)]
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
     seen_from_there = camera.unproject((pixels + 0.5) / scale - 0.5) - way_depths
     focal_px = scale * np.array([camera.fx, camera.fy])
@@ -113,7 +113,12 @@ def _small(grey: Grey, width_px: int) -> Small:
     return np.asarray(cv2.GaussianBlur(small, (0, 0), _BLUR_PX), dtype=np.float32)
 
 
-def _sampled(image: NDArray[np.generic], xy: Array) -> Array:
+def _slope(image: Small, dx: int) -> Small:
+    """Grey levels per pixel to the right, or with 0 downwards."""
+    return np.asarray(cv2.Sobel(image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125), dtype=np.float32)
+
+
+def _sampled(image: Small, xy: Array) -> Array:
     at = xy.astype(np.float32)
     found = cv2.remap(image, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)
     return np.asarray(found, dtype=np.float64).ravel()
