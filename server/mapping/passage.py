@@ -23,8 +23,9 @@ from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
 
-#: A part is placed again when its start is so long ago.
-_SETTLED_NS = 1_000_000_000
+#: A part is placed again when its start is so long ago, but no longer: a camera that stood since, or was
+#: elsewhere, has not gone on as before.
+_SETTLED_NS, _LATEST_NS = 1_000_000_000, 2_000_000_000
 
 
 @dataclass(frozen=True)
@@ -89,15 +90,18 @@ class Passage:
             submap: The part.
 
         Returns:
-            ``(scale, T)`` with ``x_new = T @ (scale * x)``, once for each part; None while it is too young,
-            or where it is one with an older part.
+            ``(scale, T)`` with ``x_new = T @ (scale * x)``, once for each part; None while it is too young or
+            when it is too old, and where it is one with an older part.
         """
         before = self._before
         if before is None or before.submap != submap:
             return None
-        if world.keyframes[-1].t_source_ns - before.start_ns < _SETTLED_NS:
+        age_ns = world.keyframes[-1].t_source_ns - before.start_ns
+        if age_ns < _SETTLED_NS:
             return None
         self._before = None
+        if age_ns > _LATEST_NS:
+            return None
         mine = world.keyframes_of(submap)
         T_first_world = invert_transform(mine[0].T_world_cam)
         unit = float(np.median([median_depth(world, k) for k in mine]))

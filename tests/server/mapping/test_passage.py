@@ -80,6 +80,15 @@ def test_a_part_whose_unit_changed_after_its_start_is_placed_again(world, drift)
     assert passage.lay_again(world, 1) is None, "once is enough"
 
 
+@pytest.mark.parametrize(("frame", "stays"), [(26, False), (36, True)])
+def test_a_camera_that_stood_for_a_while_has_not_gone_on_as_before(world, frame, stays):
+    passage = laid(world)
+    add(world, [15, 18, frame], path, 1, np.random.default_rng(1).uniform((-2, -2, 9), (2, 2, 11), (60, 3)))
+    assert (passage.lay_again(world, 1) is None) == stays
+    world.add_keyframe(keyframe(frame + 1, path(frame + 1), 1))
+    assert passage.lay_again(world, 1) is None
+
+
 def test_a_part_that_nothing_is_known_of_stays(world):
     passage = laid(world)
     for frame in (15, 18, 26):
