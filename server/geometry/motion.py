@@ -1,5 +1,8 @@
 """Motion prior: the camera goes on as it moved, for as long as that is known."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +16,9 @@ MAX_EXTRAPOLATION_S = 1.5
 MAX_GAP_S = 3.0
 #: Parts of a gap in which the motion is taken to be steady.
 _BRIDGE_STEPS = 10
+#: The way from one pose to the next is mostly noise where poses are poor, as they are before a loss: a speed
+#: is that of so long a time.
+_SPEED_S = 1.0
 
 
 class ConstantVelocity:
@@ -22,7 +28,7 @@ class ConstantVelocity:
         self._last: tuple[int, Array] | None = None
         self._rotation_rad_per_s: Array = np.zeros(3)
         self._translation_per_s: Array = np.zeros(3)
-        self._interval_s = 0.0
+        self._ways: list[tuple[float, Array]] = []
 
     def reset(self) -> None:
         """Forget the motion."""
@@ -30,8 +36,13 @@ class ConstantVelocity:
 
     @property
     def speed_map_per_s(self) -> float:
-        """Length of the translation per second."""
-        return float(np.linalg.norm(self._translation_per_s))
+        """Length of the translation per second, over the last second."""
+        return float(np.linalg.norm(self._way_per_s()))
+
+    def _way_per_s(self) -> Array:
+        """Mean translation per second in the camera's own frame: turning does not shorten it, noise does."""
+        elapsed_s = sum(interval_s for interval_s, _ in self._ways)
+        return sum((way for _, way in self._ways), np.zeros(3)) / elapsed_s if self._ways else np.zeros(3)
 
     def observe(self, t_source_ns: int, T_world_cam: Array) -> None:
         """Take the pose of a frame, in the map's unit.
@@ -45,9 +56,14 @@ class ConstantVelocity:
                 T_before_now = invert_transform(T_world_before) @ T_world_cam
                 self._rotation_rad_per_s = log_so3(T_before_now[:3, :3]) / elapsed_s
                 self._translation_per_s = T_before_now[:3, 3] / elapsed_s
-                self._interval_s = elapsed_s
+                # A way is that of a whole interval in the frame in which that began: the camera turned on it.
+                half_back = exp_so3(-0.5 * elapsed_s * self._rotation_rad_per_s)
+                self._ways.append((elapsed_s, half_back @ T_before_now[:3, 3]))
+                while sum(interval_s for interval_s, _ in self._ways[1:]) >= _SPEED_S:
+                    del self._ways[0]
             else:
                 self._rotation_rad_per_s, self._translation_per_s = np.zeros(3), np.zeros(3)
+                self._ways = []
         self._last = (t_source_ns, T_world_cam.copy())
 
     def correct(self, T_world_cam: Array, scale: float = 1.0) -> None:
@@ -55,6 +71,7 @@ class ConstantVelocity:
         if self._last is not None:
             self._last = (self._last[0], T_world_cam.copy())
             self._translation_per_s = self._translation_per_s * scale
+            self._ways = [(interval_s, scale * way) for interval_s, way in self._ways]
 
     def predict(self, t_source_ns: int) -> Array | None:
         """``T_world_cam`` expected at a time, None without any pose.
@@ -68,7 +85,13 @@ class ConstantVelocity:
         R = exp_so3(self._rotation_rad_per_s * elapsed_s)
         return np.asarray(T_world_last @ make_transform(R, self._translation_per_s * elapsed_s))
 
-    def bridge(self, t_source_ns: int, T_after_later: Array, later_s: float) -> Array | None:
+    def way_in(self, elapsed_s: float) -> Array:
+        """Translation ``(3,)`` in the camera's own frame that goes on for so long."""
+        return elapsed_s * self._way_per_s()
+
+    def bridge(
+        self, t_source_ns: int, T_after_later: Array, later_s: float, turned: Sequence[tuple[int, Array]] = ()
+    ) -> Array | None:
         """``T_world_cam`` at a time, where it is known how the camera moved from then on.
 
         How it turns and moves, in its own frame, changes evenly from what it was to what it will be: who
@@ -78,6 +101,8 @@ class ConstantVelocity:
             t_source_ns: The time.
             T_after_later: ``(4, 4)`` motion from then on.
             later_s: In so many seconds, more than 0.
+            turned: Times ``t_ns`` and how the camera had turned by then, ``R_last_then (3, 3)``, ascending
+                from the last pose to the time that is asked for; else turning is not known.
 
         Returns:
             The pose, or None without any pose, or with the last one too long ago.
@@ -88,14 +113,22 @@ class ConstantVelocity:
         gap_s = (t_source_ns - t_ns) * 1e-9
         if not 0.0 < gap_s <= MAX_GAP_S:
             return None
-        turn = np.stack([self._rotation_rad_per_s, log_so3(T_after_later[:3, :3]) / later_s])
-        way = np.stack([self._translation_per_s, T_after_later[:3, 3] / later_s])
-        # A way is that of a whole interval, in the frame in which that began: the camera turned on it.
-        for k, interval_s in enumerate((self._interval_s, later_s)):
-            way[k] = exp_so3(-0.5 * interval_s * turn[k]) @ way[k]
-        step_s = gap_s / _BRIDGE_STEPS
-        for share in (np.arange(_BRIDGE_STEPS) + 0.5) / _BRIDGE_STEPS:
-            half = exp_so3(0.5 * step_s * ((1.0 - share) * turn[0] + share * turn[1]))
-            step = make_transform(half, half @ (step_s * ((1.0 - share) * way[0] + share * way[1])))
-            T_world_cam = T_world_cam @ step @ make_transform(half, np.zeros(3))
+        turn_later = log_so3(T_after_later[:3, :3])
+        way_later = exp_so3(-0.5 * turn_later) @ T_after_later[:3, 3]
+        if turned and (turned[0][0], turned[-1][0]) == (t_ns, t_source_ns):
+            ends = np.array([then_ns - t_ns for then_ns, _ in turned]) * 1e-9 / gap_s
+            turns = [log_so3(before.T @ after) for (_, before), (_, after) in pairwise(turned)]
+        else:
+            ends = np.linspace(0.0, 1.0, _BRIDGE_STEPS + 1)
+            mixed = [
+                (1.0 - share) * self._rotation_rad_per_s + share * turn_later / later_s
+                for share in 0.5 * (ends[1:] + ends[:-1])
+            ]
+            turns = [gap_s / _BRIDGE_STEPS * turn for turn in mixed]
+        for (begin, end), turn in zip(pairwise(ends.tolist()), turns, strict=True):
+            share, step_s = 0.5 * (begin + end), (end - begin) * gap_s
+            half = exp_so3(0.5 * turn)
+            way = (1.0 - share) * self._way_per_s() + share * way_later / later_s
+            T_world_cam = T_world_cam @ make_transform(half, half @ (step_s * way))
+            T_world_cam = T_world_cam @ make_transform(half, np.zeros(3))
         return np.asarray(T_world_cam)

@@ -1,5 +1,7 @@
 """Where a new submap is put, and how large its unit is, as long as nothing better is known."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,14 +28,19 @@ _MOST_TURNED_DEG, _MOST_TURNED_DEG_S = 30.0, 60.0
 
 
 def bridge(
-    motion: CameraMotion, start: Start, grown: Start, last_ns: int | None, depth: float
+    motion: CameraMotion,
+    start: Start,
+    grown: Start,
+    last_ns: int | None,
+    depth: float,
+    turned: Sequence[tuple[int, Array]] = (),
 ) -> tuple[Array, float]:
     """Lay a way from what is known to where a new submap begins.
 
     Its unit makes the camera go on at its old speed; the slower that was, the more things are as far away as
     they were, and where it stood, or too long ago, they are just that. It begins where the camera got to:
-    turning and moving change evenly from what they were to what the submap says, or, where its unit isn't
-    told by the speed, go on as they were.
+    it turned as its images say, else turning and moving change evenly from what they were to what the submap
+    says, or, where its unit isn't told by the speed, go on as they were.
 
     Args:
         motion: Of the camera so far.
@@ -41,6 +48,7 @@ def bridge(
         grown: The same and what came before.
         last_ns: Time of the newest keyframe of the map, None where there is none.
         depth: How far things were, in the map's unit.
+        turned: How the camera turned since its last pose, see ``VisualGyroscope``.
 
     Returns:
         ``T_world_cam (4, 4)`` of the first camera of ``grown``, and world units per unit of the start.
@@ -61,12 +69,13 @@ def bridge(
     changed = _SPEED_CHANGE_DEPTHS_S * depth / motion.speed_map_per_s
     weights = _DEPTH_SIGMA**-2, 1.0 / (_SPEED_SIGMA**2 + changed**2)
     scale = float(np.exp(np.average(np.log((depth, gone / way)), weights=weights)))
+    turned = [then for then in turned if then[0] <= at_ns]
     # Of a source that gives two images one time, the second tells no speed.
     later = [k for k in grown.keyframes if k.t_source_ns > at_ns]
     soon = ([k for k in later if k.t_source_ns - at_ns <= _LATER_NS] or later[:1])[-1]
     T_later = soon.T_world_cam.copy()
     T_later[:3, 3] *= scale
-    T_world_first = motion.bridge(at_ns, T_later, (soon.t_source_ns - at_ns) * 1e-9)
+    T_world_first = motion.bridge(at_ns, T_later, (soon.t_source_ns - at_ns) * 1e-9, turned)
     return T_world_guess if T_world_first is None else T_world_first, scale
 
 

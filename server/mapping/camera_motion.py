@@ -90,9 +90,15 @@ class CameraMotion:
         """Where a camera that seems to have stopped would be if it went on, None where it did not stop."""
         return self._motion.predict(t_source_ns) if self._still else None
 
-    def bridge(self, t_source_ns: int, T_after_later: Array, later_s: float) -> Array | None:
+    def way_in(self, elapsed_s: float) -> Array:
+        """Translation ``(3,)`` in the camera's frame that goes on for so long; none while it stands."""
+        return np.zeros(3) if self._still else self._motion.way_in(elapsed_s)
+
+    def bridge(
+        self, t_source_ns: int, T_after_later: Array, later_s: float, turned: Sequence[tuple[int, Array]] = ()
+    ) -> Array | None:
         """As ``ConstantVelocity.bridge``; None while the camera stands."""
-        return None if self._still else self._motion.bridge(t_source_ns, T_after_later, later_s)
+        return None if self._still else self._motion.bridge(t_source_ns, T_after_later, later_s, turned)
 
     def comes_after_gap(self, t_source_ns: int) -> bool:
         """Note that a frame has come, and tell whether frames are missing between the last pose and it.

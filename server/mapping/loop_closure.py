@@ -21,7 +21,7 @@ from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.mapper import median_depth
 from semcast.server.mapping.pose_graph import Edge, SolvedGraph, solve_graph
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
-from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit
+from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, tells_depth
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -160,8 +160,12 @@ class LoopFinder:
         return None if place is None else self._judge(view, world, noise, newest, place, is_sure=False)
 
     def _place_of(self, found: Revisit, world: WorldMap, noise: NoiseModel, submap: int) -> Place | None:
-        """Where a frame is that sees landmarks of long ago, going by these alone."""
-        ids, xy = found.ids[found.points.ok], found.points.xy[found.points.ok]
+        """Where a frame is that sees landmarks of long ago, going by these alone.
+
+        Those of unknown depth have no say: together they agree with a pose far off.
+        """
+        has_say = found.points.ok & tells_depth(self._camera, world.keyframes_of(submap), found.ids)
+        ids, xy = found.ids[has_say], found.points.xy[has_say]
         sigma = np.full(len(ids), max(OLD_SIGMA_PX, noise.sigma0_px))
         xyz = world.landmarks.xyz[world.landmarks.rows(ids)]
         pose = search_pose(self._camera, xyz, xy, sigma, GATE_SIGMAS * sigma, seed=self._seed)

@@ -12,14 +12,14 @@ from semcast.common.geometry import invert_transform, make_transform, skew, tran
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
 from semcast.server.mapping import mapper
 from semcast.server.mapping.anchoring import anchor_tracks, resembles
-from semcast.server.mapping.bridging import bridge, may_turn
+from semcast.server.mapping.bridging import may_turn
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
-from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, colours_of
 from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
+from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
@@ -324,13 +324,13 @@ class MapBuilder:
             self.world.revisits.setdefault(frame_id, recognised)
 
     @property
-    def _enough(self) -> int:
+    def enough(self) -> int:
         """Landmarks that a keyframe has enough with."""
         return round(_ENOUGH_SHARE * self._settings.max_features)
 
     def _add_landmarks(self, image: NDArray[np.uint8]) -> None:
         parallax_deg, noise = self._settings.min_parallax_deg, self.noise.model
-        mapper.add_landmarks(self.world, self._camera, noise, image, parallax_deg, enough=self._enough)
+        mapper.add_landmarks(self.world, self._camera, noise, image, parallax_deg, enough=self.enough)
 
     def _bound(self) -> None:
         """Keep the map, and the images of its keyframes, within its size."""
@@ -384,11 +384,19 @@ class MapBuilder:
             self._adjusted = None
         return num_adjusted
 
-    def bridge(self, motion: CameraMotion, start: Start, grown: Start) -> tuple[Array, float]:
-        """Where a new submap begins and its unit, see ``bridging.bridge``."""
-        keyframes = self.world.keyframes
-        last_ns = keyframes[-1].t_source_ns if keyframes else None
-        return bridge(motion, start, grown, last_ns, mapper.usual_depth(self.world, self._enough))
+    def place_again(self, passage: Passage, on_moved: Callable[[float], None]) -> float:
+        """Move the current submap to where it is by now known to begin; the factor on lengths, else 1.
+
+        ``on_moved`` is called with it after the map has moved.
+        """
+        found = passage.lay_again(self.world, self.submap)
+        if found is None:
+            return 1.0
+        self._abandon_adjustment()
+        self.world.transform_submap(self.submap, self.submap, *found)
+        self._adjusted = None
+        on_moved(found[0])
+        return found[0]
 
     def join(
         self,

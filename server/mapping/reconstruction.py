@@ -20,6 +20,7 @@ from semcast.server.mapping.kept_frames import backfill, observed_of
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -78,6 +79,7 @@ class Reconstruction:
         self._tracks = TrackTable(s.confidence, s.max_features, s.seed)
         self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
         self._motion = CameraMotion(self._camera)
+        self._passage = Passage(self._camera, self._map.enough)
         self._shutter = RollingShutter(camera, lambda: self._map.watch.is_on)
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
@@ -139,9 +141,10 @@ class Reconstruction:
         if is_first:
             self._initialiser.clear()
         self._lap("track", since)
-        if self._state is TrackingState.TRACKING:
-            return self._track(sight, T_world_guess)
-        return self._find(sight)
+        is_tracked = self._state is TrackingState.TRACKING
+        result = self._track(sight, T_world_guess) if is_tracked else self._find(sight)
+        self._passage.note(sight, result.T_world_cam, self._motion, self._map.world)
+        return result
 
     def _lap(self, stage: str, since_ns: int) -> None:
         self._stage_ms[stage] = self._stage_ms.get(stage, 0.0) + (time.perf_counter_ns() - since_ns) * 1e-6
@@ -210,8 +213,9 @@ class Reconstruction:
             pose = self._pose(T_world_guess)
         is_vague = pose is None or self._is_after_gap
         pose = self._with_more(sight, pose, T_world_guess)
-        if pose is not None and is_vague:
-            pose = self._if_alike(sight, pose)
+        if pose is not None and is_vague and not self._resembles(sight, pose):
+            self._tracks.clear()  # nothing that was found is kept
+            pose = None
         self._lap("pose", since)
         if pose is not None:
             return self._accept(sight, pose)
@@ -239,14 +243,8 @@ class Reconstruction:
         self._tracks.keep(~np.isin(self._tracks.ids, recalled))
         return pose
 
-    def _if_alike(self, sight: Sight, pose: TrackedPose) -> TrackedPose | None:
-        """Return a pose whose tracks look as they did; of others nothing that was found is kept."""
-        if self._resembles(sight, pose):
-            return pose
-        self._tracks.clear()
-        return None
-
     def _resembles(self, sight: Sight, pose: TrackedPose) -> bool:
+        """Tell whether tracks that agree with a pose look as they did."""
         return self._map.resembles(self._tracks, sight, pose.T_world_cam, pose.ids[pose.inliers])
 
     def _accept(self, sight: Sight, pose: TrackedPose) -> FrameResult:
@@ -276,6 +274,7 @@ class Reconstruction:
             self._frames_since_keyframe = 0
             self._lap("map", since)
             pose = pose.with_unit(self._try_to_join(sight, pose.T_world_cam))
+            pose = pose.with_unit(self._map.place_again(self._passage, self._moved))
         return self._result(frame, self._last_pose(), pose, is_keyframe=is_keyframe)
 
     def _improved(self, sight: Sight, pose: TrackedPose) -> TrackedPose:
@@ -373,7 +372,8 @@ class Reconstruction:
         since = time.perf_counter_ns()
         history = self._initialiser.history
         grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
-        T_world_ref, scale = self._map.bridge(self._motion, start, grown)
+        world, submap = self._map.world, self._map.submap
+        T_world_ref, scale = self._passage.lay(self._motion, start, grown, world, submap)
         self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, history)
         noise, seed = self._map.noise.model, self._settings.seed
         backfilled = backfill(self._camera, self._map.world, grown.keyframes, history[:-1], noise, seed)

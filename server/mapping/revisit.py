@@ -7,13 +7,14 @@ images. It need not agree with the landmark's old position: seen under small ang
 may be far off in depth, which shows from another place only. So it is triangulated anew.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform, transform_points
+from semcast.common.geometry import angles_between_deg, invert_transform, transform_points
 from semcast.server.geometry.epipolar import fundamental_matrix, sampson_px
 from semcast.server.geometry.features import TrackedPoints, track_points
 from semcast.server.geometry.patch_alignment import Templates, affine_warps, align_patches, seen_alike
@@ -184,6 +185,18 @@ def _look(
     all_xy, ok = points.xy.copy(), np.zeros(len(rows), bool)
     all_xy[tried], ok[tried] = xy, agrees
     return Revisit(keyframe.frame_id, keyframe.ids[rows], replace(points, xy=all_xy, ok=ok))
+
+
+def tells_depth(camera: Intrinsics, keyframes: Sequence[Keyframe], ids: Ids) -> NDArray[np.bool_]:
+    """Which landmarks ``ids (N,)``, ascending, keyframes saw under angles that tell how far away they are."""
+    seen = gather_observations(keyframes, ids)
+    R_world_cam = np.stack([k.T_world_cam[:3, :3] for k in keyframes])
+    rays = np.einsum("nij,nj->ni", R_world_cam[seen.view], camera.unproject(seen.xy))
+    _, first = np.unique(seen.point, return_index=True)
+    number = np.searchsorted(seen.point[first], seen.point)
+    widest_deg = np.zeros(len(ids))
+    np.maximum.at(widest_deg, seen.point, angles_between_deg(rays, rays[first[number]]))
+    return widest_deg > _MIN_PARALLAX_DEG
 
 
 def place_anew(

@@ -55,6 +55,36 @@ def test_a_gap_is_bridged_by_what_came_before_and_after(rate_deg_per_s):
         assert rotation_angle_deg(guess[:3, :3].T @ after[:3, :3]) > 10.0, "going on as before does not"
 
 
+def test_a_speed_is_that_of_a_second_not_of_one_noisy_step():
+    motion = ConstantVelocity()
+    for k in range(30):
+        motion.observe(k * FRAME_NS, make_transform(np.eye(3), (0, 0, 0.5 * k + 0.1 * (k == 29))))
+    assert motion.speed_map_per_s == pytest.approx(5.1, abs=0.02), "of the last step it would be 6"
+    motion.correct(np.eye(4), scale=2.0)
+    np.testing.assert_allclose(motion.way_in(0.5), (0, 0, 5.1), atol=0.02)
+    assert np.isclose(motion.predict(30 * FRAME_NS)[2, 3], 1.2), "the next step is like the last"
+
+
+def test_how_the_camera_turned_in_a_gap_is_better_known_than_guessed():
+    """Neither before nor after it does the camera turn."""
+    motion = ConstantVelocity()
+    motion.observe(0, np.eye(4))
+    motion.observe(FRAME_NS, arc(lambda t: 0.0, 0.1))
+    rate_deg_per_s = 60.0
+    after = arc(lambda t: rate_deg_per_s if t < 0.5 else 0.0, 1.0)
+    turned = [(k * FRAME_NS, arc(lambda t: rate_deg_per_s, min(0.1 * (k - 1), 0.5))) for k in range(1, 12)]
+    turned = [(t_ns, T[:3, :3]) for t_ns, T in turned]
+    later = arc(lambda t: 0.0, 0.2)
+    expected = arc(lambda t: 0.0, 0.1) @ after
+    found = motion.bridge(11 * FRAME_NS, later, 0.2, turned)
+    assert rotation_angle_deg(found[:3, :3].T @ expected[:3, :3]) < 0.1
+    assert np.linalg.norm(found[:3, 3] - expected[:3, 3]) < 0.1
+    as_guessed = motion.bridge(11 * FRAME_NS, later, 0.2)
+    for of_another_gap in (turned[1:], turned[:-1], []):
+        np.testing.assert_array_equal(motion.bridge(11 * FRAME_NS, later, 0.2, of_another_gap), as_guessed)
+    assert rotation_angle_deg(as_guessed[:3, :3].T @ expected[:3, :3]) > 29.0
+
+
 def test_a_gap_that_is_too_long_is_not_bridged():
     motion = ConstantVelocity()
     assert motion.bridge(FRAME_NS, STEP, 0.1) is None

@@ -134,6 +134,22 @@ def test_a_place_proved_by_too_few_is_none(room, rng):
     assert not finder.pending
 
 
+def test_landmarks_of_unknown_depth_prove_no_place(room, rng):
+    """Most were seen from one place alone, and lie where they fit a pose that is beside the true one."""
+    world, _ = room
+    found = old_landmarks(room, HERE, rng, off_px=0.1)
+    vague = np.zeros(len(found.ids), bool)
+    vague[rng.permutation(len(vague))[: int(0.7 * len(vague))]] = True
+    for keyframe in world.keyframes[1:]:
+        keyframe.drop_observations(np.isin(keyframe.ids, found.ids[vague]))
+    wrong = HERE @ make_transform(exp_so3([0.0, 0.2, 0.0]), [1.2, 0.0, 0.3])
+    rays = CAMERA.unproject(found.points.xy[vague]) @ wrong[:3, :3].T
+    depth = rng.uniform(3.0, 4.0, (int(vague.sum()), 1))
+    world.move_landmarks(found.ids[vague], wrong[:3, 3] + depth * rays)
+    loop = look(LoopFinder(CAMERA, Recogniser(), 0), room, found)
+    np.testing.assert_allclose(loop.moved(drifted(HERE, NUM - 1)), HERE, atol=0.05)
+
+
 def test_where_nothing_has_drifted_there_is_no_loop_and_none_is_looked_for(room, rng):
     world, _ = room
     for keyframe in world.keyframes:

@@ -1,0 +1,124 @@
+"""From the last pose in one part of the map to the first in the next one, which shares nothing with it.
+
+Where a new part begins, and how large its unit is, is told by how the camera moved before and after, and how
+it turned meanwhile, see ``bridging``. A start has few views close to each other, and its unit changes in the
+first adjustments: after a second the part is placed again, by the way of that second.
+"""
+
+from copy import deepcopy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import invert_transform
+from semcast.server.mapping.bridging import bridge
+from semcast.server.mapping.camera_motion import CameraMotion
+from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.mapper import median_depth, usual_depth
+from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.visual_gyroscope import VisualGyroscope
+from semcast.server.mapping.world_map import WorldMap
+
+Array = NDArray[np.float64]
+
+#: A part is placed again when its start is so long ago, but no longer: a camera that stood since, or was
+#: elsewhere, has not gone on as before.
+_SETTLED_NS, _LATEST_NS = 1_000_000_000, 2_000_000_000
+
+
+@dataclass(frozen=True)
+class _Before:
+    """What a new part was placed by.
+
+    Attributes:
+        motion: Of the camera before.
+        last_ns: Time of the newest keyframe before.
+        depth: How far things were.
+        turned: How the camera turned since.
+        submap: The part.
+        start_ns: Time of the first view that told its unit.
+    """
+
+    motion: CameraMotion
+    last_ns: int
+    depth: float
+    turned: list[tuple[int, Array]]
+    submap: int
+    start_ns: int
+
+
+class Passage:
+    """Follows a camera from one part of the map to the next.
+
+    Args:
+        camera: Pinhole.
+        enough: Landmarks in sight, from which on their depth is worth something.
+    """
+
+    def __init__(self, camera: Intrinsics, enough: int) -> None:
+        self._gyroscope = VisualGyroscope(camera)
+        self._enough = enough
+        self._before: _Before | None = None
+
+    def note(self, sight: Sight, T_world_cam: Array | None, motion: CameraMotion, world: WorldMap) -> None:
+        """Take a frame with its pose, or None without."""
+        if T_world_cam is not None:
+            self._gyroscope.begin(sight)
+        elif world.keyframes:
+            self._gyroscope.go_on(sight, motion, usual_depth(world, self._enough))
+
+    def lay(
+        self, motion: CameraMotion, start: Start, grown: Start, world: WorldMap, submap: int
+    ) -> tuple[Array, float]:
+        """Where a new part begins and its unit, see ``bridging.bridge``."""
+        depth = usual_depth(world, self._enough)
+        self._before = None
+        if not world.keyframes:
+            return bridge(motion, start, grown, None, depth)
+        last_ns, turned = world.keyframes[-1].t_source_ns, self._gyroscope.turned.copy()
+        start_ns = start.keyframes[0].t_source_ns
+        self._before = _Before(deepcopy(motion), last_ns, depth, turned, submap, start_ns)
+        return bridge(motion, start, grown, last_ns, depth, turned)
+
+    def lay_again(self, world: WorldMap, submap: int) -> tuple[float, Array] | None:
+        """Similarity that moves a part to where its first second says it is.
+
+        Args:
+            world: The map; its newest keyframe is of the part.
+            submap: The part.
+
+        Returns:
+            ``(scale, T)`` with ``x_new = T @ (scale * x)``, once for each part; None while it is too young or
+            when it is too old, and where it is one with an older part.
+        """
+        before = self._before
+        if before is None or before.submap != submap:
+            return None
+        age_ns = world.keyframes[-1].t_source_ns - before.start_ns
+        if age_ns < _SETTLED_NS:
+            return None
+        self._before = None
+        if age_ns > _LATEST_NS:
+            return None
+        mine = world.keyframes_of(submap)
+        T_first_world = invert_transform(mine[0].T_world_cam)
+        unit = float(np.median([median_depth(world, k) for k in mine]))
+        if not np.isfinite(unit):
+            return None
+        keyframes = []
+        for keyframe in mine:
+            T_first_cam = T_first_world @ keyframe.T_world_cam
+            T_first_cam[:3, 3] /= unit
+            keyframes.append(replace(keyframe, T_world_cam=T_first_cam))
+        none = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0)
+        grown = Start(keyframes, *none)
+        start = Start([k for k in keyframes if k.t_source_ns >= before.start_ns], *none)
+        T_world_first, scale = bridge(
+            before.motion, start, grown, before.last_ns, before.depth, before.turned
+        )
+        scale /= unit
+        T_scaled_first = mine[0].T_world_cam.copy()
+        T_scaled_first[:3, 3] *= scale
+        return scale, T_world_first @ invert_transform(T_scaled_first)

@@ -1,0 +1,60 @@
+"""How a camera turned, told by whole images."""
+
+import cv2
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_so3, rotation_angle_deg
+from semcast.server.geometry.turning import turn_between
+
+CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
+K = np.array([[260, 0, 159.5], [0, 260, 119.5], [0, 0, 1.0]])
+STAYED = np.zeros(3)
+
+
+def scene(seed=0):
+    """A few large bright and dark patches: edges and shades, hardly a corner."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.uniform(60, 190, (7, 9)).astype(np.float32)
+    return cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC)
+
+
+def wall(R_cam_wall, t_cam_wall, seed=0):
+    """What a camera sees of a wall at unit depth in front of where it began, ``(240, 320)`` grey levels."""
+    K_wall = np.array([[260, 0, 319.5], [0, 260, 239.5], [0, 0, 1.0]])
+    plane = R_cam_wall + np.outer(t_cam_wall, (0, 0, 1.0))
+    H = K @ plane @ np.linalg.inv(K_wall)
+    return np.clip(cv2.warpPerspective(scene(seed), H, (320, 240)), 0, 255)
+
+
+def noisy(image, seed, gain=1.0):
+    rng = np.random.default_rng(seed)
+    return np.clip(gain * image + rng.normal(0, 4.0, image.shape), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("turn_deg", [(0, 0, 0), (0, 6, 0), (4, -3, 2)])
+def test_a_turn_is_told_by_images_without_corners(turn_deg):
+    R = exp_so3(np.radians(turn_deg))
+    found = turn_between(CAMERA, noisy(wall(np.eye(3), STAYED), 1), noisy(wall(R, STAYED), 2), STAYED)
+    assert rotation_angle_deg(found.T @ R) < 0.15
+
+
+def test_brightness_may_change():
+    R = exp_so3((0, 0.08, 0))
+    before, now = noisy(wall(np.eye(3), STAYED), 1), noisy(wall(R, STAYED) + 15.0, 2)
+    assert rotation_angle_deg(turn_between(CAMERA, before, now, STAYED).T @ R) < 0.3
+
+
+def test_what_moving_does_is_no_turn():
+    R, way = exp_so3((0, 0.05, 0)), np.array([0.08, 0.0, 0.05])
+    before, now = noisy(wall(np.eye(3), STAYED), 1), noisy(wall(R, -R @ way), 2)
+    assert rotation_angle_deg(turn_between(CAMERA, before, now, way).T @ R) < 0.2
+    assert rotation_angle_deg(turn_between(CAMERA, before, now, STAYED).T @ R) > 2.0
+
+
+def test_another_view_and_one_that_shows_nothing_tell_no_turn():
+    before = noisy(wall(np.eye(3), STAYED), 1)
+    assert turn_between(CAMERA, before, noisy(wall(np.eye(3), STAYED, seed=5), 2), STAYED) is None
+    even = np.full((240, 320), 120, np.uint8)
+    assert turn_between(CAMERA, even, even, STAYED) is None
