@@ -164,12 +164,12 @@ def render_scene(settings: RenderSettings) -> int:
         SourceError: The folder has files in it or can't be written, or no lens has such a distortion.
     """
     folder = settings.out
-    scene = SCENES[settings.scene](settings.seed, settings.pace)
-    scene.camera = replace(scene.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
-    Optics.of(scene.camera)  # refuses before anything is written
     try:
         if folder.exists() and any(folder.iterdir()):
             raise SourceError(f"out must be a new or an empty folder, {folder} has files in it")
+        scene = SCENES[settings.scene](settings.seed, settings.pace)
+        scene.camera = replace(scene.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
+        Optics.of(scene.camera)  # refuses before anything is written
         (folder / "images").mkdir(parents=True, exist_ok=True)
         return _draw_into(folder, settings, scene)
     except OSError as err:
