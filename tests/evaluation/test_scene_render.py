@@ -66,7 +66,8 @@ def test_a_disk_without_room_is_said_with_its_reason(
     assert not capfd.readouterr().err
 
 
-def test_a_folder_with_files_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_files_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SCENES, "room", lambda *_: pytest.fail("seconds of painting for nothing"))
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(SourceError, match="has files in it"):
         render_scene(RenderSettings(seconds=0.1, out=tmp_path))
