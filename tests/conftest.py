@@ -4,7 +4,8 @@ import functools
 import os
 import re
 import signal
-from collections.abc import Generator
+import sys
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,18 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
         (name, text.encode(errors="backslashreplace").decode()) for name, text in report.sections
     ]
     return report
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread_of_torch() -> Iterator[None]:
+    """Leave torch one thread, however many a codec is loaded with: they stay for all tests that follow.
+
+    On a busy machine those that follow take twenty times as long then.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        if torch := sys.modules.get("torch"):  # as good as always: tests import it
+            patch.setattr(torch, "set_num_threads", lambda num: None)
+        yield
 
 
 @pytest.fixture

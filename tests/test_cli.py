@@ -14,6 +14,7 @@ import pytest
 from semcast.cli import VERBS, main, verb_parser
 
 ROOT = Path(__file__).resolve().parents[1]
+DEMO = ROOT / "deploy" / "demo" / "kitti_06"
 
 
 def test_help_lists_every_verb_and_answers_at_once():
@@ -107,7 +108,7 @@ def test_names_that_are_no_text_are_shown(tmp_path):
         pytest.skip("file names are text there")
     folder = os.fsencode(tmp_path) + b"/b\xff"
     os.mkdir(folder)
-    shutil.copy(ROOT / "deploy" / "demo" / "kitti_06" / "images" / "000000.jpg", folder + b"/0.jpg")
+    shutil.copy(DEMO / "images" / "000000.jpg", folder + b"/0.jpg")
     words = [sys.executable, "-m", "semcast", "info", folder]
     environment = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
     done = subprocess.run(words, capture_output=True, text=True, env=environment)
@@ -117,7 +118,7 @@ def test_names_that_are_no_text_are_shown(tmp_path):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
 @pytest.mark.parametrize("buffered", [True, False])
-@pytest.mark.parametrize("words", [["info", "cnn"], ["info", "--help"], ["--help"], ["--version"]])
+@pytest.mark.parametrize("words", [["info", str(DEMO)], ["info", "--help"], ["--help"], ["--version"]])
 def test_a_full_disk_behind_standard_output_is_told_in_a_line(words, buffered):
     environment = {**os.environ, "PYTHONUNBUFFERED": "" if buffered else "1"}
     command = [sys.executable, "-m", "semcast", *words]

@@ -262,7 +262,7 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
     assert info.counts["semcast/demo/rx/symbols"] >= len(frames)
     assert info.counts["semcast/demo/pose"] >= len(frames)
     assert info.counts["semcast/demo/camera"] >= 1
-    again = replay(ReplaySettings(file=recording, reference=SEQUENCE))
+    again = replay(ReplaySettings(file=recording, reference=SEQUENCE, dense_cloud="none"))
     assert again["frames"]["tracked"] >= len(frames)  # none is too old or overtaken in a replay
 
 
@@ -277,8 +277,10 @@ def test_a_link_that_nothing_can_be_decoded_on_is_said(tmp_path):
     )
     assert error is None
     assert summary["frames"]["tracked"] == 0
-    assert "no image could be decoded" in told[-1][1]
-    assert told[-1][0] > 5
+    # On a busy machine it is still told that results are being written.
+    num_done, text = [row for row in told if row[1].startswith("no image could be decoded")][-1]
+    assert text == f"no image could be decoded, {num_done} outages"
+    assert num_done > 5
     assert "0 frames tracked, 0 with a pose; dropped: " in (tmp_path / "logs" / "server.log").read_text()
     assert (tmp_path / "run.rrd").stat().st_size > 20_000  # grey images
 

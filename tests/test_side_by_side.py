@@ -5,6 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import torch
+
+from semcast.common.nets.codec import NeuralCodec
 from tests.conftest import group_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,6 +39,11 @@ def test_a_file_is_in_one_process_and_all_that_need_the_clock_are_in_one(tmp_pat
     assert len(plain) == len(other) == len(clock) == len(watch) == 1
     assert clock == watch
     assert len(plain | other | clock) == 2
+
+
+def test_a_codec_with_more_threads_leaves_one_to_the_tests_that_follow(tiny_weights):
+    NeuralCodec.load(tiny_weights, num_threads=4)
+    assert torch.get_num_threads() == 1
 
 
 def test_every_mark_of_a_group_is_understood():

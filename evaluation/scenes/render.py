@@ -164,12 +164,11 @@ def render_scene(settings: RenderSettings) -> int:
     Raises:
         SourceError: The folder has files in it or can't be written, or no lens has such a distortion.
     """
-    folder = settings.out
-    scene = SCENES[settings.scene](settings.seed, settings.pace)
-    scene.camera = replace(scene.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
-    Optics.of(scene.camera)  # refuses before anything is written
-    new_folder(folder)
+    folder = new_folder(settings.out)  # refuses before the scene is painted
     try:
+        scene = SCENES[settings.scene](settings.seed, settings.pace)
+        scene.camera = replace(scene.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
+        Optics.of(scene.camera)
         (folder / "images").mkdir()
         return _draw_into(folder, settings, scene)
     except OSError as err:

@@ -3,10 +3,12 @@
 import shutil
 
 import numpy as np
+import pytest
 
 from semcast.agent.capture import Capture
 from semcast.agent.source import SourceFrame, open_source
 from semcast.agent.source_settings import SourceSettings
+from semcast.common.errors import SourceError
 from semcast.common.metrics import Metrics
 
 
@@ -60,3 +62,35 @@ def test_frames_that_are_not_sent_are_not_undistorted():
     assert all(frame.image.shape == (2, 2, 3) and (frame.image == frame.frame_id).all() for frame in taken)
     assert source.rectified == [0, 3, 6, 8]  # once each
     assert metrics.drops == {"thinned": 5}
+
+
+class Breaking(Counting):
+    """Gives one frame, leaves two out and fails."""
+
+    def __init__(self, error):
+        super().__init__()
+        self.error = error
+
+    def frames(self, stop):
+        yield SourceFrame(0, 0, 0, np.zeros((4, 4, 3), np.uint8), False)
+        self.num_unreadable = 2
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [(SourceError("the plug is out"), "the plug is out"), (KeyError(7), "the source failed: 7")],
+)
+def test_what_a_source_failed_with_is_kept_for_the_end_of_what_it_gave(error, told):
+    metrics = Metrics("agent")
+    capture = Capture(Breaking(error), "all", metrics)
+    taken = []
+    while not capture.ended:
+        frame = capture.get(1.0)
+        taken += [] if frame is None else [frame.frame_id]
+    capture.close()
+    assert taken == [0]
+    assert metrics.drops == {"unreadable": 2}, "also those after the last frame"
+    with pytest.raises(SourceError) as failed:
+        capture.raise_failure()
+    assert str(failed.value) == told

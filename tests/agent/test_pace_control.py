@@ -130,3 +130,38 @@ def test_a_fast_source_begins_with_what_two_cores_can_serve_and_goes_up():
     _, server, strides = run(lambda now_s: 0.02, 20, rate_hz=30.0)
     assert (strides[0], strides[-1]) == (3, 1)
     assert server.superseded == 0
+
+
+class Reports:
+    """Reports on every frame of a source, each with so many passed over since the one before."""
+
+    def __init__(self):
+        self.pace = PaceControl(1, 0.0)
+        self.frame_id = self.passed_over = 0
+
+    def next(self, passed_over):
+        self.pace.wants(round(self.frame_id * PERIOD_S * 1e9))
+        self.frame_id += 1
+        self.passed_over += passed_over
+        self.pace.on_report(report(self.frame_id, self.passed_over))
+
+    def num_until_stride(self, stride, passed_over):
+        """Return how many reports, all alike, it takes."""
+        for count in range(1, 1000):
+            self.next(passed_over)
+            if self.pace.stride == stride:
+                return count
+        raise AssertionError(f"the stride stays {self.pace.stride}")
+
+
+def test_a_trial_that_fails_doubles_the_patience_and_one_that_lasts_ends_that():
+    reports = Reports()
+    reports.num_until_stride(2, passed_over=1)
+    first = reports.num_until_stride(1, passed_over=0)
+    assert 30 <= first <= 33, "thirty, and those of frames from before the change: nothing has failed yet"
+    reports.num_until_stride(2, passed_over=1)
+    assert reports.num_until_stride(1, passed_over=0) == first + 30, "the trial failed at once"
+    for _ in range(40):
+        reports.next(0)
+    reports.num_until_stride(2, passed_over=1)
+    assert reports.num_until_stride(1, passed_over=0) == first, "that one did not"

@@ -325,7 +325,7 @@ def test_a_number_is_a_camera_unless_something_has_that_name(recording, tmp_path
         open_source(fast("2025", camera=PINHOLE))
 
 
-@pytest.mark.parametrize("text", ["2²", "²", "٣", "20240101123000"])
+@pytest.mark.parametrize("text", ["2²", "²", "٣", "20240101123000", "front"])
 def test_what_only_looks_like_a_camera_number_is_a_folder(text):
     assert not is_camera_number(text)
     with pytest.raises(SourceError, match=f"no sequence at {text}: there is no such file or folder"):

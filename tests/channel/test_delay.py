@@ -31,11 +31,11 @@ def test_without_delay_a_packet_is_sent_at_once_by_the_caller(ends):
 def test_a_packet_takes_as_long_as_set_and_packets_overlap(ends):
     start_s = time.monotonic()
     for k in range(10):
-        ends.line.put(bytes([k]), False, 100.0)
+        ends.line.put(bytes([k]), False, 400.0)
     came = [ends.out.get(timeout=10) for _ in range(10)]
     assert [packet[0] for packet, _ in came] == list(range(10))
-    assert came[0][1] - start_s >= 0.1
-    assert came[-1][1] - came[0][1] < 0.5, "ten delays of 0.1 s pass at the same time"
+    assert came[0][1] - start_s >= 0.4
+    assert came[-1][1] - came[0][1] < 3.0, "ten delays of 0.4 s pass at the same time"
 
 
 def test_jitter_delays_but_never_reorders(ends):

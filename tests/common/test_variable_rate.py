@@ -116,7 +116,7 @@ def test_a_lost_slot_spoils_the_rows_whose_values_it_held(weights):
 def test_what_is_in_a_lost_slot_is_not_made_louder(weights, way):
     """Blocks that are partly lost are no further from the original than one grey would be."""
     codec = NeuralCodec.load(weights["3dcsc-vr"], modulation=way)
-    for image in pictures():
+    for image in pictures(1):
         encoded = codec.encode(image, 25.0)
         for lost in range(8):
             snr_db = np.full(8, 25.0, np.float32)

@@ -106,9 +106,9 @@ def test_an_exported_encoder_of_other_weights_is_refused(folder, tiny_weights, t
 
 def test_weights_of_ones_own_stand_beside_the_shipped_ones(folder, tiny_weights):
     file = str(tiny_weights)
-    settings = CodecSettings(images=folder, codec=("3dcsc", file), snr_db=(10.0,), max_images=1)
+    settings = CodecSettings(images=folder, codec=("3dcsc-lite", file), snr_db=(10.0,), max_images=1)
     found = rows(evaluate_codec(settings))
-    assert found[file, 10.0]["psnr_db"] < found["3dcsc", 10.0]["psnr_db"] - 3, "they were never trained"
+    assert found[file, 10.0]["psnr_db"] < found["3dcsc-lite", 10.0]["psnr_db"] - 3, "they were never trained"
 
 
 def test_who_chooses_a_rate_is_told_at_first_what_the_receiver_knows(folder):

@@ -1,5 +1,7 @@
 """Scenes are drawn as lenses with distortion show them."""
 
+import copy
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +16,14 @@ from semcast.evaluation.scenes.render import SCENES, RenderSettings, frame_of, r
 BARREL, PINCUSHION = (-0.28, 0.07, 0.001, -0.001), (0.15, 0.0, 0.0, 0.0)
 
 
+@functools.cache
+def painted(name):
+    """Make a scene once: painting its surfaces takes longer than drawing a picture of them."""
+    return SCENES[name](3, "fast")
+
+
 def seen(distortion, readout_s=0.0, name="room"):
-    scene = SCENES[name](3, "fast")
+    scene = copy.copy(painted(name))
     scene.camera = replace(scene.camera, distortion=distortion)
     return frame_of(scene, 2.0, 0.0, np.random.default_rng(0), readout_s).astype(float), scene.camera
 

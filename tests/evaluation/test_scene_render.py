@@ -1,6 +1,7 @@
 """Drawn sequences are read back as recordings, and the reconstruction finds their path."""
 
 import filecmp
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,15 @@ import pytest
 from semcast.common.errors import SourceError
 from semcast.common.geometry import rotation_angle_deg
 from semcast.common.sequence import open_sequence
-from semcast.evaluation.scenes.render import SCENES, RenderSettings, frame_of, render_scene
+from semcast.evaluation.scenes.motion import Pace
+from semcast.evaluation.scenes.render import SCENES, RenderSettings, Scene, SceneName, frame_of, render_scene
 from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory
+
+
+@functools.cache
+def scene_of(name: SceneName, seed: int = 0, pace: Pace = "normal") -> Scene:
+    """Make a scene once: painting its surfaces takes longer than drawing a picture of them."""
+    return SCENES[name](seed, pace)
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +33,7 @@ def test_a_drawn_sequence_is_a_recording_with_an_exact_path(orbit: Path) -> None
     truth = sequence.groundtruth()
     assert truth is not None
     assert len(truth) == 16
-    scene = SCENES["orbit"](0, "normal")
+    scene = scene_of("orbit")
     np.testing.assert_allclose(truth.T_world_cam[7], scene.T_world_cam(0.7), atol=1e-6)
     assert sequence.intrinsics == scene.camera
 
@@ -58,7 +66,8 @@ def test_a_disk_without_room_is_said_with_its_reason(
     assert not capfd.readouterr().err
 
 
-def test_a_folder_with_files_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_files_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SCENES, "room", lambda *_: pytest.fail("seconds of painting for nothing"))
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(SourceError, match="has files in it"):
         render_scene(RenderSettings(seconds=0.1, out=tmp_path))
@@ -66,8 +75,8 @@ def test_a_folder_with_files_is_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(SCENES))
-def test_scenes_fill_the_view_and_cameras_move_smoothly(name: str) -> None:
-    scene = SCENES[name](3, "normal")
+def test_scenes_fill_the_view_and_cameras_move_smoothly(name: SceneName) -> None:
+    scene = scene_of(name)
     image = frame_of(scene, 2.0, 0.0, np.random.default_rng(0))
     assert image.shape == (scene.camera.height, scene.camera.width, 3)
     assert image.std() > 10
@@ -80,7 +89,7 @@ def test_scenes_fill_the_view_and_cameras_move_smoothly(name: str) -> None:
 
 
 def test_a_drive_round_the_block_ends_where_it_began() -> None:
-    scene = SCENES["block"](4, "normal")
+    scene = scene_of("block")
     poses = np.stack([scene.T_world_cam(t_s) for t_s in np.arange(0, 44, 0.1)])
     away_m = np.linalg.norm(poses[:, :2, 3] - poses[0, :2, 3], axis=1)
     assert away_m.max() > 40
@@ -91,9 +100,9 @@ def test_a_drive_round_the_block_ends_where_it_began() -> None:
 
 
 def test_seeds_and_paces_differ() -> None:
-    one, other = SCENES["room"](1, "normal"), SCENES["room"](2, "normal")
+    one, other = scene_of("room"), scene_of("room", 1)
     assert not np.allclose(one.T_world_cam(1.0), other.T_world_cam(1.0))
-    gentle, fast = (SCENES["room"](1, pace) for pace in ("gentle", "fast"))
+    gentle, fast = (scene_of("room", pace=pace) for pace in ("gentle", "fast"))
     times_s = np.arange(0, 5, 0.1)
     paths = [np.stack([scene.T_world_cam(t)[:3, 3] for t in times_s]) for scene in (gentle, fast)]
     lengths = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in paths]
@@ -116,7 +125,7 @@ def test_settings_out_of_range_are_refused(values: dict[str, float], message: st
 
 
 def test_a_night_has_less_light_and_the_same_noise() -> None:
-    scene = SCENES["room"](0, "normal")
+    scene = scene_of("room")
     day, night = (
         frame_of(scene, 1.0, 2.0, np.random.default_rng(0), brightness=share).astype(float)
         for share in (1.0, 0.2)
@@ -135,7 +144,7 @@ def test_the_camera_of_a_rolling_shutter_says_so(tmp_path: Path) -> None:
 
 
 def test_rows_of_a_rolling_shutter_are_drawn_at_their_times() -> None:
-    scene = SCENES["room"](0, "fast")
+    scene = scene_of("room", pace="fast")
     rng = np.random.default_rng(0)
     rolled = frame_of(scene, 1.0, 0.0, rng, readout_s=0.06)
     height = scene.camera.height
@@ -151,7 +160,7 @@ def test_rows_of_a_rolling_shutter_are_drawn_at_their_times() -> None:
 
 
 def test_a_lorry_goes_ahead_of_the_camera_and_hides_the_end_of_the_street() -> None:
-    scene, street = SCENES["lorry"](5, "normal"), SCENES["street"](5, "normal")
+    scene, street = scene_of("lorry"), scene_of("street")
     for t_s in (0.0, 4.0, 8.0):
         lorry = scene.surfaces(t_s)[-6:]
         middle = np.mean([s.corner_m + (s.edge_u_m + s.edge_v_m) / 2 for s in lorry], axis=0)

@@ -31,3 +31,54 @@ def test_depth_is_left_for_later_where_it_must_give_way():
     session = Ended()
     assert shown_of(session, gives_way=lambda: session.num_without_depth < 2) == ["patch 1", "patch 2"]
     assert shown_of(session) == ["patch 3"]
+
+
+class Adjusted(Ended):
+    """One whose last adjustment changed the map; of its depths the second confirms none."""
+
+    num_to_adjust, num_without_depth = 12, 12
+
+    def conclude(self):
+        return "update"
+
+    def complete_cloud(self, budget_s):
+        assert budget_s == 7.0
+        for patches in (("near", "far"), (), ("last",)):
+            self.num_without_depth -= 4
+            yield patches
+
+
+def test_what_changed_is_shown_and_what_is_going_on_is_told_step_by_step(monkeypatch, caplog):
+    monkeypatch.setattr("semcast.server.conclusion._LOG_INTERVAL_S", 0.0)
+    caplog.set_level("INFO", logger="semcast.server.conclusion")
+    steps = []
+    conclude(Adjusted(), lambda *shown: steps.append(shown), steps.append, 7.0)
+    assert steps == [
+        "last adjustment of 12 keyframes",
+        ("update", ()),
+        "depth 0 of 12 keyframes",
+        (None, ("near", "far")),
+        "depth 4 of 12 keyframes",
+        "depth 8 of 12 keyframes",
+        (None, ("last",)),
+        "depth 12 of 12 keyframes",
+        "writing results",
+    ]
+    assert [record.getMessage() for record in caplog.records] == [
+        "last adjustment of 12 keyframes",
+        "the depth of 12 keyframes is estimated now",
+        *(f"depth {k} of 12 keyframes" for k in (4, 8, 12)),
+    ]
+
+
+def test_a_short_end_is_not_logged_and_one_without_anything_to_do_is_not_told(caplog):
+    caplog.set_level("INFO", logger="semcast.server.conclusion")
+    told, session = [], Ended()
+    session.num_to_adjust = session.num_without_depth = 10
+    conclude(session, lambda *shown: None, told.append)
+    assert told[:2] == ["last adjustment of 10 keyframes", "depth 0 of 10 keyframes"]
+    session.num_to_adjust = 0
+    told.clear()
+    conclude(session, lambda *shown: None, told.append)
+    assert told == ["writing results"]
+    assert not caplog.records

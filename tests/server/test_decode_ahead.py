@@ -63,13 +63,13 @@ def test_it_is_busy_until_the_tracker_has_what_was_taken():
     inbox, may_decode = Inbox(2), threading.Event()
 
     def decode(x):
-        may_decode.wait(10)
+        assert may_decode.wait(60)
         if x == 1:
             raise ProtocolError("the samples don't fit")
         return (x,)
 
     ahead = DecodeAhead(inbox.take, decode, lambda m, r: None)
-    until(lambda: ahead.is_busy)
+    until(lambda: ahead.is_busy, deadline_s=30.0)
     may_decode.set()
     assert not came_true(lambda: not ahead.is_busy, 0.1), "decoded, it still waits for the tracker"
     assert ahead.get(10.0) == (0,)
@@ -143,3 +143,13 @@ def test_one_that_got_stale_while_it_waited_is_left_out_and_one_that_was_waited_
     last = len(got)
     assert asked == [last - 1]
     assert got == [*range(last - 1), last]
+
+
+def test_what_nobody_took_before_the_end_is_dropped():
+    inbox, decoded = Inbox(1), threading.Event()
+    ahead = DecodeAhead(inbox.take, lambda x: decoded.set() or (x,), lambda m, r: None)
+    assert decoded.wait(30)
+    until(lambda: not ahead._is_decoding, "the frame in the slot")
+    ahead.close()
+    assert ahead.get(0.0) is None
+    assert not ahead.is_busy

@@ -105,14 +105,17 @@ def demo():
 
 
 def run_session(demo, folder, frame_ids, epoch=5, program=None, **settings):
-    """A session over some frames of the demo; ends with its outputs unless it is ``killed``."""
+    """A session over some frames of the demo; ends with its outputs unless it is ``killed``.
+
+    Depth, which takes longer than all else, is left out unless ``settings`` want it.
+    """
     killed = settings.pop("killed", False)
     picture = settings.pop("picture", lambda demo, k: demo.image(k))
     identity = StreamIdentity(
         agent_id="a", agent_epoch=epoch, codec="x", digest="", camera=demo.intrinsics, num_frames=None
     )
     session = Session(
-        ServerSettings(bundle="inline", out=folder, **settings),
+        ServerSettings(bundle="inline", out=folder, **{"dense_cloud": "none", **settings}),
         identity,
         folder,
         None,
@@ -268,7 +271,7 @@ def test_the_summary_counts_the_keyframes_of_the_map_also_those_it_began_with(de
 
 
 def test_the_dense_cloud_lies_around_the_landmarks_where_it_is_wanted(demo, tmp_path, read_ply):
-    run_session(demo, tmp_path / "dense", range(14), mode="replay")
+    run_session(demo, tmp_path / "dense", range(14), mode="replay", dense_cloud="auto")
     run_session(demo, tmp_path / "sparse", range(14), mode="replay", dense_cloud="none")
     assert not (tmp_path / "sparse" / "dense.ply").exists()
     assert json.loads((tmp_path / "sparse" / "summary.json").read_text())["num_dense_points"] is None
@@ -288,7 +291,7 @@ def test_a_cloud_that_fails_ends_alone(demo, tmp_path, monkeypatch, caplog):
         raise RuntimeError("no depth today")
 
     monkeypatch.setattr("semcast.server.dense.builder.DenseBuilder.add_keyframe", broken)
-    run_session(demo, tmp_path, range(6))
+    run_session(demo, tmp_path, range(6), dense_cloud="auto")
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["frames"]["posed"] == 6
     assert summary["num_dense_points"] is None

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import pytest
 
 from semcast.common.keys import status_key
@@ -24,6 +26,14 @@ def ended(epoch, num_sent):
     metrics.count("sent", num_sent)
     metrics.end()
     return pack(metrics.status(epoch))
+
+
+def frame(frame_id, final=False):
+    return SimpleNamespace(frame_id=frame_id, final=final)
+
+
+#: Of a source of a hundred frames, every one sent.
+CAMERA = SimpleNamespace(num_frames=100, last_frame_id=99, frame_step=1)
 
 
 def has_come(end, idle_s, epoch=7, there=False, busy=False):
@@ -54,3 +64,32 @@ def test_after_the_last_frame_an_agent_of_the_same_name_that_is_still_there_gets
     assert has_come(end, 0.6)
     assert not has_come(end, 3.5, there=True)
     assert has_come(end, 4.5, there=True)
+
+
+def test_of_an_agent_that_is_gone_the_last_frames_may_be_lost_and_no_earlier_ones(network):
+    end = StreamEnd(network, "a")
+    end.note(frame(20), CAMERA)
+    assert end.has_begun
+    assert not has_come(end, 1000.0), "it may come back"
+    end.note(frame(98), CAMERA)
+    assert not has_come(end, 3.0, there=True)
+    assert not has_come(end, 3.0, busy=True)
+    assert not has_come(end, 1.9)
+    assert has_come(end, 2.1)
+    end.begin()
+    assert not end.has_begun
+    assert not has_come(end, 1000.0)
+
+
+def test_the_frame_that_says_it_is_the_last_ends_the_stream(network):
+    end = StreamEnd(network, "a")
+    end.note(frame(20, final=True), CAMERA)
+    assert not has_come(end, 0.4), "stragglers"
+    assert has_come(end, 0.6)
+
+
+def test_of_many_starts_the_latest_are_remembered(network):
+    end = StreamEnd(network, "a")
+    for epoch in (3, *range(100, 115), 2):
+        network.say(ended(epoch, epoch + 1))
+    assert [end.num_sent(epoch) for epoch in (2, 3, 100, 114)] == [None, 4, 101, 115]

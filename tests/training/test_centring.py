@@ -3,7 +3,7 @@
 import torch
 
 from semcast.common.nets.blocks import Stage
-from semcast.training.centring import centre_hidden, folded, hidden_layers
+from semcast.training.centring import centre_hidden, folded, hidden_layers, unfolded
 
 
 def stage():
@@ -68,3 +68,19 @@ def test_gradients_pass_through_the_mean():
     model(images(), CONDITION).square().mean().backward()
     gradient = hidden_layers(model)[0].weight.grad
     assert gradient.abs().sum() > 0
+
+
+def test_an_unfolded_network_is_centred_to_what_it_gave_and_folds_to_what_it_was():
+    def run(model):
+        model(images(), CONDITION)
+
+    shipped = stage().eval()
+    before = hidden_of(shipped, images())
+    opened = unfolded(shipped, run)
+    for layer, out in zip(hidden_layers(opened), before, strict=True):
+        torch.testing.assert_close(layer.bias.detach(), out.mean(dim=(0, 2, 3)), rtol=0, atol=1e-5)
+    centre_hidden(opened)
+    for now, then in zip(hidden_of(opened.train(), images()), before, strict=True):
+        torch.testing.assert_close(now, then, rtol=0, atol=1e-4)
+    for again, layer in zip(hidden_layers(folded(opened, run)), hidden_layers(shipped), strict=True):
+        torch.testing.assert_close(again.bias, layer.bias, rtol=0, atol=1e-5)

@@ -1,3 +1,4 @@
+import contextlib
 import json
 import math
 import os
@@ -327,38 +328,34 @@ from semcast.training.settings import TrainSettings
 torch.set_num_threads(1)
 sizes = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
 registry._entries = lambda: (registry.Architecture("3dcsc", sizes, build_3dcsc),)
-settings = TrainSettings(architecture="3dcsc", data=Path(sys.argv[1]), out=Path(sys.argv[2]), batch=2,
-                         steps=int(sys.argv[3]), bf16=False, device="cpu", crop=CropSettings(size_px=32))
-train(settings, should_stop=lambda: os.environ["RANK"] == sys.argv[4])
+runs = (("whole", 2, None), ("first", 1000, "0"), ("second", 1000, "1"))
+for (name, steps, stopped_rank), port in zip(runs, sys.argv[3:], strict=True):
+    os.environ["MASTER_PORT"] = port  # one may still be leaving the last run when the other joins the next
+    settings = TrainSettings(architecture="3dcsc", data=Path(sys.argv[1]), out=Path(sys.argv[2]) / name,
+                             batch=2, steps=steps, bf16=False, device="cpu", crop=CropSettings(size_px=32))
+    train(settings, should_stop=lambda: os.environ["RANK"] == stopped_rank)
 """
 
 
-def in_two_processes(photos, out, *, steps, stopped_rank):
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    link = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2", "OMP_NUM_THREADS": "1"}
-    arguments = [str(photos), str(out), str(steps), str(stopped_rank)]
+@pytest.mark.slow
+def test_two_processes_train_one_model_and_stop_together_when_one_is_told_to(photos, tmp_path):
+    with contextlib.ExitStack() as held:
+        free = [held.enter_context(socket.socket()) for _ in range(3)]
+        for one in free:
+            one.bind(("127.0.0.1", 0))
+        ports = [str(one.getsockname()[1]) for one in free]
+    link = {"MASTER_ADDR": "127.0.0.1", "WORLD_SIZE": "2", "OMP_NUM_THREADS": "1"}
     started = [
         subprocess.Popen(
-            [sys.executable, "-c", _WORKER, *arguments],
+            [sys.executable, "-c", _WORKER, str(photos), str(tmp_path), *ports],
             env=os.environ | link | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
         )
         for rank in (0, 1)
     ]
-    assert [process.wait(timeout=120) for process in started] == [0, 0]
-    return json.loads((out / "3dcsc.json").read_text())["made_by"]
-
-
-@pytest.mark.slow
-def test_two_processes_train_one_model(photos, tmp_path):
-    made_by = in_two_processes(photos, tmp_path / "run", steps=2, stopped_rank=None)
-    assert made_by["processes"] == 2
-    assert made_by["samples"] == 8
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rank", [0, 1])
-def test_two_processes_stop_together_when_one_is_told_to(photos, tmp_path, rank):
-    made_by = in_two_processes(photos, tmp_path / "run", steps=1000, stopped_rank=rank)
-    assert made_by["steps"] == 1
+    assert [process.wait(timeout=200) for process in started] == [0, 0]
+    whole, first, second = (
+        json.loads((tmp_path / name / "3dcsc.json").read_text())["made_by"]
+        for name in ("whole", "first", "second")
+    )
+    assert (whole["processes"], whole["steps"], whole["samples"]) == (2, 2, 8)
+    assert first["steps"] == second["steps"] == 1

@@ -39,6 +39,33 @@ def test_it_finds_the_least_of_a_quadratic():
 
 
 def test_weights_without_gradient_are_left_alone():
+    frozen, weight = (torch.nn.Parameter(torch.ones(3, 3)) for _ in range(2))
+    weight.grad = torch.eye(3)
+    Muon([{"params": [frozen]}, {"params": [weight]}], lr=0.1).step()
+    torch.testing.assert_close(frozen.data, torch.ones(3, 3))
+    assert (weight.diagonal() < 1.0).all(), "the group after it is trained"
+
+
+def test_an_update_is_the_nearest_orthogonal_matrix_of_the_nesterov_mean(monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        "semcast.training.muon.orthogonalise", lambda matrices: seen.append(matrices) or matrices
+    )
+    weight = torch.nn.Parameter(torch.full((4, 1), 10.0))
+    optimiser = Muon([weight], lr=0.1, momentum=0.75, weight_decay=0.5)
+    for gradient in (4.0, 8.0):
+        weight.grad = torch.full((4, 1), gradient)
+        optimiser.step()
+    # Momentum 0.25 * 4 = 1, then 0.75 * 1 + 0.25 * 8 = 2.75; the gradient itself counts a quarter.
+    means = [0.25 * 4.0 + 0.75 * 1.0, 0.25 * 8.0 + 0.75 * 2.75]
+    assert [matrices.unique().tolist() for matrices in seen] == [[mean] for mean in means]
+    # Four rows a column: twice the step. The decay takes 0.5 * 0.1 of the weight before it.
+    after = 10.0
+    for mean in means:
+        after = 0.95 * after - 2.0 * 0.1 * mean
+    torch.testing.assert_close(weight.data, torch.full((4, 1), after))
+
+
+def test_the_loss_of_a_closure_is_returned():
     weight = torch.nn.Parameter(torch.ones(3, 3))
-    Muon([weight], lr=0.1).step()
-    torch.testing.assert_close(weight.data, torch.ones(3, 3))
+    assert Muon([weight], lr=0.1).step(lambda: 2.5) == 2.5

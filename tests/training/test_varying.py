@@ -42,10 +42,11 @@ def through(model, x, values=None):
     return latent, x_hat, *model.judge(features, x_hat)
 
 
-def seen_by(model):
+def seen_by(model, count):
+    """What is seen of a network on so many pairs of images, of 32 blocks each."""
     seen = Observations()
     with torch.no_grad():
-        for seed in range(40):
+        for seed in range(count):
             x = images(seed=seed)
             latent, x_hat, *_ = through(model, x)
             seen.add(x, latent, x_hat)
@@ -55,7 +56,7 @@ def seen_by(model):
 @pytest.fixture(scope="module")
 def pair():
     fixed = trained()
-    seen = seen_by(fixed)
+    seen = seen_by(fixed, 40)
     torch.manual_seed(1)
     variable = build_variable_3dcsc(SIZES).eval()
     vary(fixed, variable, seen)
@@ -126,7 +127,7 @@ def test_a_network_with_fewer_units_takes_the_last_ones():
             weight.add_(0.05 * torch.randn_like(weight))
         for weight in fixed.encoder.stage16.units[0].parameters():
             weight.zero_()  # it adds nothing: without it the network computes the same
-    seen = seen_by(fixed)
+    seen = seen_by(fixed, 12)
     variable = build_variable_3dcsc(Sizes((8, 12, 16), (1, 1, 2), (1, 1, 1), 8)).eval()
     vary(fixed, variable, seen)
     with torch.no_grad():

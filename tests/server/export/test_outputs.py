@@ -9,6 +9,7 @@ import pytest
 
 from semcast.common.trajectory import Trajectory, read_tum, write_tum
 from semcast.server.export.outputs import (
+    EachFile,
     percentiles,
     plain,
     trajectory_of,
@@ -96,7 +97,7 @@ def test_trajectories_are_ordered_by_frame_and_never_go_back_in_time():
         return T
 
     trajectory = trajectory_of(
-        {5: pose(5), 1: pose(1), 3: pose(3), 9: pose(9)},
+        {5: pose(5), 1: pose(1), 2: pose(2), 3: pose(3), 9: pose(9)},
         {1: 1_000_000_000, 3: 3_000_000_000, 5: 2_000_000_000, 7: 0},
     )
     assert trajectory.t_s.tolist() == [1.0, 3.0]
@@ -120,3 +121,30 @@ def test_percentiles_by_hand():
 
 def test_versions_name_what_figures_depend_on():
     assert {"semcast", "python", "numpy"} <= set(versions())
+
+
+def written_each(folder, errors, at_the_end=None):
+    """Return which files are written where others, and what follows them, fail with these errors."""
+    written, failure = [], None
+    try:
+        with EachFile() as files:
+            for name, error in errors.items():
+                with files.attempt(folder / name) as path:
+                    if error is not None:
+                        raise error
+                    written.append(path.name)
+            if at_the_end is not None:
+                raise at_the_end
+    except (OSError, KeyError) as err:
+        failure = err
+    return written, failure
+
+
+def test_a_file_that_can_not_be_written_costs_no_other_and_hides_no_other_error(tmp_path):
+    errors = {"a": OSError(28, "No space left"), "b": None, "c": ValueError("that is no map")}
+    written, failure = written_each(tmp_path, errors)
+    assert written == ["b"]
+    assert str(failure) == "a: No space left; c: that is no map"
+    other = KeyError("k")
+    assert written_each(tmp_path, errors, at_the_end=other) == (["b"], other)
+    assert written_each(tmp_path, {"b": None}) == (["b"], None)

@@ -159,7 +159,9 @@ class Running:
     """A server on its own thread."""
 
     def __init__(self, hub, codec, load=None, **settings):
-        values = {"agent_id": AGENT, "view": ViewSettings(view="none"), "bundle": "inline"}
+        # Without depth, which takes longer than all else of a run.
+        values = {"agent_id": AGENT, "bundle": "inline", "dense_cloud": "none"}
+        values["view"] = ViewSettings(view="none")
         self.settings = ServerSettings(**{**values, **settings})
         self.stop = threading.Event()
         self.summary, self.error = None, None

@@ -39,10 +39,11 @@ DEADLINE_S = 60.0
 
 def test_a_lossless_stream_leaves_every_promised_file_and_repeats_bit_for_bit(tmp_path, open_air, read_ply):
     trajectories = []
-    for run in ("a", "b"):
+    for run, depth in (("a", "end"), ("b", "none")):
         out = tmp_path / run
         with open_air() as air:
-            running = air.serve(mode="replay", out=out, reference=DEMO, view=ViewSettings(view="file"))
+            view = ViewSettings(view="file")
+            running = air.serve(mode="replay", out=out, reference=DEMO, view=view, dense_cloud=depth)
             radio = air.agent(100, lossless=True)
             radio.stream(range(24))
             summary = running.finish()
@@ -58,6 +59,7 @@ def test_a_lossless_stream_leaves_every_promised_file_and_repeats_bit_for_bit(tm
         assert (out / "run.rrd").stat().st_size > 10_000
         assert "[reconstruction]" in (out / "settings.toml").read_text()
         assert set(radio.posed_ids()) == set(range(24))
+    assert len(read_ply(tmp_path / "a" / "dense.ply")) > 1000
     assert trajectories[0] == trajectories[1]
 
 

@@ -6,6 +6,7 @@ from drawn_boards import render, sideways
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
+from semcast.evaluation.scenes.render import RenderSettings, render_scene
 from semcast.server.mapping.bundle_problem import BundleProblem
 
 
@@ -74,6 +75,14 @@ def _projected(problem):
     T_cam_world = invert_transform(problem.T_world_cam)[problem.view]
     seen = np.einsum("mij,mj->mi", T_cam_world[:, :3, :3], problem.xyz[problem.point]) + T_cam_world[:, :3, 3]
     return problem.camera.project(seen)
+
+
+@pytest.fixture(scope="session")
+def orbit_folder(tmp_path_factory):
+    """A sequence of 25 frames of a camera that goes round a still life, by 3.5 degrees a frame."""
+    folder = tmp_path_factory.mktemp("scenes") / "orbit"
+    render_scene(RenderSettings(scene="orbit", seconds=2.5, out=folder))
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -1,5 +1,7 @@
 """Upright boards with textures, drawn for a camera that moves before them, and their reconstruction."""
 
+import functools
+
 import cv2
 import numpy as np
 
@@ -31,14 +33,17 @@ def board_texture(seed, size=512):
     return np.clip(noise * 32 + 128, 0, 255).astype(np.uint8)
 
 
-TEXTURES = [board_texture(k, 1536 if k == 0 else 256) for k in range(len(BOARDS))]
+@functools.cache
+def textures():
+    """Made when the first picture is drawn: every process of the tests imports this."""
+    return [board_texture(k, 1536 if k == 0 else 256) for k in range(len(BOARDS))]
 
 
 def render(T_world_cam):
     """Draw the boards from far to near by the homography of each."""
     T = invert_transform(T_world_cam)
     image = np.zeros(CAMERA.shape_hw, np.uint8)
-    for texture, (x, y, z, size) in zip(TEXTURES, BOARDS, strict=True):
+    for texture, (x, y, z, size) in zip(textures(), BOARDS, strict=True):
         scale = size / texture.shape[0]
         board = np.array([[scale, 0, x - size / 2], [0, scale, y - size / 2], [0, 0, z], [0, 0, 1]])
         H = CAMERA.K @ (T[:3] @ board)

@@ -4,7 +4,6 @@ import pytest
 
 from semcast.common.geometry import rotation_angle_deg
 from semcast.common.sequence import open_sequence
-from semcast.evaluation.scenes.render import RenderSettings, render_scene
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -15,11 +14,8 @@ NUM_BEFORE = 12
 
 
 @pytest.fixture(scope="module")
-def orbit(tmp_path_factory):
-    """A camera that goes round a still life, by 3.5 degrees a frame."""
-    path = tmp_path_factory.mktemp("scenes") / "orbit"
-    render_scene(RenderSettings(scene="orbit", seconds=2.5, out=path))
-    return open_sequence(path)
+def orbit(orbit_folder):
+    return open_sequence(orbit_folder)
 
 
 def behind_a_gap(sequence, num_missing):

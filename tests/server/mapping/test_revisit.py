@@ -1,5 +1,6 @@
 """Landmarks of long ago that are in sight again: found, placed anew, and used."""
 
+import functools
 from dataclasses import replace
 
 import cv2
@@ -28,6 +29,7 @@ NOISE = NoiseModel(0.7, 0.0)
 DEPTH = 2.0
 
 
+@functools.cache
 def wall():
     rng = np.random.default_rng(3)
     layers = [
@@ -37,14 +39,11 @@ def wall():
     return np.clip(noise * 30 + 128, 0, 255).astype(np.uint8)
 
 
-WALL = wall()
-
-
 def sight_from(T_world_cam, frame_id):
     """The wall as a camera sees it."""
     T = invert_transform(T_world_cam)
     on_wall = np.array([[0.01, 0, -4.5], [0, 0.01, -4.5], [0, 0, DEPTH], [0, 0, 1]])
-    grey = cv2.warpPerspective(WALL, CAMERA.K @ (T[:3] @ on_wall), SHAPE[::-1], flags=cv2.INTER_LINEAR)
+    grey = cv2.warpPerspective(wall(), CAMERA.K @ (T[:3] @ on_wall), SHAPE[::-1], flags=cv2.INTER_LINEAR)
     frame = DecodedFrame(frame_id, frame_id * 10**8, np.repeat(grey[..., None], 3, axis=2))
     return Sight(frame, to_grey(frame.image), usable_rows(frame, SHAPE[0]))
 

@@ -5,7 +5,6 @@ import pytest
 
 from semcast.common.geometry import invert_transform, rotation_angle_deg, transform_points
 from semcast.common.sequence import open_sequence
-from semcast.evaluation.scenes.render import RenderSettings, render_scene
 from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
@@ -20,11 +19,9 @@ NOISE = NoiseModel(0.7, 0.0)
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory):
+def mapped(orbit_folder):
     """A still life and its map, made of the first frames; the camera turns by 3.5 degrees a frame."""
-    path = tmp_path_factory.mktemp("scenes") / "orbit"
-    render_scene(RenderSettings(scene="orbit", seconds=2.2, out=path))
-    sequence = open_sequence(path)
+    sequence = open_sequence(orbit_folder)
     reconstruction = Reconstruction(sequence.intrinsics, ReconstructionSettings(), InlineBundle())
     for k in range(NUM_MAPPED):
         reconstruction.process(DecodedFrame(k, int(sequence.times_ns[k]), sequence.image(k)))
