@@ -117,6 +117,6 @@ def _distance_between(places: Array, xyz: Array) -> Array:
     """Return how far each place ``(N, 3)`` is from the nearest ``(M, 3)``; infinite without any."""
     if not len(xyz):
         return np.full(len(places), np.inf)
-    tree = cv2.flann_Index(xyz.astype(np.float32), _EXACT_TREE)
+    tree = cv2.flann_Index(xyz.astype(np.float32), _EXACT_TREE)  # type: ignore[attr-defined]
     _, squared = tree.knnSearch(places.astype(np.float32), 1, params=_ALL_LEAVES)
-    return np.sqrt(squared[:, 0]).astype(np.float64)
+    return np.sqrt(np.asarray(squared[:, 0], np.float64))
