@@ -27,7 +27,8 @@ from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence import open_sequence
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import ate, match_times
-from semcast.evaluation.keyframe_depth import DepthKeyframe, confirmed_depths, reconstructed
+from semcast.evaluation.cloud_error import CloudError, TrueView, cloud_error
+from semcast.evaluation.keyframe_depth import DepthKeyframe, cloud_points, confirmed_depths, reconstructed
 from semcast.evaluation.picture_strip import write_picture_strip
 from semcast.evaluation.pipeline import CLEAN, UNUSED_LINK_FIELDS, run_frames
 from semcast.evaluation.report import json_ready, provenance, write_json
@@ -124,14 +125,13 @@ class _Scene:
         sequence: The original images.
         keyframes: By frame id; poses in the units of ``metres``.
         metres: Metres in a unit of the poses; 1 where there is no truth.
-        truth: ``(H, W)`` depth in metres of each keyframe's view, infinite where there is nothing; None for
-            sequences that were not drawn.
+        truth: What each keyframe saw; None for sequences that were not drawn.
     """
 
     sequence: RecordedSequence
     keyframes: dict[int, DepthKeyframe]
     metres: float
-    truth: dict[int, NDArray[np.float32]] | None
+    truth: dict[int, TrueView] | None
 
 
 def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = None) -> dict[str, Any]:
@@ -147,7 +147,8 @@ def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = Non
         per codec, SNR and use of confidence, over keyframes and seeds: ``coverage``, the share of pixels with
         a reference that have a confirmed depth too; of these ``median_error``, relative, and
         ``outlier_share``, off by more than 5 % or where there is nothing; ``psnr_db``; and ``lost``, the
-        share of keyframes that did not arrive, whose pixels have no depth.
+        share of keyframes that did not arrive, whose pixels have no depth. Of drawn scenes ``cloud`` holds
+        figures of the points that these depths become, see ``CloudError``.
 
     Raises:
         SourceError: The recording can't be read, or has no keyframes to tell depth from.
@@ -166,11 +167,11 @@ def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = Non
         scene = _prepared(settings, Path(folder))
         originals = {k: scene.sequence.image(k) for k in scene.keyframes}
         views = {k: view_of(k, image, None, scene.sequence.intrinsics) for k, image in originals.items()}
-        clean = confirmed_depths(scene.keyframes, views)
-        against = _Reference(scene, views, clean)
+        clean = _Depths.of(scene, views)
+        against = _Reference(scene, views, clean.inverse)
         shown = sorted(views)[len(views) // 2]
         strip = [against.pictures(shown, views[shown])]
-        results = [] if scene.truth is None else [_row(CLEAN, None, "off", [against.errors(clean)], [], 0.0)]
+        results = [] if scene.truth is None else [_row(CLEAN, None, "off", against, [clean], [], 0.0)]
         for snr_db in settings.snr_db[:1] if is_of_file(settings.link) else settings.snr_db:
             pictures = {}
             for name, codec in under_name.items():
@@ -228,7 +229,9 @@ def _prepared(settings: DepthSettings, folder: Path) -> _Scene:
         exact = {}
         for k in keyframes:
             t_s = float(sequence.times_ns[k]) * 1e-9
-            exact[k] = exact_depth(scene.surfaces(t_s), scene.camera, scene.T_world_cam(t_s))
+            surfaces, T_world_cam = scene.surfaces(t_s), scene.T_world_cam(t_s)
+            seen = exact_depth(surfaces, scene.camera, T_world_cam)
+            exact[k] = TrueView(T_world_cam, scene.camera, seen, surfaces)
     return _Scene(sequence, keyframes, metres, exact)
 
 
@@ -243,18 +246,46 @@ def _at_true_poses(
     }
 
 
+@dataclass(frozen=True)
+class _Depths:
+    """What some images told.
+
+    Attributes:
+        inverse: Confirmed inverse depth by keyframe, ``(H, W)`` each.
+        cloud: What of it becomes points, ``(N, 3)`` in each keyframe's camera frame.
+    """
+
+    inverse: dict[int, DepthImage]
+    cloud: dict[int, NDArray[np.float32]]
+
+    @classmethod
+    def of(cls, scene: _Scene, views: Mapping[int, View]) -> "_Depths":
+        """Estimate them from views of a scene's keyframes."""
+        confirmed = confirmed_depths(scene.keyframes, views)
+        inverse = {k: found.inverse_depth for k, found in confirmed.items()}
+        return cls(inverse, cloud_points(confirmed, scene.keyframes, views))
+
+
 class _Reference:
     """Depth that others are measured against."""
 
     def __init__(self, scene: _Scene, views: Mapping[int, View], clean: Mapping[int, DepthImage]) -> None:
         self._metres = scene.metres
         self._clean = clean
+        self._truth = scene.truth
         self._limits = {k: (1 / f.sought.farthest, 1 / f.sought.nearest) for k, f in scene.keyframes.items()}
         self.is_exact = scene.truth is not None
         if scene.truth is not None:
-            self._depth = {k: _at_centres(scene.truth[k], views[k].shape_hw) for k in views}
+            self._depth = {k: _at_centres(scene.truth[k].depth, views[k].shape_hw) for k in views}
         else:
             self._depth = {k: 1.0 / inverse for k, inverse in clean.items()}
+
+    def cloud(self, clouds: Sequence[Mapping[int, NDArray[np.float32]]]) -> CloudError | None:
+        """Return figures of clouds in units of the poses; None where the truth is not known."""
+        if self._truth is None:
+            return None
+        in_metres = ({k: self._metres * points for k, points in cloud.items()} for cloud in clouds)
+        return cloud_error(in_metres, self._truth)
 
     def errors(self, found: Mapping[int, DepthImage]) -> tuple[NDArray[np.float64], int]:
         """Return relative errors of all pixels with both depths, and how many have a reference.
@@ -312,7 +343,7 @@ def _measured(
 ) -> tuple[list[dict[str, Any]], NDArray[np.uint8]]:
     """Return a row for each use of confidence, and a keyframe's depth with the first of them."""
     camera, ids = scene.sequence.intrinsics, sorted(scene.keyframes)
-    errors: dict[str, list[tuple[NDArray[np.float64], int]]] = {use: [] for use in settings.confidence}
+    told: dict[str, list[_Depths]] = {use: [] for use in settings.confidence}
     psnrs_db: list[float | None] = []
     picture, num_lost = None, 0
     for seed in range(settings.seed, settings.seed + settings.seeds):
@@ -329,25 +360,27 @@ def _measured(
                 k: view_of(k, d.image, d.confidence if use == "on" else None, camera)
                 for k, d in arrived.items()
             }
-            found = confirmed_depths(scene.keyframes, views)
-            errors[use].append(against.errors(found))
+            told[use].append(_Depths.of(scene, views))
             if picture is None:
                 size_hw = view_of(shown, scene.sequence.image(shown), None, camera).shape_hw
-                picture = against.coloured(shown, found.get(shown), size_hw)
+                picture = against.coloured(shown, told[use][-1].inverse.get(shown), size_hw)
     lost = num_lost / (len(ids) * settings.seeds)
     assert picture is not None, "there is a seed and a use of confidence"
     stated_db = stated_snr_db(snr_db, settings.link)
-    return [_row(name, stated_db, use, found, psnrs_db, lost) for use, found in errors.items()], picture
+    rows = [_row(name, stated_db, use, against, found, psnrs_db, lost) for use, found in told.items()]
+    return rows, picture
 
 
 def _row(
     codec: str,
     snr_db: float | None,
     confidence: str,
-    errors: list[tuple[NDArray[np.float64], int]],
+    against: _Reference,
+    told: Sequence[_Depths],
     psnrs_db: list[float | None],
     lost: float,
 ) -> dict[str, Any]:
+    errors = [against.errors(depths.inverse) for depths in told]
     every = np.concatenate([found for found, _ in errors])
     num_pixels = sum(num for _, num in errors)
     in_scene = np.isfinite(every)
@@ -360,4 +393,5 @@ def _row(
         "outlier_share": float(np.mean(every > _OUTLIER)) if len(every) else None,
         "psnr_db": finite_mean(psnrs_db),
         "lost": lost,
+        "cloud": against.cloud([depths.cloud for depths in told]),
     }

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,11 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.evaluation.pipeline import LinkedFrame
 from semcast.evaluation.reconstruct import as_received
-from semcast.server.dense.consistency import OtherDepth, num_agreeing
-from semcast.server.dense.depth_map import DepthImage, DepthMap, DepthProblem, estimate_depth
+from semcast.server.dense.consistency import OtherDepth, back_project, confirmed_depth, not_yet_seen
+from semcast.server.dense.depth_map import DepthMap, DepthProblem, estimate_depth
 from semcast.server.dense.neighbours import (
     NUM_CONFIRMING,
+    NUM_COVERING,
     DepthRange,
     choose_neighbours,
     depth_range,
@@ -86,7 +87,7 @@ def reconstructed(
 
 def confirmed_depths(
     keyframes: Mapping[int, DepthKeyframe], views: Mapping[int, View]
-) -> dict[int, DepthImage]:
+) -> dict[int, DepthMap]:
     """Estimate the depth of keyframes from their views and keep what others confirm.
 
     Args:
@@ -94,12 +95,38 @@ def confirmed_depths(
         views: Of those that arrived.
 
     Returns:
-        ``(H, W)`` inverse depth in units of the poses, NaN where it is not confirmed, of every keyframe that
-        has a view and a neighbour.
+        Inverse depth in units of the poses, NaN where it is not confirmed, of every keyframe that has a view
+        and a neighbour.
     """
     problems = {k: _problem(k, keyframes, views) for k in sorted(views)}
     maps = {k: estimate_depth(problem) for k, problem in problems.items() if problem is not None}
-    return {k: _confirmed(k, maps, keyframes, views) for k in maps}
+    order, confirmed = sorted(maps), {}
+    for place, (k, found) in enumerate(maps.items()):
+        around = order[max(0, place - NUM_CONFIRMING) : place + NUM_CONFIRMING + 1]
+        others = _seen_from(k, [maps[j] for j in around if j != k], keyframes, views)
+        needed = num_to_confirm(len(others))
+        depth = confirmed_depth(found.inverse_depth, found.step, views[k].K, others, needed)
+        confirmed[k] = replace(found, inverse_depth=depth)
+    return confirmed
+
+
+def cloud_points(
+    confirmed: Mapping[int, DepthMap], keyframes: Mapping[int, DepthKeyframe], views: Mapping[int, View]
+) -> dict[int, NDArray[np.float32]]:
+    """Return what each keyframe adds to the dense cloud, ``(N, 3)`` in its camera frame, units of the poses.
+
+    Args:
+        confirmed: Of ``confirmed_depths``.
+        keyframes: By frame id.
+        views: Those that ``confirmed`` is from.
+    """
+    added, order = {}, sorted(confirmed)
+    for place, k in enumerate(order):
+        found = confirmed[k]
+        covering = [confirmed[j] for j in order[max(0, place - NUM_COVERING) : place]]
+        points = back_project(found.inverse_depth, views[k].K)[np.isfinite(found.inverse_depth)]
+        added[k] = points[not_yet_seen(points, found.step, _seen_from(k, covering, keyframes, views))]
+    return added
 
 
 def _problem(
@@ -116,24 +143,20 @@ def _problem(
     return DepthProblem(views[k], [group for group in groups if group], sought.nearest, sought.farthest)
 
 
-def _confirmed(
+def _seen_from(
     k: int,
-    maps: Mapping[int, DepthMap],
+    maps: Iterable[DepthMap],
     keyframes: Mapping[int, DepthKeyframe],
     views: Mapping[int, View],
-) -> DepthImage:
-    found, order = maps[k], sorted(maps)
-    place = order.index(k)
-    others = [
+) -> list[OtherDepth]:
+    """Other keyframes' depth as ``consistency`` takes it."""
+    T_world_cam = keyframes[k].T_world_cam
+    return [
         OtherDepth(
-            maps[j].inverse_depth,
-            maps[j].step,
-            views[j].K,
-            invert_transform(keyframes[j].T_world_cam) @ keyframes[k].T_world_cam,
+            found.inverse_depth,
+            found.step,
+            views[found.frame_id].K,
+            invert_transform(keyframes[found.frame_id].T_world_cam) @ T_world_cam,
         )
-        for j in order[max(0, place - NUM_CONFIRMING) : place + NUM_CONFIRMING + 1]
-        if j != k
+        for found in maps
     ]
-    agreeing = num_agreeing(found.inverse_depth, found.step, views[k].K, others)
-    sure = agreeing >= num_to_confirm(len(others))
-    return np.where(sure, found.inverse_depth, np.float32(np.nan))

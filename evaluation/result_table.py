@@ -69,6 +69,18 @@ def _cell(row: Mapping[str, Any], where: str, form: str) -> str:
     return "-" if value is None else format(value, form)
 
 
+def _cloud_note(row: Mapping[str, Any]) -> str:
+    link = "" if row["snr_db"] is None else f" at {row['snr_db']:g} dB, confidence {row['confidence']}"
+    figures = [
+        _cell(row["cloud"], name, form)
+        for name, form in (("accuracy_median", ".2%"), ("accuracy_p90", ".2%"), ("completeness", ".1%"))
+    ]
+    return (
+        f"Cloud of {row['codec']}{link}: {row['cloud']['points']:.0f} points, half of them within "
+        f"{figures[0]} of a surface, nine in ten within {figures[1]}; {figures[2]} of what was seen has one."
+    )
+
+
 def _named(entries: Mapping[str, dict[str, Any]]) -> list[dict[str, Any]]:
     return [{"name": name, **entry} for name, entry in entries.items()]
 
@@ -169,7 +181,8 @@ LAYOUTS: dict[str, _Layout] = {
         },
         lambda report: [
             f"Depth that other keyframes confirm, over {report['num_keyframes']} keyframes. Coverage: share "
-            f"of the pixels with {report['reference']} depth. Errors are relative to it."
+            f"of the pixels with {report['reference']} depth. Errors are relative to it.",
+            *(_cloud_note(row) for row in report["results"] if row.get("cloud")),
         ],
     ),
     "latency": _Layout(

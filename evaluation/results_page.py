@@ -206,23 +206,41 @@ def _depth(report: Report) -> Iterator[str]:
     against = "the exact depth" if report["reference"] == "exact" else "that from the original images"
     poses = "true" if report["settings"]["poses"] == "true" else "those estimated from the original images"
     yield f"{report['num_keyframes']} keyframes, measured against {against}; poses are {poses}.\n"
-    head = ["codec", "SNR dB", "confidence", "coverage", "median error", "off by 5 %", "PSNR dB", "lost"]
+    figures = {
+        "coverage": ("coverage", ".1%"),
+        "median error": ("median_error", ".2%"),
+        "off by 5 %": ("outlier_share", ".1%"),
+    }
+    cloud = {
+        "points off by": ("accuracy_median", ".2%"),
+        "nine in ten within": ("accuracy_p90", ".2%"),
+        "of what was seen": ("completeness", ".1%"),
+    }
+    if not any(row.get("cloud") for row in report["results"]):
+        cloud = {}
     yield from table(
-        head,
+        ["codec", "SNR dB", "confidence", *figures, *cloud, "PSNR dB", "lost"],
         [
             [
                 row["codec"],
                 "-" if row["snr_db"] is None else f"{row['snr_db']:g}",
                 row["confidence"],
-                "-" if row["coverage"] is None else f"{row['coverage']:.1%}",
-                "-" if row["median_error"] is None else f"{row['median_error']:.2%}",
-                "-" if row["outlier_share"] is None else f"{row['outlier_share']:.1%}",
+                *("-" if row[name] is None else format(row[name], form) for name, form in figures.values()),
+                *(
+                    "-" if row["cloud"][name] is None else format(row["cloud"][name], form)
+                    for name, form in cloud.values()
+                ),
                 number(row["psnr_db"]),
                 f"{row['lost']:.0%}",
             ]
             for row in report["results"]
         ],
     )
+    if cloud:
+        yield (
+            "\nThe points that these depths become: how far they are from a surface, in shares of that to "
+            "the camera, and how much of what keyframes saw has one within 2 % of its distance."
+        )
 
 
 def _training(report: Report) -> Iterator[str]:

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.dense.cloud import CloudPoints, DenseCloud, DensePatch, landmark_depths, scale_since
-from semcast.server.dense.consistency import OtherDepth, agrees, back_project, num_agreeing
+from semcast.server.dense.consistency import OtherDepth, back_project, confirmed_depth, not_yet_seen
 from semcast.server.dense.depth_map import DepthMap, DepthProblem
 from semcast.server.dense.neighbours import (
     NUM_CONFIRMING,
+    NUM_COVERING,
     NUM_NEIGHBOURS,
     DepthRange,
     choose_neighbours,
@@ -29,7 +30,7 @@ Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
 #: Keyframes whose images are kept, and those of them whose depth is.
-_NUM_VIEWS, _NUM_MAPS = 12, 6
+_NUM_VIEWS, _NUM_MAPS = 12, 8
 #: The same where depth is estimated at the end: half a megabyte each. Beyond it every second one goes.
 _NUM_STORED = 300
 #: Depths that are off by a larger share than this, since the unit has changed, are left out.
@@ -39,8 +40,6 @@ _POLL_S = 0.01
 _MAX_LATER = 4
 #: Keyframes that may wait where there is no time for all.
 _MAX_WAITING = 2
-#: Keyframes before, whose points are not added once more.
-_NUM_COVERING = 4
 
 
 class DepthRunner(Protocol):
@@ -257,31 +256,31 @@ class DenseBuilder:
         found = self._maps[frame_id]
         before = sorted(k for k in self._maps if k < frame_id)[-NUM_CONFIRMING:]
         after = sorted(k for k in self._maps if k > frame_id)[:NUM_CONFIRMING]
-        others = [
-            other
-            for k in (*before, *after)
-            if (other := self._seen_from(keyframe, self._maps[k], world)) is not None
-        ]
-        agreeing = num_agreeing(found.inverse_depth, found.step, view.K, others)
-        sure = agreeing >= num_to_confirm(len(others))
-        confirmed = replace(found, inverse_depth=np.where(sure, found.inverse_depth, np.nan))
+        others = self._seen_from(keyframe, [self._maps[k] for k in (*before, *after)], world)
+        confirmed = replace(
+            found,
+            inverse_depth=confirmed_depth(
+                found.inverse_depth, found.step, view.K, others, num_to_confirm(len(others))
+            ),
+        )
+        sure = np.isfinite(confirmed.inverse_depth)
         points = back_project(confirmed.inverse_depth, view.K)[sure]
-        new = np.ones(len(points), bool)
-        for covering in self._confirmed.values():
-            other = self._seen_from(keyframe, covering, world)
-            if other is not None:
-                new &= ~agrees(points, found.step, other)
+        covering = self._seen_from(keyframe, list(self._confirmed.values()), world)
+        new = not_yet_seen(points, found.step, covering)
         self._confirmed[frame_id] = confirmed
-        for old in sorted(self._confirmed)[:-_NUM_COVERING]:
+        for old in sorted(self._confirmed)[:-NUM_COVERING]:
             del self._confirmed[old]
         patch = DensePatch(frame_id, points[new], view.rgb[sure][new], view.confidence[sure][new])
         if len(patch.xyz):
             self._cloud.add(patch, *landmark_depths(world, keyframe))
 
-    def _seen_from(self, keyframe: Keyframe, found: DepthMap, world: WorldMap) -> OtherDepth | None:
-        """Another keyframe's depth as ``consistency`` takes it; None where it is not of the same part."""
-        T_world_other, view = world.pose_of_frame(found.frame_id), self._kept.get(found.frame_id)
-        if T_world_other is None or view is None or world.submap_of.get(found.frame_id) != keyframe.submap:
-            return None
-        T_other_ref = invert_transform(T_world_other) @ keyframe.T_world_cam
-        return OtherDepth(found.inverse_depth, found.step, view.K, T_other_ref)
+    def _seen_from(self, keyframe: Keyframe, maps: Sequence[DepthMap], world: WorldMap) -> list[OtherDepth]:
+        """Other keyframes' depth as ``consistency`` takes it, of those that are of the same part."""
+        others = []
+        for found in maps:
+            T_world_other, view = world.pose_of_frame(found.frame_id), self._kept.get(found.frame_id)
+            same_part = world.submap_of.get(found.frame_id) == keyframe.submap
+            if T_world_other is not None and view is not None and same_part:
+                T_other_ref = invert_transform(T_world_other) @ keyframe.T_world_cam
+                others.append(OtherDepth(found.inverse_depth, found.step, view.K, T_other_ref))
+        return others

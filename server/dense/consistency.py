@@ -41,35 +41,58 @@ def back_project(inverse_depth: DepthImage, K: Array) -> NDArray[np.float32]:
     return np.stack([x * z, y[:, None] * z, z], axis=-1)
 
 
-def num_agreeing(
-    inverse_depth: DepthImage, step: float, K: Array, others: Sequence[OtherDepth]
-) -> NDArray[np.intp]:
-    """Count for each pixel how many other keyframes see the same surface there.
+def confirmed_depth(
+    inverse_depth: DepthImage, step: float, K: Array, others: Sequence[OtherDepth], num_needed: int
+) -> DepthImage:
+    """Keep what other keyframes see too, as the mean of all that agree, each weighted by its own step.
 
     Args:
         inverse_depth: ``(H, W)``, NaN where it is not known.
         step: What it is good to.
         K: ``(3, 3)`` of its pixels.
         others: Depths of other keyframes.
+        num_needed: So many of them have to agree.
 
     Returns:
-        ``(H, W)`` counts, 0 where the depth is not known.
+        ``(H, W)`` inverse depths, NaN where they are not confirmed.
     """
-    count = np.zeros(inverse_depth.shape, np.intp)
     known = np.isfinite(inverse_depth)
     points = back_project(inverse_depth, K)[known]
-    count[known] = sum((agrees(points, step, other) for other in others), np.zeros(len(points), np.intp))
-    return count
+    count = np.zeros(len(points), np.intp)
+    # By what a point comes nearer along its ray, in the mean: as the other camera sees it, near enough.
+    total, weight = np.zeros(len(points), np.float32), np.ones(len(points), np.float32)
+    for other in others:
+        off = _off(points, step, other)
+        agrees_here = np.isfinite(off)
+        count += agrees_here
+        share = np.float32((step / other.step) ** 2)
+        total += share * np.where(agrees_here, off, 0.0)
+        weight += share * agrees_here
+    confirmed = np.full_like(inverse_depth, np.nan)
+    confirmed[known] = np.where(
+        count >= num_needed, inverse_depth[known] * (1.0 + total / weight), np.float32(np.nan)
+    )
+    return confirmed
 
 
-def agrees(points: NDArray[np.floating], step: float, other: OtherDepth) -> NDArray[np.bool_]:
-    """Tell which points lie on what another keyframe sees.
+def not_yet_seen(
+    points: NDArray[np.floating], step: float, others: Sequence[OtherDepth]
+) -> NDArray[np.bool_]:
+    """Tell which points lie on no surface of the others: what they added is not added once more.
 
     Args:
-        points: ``(N, 3)`` in the camera frame of ``other.T_other_ref``.
+        points: ``(N, 3)`` in the camera frame of the others' ``T_other_ref``.
         step: What their inverse depth is good to.
-        other: The depth of the other keyframe.
+        others: Confirmed depth of keyframes before.
     """
+    seen = np.zeros(len(points), bool)
+    for other in others:
+        seen |= np.isfinite(_off(points, step, other))
+    return ~seen
+
+
+def _off(points: NDArray[np.floating], step: float, other: OtherDepth) -> NDArray[np.float32]:
+    """By what share another keyframe sees points ``(N, 3)`` nearer; NaN where it sees something else."""
     height, width = other.inverse_depth.shape
     T = other.T_other_ref
     A, b = (other.K @ T[:3, :3]).astype(np.float32), (other.K @ T[:3, 3]).astype(np.float32)
@@ -80,5 +103,6 @@ def agrees(points: NDArray[np.floating], step: float, other: OtherDepth) -> NDAr
     inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     at = np.where(inside, row * width + column, 0.0).astype(np.intp)
     within = np.maximum(_STEPS * max(step, other.step), _SHARE * per_z)
+    nearer = other.inverse_depth.ravel()[at] - per_z
     with np.errstate(invalid="ignore"):
-        return np.asarray(inside & (np.abs(other.inverse_depth.ravel()[at] - per_z) < within))
+        return np.asarray(np.where(inside & (np.abs(nearer) < within), nearer / per_z, np.nan), np.float32)

@@ -17,7 +17,7 @@ DepthImage = NDArray[np.float32]
 #: Depths that are tried: as many as the image moves by pixels between nearest and farthest, within these.
 MIN_DEPTHS, MAX_DEPTHS = 24, 64
 #: The second best match has to cost this share of the greatest cost more, the mean of all directions.
-_MIN_LEAD = 0.15
+_MIN_LEAD = 0.11
 #: Depths up to this many steps away belong to the same match.
 _BESIDE = 2
 #: Patches of fewer pixels are chance; pixels side by side are of one patch where their depths are at most so
@@ -80,8 +80,8 @@ class DepthMap:
 def estimate_depth(problem: DepthProblem) -> DepthMap:
     """Estimate the depth of a keyframe's pixels.
 
-    Depths are tried at equal steps of their inverse; the best one after smoothing counts, refined by a
-    parabola, where it is clearly better than any other.
+    Depths are tried at equal steps of their inverse; the best one after smoothing counts, refined between the
+    steps, where it is clearly better than any other.
     """
     reference = problem.reference
     inverse_depths = np.linspace(1.0 / problem.farthest, 1.0 / problem.nearest, _num_depths(problem))
@@ -145,8 +145,11 @@ def _lead(smoothed: Smoothed, best: NDArray[np.intp]) -> NDArray[np.float32]:
 
 
 def _refined(smoothed: Smoothed, best: NDArray[np.intp]) -> NDArray[np.float32]:
-    """Where between the depths the cost is least, in steps: the vertex of a parabola through three."""
+    """Where between the depths the cost is least, in steps: where two lines as steep on both sides meet.
+
+    Smoothed costs rise by the step, not by its square: a parabola would draw depths to those that were tried.
+    """
     middle = np.clip(best, 1, smoothed.shape[-1] - 2)
     before, at, after = (_at(smoothed, middle + k) for k in (-1, 0, 1))
-    curvature = np.maximum(before - 2.0 * at + after, 1e-6)
-    return np.asarray(middle + np.clip(0.5 * (before - after) / curvature, -0.5, 0.5), np.float32)
+    slope = np.maximum(np.maximum(before, after) - at, 1e-6)
+    return np.asarray(middle + np.clip(0.5 * (before - after) / slope, -0.5, 0.5), np.float32)

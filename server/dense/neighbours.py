@@ -21,8 +21,10 @@ _MAX_TURN_DEG = 40.0
 _NEAR, _FAR = (2.0, 1.0 / 1.3), (98.0, 1.5)
 #: Keyframes with fewer landmarks tell no range of depths.
 _MIN_LANDMARKS = 10
-#: Depth of so many keyframes on either side confirms one, two of them where there are three.
-NUM_CONFIRMING = 2
+#: Depth of so many keyframes on either side confirms one, two of them where there are three or more.
+NUM_CONFIRMING = 3
+#: Keyframes before, whose points are not added once more.
+NUM_COVERING = 4
 
 
 class DepthRange(NamedTuple):
@@ -72,4 +74,4 @@ def choose_neighbours(
 
 def num_to_confirm(num_others: int) -> int:
     """How many of the depths of other keyframes have to agree with one."""
-    return 2 if num_others > NUM_CONFIRMING else 1
+    return 2 if num_others > 2 else 1

@@ -24,6 +24,9 @@ _FAINT_LEVELS = 1.0
 #: Correlation that windows of noise have now and then: below it there is nothing in common. Otherwise depths
 #: at which more neighbours see a pixel would cost less, having more chances.
 _CHANCE = 0.2
+#: Side of a window's middle, and the share of the window's variance there from which on it counts fully: one
+#: on plain ground that reaches a thing's outline is alike at the thing's depth, where the ground is not.
+_MIDDLE, _ENOUGH = 3, 0.5
 #: No pixel has this value, nor one near it: what lies beside a warped image.
 _BESIDE = -1e4
 _WHITE = 255.0
@@ -45,6 +48,8 @@ class Neighbour:
 def match_cost(reference: View, groups: Sequence[Sequence[Neighbour]], inverse_depths: Array) -> Volume:
     """Cost of each depth at each pixel: one less the normalised cross-correlation of windows.
 
+    Where little of a window's variance is in its middle it counts for little: pixels around decide there.
+
     Of a group the mean counts, and of the groups (those before and those after the reference) the better one:
     what is hidden on one side is mostly seen from the other.
 
@@ -59,7 +64,7 @@ def match_cost(reference: View, groups: Sequence[Sequence[Neighbour]], inverse_d
     ref = _Reference(reference)
     centred = [[(n, _centred(n.view)) for n in group] for group in groups]
     K_inv = np.linalg.inv(reference.K).astype(np.float64)
-    per_correlation = UNKNOWN_COST / (1.0 - _CHANCE)
+    per_correlation = UNKNOWN_COST / (1.0 - _CHANCE) * ref.own_share()
     cost = np.empty((len(inverse_depths), *reference.shape_hw), np.uint8)
     for d, inverse_depth in enumerate(inverse_depths.tolist()):
         best = np.zeros(reference.shape_hw, np.float32)
@@ -71,7 +76,7 @@ def match_cost(reference: View, groups: Sequence[Sequence[Neighbour]], inverse_d
                 weight += seen
             total /= np.maximum(weight, 1e-6)
             np.maximum(best, total, out=best)
-        cost[d] = np.rint(per_correlation * (1.0 - np.clip(best, _CHANCE, 1.0)))
+        cost[d] = np.rint(UNKNOWN_COST - per_correlation * (np.clip(best, _CHANCE, 1.0) - _CHANCE))
     return cost
 
 
@@ -82,8 +87,12 @@ class _Reference:
         self._grey = _centred(view)
         self._window = WINDOW_OF_NOISY if view.noise > _NOISY_LEVELS else WINDOW
         self._mean = self._box(self._grey)
-        variance = np.maximum(self._box(self._grey * self._grey) - self._mean * self._mean, 0.0)
-        self._per_sd = 1.0 / np.sqrt(variance + _FAINT_LEVELS**2)
+        self._per_sd = 1.0 / np.sqrt(self._variance(self._window) + _FAINT_LEVELS**2)
+
+    def own_share(self) -> Image:
+        """Return how far windows count, 0 to 1: by what of their variance is in their middle."""
+        share = self._variance(_MIDDLE) * self._per_sd**2
+        return np.asarray(np.minimum(share / np.float32(_ENOUGH), 1.0), np.float32)
 
     def correlation(self, other: Image, H: Array) -> tuple[Image, NDArray[np.bool_]]:
         """Return the normalised cross-correlation with an image warped by ``H``, and where that is seen."""
@@ -115,9 +124,16 @@ class _Reference:
         correlation *= seen
         return correlation, seen
 
+    def _variance(self, window: int) -> Image:
+        mean = _box(self._grey, window)
+        return np.maximum(_box(self._grey * self._grey, window) - mean * mean, 0.0)
+
     def _box(self, values: Image) -> Image:
-        size = (self._window, self._window)
-        return np.asarray(cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_REPLICATE), np.float32)
+        return _box(values, self._window)
+
+
+def _box(values: Image, side: int) -> Image:
+    return np.asarray(cv2.boxFilter(values, -1, (side, side), borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
 def _centred(view: View) -> Image:

@@ -10,6 +10,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.sequence import open_sequence
 from semcast.evaluation import depth
+from semcast.evaluation.cloud_error import TrueView
 from semcast.evaluation.depth import DepthSettings, evaluate_depth
 from semcast.evaluation.keyframe_depth import DepthKeyframe, confirmed_depths, reconstructed
 from semcast.evaluation.pipeline import run_frames
@@ -39,7 +40,7 @@ def test_a_recording_is_measured_against_its_originals(room, phase_codec, tmp_pa
     assert good["coverage"] > poor["coverage"] + 0.2
     assert good["median_error"] < 0.02
     assert good["psnr_db"] > poor["psnr_db"] + 3
-    assert good["lost"] == 0.0
+    assert (good["lost"], good["cloud"]) == (0.0, None)
     strip = cv2.imread(str(tmp_path / "depth.png"))
     assert strip.shape[1] > 2 * 384, "the original and its depth are side by side"
     assert len(result_table("depth", report).rows) == 4
@@ -64,31 +65,38 @@ def test_a_drawn_scene_is_measured_against_its_exact_depth(phase_codec):
     assert clean["coverage"] > 0.3
     assert clean["median_error"] < 0.01
     assert clean["coverage"] > decoded["coverage"]
+    cloud = clean["cloud"]
+    assert 0 < cloud["accuracy_median"] < 0.01
+    assert cloud["completeness"] > max(0.4, decoded["cloud"]["completeness"])
 
 
 def drawn(truth, metres):
-    """One keyframe, 1 to 4 units of depth, whose view has four pixels with these depths in metres."""
+    """A keyframe, 1 to 4 units of depth, whose view has four pixels with these depths in metres."""
     image = np.full((2, 2, 3), 90, np.uint8)
     camera = Intrinsics(fx=2, fy=2, cx=0.5, cy=0.5, width=2, height=2)
     keyframe = DepthKeyframe(np.eye(4), DepthRange(1.0, 2.0, 4.0))
-    scene = depth._Scene(None, {5: keyframe}, metres, {5: np.asarray(truth, np.float32)})
+    true = TrueView(np.eye(4), camera, np.asarray(truth, np.float32), [])
+    scene = depth._Scene(None, {5: keyframe}, metres, {5: true})
     return depth._Reference(scene, {5: view_of(5, image, None, camera)}, {})
 
 
 def test_errors_and_their_figures_by_hand():
     against = drawn([[2.0, 4.0], [8.0, np.inf]], metres=2.0)
     # Inverse depths of map units: 2.5 m where 2 m are, nothing, 8 m where 8 m are, and a depth of the sky.
-    errors, num_pixels = against.errors({5: np.array([[0.8, np.nan], [0.25, 0.1]], np.float32)})
+    found = np.array([[0.8, np.nan], [0.25, 0.1]], np.float32)
+    errors, num_pixels = against.errors({5: found})
     assert errors.tolist() == pytest.approx([0.25, 0.0, np.inf])
     assert num_pixels == 3
     lost = against.errors({})
     assert (lost[0].tolist(), lost[1]) == ([], 3)
-    row = depth._row("x", 6.0, "on", [(errors, num_pixels), lost], [20.0, None, 30.0], 0.5)
+    there = depth._Depths({5: found}, {5: np.zeros((0, 3), np.float32)})
+    nowhere = depth._Depths({}, {})
+    row = depth._row("x", 6.0, "on", against, [there, nowhere], [20.0, None, 30.0], 0.5)
     assert row["coverage"] == pytest.approx(2 / 6)
     assert row["median_error"] == pytest.approx(0.125)
     assert row["outlier_share"] == pytest.approx(2 / 3)
     assert (row["psnr_db"], row["lost"]) == (25.0, 0.5)
-    nothing = depth._row("x", 6.0, "on", [lost], [None], 1.0)
+    nothing = depth._row("x", 6.0, "on", against, [nowhere], [None], 1.0)
     assert (nothing["coverage"], nothing["median_error"], nothing["outlier_share"]) == (0.0, None, None)
 
 
@@ -117,7 +125,9 @@ def test_wrong_poses_confirm_next_to_nothing(room):
     place = {k: DepthKeyframe(truth.T_world_cam[k], DepthRange(2.0, 5.0, 9.0)) for k in ids}
     swapped = {k: place[(7 * k + 4) % 24] for k in ids}
     right, wrong = (
-        np.mean([np.isfinite(found).mean() for found in confirmed_depths(frames, views).values()])
+        np.mean(
+            [np.isfinite(found.inverse_depth).mean() for found in confirmed_depths(frames, views).values()]
+        )
         for frames in (place, swapped)
     )
     assert right > 0.5

@@ -65,6 +65,16 @@ def test_figures_of_published_poses_fit_beside_those_of_the_corrected_path():
     assert [line.split() for line in body] == table.rows
 
 
+def test_figures_of_a_cloud_are_told_below_the_table():
+    report = shipped("depth")
+    cloud = {"points": 1234.5, "accuracy_median": 0.0031, "accuracy_p90": None, "completeness": 0.4}
+    report["results"] = [{**report["results"][0], "cloud": cloud}, {**report["results"][1], "cloud": None}]
+    *_, note = result_table("depth", report).notes
+    assert note.startswith("Cloud of none: 1234 points, half of them within 0.31% of a surface")
+    assert note.endswith("within -; 40.0% of what was seen has one.")
+    assert len(result_table("depth", report).notes) == 2
+
+
 def test_a_long_name_takes_several_lines_and_cuts_no_other_column():
     report = shipped("codec")
     name = "checkpoints/mine/a-rather-long-name-of-weights.safetensors"

@@ -86,6 +86,11 @@ def wall():
 
 
 @pytest.fixture(scope="session")
+def faint_wall():
+    return Plane((0.0, 0.0, 1.0), 4.0, leaves(1, contrast=3.0))
+
+
+@pytest.fixture(scope="session")
 def plate():
     """A small square before the wall."""
     return Plane((0.0, 0.0, 1.0), 2.0, leaves(2), half=0.4)
