@@ -122,8 +122,8 @@ class ReadoutWatch:
         least_ms = _LEAST_MS if is_first else _LEAST_CHANGE_MS
         least_explained = _LEAST_EXPLAINED if is_first else _LEAST_EXPLAINED_MORE
         is_sure = fit.readout.ms >= _LEAST_SIGMAS * fit.sigma_ms and fit.explained >= least_explained
-        # Of an object in the middle of the image hardly two columns differ in time: its wrong corners then fit
-        # a readout longer than any camera's, and images put right for that would be spoilt.
+        # An object in the middle of the image is read in no time: what its corners do wrong would take a
+        # readout longer than any camera's, and images put right for that would be spoilt.
         if is_sure and least_ms <= fit.readout.ms <= MAX_READOUT_MS:
             self._found, self._axis, self._views = fit.readout, fit.readout.axis, []
         else:
