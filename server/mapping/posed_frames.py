@@ -112,4 +112,4 @@ class PosedFrames:
         at = np.minimum(np.searchsorted(keyframe_ids, mine), len(keyframe_ids) - 1)
         each = np.where(keyframe_ids[at] == mine, scale[at], 1.0)
         self._T_keyframe_cam[: len(self), :3, 3] *= each[:, None]
-        return self._ids[: len(self)][each != 1.0]
+        return np.asarray(self._ids[: len(self)][each != 1.0])
