@@ -458,10 +458,7 @@ class MapBuilder:
         world = self.world
         ids, removed, keyframes, frames, withdrawn = changes
         row = world.landmarks.rows(ids)
-        frame_poses = np.zeros((0, 4, 4))
-        if len(frames):  # a run of hours has a hundred thousand
-            posed, T_world_cam = world.poses_of_frames()
-            frame_poses = T_world_cam[np.searchsorted(posed, frames)]
+        _, frame_poses = world.poses_of_frames(frames)  # a run of hours has a hundred thousand
         return MapUpdate(
             map_epoch=map_epoch,
             ids=ids,

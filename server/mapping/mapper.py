@@ -305,7 +305,8 @@ def median_depth_of(keyframe: Keyframe, ids: Ids, xyz: Array) -> float:
 def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> None:
     """Bring an adjustment into the map, which may have grown since it was asked.
 
-    Keyframes and landmarks that came later move rigidly with the last keyframe of the window. Observations
+    Keyframes and landmarks that came later move rigidly with the last keyframe of the window. Frames that are
+    no keyframes move with theirs, and take over what has become of the scale around it. Observations
     outside the gate are dropped, and landmarks left with fewer than two of them. The noise model is
     fitted again.
     """
@@ -329,6 +330,7 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
     ):
         if not fixed:
             world.move_keyframe(frame_id, T_world_cam)
+    world.rescale_frames(dict(zip(problem.keyframe_ids.tolist(), local_scales(result).tolist(), strict=True)))
     # A landmark that was given up and made again while the adjustment ran is one of those that came later.
     same = ~np.isin(problem.landmark_ids, later)
     world.move_landmarks(problem.landmark_ids[same], result.xyz[same])
@@ -341,6 +343,25 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
     as_noise = np.abs(result.residual_px[telling]) / np.sqrt(left[telling, None])
     noise.add(np.repeat(problem.confidence[telling], 2), as_noise.ravel())
     drop_outliers(world, result, noise.model)
+
+
+def local_scales(result: BundleResult) -> Array:
+    """Factor on lengths around each keyframe, ``(K,)``: on its landmarks' depths, and 1 if it is fixed."""
+    problem = result.problem
+    before = _depths(problem, problem.T_world_cam, problem.xyz)
+    after = _depths(problem, result.T_world_cam, result.xyz)
+    sound = (before > 0.0) & (after > 0.0)
+    scale = np.ones(len(problem.T_world_cam))
+    for k in np.flatnonzero(~problem.fixed):
+        mine = sound & (problem.view == k)
+        if mine.any():
+            scale[k] = np.median(after[mine] / before[mine])
+    return scale
+
+
+def _depths(problem: BundleProblem, T_world_cam: Array, xyz: Array) -> Array:
+    """Depth of each observation's landmark in its view, ``(M,)`` map units."""
+    return depths_in(invert_transform(T_world_cam)[problem.view], xyz[problem.point])
 
 
 def drop_outliers(world: WorldMap, result: BundleResult, noise: NoiseModel) -> None:

@@ -59,9 +59,13 @@ class PosedFrames:
         """Rows by ascending id."""
         return np.argsort(self._ids[: len(self)], kind="stable")
 
-    def columns(self) -> tuple[Ids, Ids, Array]:
-        """Return copies of ``ids (N,)`` ascending, ``keyframe_ids (N,)`` and ``T_keyframe_cam (N, 4, 4)``."""
-        order = self._in_order()
+    def columns(self, ids: Ids | None = None) -> tuple[Ids, Ids, Array]:
+        """Return copies of ``ids (N,)`` ascending, ``keyframe_ids (N,)`` and ``T_keyframe_cam (N, 4, 4)``.
+
+        Args:
+            ids: Only of these, in their order; None for all.
+        """
+        order = self._in_order() if ids is None else np.array([self._row[k] for k in ids.tolist()], np.intp)
         return self._ids[order], self._keyframe_ids[order], self._T_keyframe_cam[order]
 
     def take(self, ids: Ids, keyframe_ids: Ids, T_keyframe_cam: Array) -> None:
@@ -98,13 +102,14 @@ class PosedFrames:
             self._T_keyframe_cam[row] = self._T_keyframe_cam[last]
             self._row[int(self._ids[row])] = row
 
-    def rescale(self, factor: Mapping[int, float]) -> None:
-        """Scale the translations of the frames of some keyframes, by frame id of the keyframe."""
+    def rescale(self, factor: Mapping[int, float]) -> Ids:
+        """Scale translations of frames by the frame id of their keyframe, and return whose have changed."""
         if not factor or not len(self):
-            return
+            return np.zeros(0, np.int64)
         keyframe_ids = np.array(sorted(factor), dtype=np.int64)
         scale = np.array([factor[k] for k in keyframe_ids.tolist()])
         mine = self._keyframe_ids[: len(self)]
         at = np.minimum(np.searchsorted(keyframe_ids, mine), len(keyframe_ids) - 1)
         each = np.where(keyframe_ids[at] == mine, scale[at], 1.0)
         self._T_keyframe_cam[: len(self), :3, 3] *= each[:, None]
+        return np.asarray(self._ids[: len(self)][each != 1.0])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics
+from semcast.common.camera import MAX_READOUT_MS, Intrinsics
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
 from semcast.server.mapping.lens import believed_lens
 from semcast.server.mapping.readout import Axis, Readout, body_velocity, fit_readout
@@ -122,7 +122,9 @@ class ReadoutWatch:
         least_ms = _LEAST_MS if is_first else _LEAST_CHANGE_MS
         least_explained = _LEAST_EXPLAINED if is_first else _LEAST_EXPLAINED_MORE
         is_sure = fit.readout.ms >= _LEAST_SIGMAS * fit.sigma_ms and fit.explained >= least_explained
-        if is_sure and fit.readout.ms >= least_ms:
+        # An object in the middle of the image is read in no time: what its corners do wrong would take a
+        # readout longer than any camera's, and images put right for that would be spoilt.
+        if is_sure and least_ms <= fit.readout.ms <= MAX_READOUT_MS:
             self._found, self._axis, self._views = fit.readout, fit.readout.axis, []
         else:
             is_known = len(self._views) >= _ENOUGH_VIEWS and fit.sigma_ms <= _SURE_MS

@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform
-from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import optimise
-from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, assemble_problem
-from semcast.server.mapping.mapper import drop_outliers, gather_observations
+from semcast.server.mapping.bundle_problem import assemble_problem
+from semcast.server.mapping.mapper import drop_outliers, gather_observations, local_scales
 from semcast.server.mapping.window import within_limit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -120,31 +118,9 @@ def _adjust(
     problem = result.problem
     frame_ids = np.array([k.frame_id for k in (*part, *settled)], dtype=np.int64)
     T_world_cam = np.stack([*result.T_world_cam, *(k.T_world_cam for k in settled)])
-    scale = np.concatenate([_scales(result), np.ones(len(settled))])
+    scale = np.concatenate([local_scales(result), np.ones(len(settled))])
     order = np.argsort(frame_ids)
     world.bend(frame_ids[order], T_world_cam[order], scale[order])
     world.move_landmarks(problem.landmark_ids, result.xyz)
     drop_outliers(world, result, noise)
     return True
-
-
-def _scales(result: BundleResult) -> Array:
-    """Factor on lengths around each keyframe, ``(K,)``: what its landmarks' depths have become.
-
-    The first is 1: it stays, and so does all that was before it.
-    """
-    problem = result.problem
-    before = _depths(problem, problem.T_world_cam, problem.xyz)
-    after = _depths(problem, result.T_world_cam, result.xyz)
-    sound = (before > 0.0) & (after > 0.0)
-    scale = np.ones(len(problem.T_world_cam))
-    for k in range(1, len(scale)):
-        mine = sound & (problem.view == k)
-        if mine.any():
-            scale[k] = np.median(after[mine] / before[mine])
-    return scale
-
-
-def _depths(problem: BundleProblem, T_world_cam: Array, xyz: Array) -> Array:
-    """Depth of each observation's landmark in its view, ``(M,)`` map units."""
-    return depths_in(invert_transform(T_world_cam)[problem.view], xyz[problem.point])

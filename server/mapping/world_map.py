@@ -176,7 +176,7 @@ class WorldMap:
         self.revisits: dict[int, int] = {}
         self._changed: set[int] = set()
         self._moved_keyframes: set[int] = set()
-        self._frames_moved = False
+        self._frames_moved: set[int] = set()
         self._removed: set[int] = set()
         self._withdrawn: set[int] = set()
 
@@ -269,7 +269,8 @@ class WorldMap:
         self._moved_keyframes.update(moved)
         for keyframe in self.keyframes_of(submap):
             keyframe.T_world_cam, keyframe.submap = self.poses[keyframe.frame_id], into
-        self._rescale_frames(dict.fromkeys(moved, scale))
+        self.rescale_frames(dict.fromkeys(moved, scale))
+        self._frames_moved.update(self.frames)
 
     def bend(self, keyframe_ids: Ids, T_world_cam: Array, scale: Array) -> None:
         """Move keyframes of one submap, and with each what it made: landmarks and frames, in its scale.
@@ -298,12 +299,12 @@ class WorldMap:
         self._moved_keyframes.update(frame_ids.tolist())
         for keyframe in self.keyframes:
             keyframe.T_world_cam = self.poses[keyframe.frame_id]
-        self._rescale_frames(dict(zip(frame_ids.tolist(), scale[at].tolist(), strict=True)))
+        self.rescale_frames(dict(zip(frame_ids.tolist(), scale[at].tolist(), strict=True)))
+        self._frames_moved.update(self.frames)
 
-    def _rescale_frames(self, factor: dict[int, float]) -> None:
+    def rescale_frames(self, factor: dict[int, float]) -> None:
         """Scale the poses of frames relative to keyframes."""
-        self._frames_moved = True
-        self.frames.rescale(factor)
+        self._frames_moved.update(self.frames.rescale(factor).tolist())
 
     def bound(self, max_landmarks: int, max_keyframes: int, recent: int) -> bool:
         """Keep the map within its size: longest unseen landmarks and every second old keyframe go.
@@ -353,9 +354,9 @@ class WorldMap:
         keyframe_id, T_keyframe_cam = self.frames[frame_id]
         return np.asarray(self.poses[keyframe_id] @ T_keyframe_cam)
 
-    def poses_of_frames(self) -> tuple[Ids, Array]:
-        """Return frame ids of all posed frames, ascending, and the best current ``T_world_cam (N, 4, 4)``."""
-        ids, keyframe_ids, T_keyframe_cam = self.frames.columns()
+    def poses_of_frames(self, frame_ids: Ids | None = None) -> tuple[Ids, Array]:
+        """Return ids and the best current ``T_world_cam (N, 4, 4)`` of frames: all, ascending, or these."""
+        ids, keyframe_ids, T_keyframe_cam = self.frames.columns(frame_ids)
         if len(ids) == 0:
             return ids, T_keyframe_cam
         used, at = np.unique(keyframe_ids, return_inverse=True)
@@ -389,10 +390,10 @@ class WorldMap:
         changed = np.array(sorted(self._changed), dtype=np.int64)
         changed = changed[self.landmarks.rows(changed) >= 0]
         moved = np.array(sorted(self._moved_keyframes), dtype=np.int64)
-        frames = np.array(sorted(self.frames) if self._frames_moved else [], dtype=np.int64)
+        frames = np.array(sorted(k for k in self._frames_moved if k in self.frames), dtype=np.int64)
         withdrawn = np.array(sorted(k for k in self._withdrawn if k not in self.frames), dtype=np.int64)
         self._changed, self._removed, self._moved_keyframes = set(), set(), set()
-        self._frames_moved, self._withdrawn = False, set()
+        self._frames_moved, self._withdrawn = set(), set()
         return MapChanges(changed, removed, moved, frames, withdrawn)
 
     def arrays(self) -> dict[str, NDArray]:

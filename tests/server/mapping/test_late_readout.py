@@ -11,6 +11,7 @@ import shaken_views
 from drawn_boards import CAMERA, ate_percent, make, render
 
 from semcast.common.geometry import exp_so3, make_transform
+from semcast.server.mapping.left_over import COLUMNS, ROWS
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.state import DecodedFrame
@@ -89,6 +90,23 @@ def test_a_global_shutter_is_taken_for_one():
     _, told, _ = run(0.0, readout_ms=0.0)
     assert all(np.array_equal(trajectory[k], T) for k, T in told.items()), "watching changes nothing"
     assert ate < 0.5
+
+
+def test_a_readout_longer_than_any_camera_has_is_not_believed():
+    result = shaken_views.adjusted(replace(shaken_views.CAMERA, readout_ms=60.0))
+
+    def found(slower):
+        """What is found where rows and columns are so many times closer in time than they seem."""
+        unit = np.ones(result.left_over.shape[-1])
+        unit[[ROWS, COLUMNS]] = 1.0 / slower
+        watch = ReadoutWatch(shaken_views.CAMERA, is_wanted=True)
+        watch.take(replace(result, left_over=unit[:, None] * result.left_over * unit))
+        assert watch.is_on, "views to come may tell"
+        return watch.take_found()
+
+    assert found(1.0).ms == pytest.approx(60.0, rel=0.1)
+    assert found(1.5).ms == pytest.approx(90.0, rel=0.1)
+    assert found(2.0) is None
 
 
 def test_a_lens_that_is_clearly_another_one_is_told_once(caplog):

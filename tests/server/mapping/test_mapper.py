@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -143,6 +145,31 @@ def test_an_adjustment_mends_shaken_poses():
     assert after < 0.2 * before
     assert np.allclose(world.pose_of_frame(73), world.poses[70])
     assert noise.model.sigma0_px < 0.5
+
+
+def test_frames_between_keyframes_take_over_the_scale_that_an_adjustment_finds():
+    world, _, truth = make_world(8, 150)
+    add_landmarks(world, CAMERA, NoiseModel(6.0, 0.0), IMAGE, 0.5)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    # All but the fixed ones were 1.5 times too large, and so was a frame on the way from one to the next.
+    grown, first = 1.5, truth[1]
+    for keyframe in world.keyframes[2:]:
+        T = keyframe.T_world_cam.copy()
+        T[:3, 3] = first[:3, 3] + grown * (T[:3, 3] - first[:3, 3])
+        world.move_keyframe(keyframe.frame_id, T)
+    on_the_way, between = np.eye(4), truth[5].copy()
+    between[:3, 3] += 0.5 * (truth[6] - truth[5])[:3, 3]
+    on_the_way[:3, 3] = grown * (invert_transform(truth[5]) @ between)[:3, 3]
+    world.add_frame(53, 50, world.poses[50] @ on_the_way)
+    xyz = problem.xyz.copy()
+    asked = np.stack([world.poses[k] for k in problem.keyframe_ids.tolist()])
+    depth = transform_points(invert_transform(truth[5]), xyz)
+    large = replace(problem, T_world_cam=asked, xyz=transform_points(asked[5], grown * depth))
+    result = replace(optimise(problem), problem=large)
+    world.take_changes()
+    apply_result(world, result, OnlineNoise("off", 0.5, 0.0, True))
+    np.testing.assert_allclose(world.pose_of_frame(53)[:3, 3], between[:3, 3], atol=0.02)
+    assert 53 in world.take_changes().frames, "receivers must be told"
 
 
 def test_the_fit_finds_the_noise_that_is_there_and_not_what_its_own_weights_make():
