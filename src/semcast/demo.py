@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.codecs import check_codec, named_weights
 from semcast.common.config import to_toml
+from semcast.common.config_flags import flag_words
 from semcast.common.errors import ConfigError, SemcastError, SourceError, TransportError
 from semcast.common.keys import status_key
 from semcast.common.loopback import free_endpoint
@@ -161,7 +162,7 @@ class Playback:
 def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict[str, list[str]]:
     """Return the command lines of server and channel, in the order they are started."""
     server = [*_PROGRAM, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
-    server += ["--reference", str(sequence), *_flags(settings.camera)]
+    server += ["--reference", str(sequence), *flag_words(settings.camera)]
     server += ["--confidence", settings.confidence, "--view", settings.view]
     server += ["--viewer-port", str(settings.viewer_port), "--web-port", str(settings.web_port)]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
@@ -170,30 +171,19 @@ def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict
     if settings.record is not None:
         server += ["--record", str(settings.record)]
     channel = [*_PROGRAM, "channel", "--agent-id", AGENT_ID, "--connect", endpoint]
-    channel += [*_flags(settings.link, ("channel", "snr_db")), "--seed", str(settings.seed)]
+    channel += [*flag_words(settings.link, ("channel", "snr_db")), "--seed", str(settings.seed)]
     return {"server": server, "channel": channel}
 
 
 def agent_command(settings: DemoSettings, sequence: Path, endpoint: str, playback: Playback) -> list[str]:
     """Return the command line of the agent, which is started last."""
     agent = [*_PROGRAM, "agent", "--agent-id", AGENT_ID, "--connect", endpoint]
-    agent += ["--source", str(sequence), *_flags(settings.camera)]
+    agent += ["--source", str(sequence), *flag_words(settings.camera)]
     agent += ["--codec", settings.codec, "--modulation", settings.modulation, "--rate", settings.rate]
     agent += ["--resize", f"{playback.resize:g}", "--stride", str(playback.stride)]
     if playback.speed != 1.0:
         agent += ["--pace", "rate", "--rate-hz", f"{playback.rate_hz:.3g}"]
     return agent
-
-
-def _flags(part: CameraSettings | ChannelSettings, always: tuple[str, ...] = ()) -> list[str]:
-    """Return the flags that give a process the same camera or link: values that are no default."""
-    words: list[str] = []
-    for entry in fields(part):
-        value = getattr(part, entry.name)
-        if value != entry.default or entry.name in always:
-            values = value if isinstance(value, tuple) else (value,)
-            words += ["--" + entry.name.replace("_", "-"), *(str(v) for v in values)]
-    return words
 
 
 @dataclass
