@@ -1,8 +1,6 @@
 """A ROS bag as a recorded sequence of our own layout: images, times, camera and true path."""
 
-import contextlib
 import logging
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -99,8 +97,7 @@ def unpack(settings: UnpackSettings, on_image: Callable[[int, int], None] | None
         topic = _image_topic(bag, settings.image_topic)
         camera = bag.camera(topic, settings.camera_info_topic)
         find_pose = None if settings.truth is None else _true_poses(bag, topic, settings, settings.truth)
-        folder = new_folder(settings.out)
-        with _nothing_half_done(folder):
+        with new_folder(settings.out) as folder:
             (folder / "images").mkdir()
             times_ns, num_left_out = _write_images(bag, topic, settings, on_image)
             write_whole(folder / "times.txt", "".join(f"{seconds_of(t_ns)}\n" for t_ns in times_ns))
@@ -110,20 +107,6 @@ def unpack(settings: UnpackSettings, on_image: Callable[[int, int], None] | None
             if truth is not None:
                 write_tum(folder / "groundtruth.txt", truth)
     return Unpacked(topic, len(times_ns), num_left_out, camera, None if truth is None else len(truth))
-
-
-@contextlib.contextmanager
-def _nothing_half_done(folder: Path) -> Iterator[None]:
-    """Leave a folder that was empty as it was where it can't be filled: the next try may use it."""
-    try:
-        yield
-    except BaseException as err:
-        shutil.rmtree(folder / "images", ignore_errors=True)
-        for name in ("times.txt", "intrinsics.json", "groundtruth.txt"):
-            (folder / name).unlink(missing_ok=True)
-        if isinstance(err, OSError):
-            raise SourceError(f"can't write to {folder}: {err.strerror}") from err
-        raise
 
 
 def _image_topic(bag: RosBag, asked: str | None) -> str:
