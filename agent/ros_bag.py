@@ -22,6 +22,7 @@ from semcast.agent.ros_image import compressed_image_file, raw_image_file
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, rotation_from_quat_wxyz
+from semcast.common.ros_bag_files import is_ros_bag
 
 logger = logging.getLogger(__name__)
 
@@ -75,10 +76,15 @@ class RosBag:
         self._path = path
         if not path.exists():
             raise SourceError(f"there is no file or folder {path}")
-        with self._said():
-            # Bags of ROS 2 before Iron don't hold the definitions of their messages.
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
-            self._reader.open()
+        try:
+            with self._said():
+                # Bags of ROS 2 before Iron don't hold the definitions of their messages.
+                self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+                self._reader.open()
+        except SourceError as err:
+            if is_ros_bag(path):
+                raise
+            raise SourceError(f"{path} is no ROS bag: 'semcast info' says what it is") from err
 
     def __enter__(self) -> "RosBag":
         return self

@@ -346,6 +346,14 @@ def test_a_file_that_is_no_bag_is_an_error_in_a_line(name, content, tmp_path):
     assert "\n" not in str(caught.value)
 
 
+def test_what_is_no_bag_of_ros_is_named_as_that(tmp_path):
+    recording = tmp_path / "run.mcap"
+    recording.write_bytes(b"\x89MCAP0\r\n")
+    for path in (recording, tmp_path):
+        with pytest.raises(SourceError, match=f"{path.name} is no ROS bag: 'semcast info' says what it is"):
+            unpack(UnpackSettings(bag=path, out=tmp_path / "out"))
+
+
 def test_a_bag_with_damage_in_the_middle_is_an_error_in_a_line(tmp_path):
     bag = BagMaker("bag")
     add_images(bag)
