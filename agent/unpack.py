@@ -48,6 +48,13 @@ class UnpackSettings:
         default=None,
         metadata={"help": "true path: a topic of poses, or the frame of /tf in which the camera's are to be"},
     )
+    truth_frame: str | None = field(
+        default=None,
+        metadata={
+            "help": "frame that the poses of --truth are of, where they don't say, as PoseStamped never does "
+            "(default: the camera's)"
+        },
+    )
     camera_frame: str | None = field(
         default=None, metadata={"help": "frame of the camera (default: the one its images name)"}
     )
@@ -182,7 +189,7 @@ def _true_poses(
 ) -> Callable[[int], Array | None]:
     """Return what tells the camera's true pose at a time, None where it is not known.
 
-    Poses of a topic that don't say of what they are, are taken for the camera's.
+    Those of a topic are carried from the frame they are of to the camera's.
     """
     first = next(bag.images(topic), None)
     camera = plain_name(settings.camera_frame or (first.frame if first is not None else ""))
@@ -192,7 +199,8 @@ def _true_poses(
     for transform in bag.transforms():
         tree.add(transform)
     if bag.counts("pose").get(truth):
-        return _carried_to(camera, bag.poses(truth), truth, tree)
+        unnamed = plain_name(settings.truth_frame or camera)
+        return _carried_to(camera, bag.poses(truth), unnamed, truth, tree)
     root = plain_name(truth)
     if root not in tree.frames:
         raise SourceError(
@@ -204,14 +212,22 @@ def _true_poses(
 
 
 def _carried_to(
-    camera: str, poses: Iterable[StampedTransform], topic: str, tree: FrameTree
+    camera: str, poses: Iterable[StampedTransform], unnamed: str, topic: str, tree: FrameTree
 ) -> Callable[[int], Array | None]:
-    """Return what tells the camera's pose at a time from a topic's poses of what it is fixed to."""
+    """Return what tells the camera's pose at a time from a topic's poses of what it is fixed to.
+
+    Args:
+        camera: Its frame.
+        poses: Of the topic.
+        unnamed: Frame of those that don't say of what they are.
+        topic: For messages.
+        tree: Leads from what they are of to the camera.
+    """
     path = TransformHistory()
     bodies = set()
     for pose in poses:
         path.add(pose.time_ns, pose.T_parent_child)
-        bodies.add((pose.parent, pose.child or camera))
+        bodies.add((pose.parent, pose.child or unnamed))
     if len(bodies) != 1:
         said = ", ".join(f"{child!r} in {parent!r}" for parent, child in sorted(bodies)) or "nothing"
         raise SourceError(f"the poses of {topic} must be of one frame in one other, got {said}")

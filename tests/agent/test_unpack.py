@@ -171,6 +171,26 @@ def test_poses_of_a_sibling_of_the_camera_reach_it_too(tmp_path):
     np.testing.assert_allclose(positions, [(1.0 * k, 2.0, -3.0) for k in range(5)], atol=1e-9)
 
 
+def test_poses_that_do_not_say_of_what_they_are_can_be_said_to_be_of_a_body(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    for k in range(5):
+        bag.pose("/mocap", "room", (1.0 * k, 0.0, 0.0), START + k * STEP)
+    bag.transform("/tf_static", "base", "cam", (0.0, 2.0, 0.0), START)
+    unpack(settings(bag, tmp_path, truth="/mocap", truth_frame="/base"))
+    positions = open_sequence(tmp_path / "out").groundtruth().positions
+    np.testing.assert_allclose(positions, [(1.0 * k, 2.0, 0.0) for k in range(5)], atol=1e-9)
+
+
+def test_a_body_that_does_not_lead_to_the_camera_is_refused(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    bag.pose("/mocap", "room", (0.0, 0.0, 0.0), START)
+    bag.transform("/tf_static", "base", "cam", (0.0, 2.0, 0.0), START)
+    with pytest.raises(SourceError, match="no transform of a frame 'robot': known are base, cam"):
+        unpack(settings(bag, tmp_path, truth="/mocap", truth_frame="robot"))
+
+
 def test_poses_of_several_bodies_are_refused(tmp_path):
     bag = BagMaker()
     add_images(bag)
