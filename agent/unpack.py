@@ -1,6 +1,7 @@
 """A ROS bag as a recorded sequence of our own layout: images, times, camera and true path."""
 
 import logging
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -62,10 +63,10 @@ class UnpackSettings:
     seconds: float | None = field(default=None, metadata={"help": "take so many seconds (default: all)"})
 
     def __post_init__(self) -> None:
-        if not self.start_s >= 0.0:
-            raise ValueError(f"start_s must be at least 0, got {self.start_s:g}")
-        if self.seconds is not None and not self.seconds > 0.0:
-            raise ValueError(f"seconds must be positive, got {self.seconds:g}")
+        if not 0.0 <= self.start_s < math.inf:
+            raise ValueError(f"start_s must be at least 0 and finite, got {self.start_s:g}")
+        if self.seconds is not None and not 0.0 < self.seconds < math.inf:
+            raise ValueError(f"seconds must be positive and finite, got {self.seconds:g}")
 
 
 @dataclass(frozen=True)

@@ -387,7 +387,16 @@ def test_a_bag_with_damage_in_the_middle_is_an_error_in_a_line(tmp_path):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("name", "value"), [("start_s", -0.1), ("start_s", float("nan")), ("seconds", 0.0)])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("start_s", -0.1),
+        ("start_s", float("nan")),
+        ("start_s", float("inf")),
+        ("seconds", 0.0),
+        ("seconds", float("inf")),
+    ],
+)
 def test_ranges_are_checked(name, value, tmp_path):
     with pytest.raises(ValueError, match=name):
         UnpackSettings(bag=tmp_path / "a.bag", out=tmp_path / "out", **{name: value})
