@@ -1,8 +1,9 @@
 """Coordinate frames that hang on each other at times, as ROS keeps them in ``tf``."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,42 +34,50 @@ class StampedTransform:
     T_parent_child: Array
 
 
-@dataclass
-class _Edge:
-    """How one frame lies in its parent.
+class TransformHistory:
+    """How one frame lies in another over time. First all transforms are added, then they are asked for."""
 
-    Attributes:
-        parent: Name.
-        times_ns: One for each of ``T_parent_child``, in any order; none where it is ``fixed``.
-        T_parent_child: 4x4 each.
-        fixed: For all times.
-    """
+    def __init__(self) -> None:
+        self._times_ns: list[int] = []
+        self._transforms: list[Array] = []
+        self._fixed: Array | None = None
 
-    parent: str
-    times_ns: list[int] = field(default_factory=list)
-    T_parent_child: list[Array] = field(default_factory=list)
-    fixed: Array | None = None
+    def add(self, time_ns: int | None, T_parent_child: Array) -> None:
+        """Add a transform at a time, in any order; None: it holds for all times."""
+        if time_ns is None:
+            self._fixed = T_parent_child
+        else:
+            self._times_ns.append(time_ns)
+            self._transforms.append(T_parent_child)
 
     @cached_property
-    def _in_order(self) -> tuple[NDArray[np.int64], list[Array]]:
-        times_ns, first = np.unique(np.array(self.times_ns, dtype=np.int64), return_index=True)
-        return times_ns, [self.T_parent_child[k] for k in first]
+    def _in_order(self) -> tuple[NDArray[np.int64], Array]:
+        times_ns, first = np.unique(np.array(self._times_ns, dtype=np.int64), return_index=True)
+        return times_ns, np.array(self._transforms)[first]
+
+    @cached_property
+    def _for_all_times(self) -> Array | None:
+        """What holds at all times, also because it is said over and over, as ROS 1 does of what is rigid."""
+        if self._fixed is None and len(self._in_order[0]) > 1:
+            transforms = self._in_order[1]
+            return transforms[0] if (transforms == transforms[0]).all() else None
+        return self._fixed
 
     def at(self, time_ns: int) -> Array | None:
-        """Return the transform at a time, None where there is none within reach."""
-        if self.fixed is not None:
-            return self.fixed
-        times_ns, poses = self._in_order
+        """Return the transform at a time, ``(4, 4)``; None where there is none within reach."""
+        if self._for_all_times is not None:
+            return self._for_all_times
+        times_ns, transforms = self._in_order
         right = int(np.searchsorted(times_ns, time_ns))
         if right < len(times_ns) and times_ns[right] == time_ns:
-            return poses[right]
+            return np.asarray(transforms[right])
         if not 0 < right < len(times_ns):
             return None
         gap_ns = int(times_ns[right] - times_ns[right - 1])
         if gap_ns > MAX_GAP_NS:
             return None
         share = (time_ns - int(times_ns[right - 1])) / gap_ns
-        return interpolate_pose(poses[right - 1], poses[right], share)
+        return interpolate_pose(transforms[right - 1], transforms[right], share)
 
 
 def plain_name(frame: str) -> str:
@@ -80,35 +89,24 @@ class FrameTree:
     """Frames, each in a parent. First all transforms are added, then poses are asked for."""
 
     def __init__(self) -> None:
-        self._edges: dict[str, _Edge] = {}
+        # Child -> parent -> how the child lies in it.
+        self._edges: dict[str, dict[str, TransformHistory]] = {}
 
     @property
     def frames(self) -> list[str]:
         """All frames there are, in the order of the alphabet."""
-        return sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
+        return sorted({*self._edges, *(parent for parents in self._edges.values() for parent in parents)})
 
     def add(self, said: StampedTransform) -> None:
-        """Add a transform.
-
-        Raises:
-            SourceError: The child hangs on another parent.
-        """
-        edge = self._edges.setdefault(said.child, _Edge(said.parent))
-        if edge.parent != said.parent:
-            raise SourceError(
-                f"frame {said.child!r} must have one parent, got {edge.parent!r} and {said.parent!r}"
-            )
-        if said.time_ns is None:
-            edge.fixed = said.T_parent_child
-        else:
-            edge.times_ns.append(said.time_ns)
-            edge.T_parent_child.append(said.T_parent_child)
+        """Add a transform."""
+        parents = self._edges.setdefault(said.child, {})
+        parents.setdefault(said.parent, TransformHistory()).add(said.time_ns, said.T_parent_child)
 
     def check_connected(self, root: str, frame: str) -> None:
         """Check that transforms lead from one frame to another.
 
         Raises:
-            SourceError: They don't, or a frame is unknown.
+            SourceError: They don't, a frame is unknown, or one on the way hangs on two others.
         """
         for name in (root, frame):
             if name not in self.frames:
@@ -142,7 +140,12 @@ class FrameTree:
         """Return a frame, its parent, and so on."""
         names = [frame]
         while names[-1] in self._edges:
-            parent = self._edges[names[-1]].parent
+            parent, *others = self._edges[names[-1]]
+            if others:
+                raise SourceError(
+                    f"frame {names[-1]!r} must have one parent, got "
+                    f"{' and '.join(map(repr, (parent, *others)))}"
+                )
             if parent in names:
                 raise SourceError(f"frames must not hang on each other in a ring, got {[*names, parent]}")
             names.append(parent)
@@ -151,10 +154,10 @@ class FrameTree:
     def _down(self, ancestor: str, up: Iterable[str], time_ns: int) -> Array | None:
         """Return the pose in an ancestor of the first of the frames that lead up to it."""
         T_ancestor_frame = np.eye(4)
-        for name in up:
+        for name, parent in pairwise(up):
             if name == ancestor:
                 break
-            step = self._edges[name].at(time_ns)
+            step = self._edges[name][parent].at(time_ns)
             if step is None:
                 return None
             T_ancestor_frame = step @ T_ancestor_frame

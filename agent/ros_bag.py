@@ -1,9 +1,10 @@
 """ROS bags, versions 1 and 2: their images, cameras and transforms, read without ROS (by ``rosbags``)."""
 
 import contextlib
+import itertools
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from semcast.agent.ros_image import compressed_image_file, raw_image_file
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, rotation_from_quat_wxyz
+from semcast.common.ros_bag_files import is_ros_bag
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +47,8 @@ class BagImage:
     """An image of a bag.
 
     Attributes:
-        time_ns: When it was taken, as its header says; when it was recorded where that says nothing.
+        time_ns: When it was taken, by the clock of the headers; by that of the recording where no header says
+            when.
         frame: Coordinate frame of its camera, "" where it says none.
         suffix: Of an image file, with the point.
         content: Of that file.
@@ -73,10 +76,15 @@ class RosBag:
         self._path = path
         if not path.exists():
             raise SourceError(f"there is no file or folder {path}")
-        with self._said():
-            # Bags of ROS 2 before Iron don't hold the definitions of their messages.
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
-            self._reader.open()
+        try:
+            with self._said():
+                # Bags of ROS 2 before Iron don't hold the definitions of their messages.
+                self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+                self._reader.open()
+        except SourceError as err:
+            if is_ros_bag(path):
+                raise
+            raise SourceError(f"{path} is no ROS bag: 'semcast info' says what it is") from err
 
     def __enter__(self) -> "RosBag":
         return self
@@ -86,11 +94,18 @@ class RosBag:
 
     @contextlib.contextmanager
     def _said(self) -> Iterator[None]:
-        """Turn what the library says of a damaged bag into an error of ours."""
+        """Turn what the library says of a damaged bag into an error of ours.
+
+        It has errors of its own for damage that it looks for. For any other it fails as its parsers, of four
+        formats, happen to: by assertions, keys, texts that are none, sizes beyond memory, errors of SQLite.
+        """
         try:
             yield
         except (AnyReaderError, Reader1Error, Reader2Error, OSError) as err:
             raise SourceError(f"{self._path} can't be read as a ROS bag: {err}") from err
+        except Exception as err:
+            what = " ".join(f"{type(err).__name__} {err}".split())
+            raise SourceError(f"{self._path} can't be read as a ROS bag, it is damaged: {what}") from err
 
     @property
     def span_s(self) -> float:
@@ -127,8 +142,9 @@ class RosBag:
         """
         since_ns = self._reader.start_time + round(start_s * 1e9)
         until_ns = None if seconds is None else since_ns + round(seconds * 1e9)
+        late_ns = self._late_ns(topic)
         for connection, recorded_ns, message in self._messages({topic}, since_ns, until_ns):
-            time_ns = _stamp_ns(message.header) or recorded_ns
+            time_ns = _stamp_ns(message.header) or recorded_ns - late_ns
             frame = plain_name(message.header.frame_id)
             is_raw = connection.msgtype == _RAW
             try:
@@ -137,6 +153,15 @@ class RosBag:
                 yield BagImage(time_ns, frame, "", b"", str(err))
             else:
                 yield BagImage(time_ns, frame, suffix, content)
+
+    def _late_ns(self, topic: str) -> int:
+        """Return by how much the recording's clock is ahead of the headers'; 0 where these say no time.
+
+        A simulator's first image may well be of the time 0, of a clock that has little to do with ours.
+        """
+        first_two = itertools.islice(self._messages({topic}), 2)
+        stamps_ns = ((recorded_ns, _stamp_ns(message.header)) for _, recorded_ns, message in first_two)
+        return next((recorded_ns - stamp_ns for recorded_ns, stamp_ns in stamps_ns if stamp_ns), 0)
 
     def camera(self, image_topic: str, info_topic: str | None = None) -> Intrinsics | None:
         """Return the camera of an image topic, None where the bag says nothing of it or it wasn't calibrated.
@@ -170,25 +195,49 @@ class RosBag:
             raise SourceError(f"{topic}: {err}") from err
 
     def poses(self, topic: str) -> Iterator[StampedTransform]:
-        """Yield the poses of a topic; ``child`` is "" where they don't say whose they are."""
+        """Yield the poses of a topic; ``child`` is "" where they don't say whose they are.
+
+        Those without a rotation or with numbers that are none are left out: trackers that have lost their
+        body say such things.
+        """
+        yield from _valid_transforms(topic, self._poses(topic))
+
+    def _poses(self, topic: str) -> Iterator[tuple[str, str, int, Any]]:
         for connection, recorded_ns, message in self._messages({topic}):
             pose: Any = message
             for part in _POSES[connection.msgtype].split("."):
                 pose = getattr(pose, part)
             time_ns = _stamp_ns(message.header) or recorded_ns
-            child = plain_name(getattr(message, "child_frame_id", ""))
-            yield StampedTransform(plain_name(message.header.frame_id), child, time_ns, _matrix(pose))
+            yield message.header.frame_id, getattr(message, "child_frame_id", ""), time_ns, pose
 
     def transforms(self) -> Iterator[StampedTransform]:
-        """Yield what ``/tf`` and ``/tf_static`` say."""
+        """Yield what ``/tf`` and ``/tf_static`` say; as in ROS, but for what is no transform."""
+        yield from _valid_transforms("/tf", self._transforms())
+
+    def _transforms(self) -> Iterator[tuple[str, str, int | None, Any]]:
         for connection, recorded_ns, message in self._messages(set(_TF_TOPICS)):
             if connection.msgtype not in _TF_TYPES:
                 continue
             for said in message.transforms:
                 is_fixed = _TF_TOPICS[connection.topic]
                 time_ns = None if is_fixed else _stamp_ns(said.header) or recorded_ns
-                parent, child = plain_name(said.header.frame_id), plain_name(said.child_frame_id)
-                yield StampedTransform(parent, child, time_ns, _matrix(said.transform))
+                yield said.header.frame_id, said.child_frame_id, time_ns, said.transform
+
+
+def _valid_transforms(
+    topic: str, said: Iterable[tuple[str, str, int | None, Any]]
+) -> Iterator[StampedTransform]:
+    """Yield transforms of parent, child, time and pose of a message; warn once of those that are none."""
+    is_told = False
+    for parent, child, time_ns, pose in said:
+        try:
+            matrix = _matrix(pose)
+        except ValueError as err:
+            if not is_told:
+                logger.warning("%s: %r in %r is left out where it is no pose: %s", topic, child, parent, err)
+            is_told = True
+        else:
+            yield StampedTransform(plain_name(parent), plain_name(child), time_ns, matrix)
 
 
 def _stamp_ns(header: Any) -> int:
@@ -199,34 +248,36 @@ def _matrix(pose: Any) -> Array:
     """Return the 4x4 matrix of a ``Pose`` or a ``Transform``.
 
     Raises:
-        SourceError: Its numbers are none of a pose.
+        ValueError: Its numbers are none of a pose.
     """
     at = pose.position if hasattr(pose, "position") else pose.translation
     turn = pose.orientation if hasattr(pose, "orientation") else pose.rotation
     t = np.array([at.x, at.y, at.z], dtype=np.float64)
-    try:
-        R = rotation_from_quat_wxyz((turn.w, turn.x, turn.y, turn.z))
-    except ValueError as err:
-        raise SourceError(f"a pose of the bag is none: {err}") from err
     if not np.isfinite(t).all():
-        raise SourceError(f"a pose of the bag must be finite, got position {t.tolist()}")
-    return make_transform(R, t)
+        raise ValueError(f"position must be finite, got {t.tolist()}")
+    return make_transform(rotation_from_quat_wxyz((turn.w, turn.x, turn.y, turn.z)), t)
 
 
 def _intrinsics(info: Any, *, is_rectified: bool) -> Intrinsics:
-    """Return the camera of a ``CameraInfo``; ROS 1 writes its fields in capitals."""
+    """Return the camera of a ``CameraInfo``; ROS 1 writes its fields in capitals.
+
+    It is calibrated for whole images of full resolution. Those that are sent may be a part of them (``roi``,
+    in pixels of full resolution), of which ``binning`` makes one pixel of several.
+    """
     K, D, P = (
         np.asarray(getattr(info, n if hasattr(info, n) else n.lower()), dtype=np.float64) for n in "KDP"
     )
     matrix = P.reshape(3, 4)[:, :3] if is_rectified else K.reshape(3, 3)
-    return Intrinsics.from_dict(
+    width, height = info.roi.width or info.width, info.roi.height or info.height
+    camera = Intrinsics.from_dict(
         {
             "fx": float(matrix[0, 0]),
             "fy": float(matrix[1, 1]),
-            "cx": float(matrix[0, 2]),
-            "cy": float(matrix[1, 2]),
-            "width": int(info.width),
-            "height": int(info.height),
+            "cx": float(matrix[0, 2]) - info.roi.x_offset,
+            "cy": float(matrix[1, 2]) - info.roi.y_offset,
+            "width": int(width),
+            "height": int(height),
             **({} if is_rectified else {"distortion_model": info.distortion_model, "distortion": D.tolist()}),
         }
     )
+    return camera.scaled_to(camera.width // (info.binning_x or 1), camera.height // (info.binning_y or 1))

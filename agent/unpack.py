@@ -1,14 +1,15 @@
 """A ROS bag as a recorded sequence of our own layout: images, times, camera and true path."""
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.agent.frame_tree import FrameTree, plain_name
+from semcast.agent.frame_tree import FrameTree, StampedTransform, TransformHistory, plain_name
 from semcast.agent.ros_bag import BagImage, RosBag
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
@@ -48,6 +49,13 @@ class UnpackSettings:
         default=None,
         metadata={"help": "true path: a topic of poses, or the frame of /tf in which the camera's are to be"},
     )
+    truth_frame: str | None = field(
+        default=None,
+        metadata={
+            "help": "frame that the poses of --truth are of, where they don't say, as PoseStamped never does "
+            "(default: the camera's)"
+        },
+    )
     camera_frame: str | None = field(
         default=None, metadata={"help": "frame of the camera (default: the one its images name)"}
     )
@@ -55,10 +63,10 @@ class UnpackSettings:
     seconds: float | None = field(default=None, metadata={"help": "take so many seconds (default: all)"})
 
     def __post_init__(self) -> None:
-        if not self.start_s >= 0.0:
-            raise ValueError(f"start_s must be at least 0, got {self.start_s:g}")
-        if self.seconds is not None and not self.seconds > 0.0:
-            raise ValueError(f"seconds must be positive, got {self.seconds:g}")
+        if not 0.0 <= self.start_s < math.inf:
+            raise ValueError(f"start_s must be at least 0 and finite, got {self.start_s:g}")
+        if self.seconds is not None and not 0.0 < self.seconds < math.inf:
+            raise ValueError(f"seconds must be positive and finite, got {self.seconds:g}")
 
 
 @dataclass(frozen=True)
@@ -68,7 +76,7 @@ class Unpacked:
     Attributes:
         topic: Of its images.
         num_images: Written.
-        num_left_out: Images that can't be read, or are not younger than the one before.
+        num_left_out: Images that can't be read, or are out of order by their times.
         camera: As written, None where the bag says nothing of it.
         num_poses: True poses written, None where there are none.
     """
@@ -97,8 +105,7 @@ def unpack(settings: UnpackSettings, on_image: Callable[[int, int], None] | None
         topic = _image_topic(bag, settings.image_topic)
         camera = bag.camera(topic, settings.camera_info_topic)
         find_pose = None if settings.truth is None else _true_poses(bag, topic, settings, settings.truth)
-        folder = new_folder(settings.out)
-        try:
+        with new_folder(settings.out) as folder:
             (folder / "images").mkdir()
             times_ns, num_left_out = _write_images(bag, topic, settings, on_image)
             write_whole(folder / "times.txt", "".join(f"{seconds_of(t_ns)}\n" for t_ns in times_ns))
@@ -107,8 +114,6 @@ def unpack(settings: UnpackSettings, on_image: Callable[[int, int], None] | None
             truth = None if find_pose is None else _path(times_ns, find_pose)
             if truth is not None:
                 write_tum(folder / "groundtruth.txt", truth)
-        except OSError as err:
-            raise SourceError(f"can't write to {folder}: {err.strerror}") from err
     return Unpacked(topic, len(times_ns), num_left_out, camera, None if truth is None else len(truth))
 
 
@@ -131,8 +136,9 @@ def _write_images(
     total = bag.counts("image")[topic]
     times_ns: list[int] = []
     num_left_out = 0
-    for taken, image in enumerate(bag.images(topic, settings.start_s, settings.seconds), 1):
-        problem = image.problem or _not_younger(image, times_ns)
+    images = bag.images(topic, settings.start_s, settings.seconds)
+    for taken, (image, following) in enumerate(_with_following(images), 1):
+        problem = image.problem or _out_of_order(image, following, times_ns)
         if problem:
             if not num_left_out:
                 logger.warning("%s: image %d is left out: %s", topic, taken, problem)
@@ -153,10 +159,30 @@ def _write_images(
     return times_ns, num_left_out
 
 
-def _not_younger(image: BagImage, times_ns: list[int]) -> str:
-    if not times_ns or image.time_ns > times_ns[-1]:
+def _with_following(images: Iterable[BagImage]) -> Iterator[tuple[BagImage, BagImage | None]]:
+    """Yield each image with the one after it, None after the last."""
+    waiting = None
+    for image in images:
+        if waiting is not None:
+            yield waiting, image
+        waiting = image
+    if waiting is not None:
+        yield waiting, None
+
+
+def _out_of_order(image: BagImage, following: BagImage | None, times_ns: list[int]) -> str:
+    """Tell why an image can't be the next one, "" if it can.
+
+    Where two are in the wrong order, the one that lies between its neighbours is right: a single time far
+    ahead would otherwise cost all images up to it.
+    """
+    own = f"its time {seconds_of(image.time_ns)} s"
+    if times_ns and image.time_ns <= times_ns[-1]:
+        return f"{own} is not after {seconds_of(times_ns[-1])} s"
+    if following is None or following.problem or image.time_ns <= following.time_ns:
         return ""
-    return f"its time {seconds_of(image.time_ns)} s is not after {seconds_of(times_ns[-1])} s"
+    is_following_right = not times_ns or following.time_ns > times_ns[-1]
+    return f"{own} is not before {seconds_of(following.time_ns)} s, of the next" if is_following_right else ""
 
 
 def _true_poses(
@@ -164,24 +190,19 @@ def _true_poses(
 ) -> Callable[[int], Array | None]:
     """Return what tells the camera's true pose at a time, None where it is not known.
 
-    Poses of a topic win over what ``/tf`` says of the same frame; those that don't say of what they are, are
-    taken for the camera's.
+    Those of a topic are carried from the frame they are of to the camera's.
     """
     first = next(bag.images(topic), None)
-    camera = settings.camera_frame or (first.frame if first is not None else "")
+    camera = plain_name(settings.camera_frame or (first.frame if first is not None else ""))
     if not camera:
         raise SourceError(f"camera_frame must be given for a true path: the images of {topic} name none")
     tree = FrameTree()
-    root = plain_name(truth)
-    posed = set()
-    if truth in bag.counts("pose"):
-        for pose in bag.poses(truth):
-            tree.add(replace(pose, child=pose.child or camera))
-            posed.add(pose.child or camera)
-            root = pose.parent
     for transform in bag.transforms():
-        if transform.child not in posed:
-            tree.add(transform)
+        tree.add(transform)
+    if bag.counts("pose").get(truth):
+        unnamed = plain_name(settings.truth_frame or camera)
+        return _carried_to(camera, bag.poses(truth), unnamed, truth, tree)
+    root = plain_name(truth)
     if root not in tree.frames:
         raise SourceError(
             f"truth must be a topic of poses ({', '.join(bag.counts('pose')) or 'there is none'}) or a frame "
@@ -189,6 +210,38 @@ def _true_poses(
         )
     tree.check_connected(root, camera)
     return lambda time_ns: tree.pose(root, camera, time_ns)
+
+
+def _carried_to(
+    camera: str, poses: Iterable[StampedTransform], unnamed: str, topic: str, tree: FrameTree
+) -> Callable[[int], Array | None]:
+    """Return what tells the camera's pose at a time from a topic's poses of what it is fixed to.
+
+    Args:
+        camera: Its frame.
+        poses: Of the topic.
+        unnamed: Frame of those that don't say of what they are.
+        topic: For messages.
+        tree: Leads from what they are of to the camera.
+    """
+    path = TransformHistory()
+    bodies = set()
+    for pose in poses:
+        path.add(pose.time_ns, pose.T_parent_child)
+        bodies.add((pose.parent, pose.child or unnamed))
+    if len(bodies) != 1:
+        said = ", ".join(f"{child!r} in {parent!r}" for parent, child in sorted(bodies)) or "nothing"
+        raise SourceError(f"the poses of {topic} must be of one frame in one other, got {said}")
+    ((_, body),) = bodies
+    if body == camera:
+        return path.at
+    tree.check_connected(body, camera)
+
+    def find(time_ns: int) -> Array | None:
+        T_world_body, T_body_cam = path.at(time_ns), tree.pose(body, camera, time_ns)
+        return None if T_world_body is None or T_body_cam is None else T_world_body @ T_body_cam
+
+    return find
 
 
 def _path(times_ns: list[int], find_pose: Callable[[int], Array | None]) -> Trajectory | None:

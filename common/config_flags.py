@@ -6,7 +6,8 @@ them without the table, by their flag: ``snr_db = 4`` is ``[link]`` with ``snr_d
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import operator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
@@ -205,3 +206,27 @@ def settings_from(
     except MissingSettingError as err:
         shown = {flag.dotted: flag.shown for flag in _flags_of(cls, skip)}
         raise MissingSettingError(shown.get(err.name, err.name)) from err
+
+
+def flag_words(
+    settings: object, always: Collection[str] = (), written: Callable[[Any], str] = str
+) -> list[str]:
+    """Return the words of a command line that ``settings_from`` makes the same settings of.
+
+    Args:
+        settings: Of a settings class; those at their defaults, and None, are left out.
+        always: Dotted names of fields that are given all the same.
+        written: Writes a value; by default as it is read.
+    """
+    words: list[str] = []
+    for flag in _flags_of(type(settings), frozenset()):
+        value = operator.attrgetter(flag.dotted)(settings)
+        if value is None or (value == flag.default and flag.dotted not in always):
+            continue
+        if flag.is_positional:
+            words.append(written(value))
+        elif isinstance(value, bool):
+            words.append(flag.shown if value else flag.shown.replace("--", "--no-", 1))
+        else:
+            words += [flag.shown, *map(written, value if isinstance(value, tuple) else (value,))]
+    return words

@@ -177,9 +177,10 @@ def _left_out(num_silent: int) -> Iterator[str]:
 
 
 def _against_rival(cells: Sequence[Cell]) -> Iterator[str]:
-    yield "**Mean translation-direction error in degrees**, mean over the cells of a row, each in four rows."
+    yield "**Mean translation-direction error in degrees**, mean over the cells of a row; each cell counts in"
+    yield "four rows: recording and features, link, number of matches, all."
     yield "`better` and `worse` count those in which the 95 % interval of `robust` minus"
-    yield f"`{RIVAL}` excludes zero.\n"
+    yield f"`{RIVAL}` excludes zero; by chance alone one in forty does on either side.\n"
     rows = []
     for title, group in _groups(cells):
         figures = [number(_mean(c.mean(m) for c in group), 1) for m in _METHODS]

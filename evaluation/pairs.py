@@ -17,6 +17,7 @@ from semcast.common.errors import ConfigError
 from semcast.common.geometry import invert_transform
 from semcast.common.image import psnr_db
 from semcast.common.sequence import Sequence as RecordedSequence
+from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.evaluation.competitors import COMPETITORS
 from semcast.evaluation.match_truth import epipolar_distance_px, track_error_px
 from semcast.evaluation.pair_cell import PairCell, PairOutcome, merge_cells
@@ -209,7 +210,7 @@ def true_motions(
     truth = sequence.groundtruth()
     if truth is None:
         raise ConfigError(f"sequence {sequence.name} must have ground truth to compare pairs with")
-    frame_of_time = {t_s: k for k, t_s in enumerate((sequence.times_ns * 1e-9).tolist())}
+    frame_of_time = {t_s: k for k, t_s in enumerate(ns_to_seconds(sequence.times_ns).tolist())}
     T_world_cam = {frame_of_time[t]: T for t, T in zip(truth.t_s.tolist(), truth.T_world_cam, strict=True)}
     extent_m = float(np.linalg.norm(np.ptp(truth.positions, axis=0)))
     least_m = max(settings.min_baseline_m, settings.min_baseline_share * extent_m)

@@ -22,6 +22,9 @@ _MARKERS = "os^Dv<>P*Xhp"
 #: Matplotlib's own ten and two more: as many as Kodak has codecs. Further curves are dashed.
 _COLOURS = (*(f"C{k}" for k in range(10)), "black", "goldenrod")
 
+#: Share of all samples from which a bin stands in a reliability diagram.
+_LEAST_SHARE = 0.001
+
 
 def _new_figure(width_in: float = 5.0, height_in: float = 3.6) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
@@ -109,8 +112,9 @@ def plot_pair_errors(folder: Path, result: Mapping[str, Any]) -> list[Path]:
 
     These are Fig. 9 (``fig9_rotation.png``) and Fig. 10 (``fig10_translation_direction.png``) of the paper,
     with a panel for every gap, kind of features and thinning. The error is on a logarithmic scale: estimators
-    differ by up to a hundredfold. Bars stand where a mode was compared with others pair by pair: the 95 %
-    interval of its difference from the first of these, set upon that one's error.
+    differ by up to a hundredfold. Bars are the 95 % interval of a mode's difference, pair by pair, from the
+    first mode that others were compared with, set upon that one's error: where one doesn't reach that one's
+    curve, they differ.
 
     Args:
         folder: Where the two files go.
@@ -136,28 +140,9 @@ def plot_pair_errors(folder: Path, result: Mapping[str, Any]) -> list[Path]:
         for axes in flat[len(panels) :]:
             axes.set_visible(False)
         for axes, (variant, cells) in zip(flat, panels.items(), strict=False):
-            snr_db = [cell["snr_db"] for cell in cells]
-            for k, mode in enumerate(modes):
-                values = [cell["results"][mode][key] for cell in cells]
-                y = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
-                axes.plot(
-                    snr_db,
-                    np.where(y > 0, y, np.nan),
-                    color=_COLOURS[k % len(_COLOURS)],
-                    marker=_MARKERS[k % len(_MARKERS)],
-                    markersize=4,
-                    linewidth=2.2 if k == 0 else 1.0,
-                    zorder=3 if k == 0 else 2,
-                    label=mode,
-                )
-                _draw_intervals(axes, cells, mode, key, _COLOURS[k % len(_COLOURS)])
+            _draw_pair_errors(axes, cells, modes, key)
             title = variant if len(panels) > 1 else str(result.get("title", ""))
             axes.set_title(title, fontsize="medium")
-            axes.set(xlabel="SNR (dB)", yscale="log")
-            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axes.yaxis.set_minor_formatter(NullFormatter())
-            axes.grid(alpha=0.15, which="minor")
         for row in grid:
             row[0].set_ylabel(label, fontsize="small")
         names = flat[0].get_legend_handles_labels()
@@ -171,15 +156,46 @@ def plot_pair_errors(folder: Path, result: Mapping[str, Any]) -> list[Path]:
     return paths
 
 
+def _draw_pair_errors(
+    axes: Axes, cells: Sequence[Mapping[str, Any]], modes: Sequence[str], figure: str
+) -> None:
+    """Draw a figure of all modes over the SNR, the first one boldest."""
+    snr_db = [cell["snr_db"] for cell in cells]
+    for k, mode in enumerate(modes):
+        values = [cell["results"][mode][figure] for cell in cells]
+        y = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+        axes.plot(
+            snr_db,
+            np.where(y > 0, y, np.nan),
+            color=_COLOURS[k % len(_COLOURS)],
+            marker=_MARKERS[k % len(_MARKERS)],
+            markersize=4,
+            linewidth=2.2 if k == 0 else 1.0,
+            zorder=3 if k == 0 else 2,
+            label=mode,
+        )
+        _draw_intervals(axes, cells, mode, figure, _COLOURS[k % len(_COLOURS)])
+    axes.set(xlabel="SNR (dB)", yscale="log", xticks=snr_db)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.grid(alpha=0.15, which="minor")
+
+
 def _draw_intervals(
     axes: Axes, cells: Sequence[Mapping[str, Any]], mode: str, figure: str, colour: str
 ) -> None:
+    """Draw how far a mode is from the one that all are compared with; nothing for that one itself.
+
+    One compared with another rival would have a bar that says something else than those beside it.
+    """
     for cell in cells:
-        mine = (c for c in cell["comparisons"] if (c["mode"], c["figure"]) == (mode, figure))
-        compared = next((c for c in mine if c["paired"] and c["paired"]["low"] is not None), None)
-        if compared is not None:
-            rival = cell["results"][compared["against"]][figure]
-            bounds = rival + np.array([compared["paired"]["low"], compared["paired"]["high"]])
+        rival = next((c["against"] for c in cell["comparisons"]), None)
+        wanted = (mode, rival, figure)
+        mine = (c["paired"] for c in cell["comparisons"] if (c["mode"], c["against"], c["figure"]) == wanted)
+        paired = next(mine, None)
+        if paired is not None and paired["low"] is not None:
+            bounds = cell["results"][rival][figure] + np.array([paired["low"], paired["high"]])
             if (bounds > 0).all():  # the scale has no zero
                 axes.plot([cell["snr_db"]] * 2, bounds, color=colour, linewidth=1.0, marker="_", markersize=5)
 
@@ -230,18 +246,21 @@ def plot_reliability(
 ) -> None:
     """Draw reliability diagrams: observed against predicted, one curve per name.
 
+    Bins with hardly any samples are left out: what a few pixels of a million are like is chance.
+
     Args:
         path: Image file.
-        tables: Name to a mapping with ``predicted`` and ``observed``.
+        tables: Name to a mapping with ``predicted``, ``observed`` and ``share`` of the samples.
         observed: What was predicted, for people.
         title: Above the axes.
     """
     figure, axes = _new_figure(4.2, 4.2)
     axes.plot([0, 1], [0, 1], "k:", linewidth=1)
     for k, (name, table) in enumerate(tables.items()):
+        used = np.array(table["share"]) >= _LEAST_SHARE
         axes.plot(
-            table["predicted"],
-            table["observed"],
+            np.array(table["predicted"])[used],
+            np.array(table["observed"])[used],
             marker=_MARKERS[k % len(_MARKERS)],
             markersize=4,
             label=name,

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 import semcast
+from semcast.common.config_flags import flag_words
 from semcast.common.cores import usable_cores
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.whole_file import check_writable, whole_file
@@ -149,32 +150,8 @@ def command_line(verb: str, settings: Any) -> str:
         verb: Such as ``eval trajectory``.
         settings: A settings dataclass; ``Path`` values are shown as in ``json_ready``.
     """
-    return shlex.join(["semcast", *verb.split(), *_flags(settings)])
-
-
-def _flags(settings: Any) -> list[str]:
-    """Return the flags of all settings off their default, those of nested settings in place."""
-    words: list[str] = []
-    for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if dataclasses.is_dataclass(value):
-            words += _flags(value)
-            continue
-        default = field.default
-        if field.default_factory is not dataclasses.MISSING:
-            default = field.default_factory()
-        if value is None or (default is not dataclasses.MISSING and value == default):
-            continue
-        if field.metadata.get("positional"):
-            words.append(str(json_ready(value)))
-            continue
-        flag = str(field.metadata.get("flag", field.name)).replace("_", "-")
-        if isinstance(value, bool):
-            words.append(f"--{flag}" if value else f"--no-{flag}")
-            continue
-        items = value if isinstance(value, tuple) else (value,)
-        words += [f"--{flag}", *(str(json_ready(item)) for item in items)]
-    return words
+    words = flag_words(settings, written=lambda value: str(json_ready(value)))
+    return shlex.join(["semcast", *verb.split(), *words])
 
 
 def provenance(verb: str, settings: Any) -> dict[str, Any]:

@@ -30,11 +30,12 @@ HEAD = f"""# Results
 
 Written by `make results-page` from `evaluation/results/*.json`; each file holds the command, the seed, the
 commit and the machine. Trajectory errors are after alignment by a similarity and of the path after the last
-correction, when the stream has ended. They are medians over the seeds; in brackets the worst run, where it
-errs by over {WORST_RATIO:g} times the median. Completeness is the share of the sent frames with a pose in
-that path, also where they got it later; of the runs the least. Where a map fell into parts that never met,
-`most parts` is how many; place and scale of a later part are guesses, and count in the error. `live` means
-poses as they were published with each frame; files without such figures have no such columns. The true
+correction, when the stream has ended. They are medians over the seeds; in brackets the worst run, if its
+error is more than {WORST_RATIO:g} times the median. Completeness is the share of the sent frames that have a
+pose in that path, including those that got it later, in the run in which it is lowest. Where a map fell into
+parts that never met, `most parts` is how many; place and scale of a later part are guesses, and what is wrong
+with them counts in the error. `live` means poses as they were published with each frame; files without such
+figures have no such columns. The true
 paths of `shelf_50` and `phone_150` are not exact ([references](reading-results.md#references)). In the
 codec tables PSNR of an outage counts the grey picture the receiver shows then (12.8 dB on Kodak); elsewhere
 PSNR is a mean over the frames that could be decoded. What the figures mean and what limits them is in

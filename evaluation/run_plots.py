@@ -218,6 +218,7 @@ def _plot_error(row: Sequence[Any], result: AteResult) -> None:
     histogram.hist(result.error_m, bins=min(30, max(5, len(result.error_m) // 4)), color="#d05050")
     histogram.set(xlabel="position error (m)", ylabel="frames", title="how the error is spread")
     histogram.locator_params(axis="x", nbins=_MAX_TICKS - 1)
+    histogram.locator_params(axis="y", integer=True)
 
 
 def _plot_timeline(run: RunToPlot, path: Path) -> Path:

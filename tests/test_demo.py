@@ -23,7 +23,6 @@ from semcast.common.recording_reader import RecordingReader
 from semcast.common.sequence import open_sequence
 from semcast.common.wire import pack
 from semcast.demo import (
-    Alive,
     DemoSettings,
     Playback,
     agent_command,
@@ -31,6 +30,7 @@ from semcast.demo import (
     role_commands,
     run_demo,
 )
+from semcast.demo_watch import Alive, watch
 from semcast.real_time import Plan
 from semcast.role import Role
 from semcast.server.replay import ReplaySettings, replay
@@ -193,7 +193,7 @@ def test_a_role_that_gives_up_ends_the_demo_and_one_that_is_stopped_does_not(tmp
         stop.set()
 
     alive = Alive(set(), threading.Condition())
-    error = demo._watch(tmp_path, {"server": child}, alive, tmp_path / "none", stop, tell, lambda *row: None)
+    error = watch(tmp_path, {"server": child}, alive, stop, tell, lambda *row: None)
     assert error == (f"the {role} gave up: {says}" if ends else None)
     assert ["start it again with" in line for line in told] == ([] if ends else [True])
 
@@ -216,7 +216,7 @@ def test_the_status_line_says_what_the_server_is_at_after_the_last_frame(tmp_pat
 
     child = Role("server", [], tmp_path / "log")
     child.log.touch()
-    demo._watch(tmp_path, {"server": child}, alive, tmp_path / "none", stop, lambda line: None, progress)
+    watch(tmp_path, {"server": child}, alive, stop, lambda line: None, progress)
     assert rows == [
         (50, "tracking      120 inliers"),
         (50, "last adjustment of 9 keyframes"),

@@ -73,6 +73,8 @@ def test_the_table_of_messages_is_up_to_date():
     page = (ROOT / "docs/file-formats.md").read_text(encoding="utf-8")
     assert page == with_messages(page), "run make docs"
     assert "`payload_format`" in page
+    with pytest.raises(ValueError, match="must hold <!-- messages -->"):
+        with_messages("a page without the marks")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

@@ -1,5 +1,6 @@
 """Training images: decoded once, held in memory, cut and changed at random but repeatably."""
 
+import logging
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -16,8 +17,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from semcast.common.errors import SourceError
+from semcast.common.image_file import read_image
+from semcast.common.sequence_layouts import IMAGE_SUFFIXES, images_in
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+logger = logging.getLogger(__name__)
+
 T = TypeVar("T")
 #: A whole 16x16 block at half size, from which linear layers start.
 MIN_SIDE_PX = 32
@@ -54,27 +58,29 @@ class CropSettings:
 
 
 def read_images(folder: Path) -> list[NDArray[np.uint8]]:
-    """Read all images of a folder as ``(H, W, 3)`` uint8 RGB, by name.
+    """Read all images of a folder as ``(H, W, 3)`` uint8 RGB, by name, as an agent would read them.
+
+    Those that can't be read are left out, with a warning each.
 
     Raises:
         SourceError: The folder can't be read or holds no readable image, or one is too small.
     """
     images: list[NDArray[np.uint8]] = []
-    try:
-        paths = sorted(folder.iterdir())
-    except OSError as err:
-        raise SourceError(f"images can't be read from {folder}: {err.strerror}") from err
-    for path in (p for p in paths if p.suffix.lower() in SUFFIXES):
-        bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if bgr is not None:
-            height, width = bgr.shape[:2]
-            if min(height, width) < MIN_SIDE_PX:
-                raise SourceError(
-                    f"images must have sides of at least {MIN_SIDE_PX} pixels, {path} is {width}x{height}"
-                )
-            images.append(np.ascontiguousarray(bgr[:, :, ::-1], dtype=np.uint8))
+    # Not in the natural order of their names: which crops a seed draws goes by this one.
+    for path in sorted(images_in(folder)):
+        try:
+            image = read_image(path)
+        except SourceError as err:
+            logger.warning("left out: %s", err)
+            continue
+        height, width = image.shape[:2]
+        if min(height, width) < MIN_SIDE_PX:
+            raise SourceError(
+                f"images must have sides of at least {MIN_SIDE_PX} pixels, {path} is {width}x{height}"
+            )
+        images.append(image)
     if not images:
-        raise SourceError(f"{folder} holds no readable image ({', '.join(SUFFIXES)})")
+        raise SourceError(f"{folder} holds no readable image ({', '.join(IMAGE_SUFFIXES)})")
     return images
 
 

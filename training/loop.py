@@ -16,7 +16,6 @@ import torch
 import torch.distributed as dist
 
 from semcast.common.errors import CheckpointError
-from semcast.common.image import psnr_of_mse
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.codec import check_device
 from semcast.common.nets.registry import architecture
@@ -25,6 +24,7 @@ from semcast.common.phy.slots import BLOCK_PX, channel_bandwidth_ratio
 from semcast.common.whole_file import check_writable, whole_file
 from semcast.training.centring import centre_hidden, folded, unfolded
 from semcast.training.channel import to_device
+from semcast.training.curve import CURVE_NAME, append_row, cut_to_step, mean_of
 from semcast.training.data import Ahead, Crops, read_images
 from semcast.training.draws import Draws, seed_of_step
 from semcast.training.growing import grow
@@ -357,21 +357,6 @@ def _commit() -> str:
     return done.stdout.strip()
 
 
-def _append(path: Path, row: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row) + "\n")
-
-
-def _mean_logs(rows: list[dict[str, torch.Tensor]]) -> dict[str, float]:
-    names = {name for row in rows for name in row}
-    means = {
-        n: float(torch.stack([row[n].float() for row in rows if n in row]).mean()) for n in sorted(names)
-    }
-    means["psnr_db"] = psnr_of_mse(means["mse"])
-    return means
-
-
 def train(
     settings: TrainSettings,
     on_progress: Callable[[Progress], None] | None = None,
@@ -410,10 +395,12 @@ def train(
 def _train(
     run: Run, on_progress: Callable[[Progress], None] | None, should_stop: Callable[[], bool] | None
 ) -> TrainResult:
-    settings, log = run.settings, run.settings.out / "log.jsonl"
+    settings, log = run.settings, run.settings.out / CURVE_NAME
     rows: list[dict[str, torch.Tensor]] = []
     valid: dict[str, float] = {}
     logger.info("training %s from step %d on %s", settings.architecture, run.step, run.device)
+    if run.rank == 0:
+        cut_to_step(log, run.step)
     try:
         while run.share_done() < 1.0:
             if should_stop is not None and should_stop():
@@ -426,14 +413,16 @@ def _train(
                 rows.append(row)
             run.elapsed_s += time.perf_counter() - start_s
             if run.step % settings.log_every == 0 and run.rank == 0:
-                report = Progress(run.step, run.elapsed_s, run.share_done(), _mean_logs(rows))
+                report = Progress(run.step, run.elapsed_s, run.share_done(), mean_of(rows))
                 rows.clear()
-                _append(log, {"step": report.step, "elapsed_s": round(report.elapsed_s, 1), **report.values})
+                append_row(
+                    log, {"step": report.step, "elapsed_s": round(report.elapsed_s, 1), **report.values}
+                )
                 if on_progress is not None:
                     on_progress(report)
             if run.step % settings.valid_every == 0 and run.valid_images and run.rank == 0:
                 valid = validate(run.shippable(), run.valid_images, run.device, settings.bf16)
-                _append(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
+                append_row(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
             if run.step % settings.save_every == 0:
                 run.save()
     finally:
@@ -441,7 +430,7 @@ def _train(
         run.save()
     if run.rank == 0 and run.valid_images:
         valid = validate(run.shippable(), run.valid_images, run.device, settings.bf16)
-        _append(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
+        append_row(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
     weights = settings.out / f"{settings.architecture}.safetensors"
     if run.rank == 0:
         weights = run.export(valid)

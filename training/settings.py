@@ -16,7 +16,10 @@ _MAX_SEED = 2**32 - 1
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSettings:
-    """One training run, reproducible from these values, the data and the number of processes."""
+    """One training run, reproducible from these values, the data and the number of processes.
+
+    But for one that ends by ``minutes``: its learning rate follows the clock.
+    """
 
     architecture: str = field(default="3dcsc-lite", metadata={"help": "architecture from the registry"})
     data: Path = field(default=Path("data/train"), metadata={"help": "folder of training images"})

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.errors import SourceError
 from semcast.common.lens import DISTORTION_COUNTS
 from semcast.common.new_folder import new_folder
 from semcast.common.trajectory import Trajectory, write_tum
@@ -164,15 +163,12 @@ def render_scene(settings: RenderSettings) -> int:
     Raises:
         SourceError: The folder has files in it or can't be written, or no lens has such a distortion.
     """
-    folder = new_folder(settings.out)  # refuses before the scene is painted
-    try:
+    with new_folder(settings.out) as folder:  # refuses before the scene is painted
         scene = SCENES[settings.scene](settings.seed, settings.pace)
         scene.camera = replace(scene.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
         Optics.of(scene.camera)
         (folder / "images").mkdir()
         return _draw_into(folder, settings, scene)
-    except OSError as err:
-        raise SourceError(f"can't write to {folder}: {err.strerror}") from err
 
 
 def _draw_into(folder: Path, settings: RenderSettings, scene: Scene) -> int:

@@ -6,8 +6,8 @@ import shlex
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,18 +21,18 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.codecs import check_codec, named_weights
 from semcast.common.config import to_toml
+from semcast.common.config_flags import flag_words
 from semcast.common.errors import ConfigError, SemcastError, SourceError, TransportError
 from semcast.common.keys import status_key
 from semcast.common.loopback import free_endpoint
-from semcast.common.messages import StatusMessage
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.playback import check_playback, usual_period_ns
 from semcast.common.rate import NATIVE_RATE, RateChoice
-from semcast.common.run_folder import DEMO_SETTINGS_NAME, FRAMES_NAME, SUMMARY_NAME
+from semcast.common.run_folder import DEMO_SETTINGS_NAME, SUMMARY_NAME
 from semcast.common.sequence import Sequence, open_sequence
 from semcast.common.transport import Session, open_session
 from semcast.common.whole_file import check_writable, write_whole
-from semcast.common.wire import WireError, unpack
+from semcast.demo_watch import ERROR_CODE, START_DEADLINE_S, Alive, watch
 from semcast.real_time import plan_for
 from semcast.role import Role
 from semcast.server.former_run import check_not_foreign, discard, output_folder
@@ -41,10 +41,6 @@ from semcast.server.settings import DenseWhen, ServerSettings
 from semcast.server.view.settings import ViewChoice, ViewSettings
 from semcast.server.viewing import check_viewer
 
-#: How long a role may take from its start until it is seen: imports and weights on a slow machine.
-START_DEADLINE_S = 60.0
-#: What a role that gave up ends with; others are of signals or of wrong usage.
-ERROR_CODE = 1
 AGENT_ID = "demo"
 _PROGRAM = (sys.executable, "-m", "semcast")
 
@@ -161,7 +157,7 @@ class Playback:
 def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict[str, list[str]]:
     """Return the command lines of server and channel, in the order they are started."""
     server = [*_PROGRAM, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
-    server += ["--reference", str(sequence), *_flags(settings.camera)]
+    server += ["--reference", str(sequence), *flag_words(settings.camera)]
     server += ["--confidence", settings.confidence, "--view", settings.view]
     server += ["--viewer-port", str(settings.viewer_port), "--web-port", str(settings.web_port)]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
@@ -170,72 +166,19 @@ def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict
     if settings.record is not None:
         server += ["--record", str(settings.record)]
     channel = [*_PROGRAM, "channel", "--agent-id", AGENT_ID, "--connect", endpoint]
-    channel += [*_flags(settings.link, ("channel", "snr_db")), "--seed", str(settings.seed)]
+    channel += [*flag_words(settings.link, ("channel", "snr_db")), "--seed", str(settings.seed)]
     return {"server": server, "channel": channel}
 
 
 def agent_command(settings: DemoSettings, sequence: Path, endpoint: str, playback: Playback) -> list[str]:
     """Return the command line of the agent, which is started last."""
     agent = [*_PROGRAM, "agent", "--agent-id", AGENT_ID, "--connect", endpoint]
-    agent += ["--source", str(sequence), *_flags(settings.camera)]
+    agent += ["--source", str(sequence), *flag_words(settings.camera)]
     agent += ["--codec", settings.codec, "--modulation", settings.modulation, "--rate", settings.rate]
     agent += ["--resize", f"{playback.resize:g}", "--stride", str(playback.stride)]
     if playback.speed != 1.0:
         agent += ["--pace", "rate", "--rate-hz", f"{playback.rate_hz:.3g}"]
     return agent
-
-
-def _flags(part: CameraSettings | ChannelSettings, always: tuple[str, ...] = ()) -> list[str]:
-    """Return the flags that give a process the same camera or link: values that are no default."""
-    words: list[str] = []
-    for entry in fields(part):
-        value = getattr(part, entry.name)
-        if value != entry.default or entry.name in always:
-            values = value if isinstance(value, tuple) else (value,)
-            words += ["--" + entry.name.replace("_", "-"), *(str(v) for v in values)]
-    return words
-
-
-@dataclass
-class Alive:
-    """Which roles are there, as liveliness tokens say, and what they count; those restarted by hand too."""
-
-    roles: set[str]
-    changed: threading.Condition
-    num_outages: int = 0
-    num_unreadable: int = 0
-    activity: str = ""
-
-    def on_change(self, role: str, alive: bool) -> None:
-        """Take one change."""
-        with self.changed:
-            (self.roles.add if alive else self.roles.discard)(role)
-            self.changed.notify_all()
-
-    def on_status(self, payload: bytes) -> None:
-        """Take what agent and server say of themselves."""
-        with contextlib.suppress(WireError):
-            status = unpack(payload, StatusMessage)
-            if status.role == "server":
-                self.num_outages = status.drops.get("outage", 0)
-                self.activity = status.activity
-            else:
-                self.num_unreadable = status.drops.get("unreadable", 0)
-
-    def wait_for(self, role: str, child: Role, stop: threading.Event) -> None:
-        """Wait until a role is there.
-
-        Raises:
-            SemcastError: Its process ended, or the deadline passed.
-        """
-        deadline = time.monotonic() + START_DEADLINE_S
-        with self.changed:
-            while role not in self.roles and not stop.is_set():
-                if child.returncode is not None:
-                    raise SemcastError(f"{role} did not start: {child.last_words()}")
-                if time.monotonic() > deadline:
-                    raise SemcastError(f"{role} was not ready within {START_DEADLINE_S:g} s, see {child.log}")
-                self.changed.wait(0.1)
 
 
 def run_demo(
@@ -290,7 +233,7 @@ def run_demo(
                     child.start()
                 alive.wait_for(name, child, stop)
                 tell(f"{name} is up: {shlex.join(child.command)}")
-            error = _watch(settings.out, children, alive, summary_file, stop, tell, progress)
+            error = watch(settings.out, children, alive, stop, tell, progress)
             _keep_settings(settings, sequence, playback, tell)
             children["agent"].stop()  # what it says last counts
             if left_out := alive.num_unreadable:
@@ -412,62 +355,3 @@ def _reductions(settings: DemoSettings, playback: Playback) -> Iterator[str]:
         yield f"images are sent at {playback.resize:g} of their size; --resize 1 sends them as they are"
     if settings.rate_hz is None and playback.speed < 1.0:
         yield f"played at {playback.speed:.2g} of the recorded pace, as this machine can serve; see --rate-hz"
-
-
-def _standing(row: Mapping[str, Any]) -> str:
-    psnr = row["psnr_db"]
-    quality = "" if psnr is None else f"  {psnr:.1f} dB"
-    return f"{row['state']:<12} {row['num_inliers']:>4} inliers{quality}"
-
-
-def _watch(
-    out: Path,
-    children: Mapping[str, Role],
-    alive: Alive,
-    summary_file: Path,
-    stop: threading.Event,
-    tell: Callable[[str], None],
-    progress: Callable[[int, str], None],
-) -> str | None:
-    """Follow the rows the server writes until its summary is there; tell which process gave up, and why."""
-    rows = out / FRAMES_NAME
-    read_bytes = 0
-    num_done = num_outages = 0
-    activity = ""
-    page: str | None = None
-    while not stop.is_set() and not summary_file.exists():
-        if page is None and (page := children["server"].viewer_address()) is not None:
-            tell(f"open {page}")
-        for child in children.values():
-            code = child.returncode
-            if code and not child.told:
-                child.told = True
-                if code == ERROR_CODE or (child.name == "agent" and code > 0):
-                    return f"the {child.name} gave up: {child.last_words()}"
-                how = (
-                    f"was killed by signal {-code}"
-                    if code < 0
-                    else f"ended with code {code}: {child.last_words()}"
-                )
-                tell(f"{child.name} {how}; start it again with: {shlex.join(child.command)}")
-        if rows.exists():
-            size = rows.stat().st_size
-            if size < read_bytes:
-                read_bytes = 0
-            with rows.open("rb") as file:
-                file.seek(read_bytes)
-                complete = file.read(size - read_bytes).rpartition(b"\n")[0]
-            read_bytes += len(complete) + bool(complete)
-            for line in complete.splitlines():
-                row = json.loads(line)
-                num_done = row["frame_id"] + 1
-                progress(num_done, _standing(row))
-        if not read_bytes and alive.num_outages > num_outages:
-            num_done = num_outages = alive.num_outages
-            progress(num_done, f"no image could be decoded, {num_outages} outages")
-        if alive.activity != activity:
-            activity = alive.activity
-            progress(num_done, activity)
-        with alive.changed:
-            alive.changed.wait(0.1)
-    return None

@@ -204,11 +204,12 @@ def _figures(summary: dict[str, Any]) -> list[tuple[str, str]]:
 def describe_sequence(path: Path) -> list[Section]:
     """Say what a recorded image sequence holds; what is missing is said, not an error."""
     from semcast.common.sequence import open_sequence
+    from semcast.common.sequence_layouts import ns_to_seconds
 
     sequence = open_sequence(path)
     facts = [("images", f"{len(sequence)}, {sequence.size_wh[0]}x{sequence.size_wh[1]} px")]
     facts += _refused(*sequence.refused_images())
-    times_s = sequence.times_ns * 1e-9
+    times_s = ns_to_seconds(sequence.times_ns)
     if len(times_s) > 1:
         rate_hz = (len(times_s) - 1) / (times_s[-1] - times_s[0])
         # Where a folder records no times, they follow the rate it is opened with.

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from semcast.cli import VERBS, verb_parser
 from semcast.common.messages import Message
+from semcast.evaluation.markdown import with_part
 
 HEAD = """# Every verb and setting
 
@@ -66,10 +67,12 @@ def messages_table() -> str:
 
 
 def with_messages(page: str) -> str:
-    """Put the table between the marks of a page."""
-    before, begin, rest = page.partition("<!-- messages -->\n")
-    _, end, after = rest.partition("<!-- /messages -->")
-    return f"{before}{begin}{messages_table()}\n{end}{after}"
+    """Put the table between the marks of a page.
+
+    Raises:
+        ValueError: A mark is missing.
+    """
+    return with_part(page, "messages", messages_table())
 
 
 if __name__ == "__main__":

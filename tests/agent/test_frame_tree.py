@@ -69,9 +69,27 @@ def test_a_fixed_transform_holds_at_all_times():
     np.testing.assert_array_equal(tree.pose("body", "cam", -5), moved(2.0))
 
 
-def test_a_frame_with_two_parents_is_refused():
-    with pytest.raises(SourceError, match="frame 'cam' must have one parent, got 'body' and 'odom'"):
-        tree_of(("body", "cam", 0, moved(0.0)), ("odom", "cam", 0, moved(0.0)))
+def test_a_transform_that_is_said_again_and_again_holds_at_all_times():
+    # So static_transform_publisher of ROS 1 does, if asked to only once in many seconds.
+    tree = tree_of(("body", "cam", 0, moved(2.0)), ("body", "cam", 10_000 * MS, moved(2.0)))
+    for time_ns in (-5, 4_000 * MS, 20_000 * MS):
+        np.testing.assert_array_equal(tree.pose("body", "cam", time_ns), moved(2.0))
+
+
+def test_one_transform_alone_says_nothing_of_other_times():
+    assert tree_of(("body", "cam", 0, moved(2.0))).pose("body", "cam", 1) is None
+
+
+def test_a_frame_with_two_parents_is_refused_where_it_is_on_the_way():
+    tree = tree_of(
+        ("world", "body", None, moved(1.0)),
+        ("body", "cam", None, moved(2.0)),
+        ("cam", "gimbal", None, moved(0.0)),
+        ("odom", "gimbal", None, moved(0.0)),
+    )
+    np.testing.assert_array_equal(tree.pose("world", "cam", 0), moved(3.0))
+    with pytest.raises(SourceError, match="frame 'gimbal' must have one parent, got 'cam' and 'odom'"):
+        tree.check_connected("world", "gimbal")
 
 
 def test_frames_without_a_way_between_them_are_refused():

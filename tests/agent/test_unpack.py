@@ -77,6 +77,21 @@ def test_rectified_images_have_the_rectified_camera(tmp_path):
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion) == (40.0, 41.0, 30.5, 22.5, ())
 
 
+def test_binned_images_of_a_part_of_the_sensor_have_their_own_camera(tmp_path):
+    bag = BagMaker("bag")
+    add_images(bag)
+    # Half the resolution of a part of 128x96 that begins at (20, 10).
+    K_full = (100.0, 0.0, 83.5, 0.0, 102.0, 57.5, 0.0, 0.0, 1.0)
+    bag.camera_info(
+        "/cam/camera_info", K_full, D, P, (200, 150), roi_xywh=(20, 10, 128, 96), binning=2, time_ns=START
+    )
+    camera = unpack(settings(bag, tmp_path)).camera
+    assert (camera.width, camera.height) == WH
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50.0, 51.0, 31.5, 23.5)
+    assert camera.distortion == D
+    assert open_sequence(tmp_path / "out").stored_camera == camera
+
+
 def test_a_camera_that_was_not_calibrated_is_unknown(tmp_path, caplog):
     bag = BagMaker()
     add_images(bag)
@@ -141,6 +156,61 @@ def test_poses_of_a_body_reach_the_camera_by_tf_and_win_over_it(tmp_path):
     unpack(settings(bag, tmp_path, truth="/odom"))
     positions = open_sequence(tmp_path / "out").groundtruth().positions
     np.testing.assert_allclose(positions, [(1.0 * k, 2.0, 0.0) for k in range(5)], atol=1e-9)
+
+
+def test_poses_of_a_sibling_of_the_camera_reach_it_too(tmp_path):
+    # What a tracker of motions, or an estimator by inertia, calls its body seldom is the root of the rig.
+    bag = BagMaker()
+    add_images(bag)
+    for k in range(5):
+        bag.odometry("/vio", "world", "imu", (1.0 * k, 0.0, 0.0), START + k * STEP)
+    bag.transform("/tf_static", "base", "imu", (0.0, 0.0, 3.0), START)
+    bag.transform("/tf_static", "base", "cam", (0.0, 2.0, 0.0), START)
+    assert unpack(settings(bag, tmp_path, truth="/vio", camera_frame="/cam")).num_poses == 5
+    positions = open_sequence(tmp_path / "out").groundtruth().positions
+    np.testing.assert_allclose(positions, [(1.0 * k, 2.0, -3.0) for k in range(5)], atol=1e-9)
+
+
+def test_poses_that_do_not_say_of_what_they_are_can_be_said_to_be_of_a_body(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    for k in range(5):
+        bag.pose("/mocap", "room", (1.0 * k, 0.0, 0.0), START + k * STEP)
+    bag.transform("/tf_static", "base", "cam", (0.0, 2.0, 0.0), START)
+    unpack(settings(bag, tmp_path, truth="/mocap", truth_frame="/base"))
+    positions = open_sequence(tmp_path / "out").groundtruth().positions
+    np.testing.assert_allclose(positions, [(1.0 * k, 2.0, 0.0) for k in range(5)], atol=1e-9)
+
+
+def test_a_body_that_does_not_lead_to_the_camera_is_refused(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    bag.pose("/mocap", "room", (0.0, 0.0, 0.0), START)
+    bag.transform("/tf_static", "base", "cam", (0.0, 2.0, 0.0), START)
+    with pytest.raises(SourceError, match="no transform of a frame 'robot': known are base, cam"):
+        unpack(settings(bag, tmp_path, truth="/mocap", truth_frame="robot"))
+
+
+def test_poses_of_several_bodies_are_refused(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    for k, body in enumerate(("drone", "car")):
+        bag.odometry("/mocap", "room", body, (0.0, 0.0, 0.0), START + k * STEP)
+    with pytest.raises(SourceError, match="/mocap must be of one frame .*'car' in 'room', 'drone' in 'room'"):
+        unpack(settings(bag, tmp_path, truth="/mocap"))
+
+
+def test_what_a_tracker_says_that_lost_its_body_is_no_pose(tmp_path, caplog):
+    bag = BagMaker()
+    add_images(bag)
+    for k in range(5):
+        bag.pose("/mocap", "room", (1.0 * k, 0.0, 0.0), START + k * STEP)
+    bag.pose("/mocap", "room", (0.0, 0.0, 0.0), START + STEP // 2, w=0.0)
+    bag.pose("/mocap", "room", (float("nan"), 0.0, 0.0), START + STEP // 4)
+    bag.transform("/tf", "map", "wheel", (0.0, 0.0, 0.0), START, (0.0, 0.0, 0.0, 0.0))
+    assert unpack(settings(bag, tmp_path, truth="/mocap")).num_poses == 5
+    assert "/mocap: '' in 'room' is left out where it is no pose: position must be finite" in caplog.text
+    assert "/tf: 'wheel' in 'map' is left out" in caplog.text
 
 
 def test_images_without_a_pose_have_none(tmp_path):
@@ -210,6 +280,44 @@ def test_a_header_without_a_time_leaves_that_of_the_recording(tmp_path):
     assert open_sequence(tmp_path / "out").times_ns.tolist() == [START]
 
 
+def test_a_clock_that_begins_at_zero_tells_a_time(tmp_path):
+    bag = BagMaker()
+    for k in range(3):
+        bag.image("/cam/image_raw", picture(k), "bgr8", k * STEP, recorded_ns=START + k * STEP)
+    unpack(settings(bag, tmp_path))
+    assert open_sequence(tmp_path / "out").times_ns.tolist() == [0, STEP, 2 * STEP]
+
+
+def test_an_image_without_a_time_has_that_of_the_recording_on_the_clock_of_the_others(tmp_path):
+    bag = BagMaker()
+    for k in range(4):
+        stamp_ns = 0 if k == 2 else 7 * SECOND + k * STEP
+        bag.image("/cam/image_raw", picture(k), "bgr8", stamp_ns, recorded_ns=START + k * STEP)
+    unpack(settings(bag, tmp_path))
+    assert open_sequence(tmp_path / "out").times_ns.tolist() == [7 * SECOND + k * STEP for k in range(4)]
+
+
+@pytest.mark.parametrize("wrong", [0, 2])
+def test_one_time_far_ahead_costs_one_image(wrong, tmp_path, caplog):
+    bag = BagMaker()
+    for k in range(5):
+        stamp_ns = START + k * STEP + (3600 * SECOND if k == wrong else 0)
+        bag.image("/cam/image_raw", picture(k), "bgr8", stamp_ns, recorded_ns=START + k * STEP)
+    found = unpack(settings(bag, tmp_path))
+    assert (found.num_images, found.num_left_out) == (4, 1)
+    assert f"image {wrong + 1} is left out: its time" in caplog.text
+    expected = [START + k * STEP for k in range(5) if k != wrong]
+    assert open_sequence(tmp_path / "out").times_ns.tolist() == expected
+
+
+def test_of_two_images_of_one_time_the_first_counts(tmp_path):
+    bag = BagMaker()
+    for k in (0, 1):
+        bag.image("/cam/image_raw", picture(k), "bgr8", START, recorded_ns=START + k * STEP)
+    assert unpack(settings(bag, tmp_path)).num_images == 1
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "out" / "images" / "000000.png")), picture(0))
+
+
 def test_a_part_of_a_bag_can_be_taken(tmp_path):
     bag = BagMaker()
     add_images(bag, count=10)
@@ -222,6 +330,15 @@ def test_a_time_without_images_is_an_error(tmp_path):
     add_images(bag)
     with pytest.raises(SourceError, match="none in the time asked for"):
         unpack(settings(bag, tmp_path, start_s=60.0))
+
+
+def test_a_try_that_failed_leaves_the_folder_to_the_next(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    wanted = settings(bag, tmp_path, start_s=60.0)
+    with pytest.raises(SourceError, match="none in the time asked for"):
+        unpack(wanted)
+    assert unpack(UnpackSettings(bag=wanted.bag, out=wanted.out)).num_images == 5
 
 
 def test_a_folder_with_files_is_left_alone(tmp_path):
@@ -249,7 +366,37 @@ def test_a_file_that_is_no_bag_is_an_error_in_a_line(name, content, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("name", "value"), [("start_s", -0.1), ("start_s", float("nan")), ("seconds", 0.0)])
+def test_what_is_no_bag_of_ros_is_named_as_that(tmp_path):
+    recording = tmp_path / "run.mcap"
+    recording.write_bytes(b"\x89MCAP0\r\n")
+    for path in (recording, tmp_path):
+        with pytest.raises(SourceError, match=f"{path.name} is no ROS bag: 'semcast info' says what it is"):
+            unpack(UnpackSettings(bag=path, out=tmp_path / "out"))
+
+
+def test_a_bag_with_damage_in_the_middle_is_an_error_in_a_line(tmp_path):
+    bag = BagMaker("bag")
+    add_images(bag)
+    path = bag.write(tmp_path)
+    content = path.read_bytes()
+    # The name of a field of a message's header, which is text to those who look for it.
+    at = content.index(b"time=", content.index(b"conn=", 8000))
+    path.write_bytes(content[:at] + b"\x9c" + content[at + 1 :])
+    with pytest.raises(SourceError, match="drive.bag can't be read as a ROS bag, it is damaged: ") as caught:
+        unpack(UnpackSettings(bag=path, out=tmp_path / "out"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("start_s", -0.1),
+        ("start_s", float("nan")),
+        ("start_s", float("inf")),
+        ("seconds", 0.0),
+        ("seconds", float("inf")),
+    ],
+)
 def test_ranges_are_checked(name, value, tmp_path):
     with pytest.raises(ValueError, match=name):
         UnpackSettings(bag=tmp_path / "a.bag", out=tmp_path / "out", **{name: value})

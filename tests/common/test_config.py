@@ -9,7 +9,7 @@ from typing import Literal
 import pytest
 
 from semcast.common.config import MissingSettingError, build_settings, near_match, to_toml
-from semcast.common.config_flags import add_flags, given_values, settings_from
+from semcast.common.config_flags import add_flags, flag_words, given_values, settings_from
 from semcast.common.errors import ConfigError
 
 
@@ -258,3 +258,28 @@ def test_one_value_of_a_table_keeps_the_defaults_its_owner_gives_the_others(caps
     with pytest.raises(SystemExit):
         arguments_of(Sender, ["--help"])
     assert "(default high)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (Node(), []),
+        (
+            Node(mode="replay", loud=True, levels=(3.0, 4.0), out=Path("a b"), radio=Radio(snr_db=-2.0)),
+            ["--mode", "replay", "--loud", "--out", "a b", "--levels", "3.0", "4.0", "--snr-db", "-2.0"],
+        ),
+        # What is no default of its owner is given, though it is one of its class.
+        (
+            Sender(file=Path("x.mcap"), camera=Camera(camera="0"), antenna=Antenna()),
+            ["x.mcap", "--camera", "0", "--radio-band", "low"],
+        ),
+        (Reader(file=Path("y")), ["y"]),
+    ],
+)
+def test_the_words_of_settings_make_the_same_settings(settings, words):
+    assert flag_words(settings) == words
+    assert parse(words, cls=type(settings)) == settings
+
+
+def test_words_may_name_a_default_too():
+    assert flag_words(Node(), always=("radio.snr_db", "loud")) == ["--no-loud", "--snr-db", "10.0"]

@@ -7,6 +7,48 @@ from semcast.evaluation import plots
 from semcast.evaluation.plots import plot_against_snr, plot_pair_errors, plot_path, plot_reliability
 
 
+def reliability_of(predicted, observed, share=(0.5, 0.5)):
+    return {"predicted": predicted, "observed": observed, "share": share}
+
+
+def drawn_by(monkeypatch, draw):
+    """What a function draws instead of saving."""
+    drawn = []
+    monkeypatch.setattr(plots, "save_figure", lambda figure, path: drawn.append(figure))
+    draw()
+    return drawn
+
+
+def test_all_bars_are_of_the_difference_from_one_rival(tmp_path, monkeypatch):
+    def compared(mode, against, low, high):
+        return {
+            "mode": mode,
+            "against": against,
+            "figure": "rot_deg_mean",
+            "paired": {"low": low, "high": high},
+        }
+
+    values = {"rot_deg_mean": 1.0, "tdir_deg_mean": 1.0}
+    comparisons = [
+        compared("robust", "off", -0.5, -0.2),
+        compared("robust", "others", -0.9, -0.1),
+        compared("off", "others", -0.8, 0.8),
+    ]
+    modes = dict.fromkeys(("robust", "off", "others"), values)
+    cells = [{"snr_db": snr_db, "results": modes, "comparisons": comparisons} for snr_db in (2.0, 10.0)]
+    rotation, _ = drawn_by(monkeypatch, lambda: plot_pair_errors(tmp_path, {"cells": cells}))
+    bars = [line.get_ydata() for line in rotation.axes[0].lines if line.get_marker() == "_"]
+    np.testing.assert_allclose(bars, [(0.5, 0.8), (0.5, 0.8)])
+    assert rotation.axes[0].get_xticks().tolist() == [2.0, 10.0], "the SNRs that were measured"
+
+
+def test_a_bin_of_a_few_samples_is_no_point_of_a_reliability_diagram(tmp_path, monkeypatch):
+    table = reliability_of([0.2, 0.5, 0.8], [0.9, 0.5, 0.8], [0.0002, 0.4998, 0.5])
+    (figure,) = drawn_by(monkeypatch, lambda: plot_reliability(tmp_path / "r.png", {"c": table}, "what was"))
+    (curve,) = (line for line in figure.axes[0].lines if line.get_label() == "c")
+    assert curve.get_xdata().tolist() == [0.5, 0.8]
+
+
 def test_pair_plots_are_drawn_with_the_intervals_there_are(tmp_path):
     def cell(snr_db, off, interval=None):
         values = {"rot_deg_mean": off, "tdir_deg_mean": 2 * off}
@@ -37,7 +79,7 @@ def test_path_and_reliability_are_drawn(tmp_path):
     line = np.stack([np.arange(5.0), np.zeros(5), np.arange(5.0)], axis=1)
     plot_path(path, {"ground truth": line, "semcast": line + 0.1}, title="t")
     assert "<svg" in path.read_text()
-    plot_reliability(tmp_path / "r.png", {"c": {"predicted": [0.2, 0.8], "observed": [0.3, 0.7]}}, "what was")
+    plot_reliability(tmp_path / "r.png", {"c": reliability_of([0.2, 0.8], [0.3, 0.7])}, "what was")
     assert cv2.imread(str(tmp_path / "r.png")) is not None
 
 
@@ -53,14 +95,14 @@ def test_an_unknown_file_type_is_one_clear_error(tmp_path):
 
 
 def test_names_of_curves_stand_beside_the_axes_and_hide_no_point(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(plots, "save_figure", lambda figure, path: drawn.append(figure))
-    plot_against_snr(
-        tmp_path / "a.png", [2, 4, 6], {name: [30.0, 30.0, 31.0] for name in "abcde"}, "PSNR (dB)"
-    )
-    corner = {"predicted": [0.1, 0.9], "observed": [0.9, 0.1]}
-    plot_reliability(tmp_path / "b.png", dict.fromkeys("abcde", corner), "what was")
-    plot_path(tmp_path / "c.png", {"ground truth": np.eye(3), "semcast": -np.eye(3)})
+    def draw():
+        curves = {name: [30.0, 30.0, 31.0] for name in "abcde"}
+        plot_against_snr(tmp_path / "a.png", [2, 4, 6], curves, "PSNR (dB)")
+        corner = reliability_of([0.1, 0.9], [0.9, 0.1])
+        plot_reliability(tmp_path / "b.png", dict.fromkeys("abcde", corner), "what was")
+        plot_path(tmp_path / "c.png", {"ground truth": np.eye(3), "semcast": -np.eye(3)})
+
+    drawn = drawn_by(monkeypatch, draw)
     assert len(drawn) == 3
     for figure in drawn:
         figure.draw_without_rendering()

@@ -208,6 +208,15 @@ def test_the_spread_of_small_errors_has_few_numbers_below_it(tmp_path, monkeypat
         assert 2 <= sum(low <= tick <= high for tick in histogram.get_xticks()) <= 5
 
 
+def test_the_spread_of_a_few_errors_counts_no_half_frames(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(run_plots, "save_figure", lambda figure, path: drawn.append(figure))
+    trajectory = line(range(10))
+    trajectory.T_world_cam[:, 0, 3] = np.linspace(0.0, 1.0, 10) ** 2
+    plot_run(RunToPlot(name="run", trajectory=trajectory, rows=[], truth=line(range(10))), tmp_path)
+    assert all(count == int(count) for count in drawn[-1].axes[3].get_yticks())
+
+
 def test_a_run_without_a_decoded_frame_has_nothing_to_plot(tmp_path):
     folder = write_run(tmp_path / "run", [])
     for _ in range(2):

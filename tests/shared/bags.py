@@ -69,8 +69,13 @@ class BagMaker:
         kind = self.types.CompressedImage
         self.add(topic, kind(header=self.header(time_ns, frame), format=form, data=data), time_ns)
 
-    def camera_info(self, topic, K, D, P, size_wh, model="plumb_bob", time_ns=SECOND):
-        roi = self.types.RegionOfInterest(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    def camera_info(
+        self, topic, K, D, P, size_wh, model="plumb_bob", time_ns=SECOND, roi_xywh=(0, 0, 0, 0), binning=0
+    ):
+        x, y, width, height = roi_xywh
+        roi = self.types.RegionOfInterest(
+            x_offset=x, y_offset=y, height=height, width=width, do_rectify=False
+        )
         named = {
             "K": np.array(K, float),
             "D": np.array(D, float),
@@ -84,8 +89,8 @@ class BagMaker:
             height=size_wh[1],
             width=size_wh[0],
             distortion_model=model,
-            binning_x=0,
-            binning_y=0,
+            binning_x=binning,
+            binning_y=binning,
             roi=roi,
             **named,
         )
@@ -106,15 +111,14 @@ class BagMaker:
             ),
         )
 
-    def pose(self, topic, parent, xyz, time_ns):
-        self.add(
-            topic, self.types.PoseStamped(header=self.header(time_ns, parent), pose=self._pose(xyz)), time_ns
-        )
+    def pose(self, topic, parent, xyz, time_ns, w=1.0):
+        pose = self._pose(xyz, w)
+        self.add(topic, self.types.PoseStamped(header=self.header(time_ns, parent), pose=pose), time_ns)
 
-    def _pose(self, xyz):
+    def _pose(self, xyz, w=1.0):
         return self.types.Pose(
             position=self.types.Point(x=xyz[0], y=xyz[1], z=xyz[2]),
-            orientation=self.types.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation=self.types.Quaternion(x=0.0, y=0.0, z=0.0, w=w),
         )
 
     def odometry(self, topic, parent, child, xyz, time_ns):

@@ -78,6 +78,17 @@ def test_images_are_read_by_name_as_rgb(tmp_path):
     assert images[1][0, 0].tolist() == [255, 0, 0]
 
 
+def test_images_are_read_as_an_agent_reads_them_and_what_is_none_is_told(tmp_path, caplog):
+    clear = np.zeros((32, 40, 4), np.uint8)  # black, and not to be seen: laid on white
+    cv2.imwrite(str(tmp_path / "a.png"), clear)
+    (tmp_path / "b.jpg").write_bytes(b"damaged")
+    (image,) = read_images(tmp_path)
+    assert image.min() == 255
+    assert image.flags.c_contiguous, "crops of others can't be resized"
+    assert "left out: " in caplog.text
+    assert "b.jpg is not a readable image" in caplog.text
+
+
 def test_images_too_small_to_start_from_are_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((31, 40, 3), np.uint8))
     with pytest.raises(SourceError, match="sides of at least 32 pixels, .*a.png is 40x31"):
@@ -90,7 +101,7 @@ def test_a_folder_without_images_is_an_error(tmp_path):
 
 
 def test_a_folder_that_is_not_there_is_named_as_that(tmp_path):
-    with pytest.raises(SourceError, match="images can't be read from .*nowhere: No such file"):
+    with pytest.raises(SourceError, match="nowhere can't be read: .*No such file"):
         read_images(tmp_path / "nowhere")
 
 

@@ -99,6 +99,18 @@ def test_a_resumed_run_equals_one_without_a_break(tiny_network, photos, tmp_path
             torch.testing.assert_close(broken[part][name], tensor, rtol=0, atol=0, msg=name)
 
 
+def test_the_curve_of_a_run_that_was_killed_has_each_step_once(tiny_network, photos, tmp_path):
+    asked = iter([False, False, False, True])
+    train(settings_for(photos, tmp_path), should_stop=lambda: next(asked))
+    # What it would have reported after its last checkpoint, and was killed in.
+    with (tmp_path / "log.jsonl").open("a") as log:
+        log.write('{"step": 4, "loss": 9.0}\n{"step": 6, "lo')
+    train(settings_for(photos, tmp_path))
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [2, 4, 6]
+    assert rows[1]["loss"] != 9.0
+
+
 def test_the_weights_change_and_the_seed_decides_how(tiny_network, photos, tmp_path):
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         train(settings_for(photos, tmp_path / name, steps=2, seed=seed))

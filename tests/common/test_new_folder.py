@@ -1,0 +1,42 @@
+import pytest
+
+from semcast.common.errors import SourceError
+from semcast.common.new_folder import new_folder
+
+
+def test_a_folder_that_was_filled_stays(tmp_path):
+    with new_folder(tmp_path / "a" / "b") as folder:
+        (folder / "file").write_text("x")
+    assert [path.name for path in (tmp_path / "a" / "b").iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("what", [SourceError("damaged"), KeyboardInterrupt()])
+def test_a_folder_that_could_not_be_filled_is_empty_for_the_next_try(tmp_path, what):
+    def fill():
+        with new_folder(tmp_path / "out") as folder:
+            (folder / "images").mkdir()
+            (folder / "images" / "0.png").write_text("x")
+            (folder / "times.txt").write_text("0")
+            raise what
+
+    with pytest.raises(type(what)):
+        fill()
+    assert list((tmp_path / "out").iterdir()) == []
+    with new_folder(tmp_path / "out") as folder:
+        assert folder.is_dir()
+
+
+def test_what_is_in_a_folder_is_left_alone(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(SourceError, match="must be a new or an empty folder"), new_folder(tmp_path):
+        pass
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+
+
+def test_why_a_folder_can_not_be_written_is_said(tmp_path):
+    def fill():
+        with new_folder(tmp_path / "out"):
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(SourceError, match="can't write to .*out: No space left on device"):
+        fill()
