@@ -11,7 +11,11 @@ def test_a_folder_that_was_filled_stays(tmp_path):
 
 
 @pytest.mark.parametrize("what", [SourceError("damaged"), KeyboardInterrupt()])
-def test_a_folder_that_could_not_be_filled_is_empty_for_the_next_try(tmp_path, what):
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_folder_that_could_not_be_filled_is_as_it_was_for_the_next_try(tmp_path, what, is_there):
+    if is_there:
+        (tmp_path / "out").mkdir()
+
     def fill():
         with new_folder(tmp_path / "out") as folder:
             (folder / "images").mkdir()
@@ -21,7 +25,7 @@ def test_a_folder_that_could_not_be_filled_is_empty_for_the_next_try(tmp_path, w
 
     with pytest.raises(type(what)):
         fill()
-    assert list((tmp_path / "out").iterdir()) == []
+    assert [path.name for path in tmp_path.rglob("*")] == (["out"] if is_there else [])
     with new_folder(tmp_path / "out") as folder:
         assert folder.is_dir()
 
