@@ -346,22 +346,22 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
 
 
 def local_scales(result: BundleResult) -> Array:
-    """Factor on lengths around each keyframe, ``(K,)``: on its landmarks' depths, and 1 if it is fixed."""
+    """Factor on lengths around each keyframe, ``(K,)``: on the ways to those before and after it; 1 if fixed.
+
+    Depths of its landmarks tell less: they change by what the camera itself is moved by, too.
+    """
     problem = result.problem
-    before = _depths(problem, problem.T_world_cam, problem.xyz)
-    after = _depths(problem, result.T_world_cam, result.xyz)
-    sound = (before > 0.0) & (after > 0.0)
-    scale = np.ones(len(problem.T_world_cam))
-    for k in np.flatnonzero(~problem.fixed):
-        mine = sound & (problem.view == k)
-        if mine.any():
-            scale[k] = np.median(after[mine] / before[mine])
-    return scale
+    before, after = _ways(problem.T_world_cam), _ways(result.T_world_cam)
+    return np.where(problem.fixed | (before == 0.0), 1.0, after / np.where(before == 0.0, 1.0, before))
 
 
-def _depths(problem: BundleProblem, T_world_cam: Array, xyz: Array) -> Array:
-    """Depth of each observation's landmark in its view, ``(M,)`` map units."""
-    return depths_in(invert_transform(T_world_cam)[problem.view], xyz[problem.point])
+def _ways(T_world_cam: Array) -> Array:
+    """Sum of the distances, ``(K,)``, from each of ``(K, 4, 4)`` poses to those before and after it."""
+    ways = np.zeros(len(T_world_cam))
+    steps = np.linalg.norm(np.diff(T_world_cam[:, :3, 3], axis=0), axis=1)
+    ways[:-1] += steps
+    ways[1:] += steps
+    return ways
 
 
 def drop_outliers(world: WorldMap, result: BundleResult, noise: NoiseModel) -> None:

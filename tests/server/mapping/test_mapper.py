@@ -12,6 +12,7 @@ from semcast.server.mapping.mapper import (
     KeyframeCues,
     add_landmarks,
     apply_result,
+    local_scales,
     note_sight,
     usual_depth,
     wants_keyframe,
@@ -170,6 +171,20 @@ def test_frames_between_keyframes_take_over_the_scale_that_an_adjustment_finds()
     apply_result(world, result, OnlineNoise("off", 0.5, 0.0, True))
     np.testing.assert_allclose(world.pose_of_frame(53)[:3, 3], between[:3, 3], atol=0.02)
     assert 53 in world.take_changes().frames, "receivers must be told"
+
+
+def test_scale_around_a_keyframe_is_that_of_the_ways_to_its_neighbours():
+    world, _, _ = make_world(5, 150)
+    add_landmarks(world, CAMERA, NoiseModel(6.0, 0.0), IMAGE, 0.5)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+
+    def at(x):
+        return np.stack([make_transform(np.eye(3), (each, 0.0, 0.0)) for each in x])
+
+    # Ways before: 1, 1+1, 1+3, 3+0, 0. Afterwards: 2, 2+1, 1+6, 6+0, 0.
+    first_fixed = replace(problem, T_world_cam=at([0, 1, 2, 5, 5]), fixed=np.arange(5) == 0)
+    result = replace(optimise(problem), problem=first_fixed, T_world_cam=at([0, 2, 3, 9, 9]))
+    np.testing.assert_allclose(local_scales(result), [1.0, 3 / 2, 7 / 4, 6 / 3, 1.0])
 
 
 def test_the_fit_finds_the_noise_that_is_there_and_not_what_its_own_weights_make():
