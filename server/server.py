@@ -45,6 +45,8 @@ from semcast.server.viewing import SuccessiveViews, check_viewer
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.1
+#: The same while an adjustment is under way, which is applied when it is done and no frame waits.
+_BRIEF_S = 0.01
 WARM_UP_SHAPE_HW = (256, 384)
 #: Time for depth that is still missing where another stream waits, and where the server was stopped.
 _IN_A_HURRY_S, _STOPPED_S = 2.0, 12.0
@@ -157,7 +159,7 @@ class Server:
         started_s = active_s = time.monotonic()
         try:
             while not stop.is_set():
-                decoded = self._ahead.get(POLL_S)
+                decoded = self._next_decoded()
                 now_s = time.monotonic()
                 self._serve_requests()
                 if self._prepare():
@@ -177,6 +179,15 @@ class Server:
             self._control.close()
             summary = self._finish(is_stopped=stop.is_set())
         return summary
+
+    def _next_decoded(self) -> DecodedArrival | None:
+        """Return the next decoded frame, None when there was none in time; then the map may be adjusted."""
+        session = self._session
+        is_adjusting = session is not None and session.is_adjusting
+        decoded = self._ahead.get(_BRIEF_S if is_adjusting else POLL_S)
+        if decoded is None and session is not None:
+            session.use_time()
+        return decoded
 
     def _ended(self, idle_s: float) -> bool:
         """Tell whether nothing more is to come, ``idle_s`` after a stream's beginning or last frame; once."""

@@ -106,6 +106,7 @@ class Session:
         self._on_error = on_error
         self._reference = reference
         bundle = bundle if bundle is not None else new_bundle(settings)
+        self._bundle = bundle
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
         self._cloud = SessionCloud(settings, identity.camera, self._reconstruction, on_error)
         self._t_source_ns: dict[int, int] = {}
@@ -190,6 +191,19 @@ class Session:
         self._numbers[frame_id] = seq
         if final:
             self._num_frames = self.identity.num_until(frame_id)
+
+    @property
+    def is_adjusting(self) -> bool:
+        """Whether an adjustment of a live stream's map is under way, or waits for ``use_time``."""
+        return self._settings.mode == "live" and self._bundle.busy
+
+    def use_time(self) -> None:
+        """Bring an adjustment that is done into the map: there is time, and the next frame is spared it.
+
+        In replay that belongs to the next frame, for which it is waited for.
+        """
+        if self.is_adjusting:
+            self._reconstruction.collect()
 
     def process(
         self, frame: DecodedFrame, arrival: Arrival, on_pose: Callable[[FrameResult], None] | None = None

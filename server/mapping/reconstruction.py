@@ -123,15 +123,20 @@ class Reconstruction:
             ValueError: An array has another shape than the camera's image, or another number type.
         """
         frame.check(self._camera.shape_hw)
-        self._stage_ms = {}
         self._on_pose = on_pose
+        try:
+            return self._process(frame)
+        finally:
+            self._stage_ms = {}
+
+    def _process(self, frame: DecodedFrame) -> FrameResult:
         if frame.frame_id <= self._last_frame_id:
             return self._result(frame, self._map.world.pose_of_frame(frame.frame_id), None)
         self._last_frame_id = frame.frame_id
         if shows_nothing(frame.image):
             # As a frame that never came: tracks outlive a covered lens as they outlive a gap.
             return result_of_nothing(frame, self._state, self._map_epoch, self._map.submap)
-        self._collect()
+        self.collect()
         since = time.perf_counter_ns()
         sight = self._shutter.see(frame)
         T_world_guess = self._motion.predict(frame.t_source_ns)
@@ -149,8 +154,8 @@ class Reconstruction:
     def _lap(self, stage: str, since_ns: int) -> None:
         self._stage_ms[stage] = self._stage_ms.get(stage, 0.0) + (time.perf_counter_ns() - since_ns) * 1e-6
 
-    def _collect(self) -> None:
-        """Apply a finished adjustment, and let the motion go on from the corrected pose."""
+    def collect(self) -> None:
+        """Apply a finished adjustment now, not when the next frame comes, which then has its pose sooner."""
         since = time.perf_counter_ns()
         result = self._map.collect()
         if result is None:
@@ -319,9 +324,7 @@ class Reconstruction:
         suspect = tracks.ids[tracks.suspect]
         start = self._initialiser.add(observed, self._map.noise.model, suspect, is_damaged=waits)
         self._lap("two_view", since)
-        if start is None:
-            return self._result(frame, None, None)
-        return self._begin_map(sight, start)
+        return self._result(frame, None, None) if start is None else self._begin_map(sight, start)
 
     def _begin_submap(self) -> None:
         """Let the next start be a part of its own that shares no track with what came before.
@@ -354,8 +357,7 @@ class Reconstruction:
         return None
 
     def _recognise(self, sight: Sight) -> TrackedPose | None:
-        place = self._map.recognise(sight)
-        if place is None:
+        if (place := self._map.recognise(sight)) is None:
             return None
         # Nothing is given up for a place before there is a pose in it.
         seen = Seen(place.ids, place.xy, np.full(len(place.ids), _RECOGNISED_CONFIDENCE))
@@ -372,8 +374,7 @@ class Reconstruction:
         since = time.perf_counter_ns()
         history = self._initialiser.history
         grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
-        world, submap = self._map.world, self._map.submap
-        T_world_ref, scale = self._passage.lay(self._motion, start, grown, world, submap)
+        T_world_ref, scale = self._passage.lay(self._motion, start, grown, self._map.world, self._map.submap)
         self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, history)
         noise, seed = self._map.noise.model, self._settings.seed
         backfilled = backfill(self._camera, self._map.world, grown.keyframes, history[:-1], noise, seed)
@@ -468,8 +469,7 @@ class Reconstruction:
 
     def landmarks(self) -> tuple[Ids, Array, NDArray[np.uint8], NDArray[np.float32]]:
         """All landmarks: ids ``(N,)``, world ``xyz (N, 3)``, ``rgb (N, 3)``, confidence ``(N,)``."""
-        marks = self._map.world.landmarks
-        return marks.ids.copy(), marks.xyz.copy(), marks.rgb.copy(), marks.confidence.copy()
+        return self._map.world.landmarks.points()
 
     @property
     def world(self) -> WorldMap:

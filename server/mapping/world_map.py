@@ -45,6 +45,10 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def points(self) -> tuple[Ids, Array, NDArray[np.uint8], NDArray[np.float32]]:
+        """Return copies of ids, positions, colours and confidence."""
+        return self.ids.copy(), self.xyz.copy(), self.rgb.copy(), self.confidence.copy()
+
     def rows(self, ids: Ids) -> NDArray[np.intp]:
         """Row of each id, -1 for one that is not there."""
         if len(self.ids) == 0:

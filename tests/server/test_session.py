@@ -162,6 +162,29 @@ def test_every_frame_tells_once_what_became_of_it(demo, tmp_path):
         assert 0 < row.stage_ms["decoded_to_pose"] <= ms
 
 
+@pytest.mark.parametrize(("mode", "uses_it"), [("live", True), ("replay", False)])
+def test_time_between_two_live_frames_is_used_for_what_the_next_one_would_wait_for(
+    demo, tmp_path, mode, uses_it
+):
+    identity = StreamIdentity(
+        agent_id="a", agent_epoch=5, codec="x", digest="", camera=demo.intrinsics, num_frames=None
+    )
+    settings = ServerSettings(bundle="inline", out=tmp_path, dense_cloud="none", mode=mode)
+    session = Session(settings, identity, tmp_path, None)
+    adjusted = []
+    for k in range(8):
+        now_ns = time.perf_counter_ns()
+        frame = DecodedFrame(k, int(demo.times_ns[k]), demo.image(k), None)
+        session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}))
+        adjusted.append(session.is_adjusting)
+        session.use_time()
+        assert not session.is_adjusting
+    session.close()
+    assert any(adjusted) == uses_it
+    rows = read_rows(tmp_path / FRAMES_NAME)
+    assert any("apply" in row.stage_ms for row in rows), "it is applied in either mode"
+
+
 @pytest.mark.parametrize(("final", "source"), [(True, 4), (False, 98)])
 def test_a_source_had_as_many_frames_as_came_until_its_last(demo, final, source):
     identity = replace(IDENTITY, camera=demo.intrinsics, num_frames=98, last_frame_id=97)
