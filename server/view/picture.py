@@ -59,7 +59,7 @@ def confidence_colours(confidence: NDArray[np.float32]) -> NDArray[np.uint8]:
         uint8 RGB with one more axis, of length 3.
     """
     levels = (np.clip(np.nan_to_num(confidence, nan=0.0), 0.0, 1.0) * 255.0).astype(np.uint8)
-    return np.take(_colour_table(), levels, axis=0)
+    return np.asarray(np.take(_colour_table(), levels, axis=0), dtype=np.uint8)
 
 
 @functools.cache
