@@ -67,4 +67,4 @@ def _colour_table() -> NDArray[np.uint8]:
     """Return the colour of each of 256 levels, ``(256, 3)`` RGB."""
     stops = np.linspace(0.0, 255.0, len(CONFIDENCE_COLOURS))
     channels = [np.interp(np.arange(256), stops, channel) for channel in np.transpose(CONFIDENCE_COLOURS)]
-    return np.rint(np.stack(channels, axis=1)).astype(np.uint8)
+    return np.asarray(np.rint(np.stack(channels, axis=1)), dtype=np.uint8)
