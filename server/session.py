@@ -82,7 +82,7 @@ class Session:
         bundle: A runner made ahead by ``new_bundle``, which the session closes; None makes one.
         program: Settings of the program for the run's records; None takes ``settings``.
         on_error: Is told in a line what the stream goes on without: rows, checkpoints or images that can't be
-            written, or more of the dense cloud.
+            written, an adjustment, or more of the dense cloud.
 
     Raises:
         OSError: The folder can't be made.
@@ -105,9 +105,8 @@ class Session:
         self._folder = folder
         self._on_error = on_error
         self._reference = reference
-        bundle = bundle if bundle is not None else new_bundle(settings)
-        self._bundle = bundle
-        self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, bundle)
+        self._bundle = bundle if bundle is not None else new_bundle(settings)
+        self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, self._bundle)
         self._cloud = SessionCloud(settings, identity.camera, self._reconstruction, on_error)
         self._t_source_ns: dict[int, int] = {}
         self._numbers: dict[int, int | None] = {}
@@ -202,8 +201,13 @@ class Session:
 
         In replay that belongs to the next frame, for which it is waited for.
         """
-        if self.is_adjusting:
-            self._reconstruction.collect()
+        try:
+            if self.is_adjusting:
+                self._reconstruction.collect()
+        except Exception as err:  # on a frame's way it would cost that frame and not the stream, either
+            logger.exception("an adjustment could not be applied and is left out")
+            if self._on_error is not None:
+                self._on_error(f"an adjustment could not be applied: {err}")
 
     def process(
         self, frame: DecodedFrame, arrival: Arrival, on_pose: Callable[[FrameResult], None] | None = None
@@ -216,9 +220,8 @@ class Session:
             on_pose: Is told what the tracker found, once, as soon as it is known; the map is extended after.
         """
         self._is_concluded = False
-        quality = (
-            self._reference.psnr_db(frame.frame_id, frame.image) if self._reference is not None else None
-        )
+        reference = self._reference
+        quality = None if reference is None else reference.psnr_db(frame.frame_id, frame.image)
         tracked_ns = 0
 
         def tell(found: FrameResult) -> None:
@@ -273,9 +276,8 @@ class Session:
         if result.state is TrackingState.TRACKING:
             what = "a map has begun" if before is TrackingState.INITIALIZING else "the camera is found again"
         else:
-            what = (
-                "the camera is lost" if result.state is TrackingState.LOST else "waiting for a map to begin"
-            )
+            is_lost = result.state is TrackingState.LOST
+            what = "the camera is lost" if is_lost else "waiting for a map to begin"
         logger.info("frame %d: %s", result.frame_id, what)
 
     def _keep_image(self, frame: DecodedFrame, result: FrameResult, update: MapUpdate | None) -> None:

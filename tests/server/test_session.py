@@ -185,6 +185,32 @@ def test_time_between_two_live_frames_is_used_for_what_the_next_one_would_wait_f
     assert any("apply" in row.stage_ms for row in rows), "it is applied in either mode"
 
 
+def test_an_adjustment_that_can_not_be_applied_between_two_frames_does_not_end_the_stream(
+    demo, tmp_path, monkeypatch, caplog
+):
+    told = []
+    identity = replace(IDENTITY, camera=demo.intrinsics)
+    settings = ServerSettings(bundle="inline", out=tmp_path, dense_cloud="none")
+    session = Session(settings, identity, tmp_path, None, on_error=told.append)
+
+    def fails(self, *, wait=False):
+        self._bundle.take(wait=wait)
+        raise np.linalg.LinAlgError("singular")
+
+    with contextlib.closing(session):
+        for k in range(8):
+            now_ns = time.perf_counter_ns()
+            frame = DecodedFrame(k, int(demo.times_ns[k]), demo.image(k), None)
+            outcome = session.process(frame, Arrival(None, None, now_ns, now_ns, {}, {}))
+            with monkeypatch.context() as patch:
+                patch.setattr("semcast.server.mapping.map_builder.MapBuilder.collect", fails)
+                session.use_time()
+            assert not session.is_adjusting
+    assert outcome.result.T_world_cam is not None
+    assert set(told) == {"an adjustment could not be applied: singular"}
+    assert "could not be applied and is left out" in caplog.text
+
+
 @pytest.mark.parametrize(("final", "source"), [(True, 4), (False, 98)])
 def test_a_source_had_as_many_frames_as_came_until_its_last(demo, final, source):
     identity = replace(IDENTITY, camera=demo.intrinsics, num_frames=98, last_frame_id=97)
