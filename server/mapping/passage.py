@@ -75,7 +75,8 @@ class Passage:
         """Where a new part begins and its unit, see ``bridging.bridge``."""
         depth = usual_depth(world, self._enough)
         self._before = None
-        if not world.keyframes:
+        if not world.keyframes or motion.predict(grown.keyframes[0].t_source_ns) is None:
+            # The first part; or, after a restart of the server, one whose second will tell nothing either.
             return bridge(motion, start, grown, None, depth)
         last_ns, turned = world.keyframes[-1].t_source_ns, self._gyroscope.turned.copy()
         start_ns = start.keyframes[0].t_source_ns

@@ -96,6 +96,18 @@ def test_a_part_that_nothing_is_known_of_stays(world):
     assert passage.lay_again(world, 1) is None, "how far away is what it sees?"
 
 
+def test_a_part_that_nothing_led_to_is_not_placed_again(world):
+    """The server was started again, and its camera sees nothing of the map so far."""
+    begun = Start([keyframe(15 + k, make_transform(np.eye(3), (0, 0, 0.04 * k)), 0) for k in range(3)], *NONE)
+    passage = Passage(CAMERA, 20)
+    T, scale = passage.lay(CameraMotion(CAMERA), begun, begun, world, 1)
+    np.testing.assert_array_equal(T, np.eye(4))
+    assert scale == 1.0
+    in_front = np.random.default_rng(1).uniform((-2, -2, 7), (2, 2, 9), (len(IDS), 3))
+    add(world, [15, 18, 26], path, 1, in_front)
+    assert passage.lay_again(world, 1) is None
+
+
 def test_a_first_map_is_where_it_is():
     passage, empty = Passage(CAMERA, 20), WorldMap()
     begun = Start([keyframe(k, path(k), 0) for k in range(3)], *NONE)
