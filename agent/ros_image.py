@@ -55,7 +55,8 @@ def raw_image_file(message: RawImage) -> tuple[str, bytes]:
     """Return suffix and content of a PNG of an uncompressed image.
 
     Raises:
-        SourceError: The encoding is none of a camera, or the data are not of the size it says.
+        SourceError: The encoding is none of a camera, or the size is none that it can have, or not that of
+            the data.
     """
     encoding = message.encoding
     if encoding not in _ENCODINGS:
@@ -65,6 +66,8 @@ def raw_image_file(message: RawImage) -> tuple[str, bytes]:
     item = np.dtype(value_type).newbyteorder(">" if message.is_bigendian else "<")
     row_bytes = message.width * num_values * item.itemsize
     data = np.asarray(message.data, dtype=np.uint8)
+    if num_values == 2 and message.width % 2:  # packed: two pixels share their colour
+        raise SourceError(f"an image of {encoding} must have an even width, got {message.width}")
     if min(message.width, message.height) < 1 or message.step < row_bytes:
         raise SourceError(
             f"an image of {message.width}x{message.height} {encoding} must have rows of at least "

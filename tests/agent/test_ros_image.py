@@ -82,6 +82,12 @@ def test_a_depth_image_is_refused():
         raw_image_file(message(np.zeros((2, 2), np.uint16), "16UC1"))
 
 
+@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuv422_yuy2", "yuyv"])
+def test_half_a_pair_of_packed_pixels_is_refused(encoding):
+    with pytest.raises(SourceError, match=f"an image of {encoding} must have an even width, got 3"):
+        raw_image_file(message(np.zeros((2, 3, 2), np.uint8), encoding))
+
+
 def test_rows_shorter_than_the_image_are_refused():
     sent = message(RGB, "rgb8")
     sent.width = 3
