@@ -191,7 +191,7 @@ class RosBag:
             return None
         try:
             return _intrinsics(info, is_rectified=name.startswith("image_rect"))
-        except SourceError as err:
+        except (SourceError, ValueError) as err:  # the latter where binning leaves no pixel
             raise SourceError(f"{topic}: {err}") from err
 
     def poses(self, topic: str) -> Iterator[StampedTransform]:

@@ -92,6 +92,15 @@ def test_binned_images_of_a_part_of_the_sensor_have_their_own_camera(tmp_path):
     assert open_sequence(tmp_path / "out").stored_camera == camera
 
 
+def test_binning_that_leaves_no_pixel_is_an_error_in_a_line(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    bag.camera_info("/cam/camera_info", K, D, P, WH, binning=WH[0] + 1, time_ns=START)
+    with pytest.raises(SourceError, match="/cam/camera_info: fx must be a positive number"):
+        unpack(settings(bag, tmp_path))
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_camera_that_was_not_calibrated_is_unknown(tmp_path, caplog):
     bag = BagMaker()
     add_images(bag)
