@@ -1,6 +1,7 @@
 """The curve of a run: one line of JSON for each report and validation."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,17 @@ def cut_to_step(path: Path, step: int) -> None:
     if not path.is_file():
         return
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    kept = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step]
+    kept = [line for line in lines if line.endswith("\n") and _step_of(line) <= step]
     if len(kept) < len(lines):
         write_whole(path, "".join(kept))
+
+
+def _step_of(line: str) -> float:
+    """Return the step of a row, infinity of what is none: another row may have been added to a cut one."""
+    try:
+        return float(json.loads(line)["step"])
+    except ValueError:
+        return math.inf
 
 
 def mean_of(rows: list[dict[str, torch.Tensor]]) -> dict[str, float]:

@@ -103,8 +103,9 @@ def test_the_curve_of_a_run_that_was_killed_has_each_step_once(tiny_network, pho
     asked = iter([False, False, False, True])
     train(settings_for(photos, tmp_path), should_stop=lambda: next(asked))
     # What it would have reported after its last checkpoint, and was killed in.
+    # And another time before, when the next row was added to half a one.
     with (tmp_path / "log.jsonl").open("a") as log:
-        log.write('{"step": 4, "loss": 9.0}\n{"step": 6, "lo')
+        log.write('{"step": 4, "lo{"step": 4, "loss": 8.0}\n{"step": 4, "loss": 9.0}\n{"step": 6, "lo')
     train(settings_for(photos, tmp_path))
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [2, 4, 6]
