@@ -12,7 +12,8 @@ from semcast.common.errors import SourceError
 def new_folder(folder: Path) -> Iterator[Path]:
     """Make a folder, with those above it, to be filled in this context; an empty one may be there.
 
-    Where that ends early, by an error or Ctrl-C, all is as it was, so that the next try may use the folder.
+    Where that ends early, by an error or Ctrl-C, the folder is as it was, so that the next try may use it;
+    those above it stay.
 
     Raises:
         SourceError: It has files in it, or can't be made or written to.
