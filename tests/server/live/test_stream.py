@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import until
 
 from semcast.common.codecs import load_codec
 from semcast.common.errors import SemcastError, SourceError
@@ -114,6 +115,16 @@ def test_the_status_says_at_once_what_the_end_of_a_stream_waits_for(air, monkeyp
     assert last == "writing results"
     assert first in caplog.text
     assert depths[-1] in caplog.text
+
+
+def test_an_adjustment_is_applied_while_no_frame_comes(air):
+    running = air.serve()
+    radio = air.agent(100)
+    for k in range(10):
+        radio.stream([k])
+        session = running.server._session
+        until(lambda k=k, session=session: session.last_frame_id == k and not session.is_adjusting)
+    running.finish(stop=True)
 
 
 def test_bad_frames_are_counted_and_never_stop_the_stream(air):

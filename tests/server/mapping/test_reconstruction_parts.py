@@ -15,6 +15,7 @@ from semcast.server.mapping import reconstruction, settings
 from semcast.server.mapping.initialiser import MIN_POINTS
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.relocalisation import Place, Relocaliser
 from semcast.server.mapping.state import TrackingState
@@ -215,6 +216,35 @@ def test_a_part_begun_after_a_turn_is_not_taken_for_the_old_one(caplog, monkeypa
     for keyframe in world.keyframes:
         row = world.landmarks.rows(keyframe.ids)
         assert (world.landmarks.submap[row[row >= 0]] == keyframe.submap).all()
+
+
+def test_a_part_after_a_turn_in_bad_images_begins_as_they_say_and_gets_its_unit_after_a_second(monkeypatch):
+    """The camera turns by 56 degrees where no point can be followed; a start makes the part too large."""
+    lay, rng = Passage.lay, np.random.default_rng(0)
+
+    def laid_too_large(passage, *how):
+        T_world_ref, scale = lay(passage, *how)
+        return T_world_ref, scale if passage._before is None else 1.5 * scale
+
+    monkeypatch.setattr(Passage, "lay", laid_too_large)
+    on, turning = (make_transform(exp_so3((0, np.radians(a), 0)), (0.12, 0, 0)) for a in (0.0, 3.5))
+    truth = [np.eye(4)]
+    for step in [on] * 9 + [turning] * 16 + [on] * 16:
+        truth.append(truth[-1] @ step)
+    core, results = make(lost_after_s=0.05), []
+    for k, T in enumerate(truth):
+        image = render(T)
+        if 10 <= k < 26:
+            noise = rng.normal(0.0, 30.0, (*CAMERA.shape_hw, 1))
+            image = np.clip(cv2.GaussianBlur(image, None, 10.0) + noise, 0, 255).astype(np.uint8)
+        results.append(core.process(frame_of(k, image)))
+    assert all(r.T_world_cam is None for r in results[11:26])
+    assert (results[9].submap, results[-1].submap, results[-1].state) == (0, 1, TrackingState.TRACKING)
+    found = core.final_trajectory()
+    turned, truly_turned = (T[5][:3, :3].T @ T[30][:3, :3] for T in (found, truth))
+    assert rotation_angle_deg(turned.T @ truly_turned) < 16.0, "without a look at them half of it is missed"
+    before, after = (np.linalg.norm(found[k + 6][:3, 3] - found[k][:3, 3]) for k in (2, 34))
+    assert after == pytest.approx(before, rel=0.2)
 
 
 def test_a_place_without_a_pose_gives_nothing_up(room, monkeypatch):
