@@ -77,6 +77,8 @@ class CameraMotion:
     def correct(self, T_world_cam: Array, scale: float = 1.0) -> None:
         """Replace the last pose after the map has moved; the motion in the camera's frame stays."""
         self._motion.correct(T_world_cam, scale)
+        if scale != 1.0:
+            self._recent = []  # poses in another unit: whether the camera rests has to show anew
         if self._moving is not None:
             self._moving = (self._moving[0], T_world_cam.copy())
 

@@ -187,6 +187,18 @@ def test_a_camera_rests_when_the_image_has_hardly_moved_for_a_second():
     assert not motion.rests
 
 
+def test_a_camera_that_moves_does_not_rest_where_the_map_gets_another_unit():
+    """A quarter as large, the map has the camera pass where it was a second ago, in the unit of before."""
+    motion = CameraMotion(CAMERA)
+    for k in range(40):
+        scale = 1.0 if k <= 12 else 0.25
+        T = make_transform(np.eye(3), (0.1 * scale * k, 0.0, 0.0))
+        motion.observe(k, k * FRAME_NS, T, scale * POINTS)
+        assert not motion.rests, k
+        if k == 12:
+            motion.correct(make_transform(np.eye(3), (0.025 * k, 0.0, 0.0)), 0.25)
+
+
 def test_a_camera_whose_image_stopped_at_once_may_have_gone_on_and_does_not_rest():
     motion = CameraMotion(CAMERA)
     go(motion, [*np.linspace(0.0, 2.0, 11), *[2.0] * 30])
