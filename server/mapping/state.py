@@ -114,7 +114,7 @@ class MapUpdate:
         removed: ``(M,)`` int64, landmarks that are gone.
         keyframe_ids: ``(K,)`` int64 frame ids of keyframes added or moved.
         keyframe_poses: ``(K, 4, 4)`` their ``T_world_cam``.
-        frame_ids: ``(F,)`` int64, frames that moved otherwise than with their keyframe: when submaps joined.
+        frame_ids: ``(F,)`` int64, frames that moved otherwise than with their keyframe: in scale, too.
         frame_poses: ``(F, 4, 4)`` their ``T_world_cam``.
         withdrawn: ``(W,)`` int64, frames whose pose was taken back.
     """
