@@ -56,7 +56,7 @@ class TransformHistory:
         return times_ns, np.array(self._transforms)[first]
 
     @cached_property
-    def _for_all_times(self) -> Array | None:
+    def for_all_times(self) -> Array | None:
         """What holds at all times, also because it is said over and over, as ROS 1 does of what is rigid."""
         if self._fixed is None and len(self._in_order[0]) > 1:
             transforms = self._in_order[1]
@@ -64,9 +64,10 @@ class TransformHistory:
         return self._fixed
 
     def at(self, time_ns: int) -> Array | None:
-        """Return the transform at a time, ``(4, 4)``; None where there is none within reach."""
-        if self._for_all_times is not None:
-            return self._for_all_times
+        """Return the transform at a time, ``(4, 4)``, by those around it; None where none is within reach.
+
+        What holds ``for_all_times`` is passed over: a body that is seen at rest may be gone afterwards.
+        """
         times_ns, transforms = self._in_order
         right = int(np.searchsorted(times_ns, time_ns))
         if right < len(times_ns) and times_ns[right] == time_ns:
@@ -157,7 +158,8 @@ class FrameTree:
         for name, parent in pairwise(up):
             if name == ancestor:
                 break
-            step = self._edges[name][parent].at(time_ns)
+            edge = self._edges[name][parent]
+            step = edge.at(time_ns) if edge.for_all_times is None else edge.for_all_times
             if step is None:
                 return None
             T_ancestor_frame = step @ T_ancestor_frame

@@ -222,11 +222,12 @@ def test_what_a_tracker_says_that_lost_its_body_is_no_pose(tmp_path, caplog):
     assert "/tf: 'wheel' in 'map' is left out" in caplog.text
 
 
-def test_images_without_a_pose_have_none(tmp_path):
+@pytest.mark.parametrize("speed", [1.0, 0.0], ids=["moving", "at rest"])
+def test_images_without_a_pose_have_none(speed, tmp_path):
     bag = BagMaker()
     add_images(bag)
     for k in range(3):
-        bag.pose("/mocap", "room", (1.0 * k, 0.0, 0.0), START + k * STEP)
+        bag.pose("/mocap", "room", (speed * k, 0.0, 0.0), START + k * STEP)
     assert unpack(settings(bag, tmp_path, truth="/mocap")).num_poses == 3
 
 
