@@ -39,6 +39,8 @@ _DAMAGED_SHARE, _DAMAGED_APART = 0.5, 5
 #: the second on, or so many frames after the last keyframe, another one says something new; beyond the third
 #: the view is another.
 _STANDING_WIDTHS, _CHANGING_WIDTHS, _APART, _MOVED_WIDTHS = 0.004, 0.02, 2, 0.045
+#: Ways between keyframes below this share of how far things are tell no scale.
+_LEAST_WAY = 0.002
 #: Observations in a row that disagree before a landmark is given up.
 _MAX_MISSED = 4
 
@@ -346,13 +348,19 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
 
 
 def local_scales(result: BundleResult) -> Array:
-    """Factor on lengths around each keyframe, ``(K,)``: on the ways to those before and after it; 1 if fixed.
+    """Factor on lengths around each keyframe, ``(K,)``: on the ways to those before and after it.
 
-    Depths of its landmarks tell less: they change by what the camera itself is moved by, too.
+    It is 1 if the keyframe is fixed, or if these ways are next to nothing, as of a camera that turns on the
+    spot: how they change is chance. Depths of landmarks tell less: they change by what the camera itself is
+    moved by, too.
     """
     problem = result.problem
+    depth = float(
+        np.median(depths_in(invert_transform(problem.T_world_cam)[problem.view], problem.xyz[problem.point]))
+    )
     before, after = _ways(problem.T_world_cam), _ways(result.T_world_cam)
-    return np.where(problem.fixed | (before == 0.0), 1.0, after / np.where(before == 0.0, 1.0, before))
+    is_told = ~problem.fixed & (before > _LEAST_WAY * depth)
+    return np.where(is_told, after / np.where(is_told, before, 1.0), 1.0)
 
 
 def _ways(T_world_cam: Array) -> Array:

@@ -185,6 +185,9 @@ def test_scale_around_a_keyframe_is_that_of_the_ways_to_its_neighbours():
     first_fixed = replace(problem, T_world_cam=at([0, 1, 2, 5, 5]), fixed=np.arange(5) == 0)
     result = replace(optimise(problem), problem=first_fixed, T_world_cam=at([0, 2, 3, 9, 9]))
     np.testing.assert_allclose(local_scales(result), [1.0, 3 / 2, 7 / 4, 6 / 3, 1.0])
+    # Things are five to ten away: ways of a thousandth are chance, of whatever share they change.
+    turning = replace(result, problem=replace(first_fixed, T_world_cam=at([0.0, 0.001, 0.002, 0.003, 0.004])))
+    np.testing.assert_array_equal(local_scales(turning), np.ones(5))
 
 
 def test_the_fit_finds_the_noise_that_is_there_and_not_what_its_own_weights_make():
