@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,10 +112,9 @@ class RosBag:
         """Time from the first message to the last."""
         return self._reader.duration * 1e-9 if self._reader.message_count else 0.0
 
-    def counts(self, *kinds: str) -> dict[str, int]:
-        """Return topic -> number of messages, of topics of a kind: ``image``, ``pose``."""
-        types = {"image": (_RAW, _COMPRESSED), "pose": tuple(_POSES)}
-        wanted = {name for kind in kinds for name in types[kind]}
+    def counts(self, kind: Literal["image", "pose"]) -> dict[str, int]:
+        """Return topic -> number of messages, of topics of a kind."""
+        wanted = (_RAW, _COMPRESSED) if kind == "image" else tuple(_POSES)
         counts: dict[str, int] = {}
         for connection in self._reader.connections:
             if connection.msgtype in wanted:

@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 from semcast.common.errors import SourceError
-from semcast.common.ros_bag_files import check_no_ros_bag
+from semcast.common.ros_bag_files import MCAP_MAGIC, check_no_ros_bag
 
 logger = logging.getLogger(__name__)
 
-MAGIC = bytes((0x89, 0x4D, 0x43, 0x41, 0x50, 0x30, 0x0D, 0x0A))
 MESSAGE_ENCODING = "msgpack"
 SCHEMA_PREFIX = "semcast."
 #: Name of the metadata record every recording starts with.
@@ -155,7 +154,7 @@ class RecordingScan:
         Raises:
             SourceError: The file is no recording, or a chunk is damaged.
         """
-        if self._stream.read(len(MAGIC)) != MAGIC:
+        if self._stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             raise SourceError(f"{self._name} is not a recording: it does not start as an MCAP file")
         try:
             while True:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from semcast.common.errors import SourceError
 
-_MCAP_MAGIC = b"\x89MCAP0\r\n"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 #: After the magic: opcode of the header and its length, then the length of the profile's name.
 _MCAP_HEAD = struct.Struct("<BQI")
 
@@ -21,9 +21,9 @@ def is_ros_bag(path: Path) -> bool:
         start = _start_of(path)
     except OSError:
         return False
-    if start.startswith(_MCAP_MAGIC) and len(start) >= len(_MCAP_MAGIC) + _MCAP_HEAD.size:
-        _, _, length = _MCAP_HEAD.unpack_from(start, len(_MCAP_MAGIC))
-        begin = len(_MCAP_MAGIC) + _MCAP_HEAD.size
+    if start.startswith(MCAP_MAGIC) and len(start) >= len(MCAP_MAGIC) + _MCAP_HEAD.size:
+        _, _, length = _MCAP_HEAD.unpack_from(start, len(MCAP_MAGIC))
+        begin = len(MCAP_MAGIC) + _MCAP_HEAD.size
         return start[begin : begin + length] in (b"ros1", b"ros2")
     return path.suffix.lower() in (".bag", ".db3")
 
