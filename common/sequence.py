@@ -18,7 +18,7 @@ from semcast.common.image_file import bit_depth_of, read_image
 from semcast.common.playback import check_playback, usual_period_ns
 from semcast.common.sequence_layouts import Layout, SequenceFiles, ns_to_seconds, read_layout
 from semcast.common.sequence_sizes import size_in_header_wh, states_16_bits
-from semcast.common.trajectory import Trajectory
+from semcast.common.trajectory import Trajectory, read_tum
 
 logger = logging.getLogger(__name__)
 
@@ -264,6 +264,19 @@ def open_truth(path: Path) -> tuple[Trajectory | None, NDArray[np.int64]]:
     """
     files = read_layout(path, "auto", 10.0)
     return _truth_of(files, files.times_ns), files.times_ns
+
+
+def read_known_path(path: Path) -> Trajectory:
+    """Return the path in a TUM file, or the true path of a sequence.
+
+    Raises:
+        SourceError: It can't be read, or the sequence has none.
+    """
+    is_tum = path.is_file() and path.suffix.lower() != ".json"
+    truth = read_tum(path) if is_tum else open_truth(path)[0]
+    if truth is None:
+        raise SourceError(f"{path} is a sequence without a true path")
+    return truth
 
 
 def truth_at_frames(truth: Trajectory, times_ns: NDArray[np.int64], period_s: float) -> Trajectory | None:

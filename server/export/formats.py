@@ -4,12 +4,15 @@ import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
+
 from semcast.common.errors import ConfigError, SemcastError, SourceError
-from semcast.common.run_folder import RunData, read_image_paths, read_run
+from semcast.common.run_folder import DENSE_NAME, RunData, read_image_paths, read_run
 from semcast.server.export.colmap import write_colmap
 from semcast.server.export.nerfstudio import write_nerfstudio
-from semcast.server.export.outputs import write_ply
+from semcast.server.export.outputs import MAP_FRAME, read_ply, write_ply
 from semcast.server.export.parts import ALL, LARGEST, count_parts, parts_line, select_part
+from semcast.server.export.placement import Placement
 from semcast.server.export.poses import write_run_kitti, write_run_tum
 
 logger = logging.getLogger(__name__)
@@ -19,6 +22,7 @@ FORMATS = {
     "tum": "FILE with 't tx ty tz qx qy qz qw' (evo)",
     "kitti": "FILE with 3x4 poses, times and frame ids beside it (evo)",
     "ply": "FILE with the points (CloudCompare, MeshLab, Open3D)",
+    "dense": "FILE with the points of the dense cloud (the same)",
     "colmap": "FOLDER with sparse/0/*.txt and images/ (COLMAP, pycolmap)",
     "nerfstudio": "FOLDER with transforms.json, points and images/ (nerfstudio, gsplat)",
     "rrd": "FILE for the Rerun viewer",
@@ -29,7 +33,13 @@ FORMATS = {
 _MARKS = {"colmap": "sparse/0/points3D.txt", "nerfstudio": "points3D.ply"}
 
 
-def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> list[Path]:
+#: Finds the frame to export in, from a run of one part and the images it kept.
+FindPlacement = Callable[[RunData, Mapping[int, Path]], Placement]
+
+
+def export_run(
+    folder: Path, format_name: str, out: Path, part: str = ALL, find_placement: FindPlacement | None = None
+) -> list[Path]:
     """Write a run in another tool's format; returns the files a person opens.
 
     Several parts in one model are told as a warning.
@@ -39,10 +49,11 @@ def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> li
         format_name: One of ``FORMATS``.
         out: File or folder, as ``FORMATS`` says.
         part: Part of the map: its number, ``largest`` or ``all``.
+        find_placement: Where another frame and unit than the map's own come from.
 
     Raises:
-        SourceError: The run can't be read, has no such part, or lacks what the format needs.
-        ConfigError: ``out`` is a folder with somebody else's images.
+        SourceError: The run can't be read, has no such part, lacks what the format needs, or can't be placed.
+        ConfigError: ``out`` is a folder with somebody else's images, or parts or format can't be placed.
         SemcastError: ``out`` can't be written.
         ValueError: ``format_name`` is none of ``FORMATS``, or ``part`` neither a number nor a word for parts.
     """
@@ -52,8 +63,20 @@ def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> li
     if len(data.frame_ids) == 0:
         raise SourceError(f"{folder} has no posed frame, so there is nothing to export")
     parts = parts_line(count_parts(data.frame_submap.tolist()))
+    whole = parts is None or part == ALL
+    if format_name == "dense" and not whole:
+        raise ConfigError("--part must be all for --format dense: its points do not know their part")
     data = select_part(data, part)
     images = read_image_paths(folder)
+    placement = None
+    if find_placement is not None:
+        if format_name == "rrd":
+            raise ConfigError("--format rrd shows the map in its own frame, without --align or --marker-m")
+        if parts is not None and part == ALL:
+            raise ConfigError(f"--part must name one part, each has its own scale: {parts}")
+        placement = find_placement(data, images)
+        logger.info("%s", placement.words)
+        data = placement.run(data)
     if FORMATS[format_name].startswith("FILE") and out.is_dir():
         raise SourceError(f"{out} is a folder; --format {format_name} writes a file")
     if FORMATS[format_name].startswith("FOLDER") and out.is_file():
@@ -61,11 +84,12 @@ def export_run(folder: Path, format_name: str, out: Path, part: str = ALL) -> li
     writers: dict[str, Callable[[], list[Path]]] = {
         "tum": lambda: write_run_tum(out, data),
         "kitti": lambda: write_run_kitti(out, data),
-        "ply": lambda: _write_run_ply(out, data),
+        "ply": lambda: _write_run_ply(out, data, placement),
+        "dense": lambda: _write_run_dense(out, folder, placement),
         "colmap": lambda: write_colmap(out, data, images),
-        "nerfstudio": lambda: write_nerfstudio(out, data, images),
+        "nerfstudio": lambda: write_nerfstudio(out, data, images, placement.frame if placement else None),
         # The server's own recording shows all parts.
-        "rrd": lambda: _write_run_rrd(out, folder, data, images, copy=parts is None or part == ALL),
+        "rrd": lambda: _write_run_rrd(out, folder, data, images, copy=whole),
     }
     if parts is not None and part == ALL:
         logger.warning("parts of the map: %s; --part %s writes one that fits together", parts, LARGEST)
@@ -99,9 +123,26 @@ def _check_not_foreign(out: Path, format_name: str, images: Mapping[int, Path]) 
         raise ConfigError(f"out must hold no images of others, there is {foreign[0]}: give another folder")
 
 
-def _write_run_ply(path: Path, data: RunData) -> list[Path]:
+def _write_run_ply(path: Path, data: RunData, placement: Placement | None) -> list[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_ply(path, data.xyz, data.rgb, data.confidence)
+    write_ply(path, data.xyz, data.rgb, data.confidence, frame=placement.frame if placement else MAP_FRAME)
+    return [path]
+
+
+def _write_run_dense(path: Path, folder: Path, placement: Placement | None) -> list[Path]:
+    if not (folder / DENSE_NAME).is_file():
+        raise SourceError(f"{folder} has no dense cloud; run again with --dense-cloud live or end")
+    cloud = read_ply(folder / DENSE_NAME)
+    xyz = np.stack([cloud[axis] for axis in "xyz"], axis=1)
+    rgb = np.stack([cloud[colour] for colour in ("red", "green", "blue")], axis=1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_ply(
+        path,
+        placement.points(xyz) if placement else xyz,
+        rgb,
+        cloud["confidence"],
+        frame=placement.frame if placement else MAP_FRAME,
+    )
     return [path]
 
 

@@ -21,11 +21,19 @@ from semcast.server.export.outputs import write_ply
 T_up_world = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
-def write_nerfstudio(folder: Path, data: RunData, images: Mapping[int, Path]) -> list[Path]:
+def write_nerfstudio(
+    folder: Path, data: RunData, images: Mapping[int, Path], frame: str | None = None
+) -> list[Path]:
     """Write ``images/`` of all posed frames whose image was kept, ``points3D.ply`` and ``transforms.json``.
 
     Each file is whole or not there, and ``transforms.json``, which names the others, comes last.
     Poses and points are in the world with z up; ``applied_transform`` says how it came from ours.
+
+    Args:
+        folder: Where to write.
+        data: The run.
+        images: Frame id to file of the kept images.
+        frame: What axes and unit of ``data`` are, where these are not the map's own: they stay.
 
     Raises:
         SourceError: The run kept no images.
@@ -36,12 +44,13 @@ def write_nerfstudio(folder: Path, data: RunData, images: Mapping[int, Path]) ->
     folder.mkdir(parents=True, exist_ok=True)
     copy_images(images, frame_ids, folder / "images")
     c = data.intrinsics
+    T_out_world = T_up_world if frame is None else np.eye(4)
     row_of = {frame_id: k for k, frame_id in enumerate(data.frame_ids.tolist())}
     frames = []
     for frame_id in frame_ids:
-        T_up_opengl = T_up_world @ data.T_world_cam[row_of[frame_id]] @ T_opencv_opengl
+        T_out_opengl = T_out_world @ data.T_world_cam[row_of[frame_id]] @ T_opencv_opengl
         frames.append(
-            {"file_path": f"images/{image_name(frame_id)}", "transform_matrix": T_up_opengl.tolist()}
+            {"file_path": f"images/{image_name(frame_id)}", "transform_matrix": T_out_opengl.tolist()}
         )
     content = {
         "camera_model": "OPENCV",
@@ -55,17 +64,17 @@ def write_nerfstudio(folder: Path, data: RunData, images: Mapping[int, Path]) ->
         "k2": 0.0,
         "p1": 0.0,
         "p2": 0.0,
-        "applied_transform": T_up_world[:3].tolist(),
+        "applied_transform": T_out_world[:3].tolist(),
         "ply_file_path": "points3D.ply",
         "frames": frames,
     }
     transforms, points = folder / "transforms.json", folder / "points3D.ply"
     write_ply(
         points,
-        transform_points(T_up_world, data.xyz),
+        transform_points(T_out_world, data.xyz),
         data.rgb,
         data.confidence,
-        axes="z up, y forward of the first camera",
+        frame=frame or "z up, y forward of the first camera; map units",
     )
     write_whole(transforms, json.dumps(content, indent=1) + "\n")
     return [transforms, points]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semcast import __version__
-from semcast.common.errors import SemcastError
+from semcast.common.errors import SemcastError, SourceError
 from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.whole_file import write_whole
@@ -33,6 +33,10 @@ PLY_VERTEX = np.dtype(
     ]
 )
 _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
+_PLY_START = ("ply", "format binary_little_endian 1.0")
+_PLY_END = b"end_header\n"
+#: Axes and unit of a map.
+MAP_FRAME = "x right, y down, z forward of the first camera; map units"
 
 
 class EachFile:
@@ -70,7 +74,7 @@ def write_ply(
     rgb: NDArray[np.uint8],
     confidence: NDArray[np.float32],
     *,
-    axes: str = "x right, y down, z forward of the first camera",
+    frame: str = MAP_FRAME,
 ) -> None:
     """Write landmarks as binary PLY with colour and a ``confidence`` property in [0, 1], whole or not at all.
 
@@ -81,7 +85,7 @@ def write_ply(
         xyz: ``(N, 3)`` in the world frame, map units.
         rgb: ``(N, 3)``.
         confidence: ``(N,)``.
-        axes: What the world's axes are, for the comment in the file.
+        frame: What axes and unit are, for the comment in the file.
     """
     points = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
     finite = np.isfinite(points).all(axis=1)
@@ -93,14 +97,31 @@ def write_ply(
     vertices["confidence"] = confidence[finite]
     properties = [f"property {_PLY_TYPES[PLY_VERTEX[name].str]} {name}" for name in PLY_VERTEX.names or ()]
     header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"comment semcast map; {axes}; map units",
+        *_PLY_START,
+        f"comment semcast map; {frame}",
         f"element vertex {len(vertices)}",
         *properties,
-        "end_header",
     ]
-    write_whole(path, "\n".join(header).encode("ascii") + b"\n" + vertices.tobytes())
+    write_whole(path, "\n".join(header).encode("ascii") + b"\n" + _PLY_END + vertices.tobytes())
+
+
+def read_ply(path: Path) -> NDArray[np.void]:
+    """Read what ``write_ply`` wrote; returns ``(N,)`` of ``PLY_VERTEX``.
+
+    Raises:
+        SourceError: The file can't be read, or isn't one of ours.
+    """
+    try:
+        header, end, body = path.read_bytes().partition(_PLY_END)
+    except OSError as err:
+        raise SourceError(f"{path} can't be read: {err.strerror}") from err
+    lines = header.decode("ascii", errors="replace").splitlines()
+    names = tuple(line.split()[-1] for line in lines if line.startswith("property "))
+    if not end or tuple(lines[:2]) != _PLY_START or names != PLY_VERTEX.names:
+        raise SourceError(f"{path} is not a cloud that semcast wrote")
+    if len(body) % PLY_VERTEX.itemsize or f"element vertex {len(body) // PLY_VERTEX.itemsize}" not in lines:
+        raise SourceError(f"{path} is damaged: {len(body)} bytes do not hold the points that it promises")
+    return np.frombuffer(body, dtype=PLY_VERTEX)
 
 
 def trajectory_of(poses: Mapping[int, NDArray[np.float64]], t_source_ns: Mapping[int, int]) -> Trajectory:

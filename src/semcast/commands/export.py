@@ -3,11 +3,15 @@
 import argparse
 import re
 import sys
+from typing import TYPE_CHECKING
 
 from semcast.commands.paths import named_path
 
+if TYPE_CHECKING:
+    from semcast.server.export.formats import FindPlacement
+
 #: Kept here so that ``--help`` loads neither numpy nor OpenCV; a test holds it equal to the server's list.
-FORMATS = ("tum", "kitti", "ply", "colmap", "nerfstudio", "rrd")
+FORMATS = ("tum", "kitti", "ply", "dense", "colmap", "nerfstudio", "rrd")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--format",
         choices=FORMATS,
         required=True,
-        help="tum, kitti: poses; ply: points; colmap, nerfstudio: a folder with poses, points and images; "
-        "rrd: for the Rerun viewer",
+        help="tum, kitti: poses; ply: points; dense: those of the dense cloud; colmap, nerfstudio: a folder "
+        "with poses, points and images; rrd: for the Rerun viewer",
     )
     parser.add_argument(
         "--part",
@@ -28,6 +32,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="all",
         metavar="N|largest|all",
         help="part of the map; 'semcast info RUN' lists them where there are several (default: all)",
+    )
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument(
+        "--align",
+        type=named_path,
+        metavar="PATH",
+        help="export in the frame and unit of this known path of the camera: a TUM file on the same clock, "
+        "or a sequence with a true path",
+    )
+    place.add_argument(
+        "--marker-m",
+        type=float,
+        metavar="SIDE",
+        help="export in metres and in the frame of a printed square marker that the kept images show, whose "
+        "black square has this side: origin in its middle, x right, y up, z out of it",
+    )
+    parser.add_argument(
+        "--marker-dictionary",
+        metavar="NAME",
+        help="the marker's family, as OpenCV names them: 4x4_50, aruco_original ... (default apriltag_36h11)",
+    )
+    parser.add_argument(
+        "--marker-id",
+        type=int,
+        metavar="N",
+        help="number of the marker; by default the one that is in most images",
     )
     parser.add_argument(
         "--out", type=named_path, required=True, metavar="PATH", help="file or folder to write"
@@ -40,6 +70,30 @@ def _part(word: str) -> str:
     return word
 
 
+def _placement(arguments: argparse.Namespace) -> "FindPlacement | None":
+    """Return what finds the frame to export in, None for the map's own."""
+    from semcast.common.errors import ConfigError
+    from semcast.server.export.placement import place_by_path
+
+    if arguments.marker_m is None:
+        for option in ("marker_dictionary", "marker_id"):
+            if getattr(arguments, option) is not None:
+                raise ConfigError(f"--{option.replace('_', '-')} needs --marker-m")
+    if arguments.align is not None:
+        from semcast.common.sequence import read_known_path
+
+        known = read_known_path(arguments.align)
+        return lambda data, _: place_by_path(data, known)
+    if arguments.marker_m is not None:
+        from semcast.server.export.markers import DEFAULT_DICTIONARY, place_by_marker
+
+        dictionary = arguments.marker_dictionary or DEFAULT_DICTIONARY
+        return lambda data, images: place_by_marker(
+            data, images, arguments.marker_m, dictionary, arguments.marker_id
+        )
+    return None
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Write the export and name its files on stdout."""
     from semcast.common.errors import ConfigError
@@ -49,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.out.resolve() == arguments.run.resolve():
         raise ConfigError(f"--out must be another place than the run itself, got {arguments.out}")
-    files = export_run(arguments.run, arguments.format, arguments.out, arguments.part)
+    files = export_run(arguments.run, arguments.format, arguments.out, arguments.part, _placement(arguments))
     data = select_part(read_run(arguments.run), arguments.part)
     print(
         f"{len(data.frame_ids)} posed frames, {len(data.keyframe_ids)} keyframes, "

@@ -31,21 +31,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw the pictures and name their files on stdout."""
-    from semcast.common.errors import SourceError
     from semcast.common.run_folder import FRAMES_NAME
     from semcast.common.run_summary import read_summary
-    from semcast.common.sequence import open_truth, retimed
-    from semcast.common.trajectory import read_tum
+    from semcast.common.sequence import open_truth, read_known_path, retimed
     from semcast.evaluation.run_plots import RunToPlot, plot_run
     from semcast.server.frame_rows import read_rows
 
     folder: Path = arguments.run
     truth = None
     if arguments.truth is not None:
-        is_tum = arguments.truth.is_file() and arguments.truth.suffix.lower() != ".json"
-        truth = read_tum(arguments.truth) if is_tum else open_truth(arguments.truth)[0]
-        if truth is None:
-            raise SourceError(f"{arguments.truth} is a sequence without a true path")
+        truth = read_known_path(arguments.truth)
     else:
         reference = read_summary(folder).get("settings", {}).get("reference")
         if reference and Path(reference).exists():
