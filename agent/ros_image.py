@@ -88,7 +88,8 @@ def raw_image_file(message: RawImage) -> tuple[str, bytes]:
         )
     if len(data) != message.step * num_rows:
         raise SourceError(
-            f"{num_rows} rows of {message.step} bytes must be {message.step * num_rows} bytes, got {len(data)}"
+            f"{num_rows} rows of {message.step} bytes must be {message.step * num_rows} bytes, "
+            f"got {len(data)}"
         )
     rows = np.ascontiguousarray(data.reshape(num_rows, message.step)[:, :row_bytes])
     pixels: NDArray = rows.view(item).astype(value_type).reshape(num_rows, message.width, num_values)

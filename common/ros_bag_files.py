@@ -12,10 +12,11 @@ _MCAP_HEAD = struct.Struct("<BQI")
 
 
 def is_ros_bag(path: Path) -> bool:
-    """Tell whether a path is a bag: ``.bag``, ``.db3``, an ``.mcap`` of ROS, a folder of ROS 2's or of parts."""
+    """Tell whether a path is a bag: ``.bag``, ``.db3``, an ``.mcap`` of ROS, a folder of ROS 2's or parts."""
     try:
         if path.is_dir():
-            return bag_parts(path) != [path] or b"rosbag2_bagfile_information" in _start_of(path / "metadata.yaml")
+            is_split = bag_parts(path) != [path]
+            return is_split or b"rosbag2_bagfile_information" in _start_of(path / "metadata.yaml")
         if not path.is_file():
             return False
         start = _start_of(path)
@@ -29,7 +30,7 @@ def is_ros_bag(path: Path) -> bool:
 
 
 def bag_parts(path: Path) -> list[Path]:
-    """Return the files of a folder of nothing but ``.bag``, as ROS 1 splits its bags; else the path itself."""
+    """Return the files of a folder of nothing but ``.bag``, as ROS 1 splits one; else the path itself."""
     inside = sorted(path.iterdir()) if path.is_dir() else []
     is_split = all(part.suffix.lower() == ".bag" for part in inside)
     return inside if inside and is_split else [path]
