@@ -108,12 +108,12 @@ def test_images_are_read_by_name_as_rgb(tmp_path):
 def test_images_are_read_as_an_agent_reads_them_and_what_is_none_is_told(tmp_path, caplog):
     clear = np.zeros((32, 40, 4), np.uint8)  # black, and not to be seen: laid on white
     cv2.imwrite(str(tmp_path / "a.png"), clear)
-    (tmp_path / "b.jpg").write_bytes(b"damaged")
+    (tmp_path / "0.jpg").write_bytes(b"damaged")
     (image,) = read_images(tmp_path)
     assert image.min() == 255
     assert image.flags.c_contiguous, "crops of others can't be resized"
     assert "left out: " in caplog.text
-    assert "b.jpg is not a readable image" in caplog.text
+    assert "0.jpg is not a readable image" in caplog.text
 
 
 def test_images_too_small_to_start_from_are_refused(tmp_path):
