@@ -201,9 +201,9 @@ def test_transforms_of_a_namespace_are_those_of_what_lies_in_it(images, tmp_path
     bag = BagMaker()
     add_images(bag, images)
     for k in range(5):
-        bag.transform("/red/tf", "map", "base", (1.0 * k, 0.0, 0.0), START + k * STEP)
         if images.startswith("/red"):  # of another robot, whose frames have the same names
             bag.transform("/blue/tf", "map", "base", (0.0, 9.0, 9.0), START + k * STEP)
+        bag.transform("/red/tf", "map", "base", (1.0 * k, 0.0, 0.0), START + k * STEP)
     bag.transform("/red/tf_static", "base", "cam", (0.0, 2.0, 0.0), START)
     unpack(settings(bag, tmp_path, truth="map"))
     positions = open_sequence(tmp_path / "out").groundtruth().positions
