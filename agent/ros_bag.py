@@ -22,7 +22,7 @@ from semcast.agent.ros_image import compressed_image_file, raw_image_file
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, rotation_from_quat_wxyz
-from semcast.common.ros_bag_files import is_ros_bag
+from semcast.common.ros_bag_files import bag_parts, is_ros_bag
 
 logger = logging.getLogger(__name__)
 
@@ -31,8 +31,8 @@ Array = NDArray[np.float64]
 _RAW, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-#: Topics of tf, and whether what they say holds for all times.
-_TF_TOPICS = {"/tf": False, "/tf_static": True}
+#: Last names of the topics of tf, and whether what they say holds for all times.
+_TF_TOPICS = {"tf": False, "tf_static": True}
 #: Message with a pose -> where in it the pose is.
 _POSES = {
     "geometry_msgs/msg/PoseStamped": "pose",
@@ -66,7 +66,8 @@ class RosBag:
     """A bag that is open.
 
     Args:
-        path: ``.bag`` of ROS 1, folder with ``metadata.yaml``, ``.mcap`` or ``.db3`` of ROS 2.
+        path: ``.bag`` of ROS 1, or a folder of the parts of one; folder with ``metadata.yaml``, ``.mcap`` or
+            ``.db3`` of ROS 2.
 
     Raises:
         SourceError: There is no bag that can be read.
@@ -79,7 +80,7 @@ class RosBag:
         try:
             with self._said():
                 # Bags of ROS 2 before Iron don't hold the definitions of their messages.
-                self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+                self._reader = AnyReader(bag_parts(path), default_typestore=get_typestore(Stores.LATEST))
                 self._reader.open()
         except SourceError as err:
             if is_ros_bag(path):
@@ -209,16 +210,25 @@ class RosBag:
             time_ns = _stamp_ns(message.header) or recorded_ns
             yield message.header.frame_id, getattr(message, "child_frame_id", ""), time_ns, pose
 
-    def transforms(self) -> Iterator[StampedTransform]:
-        """Yield what ``/tf`` and ``/tf_static`` say; as in ROS, but for what is no transform."""
-        yield from _valid_transforms("/tf", self._transforms())
+    def transforms(self, near: str = "") -> Iterator[StampedTransform]:
+        """Yield what ``tf`` and ``tf_static`` say; as in ROS, but for what is no transform.
 
-    def _transforms(self) -> Iterator[tuple[str, str, int | None, Any]]:
-        for connection, recorded_ns, message in self._messages(set(_TF_TOPICS)):
-            if connection.msgtype not in _TF_TYPES:
-                continue
+        Args:
+            near: A topic. Of several namespaces those count that it lies in, if there are such: robots of a
+                team may have frames of the same names.
+        """
+        topics = {
+            c.topic
+            for c in self._reader.connections
+            if c.msgtype in _TF_TYPES and c.topic.rpartition("/")[2] in _TF_TOPICS
+        }
+        around = {topic for topic in topics if near.startswith(topic.rpartition("/")[0] + "/")}
+        yield from _valid_transforms("tf", self._transforms(around or topics))
+
+    def _transforms(self, topics: set[str]) -> Iterator[tuple[str, str, int | None, Any]]:
+        for connection, recorded_ns, message in self._messages(topics):
             for said in message.transforms:
-                is_fixed = _TF_TOPICS[connection.topic]
+                is_fixed = _TF_TOPICS[connection.topic.rpartition("/")[2]]
                 time_ns = None if is_fixed else _stamp_ns(said.header) or recorded_ns
                 yield said.header.frame_id, said.child_frame_id, time_ns, said.transform
 

@@ -24,11 +24,19 @@ _ENCODINGS: dict[str, tuple[int, type, int | None]] = {
     "bayer_bggr8": (1, np.uint8, cv2.COLOR_BayerBGGR2BGR),
     "bayer_gbrg8": (1, np.uint8, cv2.COLOR_BayerGBRG2BGR),
     "bayer_grbg8": (1, np.uint8, cv2.COLOR_BayerGRBG2BGR),
+    "bayer_rggb16": (1, np.uint16, cv2.COLOR_BayerRGGB2BGR),
+    "bayer_bggr16": (1, np.uint16, cv2.COLOR_BayerBGGR2BGR),
+    "bayer_gbrg16": (1, np.uint16, cv2.COLOR_BayerGBRG2BGR),
+    "bayer_grbg16": (1, np.uint16, cv2.COLOR_BayerGRBG2BGR),
     "yuv422": (2, np.uint8, cv2.COLOR_YUV2BGR_UYVY),
     "uyvy": (2, np.uint8, cv2.COLOR_YUV2BGR_UYVY),
     "yuv422_yuy2": (2, np.uint8, cv2.COLOR_YUV2BGR_YUY2),
     "yuyv": (2, np.uint8, cv2.COLOR_YUV2BGR_YUY2),
+    "nv12": (1, np.uint8, cv2.COLOR_YUV2BGR_NV12),
+    "nv21": (1, np.uint8, cv2.COLOR_YUV2BGR_NV21),
 }
+#: Below their brightness lie half as many rows of colour, of four pixels each.
+_WITH_ROWS_OF_COLOUR = ("nv12", "nv21")
 #: First bytes of a file -> its suffix.
 _MAGIC = ((b"\xff\xd8\xff", ".jpg"), (b"\x89PNG\r\n\x1a\n", ".png"), (b"RIFF", ".webp"))
 
@@ -66,20 +74,25 @@ def raw_image_file(message: RawImage) -> tuple[str, bytes]:
     item = np.dtype(value_type).newbyteorder(">" if message.is_bigendian else "<")
     row_bytes = message.width * num_values * item.itemsize
     data = np.asarray(message.data, dtype=np.uint8)
-    if num_values == 2 and message.width % 2:  # packed: two pixels share their colour
+    has_rows_of_colour = encoding in _WITH_ROWS_OF_COLOUR
+    # Two pixels share their colour, or four.
+    if (num_values == 2 or has_rows_of_colour) and message.width % 2:
         raise SourceError(f"an image of {encoding} must have an even width, got {message.width}")
+    if has_rows_of_colour and message.height % 2:
+        raise SourceError(f"an image of {encoding} must have an even height, got {message.height}")
+    num_rows = message.height * 3 // 2 if has_rows_of_colour else message.height
     if min(message.width, message.height) < 1 or message.step < row_bytes:
         raise SourceError(
             f"an image of {message.width}x{message.height} {encoding} must have rows of at least "
             f"{row_bytes} bytes, got {message.step}"
         )
-    if len(data) != message.step * message.height:
+    if len(data) != message.step * num_rows:
         raise SourceError(
-            f"{message.height} rows of {message.step} bytes must be {message.step * message.height} bytes, "
+            f"{num_rows} rows of {message.step} bytes must be {message.step * num_rows} bytes, "
             f"got {len(data)}"
         )
-    rows = np.ascontiguousarray(data.reshape(message.height, message.step)[:, :row_bytes])
-    pixels: NDArray = rows.view(item).astype(value_type).reshape(message.height, message.width, num_values)
+    rows = np.ascontiguousarray(data.reshape(num_rows, message.step)[:, :row_bytes])
+    pixels: NDArray = rows.view(item).astype(value_type).reshape(num_rows, message.width, num_values)
     return _png(_coloured(pixels, way))
 
 

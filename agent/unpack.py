@@ -33,7 +33,7 @@ class UnpackSettings:
 
     bag: Path = field(
         metadata={
-            "help": "ROS bag: a .bag of ROS 1; a folder, .mcap or .db3 of ROS 2",
+            "help": "ROS bag: a .bag of ROS 1, or a folder of its parts; a folder, .mcap or .db3 of ROS 2",
             "positional": True,
         }
     )
@@ -197,7 +197,7 @@ def _true_poses(
     if not camera:
         raise SourceError(f"camera_frame must be given for a true path: the images of {topic} name none")
     tree = FrameTree()
-    for transform in bag.transforms():
+    for transform in bag.transforms(topic):
         tree.add(transform)
     if bag.counts("pose").get(truth):
         unnamed = plain_name(settings.truth_frame or camera)

@@ -12,10 +12,11 @@ _MCAP_HEAD = struct.Struct("<BQI")
 
 
 def is_ros_bag(path: Path) -> bool:
-    """Tell whether a path is a bag: ``.bag``, ``.db3``, an ``.mcap`` of ROS, or a folder of ROS 2's."""
+    """Tell whether a path is a bag: ``.bag``, ``.db3``, an ``.mcap`` of ROS, a folder of ROS 2's or parts."""
     try:
         if path.is_dir():
-            return b"rosbag2_bagfile_information" in _start_of(path / "metadata.yaml")
+            is_split = bag_parts(path) != [path]
+            return is_split or b"rosbag2_bagfile_information" in _start_of(path / "metadata.yaml")
         if not path.is_file():
             return False
         start = _start_of(path)
@@ -26,6 +27,13 @@ def is_ros_bag(path: Path) -> bool:
         begin = len(MCAP_MAGIC) + _MCAP_HEAD.size
         return start[begin : begin + length] in (b"ros1", b"ros2")
     return path.suffix.lower() in (".bag", ".db3")
+
+
+def bag_parts(path: Path) -> list[Path]:
+    """Return the files of a folder of nothing but ``.bag``, as ROS 1 splits one; else the path itself."""
+    inside = sorted(path.iterdir()) if path.is_dir() else []
+    is_split = all(part.suffix.lower() == ".bag" for part in inside)
+    return inside if inside and is_split else [path]
 
 
 def check_no_ros_bag(path: Path) -> None:

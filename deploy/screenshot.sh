@@ -27,11 +27,11 @@ cleanup() {
 trap cleanup EXIT INT TERM
 
 free_port() {
-  python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])'
+  "$python" -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])'
 }
 
 photograph_page() {
-  python3 "$(dirname "$0")/photograph_page.py" "$1" "$out" "$size" "$wait_s"
+  "$python" "$(dirname "$0")/photograph_page.py" "$1" "$out" "$size" "$wait_s"
 }
 
 photograph_window() {
@@ -61,7 +61,7 @@ web)
     >"$scratch/rerun.log" 2>&1 &
   viewer=$!
   i=0
-  until python3 -c "import socket; socket.create_connection(('127.0.0.1', $web_port), 1)" 2>/dev/null; do
+  until "$python" -c "import socket; socket.create_connection(('127.0.0.1', $web_port), 1)" 2>/dev/null; do
     i=$((i + 1))
     [ $i -lt 100 ] || { tail -5 "$scratch/rerun.log" >&2; exit 1; }
     sleep 0.1

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError
 from semcast.common.sequence import ImageRectifier
-from semcast.evaluation.moving_images import Heard, Images, ImagesSettings, listen, load_images, reach_95
+from semcast.evaluation.moving_images import Heard, Images, ImagesSettings, listen, load_images
 from semcast.evaluation.report import provenance, write_json
 from semcast.server.mapping.lens import LensFit, believed_lens
 from semcast.server.mapping.readout import Readout
@@ -141,7 +141,7 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
         best.heard.check()
         if (change := best.change) is None:
             raise SemcastError(_NOT_TOLD)
-        reaches = _reaches(change)
+        reaches = _reaches(best.heard, change)
         if _is_nothing(change) or num_steps == _MAX_STEPS:
             break
         is_near = np.abs(_values(change)).max() <= _NEAR
@@ -184,9 +184,9 @@ def _sigmas(change: LensFit) -> Array:
     return np.array([change.sigma_focal, *change.sigma_radial, *change.sigma_centre])
 
 
-def _reaches(change: LensFit) -> Array:
+def _reaches(heard: Heard, change: LensFit) -> Array:
     """Return the bounds of 95 %, ``(5,)``, to either side."""
-    reaches = np.array([reach_95(sigma) for sigma in _sigmas(change)])
+    reaches = np.array([heard.reach_95(sigma) for sigma in _sigmas(change)])
     reaches[0] = max(reaches[0], _MIN_REACH)
     return reaches
 

@@ -20,7 +20,7 @@ from semcast.common.errors import SemcastError, SourceError
 from semcast.common.playback import usual_period_ns
 from semcast.common.sequence import resized
 from semcast.common.sequence_layouts import Layout
-from semcast.evaluation.statistics import small_sample_factor
+from semcast.evaluation.statistics import student_quantile
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
 from semcast.server.mapping.left_over import NUM_GROUPS
@@ -37,8 +37,6 @@ Array = NDArray[np.float64]
 MIN_FRAMES = 30
 #: Larger images tell no more and take longer.
 _MAX_PIXELS = 640 * 480
-#: Standard deviations either side of 95 %.
-_SIGMAS_95 = 1.96
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,14 +133,16 @@ class Heard:
     """What a reconstruction left.
 
     Attributes:
-        views: ``(8, 8)`` of each view, see ``left_over.information``.
+        views: ``(8, 8)`` of each keyframe, see ``left_over.information``, summed over adjustments.
         mean_px: Mean over frames of their median reprojection error, infinite without any.
         num_frames: Frames that got a pose from a map that was there.
+        share_left: Share of the variance of what was observed that adjustments leave in their residuals.
     """
 
     views: Sequence[Array]
     mean_px: float
     num_frames: int
+    share_left: float = 1.0
 
     def check(self) -> None:
         """Make sure that it is worth listening to.
@@ -156,10 +156,13 @@ class Heard:
                 "with much to see, while the camera moves sideways and turns"
             )
 
+    def reach_95(self, sigma: float) -> float:
+        """Return how far the bounds of 95 % are from what ``views`` say, with the ``sigma`` they give.
 
-def reach_95(sigma: float) -> float:
-    """Return how far the bounds of 95 % are from an estimate whose ``sigma`` comes from groups of views."""
-    return _SIGMAS_95 * small_sample_factor(NUM_GROUPS) * sigma
+        Groups of them say by how much an estimate scatters, but from residuals, which are less than what was
+        wrong with the observations: unknowns were fitted to these.
+        """
+        return student_quantile(NUM_GROUPS) * sigma / float(np.sqrt(self.share_left))
 
 
 class _Listening(InlineBundle):
@@ -169,7 +172,18 @@ class _Listening(InlineBundle):
         super().__init__()
         self.watch = ReadoutWatch(camera, is_wanted=True)
         self.world: WorldMap | None = None
-        self.views: list[Array] = []
+        self._told: dict[int, Array] = {}
+        self._num_observed = self._num_fitted = 0
+
+    @property
+    def views(self) -> list[Array]:
+        """What each keyframe's residuals say, in order of time."""
+        return [self._told[frame_id] for frame_id in sorted(self._told)]
+
+    @property
+    def share_left(self) -> float:
+        """Share of the variance of observations that is left when unknowns were fitted to them."""
+        return 1.0 - self._num_fitted / self._num_observed if self._num_observed else 1.0
 
     def submit(self, problem: BundleProblem) -> bool:
         """Adjust now."""
@@ -180,8 +194,17 @@ class _Listening(InlineBundle):
         """Return the result of the last ``submit``, once."""
         result = super().take(wait)
         if result is not None and result.left_over is not None:
-            self.views += list(result.left_over)
+            self._note(result, result.left_over)
         return result
+
+    def _note(self, result: BundleResult, left_over: Array) -> None:
+        """Note what an adjustment leaves. Windows overlap: what a keyframe says again is no other witness."""
+        for frame_id, told in zip(result.problem.keyframe_ids.tolist(), left_over, strict=True):
+            self._told[frame_id] = self._told.get(frame_id, 0.0) + told
+        used = np.isfinite(result.residual_px).all(axis=1)
+        num_views, num_points = (len(np.unique(k[used])) for k in (result.problem.view, result.problem.point))
+        self._num_observed += 2 * int(used.sum())
+        self._num_fitted += 6 * num_views + 3 * num_points
 
 
 def listen(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout) -> Heard:
@@ -208,4 +231,5 @@ def listen(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout)
                 errors_px.append(result.reprojection_error_px)
     finally:
         reconstruction.close()
-    return Heard(bundle.views, float(np.mean(errors_px)) if errors_px else np.inf, len(errors_px))
+    mean_px = float(np.mean(errors_px)) if errors_px else np.inf
+    return Heard(bundle.views, mean_px, len(errors_px), bundle.share_left)

@@ -13,15 +13,7 @@ import numpy as np
 
 from semcast.common.camera import MAX_READOUT_MS, Intrinsics
 from semcast.common.errors import SemcastError, SourceError
-from semcast.evaluation.moving_images import (
-    MIN_FRAMES,
-    Heard,
-    Images,
-    ImagesSettings,
-    listen,
-    load_images,
-    reach_95,
-)
+from semcast.evaluation.moving_images import MIN_FRAMES, Heard, Images, ImagesSettings, listen, load_images
 from semcast.evaluation.report import provenance, write_json
 from semcast.server.mapping.readout import Readout, ReadoutFit, fit_readout
 
@@ -103,7 +95,7 @@ def find_readout(
     limit_ms = min(images.period_ms, MAX_READOUT_MS)
     trials = [_seen(_tried(images, Readout("rows", 0.0)), on_trial)]
     more = _checked(trials[0])
-    readout, sigma_ms = Readout("rows", 0.0), more.sigma_ms
+    readout, reach_ms = Readout("rows", 0.0), trials[0].heard.reach_95(more.sigma_ms)
     while more.readout.ms >= max(_NOTHING_MS, more.sigma_ms) and len(trials) < _MAX_TRIALS:
         longer = readout.with_more(more.readout)
         longer = replace(longer, signed_ms=float(np.clip(longer.signed_ms, -limit_ms, limit_ms)))
@@ -112,9 +104,8 @@ def find_readout(
         is_better = trial.heard.mean_px < _BETTER * trials[-2].heard.mean_px
         if trial.heard.num_frames < MIN_FRAMES or not is_better:
             break
-        readout, sigma_ms = longer, more.sigma_ms
+        readout, reach_ms = longer, trials[-2].heard.reach_95(more.sigma_ms)
         more = _checked(trial)
-    reach_ms = reach_95(sigma_ms)
     low_ms, high_ms = readout.signed_ms - reach_ms, readout.signed_ms + reach_ms
     if high_ms - low_ms > _MAX_INTERVAL_MS:
         raise SemcastError(_NOT_TOLD)

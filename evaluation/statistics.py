@@ -145,14 +145,23 @@ def small_sample_factor(count: int, level: float = 0.95) -> float:
     Raises:
         ValueError: There are fewer than 5 samples, for which the expansion of the quantile is not good.
     """
+    normal = NormalDist().inv_cdf(0.5 + 0.5 * level)
+    return float(student_quantile(count, level) / normal * np.sqrt(count / (count - 1)))
+
+
+def student_quantile(count: int, level: float = 0.95) -> float:
+    """Return how many standard deviations, told by ``count`` samples, an interval reaches to either side.
+
+    Raises:
+        ValueError: As ``small_sample_factor``.
+    """
     if count < MIN_SAMPLES:
         raise ValueError(f"count must be at least {MIN_SAMPLES}, got {count}")
     z = NormalDist().inv_cdf(0.5 + 0.5 * level)
     nu = count - 1
-    # Student's quantile in powers of 1 / nu (Abramowitz and Stegun 26.7.5).
-    student = z + (z**3 + z) / (4 * nu) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * nu**2)
-    student += (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * nu**3)
-    return float(student / z * np.sqrt(count / nu))
+    # In powers of 1 / nu (Abramowitz and Stegun 26.7.5).
+    quantile = z + (z**3 + z) / (4 * nu) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * nu**2)
+    return quantile + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * nu**3)
 
 
 def _checked_pair(

@@ -1,6 +1,9 @@
 """The example settings are ones the roles take, and the service files keep the roles running."""
 
 import configparser
+import os
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -33,3 +36,26 @@ def test_a_service_is_tried_again_for_ever_and_has_time_to_write_its_results():
     assert float(unit["Service"]["TimeoutStopSec"]) >= STOP_DEADLINE_S
     # A signal to every process of the service would end those that adjust and write.
     assert unit["Service"]["KillMode"] == "mixed"
+
+
+@pytest.mark.skipif(shutil.which("setsid") is None, reason="the viewer runs in a group of its own")
+def test_a_screenshot_is_taken_with_the_python_that_was_named(tmp_path):
+    def tool(name, text):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+        return str(tmp_path / name)
+
+    out = tmp_path / "picture.png"
+    # Asked for a port it gives one, asked whether the viewer answers it says yes.
+    python = tool("mine", f'echo 1; case "$1" in *photograph_page.py) echo "$@" >{out};; esac')
+    tool("python3", "exit 1")
+    env = {
+        **os.environ,
+        "PATH": f"{tmp_path}:{os.environ['PATH']}",
+        "PYTHON": python,
+        "RERUN": tool("rerun", "exec sleep 9"),
+    }
+    command = [str(DEPLOY / "screenshot.sh"), "web", "run.rrd", str(out)]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=30)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "photograph_page.py http://127.0.0.1:1/" in out.read_text()

@@ -73,4 +73,5 @@ class Draws(Dataset[StepDraw]):
 
 def seed_of_step(seed: int, rank: int, step: int) -> int:
     """Return a seed of 63 bits for one step of one process."""
-    return (seed * 1_000_003 + step) * 64 + rank
+    # Every 64 processes begin where the steps of those before can't get to.
+    return (seed * 1_000_003 + step + (rank // 64 << 52)) * 64 + rank % 64

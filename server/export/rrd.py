@@ -20,7 +20,7 @@ CLOSE_DEADLINE_S = 30.0
 
 
 def write_rrd(
-    path: Path, folder: Path, data: RunData, images: Mapping[int, Path], *, copy: bool = True
+    path: Path, folder: Path, data: RunData, images: Mapping[int, Path], *, copy: bool
 ) -> list[Path]:
     """Copy the run's own recording, plots included; without one, show its poses, kept images and points.
 

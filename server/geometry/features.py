@@ -129,16 +129,12 @@ class TrackedPoints:
         ok[chosen] = True
         return replace(self, ok=ok)
 
-    def where(self, mine: NDArray[np.bool_], other: "TrackedPoints") -> "TrackedPoints":
-        """Return these points in the rows ``mine (N,)``, and those of another set in the rest."""
-        kept = mine[:, None]
-        return TrackedPoints(
-            np.where(kept, self.xy, other.xy),
-            np.where(mine, self.ok, other.ok),
-            np.where(mine, self.forward_backward_px, other.forward_backward_px),
-            np.where(mine, self.photometric_grey, other.photometric_grey),
-            np.where(mine, self.gradient_grey2, other.gradient_grey2),
-        )
+    def but_for(self, rows: NDArray[np.bool_], others: "TrackedPoints") -> "TrackedPoints":
+        """Return these points but for some ``rows (N,)``, which are the ``(M,)`` of another set."""
+        parts = {name: values.copy() for name, values in vars(self).items()}
+        for name, values in vars(others).items():
+            parts[name][rows] = values
+        return TrackedPoints(**parts)
 
     @staticmethod
     def none(count: int) -> "TrackedPoints":

@@ -47,9 +47,10 @@ def track_warped(grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, warps: 
         warps: ``(N, 2, 2)`` derivatives of pixels in ``grey1`` by those in ``grey0``.
     """
     moved = track_points(grey0, grey1, xy0, guess1_xy, max_level=1)
-    aligned = _aligned(grey0, grey1, xy0, guess1_xy, warps)
-    hardly = np.linalg.norm(warps - np.eye(2), ord=2, axis=(1, 2)) < _HARDLY_WARPED
-    found = moved.where(hardly, aligned)
+    rows = np.linalg.norm(warps - np.eye(2), ord=2, axis=(1, 2)) >= _HARDLY_WARPED
+    found = moved
+    if rows.any():
+        found = moved.but_for(rows, _aligned(grey0, grey1, xy0[rows], guess1_xy[rows], warps[rows]))
     # Points that left the image were clipped to its border and found something else there.
     near = np.linalg.norm(found.xy - guess1_xy, axis=1) < MAX_FROM_GUESS_PX
     return replace(found, ok=found.ok & near)

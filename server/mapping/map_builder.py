@@ -366,6 +366,11 @@ class MapBuilder:
         self.watch.take(result)
         return result
 
+    def finish(self, on_moved: Callable[[float], None]) -> None:
+        """Wait for an adjustment under way; ``on_moved`` is called after it has moved the map."""
+        if self.collect(wait=True) is not None:
+            on_moved(1.0)
+
     def put_right(self, camera: Intrinsics, flows: Mapping[int, ImageFlow]) -> None:
         """Make up for a rolling shutter that was not known of, see ``put_map_right``, and adjust the map."""
         self._abandon_adjustment()

@@ -373,6 +373,7 @@ class Reconstruction:
         """Bring a start into the map and pose the frames that waited for it."""
         since = time.perf_counter_ns()
         history = self._initialiser.history
+        self._map.finish(self._moved)  # a new part is placed by where the old one ends
         grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
         T_world_ref, scale = self._passage.lay(self._motion, start, grown, self._map.world, self._map.submap)
         self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, history)
@@ -463,8 +464,7 @@ class Reconstruction:
 
     def final_trajectory(self) -> dict[int, Array]:
         """Best current ``T_world_cam`` of all posed frames, by frame id; waits for a running adjustment."""
-        if self._map.collect(wait=True) is not None:
-            self._moved(1.0)
+        self._map.finish(self._moved)
         return self._map.world.trajectory()
 
     def landmarks(self) -> tuple[Ids, Array, NDArray[np.uint8], NDArray[np.float32]]:

@@ -2,6 +2,7 @@ import functools
 import http.server
 import threading
 import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -125,8 +126,8 @@ def test_a_camera_that_comes_back_with_another_size_is_said_once_and_waited_for(
 class Driver:
     """What OpenCV makes of a webcam that is unplugged after five images."""
 
-    def __init__(self):
-        self.settings, self.left = {}, 5
+    def __init__(self, number):
+        self.settings, self.left, self.number, self.is_released = {}, 5, number, False
 
     def isOpened(self):
         return True
@@ -145,16 +146,36 @@ class Driver:
         return self.left >= 0, np.zeros((48, 64, 3), np.uint8)
 
     def release(self):
-        pass
+        self.is_released = True
 
 
 def test_a_camera_that_is_plugged_in_again_has_no_queue_that_makes_frames_old_either(monkeypatch):
     monkeypatch.setattr("semcast.agent.video._REOPEN_AFTER_S", 0.01)
     opened = []
-    monkeypatch.setattr(cv2, "VideoCapture", lambda number: opened.append(Driver()) or opened[-1])
+    monkeypatch.setattr(cv2, "VideoCapture", lambda number: opened.append(Driver(number)) or opened[-1])
     source = open_source(SourceSettings(source="99", camera=PINHOLE, max_frames=8))
     assert len(list(source.frames(threading.Event()))) == 8
     assert [driver.settings for driver in opened] == 2 * [{cv2.CAP_PROP_BUFFERSIZE: 1}]
+    assert [driver.number for driver in opened] == [99, 99], "OpenCV takes a text for a file"
+    source.close()
+    assert all(driver.is_released for driver in opened)
+
+
+def test_a_rate_that_a_camera_has_no_whole_part_of_is_kept_on_the_whole(monkeypatch):
+    """Thirty images a second, of which twenty are wanted."""
+    clock = SimpleNamespace(ns=10**9)
+
+    class Ticking(Driver):
+        def read(self):
+            clock.ns += 10**9 // 30
+            return True, np.zeros((48, 64, 3), np.uint8)
+
+    now = SimpleNamespace(monotonic=lambda: clock.ns * 1e-9, monotonic_ns=lambda: clock.ns)
+    monkeypatch.setattr("semcast.agent.video.time", now)
+    monkeypatch.setattr(cv2, "VideoCapture", Ticking)
+    settings = SourceSettings(source="99", camera=PINHOLE, max_frames=41, pace="rate", rate_hz=20.0)
+    times_ns = [frame.t_capture_ns for frame in open_source(settings).frames(threading.Event())]
+    assert 40 / ((times_ns[-1] - times_ns[0]) * 1e-9) == pytest.approx(20.0, rel=0.03)
 
 
 def test_images_that_waited_before_the_start_are_thrown_away(make_camera):

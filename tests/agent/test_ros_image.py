@@ -77,6 +77,36 @@ def test_luminance_of_packed_yuv_is_where_the_encoding_says(encoding, order):
     np.testing.assert_allclose(pixels[0, :, 1], (255, (81 - 16) * 255 / 219), atol=1.0)
 
 
+@pytest.mark.parametrize(("encoding", "red_at"), [("bayer_rggb16", (0, 0)), ("bayer_grbg16", (0, 1))])
+def test_a_mosaic_of_sixteen_bits_keeps_them(encoding, red_at):
+    mosaic = np.zeros((8, 8), np.uint16)
+    mosaic[red_at[0] :: 2, red_at[1] :: 2] = 50_001
+    pixels = pixels_of(raw_image_file(message(mosaic, encoding)))
+    np.testing.assert_array_equal(pixels[4, 4], (0, 0, 50_001))
+
+
+@pytest.mark.parametrize(("encoding", "blue_first"), [("nv12", True), ("nv21", False)])
+@pytest.mark.parametrize("padding", [0, 6])
+def test_rows_of_colour_below_those_of_brightness_are_read(encoding, blue_first, padding):
+    # The left half is red, the right half grey and brighter; of each pair of colours the first is Cb in nv12.
+    bright = np.repeat(np.array([[81, 81, 180, 180]], np.uint8), 4, axis=0)
+    colour = np.repeat(np.array([[90, 240, 128, 128] if blue_first else [240, 90, 128, 128]], np.uint8), 2, 0)
+    sent = message(np.concatenate([bright, colour]), encoding, padding=padding)
+    sent.height = 4
+    pixels = pixels_of(raw_image_file(sent)).astype(int)
+    assert pixels.shape == (4, 4, 3)
+    np.testing.assert_allclose(pixels[:, 0], np.tile((0, 0, 255), (4, 1)), atol=3)
+    np.testing.assert_allclose(pixels[:, 3], 191, atol=1)
+
+
+@pytest.mark.parametrize(("shape", "told"), [((6, 3), "even width, got 3"), ((4, 4), "even height, got 3")])
+def test_half_of_four_pixels_of_a_colour_is_refused(shape, told):
+    sent = message(np.zeros(shape, np.uint8), "nv12")
+    sent.height = 4 if shape[1] == 3 else 3
+    with pytest.raises(SourceError, match=f"an image of nv12 must have an {told}"):
+        raw_image_file(sent)
+
+
 def test_a_depth_image_is_refused():
     with pytest.raises(SourceError, match=r"got '16UC1' \(a depth image\?\)"):
         raw_image_file(message(np.zeros((2, 2), np.uint16), "16UC1"))

@@ -221,11 +221,13 @@ def test_a_video_file_is_played(video):
     np.testing.assert_allclose([f.image.mean() for f in frames], [0, 40, 80, 120, 160], atol=3)
     assert [f.final for f in frames] == [False] * 4 + [True]
     assert (source.num_frames, source.intrinsics.fx, source.groundtruth()) == (5, 50.0, None)
+    assert source.last_frame_id == 8
 
 
 def test_a_video_can_be_cut_and_repeated(video):
-    _, frames = play(fast(video, camera=PINHOLE, max_frames=3))
+    source, frames = play(fast(video, camera=PINHOLE, max_frames=3))
     assert [(f.frame_id, f.final) for f in frames] == [(0, False), (1, False), (2, True)]
+    assert (source.num_frames, source.last_frame_id) == (3, 2)
     source, frames = play(fast(video, camera=PINHOLE, repeat="loop"), most=20)
     assert [f.frame_id for f in frames] == list(range(20))
     np.testing.assert_allclose(frames[9].image.mean(), 0, atol=3)
@@ -308,7 +310,7 @@ def test_a_video_needs_a_camera_that_fits(video, tmp_path):
 
 def test_what_can_not_be_opened_is_said(tmp_path):
     (tmp_path / "notes.txt").write_text("no video")
-    with pytest.raises(SourceError, match=r"video .*notes.txt can't be opened"):
+    with pytest.raises(SourceError, match=r"video .*notes.txt can't be opened$"):
         open_source(fast(tmp_path / "notes.txt", camera=PINHOLE))
     (tmp_path / "run.mcap").write_bytes(b"recording")
     with pytest.raises(SourceError, match="run.mcap can't be opened: 'semcast replay' takes recordings"):

@@ -59,6 +59,22 @@ def test_a_file_of_a_folder_and_the_folder_are_the_same_bag(tmp_path):
         assert unpack(UnpackSettings(bag=path, out=tmp_path / name)).num_images == 5
 
 
+def test_the_parts_of_a_bag_of_ros_1_are_one_in_a_folder_of_their_own(tmp_path):
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    for name, numbers in (("drive_1", (3, 4)), ("drive_0", (0, 1, 2))):
+        bag = BagMaker("bag")
+        for k in numbers:
+            bag.image("/cam/image_raw", picture(k), "bgr8", START + k * STEP)
+        bag.write(parts, name)
+    assert unpack(UnpackSettings(bag=parts, out=tmp_path / "out")).num_images == 5
+    assert open_sequence(tmp_path / "out").times_ns.tolist() == [START + k * STEP for k in range(5)]
+    assert unpack(UnpackSettings(bag=parts / "drive_0.bag", out=tmp_path / "part")).num_images == 3
+    (parts / "notes.txt").write_text("mine")
+    with pytest.raises(SourceError, match="parts is no ROS bag"):
+        unpack(UnpackSettings(bag=parts, out=tmp_path / "other"))
+
+
 def test_compressed_images_stay_what_they_are(tmp_path):
     bag = BagMaker()
     _, jpeg = cv2.imencode(".jpg", picture(7))
@@ -180,6 +196,20 @@ def test_poses_of_a_sibling_of_the_camera_reach_it_too(tmp_path):
     np.testing.assert_allclose(positions, [(1.0 * k, 2.0, -3.0) for k in range(5)], atol=1e-9)
 
 
+@pytest.mark.parametrize("images", ["/red/cam/image_raw", "/cam/image_raw"])
+def test_transforms_of_a_namespace_are_those_of_what_lies_in_it(images, tmp_path):
+    bag = BagMaker()
+    add_images(bag, images)
+    for k in range(5):
+        if images.startswith("/red"):  # of another robot, whose frames have the same names
+            bag.transform("/blue/tf", "map", "base", (0.0, 9.0, 9.0), START + k * STEP)
+        bag.transform("/red/tf", "map", "base", (1.0 * k, 0.0, 0.0), START + k * STEP)
+    bag.transform("/red/tf_static", "base", "cam", (0.0, 2.0, 0.0), START)
+    unpack(settings(bag, tmp_path, truth="map"))
+    positions = open_sequence(tmp_path / "out").groundtruth().positions
+    np.testing.assert_allclose(positions, [(1.0 * k, 2.0, 0.0) for k in range(5)], atol=1e-9)
+
+
 def test_poses_that_do_not_say_of_what_they_are_can_be_said_to_be_of_a_body(tmp_path):
     bag = BagMaker()
     add_images(bag)
@@ -219,7 +249,7 @@ def test_what_a_tracker_says_that_lost_its_body_is_no_pose(tmp_path, caplog):
     bag.transform("/tf", "map", "wheel", (0.0, 0.0, 0.0), START, (0.0, 0.0, 0.0, 0.0))
     assert unpack(settings(bag, tmp_path, truth="/mocap")).num_poses == 5
     assert "/mocap: '' in 'room' is left out where it is no pose: position must be finite" in caplog.text
-    assert "/tf: 'wheel' in 'map' is left out" in caplog.text
+    assert "tf: 'wheel' in 'map' is left out" in caplog.text
 
 
 @pytest.mark.parametrize("speed", [1.0, 0.0], ids=["moving", "at rest"])

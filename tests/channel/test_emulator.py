@@ -257,6 +257,9 @@ def test_bad_messages_are_counted_and_told_and_do_no_harm(ends, make, caplog):
     until(lambda: len(e.received) == 2)
     assert e.status[-1].role == "channel"
     assert [f.agent_epoch for f in e.received] == [3, 4]
+    e.tx.put(pack(e.received[0]))
+    until(lambda: e.status[-1].drops.get("protocol") == 5)
+    assert "frame must be tx, got rx" in caplog.text
 
 
 def test_a_process_ends_cleanly_on_sigterm_and_another_takes_over_after_a_kill(make):

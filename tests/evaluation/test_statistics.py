@@ -11,6 +11,7 @@ from semcast.evaluation.statistics import (
     pose_auc_percent,
     small_sample_factor,
     spearman,
+    student_quantile,
 )
 
 
@@ -158,6 +159,7 @@ def test_bootstrap_ratio_and_bad_input(rng):
 
 @pytest.mark.parametrize(("count", "student"), [(5, 2.776), (8, 2.365), (20, 2.093), (1000, 1.962)])
 def test_few_samples_widen_an_interval_by_student_s_quantile(count, student):
+    assert student_quantile(count) == pytest.approx(student, rel=0.003)
     expected = student / 1.95996 * np.sqrt(count / (count - 1))
     assert small_sample_factor(count) == pytest.approx(expected, rel=0.003)
 

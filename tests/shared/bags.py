@@ -134,10 +134,10 @@ class BagMaker:
         )
         self.add(topic, message, time_ns)
 
-    def write(self, folder):
+    def write(self, folder, name="drive"):
         """Write the bag and return its path: a file, but for sqlite3, where it is a folder."""
         is_ros1 = self._container == "bag"
-        path = folder / ("drive.bag" if is_ros1 else "drive")
+        path = folder / (f"{name}.bag" if is_ros1 else name)
         plugins = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
         writer = (
             Writer1(path) if is_ros1 else Writer2(path, version=9, storage_plugin=plugins[self._container])
@@ -150,4 +150,4 @@ class BagMaker:
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, kind, typestore=self._store)
                 writer.write(connections[topic], time_ns, serialise(message, kind))
-        return path / "drive.mcap" if self._container == "mcap" else path
+        return path / f"{name}.mcap" if self._container == "mcap" else path

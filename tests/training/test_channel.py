@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,12 +16,17 @@ def plain_draw(snr_db, gains):
     return LinkDraw(level, level, torch.ones(1), gain, torch.zeros_like(gain))
 
 
-def test_noise_has_half_its_variance_in_each_real():
+def vars_of(draw):
+    return vars(draw).values()
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.1])
+def test_noise_has_half_its_variance_in_each_real_over_what_the_slot_lets_through(gain):
     generator = torch.Generator().manual_seed(0)
     y = torch.zeros(1, 94, 1, 2000)
     snr_db = 3.0
-    y_rx, _ = through_link(y, plain_draw(snr_db, [1.0]), torch.randn(y.shape, generator=generator))
-    linear = 10 ** (snr_db / 10)
+    y_rx, _ = through_link(y, plain_draw(snr_db, [gain]), torch.randn(y.shape, generator=generator))
+    linear = gain * 10 ** (snr_db / 10)
     unshrunk = y_rx * (1 + linear) / linear
     expected = 0.5 / linear
     sigma = expected * (2 / y.numel()) ** 0.5
@@ -33,6 +39,13 @@ def test_the_equaliser_shrinks_by_snr_over_one_plus_snr():
     torch.testing.assert_close(y_rx[0, 0, 0], torch.full((3,), 10 / 11))
     torch.testing.assert_close(y_rx[0, 0, 1], torch.full((3,), 0.5))
     torch.testing.assert_close(effective_db[0, 0, :, 0], torch.tensor([10.0, 0.0]))
+    # By what the receiver believes, which is wrong in the second slot.
+    mistaken = replace(
+        plain_draw(10.0, [1.0, 0.1]), estimate_error_db=torch.tensor([0.0, 3.0]).view(1, 1, 2, 1)
+    )
+    y_rx, effective_db = through_link(y, mistaken, torch.zeros_like(y))
+    torch.testing.assert_close(effective_db[0, 0, :, 0], torch.tensor([10.0, 3.0]))
+    torch.testing.assert_close(y_rx[0, 0, 1, 0].item(), 10**0.3 / (1 + 10**0.3))
 
 
 def test_a_lost_slot_is_zero_at_the_floor():
@@ -53,7 +66,14 @@ def test_draws_follow_the_settings():
     assert (draw.is_qam == 1).all()
     assert draw.gain.shape == (2000, 1, 8, 1)
     assert draw.gain.mean().item() == pytest.approx(1.0, abs=0.04)
+    # Half of the images fade by Rayleigh, with a variance of 1, half by Rice with a factor K of up to 6:
+    # the mean of (1 + 2 K) / (1 + K)^2 is 0.506.
+    assert draw.gain.var().item() == pytest.approx(0.753, abs=0.06)
     assert (draw.gain > 0).all()
+    assert (draw.expected_snr_db - draw.snr_db).std().item() == pytest.approx(1.0, abs=0.07)
+    assert draw.estimate_error_db.std().item() == pytest.approx(0.5, abs=0.02)
+    again = draw_links(settings, 2000, 8, torch.Generator().manual_seed(0))
+    assert all(torch.equal(one, other) for one, other in zip(*map(vars_of, (draw, again)), strict=True))
 
 
 def test_without_fading_and_loss_every_slot_has_gain_one():

@@ -67,6 +67,33 @@ def test_grey_crops_have_equal_channels():
     np.testing.assert_array_equal(crop[..., 0], crop[..., 2])
 
 
+def drawn(image, share_grey=0.0, num=600):
+    settings = CropSettings(size_px=32, scale_min=1.0, scale_max=1.0, share_grey=share_grey)
+    return [random_crop(image, settings, np.random.default_rng(k)) for k in range(num)]
+
+
+def test_crops_are_mirrored_and_turned_alike_often():
+    image = photo(32, 32)
+    sides = [np.rot90(side, k).tobytes() for side in (image, image[:, ::-1]) for k in range(4)]
+    seen = [sides.index(crop.tobytes()) for crop in drawn(image) if crop.tobytes() in sides]
+    assert len(seen) / 600 == pytest.approx(0.7, abs=0.06), "the others have another contrast"
+    assert np.bincount(seen, minlength=8).min() > 25  # of 52
+
+
+def test_three_of_ten_crops_have_another_contrast_and_brightness():
+    grey = [int(crop[0, 0, 0]) for crop in drawn(np.full((32, 32, 3), 100, np.uint8))]
+    other = [value for value in grey if value != 100]
+    assert len(other) / 600 == pytest.approx(0.3, abs=0.06)
+    # (100 - 128) * contrast + 128 + brightness, 0.7 to 1.25 and -25 to 25.
+    assert 68 <= min(other) < 78
+    assert 123 < max(other) <= 133
+
+
+def test_the_share_of_grey_crops_is_as_told():
+    is_grey = [(crop == crop[..., :1]).all() for crop in drawn(photo(32, 32), share_grey=0.25)]
+    assert np.mean(is_grey) == pytest.approx(0.25, abs=0.06)
+
+
 def test_images_are_read_by_name_as_rgb(tmp_path):
     red = np.zeros((32, 40, 3), np.uint8)
     red[..., 2] = 255  # BGR for cv2
@@ -81,12 +108,12 @@ def test_images_are_read_by_name_as_rgb(tmp_path):
 def test_images_are_read_as_an_agent_reads_them_and_what_is_none_is_told(tmp_path, caplog):
     clear = np.zeros((32, 40, 4), np.uint8)  # black, and not to be seen: laid on white
     cv2.imwrite(str(tmp_path / "a.png"), clear)
-    (tmp_path / "b.jpg").write_bytes(b"damaged")
+    (tmp_path / "0.jpg").write_bytes(b"damaged")
     (image,) = read_images(tmp_path)
     assert image.min() == 255
     assert image.flags.c_contiguous, "crops of others can't be resized"
     assert "left out: " in caplog.text
-    assert "b.jpg is not a readable image" in caplog.text
+    assert "0.jpg is not a readable image" in caplog.text
 
 
 def test_images_too_small_to_start_from_are_refused(tmp_path):

@@ -3,7 +3,7 @@ import torch
 from semcast.training.allocations import AllocationSettings
 from semcast.training.channel import LinkDrawSettings
 from semcast.training.data import Ahead, Crops, CropSettings
-from semcast.training.draws import Draws
+from semcast.training.draws import Draws, seed_of_step
 from tests.training.test_data import photo
 
 
@@ -43,3 +43,16 @@ def test_a_fixed_rate_has_no_allocation_and_shapes_are_those_of_the_crops():
     assert draw.pixels.shape == (4, 3, 32, 32)
     assert draw.links.gain.shape == (4, 1, 2, 1)
     assert draw.sent.values.shape == (4, 1, 2, 2)
+
+
+def test_no_two_processes_share_a_seed_however_many_they_are():
+    most = 2**32 - 1
+    seeds = [
+        seed_of_step(seed, rank, step)
+        for seed in (0, 1, most)
+        for rank in (0, 1, 63, 64, 65, 127, 128, 2047)
+        for step in (0, 1, 2, 999_999)
+    ]
+    assert len(set(seeds)) == len(seeds)
+    assert max(seeds) < 2**63
+    assert seed_of_step(3, 5, 7) == (3 * 1_000_003 + 7) * 64 + 5, "as runs of old had them"

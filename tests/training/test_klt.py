@@ -20,12 +20,12 @@ def smooth_photos():
             for _ in range(4)
         ]
         tint = rng.uniform(0.6, 1.2, size=3)
-        photos.append(np.clip((128 + sum(waves))[:, :, None] * tint, 0, 255).astype(np.uint8))
+        photos.append(np.clip((88 + sum(waves))[:, :, None] * tint, 0, 255).astype(np.uint8))
     return photos
 
 
 def test_statistics_of_constant_images_are_their_colour():
-    image = np.full((64, 64, 3), (0, 128, 255), np.uint8)
+    image = np.full((65, 67, 3), (0, 128, 255), np.uint8)
     mean, covariance = block_statistics([image])
     np.testing.assert_allclose(mean[:256], -0.5, atol=1e-6)
     np.testing.assert_allclose(mean[512:], 0.5, atol=1e-6)
@@ -71,6 +71,10 @@ def test_the_linear_link_returns_what_its_coefficients_hold():
     assert link.power.mean() == pytest.approx(1.0)
     rms = np.sqrt(np.mean((link.mix**2) @ link.power))
     assert rms == pytest.approx(0.9, rel=1e-3)
+    # Mixed, each coefficient is in many values; apart, in its own.
+    assert np.abs(link.mix).max() < 0.7 * np.linalg.norm(link.mix, axis=0).max()
+    apart = linear_link(smooth_photos(), 40, None)
+    np.testing.assert_allclose(apart.mix, 0.9 * np.eye(40))
 
 
 def test_wiener_gains_by_hand():
@@ -78,6 +82,7 @@ def test_wiener_gains_by_hand():
     eye = np.eye(47)
     link = LinearLink(eye, eye, np.ones(47), eye, eye, eye)
     np.testing.assert_allclose(link.wiener(0.0), 1.0 / 1.5 * 2.0)
+    np.testing.assert_allclose(link.wiener(10.0), 1.0 / 1.05 * 1.1)
 
 
 def test_an_architecture_without_a_linear_heart_is_refused():

@@ -40,11 +40,11 @@ def test_the_knee_bends_large_errors_only():
 
 
 def test_the_confidence_label_is_the_papers():
-    x = torch.zeros(1, 3, 1, 2)
-    x_hat = x.clone()
-    x_hat[0, :, 0, 1] = torch.tensor([0.03, 0.0, 0.0])
+    x = torch.tensor([0.5, 0.5, 1.0, 0.0]).view(1, 1, 1, 4).repeat(1, 3, 1, 1)
+    x_hat = x + torch.tensor([0.0, 0.0, 0.4, -0.2])  # beyond black and white is black and white
+    x_hat[0, 0, 0, 1] += 0.03
     label = confidence_label(x_hat, x, 30.0)
-    torch.testing.assert_close(label.flatten(), torch.tensor([1.0, 1.0 - math.tanh(0.3)]))
+    torch.testing.assert_close(label.flatten(), torch.tensor([1.0, 1.0 - math.tanh(0.3), 1.0, 1.0]))
 
 
 def test_both_confidence_losses_are_least_at_the_label():
@@ -153,3 +153,5 @@ def test_bad_weights_are_refused():
         LossSettings(descriptor=-1.0)
     with pytest.raises(ValueError, match="mse must be >= 0, got nan"):
         LossSettings(mse=math.nan)
+    with pytest.raises(ValueError, match="confidence_sharpness must be > 0, got 0"):
+        LossSettings(confidence_sharpness=0.0)

@@ -235,8 +235,9 @@ def test_pycolmap_reads_the_ply_map(tmp_path, arc_run, write_arc_run):
 def test_the_servers_own_rerun_recording_is_copied(tmp_path, arc_run, write_arc_run):
     write_arc_run(tmp_path / "run", arc_run())
     (tmp_path / "run" / "run.rrd").write_bytes(b"as the server wrote it")
-    export_run(tmp_path / "run", "rrd", tmp_path / "copy.rrd")
-    assert (tmp_path / "copy.rrd").read_bytes() == b"as the server wrote it"
+    copy = tmp_path / "new" / "copy.rrd"
+    assert export_run(tmp_path / "run", "rrd", copy) == [copy]
+    assert copy.read_bytes() == b"as the server wrote it"
     export_run(tmp_path / "run", "rrd", tmp_path / "part.rrd", part="0")
     assert (tmp_path / "part.rrd").read_bytes() == b"as the server wrote it", "there is no other part"
 

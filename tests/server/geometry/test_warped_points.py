@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semcast.server.geometry import warped_points
 from semcast.server.geometry.features import detect_corners, track_points
 from semcast.server.geometry.warped_points import track_warped
 from semcast.server.geometry.wide_search import WideFeatures, search_wide
@@ -74,6 +75,25 @@ def test_where_windows_hardly_warp_points_far_from_their_guess_are_found_too(tex
     found = track_warped(texture, image, corners, far_off, np.tile(np.eye(2), (len(there), 1, 1)))
     assert found.ok.mean() > 0.8
     assert (off_px(found, there) < 0.5).mean() > 0.9
+
+
+@pytest.mark.parametrize("share_warped", [0.0, 0.5])
+def test_only_windows_that_are_warped_are_aligned(texture, share_warped, monkeypatch):
+    image, corners, there = warped(texture, np.eye(2))
+    rows = np.random.default_rng(4).random(len(there)) < share_warped
+    warps = np.where(rows[:, None, None], 1.2 * np.eye(2), np.eye(2))
+    aligned, align = [], warped_points.align_patches
+    monkeypatch.setattr(
+        warped_points,
+        "align_patches",
+        lambda *how, **more: aligned.append(len(how[0])) or align(*how, **more),
+    )
+    together = track_warped(texture, image, corners, there, warps)
+    assert aligned == ([rows.sum()] * 2 if rows.any() else []), "there and back"
+    alone = track_warped(texture, image, corners[rows], there[rows], warps[rows])
+    for name, values in vars(together).items():
+        np.testing.assert_array_equal(values[rows], vars(alone)[name])
+    assert together.ok[~rows].mean() > 0.9
 
 
 def test_matches_around_a_point_tell_how_its_window_was_warped(texture):

@@ -1,5 +1,7 @@
 """A camera that loses its map: parts begun anew, joined again, and turns that leave all landmarks behind."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from semcast.common.geometry import (
     rotation_angle_deg,
 )
 from semcast.server.mapping import reconstruction, settings
+from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.initialiser import MIN_POINTS
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
@@ -92,6 +95,44 @@ def test_the_unit_of_a_new_part_is_told_by_its_start_alone(monkeypatch):
     way = np.linalg.norm(trajectory[start[-1]][:3, 3] - trajectory[start[0]][:3, 3])
     elapsed_s = (start[-1] - start[0]) * FRAME_NS * 1e-9
     assert way / elapsed_s == pytest.approx(speed_map_per_s, rel=0.1)
+
+
+class MovingBundle(InlineBundle):
+    """Moves the newest keyframe when told to, at once or only when the result is waited for."""
+
+    def __init__(self, *, is_late):
+        super().__init__()
+        self._is_late, self.moves = is_late, False
+
+    def take(self, wait=False):
+        if self.moves and self._is_late and not wait:
+            return None
+        result = super().take(wait)
+        if result is None or not self.moves:
+            return result
+        self.moves, poses = False, result.T_world_cam.copy()
+        poses[-1, :3, 3] += (0.02, 0.1, 0.0)
+        return replace(result, T_world_cam=poses)
+
+
+def test_a_new_part_is_placed_by_the_old_one_as_its_last_adjustment_leaves_it():
+    """The camera jumps out of view while the adjustment that the last keyframe asked for is under way."""
+    x = [0.12 * k for k in range(6)] + [13.0 - 0.3 * k for k in range(5)]
+    images = [render(make_transform(np.eye(3), (v, 0.05 * np.sin(v), 0.0))) for v in x]
+
+    def path(*, is_late):
+        bundle = MovingBundle(is_late=is_late)
+        core = make(bundle, lost_after_s=0.05)
+        for k, image in enumerate(images):
+            bundle.moves |= k == 6
+            result = core.process(frame_of(k, image))
+        assert (result.submap, bundle.moves) == (1, False)
+        return core.final_trajectory()
+
+    in_time, late = path(is_late=False), path(is_late=True)
+    assert in_time.keys() == late.keys()
+    for k in in_time:
+        np.testing.assert_allclose(late[k], in_time[k], atol=1e-3)
 
 
 def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch):
