@@ -1,7 +1,7 @@
 """Bundle adjustment of few views by dense algebra: all observations at once, points eliminated (Schur).
 
-For a window it takes a third to a half of the time of GTSAM, which has an object for each observation. Loss,
-damping and when to stop are those of GTSAM's Levenberg-Marquardt, so that both end in the same place.
+For a window that is faster than GTSAM, which has an object for each observation. Loss, damping and when to
+stop are those of GTSAM's Levenberg-Marquardt, so that both end in the same place.
 
 Arrays have observations along their last axis, which sums and products then run along.
 """
