@@ -30,9 +30,15 @@ def test_help_lists_every_verb_and_answers_at_once():
 
 @pytest.mark.parametrize(
     ("verb", "given", "threads"),
-    [("agent", {}, "1"), ("agent", {"OPENBLAS_NUM_THREADS": "3"}, "3"), ("info", {}, None)],
+    [
+        *((verb, {}, "1") for verb in ("agent", "server", "replay", "eval")),
+        ("agent", {"OPENBLAS_NUM_THREADS": "3"}, "3"),
+        ("info", {}, None),
+    ],
 )
-def test_an_agent_leaves_the_other_cores_alone_unless_told(monkeypatch, capsys, verb, given, threads):
+def test_what_deals_with_frames_leaves_the_other_cores_alone_unless_told(
+    monkeypatch, capsys, verb, given, threads
+):
     own = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
     monkeypatch.setattr(os, "environ", own | given)
     with pytest.raises(SystemExit):

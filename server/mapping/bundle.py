@@ -1,4 +1,4 @@
-"""Bundle adjustment of a window of keyframes with GTSAM: one noise model per observation.
+"""Bundle adjustment with a noise model per observation: of a window by dense algebra, of a map by GTSAM.
 
 Traps held off here: ``Rot3`` of a matrix that is not orthonormal ends the interpreter, so rotations are
 projected first; a landmark behind a camera gives a silently bad minimum, so depths are checked first.
@@ -15,13 +15,19 @@ from semcast.common.geometry import invert_transform, project_to_so3
 from semcast.server.geometry.projection import project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
+from semcast.server.mapping.dense_bundle import Baseline, State, Window, last_covariance, minimise
 from semcast.server.mapping.left_over import information
 
 Array = NDArray[np.float64]
 
+#: Poses, points and the covariance of the last pose, or None.
+_Solved = tuple[Array, Array, Array | None]
+
 #: Observations share noise models: their sigmas are rounded to so many steps.
 NUM_SIGMAS = 16
 SIGMA_RANGE_PX = (0.1, 12.0)
+#: Free views that dense algebra is for: its time grows with their square and the number of points.
+_MAX_DENSE_VIEWS = 60
 #: With fewer there is no window, but what is left of one.
 _MIN_OBSERVATIONS = 10
 #: Holds a fixed pose: radians and map units.
@@ -63,6 +69,16 @@ def _noise_model(sigma_px: float, huber_px: float | None) -> gtsam.noiseModel.Ro
     return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, sigma_px))
 
 
+def _baseline(problem: BundleProblem) -> Baseline | None:
+    """Return what holds the scale: the longest way from the first view, for a camera may come back to it."""
+    if not problem.keep_baseline or len(problem.T_world_cam) < 2:
+        return None
+    away = np.linalg.norm(problem.T_world_cam[:, :3, 3] - problem.T_world_cam[0, :3, 3], axis=1)
+    furthest = int(away.argmax())
+    length_map = float(away[furthest])
+    return Baseline((0, furthest), length_map, max(1e-4 * length_map, 1e-9))
+
+
 def _build(
     problem: BundleProblem, used: NDArray[np.bool_]
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -73,13 +89,10 @@ def _build(
         values.insert(X(k), pose)
         if problem.fixed[k]:
             graph.add(gtsam.PriorFactorPose3(X(k), pose, fixed_noise))
-    if problem.keep_baseline and len(problem.T_world_cam) > 1:
-        away = np.linalg.norm(problem.T_world_cam[:, :3, 3] - problem.T_world_cam[0, :3, 3], axis=1)
-        # The longest one: a camera that came back to where it began would say nothing about the scale.
-        furthest = int(away.argmax())
-        baseline = float(away[furthest])
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, max(1e-4 * baseline, 1e-9))
-        graph.add(gtsam.RangeFactorPose3(X(0), X(furthest), baseline, noise))
+    if (held := _baseline(problem)) is not None:
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, held.sigma_map)
+        first, furthest = held.views
+        graph.add(gtsam.RangeFactorPose3(X(first), X(furthest), held.length_map, noise))
     for p in np.unique(problem.point[used]).tolist():
         values.insert(L(p), problem.xyz[p])
     sigmas, step = quantised_sigma(problem.sigma_px)
@@ -109,32 +122,13 @@ def optimise(problem: BundleProblem) -> BundleResult:
     residual, front = residuals_px(problem, problem.T_world_cam, problem.xyz)
     count = np.bincount(problem.point[front], minlength=len(problem.xyz))
     used = front & (count[problem.point] >= 2) & np.isfinite(problem.xy).all(axis=1)
-    T_world_cam, xyz, covariance, ok = problem.T_world_cam.copy(), problem.xyz.copy(), None, False
+    solved: _Solved | None = None
     is_posed = bool(np.isfinite(problem.T_world_cam).all())
     if int(used.sum()) >= _MIN_OBSERVATIONS and problem.fixed.any() and is_posed:
-        graph, values = _build(problem, used)
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(problem.iterations)
-        parameters.setRelativeErrorTol(1e-3)
-        parameters.setlambdaInitial(1e-4)
-        try:
-            optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
-            before = optimiser.error()
-            solved = optimiser.optimize()
-            ok = bool(np.isfinite(optimiser.error()) and optimiser.error() <= before)
-        except (RuntimeError, IndexError):  # an indeterminate system, a pose without a factor
-            ok = False
-        if ok:
-            for k in np.flatnonzero(~problem.fixed).tolist():
-                pose = solved.atPose3(X(k)).matrix()
-                T_world_cam[k] = pose
-            points = np.unique(problem.point[used])
-            xyz[points] = np.array([solved.atPoint3(L(p)) for p in points.tolist()])
-            ok = bool(np.isfinite(T_world_cam).all() and np.isfinite(xyz).all())
-            if ok and problem.with_covariance:
-                covariance = _covariance(graph, solved, len(T_world_cam) - 1)
-        if not ok:
-            T_world_cam, xyz = problem.T_world_cam.copy(), problem.xyz.copy()
+        is_small = int((~problem.fixed).sum()) <= _MAX_DENSE_VIEWS
+        solved = (_by_dense_algebra if is_small else _by_gtsam)(problem, used)
+    ok = solved is not None
+    T_world_cam, xyz, covariance = solved or (problem.T_world_cam.copy(), problem.xyz.copy(), None)
     residual, _ = residuals_px(problem, T_world_cam, xyz)
     residual[~used] = np.nan
     left_over = None
@@ -142,6 +136,62 @@ def optimise(problem: BundleProblem) -> BundleResult:
         left_over = information(problem, problem.motion, T_world_cam, xyz, residual)
     elapsed_ms = (time.perf_counter_ns() - started) * 1e-6
     return BundleResult(problem, ok, T_world_cam, xyz, residual, covariance, elapsed_ms, left_over)
+
+
+def _window_of(problem: BundleProblem, used: NDArray[np.bool_]) -> tuple[Window, State, NDArray[np.intp]]:
+    """Return what dense algebra is given, where it begins, and which points these are."""
+    points, point = np.unique(problem.point[used], return_inverse=True)
+    sigmas, step = quantised_sigma(problem.sigma_px[used])
+    sigma_px = sigmas[step]
+    window = Window(
+        camera=problem.camera,
+        free=~problem.fixed,
+        num_points=len(points),
+        view=problem.view[used],
+        point=point,
+        xy=problem.xy[used],
+        sigma_px=sigma_px,
+        limit=np.full(len(sigma_px), HUBER_K) if problem.huber_px is None else problem.huber_px / sigma_px,
+        baseline=_baseline(problem),
+    )
+    return window, State(problem.T_world_cam, problem.xyz[points]), points
+
+
+def _by_dense_algebra(problem: BundleProblem, used: NDArray[np.bool_]) -> _Solved | None:
+    window, state, points = _window_of(problem, used)
+    solved = minimise(window, state, problem.iterations)
+    T_world_cam, xyz = solved.T_world_cam.copy(), problem.xyz.copy()
+    for k in np.flatnonzero(window.free).tolist():
+        T_world_cam[k, :3, :3] = project_to_so3(T_world_cam[k, :3, :3])
+    xyz[points] = solved.xyz
+    if not (np.isfinite(T_world_cam).all() and np.isfinite(xyz).all()):
+        return None
+    return T_world_cam, xyz, last_covariance(window, solved) if problem.with_covariance else None
+
+
+def _by_gtsam(problem: BundleProblem, used: NDArray[np.bool_]) -> _Solved | None:
+    graph, values = _build(problem, used)
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(problem.iterations)
+    parameters.setRelativeErrorTol(1e-3)
+    parameters.setlambdaInitial(1e-4)
+    try:
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
+        before = optimiser.error()
+        solved = optimiser.optimize()
+    except (RuntimeError, IndexError):  # an indeterminate system, a pose without a factor
+        return None
+    if not (np.isfinite(optimiser.error()) and optimiser.error() <= before):
+        return None
+    T_world_cam, xyz = problem.T_world_cam.copy(), problem.xyz.copy()
+    for k in np.flatnonzero(~problem.fixed).tolist():
+        T_world_cam[k] = solved.atPose3(X(k)).matrix()
+    points = np.unique(problem.point[used])
+    xyz[points] = np.array([solved.atPoint3(L(p)) for p in points.tolist()])
+    if not (np.isfinite(T_world_cam).all() and np.isfinite(xyz).all()):
+        return None
+    covariance = _covariance(graph, solved, len(T_world_cam) - 1) if problem.with_covariance else None
+    return T_world_cam, xyz, covariance
 
 
 def _covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int) -> Array | None:

@@ -25,6 +25,8 @@ from semcast.common.interrupts import ctrl_c_held
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
+#: Verbs whose matrices are small: those of frames, and of windows of keyframes.
+_ONE_THREAD = frozenset({"agent", "server", "replay", "eval"})
 #: verb -> (module in semcast.commands, one line of help)
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "run agent, channel and server together on a recorded sequence and watch"),
@@ -132,9 +134,9 @@ def _quieten_libraries() -> None:
 def _compute_in_one_thread() -> None:
     """Let numpy's matrix products be computed in the thread that asks for them; before numpy is imported.
 
-    OpenBLAS would share those of images wider than 950 pixels among all cores, whose threads wait for each
-    other by spinning: what takes a millisecond then takes tens of them on all cores of a machine that has
-    other work. Networks have threads of their own. What the user has set holds.
+    OpenBLAS would share those of images wider than 950 pixels, and of adjustments, among all cores, whose
+    threads wait for each other by spinning: what takes a millisecond then takes tens of them on all cores of
+    a machine that has other work. Networks have threads of their own. What the user has set holds.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -205,7 +207,7 @@ def _run(words: list[str]) -> int:
     handler = _configure_logging(debug)
     if not debug:
         _quieten_libraries()
-    if verb == "agent":
+    if verb in _ONE_THREAD:
         _compute_in_one_thread()
     try:
         parser = verb_parser(verb)

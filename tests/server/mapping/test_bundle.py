@@ -1,5 +1,6 @@
 import os
 import signal
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.geometry.pnp import project_with_jacobian
-from semcast.server.mapping import bundle
+from semcast.server.mapping import bundle, dense_bundle
 from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.bundle_process import ProcessBundle
@@ -175,13 +176,13 @@ def test_a_point_takes_part_from_its_second_view_on():
     ],
     ids=["no gauge", "all behind", "nan", "no parallax", "no rotations", "nothing seen last", "unseen pose"],
 )
-def test_degenerate_windows_end_without_an_exception(changes):
+def test_degenerate_windows_end_without_an_exception(monkeypatch, changes):
     problem, _, _ = make_problem()
-    result = optimise(BundleProblem(**{**vars(problem), **changes}))
-    assert np.isfinite(result.xyz).all()
-    assert np.isfinite(result.T_world_cam).all()
-    if not result.ok:
-        assert np.array_equal(result.xyz, result.problem.xyz)
+    for result in both_ways(monkeypatch, BundleProblem(**{**vars(problem), **changes})):
+        assert np.isfinite(result.xyz).all()
+        assert np.isfinite(result.T_world_cam).all()
+        if not result.ok:
+            assert np.array_equal(result.xyz, result.problem.xyz)
 
 
 def test_a_pose_that_is_not_finite_is_an_adjustment_that_failed():
@@ -192,6 +193,83 @@ def test_a_pose_that_is_not_finite_is_an_adjustment_that_failed():
     assert not result.ok
     np.testing.assert_array_equal(result.T_world_cam, T_world_cam)
     np.testing.assert_array_equal(result.xyz, problem.xyz)
+
+
+def both_ways(monkeypatch, problem):
+    """By dense algebra and by GTSAM."""
+    dense = optimise(problem)
+    with monkeypatch.context() as patched:
+        patched.setattr(bundle, "_MAX_DENSE_VIEWS", -1)
+        return dense, optimise(problem)
+
+
+def with_outliers(problem):
+    xy = problem.xy.copy()
+    xy[::9] += (30.0, -20.0)
+    return {"xy": xy}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        lambda problem: {},
+        lambda problem: {"iterations": 1},
+        with_outliers,
+        lambda problem: {**with_outliers(problem), "huber_px": 1.0},
+        lambda problem: {"fixed": np.arange(6) == 0, "keep_baseline": True},
+        lambda problem: {"fixed": np.arange(6) == 3, "keep_baseline": True},
+        lambda problem: {"view": problem.view[::-1], "point": problem.point[::-1], "xy": problem.xy[::-1]},
+        lambda problem: (
+            {name: np.repeat(vars(problem)[name], 2, axis=0) for name in ("view", "point", "xy")}
+            | {name: np.repeat(vars(problem)[name], 2) for name in ("sigma_px", "confidence")}
+        ),
+    ],
+    ids=["window", "a step", "outliers", "Eq. 22", "baseline", "its ends free", "any order", "seen twice"],
+)
+def test_dense_algebra_ends_where_gtsam_does(monkeypatch, changes):
+    problem, _, _ = make_problem(num_points=40, shake=0.05)
+    dense, sparse = both_ways(monkeypatch, BundleProblem(**{**vars(problem), **changes(problem)}))
+    assert dense.ok
+    assert sparse.ok
+    assert np.abs(sparse.T_world_cam - problem.T_world_cam).max() > 0.01
+    np.testing.assert_allclose(dense.T_world_cam, sparse.T_world_cam, atol=2e-6)
+    np.testing.assert_allclose(dense.xyz, sparse.xyz, atol=2e-5)
+    scale = np.sqrt(np.diag(sparse.covariance))
+    difference = (dense.covariance - sparse.covariance) / np.outer(scale, scale)
+    assert np.abs(difference).max() < 1e-3
+
+
+def test_a_step_that_would_make_it_worse_is_shortened_as_gtsam_does(monkeypatch):
+    problem, _, _ = make_problem(num_views=4, num_points=4, shake=0.4, seed=5)
+    tried = []
+    step = dense_bundle.Normal.step
+    monkeypatch.setattr(
+        dense_bundle.Normal, "step", lambda self, damping: tried.append(damping) or step(self, damping)
+    )
+    dense, sparse = both_ways(monkeypatch, problem)
+    assert any(later > before for before, later in pairwise(tried)), "nothing was shortened"
+    np.testing.assert_allclose(dense.T_world_cam, sparse.T_world_cam, atol=1e-5)
+
+
+@pytest.mark.parametrize("fixed_last", [True, False], ids=["held", "unseen"])
+def test_a_last_pose_that_is_held_or_unseen_has_no_covariance(fixed_last):
+    problem, T_world_cam, _ = make_problem(noise_px=0.1)
+    seen = np.ones(len(problem.view), bool) if fixed_last else problem.view != 5
+    kept = {name: vars(problem)[name][seen] for name in ("view", "point", "xy", "sigma_px", "confidence")}
+    fixed = problem.fixed | (fixed_last & (np.arange(6) == 5))
+    result = optimise(BundleProblem(**{**vars(problem), **kept, "fixed": fixed}))
+    assert result.ok
+    assert result.covariance is None
+    np.testing.assert_allclose(result.T_world_cam[5], problem.T_world_cam[5], atol=1e-12)
+    assert np.linalg.norm(result.T_world_cam[2:5, :3, 3] - T_world_cam[2:5, :3, 3], axis=1).max() < 0.05
+
+
+def test_points_are_adjusted_where_all_poses_are_held():
+    problem, _, xyz = make_problem(noise_px=0.0, shake=0.0)
+    moved = BundleProblem(**{**vars(problem), "fixed": np.ones(6, bool), "xyz": xyz + 0.02})
+    result = optimise(moved)
+    assert result.ok
+    np.testing.assert_allclose(result.xyz, xyz, atol=1e-4)
 
 
 def test_sigmas_share_sixteen_models():
@@ -233,6 +311,10 @@ def test_the_weight_is_outside_of_the_loss_in_the_papers_objective_and_inside_in
     # Ours: rho(r / sigma), linear beyond 1.345 sigma.
     graph, values = bundle._build(problem, used)
     assert graph.error(values) == pytest.approx(1.345 * (residual_px / sigma - 1.345 / 2))
+    for asked in (paper, problem):
+        graph, values = bundle._build(asked, used)
+        window, state, _ = bundle._window_of(asked, used)
+        assert dense_bundle.see(window, state).cost == pytest.approx(graph.error(values))
 
 
 def test_inline_gives_the_same_bits_again():

@@ -1,0 +1,311 @@
+"""Bundle adjustment of few views by dense algebra: all observations at once, points eliminated (Schur).
+
+For a window that is faster than GTSAM, which has an object for each observation. Loss, damping and when to
+stop are those of GTSAM's Levenberg-Marquardt, so that both end in the same place.
+
+Arrays have observations along their last axis, which sums and products then run along.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import exp_se3, invert_transform
+
+Array = NDArray[np.float64]
+
+#: Damping at the start, by what it changes after a step was taken or not, and where the search for one ends.
+_FIRST_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-4, 10.0, 1e5
+#: A step is taken if it lowers the cost by this share of what the linear system promised.
+_MIN_KEPT_PROMISE = 1e-3
+#: The search ends when a step lowers the cost by less than this share, or this much.
+_SMALL_SHARE, _SMALL = 1e-3, 1e-5
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A distance between two views that is held.
+
+    Attributes:
+        views: Their rows.
+        length_map: The distance.
+        sigma_map: Its standard deviation.
+    """
+
+    views: tuple[int, int]
+    length_map: float
+    sigma_map: float
+
+
+@dataclass(frozen=True)
+class State:
+    """What is adjusted: poses ``T_world_cam (K, 4, 4)`` and points ``xyz (P, 3)``."""
+
+    T_world_cam: Array
+    xyz: Array
+
+
+@dataclass(frozen=True)
+class Window:
+    """What poses and points are adjusted to.
+
+    Attributes:
+        camera: Pinhole.
+        free: ``(K,)`` bool, views whose poses are adjusted.
+        num_points: Each has an observation.
+        view: ``(M,)`` of each observation.
+        point: ``(M,)``.
+        xy: ``(M, 2)`` pixels.
+        sigma_px: ``(M,)`` standard deviation per coordinate.
+        limit: ``(M,)`` Huber's limit in standard deviations.
+        baseline: Or None.
+    """
+
+    camera: Intrinsics
+    free: NDArray[np.bool_]
+    num_points: int
+    view: NDArray[np.intp]
+    point: NDArray[np.intp]
+    xy: Array
+    sigma_px: Array
+    limit: Array
+    baseline: Baseline | None
+
+    @cached_property
+    def num_unknowns(self) -> int:
+        """Of the poses."""
+        return 6 * int(self.free.sum())
+
+    @cached_property
+    def first_unknown(self) -> NDArray[np.intp]:
+        """``(K,)`` of each view's pose, of no meaning for those that are not free."""
+        return np.asarray(6 * (np.cumsum(self.free) - 1))
+
+    @cached_property
+    def of_free(self) -> NDArray[np.intp]:
+        """Observations of free views, one view after the other."""
+        rows = np.flatnonzero(self.free[self.view])
+        return rows[np.argsort(self.view[rows], kind="stable")]
+
+    @cached_property
+    def place(self) -> NDArray[np.intp]:
+        """Where the products of points' and poses' slopes, ``(3, 6, F)``, belong in ``Normal.both``, flat."""
+        row = 3 * self.point[self.of_free] + np.arange(3)[:, None]
+        column = self.first_unknown[self.view[self.of_free]] + np.arange(6)[:, None]
+        return np.asarray((row[:, None] * self.num_unknowns + column).ravel())
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A state as its views see it.
+
+    Attributes:
+        state: The state.
+        R_cam_world: ``(3, 3, M)`` of the view of each observation.
+        points_cam: ``(3, M)`` its point in that view.
+        residual_px: ``(2, M)`` observed minus projected; large, and nothing changes it, behind the camera.
+        length: ``(M,)`` of the residual in standard deviations.
+        cost: Sum of all losses.
+    """
+
+    state: State
+    R_cam_world: Array
+    points_cam: Array
+    residual_px: Array
+    length: Array
+    cost: float
+
+
+def see(window: Window, state: State) -> Seen:
+    """Project all points, and sum up how far off that is."""
+    T_cam_world = invert_transform(state.T_world_cam).transpose(1, 2, 0)[:3].take(window.view, axis=2)
+    R_cam_world = T_cam_world[:, :3]
+    points = np.einsum("ijm,jm->im", R_cam_world, state.xyz.T.take(window.point, axis=1)) + T_cam_world[:, 3]
+    z = np.where(points[2] > 0.0, points[2], np.nan)
+    camera = window.camera
+    seen_xy = np.stack([camera.fx * points[0] / z + camera.cx, camera.fy * points[1] / z + camera.cy])
+    residual = np.nan_to_num(window.xy.T - seen_xy, nan=2.0 * camera.fx)
+    length = np.hypot(*residual) / window.sigma_px
+    within = np.minimum(length, window.limit)
+    cost = float((within * (length - 0.5 * within)).sum())
+    if window.baseline is not None:
+        cost += 0.5 * _along(window.baseline, state)[1] ** 2
+    return Seen(state, R_cam_world, points, residual, length, cost)
+
+
+def _along(baseline: Baseline, state: State) -> tuple[Array, float]:
+    """Unit vector from the first view to the second, and what is missing to the length, in sigmas."""
+    first, second = (state.T_world_cam[k, :3, 3] for k in baseline.views)
+    length_map = float(np.linalg.norm(second - first))
+    return (second - first) / length_map, (baseline.length_map - length_map) / baseline.sigma_map
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations, with C unknowns of poses.
+
+    Attributes:
+        poses: ``(C, C)``.
+        points: ``(P, 3, 3)``, each point for itself.
+        both: ``(P, 3, C)``.
+        right_poses: ``(C,)`` right side.
+        right_points: ``(P, 3)`` right side.
+    """
+
+    poses: Array
+    points: Array
+    both: Array
+    right_poses: Array
+    right_points: Array
+
+    def reduced(self, damping: float) -> tuple[Array, Array, Array]:
+        """Eliminate the points.
+
+        Returns:
+            The poses' system ``(C, C)``; the inverse Cholesky factors ``(P, 3, 3)`` of the points' own ones;
+            and ``both`` multiplied by these, ``(P, 3, C)``.
+
+        Raises:
+            LinAlgError: A point is not determined.
+        """
+        factor = np.asarray(np.linalg.inv(np.linalg.cholesky(self.points + damping * np.eye(3))), np.float64)
+        scaled = factor @ self.both
+        flat = scaled.reshape(3 * len(scaled), len(self.poses))
+        return self.poses + damping * np.eye(len(self.poses)) - flat.T @ flat, factor, scaled
+
+    def step(self, damping: float) -> tuple[Array, Array, float]:
+        """Solve: twists of poses ``(C,)``, moves of points ``(P, 3)``, and by how much the cost should fall.
+
+        Raises:
+            LinAlgError: The system is singular.
+        """
+        system, factor, scaled = self.reduced(damping)
+        right = np.einsum("pij,pj->pi", factor, self.right_points)
+        right_poses = self.right_poses - np.tensordot(right, scaled, 2)
+        twists = np.asarray(np.linalg.solve(system, right_poses), np.float64)
+        moves: Array = np.einsum("pji,pj->pi", factor, right - scaled @ twists)
+        promised = twists @ self.right_poses + (moves * self.right_points).sum()
+        promised += damping * (twists @ twists + (moves**2).sum())
+        return twists, moves, 0.5 * float(promised)
+
+
+def linearise(window: Window, seen: Seen) -> Normal:
+    """Return the normal equations around a state, each observation weighted by Huber's loss."""
+    x, y, z = seen.points_cam
+    front = z > 0.0
+    z = np.where(front, z, 1.0)
+    weight = np.sqrt(np.minimum(1.0, window.limit / np.maximum(seen.length, 1e-12))) / window.sigma_px
+    weight = np.where(front, weight, 0.0)
+    by_point = np.zeros((2, 3, len(z)))
+    x_px, y_px = weight * window.camera.fx / z, weight * window.camera.fy / z
+    by_point[0, 0], by_point[0, 2] = x_px, -x_px * x / z
+    by_point[1, 1], by_point[1, 2] = y_px, -y_px * y / z
+    residual = weight * seen.residual_px
+    by_xyz = np.einsum("aim,ijm->ajm", by_point, seen.R_cam_world)
+    own = _products(by_xyz, np.concatenate([by_xyz, residual[:, None]], axis=1))
+    sums = [_summed(window.point, row, window.num_points) for row in own.reshape(12, -1)]
+    points = np.stack(sums, axis=1).reshape(window.num_points, 3, 4)
+    rows, count = window.of_free, window.num_unknowns
+    by_point, by_xyz = by_point[..., rows], by_xyz[..., rows]
+    # What moves is the camera, in its own frame.
+    turn = np.cross(by_point, seen.points_cam[:, rows], axisa=1, axisb=0, axisc=1)
+    by_pose = np.concatenate([turn, -by_point], axis=1)
+    poses, right_poses = _poses_own(window, by_pose, residual[:, rows])
+    _hold_baseline(window, seen.state, poses, right_poses)
+    both = _summed(window.place, _products(by_xyz, by_pose).ravel(), 3 * window.num_points * count)
+    both = both.reshape(window.num_points, 3, count)
+    return Normal(poses, points[..., :3], both, right_poses, points[..., 3])
+
+
+def _summed(group: NDArray[np.intp], values: Array, num_groups: int) -> Array:
+    """Sums of values ``(N,)`` over groups."""
+    return np.asarray(np.bincount(group, values, num_groups), dtype=np.float64)
+
+
+def _products(slopes0: Array, slopes1: Array) -> Array:
+    """Each observation's products of slopes ``(2, I, M)`` and ``(2, J, M)``: ``(I, J, M)``."""
+    return np.asarray(np.einsum("aim,ajm->ijm", slopes0, slopes1))
+
+
+def _poses_own(window: Window, by_pose: Array, residual: Array) -> tuple[Array, Array]:
+    """The poses' part ``(C, C)`` of normal equations, and its right side ``(C,)``."""
+    slopes = np.concatenate([by_pose, residual[:, None]], axis=1).transpose(1, 0, 2)
+    poses, right = np.zeros((window.num_unknowns, window.num_unknowns)), np.zeros(window.num_unknowns)
+    ends = np.searchsorted(window.view[window.of_free], np.flatnonzero(window.free), side="right")
+    for k, (since, end) in enumerate(pairwise((0, *ends.tolist()))):
+        flat = slopes[:, :, since:end].reshape(7, -1)
+        products = flat @ flat.T
+        poses[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = products[:6, :6]
+        right[6 * k : 6 * k + 6] = products[:6, 6]
+    return poses, right
+
+
+def _hold_baseline(window: Window, state: State, poses: Array, right_poses: Array) -> None:
+    """Add what holds the baseline to the poses' part of normal equations."""
+    if window.baseline is None:
+        return
+    direction, missing = _along(window.baseline, state)
+    slope = np.zeros(window.num_unknowns)
+    for view, sign in zip(window.baseline.views, (-1.0, 1.0), strict=True):
+        if window.free[view]:
+            at = window.first_unknown[view] + 3
+            slope[at : at + 3] = sign * direction @ state.T_world_cam[view, :3, :3]
+    slope /= window.baseline.sigma_map
+    poses += np.outer(slope, slope)
+    right_poses += missing * slope
+
+
+def _moved(window: Window, state: State, twists: Array, moves: Array) -> State:
+    T_world_cam = state.T_world_cam.copy()
+    for k, twist in zip(np.flatnonzero(window.free).tolist(), twists.reshape(-1, 6), strict=True):
+        T_world_cam[k] = T_world_cam[k] @ exp_se3(twist)
+    return State(T_world_cam, state.xyz + moves)
+
+
+def minimise(window: Window, state: State, iterations: int) -> State:
+    """Return the state after so many steps at most; the one it began with where none makes it better."""
+    seen, damping = see(window, state), _FIRST_DAMPING
+    for _ in range(iterations):
+        better, damping = _better(window, seen, damping)
+        if better is None:
+            break
+        before, seen = seen.cost, better
+        if before - seen.cost <= max(_SMALL_SHARE * before, _SMALL):
+            break
+    return seen.state
+
+
+def _better(window: Window, seen: Seen, damping: float) -> tuple[Seen | None, float]:
+    """Find a damping with which a step is worth it: where that leads to, or None, and the next damping."""
+    normal = linearise(window, seen)
+    while damping < _MAX_DAMPING:
+        try:
+            twists, moves, promised = normal.step(damping)
+        except np.linalg.LinAlgError:
+            promised = -1.0
+        if promised >= 0.0:
+            moved = see(window, _moved(window, seen.state, twists, moves))
+            fall = seen.cost - moved.cost
+            if fall > _MIN_KEPT_PROMISE * promised > 0.0:
+                return moved, damping / _DAMPING_FACTOR
+            if abs(fall) < _SMALL_SHARE * seen.cost:
+                break
+        damping *= _DAMPING_FACTOR
+    return None, damping
+
+
+def last_covariance(window: Window, state: State) -> Array | None:
+    """Marginal covariance ``(6, 6)`` of the last pose, None where it is held or nothing fixes it."""
+    if not window.free[-1]:
+        return None
+    try:
+        system = linearise(window, see(window, state)).reduced(0.0)[0]
+        np.linalg.cholesky(system)
+        covariance = np.asarray(np.linalg.inv(system)[-6:, -6:], np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    return covariance if np.isfinite(covariance).all() else None
