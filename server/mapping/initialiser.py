@@ -174,7 +174,7 @@ class Initialiser:
         """
         if len(observed.ids) < MIN_MATCHES:
             return None
-        self._remember(observed)
+        self._remember(observed, suspect)
         if is_damaged or self._reference == len(self.history) - 1:
             return None
         pair = _pair(self.history[self._reference], observed, suspect)
@@ -204,13 +204,13 @@ class Initialiser:
             self._undecided_px = evidence_px
         return start
 
-    def _remember(self, observed: Observed) -> None:
+    def _remember(self, observed: Observed, suspect: Ids) -> None:
         """Add a frame to those kept, and look whether the reference may stay."""
         self.history.append(observed)
         if len(self.history) > MAX_HISTORY:
             self.history.pop(0)
             self._reference = max(0, self._reference - 1)
-        self._move_reference()
+        self._move_reference(suspect)
         self._forget_images()
 
     def _scene_of(self, pair: _Pair, noise: NoiseModel) -> SceneMotion | None:
@@ -287,15 +287,16 @@ class Initialiser:
         self._num_contested += 1
         return self._num_contested <= _MAX_CONTESTED
 
-    def _move_reference(self) -> None:
+    def _move_reference(self, suspect: Ids) -> None:
         """Let the reference be the oldest frame that still shares enough tracks with the newest.
 
         Enough are so many that those of them that agree, by their share in the last search, make a start.
         With fewer the reference would stay for as long as the last few tracks last, and no start come of it.
+        Tracks that stand in the image last longest of all, and don't count: no start rests on them.
         """
-        newest = self.history[-1]
+        newest = self.history[-1].without(suspect)
         while self._reference < len(self.history) - 1:
-            reference = self.history[self._reference]
+            reference = self.history[self._reference].without(suspect)
             shared = int(np.isin(reference.ids, newest.ids, assume_unique=True).sum())
             if shared >= max(MIN_POINTS / self._agreeing, _MIN_SHARED * len(reference.ids)):
                 return

@@ -76,7 +76,7 @@ class Reconstruction:
 
     def _begin(self, camera: Intrinsics) -> None:
         s = self._settings
-        self._tracks = TrackTable(s.confidence, s.max_features, s.seed)
+        self._tracks = TrackTable(s.confidence, s.max_features, s.seed, turntable=s.turntable)
         self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
         self._motion = CameraMotion(self._camera)
         self._passage = Passage(self._camera, self._map.enough)

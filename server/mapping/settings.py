@@ -69,6 +69,14 @@ class ReconstructionSettings:
         },
     )
 
+    turntable: bool = field(
+        default=False,
+        metadata={
+            "help": "the camera stands and what it looks at turns, as on a turntable: only what moves in the "
+            "image is taken for the scene"
+        },
+    )
+
     def __post_init__(self) -> None:
         """Check ranges."""
         if self.confidence not in get_args(ConfidenceMode):

@@ -3,7 +3,8 @@
 They never leave the image, and each frame adds to them, until they are most of all tracks: what is seen of
 the scene is too little then, and a start waits for ever for a camera that seems to stand still. Whether the
 scene moves is therefore asked of the image's area, not of the tracks. Something large that drives past a
-camera that stands still moves through less than half of it.
+camera that stands still moves through less than half of it. So does what turns on a turntable, where the rest
+of the image stands for good: nothing but what the user says tells one from the other.
 """
 
 import numpy as np
@@ -27,6 +28,8 @@ _SUSPECT_WIDTHS, _MANY_SHARE = 0.006, 0.1
 _COLUMNS = 12
 #: Less than this from one frame to the next is no motion, but noise.
 _LEAST_MOTION_PX = 0.5
+#: Fewer tracks that move are no turntable, but slipped.
+_MIN_TURNING = 12
 
 
 def cells_of(xy: Array, width: int) -> NDArray[np.intp]:
@@ -52,6 +55,19 @@ def scene_motion_px(xy: Array, motion_px: Array, width: int) -> float:
     middle = begins + (np.bincount(group) - 1) // 2
     motion = float(np.median(motion_px[order[middle]]))
     return motion if motion >= _LEAST_MOTION_PX else 0.0
+
+
+def turning_motion_px(xy: Array, motion_px: Array, width: int, sd_px: Array) -> float:
+    """Return the same where the scene is only what moves, by more than the noise of its tracks explains.
+
+    Args:
+        xy: ``(N, 2)`` tracks.
+        motion_px: ``(N,)`` how far each moved.
+        width: Of the image.
+        sd_px: ``(N,)`` standard deviation of a position per coordinate.
+    """
+    moves = motion_px >= np.maximum(_LEAST_MOTION_PX, _NOISE_SIGMAS * np.sqrt(2.0) * sd_px)
+    return scene_motion_px(xy[moves], motion_px[moves], width) if moves.sum() >= _MIN_TURNING else 0.0
 
 
 def stood(

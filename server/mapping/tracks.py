@@ -28,7 +28,7 @@ from semcast.server.geometry.weighting import (
 from semcast.server.geometry.wide_search import Carried, WideFeatures, search_wide
 from semcast.server.mapping.found import Found
 from semcast.server.mapping.sight import Seen, Sight
-from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood
+from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood, turning_motion_px
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -71,7 +71,10 @@ class TrackTable:
         stood_widths: ``(N,)`` image widths the scene went since then.
     """
 
-    def __init__(self, mode: ConfidenceMode, max_features: int, seed: int) -> None:
+    def __init__(
+        self, mode: ConfidenceMode, max_features: int, seed: int, *, turntable: bool = False
+    ) -> None:
+        self._turntable = turntable
         self._mode: ConfidenceMode = mode
         self._max_features = max_features
         self._rng = np.random.default_rng(seed)
@@ -320,10 +323,14 @@ class TrackTable:
         self.xy = np.where(ok[:, None], found.xy, self.xy)
         self.age = self.age + ok
         width = sight.grey.shape[1]
-        scene_px = scene_motion_px(self.xy[ok], np.linalg.norm(self.velocity[ok], axis=1), width)
+        motion_px, sd_px = np.linalg.norm(self.velocity[ok], axis=1), np.sqrt(self.variance_px2)
+        if self._turntable:
+            scene_px = turning_motion_px(self.xy[ok], motion_px, width, sd_px[ok])
+        else:
+            scene_px = scene_motion_px(self.xy[ok], motion_px, width)
         passed = np.where(ok, scene_px, 0.0)  # where a track that coasts is, nobody knows
         self.anchor_xy, self.stood_widths = stood(
-            self.xy, self.anchor_xy, self.stood_widths, passed, width, np.sqrt(self.variance_px2)
+            self.xy, self.anchor_xy, self.stood_widths, passed, width, sd_px
         )
         self.missed = np.where(ok, 0, self.missed + 1)
         cues = replace(

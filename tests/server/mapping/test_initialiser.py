@@ -271,21 +271,42 @@ def test_a_start_is_looked_at_anew_without_tracks_that_were_left_out(monkeypatch
     assert len(asked) == so_far + 1
 
 
-def test_no_start_rests_on_suspect_tracks():
+def before_what_stands(frames):
+    """Frames that see a hundred points more, which never move, and their ids."""
     rng = np.random.default_rng(7)
-    ids = 1000 + np.arange(100)
+    ids = 100_000 + np.arange(100)
     standing = np.column_stack((rng.uniform(0, 640, 100), rng.uniform(400, 480, 100)))
-    frames = [
+    both = [
         replace(
             f,
             ids=np.concatenate([f.ids, ids]),
             xy=np.concatenate([f.xy, standing]),
             confidence=np.ones(len(f.ids) + 100),
         )
-        for f in ride(6)[0]
+        for f in frames
     ]
+    return both, ids
+
+
+def test_no_start_rests_on_suspect_tracks():
+    frames, ids = before_what_stands(ride(6)[0])
     initialiser = Initialiser(CAMERA, "off", 1.0, 0)
     found = [initialiser.add(frame, NOISE, ids) for frame in frames]
     start = next(start for start in found if start is not None)
     assert not np.isin(ids, start.ids).any()
     assert not any(np.isin(ids, keyframe.ids).any() for keyframe in start.keyframes)
+
+
+def test_what_stands_ties_no_start_to_frames_whose_scene_is_out_of_sight():
+    """The camera rests, then sees another scene, and goes: old and new frames share only what stands."""
+    rest = same_view(ride(1)[0][0], 3, 0)
+    ahead = [
+        replace(f, frame_id=f.frame_id + 3, t_source_ns=(f.frame_id + 3) * 100_000_000, ids=f.ids + 1000)
+        for f in ride(4)[0]
+    ]
+    frames, ids = before_what_stands([*rest, *ahead])
+    initialiser = Initialiser(CAMERA, "off", 1.0, 0)
+    found = [initialiser.add(frame, NOISE, ids) for frame in frames]
+    start = next(start for start in found if start is not None)
+    assert not np.isin(start.ids, ids).any()
+    assert min(k.frame_id for k in start.keyframes) >= 3

@@ -2,7 +2,8 @@
 
 import cv2
 import numpy as np
-from drawn_boards import ate_percent, frame_of, make, render
+import pytest
+from drawn_boards import ate_percent, frame_of, make, render, sideways
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform
@@ -10,7 +11,7 @@ from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
 from semcast.server.mapping.sight import Sight
-from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood
+from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood, turning_motion_px
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable
 
@@ -63,6 +64,19 @@ def test_the_motion_of_the_scene_is_that_of_most_of_the_area_not_of_most_tracks(
     assert scene_motion_px(xy, 7.0 - motion, 640) == 0.0, "something that drives past a camera at rest"
     assert scene_motion_px(xy, np.full(len(xy), 0.2), 640) == 0.0, "noise"
     assert scene_motion_px(np.zeros((0, 2)), np.zeros(0), 640) == 0.0
+
+
+def test_on_a_turntable_the_scene_is_what_moves():
+    xy = np.stack(np.meshgrid(np.arange(20, 640, 60.0), np.arange(20, 400, 60.0)), axis=-1).reshape(-1, 2)
+    motion = np.where(np.hypot(*(xy - (320, 200)).T) < 130, 3.0, 0.2)
+    assert scene_motion_px(xy, motion, 640) == 0.0
+    noise = np.full(len(xy), 0.1)
+    assert turning_motion_px(xy, motion, 640, noise) == 3.0
+    assert turning_motion_px(xy, np.where(motion == 3.0, 3.0, 0.9), 640, 5 * noise) == 3.0, (
+        "the rest is noise"
+    )
+    slipped = np.where(np.arange(len(xy)) < 5, 3.0, 0.2)
+    assert turning_motion_px(xy, slipped, 640, noise) == 0.0
 
 
 def test_a_track_that_moves_begins_anew():
@@ -193,3 +207,19 @@ def test_a_map_that_begins_behind_a_bonnet_does_not_rest_on_it():
     reconstruction.close()
     assert len(trajectory) == 30
     assert ate_percent(trajectory, path) < 1.0
+
+
+@pytest.mark.parametrize("turntable", [False, True])
+def test_what_turns_before_a_camera_at_rest_is_reconstructed_if_that_is_said(turntable):
+    """Less than half of the image moves, as of a thing on a turntable before a wall with a pattern."""
+    path = sideways()
+    reconstruction = make(turntable=turntable)
+    for k, T_world_cam in enumerate(path):
+        image = np.repeat(BONNET[..., None], 3, axis=2)
+        image[40:200, 75:245] = render(T_world_cam)[40:200, 75:245]
+        reconstruction.process(frame_of(k, image))
+    trajectory = reconstruction.final_trajectory()
+    reconstruction.close()
+    assert len(trajectory) == (len(path) if turntable else 0)
+    if turntable:
+        assert ate_percent(trajectory, path) < 1.0
