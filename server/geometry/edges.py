@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 #: Along an edge a standard deviation is at most so many times that across it: nothing is known to less than
 #: a tenth of a pixel, and edges that are bent are straight for a few pixels only.
 _MOST_RATIO = 10.0
-#: Half the side of the window whose gradients count, that of Lucas-Kanade.
-_REACH_PX = 8
+#: Half the side of the window whose gradients count, and steps between them: they are smooth over as much.
+_REACH_PX, _STEP_PX = 8, 2
 #: Steps that ``rounded`` takes.
 _LENGTH_STEP, _ANGLE_STEP = 0.2, np.pi / 36
 
@@ -31,7 +31,7 @@ def edges_at(grey: NDArray[np.uint8], xy: Array) -> Array:
     height, width = grey.shape
     if len(xy) == 0 or min(height, width) <= 2 * _REACH_PX:
         return np.zeros((len(xy), 2))
-    offset = np.arange(-_REACH_PX, _REACH_PX + 1)
+    offset = np.arange(-_REACH_PX, _REACH_PX + 1, _STEP_PX)
     x = np.clip(np.rint(xy[:, 0]).astype(np.intp), _REACH_PX, width - 1 - _REACH_PX)
     y = np.clip(np.rint(xy[:, 1]).astype(np.intp), _REACH_PX, height - 1 - _REACH_PX)
     pixel = ((y[:, None] + offset) * width)[:, :, None] + (x[:, None] + offset)[:, None, :]

@@ -90,6 +90,6 @@ def test_rounding_leaves_few_edges_close_to_what_they_were():
 def test_the_gradients_are_those_of_the_window_around_the_point():
     grey = half_plane(0.0)
     grey[:, 200:] = cv2.transpose(half_plane(0.0))[:240, :120]  # another scene to the right
-    point = np.array([[100.0, 120.0]])
-    assert np.allclose(edges_at(grey, point), edges_at(half_plane(0.0), point))
-    assert not np.allclose(edges_at(grey, point + [140, 0]), edges_at(half_plane(0.0), point + [140, 0]))
+    left, right = np.array([[100.0, 120.0]]), np.array([[240.0, 120.0]])
+    assert np.allclose(edges_at(grey, left), edges_at(half_plane(0.0), left))
+    assert not np.allclose(edges_at(grey, right), edges_at(half_plane(0.0), right))

@@ -8,7 +8,6 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
-from semcast.server.geometry.edges import edges_at
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
@@ -496,24 +495,3 @@ def test_a_track_that_fits_nowhere_stays_where_it_is(mapped):
     np.testing.assert_array_equal(tracks.xy, followed)
     world.remove_landmarks(np.arange(len(world.landmarks)) >= 4)
     assert anchor(mapped, sight, 30) == 4, "too few depths to tell those of others"
-
-
-@pytest.mark.parametrize(("mode", "has_edges"), [("robust", True), ("off", False), ("paper", False)])
-def test_a_track_has_the_edge_of_its_newest_image(mode, has_edges):
-    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    images = [np.where(x < SHAPE[1] // 2 + 3 * k, 60, 180) + 4 * ((x // 8 + y // 8) % 2) for k in range(2)]
-    sights = []
-    for k, image in enumerate(images):
-        frame = DecodedFrame(k, k * 10**8, np.repeat(image[..., None], 3, axis=2).astype(np.uint8))
-        sights.append(Sight(frame, to_grey(frame.image), usable_rows(frame, SHAPE[0])))
-    tracks = TrackTable(mode, 150, 0)
-    tracks.remember(sights[0])
-    assert tracks.refill(sights[0]) > 20
-    begun = tracks.edge.copy()
-    tracks.follow(sights[1], tracks.xy)
-    assert len(tracks.edge) == len(tracks) > 20
-    assert tracks.edge.any() == begun.any() == has_edges
-    if has_edges:
-        assert np.array_equal(tracks.edge, edges_at(sights[1].grey, tracks.xy))
-        assert not np.array_equal(tracks.edge, begun[: len(tracks)])
-        assert np.array_equal(tracks.seen().edge, tracks.edge[tracks.visible])
