@@ -42,7 +42,8 @@ def edges_at(grey: NDArray[np.uint8], xy: Array) -> Array:
     weak, strong = np.maximum(half - spread, 0.0), half + spread
     ratio = np.minimum(np.sqrt((strong + 1e-9) / (weak + 1e-9)), _MOST_RATIO)
     across = 0.5 * np.arctan2(2.0 * xy_, xx - yy)
-    return 0.5 * np.log(ratio)[:, None] * np.column_stack([-np.sin(across), np.cos(across)])
+    along = np.column_stack([-np.sin(across), np.cos(across)])
+    return np.asarray(0.5 * np.log(ratio)[:, None] * along)
 
 
 def whiteners(edge: Array) -> Array:

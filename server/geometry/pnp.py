@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, make_transform, project_to_so3, transform_points
-from semcast.server.geometry.edges import whitened, whiteners
+from semcast.server.geometry.edges import whiteners
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 
@@ -115,10 +115,9 @@ def refine_pose(
     T_start = T_cam_world.copy()
     T = T_start.copy()
     whitener = None if edge is None else whiteners(edge)
-    if spread_px is not None and edge is None:
-        whitener = _whitener(sigma_px, spread_px)
-    elif spread_px is not None:
-        whitener = _whitener(sigma_px, whitened(edge, spread_px)) @ whitener
+    if spread_px is not None:
+        shape = np.eye(2) if whitener is None else whitener
+        whitener = _whitener(sigma_px, (shape @ spread_px[..., None])[..., 0]) @ shape
     weight = sigma_px**-2.0
     hessian = np.zeros((6, 6))
     for iteration in range(iterations):

@@ -163,12 +163,10 @@ def _share_across(
     whitener: Array,
 ) -> Array:
     """Share of the angle to a point's first ray that counts, ``(M,)``: along an edge it tells little."""
-    moved = (
-        _jacobian(camera, R_cam_world, points_cam) @ (xyz - centre[_first(point, len(xyz))])[point][..., None]
-    )
-    size = np.linalg.norm(moved[..., 0], axis=1)
-    told = np.linalg.norm((whitener @ moved)[..., 0], axis=1)
-    return np.minimum(1.0, told / np.maximum(size, 1e-12))
+    first_ray = xyz - centre[_first(point, len(xyz))]
+    moved = _jacobian(camera, R_cam_world, points_cam) @ first_ray[point][..., None]
+    size, told = (np.linalg.norm(way[..., 0], axis=1) for way in (moved, whitener @ moved))
+    return np.asarray(np.minimum(1.0, told / np.maximum(size, 1e-12)))
 
 
 def _first(point: NDArray[np.intp], num_points: int) -> NDArray[np.intp]:

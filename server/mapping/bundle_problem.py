@@ -80,7 +80,8 @@ class BundleProblem:
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""
-        object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.xy), 2)))
+        if len(self.edge) != len(self.xy):
+            object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.xy), 2)))
 
 
 class Frame(Protocol):

@@ -47,7 +47,8 @@ class Observed:
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""
-        object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.ids), 2)))
+        if len(self.edge) != len(self.ids):
+            object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.ids), 2)))
 
     def without(self, ids: Ids) -> "Observed":
         """Return the same without some tracks."""

@@ -91,7 +91,8 @@ class Seen:
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""
-        object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.ids), 2)))
+        if len(self.edge) != len(self.ids):
+            object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.ids), 2)))
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -135,7 +135,8 @@ class Keyframe:
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""
-        self.edge = np.broadcast_to(self.edge, (len(self.ids), 2))
+        if len(self.edge) != len(self.ids):
+            self.edge = np.broadcast_to(self.edge, (len(self.ids), 2))
 
     def drop_observations(self, bad: NDArray[np.bool_]) -> None:
         """Forget the observations in the mask."""
@@ -453,6 +454,8 @@ class WorldMap:
         )
         ends = np.cumsum(arrays["keyframes.length"], axis=0)
         starts = ends - arrays["keyframes.length"]
+        # Older checkpoints have no edges.
+        edges = arrays.get("keyframes.edge", np.zeros_like(arrays["keyframes.xy"]))
         for k, frame_id in enumerate(arrays["keyframes.frame_id"].tolist()):
             parts = {
                 part: np.array(arrays[f"keyframes.{part}"][starts[k, j] : ends[k, j]])
@@ -464,14 +467,10 @@ class WorldMap:
                     t_source_ns=int(arrays["keyframes.t_source_ns"][k]),
                     T_world_cam=self.poses[frame_id],
                     submap=self.submap_of[frame_id],
+                    edge=np.array(edges[starts[k, 0] : ends[k, 0]]),
                     **parts,
                 )
             )
-        if "keyframes.edge" in arrays:  # older checkpoints have none
-            for keyframe, edge in zip(
-                self.keyframes, np.split(arrays["keyframes.edge"], ends[:, 0]), strict=False
-            ):
-                keyframe.edge = edge.copy()
         there = {k.frame_id for k in self.keyframes}
         revisits = arrays.get("revisits", np.zeros((0, 2), np.int64))  # older checkpoints have none
         self.revisits = {new: old for new, old in revisits.tolist() if {new, old} <= there}
