@@ -60,7 +60,7 @@ class TrackedPose:
         covariance: ``(6, 6)`` in the camera's frame, rotation before translation, or None.
         ids: ``(N,)`` landmarks that were looked at.
         inliers: ``(N,)`` bool, those that agree.
-        residual_px: ``(N,)`` reprojection errors.
+        residual_px: ``(N,)`` reprojection errors, as if they were known alike in all directions.
     """
 
     T_world_cam: Array
