@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, make_transform, project_to_so3, transform_points
+from semcast.server.geometry.edges import whiteners
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 
@@ -90,6 +91,7 @@ def refine_pose(
     *,
     iterations: int = 10,
     spread_px: Array | None = None,
+    edge: Array | None = None,
 ) -> PoseEstimate:
     """Minimise weighted reprojection errors under Huber's loss by Gauss-Newton over the pose alone.
 
@@ -105,13 +107,17 @@ def refine_pose(
         gate_px: ``(N,)`` reprojection error up to which an observation is an inlier.
         iterations: Steps at most; from the third on without points three gates off.
         spread_px: ``(N, 2)`` the vectors ``s``, None where all points are certain.
+        edge: ``(N, 2)`` of the observations, see ``edges``; None where errors have no direction.
 
     Returns:
         The refined pose; the start with no inlier where nothing could be solved.
     """
     T_start = T_cam_world.copy()
     T = T_start.copy()
-    whitener = None if spread_px is None else _whitener(sigma_px, spread_px)
+    whitener = None if edge is None else whiteners(edge)
+    if spread_px is not None:
+        shape = np.eye(2) if whitener is None else whitener
+        whitener = _whitener(sigma_px, (shape @ spread_px[..., None])[..., 0]) @ shape
     weight = sigma_px**-2.0
     hessian = np.zeros((6, 6))
     for iteration in range(iterations):
@@ -202,6 +208,7 @@ def search_pose(
     seed: int,
     min_inliers: int = 12,
     max_iterations: int = 1000,
+    edge: Array | None = None,
 ) -> PoseEstimate | None:
     """Find a pose without a prior by PoseLib's LO-RANSAC over three points, then refine it with weights.
 
@@ -217,6 +224,7 @@ def search_pose(
         seed: Of the search.
         min_inliers: Observations that must agree with what the search found, and after the refinement.
         max_iterations: Hypotheses at most.
+        edge: See ``refine_pose``.
 
     Returns:
         The pose, or None when fewer than ``min_inliers`` agree.
@@ -237,5 +245,5 @@ def search_pose(
     if info["num_inliers"] < min_inliers or not (np.isfinite(R).all() and np.isfinite(t).all()):
         return None
     start = make_transform(project_to_so3(R), t)
-    estimate = refine_pose(camera, start, points_world, keypoints_xy, sigma_px, gate_px)
+    estimate = refine_pose(camera, start, points_world, keypoints_xy, sigma_px, gate_px, edge=edge)
     return estimate if estimate.num_inliers >= min_inliers else None

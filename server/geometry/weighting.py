@@ -10,13 +10,14 @@ without information ends at ``beta = 0``: unweighted.
 """
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import LABEL_SHARPNESS, displacement_px
+from semcast.server.geometry.edges import alike, edges_at
 
 Array = NDArray[np.float64]
 
@@ -202,6 +203,7 @@ class KeypointCues:
         forward_backward_px: ``(N,)`` distance of tracking there and back.
         photometric_grey: ``(N,)`` mean absolute difference of the tracked windows.
         drift_px2: ``(N,)`` variance left by the images a point was followed through; 0 where it is new.
+        edge: ``(N, 2)`` along which it is known less, see ``edges``.
     """
 
     pixel_confidence: Array | None
@@ -210,6 +212,7 @@ class KeypointCues:
     forward_backward_px: Array
     photometric_grey: Array
     drift_px2: Array | float = 0.0
+    edge: Array = field(default_factory=alike)
 
 
 def localisation_variance_px2(cues: KeypointCues) -> Array:
@@ -268,3 +271,11 @@ def observation_confidence(mode: ConfidenceMode, cues: KeypointCues, rng: np.ran
     if mode == "inverted":
         return np.asarray(1.0 - c)
     return c
+
+
+def observation_edges(mode: ConfidenceMode, grey: NDArray[np.uint8], xy: Array) -> Array:
+    """Edges of keypoints ``(N, 2)`` that the geometry is given in a mode, ``(N, 2)``, see ``edges``.
+
+    The paper's noise has no direction, and ``off`` leaves out all that speaks of a keypoint's displacement.
+    """
+    return np.zeros((len(xy), 2)) if mode in ("off", "paper") else edges_at(grey, xy)

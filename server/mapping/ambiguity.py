@@ -20,6 +20,7 @@ from semcast.common.geometry import (
     invert_transform,
     rotation_angle_deg,
 )
+from semcast.server.geometry.edges import whitened
 from semcast.server.mapping.bundle import optimise, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.planar import twin
@@ -68,7 +69,8 @@ def adjusted(problem: BundleProblem) -> Side:
     result = optimise(problem)
     # All observations anew: those that could not be used at the start count as well.
     residual, _ = residuals_px(problem, result.T_world_cam, result.xyz)
-    size = np.linalg.norm(np.nan_to_num(residual, nan=1e6), axis=1) / problem.sigma_px
+    error = whitened(problem.edge, np.nan_to_num(residual, nan=1e6))
+    size = np.linalg.norm(error, axis=1) / problem.sigma_px
     return Side(result.T_world_cam, result.xyz, float((np.minimum(size, _CUT_SIGMAS) ** 2).sum()), result.ok)
 
 

@@ -12,6 +12,7 @@ from gtsam.symbol_shorthand import L, X
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, project_to_so3
+from semcast.server.geometry.edges import rounded, whiteners
 from semcast.server.geometry.projection import project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
@@ -58,7 +59,9 @@ def residuals_px(problem: BundleProblem, T_world_cam: Array, xyz: Array) -> tupl
     return np.where(front[:, None], problem.xy - projected, np.nan), front
 
 
-def _noise_model(sigma_px: float, huber_px: float | None) -> gtsam.noiseModel.Robust:
+def _noise_model(
+    sigma_px: float, huber_px: float | None, edge: tuple[float, float]
+) -> gtsam.noiseModel.Robust:
     """Return Huber's loss of the residual over sigma.
 
     GTSAM puts the weight inside the loss. With a limit of ``huber_px / sigma`` that is ``sigma^-2`` times the
@@ -66,7 +69,10 @@ def _noise_model(sigma_px: float, huber_px: float | None) -> gtsam.noiseModel.Ro
     """
     limit = HUBER_K if huber_px is None else huber_px / sigma_px
     huber = gtsam.noiseModel.mEstimator.Huber.Create(limit)
-    return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, sigma_px))
+    if edge == (0.0, 0.0):
+        return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, sigma_px))
+    root = whiteners(np.array([edge]))[0] / sigma_px
+    return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Information(root @ root))
 
 
 def _baseline(problem: BundleProblem) -> Baseline | None:
@@ -96,20 +102,25 @@ def _build(
     for p in np.unique(problem.point[used]).tolist():
         values.insert(L(p), problem.xyz[p])
     sigmas, step = quantised_sigma(problem.sigma_px)
-    models = [_noise_model(float(sigma), problem.huber_px) for sigma in sigmas]
+    shapes = rounded(problem.edge).tolist()
+    models: dict[tuple[int, float, float], gtsam.noiseModel.Robust] = {}
     camera = problem.camera
     calibration = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
     factor = gtsam.GenericProjectionFactorCal3_S2
     pose_keys = [X(k) for k in range(len(problem.T_world_cam))]
     rows = np.flatnonzero(used)
-    for xy, s, k, p in zip(
+    for row, xy, s, k, p in zip(
+        rows.tolist(),
         problem.xy[rows],
         step[rows].tolist(),
         problem.view[rows].tolist(),
         problem.point[rows].tolist(),
         strict=True,
     ):
-        graph.add(factor(xy, models[s], pose_keys[k], L(p), calibration))
+        kind = (s, *shapes[row])
+        if kind not in models:
+            models[kind] = _noise_model(float(sigmas[s]), problem.huber_px, kind[1:])
+        graph.add(factor(xy, models[kind], pose_keys[k], L(p), calibration))
     return graph, values
 
 

@@ -1,13 +1,14 @@
 """What bundle adjustment is asked and what it answers: plain arrays that travel between processes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
+from semcast.server.geometry.edges import alike
 from semcast.server.geometry.weighting import NoiseModel
 
 Array = NDArray[np.float64]
@@ -53,6 +54,7 @@ class BundleProblem:
             see is adjusted.
         with_covariance: Whether the covariance of the last pose is wanted.
         huber_px: See ``NoiseModel``.
+        edge: ``(M, 2)`` of each observation, see ``edges``.
         motion: Of the views, where it is wanted what the residuals say about shutter and lens.
     """
 
@@ -74,6 +76,12 @@ class BundleProblem:
     with_covariance: bool = True
     huber_px: float | None = None
     motion: ViewMotion | None = None
+    edge: Array = field(default_factory=alike)
+
+    def __post_init__(self) -> None:
+        """Have an edge for each observation."""
+        if len(self.edge) != len(self.xy):
+            object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.xy), 2)))
 
 
 class Frame(Protocol):
@@ -92,16 +100,18 @@ class Observations(NamedTuple):
         point: ``(M,)`` row of the track among those asked for.
         xy: ``(M, 2)`` pixels.
         confidence: ``(M,)`` in [0, 1].
+        edge: ``(M, 2)`` see ``edges``.
     """
 
     view: NDArray[np.intp]
     point: NDArray[np.intp]
     xy: Array
     confidence: Array
+    edge: Array
 
     def of_rows(self, kept: NDArray[np.bool_], point: NDArray[np.intp]) -> "Observations":
         """Return those that are ``kept (M,)``, with the rows their tracks have then."""
-        return Observations(self.view[kept], point, self.xy[kept], self.confidence[kept])
+        return Observations(self.view[kept], point, self.xy[kept], self.confidence[kept], self.edge[kept])
 
 
 def assemble_problem(
@@ -155,6 +165,7 @@ def assemble_problem(
         num_anchors=num_anchors,
         with_covariance=with_covariance,
         huber_px=noise.huber_px,
+        edge=seen.edge,
     )
 
 

@@ -57,7 +57,7 @@ def hypothesis_of(side: Side, views: Sequence[Observed], camera: Intrinsics, noi
         noise: Of the observations.
     """
     ids = np.unique(np.concatenate([o.ids for o in views]))
-    view, point, xy, confidence = gather_observations(views, ids)
+    view, point, xy, confidence, _ = gather_observations(views, ids)
     sigma = noise.sigma_px(confidence)
     points = triangulate(camera, invert_transform(side.T_world_cam), view, point, xy, sigma, len(ids))
     seen = np.bincount(point, minlength=len(ids))

@@ -349,7 +349,7 @@ class Initialiser:
         for o, T in zip(chosen, invert_transform(T_cam_world), strict=True):
             T[:3, 3] *= scale
             keyframes.append(keyframe_of(o, T))
-        _, point, _, confidence = gather_observations(chosen, all_ids[good])
+        _, point, _, confidence, _ = gather_observations(chosen, all_ids[good])
         mean = np.bincount(point, weights=confidence) / np.bincount(point)
         return Start(keyframes, all_ids[good], scale * points.xyz[good], mean)
 
@@ -377,7 +377,7 @@ class Initialiser:
     def _triangulate(
         self, frames: list[Observed], T_cam_world: Array, ids: Ids, noise: NoiseModel
     ) -> Triangulation:
-        view, point, xy, confidence = gather_observations(frames, ids)
+        view, point, xy, confidence, _ = gather_observations(frames, ids)
         sigma = noise.sigma_px(confidence)
         return triangulate(self._camera, T_cam_world, view, point, xy, sigma, len(ids))
 

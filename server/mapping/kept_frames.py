@@ -1,13 +1,14 @@
 """Frames kept from before there is a map, and their poses once there is one."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
+from semcast.server.geometry.edges import alike
 from semcast.server.geometry.features import Grey
 from semcast.server.geometry.pnp import refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
@@ -32,6 +33,7 @@ class Observed:
         confidence: ``(N,)`` of the positions.
         rgb: ``(N, 3)`` uint8, or None.
         grey: ``(H, W)`` uint8, or None.
+        edge: ``(N, 2)`` of the positions, see ``edges``.
     """
 
     frame_id: int
@@ -41,12 +43,25 @@ class Observed:
     confidence: Array
     rgb: NDArray[np.uint8] | None = None
     grey: Grey | None = None
+    edge: Array = field(default_factory=alike)
+
+    def __post_init__(self) -> None:
+        """Have an edge for each observation."""
+        if len(self.edge) != len(self.ids):
+            object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.ids), 2)))
 
     def without(self, ids: Ids) -> "Observed":
         """Return the same without some tracks."""
         kept = ~np.isin(self.ids, ids)
         rgb = None if self.rgb is None else self.rgb[kept]
-        return replace(self, ids=self.ids[kept], xy=self.xy[kept], confidence=self.confidence[kept], rgb=rgb)
+        return replace(
+            self,
+            ids=self.ids[kept],
+            xy=self.xy[kept],
+            confidence=self.confidence[kept],
+            rgb=rgb,
+            edge=self.edge[kept],
+        )
 
 
 def observed_of(sight: Sight, tracks: TrackTable, rows: NDArray[np.bool_]) -> Observed:
@@ -59,6 +74,7 @@ def observed_of(sight: Sight, tracks: TrackTable, rows: NDArray[np.bool_]) -> Ob
         tracks.confidence[rows],
         sample_colours(sight.frame.image, tracks.xy[rows]),
         sight.grey,
+        tracks.edge[rows],
     )
 
 
@@ -82,6 +98,7 @@ def keyframe_of(observed: Observed, T_world_cam: Array) -> Keyframe:
         ids=observed.ids,
         xy=observed.xy,
         confidence=observed.confidence,
+        edge=observed.edge,
         descriptor_ids=np.zeros(0, np.int64),
         descriptors=np.zeros((0, 32), np.uint8),
     )
@@ -117,7 +134,8 @@ def pose_of(
         return None
     sigma = noise.sigma_px(observed.confidence[row_o])
     gate = noise.threshold_px(observed.confidence[row_o])
-    estimate = refine_pose(camera, invert_transform(T_world_guess), xyz[row], observed.xy[row_o], sigma, gate)
+    T_cam_world, edge = invert_transform(T_world_guess), observed.edge[row_o]
+    estimate = refine_pose(camera, T_cam_world, xyz[row], observed.xy[row_o], sigma, gate, edge=edge)
     if estimate.num_inliers < 0.5 * len(row):
         searched = search_pose(
             camera, xyz[row], observed.xy[row_o], sigma, gate, seed=seed, min_inliers=min_inliers

@@ -45,13 +45,13 @@ def place_left_out(world: WorldMap, camera: Intrinsics, noise: NoiseModel, resul
     # What came after the adjustment was asked for has moved with its last keyframe.
     there = (row >= 0) & (world.landmarks.born[row] <= last_id) & (world.landmarks.submap[row] == submap)
     ids = ids[there]
-    view, point, xy, confidence = gather_observations(views, ids)
+    view, point, xy, confidence, edge = gather_observations(views, ids)
     count = np.bincount(point, minlength=len(ids))
     if not (count >= 2).any():
         return 0
     T_cam_world = invert_transform(np.stack([k.T_world_cam for k in views]))
     sigma_px = noise.sigma_px(confidence)
-    placed = triangulate(camera, T_cam_world, view, point, xy, sigma_px, len(ids), refinements=1)
+    placed = triangulate(camera, T_cam_world, view, point, xy, sigma_px, len(ids), refinements=1, edge=edge)
     good = (count >= 2) & placed.in_front & (placed.error_sigma < MAX_ERROR_SIGMA)
     world.move_landmarks(ids[good], placed.xyz[good])
     return int(good.sum())

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
+from semcast.server.geometry.edges import whiteners
 from semcast.server.geometry.projection import MIN_DEPTH_MAP
 from semcast.server.mapping.bundle_problem import BundleProblem, ViewMotion
 
@@ -60,6 +61,7 @@ def information(
     if not used.any():
         return told
     view, point, points = problem.view[used], problem.point[used], points[used]
+    whitener = whiteners(problem.edge[used])
     camera = problem.camera
     by_point = by_points(camera, points)
     by_pose = by_poses(by_point, points)
@@ -75,9 +77,10 @@ def information(
         ],
         axis=2,
     )
-    weight = _weights(residual_px[used], problem.sigma_px[used])[:, None, None]
+    error = (whitener @ residual_px[used, :, None])[..., 0]
+    weight = _weights(error, problem.sigma_px[used])[:, None, None] * whitener
     left = _unexplained(
-        weight * by_pose, weight * by_xyz, weight * patterns, view, point, (num_views, num_points)
+        weight @ by_pose, weight @ by_xyz, weight @ patterns, view, point, (num_views, num_points)
     )
     np.add.at(told, view, np.einsum("mkg,mkh->mgh", left, left))
     return told

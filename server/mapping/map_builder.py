@@ -303,6 +303,7 @@ class MapBuilder:
                 ids=ids,
                 xy=xy,
                 confidence=tracks.confidence[visible],
+                edge=tracks.edge[visible],
                 descriptor_ids=descriptor_ids,
                 descriptors=descriptors,
             )

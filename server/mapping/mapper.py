@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.geometry.edges import whitened
 from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
@@ -211,13 +212,13 @@ def new_landmarks(
         min_parallax_deg: Angle between rays.
         median_depth_map: Of what ``seen_from`` sees; points many times as far are as good as at infinity.
     """
-    view, point, xy, confidence = gather_observations(views, wanted)
+    view, point, xy, confidence, edge = gather_observations(views, wanted)
     seen = np.bincount(point, minlength=len(wanted))
     if not (seen >= 2).any():
         return NewLandmarks(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
     T_cam_world = invert_transform(np.stack([k.T_world_cam for k in views]))
     sigma = noise.sigma_px(confidence)
-    points = triangulate(camera, T_cam_world, view, point, xy, sigma, len(wanted))
+    points = triangulate(camera, T_cam_world, view, point, xy, sigma, len(wanted), edge=edge)
     depth = depths_in(invert_transform(seen_from.T_world_cam), points.xyz)
     # A fixed error in pixels is what an angle is compared with: noisy images need more parallax.
     wanted_deg = max(min_parallax_deg, float(np.degrees(2.5 * np.median(sigma) / camera.fx)))
@@ -256,6 +257,10 @@ class Seen(Protocol):
     def confidence(self) -> Array:
         """``(M,)``."""
 
+    @property
+    def edge(self) -> Array:
+        """``(M, 2)``."""
+
 
 def gather_observations(views: Sequence[Seen], ids: Ids) -> Observations:
     """Find every observation of some tracks in some views.
@@ -265,9 +270,10 @@ def gather_observations(views: Sequence[Seen], ids: Ids) -> Observations:
         ids: ``(P,)`` tracks, ascending.
 
     Returns:
-        View ``(M,)``, row into ``ids (M,)``, pixel ``(M, 2)`` and confidence ``(M,)`` of each, view by view.
+        View ``(M,)``, row into ``ids (M,)``, pixel ``(M, 2)``, confidence ``(M,)`` and edge ``(M, 2)`` of
+        each, view by view.
     """
-    view, point, xy, confidence = [], [], [], []
+    view, point, xy, confidence, edge = [], [], [], [], []
     for k, keyframe in enumerate(views):
         row = np.minimum(np.searchsorted(ids, keyframe.ids), max(0, len(ids) - 1))
         hit = ids[row] == keyframe.ids if len(ids) else np.zeros(len(keyframe.ids), bool)
@@ -275,7 +281,8 @@ def gather_observations(views: Sequence[Seen], ids: Ids) -> Observations:
         point.append(row[hit].astype(np.intp))
         xy.append(keyframe.xy[hit])
         confidence.append(keyframe.confidence[hit])
-    return Observations(*(np.concatenate(column) for column in (view, point, xy, confidence)))
+        edge.append(keyframe.edge[hit])
+    return Observations(*(np.concatenate(column) for column in (view, point, xy, confidence, edge)))
 
 
 def median_depth(world: WorldMap, keyframe: Keyframe) -> float:
@@ -337,12 +344,13 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
     same = ~np.isin(problem.landmark_ids, later)
     world.move_landmarks(problem.landmark_ids[same], result.xyz[same])
     known = np.asarray(np.isfinite(result.residual_px).all(axis=1))
-    size = np.linalg.norm(np.nan_to_num(result.residual_px), axis=1)
+    error = whitened(problem.edge, result.residual_px)
+    size = np.linalg.norm(np.nan_to_num(error), axis=1)
     left = _share_left(problem, known)
     telling = (
         known & (problem.view >= problem.num_anchors) & (size < 12.0 * problem.sigma_px) & (left > _MIN_LEFT)
     )
-    as_noise = np.abs(result.residual_px[telling]) / np.sqrt(left[telling, None])
+    as_noise = np.abs(error[telling]) / np.sqrt(left[telling, None])
     noise.add(np.repeat(problem.confidence[telling], 2), as_noise.ravel())
     drop_outliers(world, result, noise.model)
 
@@ -374,8 +382,9 @@ def _ways(T_world_cam: Array) -> Array:
 
 def drop_outliers(world: WorldMap, result: BundleResult, noise: NoiseModel) -> None:
     """Drop observations outside the gate, and landmarks left with fewer than two of them."""
-    residual_px, problem = result.residual_px, result.problem
-    size = np.linalg.norm(np.nan_to_num(residual_px, nan=np.inf), axis=1)
+    problem = result.problem
+    error = whitened(problem.edge, result.residual_px)
+    size = np.linalg.norm(np.nan_to_num(error, nan=np.inf), axis=1)
     _drop(world, problem, size > 1.3 * noise.threshold_px(problem.confidence))
 
 

@@ -227,7 +227,7 @@ def place_anew(
     views = mine[max(0, at - _NEIGHBOURS) : at + _NEIGHBOURS + 1]
     ids, xy = found.ids[found.points.ok], found.points.xy[found.points.ok]
     count = len(ids)
-    view, point, xy_then, confidence = gather_observations(views, ids)
+    view, point, xy_then, confidence, _ = gather_observations(views, ids)
     T_cam_world = invert_transform(T_world_cam)
     placed = triangulate(
         camera,

@@ -1,12 +1,13 @@
 """What one image shows: the image itself with the rows that arrived, and tracks in it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.phy.slots import BLOCK_PX
+from semcast.server.geometry.edges import alike
 from semcast.server.geometry.features import Grey
 from semcast.server.geometry.wide_search import WideFeatures
 from semcast.server.mapping.state import DecodedFrame
@@ -80,14 +81,21 @@ class Seen:
         ids: ``(N,)`` int64.
         xy: ``(N, 2)`` pixels.
         confidence: ``(N,)`` of the positions.
+        edge: ``(N, 2)`` along which they are known less, see ``edges``; by default they have none.
     """
 
     ids: Ids
     xy: Array
     confidence: Array
+    edge: Array = field(default_factory=alike)
+
+    def __post_init__(self) -> None:
+        """Have an edge for each observation."""
+        if len(self.edge) != len(self.ids):
+            object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.ids), 2)))
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "Seen":
-        return Seen(self.ids[rows], self.xy[rows], self.confidence[rows])
+        return Seen(self.ids[rows], self.xy[rows], self.confidence[rows], self.edge[rows])

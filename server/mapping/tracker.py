@@ -60,7 +60,7 @@ class TrackedPose:
         covariance: ``(6, 6)`` in the camera's frame, rotation before translation, or None.
         ids: ``(N,)`` landmarks that were looked at.
         inliers: ``(N,)`` bool, those that agree.
-        residual_px: ``(N,)`` reprojection errors.
+        residual_px: ``(N,)`` reprojection errors, as if they were known alike in all directions.
     """
 
     T_world_cam: Array
@@ -177,11 +177,14 @@ def track_pose(
     sigma, gate = noise.sigma_px(marks.confidence), noise.threshold_px(marks.confidence)
     best: PoseEstimate | None = None
     if T_world_guess is not None and len(points) >= min_inliers:
-        best = refine_pose(camera, invert_transform(T_world_guess), points, marks.xy, sigma, gate)
+        best = refine_pose(
+            camera, invert_transform(T_world_guess), points, marks.xy, sigma, gate, edge=marks.edge
+        )
     if best is None or best.num_inliers < max(min_inliers, _MIN_INLIER_SHARE * len(points)):
         count, share = _BELIEVED_AFTER_GAP if is_after_gap else (0, 0.0)
         least = max(min_inliers, count, math.ceil(share * len(points)))
-        searched = search_pose(camera, points, marks.xy, sigma, gate, seed=seed, min_inliers=least)
+        how = {"seed": seed, "min_inliers": least}
+        searched = search_pose(camera, points, marks.xy, sigma, gate, edge=marks.edge, **how)
         if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
             best = searched
     enough = max(min_inliers, min_share * len(points))
@@ -247,8 +250,11 @@ def _steadied(
     sigma[count:] *= wider
     gate[count:] *= np.minimum(wider, _MOST_WIDER)
     spread = np.concatenate([np.zeros((count, 2)), rays.spread_px])
+    edge = np.concatenate([marks.edge, with_ray.edge])
     start = invert_transform(T_world_cam)
-    pose = refine_pose(camera, start, points, observed, sigma, gate, iterations=6, spread_px=spread)
+    pose = refine_pose(
+        camera, start, points, observed, sigma, gate, iterations=6, spread_px=spread, edge=edge
+    )
     agreeing, rays_agreeing = pose.inliers[:count], pose.inliers[count:]
     if agreeing.sum() < min_inliers or rays_agreeing.sum() < max(needed[0], needed[1] * len(rays.row)):
         return None

@@ -23,6 +23,7 @@ from semcast.server.geometry.weighting import (
     KeypointCues,
     localisation_variance_px2,
     observation_confidence,
+    observation_edges,
     variance_confidence,
 )
 from semcast.server.geometry.wide_search import Carried, WideFeatures, search_wide
@@ -48,7 +49,7 @@ _PLENTY_OF_MATCHES = 80
 _REFUTED_PX = 3.0
 #: What a track has, by attribute of ``TrackTable``.
 _MOTION = ("ids", "xy", "velocity", "confidence", "variance_px2", "drift_px2", "age", "missed")
-_COLUMNS = (*_MOTION, "anchor_xy", "stood_widths")
+_COLUMNS = (*_MOTION, "anchor_xy", "stood_widths", "edge")
 #: Share of an image's localisation variance that stays with a point followed on from it. Most of it goes with
 #: the image: the next step begins where this one ended, and takes its error back. Measured against tracks of
 #: the original images.
@@ -69,6 +70,7 @@ class TrackTable:
         missed: ``(N,)`` int64, frames since its last sight; 0 is visible now.
         anchor_xy: ``(N, 2)`` where it began to stand still in the image.
         stood_widths: ``(N,)`` image widths the scene went since then.
+        edge: ``(N, 2)`` of the newest position, see ``edges``.
     """
 
     def __init__(
@@ -97,6 +99,7 @@ class TrackTable:
         self.missed: Ids = np.zeros(0, np.int64)
         self.anchor_xy: Array = np.zeros((0, 2))
         self.stood_widths: Array = np.zeros(0)
+        self.edge: Array = np.zeros((0, 2))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -131,7 +134,7 @@ class TrackTable:
 
     def seen(self) -> Seen:
         """Tracks that are visible now."""
-        return Seen(self.ids, self.xy, self.confidence)[self.visible]
+        return Seen(self.ids, self.xy, self.confidence, self.edge)[self.visible]
 
     @property
     def frame_ids(self) -> list[int]:
@@ -159,6 +162,7 @@ class TrackTable:
         self.missed = np.zeros(count, np.int64)
         self.anchor_xy = self.xy.copy()
         self.stood_widths = np.zeros(count)
+        self.edge = np.zeros((count, 2))
 
     def renew(self, others: Ids) -> tuple[Ids, Ids]:
         """Give all tracks new ids, as if they began now, and ids kept elsewhere with them.
@@ -343,6 +347,8 @@ class TrackTable:
         self.confidence[ok] = observation_confidence(self._mode, cues, self._rng)
         self.variance_px2 = self.variance_px2.copy()
         self.variance_px2[ok] = localisation_variance_px2(cues)
+        self.edge = self.edge.copy()
+        self.edge[ok] = cues.edge
         self.drift_px2 = self.drift_px2 + _KEPT_VARIANCE * np.where(ok, self.variance_px2, 0.0)
         alive = ok | (coasting & (self.missed <= MAX_COAST))
         alive[ok] &= deduplicate(self.xy[ok])
@@ -437,6 +443,7 @@ class TrackTable:
             "missed": np.zeros(len(ids), np.int64),
             "anchor_xy": xy,
             "stood_widths": np.zeros(len(ids)),
+            "edge": cues.edge,
         }
         order = np.argsort(np.concatenate([self.ids, ids]), kind="stable")
         for name in _COLUMNS:
@@ -484,9 +491,8 @@ class TrackTable:
         self._next_id += count
         return count
 
-    @staticmethod
     def _cues(
-        sight: Sight, xy: Array, forward_backward: Array, photometric: Array, gradient: Array
+        self, sight: Sight, xy: Array, forward_backward: Array, photometric: Array, gradient: Array
     ) -> KeypointCues:
         pixel, keypoint = sight.frame.confidence, sight.frame.keypoint_confidence
         return KeypointCues(
@@ -495,4 +501,5 @@ class TrackTable:
             gradient_grey2=gradient,
             forward_backward_px=forward_backward,
             photometric_grey=photometric,
+            edge=observation_edges(self._mode, sight.grey, xy),
         )

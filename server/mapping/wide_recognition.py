@@ -146,8 +146,16 @@ class WideRecogniser:
         matches = match_wide(self._features_of(view.image), sight.wide_features, _MAX_RATIO)
         rows, carried = matches.carry(view.xy, _MAX_OFFSET_PX)
         sigma = np.full(len(rows), max(_CARRIED_SIGMA_PX, noise.sigma0_px))
-        how = {"seed": self._seed, "min_inliers": _MIN_FIRST, "max_iterations": _SEARCH_ITERATIONS}
-        return search_pose(self._camera, view.xyz[rows], carried, sigma, GATE_SIGMAS * sigma, **how)
+        return search_pose(
+            self._camera,
+            view.xyz[rows],
+            carried,
+            sigma,
+            GATE_SIGMAS * sigma,
+            seed=self._seed,
+            min_inliers=_MIN_FIRST,
+            max_iterations=_SEARCH_ITERATIONS,
+        )
 
     def _proved(
         self, sight: Sight, view: _View, found: PoseEstimate | None, noise: NoiseModel

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.geometry.edges import alike
 from semcast.server.mapping.map_arrays import check_map_arrays
 from semcast.server.mapping.posed_frames import PosedFrames
 
@@ -117,6 +118,7 @@ class Keyframe:
         descriptor_ids: ``(D,)`` int64 tracks that have a descriptor.
         descriptors: ``(D, 32)`` uint8.
         refuted: ``(R,)`` int64 tracks seen that no point at rest explains, ascending.
+        edge: ``(M, 2)`` of each observation, see ``edges``.
     """
 
     frame_id: int
@@ -129,10 +131,17 @@ class Keyframe:
     descriptor_ids: Ids
     descriptors: NDArray[np.uint8]
     refuted: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
+    edge: Array = field(default_factory=alike)
+
+    def __post_init__(self) -> None:
+        """Have an edge for each observation."""
+        if len(self.edge) != len(self.ids):
+            self.edge = np.broadcast_to(self.edge, (len(self.ids), 2))
 
     def drop_observations(self, bad: NDArray[np.bool_]) -> None:
         """Forget the observations in the mask."""
         self.ids, self.xy, self.confidence = self.ids[~bad], self.xy[~bad], self.confidence[~bad]
+        self.edge = self.edge[~bad]
 
 
 _KEYFRAME_PARTS = ("ids", "xy", "confidence", "descriptor_ids", "descriptors")
@@ -413,6 +422,7 @@ class WorldMap:
             **{
                 f"keyframes.{p}": _joined([getattr(k, p) for k in self.keyframes], p) for p in _KEYFRAME_PARTS
             },
+            "keyframes.edge": np.concatenate([np.zeros((0, 2)), *(k.edge for k in self.keyframes)]),
             "poses.frame_id": np.array(posed, dtype=np.int64),
             "poses.T_world_cam": np.array([self.poses[k] for k in posed]).reshape(-1, 4, 4),
             "poses.submap": np.array([self.submap_of[k] for k in posed], dtype=np.int64),
@@ -444,6 +454,8 @@ class WorldMap:
         )
         ends = np.cumsum(arrays["keyframes.length"], axis=0)
         starts = ends - arrays["keyframes.length"]
+        # Older checkpoints have no edges.
+        edges = arrays.get("keyframes.edge", np.zeros_like(arrays["keyframes.xy"]))
         for k, frame_id in enumerate(arrays["keyframes.frame_id"].tolist()):
             parts = {
                 part: np.array(arrays[f"keyframes.{part}"][starts[k, j] : ends[k, j]])
@@ -455,6 +467,7 @@ class WorldMap:
                     t_source_ns=int(arrays["keyframes.t_source_ns"][k]),
                     T_world_cam=self.poses[frame_id],
                     submap=self.submap_of[frame_id],
+                    edge=np.array(edges[starts[k, 0] : ends[k, 0]]),
                     **parts,
                 )
             )

@@ -3,6 +3,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, invert_transform, log_so3, rotation_angle_deg, transform_points
+from semcast.server.geometry.edges import whiteners
 from semcast.server.geometry.pnp import project_with_jacobian, refine_pose, search_pose
 
 CAMERA = Intrinsics(fx=500, fy=480, cx=320, cy=240, width=640, height=480)
@@ -147,3 +148,37 @@ def test_search_among_nonsense_finds_nothing():
     points, xy = rng.normal(0, 1, (40, 3)), rng.uniform(0, 480, (40, 2))
     assert search_pose(CAMERA, points, xy, sigma, 3 * sigma, seed=0, min_inliers=15) is None
     assert search_pose(CAMERA, points[:3], xy[:3], sigma[:3], sigma[:3], seed=0) is None
+
+
+def test_points_that_slid_along_edges_hold_the_camera_across_them():
+    errors = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        T, points, exact = make_view(seed, num=60)
+        angle = rng.uniform(0, np.pi, 60)
+        along = np.column_stack([np.cos(angle), np.sin(angle)])
+        across = np.column_stack([-along[:, 1], along[:, 0]])
+        xy = exact + along * rng.normal(0, 2.0, (60, 1)) + across * rng.normal(0, 0.1, (60, 1))
+        edge = 0.5 * np.log(20.0) * along
+        start = exp_se3(rng.normal(0, 0.02, 6)) @ T
+        sigma = np.sqrt(0.2)
+        found = [refine(start, points, xy, sigma, edge=e) for e in (edge, None)]
+        errors.append([np.linalg.norm((f.T_cam_world @ invert_transform(T))[:3, 3]) for f in found])
+        assert found[0].inliers.mean() > 0.95
+    shaped, alike = np.mean(errors, axis=0)
+    assert shaped < 0.3 * alike
+
+
+def test_edges_and_uncertain_depths_add_up():
+    T, points, exact = make_view(3, num=8)
+    rng = np.random.default_rng(3)
+    edge, spread = rng.normal(0, 0.5, (8, 2)), rng.normal(0, 2.0, (8, 2))
+    sigma = np.linspace(0.3, 1.0, 8)
+    found = refine(T, points, exact, sigma, edge=edge, spread_px=spread)
+    _, J = project_with_jacobian(CAMERA, transform_points(T, points))
+    information = np.zeros((6, 6))
+    for j, e, s, size in zip(J, edge, spread, sigma, strict=True):
+        W = whiteners(e[None])[0]
+        covariance = size**2 * np.linalg.inv(W @ W) + np.outer(s, s)
+        information += j.T @ np.linalg.inv(covariance) @ j
+    assert np.allclose(found.covariance @ information, np.eye(6), atol=1e-4)

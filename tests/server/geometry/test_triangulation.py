@@ -90,3 +90,39 @@ def test_no_observations_give_no_points():
         found = triangulate(CAMERA, np.eye(4)[None], none, none, np.zeros((0, 2)), np.zeros(0), num_points)
         assert found.xyz.shape == (num_points, 3)
         assert not found.in_front.any()
+
+
+def slid(xy, along, rng, *, along_px=2.0, across_px=0.1):
+    """Observations that slid along edges, and the edges that say so."""
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    moved = (
+        xy + along * rng.normal(0, along_px, (len(xy), 1)) + across * rng.normal(0, across_px, (len(xy), 1))
+    )
+    return moved, 0.5 * np.log(along_px / across_px) * along
+
+
+def test_points_that_slid_along_upright_edges_have_their_depth():
+    rng = np.random.default_rng(0)
+    T_cam_world, points, view, point, exact = make_views(rng, 5)  # the camera goes to the right
+    xy, edge = slid(exact, np.tile([0.0, 1.0], (len(exact), 1)), rng)
+    sigma = np.full(len(xy), np.sqrt(0.2))
+    shaped, alike = (
+        triangulate(CAMERA, T_cam_world, view, point, xy, sigma, len(points), edge=e) for e in (edge, None)
+    )
+    depth_error = [np.median(np.abs(found.xyz - points)[:, 2]) for found in (shaped, alike)]
+    assert depth_error[0] < 0.6 * depth_error[1]
+    assert 0.7 < np.median(shaped.error_sigma) < 1.2
+    assert np.median(alike.error_sigma) > 2.0
+
+
+def test_parallax_along_an_edge_hardly_counts():
+    _, points, view, point, _ = make_views(np.random.default_rng(1), 3)
+    T_cam_world = invert_transform(np.stack([make_transform(np.eye(3), (0.4 * k, 0, 0)) for k in range(3)]))
+    xy = np.concatenate([CAMERA.project(transform_points(T, points)) for T in T_cam_world])
+    how = (CAMERA, T_cam_world, view, point, xy, np.ones(len(xy)), len(points))
+    free = triangulate(*how).parallax_deg
+    length = 0.5 * np.log(10.0)
+    lying = triangulate(*how, edge=np.tile([length, 0.0], (len(xy), 1))).parallax_deg
+    upright = triangulate(*how, edge=np.tile([0.0, length], (len(xy), 1))).parallax_deg
+    assert np.allclose(lying, free / np.sqrt(10.0)), "the camera goes along them"
+    assert np.allclose(upright, free), "and across these, which is not worth more than at a corner"

@@ -113,3 +113,16 @@ def test_what_is_found_for_the_first_time_is_not_ahead_of_what_led_in_turn(wall,
     truth = wall(bend=0.1, noise_px=0.4)
     _, sides = decide(truth, [(truth, 0.65)])
     assert direction_error_deg(sides[0].T_world_cam, truth.T_world_cam) < 10.0
+
+
+def test_what_slid_along_edges_is_no_evidence_against_a_structure(arc):
+    truth = arc(focal_px=600.0, depth=4.0)
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0, np.pi, len(truth.xy))
+    along = np.column_stack([np.cos(angle), np.sin(angle)])
+    xy = truth.xy + along * rng.normal(0, 1.5, (len(angle), 1))
+    sigma_px = np.full(len(xy), np.sqrt(0.15))
+    edge = 0.5 * np.log(15.0) * along
+    side = ambiguity.adjusted(replace(truth, xy=xy, sigma_px=sigma_px, edge=edge))
+    assert side.cost < 2.0 * len(xy), "what noise of this size costs"
+    assert ambiguity.adjusted(replace(truth, xy=xy, sigma_px=sigma_px)).cost > 3.0 * side.cost

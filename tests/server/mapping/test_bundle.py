@@ -7,6 +7,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
+from semcast.server.geometry.edges import alike
 from semcast.server.geometry.pnp import project_with_jacobian
 from semcast.server.mapping import bundle, dense_bundle
 from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
@@ -155,7 +156,9 @@ def test_a_point_behind_a_camera_is_left_out():
 def test_a_point_takes_part_from_its_second_view_on():
     problem, _, xyz = make_problem(noise_px=0.0)
     kept = ~((problem.point == 0) & (problem.view > 1)) & ~((problem.point == 1) & (problem.view != 5))
-    of_kept = {name: vars(problem)[name][kept] for name in ("view", "point", "xy", "sigma_px", "confidence")}
+    of_kept = {
+        name: vars(problem)[name][kept] for name in ("view", "point", "xy", "sigma_px", "confidence", "edge")
+    }
     result = optimise(BundleProblem(**{**vars(problem), **of_kept}))
     assert np.allclose(result.xyz[0], xyz[0], atol=1e-3), "seen by two"
     assert np.isfinite(result.residual_px[of_kept["point"] == 0]).all()
@@ -282,9 +285,8 @@ def test_sigmas_share_sixteen_models():
 
 def test_residuals_by_hand():
     problem, _, _ = make_problem()
-    one = BundleProblem(
-        **{**vars(problem), "view": np.array([0]), "point": np.array([0]), "xy": np.array([[330.0, 235.0]])}
-    )
+    changes = {"view": np.array([0]), "point": np.array([0]), "xy": np.array([[330.0, 235.0]])}
+    one = BundleProblem(**{**vars(problem), **changes, "edge": alike()})
     residual, front = residuals_px(one, np.eye(4)[None], np.array([[0.0, 0.0, 2.0]]))
     assert residual.tolist() == [[10.0, -5.0]]
     assert front.tolist() == [True]
@@ -301,6 +303,7 @@ def test_the_weight_is_outside_of_the_loss_in_the_papers_objective_and_inside_in
         "view": np.array([0]),
         "point": np.array([0]),
         "sigma_px": np.array([sigma]),
+        "edge": alike(),
     }
     problem = BundleProblem(**{**vars(make_problem()[0]), **one})
     paper = BundleProblem(**{**vars(problem), "huber_px": limit_px})
@@ -365,3 +368,20 @@ def test_live_process_never_waits_unless_asked():
         assert not runner.busy
     finally:
         runner.close()
+
+
+def test_a_window_of_points_that_slid_along_edges():
+    errors = []
+    for seed in range(4):
+        problem, T_world_cam, _ = make_problem(seed=seed, noise_px=0.0, sigma_px=lambda view, *_: 0.0 * view)
+        rng = np.random.default_rng(seed)
+        angle = rng.uniform(0, np.pi, 60)[problem.point]
+        along = np.column_stack([np.cos(angle), np.sin(angle)])
+        across = np.column_stack([-along[:, 1], along[:, 0]])
+        slid = along * rng.normal(0, 1.5, (len(angle), 1)) + across * rng.normal(0, 0.1, (len(angle), 1))
+        values = {**vars(problem), "xy": problem.xy + slid, "sigma_px": np.full(len(angle), np.sqrt(0.15))}
+        edge = 0.5 * np.log(15.0) * along
+        found = [optimise(BundleProblem(**{**values, "edge": e})) for e in (edge, alike())]
+        errors.append([pose_error(result, T_world_cam) for result in found])
+    shaped, round_ = np.mean(errors, axis=0)
+    assert shaped < 0.6 * round_

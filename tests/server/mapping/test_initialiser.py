@@ -6,6 +6,7 @@ import numpy as np
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
+from semcast.server.geometry.edges import alike
 from semcast.server.geometry.two_view import estimate_two_view
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.ambiguity import adjusted
@@ -242,6 +243,7 @@ def test_tracks_that_stand_hold_no_start_up_once_they_are_left_out():
             ids=np.concatenate([f.ids, ids]),
             xy=np.concatenate([f.xy, bonnet]),
             confidence=np.ones(len(f.ids) + 300),
+            edge=alike(),
         )
         for f in ride(8)[0]
     ]
@@ -282,6 +284,7 @@ def before_what_stands(frames):
             ids=np.concatenate([f.ids, ids]),
             xy=np.concatenate([f.xy, standing]),
             confidence=np.ones(len(f.ids) + 100),
+            edge=alike(),
         )
         for f in frames
     ]

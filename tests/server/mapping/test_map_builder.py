@@ -50,6 +50,7 @@ class NewestFrame:
         self.visible = np.ones(len(ids), bool)
         self.suspect = np.zeros(len(ids), bool)
         self.confidence = np.full(len(ids), 0.8)
+        self.edge = np.tile([0.3, -0.4], (len(ids), 1))
 
     def settle_at(self, rows, xy, scatter_px2):
         assert np.isnan(scatter_px2).all()
@@ -230,7 +231,9 @@ def test_a_keyframe_keeps_no_track_that_may_stand_with_the_camera(builder):
     newest = NewestFrame(ids, seen(xyz, pose(0.4)))
     newest.suspect[:20] = True
     builder.make_keyframe(sight, newest, pose(0.4))
-    assert np.array_equal(builder.world.keyframes[-1].ids, ids[20:])
+    keyframe = builder.world.keyframes[-1]
+    assert np.array_equal(keyframe.ids, ids[20:])
+    assert np.array_equal(keyframe.edge, newest.edge[20:])
 
 
 def test_a_camera_found_back_far_in_the_past_is_held_by_the_keyframes_there(builder):

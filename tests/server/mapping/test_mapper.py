@@ -5,6 +5,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
+from semcast.server.geometry.edges import whiteners
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
 from semcast.server.mapping import window
 from semcast.server.mapping.bundle import optimise
@@ -262,6 +263,31 @@ def test_outliers_of_an_adjustment_are_dropped():
     assert chosen not in world.keyframes[3].ids
     assert chosen in world.keyframes[2].ids
     assert world.landmarks.rows(np.array([chosen]))[0] >= 0
+
+
+def put_edges(world, rng, *, along_px=2.0, across_px=0.1):
+    """Let all tracks slide along edges of all directions, which the keyframes know of."""
+    for keyframe in world.keyframes:
+        angle = rng.uniform(0, np.pi, len(keyframe.ids))
+        along = np.column_stack([np.cos(angle), np.sin(angle)])
+        across = np.column_stack([-along[:, 1], along[:, 0]])
+        keyframe.xy += along * rng.normal(0, along_px, (len(angle), 1))
+        keyframe.xy += across * rng.normal(0, across_px, (len(angle), 1))
+        keyframe.edge = 0.5 * np.log(along_px / across_px) * along
+
+
+def test_tracks_that_slide_along_edges_become_landmarks_and_stay():
+    world, _, _ = make_world(6, 100, noise_px=0.0)
+    put_edges(world, np.random.default_rng(0))
+    noise = OnlineNoise("robust", np.sqrt(0.2), 0.0, True)
+    assert add_landmarks(world, CAMERA, noise.model, IMAGE, 1.0) > 90
+    problem = build_problem(world, CAMERA, noise.model, 10)
+    apply_result(world, optimise(problem), noise)
+    assert min(len(k.ids) for k in world.keyframes) > 90, "2 pixels along an edge are no outlier"
+    assert noise.model.sigma0_px == pytest.approx(np.sqrt(0.2), rel=0.15), "nor more noise than there is"
+    world.keyframes[3].xy[world.keyframes[3].ids == 5] += 8.0 * whiteners(world.keyframes[3].edge[5:6])[0, 0]
+    apply_result(world, optimise(build_problem(world, CAMERA, noise.model, 10)), noise)
+    assert 5 not in world.keyframes[3].ids
 
 
 def test_a_large_window_is_cut_to_what_several_keyframes_see():

@@ -81,3 +81,23 @@ def test_a_pose_near_the_guess_is_believed_after_a_gap_too():
     )
     assert pose is not None
     np.testing.assert_allclose(pose.T_world_cam, np.eye(4), atol=1e-2)
+
+
+@pytest.mark.parametrize("guess_is_near", [True, False])
+def test_landmarks_that_slid_along_edges_carry_a_pose(guess_is_near):
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (60, 3))
+    angle = rng.uniform(0, np.pi, 60)
+    along = np.column_stack([np.cos(angle), np.sin(angle)])
+    xy = CAMERA.project(xyz) + along * rng.normal(0, 2.0, (60, 1))
+    world = WorldMap()
+    world.add_landmarks(np.arange(60), xyz, np.zeros((60, 3), np.uint8), np.ones(60), 0, 0)
+    noise = NoiseModel(np.sqrt(0.2), 0.0)
+    guess = np.eye(4) if guess_is_near else None
+    seen = Seen(np.arange(60), xy, np.ones(60), 0.5 * np.log(20.0) * along)
+    pose = track_pose(CAMERA, world, noise, seen, guess, submap=0, seed=0)
+    assert pose is not None
+    assert pose.num_inliers > 55
+    np.testing.assert_allclose(pose.T_world_cam, np.eye(4), atol=5e-3)
+    rows = np.arange(20)
+    assert np.array_equal(seen[rows].edge, seen.edge[rows])

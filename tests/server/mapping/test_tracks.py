@@ -339,9 +339,9 @@ def test_older_keyframes_are_not_looked_at_once_enough_is_found(mapped):
     world, images, tracks = mapped
     old = world.keyframes[0]
     half = np.arange(len(old.ids)) % 2 == 0
-    world.add_keyframe(
-        replace(old, frame_id=1, ids=old.ids[half], xy=old.xy[half], confidence=old.confidence[half])
-    )
+    newer = replace(old, frame_id=1)
+    newer.drop_observations(~half)
+    world.add_keyframe(newer)
     images.append(SeenFrom(1, images.newest(1)[0].grey))
     before = world.keyframes[-1].ids
     sight = sight_at(24, frame_id=2)

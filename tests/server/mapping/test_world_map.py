@@ -24,6 +24,7 @@ def make_keyframe(frame_id, ids, submap=0, seed=0):
         confidence=rng.uniform(0, 1, len(ids)),
         descriptor_ids=ids[::2],
         descriptors=rng.integers(0, 256, (len(ids[::2]), 32), dtype=np.uint8),
+        edge=rng.normal(0, 0.5, (len(ids), 2)),
     )
 
 
@@ -223,6 +224,17 @@ def test_arrays_bring_the_map_back():
     for name, array in again.arrays().items():
         assert np.array_equal(array, arrays[name]), name
     assert again.keyframes[2].submap == 1
+    assert np.array_equal(again.keyframes[2].edge, world.keyframes[2].edge)
+
+
+def test_observations_of_older_checkpoints_have_no_edges():
+    arrays = make_world().arrays()
+    del arrays["keyframes.edge"]
+    again = WorldMap()
+    again.restore(arrays)
+    assert not again.keyframes[2].edge.any()
+    again.keyframes[2].drop_observations(np.arange(6) == 2)
+    assert again.keyframes[2].edge.shape == (5, 2)
 
 
 def test_contradicting_arrays_are_refused():

@@ -1,0 +1,74 @@
+"""How much better a point is known across an edge than along it.
+
+The error of an aligned window is distributed as the inverse of its structure tensor. How large it is, the
+noise model says of the point's confidence; what shape it has is told here. A point on the frame of a door
+slides along it by a pixel or two, and is as well known across it as the best corner: of tracks in decoded
+images of a corridor, held against the true path, 0.15 against 1.5 pixels, and 0.4 against 0.7 on bare walls.
+Taken for alike in all directions it would count for little, or mislead.
+
+An *edge* is a vector along the edge whose length ``a`` is half the logarithm of the ratio of the two
+standard deviations: the covariance is ``sigma^2 (e^2a u u^T + e^-2a n n^T)``, of the same determinant
+whatever the shape. The zero vector is a point that is known alike in all directions.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Along an edge a standard deviation is at most so many times that across it: nothing is known to less than
+#: a tenth of a pixel, and edges that are bent are straight for a few pixels only.
+_MOST_RATIO = 10.0
+#: Half the side of the window whose gradients count, and steps between them: they are smooth over as much.
+_REACH_PX, _STEP_PX = 8, 2
+#: Steps that ``rounded`` takes.
+_LENGTH_STEP, _ANGLE_STEP = 0.2, np.pi / 36
+
+
+def edges_at(grey: NDArray[np.uint8], xy: Array) -> Array:
+    """Edges at points ``(N, 2)`` of an ``(H, W)`` image, ``(N, 2)``; their sign has no meaning."""
+    height, width = grey.shape
+    if len(xy) == 0 or min(height, width) <= 2 * _REACH_PX:
+        return np.zeros((len(xy), 2))
+    offset = np.arange(-_REACH_PX, _REACH_PX + 1, _STEP_PX)
+    x = np.clip(np.rint(xy[:, 0]).astype(np.intp), _REACH_PX, width - 1 - _REACH_PX)
+    y = np.clip(np.rint(xy[:, 1]).astype(np.intp), _REACH_PX, height - 1 - _REACH_PX)
+    pixel = ((y[:, None] + offset) * width)[:, :, None] + (x[:, None] + offset)[:, None, :]
+    gx = cv2.Sobel(grey, cv2.CV_16S, 1, 0).ravel()[pixel].reshape(len(xy), -1).astype(np.float32)
+    gy = cv2.Sobel(grey, cv2.CV_16S, 0, 1).ravel()[pixel].reshape(len(xy), -1).astype(np.float32)
+    xx, xy_, yy = (np.einsum("nk,nk->n", a, b).astype(np.float64) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
+    half, spread = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy_)
+    weak, strong = np.maximum(half - spread, 0.0), half + spread
+    ratio = np.minimum(np.sqrt((strong + 1e-9) / (weak + 1e-9)), _MOST_RATIO)
+    across = 0.5 * np.arctan2(2.0 * xy_, xx - yy)
+    along = np.column_stack([-np.sin(across), np.cos(across)])
+    return np.asarray(0.5 * np.log(ratio)[:, None] * along)
+
+
+def whiteners(edge: Array) -> Array:
+    """``(N, 2, 2)`` that give errors at points with edges ``(N, 2)`` the same size in all directions.
+
+    They are symmetric and of determinant 1: what is left has the noise model's sigma.
+    """
+    length = np.linalg.norm(edge, axis=1)
+    along = edge / np.maximum(length, 1e-12)[:, None]
+    turned = np.eye(2) - 2.0 * along[:, :, None] * along[:, None, :]
+    return np.asarray(np.cosh(length)[:, None, None] * np.eye(2) + np.sinh(length)[:, None, None] * turned)
+
+
+def whitened(edge: Array, error_px: Array) -> Array:
+    """Errors ``(N, 2)`` at points with edges ``(N, 2)`` as if they were known alike in all directions."""
+    return np.asarray((whiteners(edge) @ error_px[..., None])[..., 0])
+
+
+def rounded(edge: Array) -> Array:
+    """Edges ``(N, 2)`` of which few differ: of some lengths and directions."""
+    length = np.rint(np.linalg.norm(edge, axis=1) / _LENGTH_STEP) * _LENGTH_STEP
+    angle = np.rint(np.arctan2(edge[:, 1], edge[:, 0]) % np.pi / _ANGLE_STEP) * _ANGLE_STEP
+    return np.asarray(length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]))
+
+
+def alike() -> Array:
+    """Stand for any number of points that are known alike in all directions, ``(1, 2)``."""
+    return np.zeros((1, 2))
