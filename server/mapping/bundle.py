@@ -1,4 +1,4 @@
-"""Bundle adjustment with a noise model per observation: of a window by dense algebra, of a map by GTSAM.
+"""Bundle adjustment with a noise model per observation: of a window by dense algebra, or else by GTSAM.
 
 Traps held off here: ``Rot3`` of a matrix that is not orthonormal ends the interpreter, so rotations are
 projected first; a landmark behind a camera gives a silently bad minimum, so depths are checked first.
@@ -136,8 +136,8 @@ def optimise(problem: BundleProblem) -> BundleResult:
     solved: _Solved | None = None
     is_posed = bool(np.isfinite(problem.T_world_cam).all())
     if int(used.sum()) >= _MIN_OBSERVATIONS and problem.fixed.any() and is_posed:
-        is_small = int((~problem.fixed).sum()) <= _MAX_DENSE_VIEWS
-        solved = (_by_dense_algebra if is_small else _by_gtsam)(problem, used)
+        is_dense = problem.solver == "dense" and int((~problem.fixed).sum()) <= _MAX_DENSE_VIEWS
+        solved = (_by_dense_algebra if is_dense else _by_gtsam)(problem, used)
     ok = solved is not None
     T_world_cam, xyz, covariance = solved or (problem.T_world_cam.copy(), problem.xyz.copy(), None)
     residual, _ = residuals_px(problem, T_world_cam, xyz)
@@ -152,8 +152,7 @@ def optimise(problem: BundleProblem) -> BundleResult:
 def _window_of(problem: BundleProblem, used: NDArray[np.bool_]) -> tuple[Window, State, NDArray[np.intp]]:
     """Return what dense algebra is given, where it begins, and which points these are."""
     points, point = np.unique(problem.point[used], return_inverse=True)
-    sigmas, step = quantised_sigma(problem.sigma_px[used])
-    sigma_px = sigmas[step]
+    sigma_px = np.clip(problem.sigma_px[used], *SIGMA_RANGE_PX)
     window = Window(
         camera=problem.camera,
         free=~problem.fixed,
@@ -161,7 +160,7 @@ def _window_of(problem: BundleProblem, used: NDArray[np.bool_]) -> tuple[Window,
         view=problem.view[used],
         point=point,
         xy=problem.xy[used],
-        sigma_px=sigma_px,
+        whitener=whiteners(problem.edge[used]).transpose(1, 2, 0) / sigma_px,
         limit=np.full(len(sigma_px), HUBER_K) if problem.huber_px is None else problem.huber_px / sigma_px,
         baseline=_baseline(problem),
     )

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from semcast.server.geometry.edges import alike
 from semcast.server.geometry.weighting import NoiseModel
 
 Array = NDArray[np.float64]
+
+#: By what a window is solved; both end in the same place.
+Solver = Literal["dense", "gtsam"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class BundleProblem:
         huber_px: See ``NoiseModel``.
         edge: ``(M, 2)`` of each observation, see ``edges``.
         motion: Of the views, where it is wanted what the residuals say about shutter and lens.
+        solver: Of small problems; large ones are GTSAM's in any case.
     """
 
     camera: Intrinsics
@@ -77,6 +81,7 @@ class BundleProblem:
     huber_px: float | None = None
     motion: ViewMotion | None = None
     edge: Array = field(default_factory=alike)
+    solver: Solver = "dense"
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""

@@ -60,7 +60,7 @@ class Window:
         view: ``(M,)`` of each observation.
         point: ``(M,)``.
         xy: ``(M, 2)`` pixels.
-        sigma_px: ``(M,)`` standard deviation per coordinate.
+        whitener: ``(2, 2, M)`` that bring errors in pixels to standard deviations.
         limit: ``(M,)`` Huber's limit in standard deviations.
         baseline: Or None.
     """
@@ -71,7 +71,7 @@ class Window:
     view: NDArray[np.intp]
     point: NDArray[np.intp]
     xy: Array
-    sigma_px: Array
+    whitener: Array
     limit: Array
     baseline: Baseline | None
 
@@ -107,15 +107,16 @@ class Seen:
         state: The state.
         R_cam_world: ``(3, 3, M)`` of the view of each observation.
         points_cam: ``(3, M)`` its point in that view.
-        residual_px: ``(2, M)`` observed minus projected; large, and nothing changes it, behind the camera.
-        length: ``(M,)`` of the residual in standard deviations.
+        residual: ``(2, M)`` observed minus projected in standard deviations; large, and nothing changes it,
+            behind the camera.
+        length: ``(M,)`` of the residual.
         cost: Sum of all losses.
     """
 
     state: State
     R_cam_world: Array
     points_cam: Array
-    residual_px: Array
+    residual: Array
     length: Array
     cost: float
 
@@ -128,8 +129,9 @@ def see(window: Window, state: State) -> Seen:
     z = np.where(points[2] > 0.0, points[2], np.nan)
     camera = window.camera
     seen_xy = np.stack([camera.fx * points[0] / z + camera.cx, camera.fy * points[1] / z + camera.cy])
-    residual = np.nan_to_num(window.xy.T - seen_xy, nan=2.0 * camera.fx)
-    length = np.hypot(*residual) / window.sigma_px
+    error_px = np.nan_to_num(window.xy.T - seen_xy, nan=2.0 * camera.fx)
+    residual = np.asarray(np.einsum("abm,bm->am", window.whitener, error_px))
+    length = np.hypot(*residual)
     within = np.minimum(length, window.limit)
     cost = float((within * (length - 0.5 * within)).sum())
     if window.baseline is not None:
@@ -198,13 +200,12 @@ def linearise(window: Window, seen: Seen) -> Normal:
     x, y, z = seen.points_cam
     front = z > 0.0
     z = np.where(front, z, 1.0)
-    weight = np.sqrt(np.minimum(1.0, window.limit / np.maximum(seen.length, 1e-12))) / window.sigma_px
+    weight = np.sqrt(np.minimum(1.0, window.limit / np.maximum(seen.length, 1e-12)))
     weight = np.where(front, weight, 0.0)
-    by_point = np.zeros((2, 3, len(z)))
-    x_px, y_px = weight * window.camera.fx / z, weight * window.camera.fy / z
-    by_point[0, 0], by_point[0, 2] = x_px, -x_px * x / z
-    by_point[1, 1], by_point[1, 2] = y_px, -y_px * y / z
-    residual = weight * seen.residual_px
+    residual = weight * seen.residual
+    by_x, by_y = (weight * window.whitener * (f / z) for f in (window.camera.fx, window.camera.fy))
+    by_x, by_y = by_x[:, 0], by_y[:, 1]
+    by_point = np.stack([by_x, by_y, -(by_x * x + by_y * y) / z], axis=1)
     by_xyz = np.einsum("aim,ijm->ajm", by_point, seen.R_cam_world)
     own = _products(by_xyz, np.concatenate([by_xyz, residual[:, None]], axis=1))
     sums = [_summed(window.point, row, window.num_points) for row in own.reshape(12, -1)]

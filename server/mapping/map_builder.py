@@ -353,7 +353,8 @@ class MapBuilder:
             map_version=self._version,
         )
         if problem is not None:
-            self._bundle.submit(replace(problem, motion=self.watch.motion(self.world, problem)))
+            motion = self.watch.motion(self.world, problem)
+            self._bundle.submit(replace(problem, motion=motion, solver=self._settings.bundle_solver))
 
     def collect(self, *, wait: bool = False) -> BundleResult | None:
         """Bring a finished adjustment into the map; the result, or None where there is none."""

@@ -6,6 +6,7 @@ from typing import get_args
 
 from semcast.common.camera import Intrinsics, ReadoutFrom, check_readout
 from semcast.server.geometry.weighting import ConfidenceMode
+from semcast.server.mapping.bundle_problem import Solver
 
 #: A place gets as many chances to be recognised, however far apart frames are.
 _LEAST_LOST_FRAMES = 3
@@ -28,6 +29,13 @@ class ReconstructionSettings:
     seed: int = field(default=0, metadata={"help": "seed of every random search"})
     max_features: int = field(default=500, metadata={"help": "keypoints followed at most"})
     window_size: int = field(default=20, metadata={"help": "keyframes in one bundle adjustment"})
+    bundle_solver: Solver = field(
+        default="dense",
+        metadata={
+            "help": "solver of a window's bundle adjustment: dense (Schur complement, the faster one) or gtsam "
+            "(its factor graph); both end in the same place"
+        },
+    )
     final_adjustment: bool = field(
         default=True,
         metadata={"help": "adjust all keyframes at once when a stream has ended, before results are written"},
@@ -79,6 +87,10 @@ class ReconstructionSettings:
 
     def __post_init__(self) -> None:
         """Check ranges."""
+        if self.bundle_solver not in get_args(Solver):
+            raise ValueError(
+                f"bundle_solver must be one of {', '.join(get_args(Solver))}, got {self.bundle_solver!r}"
+            )
         if self.confidence not in get_args(ConfidenceMode):
             allowed = ", ".join(get_args(ConfidenceMode))
             raise ValueError(f"confidence must be one of {allowed}, got {self.confidence!r}")
