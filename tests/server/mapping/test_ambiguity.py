@@ -30,9 +30,9 @@ def test_without_perspective_nothing_is_decided_before_the_last_chance(arc):
 
 def test_structures_that_turned_differently_are_two(arc, relative):
     """A relief that is too deep, some of its points on the wrong side: the cameras go the same way."""
-    truth = arc(focal_px=600.0, depth=4.0, noise_px=0.7, seed=7)
+    truth = arc(focal_px=600.0, depth=4.0, noise_px=0.7, seed=2)
     image = mirrored(truth)
-    wrong = np.random.default_rng(7).random(len(truth.xyz)) < 0.7
+    wrong = np.random.default_rng(7).random(len(truth.xyz)) < 0.6
     xyz = np.where(wrong[:, None], image.xyz, truth.xyz)
     _, sides = decide(replace(truth, T_world_cam=image.T_world_cam, xyz=xyz))
     true_turn = relative(truth.T_world_cam)[:3, :3]

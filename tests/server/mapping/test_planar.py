@@ -65,7 +65,7 @@ def test_a_scene_with_depth_has_no_twin_and_moving_straight_at_a_wall_neither(ar
 def test_too_few_common_points_have_no_twin(wall):
     truth = wall()
     keep = (truth.view != 0) | (truth.point < 8)
-    rows = ("view", "point", "xy", "sigma_px", "confidence")
+    rows = ("view", "point", "xy", "sigma_px", "confidence", "edge")
     few = replace(truth, **{name: getattr(truth, name)[keep] for name in rows})
     assert twin(few) is None
 

@@ -276,7 +276,7 @@ def test_a_part_after_a_turn_in_bad_images_begins_as_they_say_and_gets_its_unit_
     for k, T in enumerate(truth):
         image = render(T)
         if 10 <= k < 26:
-            noise = rng.normal(0.0, 60.0, (*CAMERA.shape_hw, 1))
+            noise = rng.normal(0.0, 30.0, (*CAMERA.shape_hw, 1))
             image = np.clip(cv2.GaussianBlur(image, None, 10.0) + noise, 0, 255).astype(np.uint8)
         results.append(core.process(frame_of(k, image)))
     assert all(r.T_world_cam is None for r in results[11:26])
