@@ -33,6 +33,11 @@ _EIGEN_UNIT = 1024.0
 _MIN_EIGEN_GREY2 = 0.5
 #: Nor are corners weaker than this share of the strongest worth following.
 _MIN_EIGEN_SHARE = 0.0005
+#: What the noise of the sensor makes of plain ground is weaker than so many times its gradient energy.
+_NOISE_FACTOR = 3.0
+#: Side of the cells of which the share with the least roughness is plain.
+_NOISE_CELL_PX, _PLAIN_SHARE = 16, 0.2
+_ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _ORB_SCALE = 1.2
 #: Where so many points were found in spite of another exposure, they tell it, and few levels put them right.
 _MOSTLY_FOUND, _LEVELS_ANEW = 0.6, 1
@@ -77,7 +82,9 @@ def detect_corners(
     if num_wanted <= 0 or height <= 2 * BORDER_PX or width <= 2 * BORDER_PX:
         return np.zeros((0, 2), np.float32)
     strength = corner_strength(grey) if strength is None else strength
-    floor = max(_MIN_EIGEN_GREY2, _MIN_EIGEN_SHARE * float(strength.max()))
+    floor = max(
+        _MIN_EIGEN_GREY2, _MIN_EIGEN_SHARE * float(strength.max()), _NOISE_FACTOR * noise_energy_grey2(grey)
+    )
     peak = (strength >= cv2.dilate(strength, _square(_PEAK_REACH_PX))) & (strength > floor)
     peak[:BORDER_PX] = peak[-BORDER_PX:] = False
     peak[:, :BORDER_PX] = peak[:, -BORDER_PX:] = False
@@ -110,6 +117,20 @@ def detect_corners(
     far = ~(np.abs(refined - corners).max(axis=1) <= 3.0)
     refined[far] = corners[far]
     return np.asarray(refined, dtype=np.float32)
+
+
+def noise_energy_grey2(grey: Grey) -> float:
+    """Mean gradient energy that the noise of the sensor adds to every pixel, grey levels^2 per pixel^2.
+
+    Noise is what plain parts of the image have of the second differences that edges and shades have least of
+    (Immerkaer, "Fast noise variance estimation", 1996).
+    """
+    size = (max(1, grey.shape[1] // _NOISE_CELL_PX), max(1, grey.shape[0] // _NOISE_CELL_PX))
+    rough = np.abs(cv2.filter2D(grey, cv2.CV_32F, _ROUGHNESS))
+    plain = float(np.quantile(cv2.resize(rough, size, interpolation=cv2.INTER_AREA), _PLAIN_SHARE))
+    # The filter has a norm of 6, the mean size of a Gaussian value is sqrt(2 / pi) sigma, and the derivatives
+    # of ``corner_strength`` keep 12 / 64 of the variance.
+    return 12.0 / 64.0 * np.pi / 2.0 * (plain / 6.0) ** 2
 
 
 def _square(reach_px: int) -> NDArray[np.uint8]:
@@ -248,7 +269,7 @@ def _track_alike(
     distance = np.where((back_status.ravel() == 1) & np.isfinite(distance), distance, 99.0)
     ok &= distance <= max_forward_backward_px
     return TrackedPoints(
-        xy=_placed(grey0, grey1, start, found, ok),
+        xy=_placed(grey0, grey1, start, np.asarray(found, dtype=np.float32), ok),
         ok=ok,
         forward_backward_px=distance,
         photometric_grey=_where_found(np.asarray(error), np.asarray(status)),

@@ -10,6 +10,7 @@ from semcast.server.geometry.features import (
     detect_corners,
     hamming,
     match_descriptors,
+    noise_energy_grey2,
     sample_map,
     to_grey,
     track_points,
@@ -76,6 +77,23 @@ def test_a_thing_that_is_small_in_the_picture_has_many_corners():
     first = detect_corners(grey, 500)
     more = detect_corners(grey, 500, first.astype(float))
     assert len(first) + len(more) > 100
+
+
+@pytest.mark.parametrize("sd", [1.5, 4.0])
+def test_noise_on_plain_ground_is_measured_and_has_hardly_any_corners(sd):
+    rng = np.random.default_rng(3)
+    grey = np.full((480, 640), 128.0)
+    grey[200:260, 300:360] = cv2.resize(texture(shape=(180, 180)), (60, 60), interpolation=cv2.INTER_AREA)
+    noisy = np.rint(grey + rng.normal(0, sd, grey.shape)).clip(0, 255).astype(np.uint8)
+    assert noise_energy_grey2(noisy) == pytest.approx(12 / 64 * sd**2, rel=0.15)
+    corners = detect_corners(noisy, 500)
+    on_thing = np.all((corners > (295, 195)) & (corners < (365, 265)), axis=1)
+    assert on_thing.sum() > 60
+    assert (~on_thing).sum() < on_thing.sum()
+
+
+def test_an_image_with_something_everywhere_has_no_noise():
+    assert noise_energy_grey2(texture()) < 0.1
 
 
 def test_an_empty_image_has_no_corners():
