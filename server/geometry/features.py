@@ -16,11 +16,12 @@ Grey = NDArray[np.uint8]
 
 #: Points nearer to the border have no whole window.
 BORDER_PX = 8
-#: A corner is the strongest within so many pixels to each side, and further than that from points there are.
-_PEAK_REACH_PX, _FREE_REACH_PX = 1, 3
+#: A corner is the strongest within so many pixels to each side, and is so far from points that are followed:
+#: first where there are enough of such, then where all that can be followed is small in the picture.
+_FAR_APART, _CLOSE_TOGETHER = (3, 7), (1, 3)
 #: Side of the window by which a point that was found is placed. The large one finds it, and tells whether it
 #: is the same; but it reaches past the outline of what the point is on, and over surfaces turned otherwise.
-_FINE_WINDOW_PX = 11
+_FINE_WINDOW_PX = 15
 #: When a search ends: so many steps, or one so small.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 #: A small window that ends further from there has found something else.
@@ -85,7 +86,12 @@ def detect_corners(
     floor = max(
         _MIN_EIGEN_GREY2, _MIN_EIGEN_SHARE * float(strength.max()), _NOISE_FACTOR * noise_energy_grey2(grey)
     )
-    peak = (strength >= cv2.dilate(strength, _square(_PEAK_REACH_PX))) & (strength > floor)
+    peak_reach, free_reach = _FAR_APART
+    peak = _peaks(strength, floor, peak_reach)
+    num_occupied = 0 if occupied_xy is None else len(occupied_xy)
+    if np.count_nonzero(peak) < num_wanted + num_occupied:
+        peak_reach, free_reach = _CLOSE_TOGETHER
+        peak = _peaks(strength, floor, peak_reach)
     peak[:BORDER_PX] = peak[-BORDER_PX:] = False
     peak[:, :BORDER_PX] = peak[:, -BORDER_PX:] = False
     if usable is not None:
@@ -98,7 +104,7 @@ def detect_corners(
         y = np.clip(np.rint(occupied_xy[:, 1]).astype(int), 0, height - 1)
         near = np.zeros((height, width), np.uint8)
         near[y, x] = 1
-        peak &= cv2.dilate(near, _square(_FREE_REACH_PX)) == 0
+        peak &= cv2.dilate(near, _square(free_reach)) == 0
         counts = np.bincount(y // cell_px * columns + x // cell_px, minlength=num_cells)
     ys, xs = np.nonzero(peak)
     if len(xs) == 0:
@@ -131,6 +137,11 @@ def noise_energy_grey2(grey: Grey) -> float:
     # The filter has a norm of 6, the mean size of a Gaussian value is sqrt(2 / pi) sigma, and the derivatives
     # of ``corner_strength`` keep 12 / 64 of the variance.
     return 12.0 / 64.0 * np.pi / 2.0 * (plain / 6.0) ** 2
+
+
+def _peaks(strength: NDArray[np.float32], floor: float, reach_px: int) -> NDArray[np.bool_]:
+    """Which pixels are the strongest within a reach to each side, and stronger than the floor."""
+    return np.asarray((strength >= cv2.dilate(strength, _square(reach_px))) & (strength > floor))
 
 
 def _square(reach_px: int) -> NDArray[np.uint8]:

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 NUM_ANCHORS = 10
 #: Side of the patches by which tracks are put back, and every so many of their pixels that are looked at: a
 #: small one finds what is a pixel or two off, and has less of what is behind an outline.
-_FINE_PATCH = (9, 1)
+_FINE_PATCH = (11, 1)
 #: And of those by which they are told from chance finds, whose correlation needs more around.
 _WHOLE_PATCH = (ANCHOR_PATCH_PX, 2)
 #: Places from which on their scatter tells how well a track is known.
