@@ -16,6 +16,16 @@ Grey = NDArray[np.uint8]
 
 #: Points nearer to the border have no whole window.
 BORDER_PX = 8
+#: A corner is the strongest within so many pixels to each side, and is so far from points that are followed:
+#: first where there are enough of such, then where all that can be followed is small in the picture.
+_FAR_APART, _CLOSE_TOGETHER = (3, 7), (1, 3)
+#: Side of the window by which a point that was found is placed. The large one finds it, and tells whether it
+#: is the same; but it reaches past the outline of what the point is on, and over surfaces turned otherwise.
+_FINE_WINDOW_PX = 15
+#: When a search ends: so many steps, or one so small.
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
+#: A small window that ends further from there has found something else.
+_MAX_FINE_MOVE_PX = 1.5
 #: OpenCV's KLT gives the smaller eigenvalue of the mean structure tensor in units of 32^2 / 2^20 grey^2.
 _EIGEN_UNIT = 1024.0
 #: Corners weaker than this mean gradient energy (grey levels^2 per pixel^2) are noise: of a sensor with
@@ -24,6 +34,11 @@ _EIGEN_UNIT = 1024.0
 _MIN_EIGEN_GREY2 = 0.5
 #: Nor are corners weaker than this share of the strongest worth following.
 _MIN_EIGEN_SHARE = 0.0005
+#: What the noise of the sensor makes of plain ground is weaker than so many times its gradient energy.
+_NOISE_FACTOR = 3.0
+#: Side of the cells of which the share with the least roughness is plain.
+_NOISE_CELL_PX, _PLAIN_SHARE = 16, 0.2
+_ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _ORB_SCALE = 1.2
 #: Where so many points were found in spite of another exposure, they tell it, and few levels put them right.
 _MOSTLY_FOUND, _LEVELS_ANEW = 0.6, 1
@@ -68,8 +83,15 @@ def detect_corners(
     if num_wanted <= 0 or height <= 2 * BORDER_PX or width <= 2 * BORDER_PX:
         return np.zeros((0, 2), np.float32)
     strength = corner_strength(grey) if strength is None else strength
-    floor = max(_MIN_EIGEN_GREY2, _MIN_EIGEN_SHARE * float(strength.max()))
-    peak = (strength >= cv2.dilate(strength, np.ones((7, 7), np.uint8))) & (strength > floor)
+    floor = max(
+        _MIN_EIGEN_GREY2, _MIN_EIGEN_SHARE * float(strength.max()), _NOISE_FACTOR * noise_energy_grey2(grey)
+    )
+    peak_reach, free_reach = _FAR_APART
+    peak = _peaks(strength, floor, peak_reach)
+    num_occupied = 0 if occupied_xy is None else len(occupied_xy)
+    if np.count_nonzero(peak) < num_wanted + num_occupied:
+        peak_reach, free_reach = _CLOSE_TOGETHER
+        peak = _peaks(strength, floor, peak_reach)
     peak[:BORDER_PX] = peak[-BORDER_PX:] = False
     peak[:, :BORDER_PX] = peak[:, -BORDER_PX:] = False
     if usable is not None:
@@ -82,7 +104,7 @@ def detect_corners(
         y = np.clip(np.rint(occupied_xy[:, 1]).astype(int), 0, height - 1)
         near = np.zeros((height, width), np.uint8)
         near[y, x] = 1
-        peak &= cv2.dilate(near, np.ones((15, 15), np.uint8)) == 0
+        peak &= cv2.dilate(near, _square(free_reach)) == 0
         counts = np.bincount(y // cell_px * columns + x // cell_px, minlength=num_cells)
     ys, xs = np.nonzero(peak)
     if len(xs) == 0:
@@ -101,6 +123,29 @@ def detect_corners(
     far = ~(np.abs(refined - corners).max(axis=1) <= 3.0)
     refined[far] = corners[far]
     return np.asarray(refined, dtype=np.float32)
+
+
+def noise_energy_grey2(grey: Grey) -> float:
+    """Mean gradient energy that the noise of the sensor adds to every pixel, grey levels^2 per pixel^2.
+
+    Noise is what plain parts of the image have of the second differences that edges and shades have least of
+    (Immerkaer, "Fast noise variance estimation", 1996).
+    """
+    size = (max(1, grey.shape[1] // _NOISE_CELL_PX), max(1, grey.shape[0] // _NOISE_CELL_PX))
+    rough = np.abs(cv2.filter2D(grey, cv2.CV_32F, _ROUGHNESS))
+    plain = float(np.quantile(cv2.resize(rough, size, interpolation=cv2.INTER_AREA), _PLAIN_SHARE))
+    # The filter has a norm of 6, the mean size of a Gaussian value is sqrt(2 / pi) sigma, and the derivatives
+    # of ``corner_strength`` keep 12 / 64 of the variance.
+    return 12.0 / 64.0 * np.pi / 2.0 * (plain / 6.0) ** 2
+
+
+def _peaks(strength: NDArray[np.float32], floor: float, reach_px: int) -> NDArray[np.bool_]:
+    """Which pixels are the strongest within a reach to each side, and stronger than the floor."""
+    return np.asarray((strength >= cv2.dilate(strength, _square(reach_px))) & (strength > floor))
+
+
+def _square(reach_px: int) -> NDArray[np.uint8]:
+    return np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -205,10 +250,9 @@ def _track_alike(
     start = np.ascontiguousarray(xy0, dtype=np.float32)
     guess = np.clip(np.nan_to_num(guess1_xy), (0, 0), (width - 1, height - 1)).astype(np.float32)
     window = (window_px, window_px)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
     found, status, error = cv2.calcOpticalFlowPyrLK(
-        grey0, grey1, start, guess.copy(), None, None, window, max_level, criteria, flags, 1e-4
+        grey0, grey1, start, guess.copy(), None, None, window, max_level, _CRITERIA, flags, 1e-4
     )
     found = np.nan_to_num(found.reshape(-1, 2), nan=-1e4, posinf=-1e4, neginf=-1e4)
     inside = (found[:, 0] >= 1) & (found[:, 1] >= 1) & (found[:, 0] < width - 2) & (found[:, 1] < height - 2)
@@ -224,7 +268,7 @@ def _track_alike(
         None,
         window,
         min(2, max_level),
-        criteria,
+        _CRITERIA,
         flags | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS,
         1e-4,
     )
@@ -232,12 +276,30 @@ def _track_alike(
     distance = np.where((back_status.ravel() == 1) & np.isfinite(distance), distance, 99.0)
     ok &= distance <= max_forward_backward_px
     return TrackedPoints(
-        xy=found.astype(np.float64),
+        xy=_placed(grey0, grey1, start, np.asarray(found, dtype=np.float32), ok),
         ok=ok,
         forward_backward_px=distance,
         photometric_grey=_where_found(np.asarray(error), np.asarray(status)),
         gradient_grey2=_where_found(np.asarray(eigen), np.asarray(back_status)) * _EIGEN_UNIT,
     )
+
+
+def _placed(
+    grey0: Grey, grey1: Grey, start: NDArray[np.float32], found: NDArray[np.float32], ok: NDArray[np.bool_]
+) -> Array:
+    """Where the points that are ``ok`` are by a small window, the others by the large one."""
+    rows = np.flatnonzero(ok)
+    xy = found.astype(np.float64)
+    if len(rows) == 0:
+        return xy
+    window, flags = (_FINE_WINDOW_PX, _FINE_WINDOW_PX), cv2.OPTFLOW_USE_INITIAL_FLOW
+    placed, status, _ = cv2.calcOpticalFlowPyrLK(
+        grey0, grey1, start[rows], found[rows].copy(), None, None, window, 0, _CRITERIA, flags, 1e-4
+    )
+    placed = placed.reshape(-1, 2)
+    near = (status.ravel() == 1) & (np.abs(placed - found[rows]).max(axis=1) < _MAX_FINE_MOVE_PX)
+    xy[rows[near]] = placed[near]
+    return xy
 
 
 def _where_found(values: NDArray[Any], status: NDArray[Any]) -> Array:
@@ -255,7 +317,7 @@ def sample_map(values: NDArray[np.float32], keypoints_xy: Array) -> Array:
     return np.nan_to_num(values[y, x].astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
 
 
-def deduplicate(keypoints_xy: Array, cell_px: float = 4.0) -> NDArray[np.bool_]:
+def deduplicate(keypoints_xy: Array, cell_px: float = 2.0) -> NDArray[np.bool_]:
     """Mark the first of all points ``(N, 2)`` that share a cell of this side, ``(N,)`` bool."""
     cells = np.floor(keypoints_xy / cell_px).astype(np.int64)
     _, first = np.unique(cell_keys(cells), return_index=True)

@@ -57,16 +57,19 @@ class Templates:
     dy: Values
 
     @staticmethod
-    def cut(image: Grey, centres_xy: Array, window_px: int = KLT_WINDOW_PX) -> "Templates":
+    def cut(
+        image: Grey, centres_xy: Array, window_px: int = KLT_WINDOW_PX, stride_px: int = _STRIDE_PX
+    ) -> "Templates":
         """Cut the windows around ``(N, 2)`` pixels of an image; beyond the border its last values go on.
 
         Args:
             image: ``(H, W)``.
             centres_xy: ``(N, 2)``.
             window_px: Side of a window, odd.
+            stride_px: Every so many pixels of it are looked at.
         """
         half = window_px // 2
-        offset = np.arange(-half, half + 1, _STRIDE_PX, dtype=np.float32)
+        offset = np.arange(-half, half + 1, stride_px, dtype=np.float32)
         dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
         x, y = (centres_xy[:, k : k + 1].astype(np.float32) for k in range(2))
         grey = image.astype(np.float32)

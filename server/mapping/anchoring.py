@@ -32,6 +32,11 @@ Array = NDArray[np.float64]
 
 #: Keyframes that are looked at, the newest ones.
 NUM_ANCHORS = 10
+#: Side of the patches by which tracks are put back, and every so many of their pixels that are looked at: a
+#: small one finds what is a pixel or two off, and has less of what is behind an outline.
+_FINE_PATCH = (11, 1)
+#: And of those by which they are told from chance finds, whose correlation needs more around.
+_WHOLE_PATCH = (ANCHOR_PATCH_PX, 2)
 #: Places from which on their scatter tells how well a track is known.
 _MIN_PLACES = 4
 #: Keyframes that the tracks behind a pose are compared with, and how many of those these show must look as
@@ -71,7 +76,7 @@ def anchor_tracks(
     """
     views = _views(world, images, submap, NUM_ANCHORS)
     all_rows = np.flatnonzero(tracks.visible)
-    aligned = _align(camera, world, views, tracks, all_rows, sight, T_world_cam)
+    aligned = _align(camera, world, views, tracks, all_rows, sight, T_world_cam, _FINE_PATCH)
     if aligned is None:
         return 0
     rows, anchor, found = aligned
@@ -111,7 +116,7 @@ def resembles(
     """
     views = _views(world, images, submap, _NUM_COMPARED)
     rows = np.flatnonzero(tracks.visible & np.isin(tracks.ids, ids))
-    aligned = _align(camera, world, views, tracks, rows, sight, T_world_cam)
+    aligned = _align(camera, world, views, tracks, rows, sight, T_world_cam, _WHOLE_PATCH)
     if aligned is None:
         return False
     rows, _, found = aligned
@@ -135,8 +140,9 @@ def _align(
     wanted: NDArray[np.intp],
     sight: Sight,
     T_world_cam: Array,
+    patch: tuple[int, int],
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], AlignedPatches] | None:
-    """Align some tracks with each keyframe that saw them.
+    """Align some tracks with each keyframe that saw them, by patches of some side and stride.
 
     Returns:
         Rows of tracks ``(M,)``, one for each keyframe that shows it, that keyframe's row ``(M,)``, and where
@@ -151,7 +157,7 @@ def _align(
         rows, xy0, depth = rows[told], xy0[told], depth[told]
         warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
         alike = seen_alike(warps, depth_now)
-        parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike], ANCHOR_PATCH_PX)))
+        parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike], *patch)))
     if not any(len(part[0]) for part in parts):
         return None
     rows, warps = (np.concatenate([part[k] for part in parts]) for k in (0, 1))

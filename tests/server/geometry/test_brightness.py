@@ -53,7 +53,7 @@ def test_points_are_followed_to_where_they_are_through_a_change_of_exposure(grey
     found = track_points(grey, moved, corners, corners)
     error = np.linalg.norm(found.xy[found.ok] - corners[found.ok] - (3, 2), axis=1)
     assert found.ok.mean() > 0.95
-    assert np.median(error) < 0.05
+    assert np.median(error) < 0.08
     assert np.median(found.photometric_grey[found.ok]) < 2.0
     monkeypatch.setattr("semcast.server.geometry.features.brightness_change", lambda *_: None)
     without = track_points(grey, moved, corners, corners)

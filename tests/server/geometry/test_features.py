@@ -10,6 +10,7 @@ from semcast.server.geometry.features import (
     detect_corners,
     hamming,
     match_descriptors,
+    noise_energy_grey2,
     sample_map,
     to_grey,
     track_points,
@@ -66,8 +67,33 @@ def test_corners_keep_away_from_those_there_and_from_lost_rows():
     usable[96:160] = False
     more = detect_corners(grey, 100, first.astype(float), usable)
     distance = np.linalg.norm(first[:, None] - more[None], axis=2).min()
-    assert distance > 3.5
+    assert distance > 2.0
     assert not np.any((more[:, 1] >= 96 + 3.5) & (more[:, 1] < 160 - 3.5))
+
+
+def test_a_thing_that_is_small_in_the_picture_has_many_corners():
+    grey = np.full((480, 640), 240, np.uint8)
+    grey[200:260, 300:360] = cv2.resize(texture(shape=(180, 180)), (60, 60), interpolation=cv2.INTER_AREA)
+    first = detect_corners(grey, 500)
+    more = detect_corners(grey, 500, first.astype(float))
+    assert len(first) + len(more) > 100
+
+
+@pytest.mark.parametrize("sd", [1.5, 4.0])
+def test_noise_on_plain_ground_is_measured_and_has_hardly_any_corners(sd):
+    rng = np.random.default_rng(3)
+    grey = np.full((480, 640), 128.0)
+    grey[200:260, 300:360] = cv2.resize(texture(shape=(180, 180)), (60, 60), interpolation=cv2.INTER_AREA)
+    noisy = np.rint(grey + rng.normal(0, sd, grey.shape)).clip(0, 255).astype(np.uint8)
+    assert noise_energy_grey2(noisy) == pytest.approx(12 / 64 * sd**2, rel=0.15)
+    corners = detect_corners(noisy, 500)
+    on_thing = np.all((corners > (295, 195)) & (corners < (365, 265)), axis=1)
+    assert on_thing.sum() > 60
+    assert (~on_thing).sum() < on_thing.sum()
+
+
+def test_an_image_with_something_everywhere_has_no_noise():
+    assert noise_energy_grey2(texture()) < 0.1
 
 
 def test_an_empty_image_has_no_corners():
@@ -90,6 +116,27 @@ def test_points_are_followed_to_a_fraction_of_a_pixel(shift, share):
     assert np.median(error) < 0.1
     assert np.median(found.forward_backward_px[found.ok]) < 0.1
     assert np.all(found.gradient_grey2[found.ok] > 0)
+
+
+def test_points_near_an_outline_are_placed_by_what_is_inside_it():
+    inside = np.zeros((240, 320), np.uint8)
+    for x in range(30, 320, 40):
+        for y in range(30, 240, 40):
+            cv2.circle(inside, (x, y), 13, 255, -1)
+
+    def seen(shift, behind):
+        mask = shifted(inside, *shift)[..., None].astype(np.float32) / 255
+        thing, ground = shifted(texture(0), *shift), shifted(texture(1), *behind)
+        return np.rint(mask[..., 0] * thing + (1 - mask[..., 0]) * ground).astype(np.uint8)
+
+    shift = (2.0, 1.0)
+    grey0, grey1 = seen((0, 0), (0, 0)), seen(shift, (0.5, -0.5))
+    usable = cv2.erode(inside, np.ones((13, 13), np.uint8)) > 0
+    corners = detect_corners(grey0, 200, usable=usable).astype(np.float64)
+    found = track_points(grey0, grey1, corners, corners + shift)
+    error = np.linalg.norm(found.xy - corners - shift, axis=1)[found.ok]
+    assert len(error) > 30
+    assert np.median(error) < 0.1
 
 
 def test_gradient_of_tracking_is_that_of_the_corner_strength():
@@ -125,8 +172,8 @@ def test_sampling_takes_the_nearest_pixel_and_counts_nan_as_nothing():
 
 
 def test_of_points_in_one_cell_one_stays():
-    keep = deduplicate(np.array([[1.0, 1], [2, 2], [9, 9], [9.5, 9]]))
-    assert keep.tolist() == [True, False, True, False]
+    keep = deduplicate(np.array([[1.0, 1], [1.5, 1.5], [9, 9], [11.0, 9]]))
+    assert keep.tolist() == [True, False, True, True]
 
 
 def test_descriptors_match_across_a_shift_and_a_change_of_size():
