@@ -32,8 +32,8 @@ class ReconstructionSettings:
     bundle_solver: Solver = field(
         default="dense",
         metadata={
-            "help": "solver of a window's bundle adjustment: dense (Schur complement, the faster one) or gtsam "
-            "(its factor graph); both end in the same place"
+            "help": "solver of a window's bundle adjustment: dense (Schur complement, the faster one) or "
+            "gtsam (its factor graph); both end in the same place"
         },
     )
     final_adjustment: bool = field(

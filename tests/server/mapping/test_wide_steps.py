@@ -36,8 +36,9 @@ def test_tracks_are_found_again_after_a_turn_of_the_image():
 
 def test_many_tracks_that_descriptors_refute_do_not_outvote_fewer_that_they_find():
     tracks = begin(x=20, y=10)
+    xy = dict(zip(tracks.ids.tolist(), tracks.xy, strict=True))
     tracks.follow(sight_at(20, 10), tracks.xy)
-    count, xy = int(tracks.visible.sum()), dict(zip(tracks.ids.tolist(), tracks.xy, strict=True))
+    count = int(tracks.visible.sum())
     assert tracks.follow_jump(sight_at(135, 75)), "as if all had been found where they were"
     assert tracks.visible.sum() < count
     moved = tracks.xy - [xy[k] for k in tracks.ids.tolist()]
