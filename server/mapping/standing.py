@@ -39,14 +39,21 @@ def cells_of(xy: Array, width: int) -> NDArray[np.intp]:
     return np.asarray(group, dtype=np.intp)
 
 
-def scene_motion_px(xy: Array, motion_px: Array, width: int) -> float:
+def scene_motion_px(xy: Array, motion_px: Array, width: int, moving_sd_px: Array | None = None) -> float:
     """How far the scene moved in the image from one frame to the next: the median over its area.
 
     Args:
         xy: ``(N, 2)`` tracks.
         motion_px: ``(N,)`` how far each moved.
         width: Of the image.
+        moving_sd_px: ``(N,)`` standard deviation of a position per coordinate, where only what moves by more
+            than that explains is the scene, as on a turntable; None where all of it is.
     """
+    if moving_sd_px is not None:
+        moves = motion_px >= np.maximum(_LEAST_MOTION_PX, _NOISE_SIGMAS * np.sqrt(2.0) * moving_sd_px)
+        if moves.sum() < _MIN_TURNING:
+            return 0.0
+        xy, motion_px = xy[moves], motion_px[moves]
     if len(xy) == 0:
         return 0.0
     group = cells_of(xy, width)
@@ -55,19 +62,6 @@ def scene_motion_px(xy: Array, motion_px: Array, width: int) -> float:
     middle = begins + (np.bincount(group) - 1) // 2
     motion = float(np.median(motion_px[order[middle]]))
     return motion if motion >= _LEAST_MOTION_PX else 0.0
-
-
-def turning_motion_px(xy: Array, motion_px: Array, width: int, sd_px: Array) -> float:
-    """Return the same where the scene is only what moves, by more than the noise of its tracks explains.
-
-    Args:
-        xy: ``(N, 2)`` tracks.
-        motion_px: ``(N,)`` how far each moved.
-        width: Of the image.
-        sd_px: ``(N,)`` standard deviation of a position per coordinate.
-    """
-    moves = motion_px >= np.maximum(_LEAST_MOTION_PX, _NOISE_SIGMAS * np.sqrt(2.0) * sd_px)
-    return scene_motion_px(xy[moves], motion_px[moves], width) if moves.sum() >= _MIN_TURNING else 0.0
 
 
 def stood(

@@ -29,7 +29,7 @@ from semcast.server.geometry.weighting import (
 from semcast.server.geometry.wide_search import Carried, WideFeatures, search_wide
 from semcast.server.mapping.found import Found
 from semcast.server.mapping.sight import Seen, Sight
-from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood, turning_motion_px
+from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -73,9 +73,7 @@ class TrackTable:
         edge: ``(N, 2)`` of the newest position, see ``edges``.
     """
 
-    def __init__(
-        self, mode: ConfidenceMode, max_features: int, seed: int, *, turntable: bool = False
-    ) -> None:
+    def __init__(self, mode: ConfidenceMode, max_features: int, seed: int, turntable: bool = False) -> None:
         self._turntable = turntable
         self._mode: ConfidenceMode = mode
         self._max_features = max_features
@@ -328,10 +326,8 @@ class TrackTable:
         self.age = self.age + ok
         width = sight.grey.shape[1]
         motion_px, sd_px = np.linalg.norm(self.velocity[ok], axis=1), np.sqrt(self.variance_px2)
-        if self._turntable:
-            scene_px = turning_motion_px(self.xy[ok], motion_px, width, sd_px[ok])
-        else:
-            scene_px = scene_motion_px(self.xy[ok], motion_px, width)
+        moving_sd_px = sd_px[ok] if self._turntable else None
+        scene_px = scene_motion_px(self.xy[ok], motion_px, width, moving_sd_px)
         passed = np.where(ok, scene_px, 0.0)  # where a track that coasts is, nobody knows
         self.anchor_xy, self.stood_widths = stood(
             self.xy, self.anchor_xy, self.stood_widths, passed, width, sd_px
@@ -343,9 +339,8 @@ class TrackTable:
             ),
             drift_px2=self.drift_px2[ok],
         )
-        self.confidence = self.confidence.copy()
+        self.confidence, self.variance_px2 = self.confidence.copy(), self.variance_px2.copy()
         self.confidence[ok] = observation_confidence(self._mode, cues, self._rng)
-        self.variance_px2 = self.variance_px2.copy()
         self.variance_px2[ok] = localisation_variance_px2(cues)
         self.edge = self.edge.copy()
         self.edge[ok] = cues.edge

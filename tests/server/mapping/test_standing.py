@@ -11,7 +11,7 @@ from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
 from semcast.server.mapping.sight import Sight
-from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood, turning_motion_px
+from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable
 
@@ -71,12 +71,10 @@ def test_on_a_turntable_the_scene_is_what_moves():
     motion = np.where(np.hypot(*(xy - (320, 200)).T) < 130, 3.0, 0.2)
     assert scene_motion_px(xy, motion, 640) == 0.0
     noise = np.full(len(xy), 0.1)
-    assert turning_motion_px(xy, motion, 640, noise) == 3.0
-    assert turning_motion_px(xy, np.where(motion == 3.0, 3.0, 0.9), 640, 5 * noise) == 3.0, (
-        "the rest is noise"
-    )
+    assert scene_motion_px(xy, motion, 640, noise) == 3.0
+    assert scene_motion_px(xy, np.where(motion == 3.0, 3.0, 0.9), 640, 5 * noise) == 3.0, "the rest is noise"
     slipped = np.where(np.arange(len(xy)) < 5, 3.0, 0.2)
-    assert turning_motion_px(xy, slipped, 640, noise) == 0.0
+    assert scene_motion_px(xy, slipped, 640, noise) == 0.0
 
 
 def test_a_track_that_moves_begins_anew():
