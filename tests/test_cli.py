@@ -31,7 +31,7 @@ def test_help_lists_every_verb_and_answers_at_once():
 @pytest.mark.parametrize(
     ("verb", "given", "threads"),
     [
-        *((verb, {}, "1") for verb in ("agent", "server", "replay", "eval")),
+        *((verb, {}, "1") for verb in ("agent", "server", "replay", "eval", "lens", "shutter")),
         ("agent", {"OPENBLAS_NUM_THREADS": "3"}, "3"),
         ("info", {}, None),
     ],

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
 #: Verbs whose matrices are small: those of frames, and of windows of keyframes.
-_ONE_THREAD = frozenset({"agent", "server", "replay", "eval"})
+_ONE_THREAD = frozenset({"agent", "server", "replay", "eval", "lens", "shutter"})
 #: verb -> (module in semcast.commands, one line of help)
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "run agent, channel and server together on a recorded sequence and watch"),
