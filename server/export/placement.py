@@ -22,6 +22,7 @@ from semcast.common.sequence import truth_at_frames
 from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import match_times
+from semcast.server.export.poses import rising_times
 
 Array = NDArray[np.float64]
 
@@ -67,7 +68,8 @@ def place_by_path(data: RunData, known: Trajectory) -> Placement:
     """Return the similarity that brings a run's camera path onto a known one.
 
     Positions decide. Only on a straight path, where they leave the rotation about it open, do the known
-    directions, which then have to be those of the camera (x right, y down, z forward).
+    directions, which then have to be those of the camera (x right, y down, z forward). Frames whose time does
+    not increase are left out: nothing tells which of two at one time a known pose is of.
 
     Args:
         data: The run, of one part.
@@ -79,16 +81,18 @@ def place_by_path(data: RunData, known: Trajectory) -> Placement:
     """
     # Known poses may come at uneven times, and fewer of them than frames: one may be absent between two.
     gap_s = 2.0 * float(np.median(np.diff(known.t_s))) if len(known) > 1 else 0.0
-    at_frames = truth_at_frames(known, data.t_source_ns, gap_s)
+    rising = rising_times(data.t_source_ns)
+    times_ns, T_world_cam = data.t_source_ns[rising], data.T_world_cam[rising]
+    at_frames = truth_at_frames(known, times_ns, gap_s)
     matched = np.zeros((2, 0), dtype=np.int64)
     if at_frames is not None:
-        matched = np.stack(match_times(ns_to_seconds(data.t_source_ns), at_frames.t_s))
+        matched = np.stack(match_times(ns_to_seconds(times_ns), at_frames.t_s))
     if at_frames is None or matched.shape[1] < MIN_MATCHES:
         raise SourceError(
             f"the known path must have a pose at the time of {MIN_MATCHES} posed frames or more, "
             f"got {matched.shape[1]} of {len(data.frame_ids)}"
         )
-    T_map_cam, T_known_cam = data.T_world_cam[matched[0]], at_frames.T_world_cam[matched[1]]
+    T_map_cam, T_known_cam = T_world_cam[matched[0]], at_frames.T_world_cam[matched[1]]
     p_map, p_known = T_map_cam[:, :3, 3], T_known_cam[:, :3, 3]
     if not (np.ptp(p_map, axis=0).any() and np.ptp(p_known, axis=0).any()):
         raise SourceError("the camera must move to be aligned with a known path, got a path of one place")

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semcast.common.run_folder import RunData
 from semcast.common.sequence_layouts import ns_to_seconds
@@ -10,15 +11,19 @@ from semcast.common.trajectory import Trajectory, seconds_of, write_tum
 from semcast.common.whole_file import write_whole
 
 
+def rising_times(times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Mark the times ``(N,)`` that are later than all before them: a source may have begun anew."""
+    return np.concatenate([[True], times_ns[1:] > np.maximum.accumulate(times_ns)[:-1]])[: len(times_ns)]
+
+
 def write_run_tum(path: Path, data: RunData) -> list[Path]:
     """Write ``t tx ty tz qx qy qz qw`` of all posed frames; returns the file.
 
     Frames whose time does not increase are left out: the format is ordered by time.
     """
-    times_ns = data.t_source_ns
-    rising = np.concatenate([[True], times_ns[1:] > np.maximum.accumulate(times_ns)[:-1]])[: len(times_ns)]
+    rising = rising_times(data.t_source_ns)
     path.parent.mkdir(parents=True, exist_ok=True)
-    times_ns = times_ns[rising]
+    times_ns = data.t_source_ns[rising]
     write_tum(path, Trajectory(ns_to_seconds(times_ns), data.T_world_cam[rising], times_ns))
     return [path]
 

@@ -59,6 +59,17 @@ def test_a_path_is_known_at_other_times_and_in_part_of_the_run(arc_run):
     assert "aligned with 19 known poses" in placement.words
 
 
+def test_frames_of_a_source_that_began_anew_are_placed_but_not_aligned(arc_run):
+    data = arc_run(num_frames=12)
+    known = known_path(data)
+    again = data.t_source_ns.copy()
+    again[8:] = again[:4]
+    data = replace(data, t_source_ns=again)
+    placement = place_by_path(data, known)
+    assert placement.words.startswith("aligned with 8 known poses, ")
+    np.testing.assert_allclose(placement.run(data).T_world_cam, in_metres(data.T_world_cam), atol=1e-9)
+
+
 def straight(data):
     T = data.T_world_cam.copy()
     T[:, :3, 3] = np.linspace(0, 4, len(T))[:, None] * np.array([0.1, 0.0, 1.0])
