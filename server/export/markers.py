@@ -36,6 +36,8 @@ _APRILTAG_PIXEL_CENTRE = 0.5
 #: What a corner behind the camera is off by.
 _BEHIND_PX = 1e4
 _ITERATIONS = 20
+#: Of a marker in the map, whose logarithm is fitted.
+_LEAST_SCALE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -161,9 +163,10 @@ def _fit(views: MarkerViews, camera: Intrinsics, side_m: float, name: str) -> Pl
     rms_px = float(np.sqrt((fit.residuals**2).mean()))
     uncertainty = 1.96 * fit.sigma_log_scale * max(rms_px, _LEAST_SIGMA_PX)
     if not uncertainty <= MAX_UNCERTAINTY:
+        by = f" by {100 * uncertainty:.0f} %" if np.isfinite(uncertainty) else ""
         raise SourceError(
             f"{name} must be seen from several places to tell the scale; its {len(views)} images leave it "
-            f"open by {100 * uncertainty:.0f} %"
+            f"open{by}"
         )
     scale = 1.0 / fit.scale
     words = (
@@ -180,7 +183,8 @@ class _Fit:
 
     Attributes:
         residuals: ``(N, 4, 2)`` pixels.
-        sigma_log_scale: Standard deviation of log ``scale`` for corners known to one pixel.
+        sigma_log_scale: Standard deviation of log ``scale`` for corners known to one pixel; infinite where
+            they leave it open.
     """
 
     scale: float
@@ -199,6 +203,8 @@ def _least_squares(views: MarkerViews, camera: Intrinsics, side_m: float) -> _Fi
     square = 0.5 * side_m * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
     T_cam_world = invert_transform(views.T_world_cam)
     start = align_umeyama(square, _triangulated(views.corners_xy, T_cam_world, camera))
+    # Rays of cameras in one place meet there.
+    start = (max(start[0], _LEAST_SCALE), *start[1:])
 
     def residuals(log_scale: float, R: Array, t: Array) -> Array:
         corners = np.exp(log_scale) * square @ R.T + t
@@ -228,8 +234,9 @@ def _least_squares(views: MarkerViews, camera: Intrinsics, side_m: float) -> _Fi
                 break
         else:
             damping *= 10.0
-    covariance = np.linalg.pinv(J.T @ J)
-    return _Fit(float(np.exp(x[0])), x[1], x[2], r, float(np.sqrt(covariance[0, 0])))
+    JtJ = J.T @ J
+    sigma = float(np.sqrt(np.linalg.inv(JtJ)[0, 0])) if np.linalg.matrix_rank(JtJ) == len(JtJ) else np.inf
+    return _Fit(float(np.exp(x[0])), x[1], x[2], r, sigma)
 
 
 def _triangulated(corners_xy: Array, T_cam_world: Array, camera: Intrinsics) -> Array:

@@ -217,6 +217,15 @@ def test_a_marker_seen_from_one_place_tells_no_scale(marker_run, arc_run):
         place_by_marker(data, images, 0.3, FAMILY)
 
 
+@pytest.mark.parametrize("step", [0.0, 1e-5])
+def test_a_camera_that_only_turns_tells_no_scale(marker_run, arc_run, step):
+    data = arc_run(num_frames=5)
+    T_world_cam = [make_transform(exp_so3((0.02 * k, 0.0, 0.0)), (step * k, 0.0, 0.0)) for k in range(5)]
+    data, images = marker_run(data=replace(data, T_world_cam=np.stack(T_world_cam)))
+    with pytest.raises(SourceError, match="must be seen from several places to tell the scale"):
+        place_by_marker(data, images, 0.3, FAMILY)
+
+
 def test_what_a_marker_needs_is_said(marker_run):
     data, images = marker_run()
     few = dict(list(images.items())[:2])
