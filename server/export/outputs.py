@@ -32,11 +32,21 @@ PLY_VERTEX = np.dtype(
         ("confidence", "<f4"),
     ]
 )
-_PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
+#: The same for points so far from the origin that single precision would put them on steps.
+PLY_FAR_VERTEX = np.dtype(
+    [(name, "<f8" if name in "xyz" else PLY_VERTEX[name]) for name in PLY_VERTEX.names or ()]
+)
+#: Share of a cloud's extent that these steps may be.
+_MAX_STEP_SHARE = 1e-5
+_PLY_TYPES = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
 _PLY_START = ("ply", "format binary_little_endian 1.0")
 _PLY_END = b"end_header\n"
 #: Axes and unit of a map.
 MAP_FRAME = "x right, y down, z forward of the first camera; map units"
+
+
+def _ply_properties(vertex: np.dtype) -> list[str]:
+    return [f"property {_PLY_TYPES[vertex[name].str]} {name}" for name in vertex.names or ()]
 
 
 class EachFile:
@@ -78,7 +88,8 @@ def write_ply(
 ) -> None:
     """Write landmarks as binary PLY with colour and a ``confidence`` property in [0, 1], whole or not at all.
 
-    Points with a non-finite coordinate are left out.
+    Points with a non-finite coordinate are left out. Coordinates are in single precision, and in double where
+    all points are far from the origin, as in a frame of satellites.
 
     Args:
         path: File to write.
@@ -89,24 +100,32 @@ def write_ply(
     """
     points = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
     finite = np.isfinite(points).all(axis=1)
-    vertices = np.empty(int(finite.sum()), dtype=PLY_VERTEX)
+    vertex = PLY_FAR_VERTEX if _is_far(points[finite]) else PLY_VERTEX
+    vertices = np.empty(int(finite.sum()), dtype=vertex)
     for axis, name in enumerate(("x", "y", "z")):
         vertices[name] = points[finite, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         vertices[name] = rgb[finite, channel]
     vertices["confidence"] = confidence[finite]
-    properties = [f"property {_PLY_TYPES[PLY_VERTEX[name].str]} {name}" for name in PLY_VERTEX.names or ()]
     header = [
         *_PLY_START,
         f"comment semcast map; {frame}",
         f"element vertex {len(vertices)}",
-        *properties,
+        *_ply_properties(vertex),
     ]
     write_whole(path, "\n".join(header).encode("ascii") + b"\n" + _PLY_END + vertices.tobytes())
 
 
+def _is_far(points: NDArray[np.float64]) -> bool:
+    """Tell whether single precision is too coarse for what points ``(N, 3)`` differ by."""
+    if len(points) == 0:
+        return False
+    step = float(np.spacing(np.abs(points).max().astype(np.float32)))
+    return bool(0.0 < _MAX_STEP_SHARE * np.ptp(points, axis=0).max() < step)
+
+
 def read_ply(path: Path) -> NDArray[np.void]:
-    """Read what ``write_ply`` wrote; returns ``(N,)`` of ``PLY_VERTEX``.
+    """Read what ``write_ply`` wrote; returns ``(N,)`` of ``PLY_VERTEX`` or ``PLY_FAR_VERTEX``.
 
     Raises:
         SourceError: The file can't be read, or isn't one of ours.
@@ -116,12 +135,13 @@ def read_ply(path: Path) -> NDArray[np.void]:
     except OSError as err:
         raise SourceError(f"{path} can't be read: {err.strerror}") from err
     lines = header.decode("ascii", errors="replace").splitlines()
-    names = tuple(line.split()[-1] for line in lines if line.startswith("property "))
-    if not end or tuple(lines[:2]) != _PLY_START or names != PLY_VERTEX.names:
+    properties = [line for line in lines if line.startswith("property ")]
+    vertex = next((v for v in (PLY_VERTEX, PLY_FAR_VERTEX) if _ply_properties(v) == properties), None)
+    if not end or tuple(lines[:2]) != _PLY_START or vertex is None:
         raise SourceError(f"{path} is not a cloud that semcast wrote")
-    if len(body) % PLY_VERTEX.itemsize or f"element vertex {len(body) // PLY_VERTEX.itemsize}" not in lines:
+    if len(body) % vertex.itemsize or f"element vertex {len(body) // vertex.itemsize}" not in lines:
         raise SourceError(f"{path} is damaged: {len(body)} bytes do not hold the points that it promises")
-    return np.frombuffer(body, dtype=PLY_VERTEX)
+    return np.frombuffer(body, dtype=vertex)
 
 
 def trajectory_of(poses: Mapping[int, NDArray[np.float64]], t_source_ns: Mapping[int, int]) -> Trajectory:

@@ -12,6 +12,7 @@ from semcast.server.export.outputs import (
     EachFile,
     percentiles,
     plain,
+    read_ply,
     trajectory_of,
     versions,
     write_json,
@@ -63,6 +64,17 @@ def test_ply_round_trip_leaves_out_points_at_infinity(tmp_path, read_ply):
 def test_ply_of_an_empty_map_is_valid(tmp_path, read_ply):
     write_ply(tmp_path / "map.ply", np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32))
     assert len(read_ply(tmp_path / "map.ply")) == 0
+
+
+@pytest.mark.parametrize("shift", [(0, 0, 0), (692e3, 5_334e3, 520)], ids=["map", "satellites"])
+def test_points_far_from_the_origin_keep_their_distances(tmp_path, shift):
+    xyz = np.random.default_rng(0).normal(size=(50, 3)) + shift
+    write_ply(tmp_path / "map.ply", xyz, np.zeros((50, 3), np.uint8), np.ones(50, np.float32))
+    cloud = read_ply(tmp_path / "map.ply")
+    np.testing.assert_allclose(np.stack([cloud[a] for a in "xyz"], axis=1) - shift, xyz - shift, atol=1e-6)
+    assert cloud["confidence"].tolist() == [1.0] * 50
+    kind = b"double" if any(shift) else b"float"
+    assert b"property " + kind + b" x\n" in (tmp_path / "map.ply").read_bytes()
 
 
 def test_ply_opens_in_colmap(tmp_path):
