@@ -72,6 +72,11 @@ def export_run(
     if find_placement is not None:
         if format_name == "rrd":
             raise ConfigError("--format rrd shows the map in its own frame, without --align or --marker-m")
+        if parts is not None and format_name == "dense":
+            raise ConfigError(
+                f"--format dense can't be in metres here: each part has its own scale ({parts}), and "
+                "points of the dense cloud do not know their part"
+            )
         if parts is not None and part == ALL:
             raise ConfigError(f"--part must name one part, each has its own scale: {parts}")
         placement = find_placement(data, images)

@@ -300,6 +300,8 @@ def test_placements_that_can_not_be_are_refused_in_one_line(tmp_path, marker_run
     write_ply(tmp_path / "run" / "dense.ply", data.xyz, data.rgb, data.confidence)
     assert export(tmp_path, "--format", "dense", "--part", "largest", *out) == 1
     assert "--part must be all for --format dense" in capsys.readouterr().err
+    assert export(tmp_path, "--format", "dense", "--marker-m", 0.3, *out) == 1
+    assert "--format dense can't be in metres here: " in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
     marker = ("--marker-m", SIDE * SCALE, "--part", "1")
     assert export(tmp_path, "--format", "tum", *marker, *out) == 0
