@@ -24,6 +24,8 @@ _FIRST_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-4, 10.0, 1e5
 _MIN_KEPT_PROMISE = 1e-3
 #: The search ends when a step lowers the cost by less than this share, or this much.
 _SMALL_SHARE, _SMALL = 1e-3, 1e-5
+#: A shorter way has no direction.
+_LEAST_LENGTH = 1e-12
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,8 @@ def _along(baseline: Baseline, state: State) -> tuple[Array, float]:
     """Unit vector from the first view to the second, and what is missing to the length, in sigmas."""
     first, second = (state.T_world_cam[k, :3, 3] for k in baseline.views)
     length_map = float(np.linalg.norm(second - first))
-    return (second - first) / length_map, (baseline.length_map - length_map) / baseline.sigma_map
+    missing = (baseline.length_map - length_map) / baseline.sigma_map
+    return (second - first) / max(length_map, _LEAST_LENGTH), missing
 
 
 @dataclass(frozen=True)

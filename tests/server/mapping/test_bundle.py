@@ -174,11 +174,21 @@ def test_a_point_takes_part_from_its_second_view_on():
         {"xyz": np.full((60, 3), (0.0, 0.0, -4.0))},
         {"xy": np.full((360, 2), np.nan)},
         {"T_world_cam": np.stack([np.eye(4)] * 6), "xyz": np.full((60, 3), (0.0, 0.0, 5.0))},
+        {"T_world_cam": np.stack([np.eye(4)] * 6), "keep_baseline": True},
         {"T_world_cam": np.stack([1.3 * np.eye(4)] * 6)},
         {"xy": np.concatenate([np.zeros((300, 2)), np.full((60, 2), np.nan)])},
         {"view": np.repeat(np.arange(6), 60) % 5},
     ],
-    ids=["no gauge", "all behind", "nan", "no parallax", "no rotations", "nothing seen last", "unseen pose"],
+    ids=[
+        "no gauge",
+        "all behind",
+        "nan",
+        "no parallax",
+        "no baseline",
+        "no rotations",
+        "nothing seen last",
+        "unseen pose",
+    ],
 )
 def test_degenerate_windows_end_without_an_exception(changes):
     problem, _, _ = make_problem()
