@@ -183,9 +183,10 @@ def test_a_marker_gives_metres_and_its_own_axes(marker_run):
 
 def test_the_stated_uncertainty_covers_the_error_and_is_not_idle(marker_run):
     data, images = marker_run()
-    words = place_by_marker(data, images, SIDE * SCALE, FAMILY).words
-    within = float(words.split("within ")[1].split(" %")[0]) / 100
+    placement = place_by_marker(data, images, SIDE * SCALE, FAMILY)
+    within = float(placement.words.split("within ")[1].split(" %")[0]) / 100
     assert 0.0003 < within < 0.01
+    assert abs(np.log(placement.scale / SCALE)) <= within
 
 
 def test_an_image_that_shows_the_marker_elsewhere_is_left_out(marker_run):
