@@ -97,8 +97,8 @@ def place_by_path(data: RunData, known: Trajectory) -> Placement:
     if not (np.ptp(p_map, axis=0).any() and np.ptp(p_known, axis=0).any()):
         raise SourceError("the camera must move to be aligned with a known path, got a path of one place")
     scale, R, t = align_umeyama(p_map, p_known)
-    length, width, _ = np.linalg.svd(p_known - p_known.mean(axis=0), compute_uv=False)
-    if length > STRAIGHT * width:
+    # The noise of satellites gives a known path a width that the camera's own does not have.
+    if _is_straight(p_map) or _is_straight(p_known):
         R = _turned_about_path(R, p_known, T_map_cam, T_known_cam)
         t = p_known.mean(axis=0) - scale * R @ p_map.mean(axis=0)
     rms = float(np.sqrt(((scale * p_map @ R.T + t - p_known) ** 2).sum(axis=1).mean()))
@@ -106,6 +106,11 @@ def place_by_path(data: RunData, known: Trajectory) -> Placement:
         f"aligned with {len(p_map)} known poses, {rms:.3g} m apart (RMS); 1 unit of the map is {scale:.4g} m"
     )
     return Placement(scale, R, t, "axes and unit of the known path", words)
+
+
+def _is_straight(positions: Array) -> bool:
+    length, width, _ = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+    return bool(length > STRAIGHT * width)
 
 
 def _turned_about_path(R: Array, p_known: Array, T_map_cam: Array, T_known_cam: Array) -> Array:

@@ -92,6 +92,14 @@ def test_on_a_straight_path_positions_stay_exact_where_directions_are_a_little_o
     assert 0.5 < rotation_angle_deg(placement.R @ R_METRES_MAP.T) < 5.0
 
 
+def test_noise_of_a_known_straight_path_does_not_say_what_is_up(arc_run):
+    data = straight(arc_run(num_frames=30))
+    known = known_path(data)
+    known.T_world_cam[:, :3, 3] += np.random.default_rng(2).normal(0, 0.02, (30, 3))  # of 0.8 m
+    placement = place_by_path(data, known)
+    assert rotation_angle_deg(placement.R @ R_METRES_MAP.T) < 5.0
+
+
 def test_directions_of_something_else_than_the_camera_do_not_tip_a_straight_path_over(arc_run):
     data = straight(arc_run())
     known = known_path(data)
