@@ -1,4 +1,4 @@
-"""Bundle adjustment in a process of its own: GTSAM holds the interpreter lock while it works."""
+"""Bundle adjustment in a process of its own: no frame waits for it, nor for the lock that GTSAM holds."""
 
 from collections.abc import Callable
 
