@@ -36,6 +36,8 @@ _MIN_EIGEN_GREY2 = 0.5
 _MIN_EIGEN_SHARE = 0.0005
 #: What the noise of the sensor makes of plain ground is weaker than so many times its gradient energy.
 _NOISE_FACTOR = 3.0
+#: Nor has a sensor more than that of four grey levels: what is rougher all over is gravel or grass.
+_MOST_NOISE_GREY2 = 12.0 / 64.0 * 4.0**2
 #: Side of the cells of which the share with the least roughness is plain.
 _NOISE_CELL_PX, _PLAIN_SHARE = 16, 0.2
 _ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
@@ -136,7 +138,7 @@ def noise_energy_grey2(grey: Grey) -> float:
     plain = float(np.quantile(cv2.resize(rough, size, interpolation=cv2.INTER_AREA), _PLAIN_SHARE))
     # The filter has a norm of 6, the mean size of a Gaussian value is sqrt(2 / pi) sigma, and the derivatives
     # of ``corner_strength`` keep 12 / 64 of the variance.
-    return 12.0 / 64.0 * np.pi / 2.0 * (plain / 6.0) ** 2
+    return min(12.0 / 64.0 * np.pi / 2.0 * (plain / 6.0) ** 2, _MOST_NOISE_GREY2)
 
 
 def _peaks(strength: NDArray[np.float32], floor: float, reach_px: int) -> NDArray[np.bool_]:

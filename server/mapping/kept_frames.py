@@ -138,7 +138,7 @@ def pose_of(
     estimate = refine_pose(camera, T_cam_world, xyz[row], observed.xy[row_o], sigma, gate, edge=edge)
     if estimate.num_inliers < 0.5 * len(row):
         searched = search_pose(
-            camera, xyz[row], observed.xy[row_o], sigma, gate, seed=seed, min_inliers=min_inliers
+            camera, xyz[row], observed.xy[row_o], sigma, gate, seed=seed, min_inliers=min_inliers, edge=edge
         )
         if searched is not None and searched.num_inliers > estimate.num_inliers:
             estimate = searched

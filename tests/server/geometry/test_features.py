@@ -96,6 +96,11 @@ def test_an_image_with_something_everywhere_has_no_noise():
     assert noise_energy_grey2(texture()) < 0.1
 
 
+def test_gravel_is_no_noise():
+    grey = np.random.default_rng(2).normal(128, 35, (240, 320)).clip(0, 255).astype(np.uint8)
+    assert len(detect_corners(grey, 200)) == 200
+
+
 def test_an_empty_image_has_no_corners():
     assert detect_corners(np.zeros((100, 100), np.uint8), 50).shape == (0, 2)
     assert detect_corners(np.full((100, 100), 255, np.uint8), 50).shape == (0, 2)
