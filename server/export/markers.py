@@ -132,7 +132,7 @@ def find_markers(path: Path, camera: Intrinsics, dictionary: str) -> dict[int, A
     if grey is None or grey.shape != camera.shape_hw:
         raise SourceError(f"{path} must be an image of {camera.width}x{camera.height}")
     parameters = cv2.aruco.DetectorParameters()
-    # Lines along the sides: on soft pictures the other ways make a marker of 70 px 1 to 2 % too small.
+    # Lines along the sides: of soft pictures the other ways make markers too small.
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(known[dictionary]), parameters)
     corners, numbers, _ = detector.detectMarkers(grey)
