@@ -74,7 +74,7 @@ def test_imports_go_one_way(folder):
         ("mapping", {"geometry", "mapping"}),
         ("dense", {"geometry", "mapping", "dense"}),
         ("view", {"mapping", "dense", "view"}),
-        ("export", {"export", "view"}),
+        ("export", {"export", "geometry", "view"}),
     ],
 )
 def test_the_servers_folders_are_layers(folder, may_import):

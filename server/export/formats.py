@@ -82,6 +82,7 @@ def export_run(
         placement = find_placement(data, images)
         logger.info("%s", placement.words)
         data = placement.run(data)
+    frame = MAP_FRAME if placement is None else placement.frame
     if FORMATS[format_name].startswith("FILE") and out.is_dir():
         raise SourceError(f"{out} is a folder; --format {format_name} writes a file")
     if FORMATS[format_name].startswith("FOLDER") and out.is_file():
@@ -89,7 +90,7 @@ def export_run(
     writers: dict[str, Callable[[], list[Path]]] = {
         "tum": lambda: write_run_tum(out, data),
         "kitti": lambda: write_run_kitti(out, data),
-        "ply": lambda: _write_run_ply(out, data, placement),
+        "ply": lambda: _write_run_ply(out, data, frame),
         "dense": lambda: _write_run_dense(out, folder, placement),
         "colmap": lambda: write_colmap(out, data, images),
         "nerfstudio": lambda: write_nerfstudio(out, data, images, placement.frame if placement else None),
@@ -128,9 +129,9 @@ def _check_not_foreign(out: Path, format_name: str, images: Mapping[int, Path]) 
         raise ConfigError(f"out must hold no images of others, there is {foreign[0]}: give another folder")
 
 
-def _write_run_ply(path: Path, data: RunData, placement: Placement | None) -> list[Path]:
+def _write_run_ply(path: Path, data: RunData, frame: str) -> list[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_ply(path, data.xyz, data.rgb, data.confidence, frame=placement.frame if placement else MAP_FRAME)
+    write_ply(path, data.xyz, data.rgb, data.confidence, frame=frame)
     return [path]
 
 

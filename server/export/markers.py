@@ -18,6 +18,7 @@ from semcast.common.errors import ConfigError, SourceError
 from semcast.common.geometry import align_umeyama, exp_so3, invert_transform
 from semcast.common.run_folder import RunData
 from semcast.server.export.placement import Placement
+from semcast.server.geometry.triangulation import triangulate
 
 Array = NDArray[np.float64]
 
@@ -91,9 +92,10 @@ def place_by_marker(
         raise SourceError(
             "the run kept no images, and a marker is looked for in them; run again with --save-images"
         )
+    detector = _detector(dictionary)
     rows, corners = defaultdict(list), defaultdict(list)
     for frame_id, path in posed.items():
-        for found, xy in find_markers(path, data.intrinsics, dictionary).items():
+        for found, xy in _find_markers(path, data.intrinsics, detector).items():
             rows[found].append(row_of[frame_id])
             corners[found].append(xy)
     number = max(rows, key=lambda k: (len(rows[k]), -k), default=None) if marker_id is None else marker_id
@@ -113,28 +115,30 @@ def dictionaries() -> dict[str, int]:
     return {name.removeprefix("DICT_").lower(): getattr(cv2.aruco, name) for name in names}
 
 
-def find_markers(path: Path, camera: Intrinsics, dictionary: str) -> dict[int, Array]:
-    """Return marker number to corners ``(4, 2)`` in pixels; a number that is there twice is left out.
-
-    Args:
-        path: The image.
-        camera: Of the image.
-        dictionary: See ``place_by_marker``.
+def _detector(dictionary: str) -> cv2.aruco.ArucoDetector:
+    """Return what finds markers of a family.
 
     Raises:
         ConfigError: There is no such dictionary.
-        SourceError: The image can't be read, or is not the camera's.
     """
     known = dictionaries()
     if dictionary not in known:
         raise ConfigError(f"dictionary must be one of {', '.join(known)}, got {dictionary!r}")
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if grey is None or grey.shape != camera.shape_hw:
-        raise SourceError(f"{path} must be an image of {camera.width}x{camera.height}")
     parameters = cv2.aruco.DetectorParameters()
     # Lines along the sides: of soft pictures the other ways make markers too small.
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(known[dictionary]), parameters)
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(known[dictionary]), parameters)
+
+
+def _find_markers(path: Path, camera: Intrinsics, detector: cv2.aruco.ArucoDetector) -> dict[int, Array]:
+    """Return marker number to corners ``(4, 2)`` in pixels; a number that is there twice is left out.
+
+    Raises:
+        SourceError: The image can't be read, or is not the camera's.
+    """
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if grey is None or grey.shape != camera.shape_hw:
+        raise SourceError(f"{path} must be an image of {camera.width}x{camera.height}")
     corners, numbers, _ = detector.detectMarkers(grey)
     flat = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
     return {
@@ -202,7 +206,10 @@ def _least_squares(views: MarkerViews, camera: Intrinsics, side_m: float) -> _Fi
     """Minimise the reprojection error over seven parameters (Levenberg-Marquardt)."""
     square = 0.5 * side_m * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
     T_cam_world = invert_transform(views.T_world_cam)
-    start = align_umeyama(square, _triangulated(views.corners_xy, T_cam_world, camera))
+    view, corner = (k.ravel() for k in np.indices((len(views), 4)))
+    seen_xy = views.corners_xy.reshape(-1, 2)
+    corners_map = triangulate(camera, T_cam_world, view, corner, seen_xy, np.ones(len(seen_xy)), 4).xyz
+    start = align_umeyama(square, corners_map)
     # Rays of cameras in one place meet there.
     start = (max(start[0], _LEAST_SCALE), *start[1:])
 
@@ -237,18 +244,3 @@ def _least_squares(views: MarkerViews, camera: Intrinsics, side_m: float) -> _Fi
     JtJ = J.T @ J
     sigma = float(np.sqrt(np.linalg.inv(JtJ)[0, 0])) if np.linalg.matrix_rank(JtJ) == len(JtJ) else np.inf
     return _Fit(float(np.exp(x[0])), x[1], x[2], r, sigma)
-
-
-def _triangulated(corners_xy: Array, T_cam_world: Array, camera: Intrinsics) -> Array:
-    """Return ``(4, 3)``: the points that are nearest to the rays of all images."""
-    R_world_cam = T_cam_world[:, :3, :3].transpose(0, 2, 1)
-    centres = -np.einsum("nij,nj->ni", R_world_cam, T_cam_world[:, :3, 3])
-    points = []
-    for corner in range(4):
-        rays = np.einsum("nij,nj->ni", R_world_cam, camera.unproject(corners_xy[:, corner]))
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-        points.append(
-            np.linalg.lstsq(across.sum(axis=0), (across @ centres[:, :, None]).sum(axis=0)[:, 0])[0]
-        )
-    return np.array(points)

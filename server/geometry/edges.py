@@ -71,3 +71,8 @@ def rounded(edge: Array) -> Array:
 def alike() -> Array:
     """Stand for any number of points that are known alike in all directions, ``(1, 2)``."""
     return np.zeros((1, 2))
+
+
+def each_of(edge: Array, count: int) -> Array:
+    """Return the edges ``(N, 2)`` of so many points: what ``alike`` stands for is told one by one."""
+    return edge if len(edge) == count else np.broadcast_to(edge, (count, 2))

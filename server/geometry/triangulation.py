@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import angles_between_deg
-from semcast.server.geometry.edges import whitened, whiteners
+from semcast.server.geometry.edges import whiteners
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front
 
 Array = NDArray[np.float64]
@@ -77,7 +77,9 @@ def triangulate(
         xyz = xyz + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
     points_cam = (R @ xyz[point][:, :, None])[..., 0] + t
     projected, front = project_in_front(camera, points_cam)
-    error_px = keypoints_xy - projected if edge is None else whitened(edge, keypoints_xy - projected)
+    error_px = keypoints_xy - projected
+    if whitener is not None:
+        error_px = (whitener @ error_px[..., None])[..., 0]
     square = (error_px**2).sum(axis=1) * w
     count = np.bincount(point, minlength=num_points)
     error = np.sqrt(np.bincount(point, weights=square, minlength=num_points) / np.maximum(1, 2 * count))

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.server.geometry.edges import alike
+from semcast.server.geometry.edges import alike, each_of, whitened
 from semcast.server.geometry.weighting import NoiseModel
 
 Array = NDArray[np.float64]
@@ -85,8 +86,7 @@ class BundleProblem:
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""
-        if len(self.edge) != len(self.xy):
-            object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.xy), 2)))
+        object.__setattr__(self, "edge", each_of(self.edge, len(self.xy)))
 
 
 class Frame(Protocol):
@@ -198,6 +198,11 @@ class BundleResult:
     covariance: Array | None
     elapsed_ms: float
     left_over: Array | None = None
+
+    @cached_property
+    def whitened_px(self) -> Array:
+        """``(M, 2)`` the residuals as if observations were known alike in all directions, see ``edges``."""
+        return whitened(self.problem.edge, self.residual_px)
 
 
 class BundleRunner(Protocol):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
-from semcast.server.geometry.edges import alike
+from semcast.server.geometry.edges import alike, each_of
 from semcast.server.geometry.features import Grey
 from semcast.server.geometry.pnp import refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
@@ -47,8 +47,7 @@ class Observed:
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""
-        if len(self.edge) != len(self.ids):
-            object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.ids), 2)))
+        object.__setattr__(self, "edge", each_of(self.edge, len(self.ids)))
 
     def without(self, ids: Ids) -> "Observed":
         """Return the same without some tracks."""

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
-from semcast.server.geometry.edges import whitened
 from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
@@ -344,7 +343,7 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
     same = ~np.isin(problem.landmark_ids, later)
     world.move_landmarks(problem.landmark_ids[same], result.xyz[same])
     known = np.asarray(np.isfinite(result.residual_px).all(axis=1))
-    error = whitened(problem.edge, result.residual_px)
+    error = result.whitened_px
     size = np.linalg.norm(np.nan_to_num(error), axis=1)
     left = _share_left(problem, known)
     telling = (
@@ -383,8 +382,7 @@ def _ways(T_world_cam: Array) -> Array:
 def drop_outliers(world: WorldMap, result: BundleResult, noise: NoiseModel) -> None:
     """Drop observations outside the gate, and landmarks left with fewer than two of them."""
     problem = result.problem
-    error = whitened(problem.edge, result.residual_px)
-    size = np.linalg.norm(np.nan_to_num(error, nan=np.inf), axis=1)
+    size = np.linalg.norm(np.nan_to_num(result.whitened_px, nan=np.inf), axis=1)
     _drop(world, problem, size > 1.3 * noise.threshold_px(problem.confidence))
 
 

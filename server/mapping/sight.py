@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.phy.slots import BLOCK_PX
-from semcast.server.geometry.edges import alike
+from semcast.server.geometry.edges import alike, each_of
 from semcast.server.geometry.features import Grey
 from semcast.server.geometry.wide_search import WideFeatures
 from semcast.server.mapping.state import DecodedFrame
@@ -91,8 +91,7 @@ class Seen:
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""
-        if len(self.edge) != len(self.ids):
-            object.__setattr__(self, "edge", np.broadcast_to(self.edge, (len(self.ids), 2)))
+        object.__setattr__(self, "edge", each_of(self.edge, len(self.ids)))
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, transform_points
-from semcast.server.geometry.edges import alike
+from semcast.server.geometry.edges import alike, each_of
 from semcast.server.mapping.map_arrays import check_map_arrays
 from semcast.server.mapping.posed_frames import PosedFrames
 
@@ -135,8 +135,7 @@ class Keyframe:
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""
-        if len(self.edge) != len(self.ids):
-            self.edge = np.broadcast_to(self.edge, (len(self.ids), 2))
+        self.edge = each_of(self.edge, len(self.ids))
 
     def drop_observations(self, bad: NDArray[np.bool_]) -> None:
         """Forget the observations in the mask."""

@@ -110,6 +110,16 @@ def test_lossless_process_gives_what_inline_gives(room):
     assert all(np.array_equal(inline[k], process[k]) for k in inline)
 
 
+@pytest.mark.parametrize("solver", ["dense", "gtsam"])
+def test_windows_are_adjusted_by_the_solver_that_is_asked_for(room, monkeypatch, solver):
+    _, images = room
+    asked, submit = [], InlineBundle.submit
+    monkeypatch.setattr(InlineBundle, "submit", lambda self, p: asked.append(p.solver) or submit(self, p))
+    run(images[:12], make(bundle_solver=solver))
+    assert len(asked) > 2
+    assert set(asked) == {solver}
+
+
 def test_live_process_follows_too(room):
     poses, images = room
     _, trajectory = run(images, make(ProcessBundle()))
