@@ -1,5 +1,7 @@
 """What an adjustment had no room for goes where its keyframes went."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -108,7 +110,7 @@ def test_without_anything_left_out_or_an_adjustment_nothing_moves(monkeypatch, s
     world, _ = world_with_shaken_keyframes()
     result, _ = adjusted(world, monkeypatch, 400 if spoil == "failed" else 100_000)
     if spoil == "failed":
-        result = type(result)(**{**vars(result), "ok": False})
+        result = replace(result, ok=False)
     before = world.landmarks.xyz.copy()
     assert place_left_out(world, CAMERA, NOISE, result) == 0
     np.testing.assert_array_equal(world.landmarks.xyz, before)
