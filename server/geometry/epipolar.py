@@ -3,6 +3,10 @@
 What both cameras see lies on one half of its epipolar line, which begins where the point would be if it were
 infinitely far away. The Sampson distance knows the whole line: with it alone a pose fits as well whose
 translation is turned round and whose rotation makes up for some of that, and a refinement ends there.
+
+The error of a match may have a shape, see ``edges``: what slid along an edge is off its epipolar line by no
+more than its error across the line, whichever way that lies. *Shapes* are the covariances of both ends,
+``(N, 2, 2)`` each and of determinant 1; distances are then those of matches known alike in all directions.
 """
 
 import numpy as np
@@ -10,9 +14,11 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import angles_between_deg, exp_so3, make_transform, project_to_so3, skew
+from semcast.server.geometry.edges import whiteners
 from semcast.server.geometry.weighting import HUBER_K
 
 Array = NDArray[np.float64]
+Shapes = tuple[Array, Array]
 
 _HALF_ROOT = 0.5**0.5
 #: Derivatives of a rotation at the identity, ``(3, 3, 3)``.
@@ -30,13 +36,20 @@ def fundamental_matrix(camera: Intrinsics, T_cam1_cam0: Array) -> Array:
     return np.asarray(K_inv.T @ essential_matrix(T_cam1_cam0) @ K_inv)
 
 
-def sampson_px(F: Array, keypoints0_xy: Array, keypoints1_xy: Array) -> Array:
+def shape_of(edge: Array) -> Array:
+    """Covariances ``(N, 2, 2)`` of determinant 1 of errors at points with edges ``(N, 2)``."""
+    # What whitens twice the edge turned across itself is as long along the edge as it would be short.
+    return whiteners(2.0 * np.column_stack([-edge[:, 1], edge[:, 0]]))
+
+
+def sampson_px(F: Array, keypoints0_xy: Array, keypoints1_xy: Array, shapes: Shapes | None = None) -> Array:
     """Signed Sampson distance in pixels: first-order distance of a match to the epipolar constraint.
 
     Args:
         F: ``(3, 3)`` or ``(B, 3, 3)`` fundamental matrices.
         keypoints0_xy: ``(N, 2)``.
         keypoints1_xy: ``(N, 2)``.
+        shapes: Of the errors; None where they are alike in all directions.
 
     Returns:
         ``(N,)`` or ``(B, N)``.
@@ -46,11 +59,22 @@ def sampson_px(F: Array, keypoints0_xy: Array, keypoints1_xy: Array) -> Array:
     line1 = x0 @ np.swapaxes(F, -1, -2)
     line0 = x1 @ F
     algebraic = (x1 * line1).sum(axis=-1)
-    square = line1[..., 0] ** 2 + line1[..., 1] ** 2 + line0[..., 0] ** 2 + line0[..., 1] ** 2
+    square = 0.0
+    for line, spread in zip((line0, line1), _spreads(line0, line1, shapes), strict=True):
+        square = square + line[..., 0] * spread[..., 0] + line[..., 1] * spread[..., 1]
     return np.asarray(algebraic / np.sqrt(np.maximum(square, 1e-18)))
 
 
-def half_line_px(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:
+def _spreads(line0: Array, line1: Array, shapes: Shapes | None) -> tuple[Array, Array]:
+    """How errors move matches across their epipolar lines: shapes times normals, ``(..., N, 2)`` each."""
+    if shapes is None:
+        return line0[..., :2], line1[..., :2]
+    return (shapes[0] @ line0[..., :2, None])[..., 0], (shapes[1] @ line1[..., :2, None])[..., 0]
+
+
+def half_line_px(
+    camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array, shapes: Shapes | None = None
+) -> Array:
     """Distance in pixels of matches to the half of their epipolar line in front of the cameras, ``(N,)``.
 
     It is the Sampson distance, and for a point behind the cameras also the way along the line to where its
@@ -61,8 +85,9 @@ def half_line_px(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array)
         T_cam1_cam0: ``(4, 4)`` relative pose.
         xy0: ``(N, 2)`` pixels.
         xy1: ``(N, 2)`` pixels, matched row by row.
+        shapes: Of the errors across the line; None where they are alike in all directions.
     """
-    across = sampson_px(fundamental_matrix(camera, T_cam1_cam0), xy0, xy1)
+    across = sampson_px(fundamental_matrix(camera, T_cam1_cam0), xy0, xy1, shapes)
     return np.hypot(across, beyond_infinity_px(camera, T_cam1_cam0, xy0, xy1))
 
 
@@ -212,7 +237,12 @@ def _moved(T: Array, step: Array, tangent: Array) -> Array:
 
 
 def sampson_jacobian(
-    camera: Intrinsics, T_cam1_cam0: Array, tangent: Array, xy0: Array, xy1: Array
+    camera: Intrinsics,
+    T_cam1_cam0: Array,
+    tangent: Array,
+    xy0: Array,
+    xy1: Array,
+    shapes: Shapes | None = None,
 ) -> tuple[Array, Array]:
     """Sampson distances of a pose and how they change with it.
 
@@ -222,6 +252,7 @@ def sampson_jacobian(
         tangent: ``(2, 3)`` unit vectors across the translation.
         xy0: ``(N, 2)``.
         xy1: ``(N, 2)``.
+        shapes: Of the errors; None where they are alike in all directions.
 
     Returns:
         ``(N,)`` pixels, and ``(N, 5)`` their derivatives by a turn applied from the left (3, radians) and by
@@ -235,9 +266,10 @@ def sampson_jacobian(
     x1 = np.concatenate([xy1, np.ones((len(xy1), 1))], axis=1)
     line1, dline1 = x0 @ F.T, x0 @ np.swapaxes(dF, 1, 2)
     line0, dline0 = x1 @ F[:, :2], x1 @ dF[:, :, :2]
-    square = np.maximum((line1[:, :2] ** 2).sum(axis=1) + (line0**2).sum(axis=1), 1e-18)
+    spread0, spread1 = _spreads(line0, line1, shapes)
+    square = np.maximum((line1[:, :2] * spread1).sum(axis=1) + (line0 * spread0).sum(axis=1), 1e-18)
     residual = (x1 * line1).sum(axis=1) / np.sqrt(square)
-    dsquare = (line1[:, :2] * dline1[..., :2]).sum(axis=2) + (line0 * dline0).sum(axis=2)
+    dsquare = (spread1 * dline1[..., :2]).sum(axis=2) + (spread0 * dline0).sum(axis=2)
     J = (x1 * dline1).sum(axis=2) / np.sqrt(square) - residual * dsquare / square
     return residual, J.T
 
@@ -249,6 +281,7 @@ def refine_relative_pose(
     xy1: Array,
     sigma_px: Array,
     *,
+    shapes: Shapes | None = None,
     cut_sigmas: float = 4.0,
     iterations: int = 10,
 ) -> Array:
@@ -260,6 +293,7 @@ def refine_relative_pose(
         xy0: ``(N, 2)``.
         xy1: ``(N, 2)``.
         sigma_px: ``(N,)`` standard deviation of each match's distance.
+        shapes: Of the errors across the lines; None where they are alike in all directions.
         cut_sigmas: Residuals beyond it pull no longer (Huber up to there).
         iterations: Gauss-Newton steps at most.
 
@@ -270,7 +304,7 @@ def refine_relative_pose(
     def linearised(T: Array) -> tuple[float, Array, Array, Array]:
         """Cost, tangent of the translation, and the normal equations of a step."""
         tangent = _tangent(T[:3, 3])
-        across, J = sampson_jacobian(camera, T, tangent, xy0, xy1)
+        across, J = sampson_jacobian(camera, T, tangent, xy0, xy1, shapes)
         beyond, J_beyond = beyond_infinity_jacobian(camera, T, tangent, xy0, xy1)
         size = np.hypot(across, beyond) / sigma_px
         a = np.minimum(size, cut_sigmas)

@@ -22,6 +22,7 @@ from semcast.common.geometry import make_transform, project_to_so3, rotation_ang
 from semcast.common.shapes import check_shape
 from semcast.server.geometry.agreement import neighbour_agreement
 from semcast.server.geometry.epipolar import (
+    Shapes,
     depths,
     fit_rotation,
     fundamental_matrix,
@@ -31,6 +32,7 @@ from semcast.server.geometry.epipolar import (
     refine_relative_pose,
     rotation_residual_px,
     sampson_px,
+    shape_of,
 )
 from semcast.server.geometry.lo_ransac import lo_ransac
 from semcast.server.geometry.ransac import confidence_ransac, in_front
@@ -88,6 +90,7 @@ def estimate_two_view(
     keypoints1_xy: Array,
     confidence: Array | None = None,
     *,
+    edges: tuple[Array, Array] | None = None,
     mode: ConfidenceMode = "robust",
     threshold_px: float = 1.0,
     seed: int = 0,
@@ -102,6 +105,8 @@ def estimate_two_view(
         keypoints0_xy: ``(N, 2)`` pixels.
         keypoints1_xy: ``(N, 2)`` pixels, matched row by row.
         confidence: ``(N,)`` in [0, 1], from ``weighting``; None is the same as mode ``off``.
+        edges: ``(N, 2)`` of the keypoints of both images, see ``edges``: known to the choice and the
+            refinement, except in mode ``paper``. None where errors have no direction.
         mode: ``paper`` is the paper's RANSAC; ``off`` knows no confidence; all others search in order of it
             too and refine with fitted weights.
         threshold_px: Inlier threshold on the Sampson distance.
@@ -117,6 +122,8 @@ def estimate_two_view(
         ValueError: Shapes disagree, the camera has distortion, or an argument is out of range.
     """
     xy0, xy1 = _checked_matches(camera, keypoints0_xy, keypoints1_xy, confidence, mode, threshold_px)
+    for edge in edges or ():
+        check_shape(edge, f"{len(xy0)} 2", "edges")
     if len(xy0) < MIN_MATCHES or not (np.isfinite(xy0).all() and np.isfinite(xy1).all()):
         return None
     if mode == "paper" and confidence is not None:
@@ -141,11 +148,14 @@ def estimate_two_view(
     candidates += _near_turning(camera, xy0[kept], xy1[kept], threshold_px)
     if choose_model:
         candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
-    T_found = _likeliest(camera, candidates, xy0, xy1, _weights(agreement), threshold_px)
+    shapes = None if edges is None else (shape_of(edges[0]), shape_of(edges[1]))
+    T_found = _likeliest(camera, candidates, xy0, xy1, shapes, _weights(agreement), threshold_px)
     if T_found is None:
         return None
     trusted = None if confidence is None else confidence[kept]
-    T = _refine(camera, T_found, xy0[kept], xy1[kept], trusted, threshold_px)
+    if shapes is not None:
+        shapes = shapes[0][kept], shapes[1][kept]
+    T = _refine(camera, T_found, xy0[kept], xy1[kept], shapes, trusted, threshold_px)
     return _result(camera, T, xy0, xy1, threshold_px, choose_model)
 
 
@@ -190,6 +200,7 @@ def _likeliest(
     candidates: Sequence[Array | None],
     xy0: Array,
     xy1: Array,
+    shapes: Shapes | None,
     weight: Array,
     threshold_px: float,
 ) -> Array | None:
@@ -201,7 +212,7 @@ def _likeliest(
         turn_cost = _TURN_COST * float(np.sqrt(rotation_angle_deg(candidate[:3, :3])) / weight.sum())
         for way in (1.0, -1.0):  # a search tells the translation up to its sign
             T = make_transform(candidate[:3, :3], way * candidate[:3, 3])
-            cost = _score(camera, T, xy0, xy1, threshold_px, weight) + turn_cost
+            cost = _score(camera, T, xy0, xy1, shapes, threshold_px, weight) + turn_cost
             judged.append((cost if k == 0 else _TO_DISPLACE * cost, k, T))
     if not judged:
         return None
@@ -222,13 +233,21 @@ def _weights(agreement: Array) -> Array:
     return np.clip((agreement - low) / (high - low), _LEAST_WEIGHT, 1.0)
 
 
-def _score(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float, weight: Array) -> float:
+def _score(
+    camera: Intrinsics,
+    T: Array,
+    xy0: Array,
+    xy1: Array,
+    shapes: Shapes | None,
+    threshold_px: float,
+    weight: Array,
+) -> float:
     """MSAC score without confidence over the distances to epipolar half lines.
 
     It is the mean over several thresholds, because the noise of decoded images is not known beforehand.
     Which half tells the two poses of a plane apart, which fit the epipolar constraint equally well.
     """
-    residual = half_line_px(camera, T, xy0, xy1)
+    residual = half_line_px(camera, T, xy0, xy1, shapes)
     return float(np.mean([msac_score(residual, factor * threshold_px, weight) for factor in _SCORE_FACTORS]))
 
 
@@ -318,10 +337,16 @@ def _from_plane(
 
 
 def _refine(
-    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, confidence: Array | None, threshold_px: float
+    camera: Intrinsics,
+    T: Array,
+    xy0: Array,
+    xy1: Array,
+    shapes: Shapes | None,
+    confidence: Array | None,
+    threshold_px: float,
 ) -> Array:
     """Refine with the noise fitted to this pair; with equal weights where confidence tells nothing."""
-    residual = half_line_px(camera, T, xy0, xy1)
+    residual = half_line_px(camera, T, xy0, xy1, shapes)
     near = residual < 3.0 * threshold_px
     if int(near.sum()) < MIN_MATCHES:
         return T
@@ -330,9 +355,8 @@ def _refine(
     if model is not None and confidence is not None:
         sigma = NoiseModel(1.0, _BETA_SHARE * model.beta).sigma_px(confidence)
     scale_px = float(np.median(residual[near] / sigma[near])) / 0.6745
-    return refine_relative_pose(
-        camera, T, xy0, xy1, max(scale_px, _MIN_SIGMA_PX) * sigma, cut_sigmas=_CUT_SIGMAS
-    )
+    sigma_px = max(scale_px, _MIN_SIGMA_PX) * sigma
+    return refine_relative_pose(camera, T, xy0, xy1, sigma_px, shapes=shapes, cut_sigmas=_CUT_SIGMAS)
 
 
 def _result(

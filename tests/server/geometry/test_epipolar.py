@@ -23,6 +23,7 @@ from semcast.server.geometry.epipolar import (
     rotation_residual_px,
     sampson_jacobian,
     sampson_px,
+    shape_of,
 )
 
 CAMERA = Intrinsics(fx=500, fy=480, cx=320, cy=240, width=640, height=480)
@@ -64,23 +65,54 @@ def test_sampson_of_many_matrices_is_that_of_each():
     assert np.allclose(sampson_px(F, xy0, xy1), [sampson_px(f, xy0, xy1) for f in F])
 
 
-def test_the_derivative_of_sampson_is_that_of_small_steps():
+@pytest.mark.parametrize("length", [0.0, 0.7])
+def test_the_derivative_of_sampson_is_that_of_small_steps(length):
     rng = np.random.default_rng(4)
     T, _, xy0, xy1 = make_pair(rng, num=40, noise_px=2.0)
+    shapes = shape_of(length * rng.normal(0, 1, (40, 2))), shape_of(length * rng.normal(0, 1, (40, 2)))
     t = T[:3, 3]
     across = np.cross(t, (0.3, -0.5, 0.8))
     tangent = np.stack([across, np.cross(t, across)]) / np.linalg.norm(across)
-    residual, J = sampson_jacobian(CAMERA, T, tangent, xy0, xy1)
-    assert np.allclose(residual, sampson_px(fundamental_matrix(CAMERA, T), xy0, xy1), atol=1e-12)
+    residual, J = sampson_jacobian(CAMERA, T, tangent, xy0, xy1, shapes)
+    assert np.allclose(residual, sampson_px(fundamental_matrix(CAMERA, T), xy0, xy1, shapes), atol=1e-12)
     for k in range(5):
         step = 1e-6 * np.eye(5)[k]
 
         def moved(step):
             turned = t + step[3:] @ tangent
             pose = make_transform(exp_so3(step[:3]) @ T[:3, :3], turned / np.linalg.norm(turned))
-            return sampson_px(fundamental_matrix(CAMERA, pose), xy0, xy1)
+            return sampson_px(fundamental_matrix(CAMERA, pose), xy0, xy1, shapes)
 
         assert np.allclose(J[:, k], (moved(step) - moved(-step)) / 2e-6, rtol=1e-4, atol=1e-3)
+
+
+def test_the_shape_of_an_error_is_as_long_along_its_edge_as_it_is_short_across():
+    # Half the logarithm of 9: along the edge the standard deviation is 3, across it 1 / 3.
+    edge = 0.5 * np.log(9.0) * np.array([[1.0, 0], [0, -1], [0.6, 0.8], [0, 0]])
+    shape = shape_of(edge)
+    assert np.allclose(shape[:2], [np.diag([9, 1 / 9]), np.diag([1 / 9, 9])])
+    assert np.allclose(shape[2] @ (0.6, 0.8), 9 * np.array([0.6, 0.8]))
+    assert np.allclose(shape[2] @ (-0.8, 0.6), np.array([-0.8, 0.6]) / 9)
+    assert np.allclose(shape[3], np.eye(2))
+
+
+def test_a_match_off_its_line_weighs_by_its_error_across_the_line():
+    # Lines are rows: of edges along them the standard deviation across is 1 / 3, of upright ones 3.
+    T = make_transform(np.eye(3), (1, 0, 0))
+    square = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
+    xy0, xy1 = np.full((3, 2), (300.0, 200.0)), np.full((3, 2), (350.0, 201.0))
+    length = 0.5 * np.log(9.0)
+    edge0 = length * np.array([[1.0, 0], [0, 1], [1, 0]])
+    edge1 = length * np.array([[1.0, 0], [0, 1], [0, 1]])
+    found = half_line_px(square, T, xy0, xy1, (shape_of(edge0), shape_of(edge1)))
+    assert np.allclose(found, 1.0 / np.sqrt([2 / 9, 18, 1 / 9 + 9]))
+
+
+def test_matches_known_alike_in_all_directions_have_the_distance_of_those_without_a_shape():
+    T, _, xy0, xy1 = make_pair(np.random.default_rng(5), noise_px=2.0)
+    alike = shape_of(np.zeros((len(xy0), 2)))
+    F = np.stack([fundamental_matrix(CAMERA, T), np.diag([1.0, 2, 3])])
+    assert np.allclose(sampson_px(F, xy0, xy1, (alike, alike)), sampson_px(F, xy0, xy1))
 
 
 def test_half_of_an_epipolar_line_is_in_front_of_the_cameras():
@@ -179,3 +211,21 @@ def test_weights_help_when_they_are_right():
             found = refine_relative_pose(CAMERA, T, xy0, xy1, s, cut_sigmas=9, iterations=20)
             errors[name].append(angle_between_deg(found[:3, 3], T[:3, 3]))
     assert np.mean(errors["weighted"]) < 0.5 * np.mean(errors["equal"])
+
+
+def test_matches_that_slide_along_edges_help_where_their_shape_is_known():
+    errors = {"shaped": [], "alike": []}
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        T, _, xy0, xy1 = make_pair(rng, num=80)
+        angle = rng.uniform(0, np.pi, 80)
+        along = np.column_stack([np.cos(angle), np.sin(angle)])
+        across = np.column_stack([-along[:, 1], along[:, 0]])
+        xy1 = xy1 + rng.normal(0, 3.0, (80, 1)) * along + rng.normal(0, 0.2, (80, 1)) * across
+        edge = 0.5 * np.log(3.0 / 0.2) * along
+        for name, shapes in (("shaped", (shape_of(edge), shape_of(edge))), ("alike", None)):
+            found = refine_relative_pose(
+                CAMERA, T, xy0, xy1, np.full(80, 1.5), shapes=shapes, cut_sigmas=9, iterations=20
+            )
+            errors[name].append(angle_between_deg(found[:3, 3], T[:3, 3]))
+    assert np.mean(errors["shaped"]) < 0.6 * np.mean(errors["alike"])

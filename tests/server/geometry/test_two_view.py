@@ -12,6 +12,7 @@ from semcast.common.geometry import (
     transform_points,
 )
 from semcast.server.geometry import two_view
+from semcast.server.geometry.epipolar import shape_of
 from semcast.server.geometry.two_view import estimate_two_view, follows
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
@@ -204,6 +205,39 @@ def test_confidence_that_is_off_or_all_alike_is_none(mode, spread):
     assert np.array_equal(a.T_cam1_cam0, b.T_cam1_cam0)
 
 
+def test_of_two_motions_that_one_counts_whose_matches_are_off_along_their_edges_only():
+    # The camera moves sideways, so matches stay in their rows; three of five slid down upright edges by 2 px.
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-3, -2, 5), (3, 2, 12), (100, 3))
+    T = make_transform(np.eye(3), (1.0, 0.0, 0.0))
+    xy0, xy1 = CAMERA.project(points), CAMERA.project(transform_points(T, points))
+    slid = np.arange(100) % 5 < 3
+    xy1[slid, 1] += 2.0
+    tilted = make_transform(exp_so3((-2.0 / CAMERA.fy, 0, 0)), T[:3, 3])
+    upright = shape_of(slid[:, None] * 0.5 * np.log(6.0) * np.array([0.0, 1.0]))
+    for shapes, likeliest in ((None, tilted), ((upright, upright), T)):
+        for candidates in ((T, tilted), (tilted, T)):
+            found = two_view._likeliest(CAMERA, candidates, xy0, xy1, shapes, np.ones(100), 1.0)
+            assert np.array_equal(found, likeliest)
+
+
+def test_edges_that_matches_slid_along_take_errors_off_but_not_in_the_paper():
+    errors = {"known": [], "unknown": []}
+    for seed in range(8):
+        T, xy0, xy1, is_outlier = make_matches(seed, num=120, noise_px=0.1, t=(1.0, 0.3, 0.2))
+        rng = np.random.default_rng(100 + seed)
+        along = np.stack([np.sin(angle := rng.uniform(0, np.pi, 120)), np.cos(angle)], axis=1)
+        xy1 += rng.normal(0, 1.5, (120, 1)) * along
+        edges = 0.5 * np.log(10.0) * along, 0.5 * np.log(10.0) * along
+        found = [estimate_two_view(CAMERA, xy0, xy1, edges=e, seed=seed, **FAST) for e in (edges, None)]
+        for name, pose in zip(errors, found, strict=True):
+            errors[name].append(errors_deg(pose, T)[1])
+    assert np.mean(errors["known"]) < 0.7 * np.mean(errors["unknown"])
+    told = {"confidence": np.where(is_outlier, 0.3, 0.9), "mode": "paper"}
+    a, b = (estimate_two_view(CAMERA, xy0, xy1, edges=e, **told) for e in (edges, None))
+    assert np.array_equal(a.T_cam1_cam0, b.T_cam1_cam0)
+
+
 def test_matches_are_drawn_from_all_from_those_that_agree_and_in_order_of_confidence():
     kept = np.array([0, 2, 3])
     every, among, ordered = two_view._orders_of_drawing(4, kept, np.array([0.1, 1.0, 0.5, 0.9]))
@@ -227,6 +261,7 @@ def test_the_same_seed_gives_the_same_result():
         ({"keypoints1_xy": np.zeros((9, 2))}, r"keypoints1_xy must have shape \(10 2\), got \(9, 2\)"),
         ({"keypoints0_xy": np.zeros((10, 3))}, "keypoints0_xy must have shape"),
         ({"confidence": np.ones(5)}, r"confidence must have shape \(10\), got \(5,\)"),
+        ({"edges": (np.zeros((10, 2)), np.zeros((9, 2)))}, r"edges must have shape \(10 2\), got \(9, 2\)"),
         ({"mode": "robst"}, "mode must be one of robust, .*, got 'robst'"),
         ({"threshold_px": float("nan")}, "threshold_px must be positive, got nan"),
         ({"camera": replace(CAMERA, distortion=(0.1, 0.0, 0.0, 0.0))}, "camera must be without distortion"),
