@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import DecodedImage
+from semcast.server.geometry.edges import edges_at
 from semcast.server.geometry.features import (
     corner_strength,
     deduplicate,
@@ -42,6 +43,8 @@ class PairMatches:
         gradient1_grey2: ``(N,)`` at the second end: of the tracked window for KLT.
         forward_backward_px: ``(N,)`` way there and back of a KLT track; None for descriptors.
         photometric_grey: ``(N,)`` difference of the windows of a KLT track; None for descriptors.
+        edge0: ``(N, 2)`` edges at the first ends, along which they are known less, see ``edges``.
+        edge1: ``(N, 2)`` edges at the second ends.
     """
 
     keypoints0_xy: Array
@@ -54,6 +57,8 @@ class PairMatches:
     gradient1_grey2: Array
     forward_backward_px: Array | None
     photometric_grey: Array | None
+    edge0: Array
+    edge1: Array
 
     def __len__(self) -> int:
         return len(self.keypoints0_xy)
@@ -134,6 +139,8 @@ def match_pair(
         gradient1_grey2=gradient1_grey2,
         forward_backward_px=forward_backward_px,
         photometric_grey=photometric_grey,
+        edge0=edges_at(grey0, xy0),
+        edge1=edges_at(grey1, xy1),
     )
     keep = deduplicate(xy0, _DUPLICATE_PX) & deduplicate(xy1, _DUPLICATE_PX)
     return matches.take(np.flatnonzero(keep))

@@ -55,7 +55,11 @@ def match_confidence(mode: ConfidenceMode, matches: PairMatches, seed: int) -> A
 
 
 def confidence_estimator(mode: ConfidenceMode) -> Estimator:
-    """Return the server's two-view estimator in a confidence mode."""
+    """Return the server's two-view estimator in a confidence mode.
+
+    All but ``paper`` are told the shape of errors, ``off`` too: it is no confidence, and confidence alone is
+    to separate ``off`` from the others.
+    """
 
     def estimate(matches: PairMatches, camera: Intrinsics, threshold_px: float, seed: int) -> Array | None:
         found = estimate_two_view(
@@ -63,6 +67,7 @@ def confidence_estimator(mode: ConfidenceMode) -> Estimator:
             matches.keypoints0_xy,
             matches.keypoints1_xy,
             match_confidence(mode, matches, seed),
+            edges=(matches.edge0, matches.edge1),
             mode=mode,
             threshold_px=threshold_px,
             seed=seed,

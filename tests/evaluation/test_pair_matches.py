@@ -33,6 +33,17 @@ def test_confidence_is_that_of_the_worse_end(pair):
     assert (matches.cues["forward_backward"] <= 0).all()
 
 
+@pytest.mark.parametrize("features", ["klt", "sift"])
+def test_each_end_has_the_edge_of_its_image(pair, features):
+    # Blurred along the columns all edges of the second image are upright, those of the first are not.
+    first, second = pair
+    streaks = cv2.GaussianBlur(second.image, (1, 61), 0.1, sigmaY=4.0)
+    matches = match_pair(first, DecodedImage(streaks, second.confidence), features, 400)
+    assert len(matches.edge0) == len(matches.edge1) == len(matches) > 10
+    upright0, upright1 = (np.abs(e[:, 1]) - np.abs(e[:, 0]) for e in (matches.edge0, matches.edge1))
+    assert np.median(upright1) > np.median(upright0) + 0.2
+
+
 def test_keypoint_confidence_becomes_a_cue_where_both_images_have_it(pair):
     first, second = pair
     half = np.full((128, 192), 0.5, np.float32)

@@ -52,6 +52,8 @@ def matches(rng):
         gradient1_grey2=rng.uniform(10, 200, 150),
         forward_backward_px=rng.exponential(0.2, 150),
         photometric_grey=rng.uniform(1, 5, 150),
+        edge0=np.zeros((150, 2)),
+        edge1=np.zeros((150, 2)),
     )
 
 
@@ -104,6 +106,13 @@ def test_every_mode_finds_the_pose(mode, matches):
     error = relative_pose_error(estimate, T_CAM1_CAM0)
     assert error.rot_deg < 1.0
     assert error.tdir_deg < 10.0
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_mode_but_that_of_the_paper_is_told_the_shape_of_errors(mode, matches, rng):
+    edged = replace(matches, edge0=rng.normal(0, 1, (150, 2)), edge1=rng.normal(0, 1, (150, 2)))
+    poses = [confidence_estimator(mode)(m, CAMERA, 1.0, 0) for m in (matches, edged)]
+    assert np.array_equal(*poses) == (mode == "paper")
 
 
 @pytest.mark.parametrize("name", COMPETITORS)
