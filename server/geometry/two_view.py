@@ -3,10 +3,11 @@
 ``robust``: PoseLib's LO-RANSAC three times, each at two thresholds: drawing uniformly from all matches,
 uniformly from those that move as their neighbours do, and among these the trusted ones first. Beside what
 they find stand the best motions near pure turning. The poses, each with its translation either way, are
-judged by how near matches are to the halves of their epipolar lines in front of the cameras; the score knows
-the agreement, but not confidence, and holds a little against turning, since few matches are often explained
-as well by a large turn that the camera never made. Then comes a refinement whose weights are fitted to this
-pair's own residuals. A misleading confidence can therefore cost time, hardly accuracy.
+judged by how near matches are to the halves of their epipolar lines in front of the cameras, for the error
+that each has across its line; the score knows the agreement, but not confidence, and holds a little against
+turning, since few matches are often explained as well by a large turn that the camera never made. Then
+comes a refinement whose weights are fitted to this pair's own residuals. A misleading confidence can
+therefore cost time, hardly accuracy.
 """
 
 from collections.abc import Sequence
