@@ -59,9 +59,8 @@ def sampson_px(F: Array, keypoints0_xy: Array, keypoints1_xy: Array, shapes: Sha
     line1 = x0 @ np.swapaxes(F, -1, -2)
     line0 = x1 @ F
     algebraic = (x1 * line1).sum(axis=-1)
-    square = 0.0
-    for line, spread in zip((line0, line1), _spreads(line0, line1, shapes), strict=True):
-        square = square + line[..., 0] * spread[..., 0] + line[..., 1] * spread[..., 1]
+    spread0, spread1 = _spreads(line0, line1, shapes)
+    square = (line1[..., :2] * spread1).sum(axis=-1) + (line0[..., :2] * spread0).sum(axis=-1)
     return np.asarray(algebraic / np.sqrt(np.maximum(square, 1e-18)))
 
 
