@@ -74,6 +74,11 @@ def pose_key(agent_id: str) -> str:
     return _key(agent_id, "pose")
 
 
+def metric_pose_key(agent_id: str) -> str:
+    """``MetricPose``, where the metre is known."""
+    return _key(agent_id, "metric_pose")
+
+
 def map_key(agent_id: str) -> str:
     """``MapMessage``: what changed, and a queryable that gives the whole map to whoever comes late."""
     return _key(agent_id, "map")

@@ -2,14 +2,14 @@
 
 import logging
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.errors import TransportError
 from semcast.common.keys import map_key
-from semcast.common.messages import MapMessage
+from semcast.common.messages import MapMessage, MetricPose
 from semcast.common.transport import Session
 from semcast.common.wire import WireError, unpack
 
@@ -39,6 +39,21 @@ class MirroredMap:
     confidence: NDArray[np.float32]
     keyframe_ids: NDArray[np.int64]
     keyframe_poses: NDArray[np.float64]
+
+    def in_metres(self, pose: MetricPose) -> "MirroredMap":
+        """Return the map in metres and in the frame of a marker, as a pose of the same map epoch tells.
+
+        That holds for the part of the map the pose is in; place and size of other parts are guesses.
+        """
+        T_marker_world = np.array(pose.T_marker_world).reshape(4, 4)
+        R, t = T_marker_world[:3, :3], T_marker_world[:3, 3]
+        keyframe_poses = self.keyframe_poses.copy()
+        keyframe_poses[:, :3, 3] *= pose.m_per_unit
+        return replace(
+            self,
+            xyz=(pose.m_per_unit * self.xyz @ R.T + t).astype(np.float32),
+            keyframe_poses=T_marker_world @ keyframe_poses,
+        )
 
     def updated(self, message: MapMessage) -> "MirroredMap":
         """Return the map with what a message says is new, moved or gone; a new epoch begins anew."""

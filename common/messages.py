@@ -353,6 +353,37 @@ class PoseMessage:
 
 
 @dataclass(frozen=True, kw_only=True)
+class MetricPose:
+    """The camera's pose for one frame in metres and in the frame of a marker, behind its ``pose``.
+
+    Attributes:
+        T_marker_cam: 4x4, row by row, metres.
+        covariance: As of the ``pose``, translation in metres; the unit's own uncertainty is not in it.
+        m_per_unit: Metres in a unit of the part of the map that the frame is in.
+        relative_sigma: Standard deviation of that as a share of it.
+        T_marker_world: 4x4, row by row: ``p_marker = R (m_per_unit p_world) + t`` for points of that part.
+        marker_id: Number of the marker.
+        num_keyframes: That show it alike.
+    """
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+    kind: str = _kind("metric_pose")
+    agent_epoch: int = field(metadata=_COUNT)
+    frame_id: int = field(metadata=_COUNT)
+    t_capture_ns: int = field(metadata=_TIME_NS)
+    t_source_ns: int = field(metadata=_TIME_NS)
+    T_marker_cam: tuple[float, ...] = field(metadata=rule(Many(Number(), count=16)))
+    covariance: tuple[float, ...] | None = field(metadata=rule(Maybe(Many(Number(), count=36))))
+    m_per_unit: float = field(metadata=rule(Number(0.0)))
+    relative_sigma: float = field(metadata=rule(Number(0.0)))
+    T_marker_world: tuple[float, ...] = field(metadata=rule(Many(Number(), count=16)))
+    marker_id: int = field(metadata=_COUNT)
+    num_keyframes: int = field(metadata=_COUNT)
+    map_epoch: int = field(metadata=_COUNT)
+    submap: int = field(metadata=_COUNT)
+
+
+@dataclass(frozen=True, kw_only=True)
 class MapMessage:
     """What changed in the map.
 
@@ -452,6 +483,7 @@ Message = (
     | FlowMessage
     | ChannelReport
     | PoseMessage
+    | MetricPose
     | MapMessage
     | StatusMessage
     | ControlRequest

@@ -53,6 +53,7 @@ class FrameRow:
         confidence_mean: Mean of the confidence map.
         t_arrival_ns: When it arrived, on the server's monotonic clock, which begins anew with the machine.
             None in rows of older runs.
+        m_per_unit: Metres in a unit of the map, as published with the pose.
         age_ms: From arrival at the server to the pose.
         stage_ms: Duration of each stage, and ``decoded_to_pose`` from the end of the decoder to the pose.
     """
@@ -75,6 +76,7 @@ class FrameRow:
     submap: int = 0
     seq: int | None = None
     t_arrival_ns: int | None = None
+    m_per_unit: float | None = None
 
     @classmethod
     def of(cls, frame: DecodedFrame, result: FrameResult, **rest: Any) -> "FrameRow":

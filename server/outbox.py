@@ -9,13 +9,15 @@ from typing import Literal
 import numpy as np
 
 from semcast.common.errors import SemcastError
-from semcast.common.keys import map_key, pose_key
+from semcast.common.geometry import make_transform
+from semcast.common.keys import map_key, metric_pose_key, pose_key
 from semcast.common.mailbox import Mailbox
-from semcast.common.messages import MapMessage, PoseMessage
+from semcast.common.messages import MapMessage, MetricPose, PoseMessage
 from semcast.common.metrics import Metrics
 from semcast.common.transport import Publisher, Session
 from semcast.common.wire import pack
 from semcast.common.worker_guard import WorkerGuard
+from semcast.server.export.markers import MarkerPlacement
 from semcast.server.mapping.state import FrameResult, MapUpdate
 from semcast.server.receiver import ReceivedFrame
 
@@ -39,9 +41,10 @@ class Outbox:
 
     def __init__(self, session: Session, agent_id: str, metrics: Metrics) -> None:
         self._pose = session.publisher(pose_key(agent_id), "every")
+        self._metric_pose = session.publisher(metric_pose_key(agent_id), "every")
         self._map = session.publisher(map_key(agent_id), "every")
         self._metrics = metrics
-        self._box: Mailbox[PoseMessage | Literal["map"]] = Mailbox(CAPACITY, "newest")
+        self._box: Mailbox[PoseMessage | MetricPose | Literal["map"]] = Mailbox(CAPACITY, "newest")
         self._change: MapMessage | None = None
         self._change_lock = threading.Lock()
         self._t_capture_ns: OrderedDict[tuple[int, int], int] = OrderedDict()
@@ -49,8 +52,16 @@ class Outbox:
         self._thread = threading.Thread(target=self._run, name="semcast-outbox", daemon=True)
         self._thread.start()
 
-    def put_pose(self, arrival: ReceivedFrame, result: FrameResult) -> None:
-        """Send what became of one frame, after the poses it gave to earlier frames."""
+    def put_pose(
+        self, arrival: ReceivedFrame, result: FrameResult, placement: MarkerPlacement | None = None
+    ) -> None:
+        """Send what became of one frame, after the poses it gave to earlier frames.
+
+        Args:
+            arrival: The frame.
+            result: What the tracker made of it.
+            placement: The way from its part of the map to metres, where that is known.
+        """
         epoch = arrival.message.agent_epoch
         self._t_capture_ns[(epoch, result.frame_id)] = arrival.message.t_capture_ns
         while len(self._t_capture_ns) > CAPACITY:
@@ -72,7 +83,10 @@ class Outbox:
                 submap=result.submap,
             )
             self._put(message)
-        self._put(pose_message(arrival, result))
+        pose = pose_message(arrival, result)
+        self._put(pose)
+        if placement is not None and pose.T_world_cam is not None:
+            self._put(metric_pose(pose, placement))
 
     def put_map(self, agent_epoch: int, update: MapUpdate) -> None:
         """Send what a frame, or the end of a stream, changed in the map."""
@@ -84,19 +98,21 @@ class Outbox:
         if waiting is None:
             self._put("map")
 
-    def _put(self, entry: PoseMessage | Literal["map"]) -> None:
+    def _put(self, entry: PoseMessage | MetricPose | Literal["map"]) -> None:
         self._metrics.drop("outbox", self._box.put(entry) or 0)
 
     def _run(self) -> None:
         while (entry := self._box.get()) is not None:
             if isinstance(entry, PoseMessage):
                 self._send(self._pose, entry)
+            elif isinstance(entry, MetricPose):
+                self._send(self._metric_pose, entry)
             with self._change_lock:
                 change, self._change = self._change, None
             if change is not None:
                 self._send(self._map, change)
 
-    def _send(self, publisher: Publisher, message: PoseMessage | MapMessage) -> None:
+    def _send(self, publisher: Publisher, message: PoseMessage | MetricPose | MapMessage) -> None:
         with self._guard:
             try:
                 publisher.put(pack(message))
@@ -129,6 +145,32 @@ def pose_message(arrival: ReceivedFrame, result: FrameResult) -> PoseMessage:
         covariance=tuple(covariance.ravel().tolist()) if covariance is not None and known else None,
         map_epoch=result.map_epoch,
         submap=result.submap,
+    )
+
+
+def metric_pose(pose: PoseMessage, placement: MarkerPlacement) -> MetricPose:
+    """Return a pose in metres."""
+    T_marker_cam = np.array(pose.T_world_cam).reshape(4, 4)
+    T_marker_cam[:3, 3] = placement.points(T_marker_cam[None, :3, 3])[0]
+    T_marker_cam[:3, :3] = placement.R @ T_marker_cam[:3, :3]
+    covariance = pose.covariance
+    if covariance is not None:
+        unit = np.repeat([1.0, placement.scale], 3)
+        covariance = tuple((np.array(covariance).reshape(6, 6) * np.outer(unit, unit)).ravel().tolist())
+    return MetricPose(
+        agent_epoch=pose.agent_epoch,
+        frame_id=pose.frame_id,
+        t_capture_ns=pose.t_capture_ns,
+        t_source_ns=pose.t_source_ns,
+        T_marker_cam=tuple(T_marker_cam.ravel().tolist()),
+        covariance=covariance,
+        m_per_unit=placement.scale,
+        relative_sigma=placement.relative_sigma,
+        T_marker_world=tuple(make_transform(placement.R, placement.t).ravel().tolist()),
+        marker_id=placement.marker_id,
+        num_keyframes=placement.num_images,
+        map_epoch=pose.map_epoch,
+        submap=pose.submap,
     )
 
 

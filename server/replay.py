@@ -29,6 +29,7 @@ from semcast.server.decoder import Arrival, FrameDecoder, codec_loader
 from semcast.server.former_run import output_folder
 from semcast.server.frame_views import missing_view
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.marker_settings import MarkerSettings
 from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_order import in_order
 from semcast.server.recorded_streams import RecordedStream, choose_stream
@@ -102,6 +103,7 @@ class ReplaySettings:
     threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})
     start_s: float = field(default=0.0, metadata={"help": "leave out frames before this time of the source"})
     end_s: float | None = field(default=None, metadata={"help": "leave out frames after this time"})
+    marker: MarkerSettings = field(default=MarkerSettings(), metadata={"help": "marker that tells the metre"})
     reconstruction: ReconstructionSettings = field(
         default=ReconstructionSettings(), metadata={"help": "tracking and mapping"}
     )
@@ -167,6 +169,7 @@ def replay(
         reference=settings.reference,
         bundle="inline",
         resume=False,
+        marker=settings.marker,
         reconstruction=settings.reconstruction,
         view=settings.view,
     )

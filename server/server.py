@@ -21,6 +21,7 @@ from semcast.common.transport import Session as NetworkSession
 from semcast.common.transport import open_session
 from semcast.common.wire import pack
 from semcast.server.announcement import Announcement
+from semcast.server.bundle_runner import new_bundle
 from semcast.server.conclusion import conclude
 from semcast.server.control import Control
 from semcast.server.decode_ahead import DecodeAhead
@@ -36,7 +37,7 @@ from semcast.server.outbox import Outbox, map_message
 from semcast.server.receiver import ReceivedFrame, Receiver
 from semcast.server.record import recording
 from semcast.server.reference import Reference, sequence_reference
-from semcast.server.session import Outcome, Session, new_bundle
+from semcast.server.session import Outcome, Session
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_end import StreamEnd
 from semcast.server.stream_identity import StreamIdentity
@@ -308,7 +309,7 @@ class Server:
             outcome = session.process(
                 decoded.frame,
                 Arrival.of(decoded, self.metrics.drops),
-                lambda found: self._outbox.put_pose(decoded.arrival, found),
+                lambda found: self._outbox.put_pose(decoded.arrival, found, session.metres.of(found)),
             )
         except Exception as err:
             logger.exception("frame %d could not be tracked and is left out", message.frame_id)

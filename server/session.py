@@ -26,6 +26,7 @@ from semcast.common.run_folder import (
     SUMMARY_NAME,
 )
 from semcast.common.whole_file import write_whole
+from semcast.server.bundle_runner import new_bundle
 from semcast.server.checkpoint import (
     Checkpoint,
     CheckpointHeader,
@@ -40,11 +41,10 @@ from semcast.server.former_run import set_aside
 from semcast.server.frame_rows import FrameRow, FrameRows, run_line, summarise
 from semcast.server.frame_views import frame_view
 from semcast.server.image_writer import ImageWriter
-from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleRunner
-from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
+from semcast.server.metres import Metres
 from semcast.server.reference import Reference
 from semcast.server.run_results import Results, results_of, write_results
 from semcast.server.sent_frames import stretches
@@ -108,6 +108,8 @@ class Session:
         self._bundle = bundle if bundle is not None else new_bundle(settings)
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, self._bundle)
         self._cloud = SessionCloud(settings, identity.camera, self._reconstruction, on_error)
+        #: What a unit of each part of the map is.
+        self.metres = Metres(settings.marker, identity.camera, self._reconstruction)
         self._t_source_ns: dict[int, int] = {}
         self._numbers: dict[int, int | None] = {}
         self._num_frames = identity.num_frames
@@ -172,9 +174,10 @@ class Session:
                 logger.info("a new map is started, the checkpoint is of another stream: %s", reason)
                 return False
             self._reconstruction.restore(checkpoint.arrays)
+            self.metres.restore(checkpoint.arrays)
         except (CheckpointError, ValueError, KeyError) as err:
             logger.warning("a new map is started, the checkpoint can't be used: %s", err)
-            self._reconstruction.reset()
+            self.restart_map()
             return False
         self._last_frame_id = checkpoint.header.frame_id
         self._map_epoch = checkpoint.header.map_epoch
@@ -234,6 +237,7 @@ class Session:
         if not tracked_ns:
             tell(result)
         self._log_state(result)
+        metric = self.metres.of(result)
         update = self._reconstruction.take_map_update()
         patches = self._cloud.grow(frame, result, update)
         self._last_frame_id = frame.frame_id
@@ -247,6 +251,7 @@ class Session:
             snr_set_db=arrival.snr_set_db,
             snr_estimated_db=arrival.snr_estimated_db,
             psnr_db=psnr,
+            m_per_unit=None if metric is None else metric.scale,
             seq=self._numbers.setdefault(frame.frame_id, None),
             t_arrival_ns=arrival.t_arrival_ns,
             age_ms=(tracked_ns - arrival.t_arrival_ns) * 1e-6,
@@ -257,6 +262,7 @@ class Session:
             },
         )
         self._record.add(row)
+        update = self.metres.follow(update, frame, result)
         self._keep_image(frame, result, update)
         self._map_epoch = result.map_epoch
         if time.monotonic() - self._last_checkpoint_s >= self._settings.checkpoint_interval_s:
@@ -318,7 +324,8 @@ class Session:
             t_source_ns=self._t_source_ns.get(self._last_frame_id, 0),
             map_epoch=self._map_epoch,
         )
-        self._checkpoints.submit(Checkpoint(header, self._reconstruction.snapshot()))
+        arrays = {**self._reconstruction.snapshot(), **self.metres.arrays()}
+        self._checkpoints.submit(Checkpoint(header, arrays))
 
     def whole_map(self) -> MapUpdate:
         """Return the map as one update, for who has seen none before."""
@@ -329,6 +336,7 @@ class Session:
         self._reconstruction.reset()
         self._restored = {}
         self._cloud.reset()
+        self.metres.reset()
 
     def conclude(self) -> MapUpdate | None:
         """Adjust the whole map, as the settings want it, now that the stream has ended; what that changed.
@@ -346,6 +354,8 @@ class Session:
             logger.exception("the map could not be adjusted as a whole and stays as it was")
         update = self._reconstruction.take_map_update()
         self._cloud.follow(update)
+        update = self.metres.follow(update)
+        self.metres.tell()
         return update
 
     @property
@@ -434,6 +444,7 @@ class Session:
         }
         summary["readout_ms"] = self._reconstruction.camera.readout_ms
         summary["readout_from"] = self._reconstruction.camera.readout_from
+        summary["metres"] = self.metres.summary()
         summary["resumed"] = self.resumed
         summary["versions"] = versions()
         summary["settings"] = settings_to_dict(self._program)
@@ -486,15 +497,3 @@ class Session:
         self._record.close()
         self._reconstruction.close()
         self._cloud.close()
-
-
-def new_bundle(settings: ServerSettings, on_give_up: Callable[[str], None] | None = None) -> BundleRunner:
-    """Return a runner of bundle adjustments as the settings want it.
-
-    Args:
-        settings: Of the server.
-        on_give_up: Is told why, when nothing will be adjusted any more.
-    """
-    if settings.bundle == "inline":
-        return InlineBundle()
-    return ProcessBundle(lossless=settings.mode == "replay", on_give_up=on_give_up)

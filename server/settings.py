@@ -10,6 +10,7 @@ from semcast.common.cores import check_threads, usable_cores
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import HubSettings
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.marker_settings import MarkerSettings
 from semcast.server.view.settings import ViewSettings
 
 #: When the depth of keyframes is estimated.
@@ -55,6 +56,7 @@ class ServerSettings:
         keep_running: Go on after the source's last frame and wait for the next agent.
         idle_timeout_s: End when nothing arrives for so long after the first frame.
         duration_s: End after so long.
+        marker: Tells the metre.
         reconstruction: Tracking and mapping.
         view: Viewer.
     """
@@ -114,6 +116,7 @@ class ServerSettings:
         default=None, metadata={"help": "end when nothing arrived for so many seconds after the first frame"}
     )
     duration_s: float | None = field(default=None, metadata={"help": "end after so many seconds"})
+    marker: MarkerSettings = field(default=MarkerSettings(), metadata={"help": "marker that tells the metre"})
     reconstruction: ReconstructionSettings = field(
         default=ReconstructionSettings(), metadata={"help": "tracking and mapping"}
     )

@@ -4,7 +4,7 @@ Garrido-Jurado et al., Automatic generation and detection of highly reliable fid
 2014; Olson, AprilTag: a robust and flexible visual fiducial system, 2011. Found by OpenCV.
 """
 
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,18 +22,21 @@ from semcast.server.geometry.triangulation import triangulate
 
 Array = NDArray[np.float64]
 
-#: Few false alarms; the family robots know best.
-DEFAULT_DICTIONARY = "apriltag_36h11"
 #: Two images and their marker can agree by accident.
 MIN_IMAGES = 3
 #: An image whose corners are further off than this, and than thrice what is usual, has seen something else.
 _OUTLIER_PX = 3.0
 #: Corners are not known better than this, however well a few of them fit.
 _LEAST_SIGMA_PX = 0.2
+#: By which the sides of a marker in soft pictures are further in or out.
+_SOFT_EDGE_PX = 0.1
+#: Of the marker's width, around it: what its lines and their surroundings are looked for in.
+_MARGIN_SHARE = 0.3
 #: A scale less certain than this (95 %) is none.
 MAX_UNCERTAINTY = 0.1
 #: Where its refinement of corners has the middle of the first pixel; ours is at 0.
 _APRILTAG_PIXEL_CENTRE = 0.5
+_TWO_SIDED_95 = 1.96
 #: What a corner behind the camera is off by.
 _BEHIND_PX = 1e4
 _ITERATIONS = 20
@@ -61,14 +64,134 @@ class MarkerViews:
         return MarkerViews(self.T_world_cam[kept], self.corners_xy[kept])
 
 
+@dataclass(frozen=True)
+class MarkerPlacement(Placement):
+    """A placement by a marker.
+
+    Attributes:
+        marker_id: The marker's number.
+        side_m: Of its black square.
+        num_images: That agree about it.
+        relative_sigma: Standard deviation of ``scale`` as a share of it.
+    """
+
+    marker_id: int
+    side_m: float
+    num_images: int
+    relative_sigma: float
+
+    @property
+    def corners_map(self) -> Array:
+        """``(4, 3)`` corners of the marker in the map: top left as printed, then clockwise."""
+        return np.asarray((_square(self.side_m) - self.t) @ self.R / self.scale)
+
+
+class Sightings:
+    """Where markers of a family are in the images of a run.
+
+    Args:
+        dictionary: OpenCV's name of the family, such as ``apriltag_36h11`` or ``4x4_50``.
+
+    Attributes:
+        of: Marker number -> frame id -> ``(4, 2)`` pixels.
+        num_images: That were looked at.
+        num_doubled: Marker number -> images that show it twice, where it is left out.
+
+    Raises:
+        ConfigError: There is no such family.
+    """
+
+    def __init__(self, dictionary: str) -> None:
+        known = dictionaries()
+        if dictionary not in known:
+            raise ConfigError(f"dictionary must be one of {', '.join(known)}, got {dictionary!r}")
+        self._dictionary = dictionary
+        family = cv2.aruco.getPredefinedDictionary(known[dictionary])
+        self._quick = cv2.aruco.ArucoDetector(family, cv2.aruco.DetectorParameters())
+        parameters = cv2.aruco.DetectorParameters()
+        # Lines along the sides: of soft pictures the other ways make markers too small.
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
+        self._exact = cv2.aruco.ArucoDetector(family, parameters)
+        self.of: dict[int, dict[int, Array]] = {}
+        self.num_images = 0
+        self.num_doubled: Counter[int] = Counter()
+
+    def look(self, frame_id: int, grey: NDArray[np.uint8]) -> None:
+        """Look for markers in an image ``(H, W)``.
+
+        Lines are looked for where there is a marker: in a whole image they take several times as long.
+        """
+        self.num_images += 1
+        corners, numbers, _ = self._quick.detectMarkers(grey)
+        there = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
+        for number, quick in zip(there, corners, strict=True):
+            if there.count(number) > 1:
+                continue
+            xy = self._refined(grey, number, quick[0])
+            if xy is not None:
+                self.of.setdefault(number, {})[frame_id] = xy
+        self.num_doubled.update({number for number in there if there.count(number) > 1})
+
+    def _refined(self, grey: NDArray[np.uint8], number: int, corners_xy: NDArray[np.float32]) -> Array | None:
+        """Return the corners by the lines along the sides, None where these show no such marker."""
+        low, high = corners_xy.min(axis=0), corners_xy.max(axis=0)
+        margin = _MARGIN_SHARE * (high - low).max()
+        left, top = np.maximum(low - margin, 0).astype(int)
+        right, bottom = (high + margin).astype(int) + 1
+        around, numbers, _ = self._exact.detectMarkers(np.ascontiguousarray(grey[top:bottom, left:right]))
+        same = [] if numbers is None else np.flatnonzero(np.ravel(numbers) == number)
+        if len(same) != 1:
+            return None
+        in_part = np.asarray(around[same[0]][0], dtype=np.float64)
+        return np.asarray(in_part + np.array([left, top]) - _APRILTAG_PIXEL_CENTRE)
+
+    def place(
+        self, T_world_cam: Mapping[int, Array], camera: Intrinsics, side_m: float, marker_id: int | None
+    ) -> MarkerPlacement:
+        """Return the similarity from the map to the frame of a marker, in metres.
+
+        Args:
+            T_world_cam: Poses of images of one part of the map, by frame id; others do not count.
+            camera: Of the images.
+            side_m: Side of the marker's black square.
+            marker_id: Its number; None for the one in most images.
+
+        Raises:
+            SourceError: No marker was found in enough images, or from too few directions to tell the scale.
+        """
+        ids = {k: sorted(seen.keys() & T_world_cam.keys()) for k, seen in self.of.items()}
+        if marker_id is None:
+            marker_id = max(ids, key=lambda k: (len(ids[k]), -k), default=None)
+        if marker_id is None or not ids.get(marker_id):
+            raise SourceError(self.none_found(marker_id))
+        seen = self.of[marker_id]
+        views = MarkerViews(
+            np.array([T_world_cam[k] for k in ids[marker_id]]), np.array([seen[k] for k in ids[marker_id]])
+        )
+        return _fit(views, camera, side_m, marker_id)
+
+    def none_found(self, marker_id: int | None) -> str:
+        """Say in a line that a marker is in no image, and what is."""
+        number = "of any number" if marker_id is None else marker_id
+        text = (
+            f"marker {number} of {self._dictionary} must be in {MIN_IMAGES} images or more, "
+            f"got none of {self.num_images}"
+        )
+        if self.of:
+            text += f"; found: {', '.join(map(str, sorted(self.of)))}"
+        for doubled, count in sorted(self.num_doubled.items()):
+            text += f"; {doubled} is there twice in {count}"
+        return text
+
+
 def place_by_marker(
     data: RunData,
     images: Mapping[int, Path],
     side_m: float,
     dictionary: str,
     marker_id: int | None = None,
-) -> Placement:
-    """Return the similarity from the map to the frame of a marker, in metres.
+) -> MarkerPlacement:
+    """Return the similarity from the map of a finished run to the frame of a marker, in metres.
 
     The frame's origin is the marker's centre, x points right and y up on the marker as printed, z out of it:
     with a marker on the floor z is up.
@@ -86,27 +209,19 @@ def place_by_marker(
     """
     if not (np.isfinite(side_m) and side_m > 0):
         raise ConfigError(f"side of the marker must be above 0 m, got {side_m}")
-    row_of = {frame_id: k for k, frame_id in enumerate(data.frame_ids.tolist())}
-    posed = {frame_id: path for frame_id, path in images.items() if frame_id in row_of}
+    T_world_cam = dict(zip(data.frame_ids.tolist(), data.T_world_cam, strict=True))
+    posed = {frame_id: path for frame_id, path in images.items() if frame_id in T_world_cam}
     if not posed:
         raise SourceError(
             "the run kept no images, and a marker is looked for in them; run again with --save-images"
         )
-    detector = _detector(dictionary)
-    rows, corners = defaultdict(list), defaultdict(list)
+    sightings = Sightings(dictionary)
     for frame_id, path in posed.items():
-        for found, xy in _find_markers(path, data.intrinsics, detector).items():
-            rows[found].append(row_of[frame_id])
-            corners[found].append(xy)
-    number = max(rows, key=lambda k: (len(rows[k]), -k), default=None) if marker_id is None else marker_id
-    if number is None or number not in rows:
-        others = f"; found: {', '.join(map(str, sorted(rows)))}" if rows else ""
-        raise SourceError(
-            f"marker {'of any number' if number is None else number} of {dictionary} must be in "
-            f"{MIN_IMAGES} images or more, got none of {len(posed)}{others}"
-        )
-    views = MarkerViews(data.T_world_cam[rows[number]], np.array(corners[number]))
-    return _fit(views, data.intrinsics, side_m, f"marker {number}")
+        grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if grey is None or grey.shape != data.intrinsics.shape_hw:
+            raise SourceError(f"{path} must be an image of {data.intrinsics.width}x{data.intrinsics.height}")
+        sightings.look(frame_id, np.asarray(grey, dtype=np.uint8))
+    return sightings.place(T_world_cam, data.intrinsics, side_m, marker_id)
 
 
 def dictionaries() -> dict[str, int]:
@@ -115,42 +230,9 @@ def dictionaries() -> dict[str, int]:
     return {name.removeprefix("DICT_").lower(): getattr(cv2.aruco, name) for name in names}
 
 
-def _detector(dictionary: str) -> cv2.aruco.ArucoDetector:
-    """Return what finds markers of a family.
-
-    Raises:
-        ConfigError: There is no such dictionary.
-    """
-    known = dictionaries()
-    if dictionary not in known:
-        raise ConfigError(f"dictionary must be one of {', '.join(known)}, got {dictionary!r}")
-    parameters = cv2.aruco.DetectorParameters()
-    # Lines along the sides: of soft pictures the other ways make markers too small.
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
-    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(known[dictionary]), parameters)
-
-
-def _find_markers(path: Path, camera: Intrinsics, detector: cv2.aruco.ArucoDetector) -> dict[int, Array]:
-    """Return marker number to corners ``(4, 2)`` in pixels; a number that is there twice is left out.
-
-    Raises:
-        SourceError: The image can't be read, or is not the camera's.
-    """
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if grey is None or grey.shape != camera.shape_hw:
-        raise SourceError(f"{path} must be an image of {camera.width}x{camera.height}")
-    corners, numbers, _ = detector.detectMarkers(grey)
-    flat = [] if numbers is None else [int(number) for number in np.ravel(numbers)]
-    return {
-        number: np.asarray(xy, dtype=np.float64).reshape(4, 2) - _APRILTAG_PIXEL_CENTRE
-        for number, xy in zip(flat, corners, strict=True)
-        if flat.count(number) == 1
-    }
-
-
-def _fit(views: MarkerViews, camera: Intrinsics, side_m: float, name: str) -> Placement:
+def _fit(views: MarkerViews, camera: Intrinsics, side_m: float, marker_id: int) -> MarkerPlacement:
     """Fit position, rotation and size of the marker in the map to its corners in all images."""
-    num_found = len(views)
+    num_found, name = len(views), f"marker {marker_id}"
     fit = None
     while len(views) >= MIN_IMAGES:
         fit = _least_squares(views, camera, side_m)
@@ -165,7 +247,7 @@ def _fit(views: MarkerViews, camera: Intrinsics, side_m: float, name: str) -> Pl
             f"{name} must be seen alike in {MIN_IMAGES} images or more, got {len(views)} of {num_found}"
         )
     rms_px = float(np.sqrt((fit.residuals**2).mean()))
-    uncertainty = 1.96 * fit.sigma_log_scale * max(rms_px, _LEAST_SIGMA_PX)
+    uncertainty = _TWO_SIDED_95 * fit.sigma_log_scale
     if not uncertainty <= MAX_UNCERTAINTY:
         by = f" by {100 * uncertainty:.0f} %" if np.isfinite(uncertainty) else ""
         raise SourceError(
@@ -173,12 +255,20 @@ def _fit(views: MarkerViews, camera: Intrinsics, side_m: float, name: str) -> Pl
             f"open{by}"
         )
     scale = 1.0 / fit.scale
-    words = (
-        f"{name}: {len(views)} images, {rms_px:.2f} px; 1 unit of the map is {scale:.4g} m, "
-        f"within {100 * uncertainty:.2g} % (95 %)"
+    return MarkerPlacement(
+        scale=scale,
+        R=fit.R.T,
+        t=-scale * fit.R.T @ fit.t,
+        frame=f"x right, y up, z out of {name}; metres",
+        words=(
+            f"{name}: {len(views)} images, {rms_px:.2f} px; 1 unit of the map is {scale:.4g} m, "
+            f"within {100 * uncertainty:.2g} % (95 %)"
+        ),
+        marker_id=marker_id,
+        side_m=side_m,
+        num_images=len(views),
+        relative_sigma=fit.sigma_log_scale,
     )
-    frame = f"x right, y up, z out of {name}; metres"
-    return Placement(scale, fit.R.T, -scale * fit.R.T @ fit.t, frame, words)
 
 
 @dataclass(frozen=True)
@@ -187,8 +277,7 @@ class _Fit:
 
     Attributes:
         residuals: ``(N, 4, 2)`` pixels.
-        sigma_log_scale: Standard deviation of log ``scale`` for corners known to one pixel; infinite where
-            they leave it open.
+        sigma_log_scale: Standard deviation of log ``scale``; infinite where the images leave it open.
     """
 
     scale: float
@@ -198,13 +287,17 @@ class _Fit:
     sigma_log_scale: float
 
 
+def _square(side_m: float) -> Array:
+    return 0.5 * side_m * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+
+
 def _view_errors_px(residuals: Array) -> Array:
     return np.asarray(np.sqrt((residuals**2).sum(axis=2).mean(axis=1)))
 
 
 def _least_squares(views: MarkerViews, camera: Intrinsics, side_m: float) -> _Fit:
     """Minimise the reprojection error over seven parameters (Levenberg-Marquardt)."""
-    square = 0.5 * side_m * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    square = _square(side_m)
     T_cam_world = invert_transform(views.T_world_cam)
     view, corner = (k.ravel() for k in np.indices((len(views), 4)))
     seen_xy = views.corners_xy.reshape(-1, 2)
@@ -241,6 +334,21 @@ def _least_squares(views: MarkerViews, camera: Intrinsics, side_m: float) -> _Fi
                 break
         else:
             damping *= 10.0
-    JtJ = J.T @ J
-    sigma = float(np.sqrt(np.linalg.inv(JtJ)[0, 0])) if np.linalg.matrix_rank(JtJ) == len(JtJ) else np.inf
-    return _Fit(float(np.exp(x[0])), x[1], x[2], r, sigma)
+    return _Fit(float(np.exp(x[0])), x[1], x[2], r, _sigma_log_scale(J, r, views.corners_xy))
+
+
+def _sigma_log_scale(J: Array, r: Array, corners_xy: Array) -> float:
+    """Return the standard deviation of the logarithm of the scale, infinite where that is open.
+
+    Corners err each for itself; the four of an image together, as its pose does; and all of them inwards or
+    outwards, as soft edges do in every image alike.
+    """
+    if np.linalg.matrix_rank(J.T @ J) < J.shape[1]:
+        return np.inf
+    per_px = np.linalg.pinv(J)[0].reshape(corners_xy.shape)
+    outwards = corners_xy - corners_xy.mean(axis=1, keepdims=True)
+    outwards /= np.linalg.norm(outwards, axis=2, keepdims=True)
+    sigma_px = max(float(np.sqrt((r**2).mean())), _LEAST_SIGMA_PX)
+    alone, together = (per_px**2).sum(), (per_px.sum(axis=1) ** 2).sum()
+    soft_px = _SOFT_EDGE_PX * (per_px * outwards).sum()
+    return float(np.sqrt(sigma_px**2 * (alone + together) + soft_px**2))

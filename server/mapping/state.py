@@ -102,6 +102,19 @@ class FrameResult:
 
 
 @dataclass(frozen=True)
+class Marker:
+    """A printed marker in the map, that tells what a unit of it is.
+
+    Attributes:
+        corners_map: ``(4, 3)`` round its square, ``(0, 3)`` where none tells anything any more.
+        words: What it tells.
+    """
+
+    corners_map: Array
+    words: str
+
+
+@dataclass(frozen=True)
 class MapUpdate:
     """What changed in the map since the last update was taken.
 
@@ -117,6 +130,7 @@ class MapUpdate:
         frame_ids: ``(F,)`` int64, frames that moved otherwise than with their keyframe: in scale, too.
         frame_poses: ``(F, 4, 4)`` their ``T_world_cam``.
         withdrawn: ``(W,)`` int64, frames whose pose was taken back.
+        marker: As the map has it now; None while none tells anything.
     """
 
     map_epoch: int
@@ -130,3 +144,4 @@ class MapUpdate:
     frame_ids: NDArray[np.int64]
     frame_poses: Array
     withdrawn: NDArray[np.int64]
+    marker: Marker | None = None

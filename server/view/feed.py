@@ -81,6 +81,7 @@ def _apply(scene: Scene, item: _Pending) -> None:
         scene.set_keyframes(update.keyframe_ids, update.keyframe_poses)
         scene.move_frames(update.frame_ids, update.frame_poses)
         scene.withdraw_frames(update.withdrawn)
+        scene.set_marker(update.marker)
         scene.add_landmarks(update.ids, update.xyz, update.rgb, update.confidence, update.removed)
     scene.set_patches(item.patches)
     if item.view is not None:

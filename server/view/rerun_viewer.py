@@ -11,6 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from semcast.common.camera import Intrinsics
+from semcast.server.mapping.state import Marker
 from semcast.server.view.patch_table import PlacedPatch
 from semcast.server.view.picture import Picture, confidence_colours
 from semcast.server.view.scene import Changes, PointChunk, Row
@@ -24,6 +25,7 @@ PATH_COLOUR = (255, 170, 40)
 TRUTH_COLOUR = (150, 160, 180)
 INLIER_COLOUR = (80, 230, 120)
 OTHER_COLOUR = (240, 120, 70)
+MARKER_COLOUR = (90, 170, 255)
 
 #: Entity of the dense cloud, one below it for each keyframe.
 DENSE = "world/dense"
@@ -193,6 +195,7 @@ class RerunStream:
                 "world/map_colour",
                 DENSE,
                 "world/truth",
+                "world/marker",
             ):
                 stream.log(path, rr.Clear(recursive=True))
         if changes.frustum_size is not None and changes.frustum_size > 0:
@@ -213,6 +216,8 @@ class RerunStream:
                 "world/truth",
                 rr.LineStrips3D([changes.truth], colors=TRUTH_COLOUR, radii=rr.Radius.ui_points(1.2)),
             )
+        if changes.marker is not None:
+            self._write_marker(changes.marker)
         for chunk in changes.chunks:
             self._write_points(chunk)
         for patch in changes.patches:
@@ -264,6 +269,20 @@ class RerunStream:
             self._open().log(
                 f"world/{path}/{chunk.idx:04d}", rr.Points3D(chunk.xyz, colors=colours, radii=radius)
             )
+
+    def _write_marker(self, marker: Marker) -> None:
+        corners = marker.corners_map
+        outline = [np.concatenate([corners, corners[:1]])] if len(corners) else []
+        self._open().log(
+            "world/marker",
+            rr.LineStrips3D(
+                outline,
+                colors=MARKER_COLOUR,
+                radii=rr.Radius.ui_points(2.0),
+                labels=[marker.words] * len(outline),
+                show_labels=True,
+            ),
+        )
 
     def _write_patch(self, patch: PlacedPatch) -> None:
         """Send dense points once, in their keyframe's axes; where they are goes with that."""

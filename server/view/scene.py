@@ -16,6 +16,7 @@ from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import match_times
 from semcast.server.dense.cloud import DensePatch
+from semcast.server.mapping.state import Marker
 from semcast.server.view.frame_view import MISSING, FrameView
 from semcast.server.view.landmark_table import LandmarkTable
 from semcast.server.view.patch_table import PatchTable, PlacedPatch
@@ -29,6 +30,7 @@ Array = NDArray[np.float64]
 MAX_ROWS = 20_000
 #: Depth of the drawn frustum as share of the median landmark distance.
 FRUSTUM_SHARE = 0.15
+_NO_MARKER = Marker(np.zeros((0, 3)), "")
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class Changes:
         chunks: Landmarks that were added, moved or removed.
         patches: Dense points that were added or moved.
         truth: ``(N, 3)`` aligned true path, or None when unchanged.
+        marker: None when unchanged.
         picture: The newest image, or None when unchanged.
         frustum_size: Distance of the drawn image plane in map units, or None when unchanged.
     """
@@ -81,6 +84,7 @@ class Changes:
     chunks: list[PointChunk]
     patches: list[PlacedPatch]
     truth: NDArray[np.float32] | None
+    marker: Marker | None
     picture: Picture | None
     frustum_size: float | None
 
@@ -94,6 +98,7 @@ class Changes:
             or self.chunks
             or self.patches
             or self.truth is not None
+            or self.marker is not None
             or self.picture is not None
             or self.frustum_size is not None
         )
@@ -109,6 +114,7 @@ class Cursor:
     chunks: dict[int, int] = field(default_factory=dict)
     patches: dict[int, tuple[int, int]] = field(default_factory=dict)
     truth_version: int = 0
+    marker_version: int = 0
     picture_id: int = -1
     frustum_size: float = 0.0
 
@@ -139,6 +145,8 @@ class Scene:
         self._patches = PatchTable()
         self._truth_version = 0
         self._aligned: NDArray[np.float32] | None = None
+        self._marker = _NO_MARKER
+        self._marker_version = 0
         self._frustum_size = 0.0
         self._size = 0.0
         self._spectator = Spectator()
@@ -205,6 +213,13 @@ class Scene:
         """Replace the newest image."""
         self._picture = picture
 
+    def set_marker(self, marker: Marker | None) -> None:
+        """Set where the marker is that tells the metre, None while none does."""
+        marker = _NO_MARKER if marker is None else marker
+        if marker is not self._marker:
+            self._marker = marker
+            self._marker_version += 1
+
     def poses(self) -> Array:
         """Return ``T_world_cam`` ``(N, 4, 4)`` of posed frames, after all corrections."""
         return self._path.poses()
@@ -244,6 +259,7 @@ class Scene:
             cursor.chunks.clear()
             cursor.patches.clear()
             cursor.truth_version = 0
+            cursor.marker_version = 0
             cursor.frustum_size = 0.0
             cursor.generation = self._generation
         missing = min(self._num_rows - cursor.num_rows, len(self._rows))
@@ -262,6 +278,8 @@ class Scene:
         patches = self._patches.changes_since(cursor.patches)
         truth = self._aligned if cursor.truth_version != self._truth_version else None
         cursor.truth_version = self._truth_version
+        marker = self._marker if cursor.marker_version != self._marker_version else None
+        cursor.marker_version = self._marker_version
         picture = self._picture
         if picture is not None and picture.frame_id == cursor.picture_id:
             picture = None
@@ -269,7 +287,7 @@ class Scene:
             cursor.picture_id = picture.frame_id
         size = self._frustum_size if self._frustum_size != cursor.frustum_size else None
         cursor.frustum_size = self._frustum_size
-        return Changes(cleared, rows, segments, chunks, patches, truth, picture, size)
+        return Changes(cleared, rows, segments, chunks, patches, truth, marker, picture, size)
 
 
 def align_poses(T_from_cam: Array, T_to_cam: Array) -> tuple[float, Array, Array] | None:

@@ -11,6 +11,7 @@ def test_keys_are_those_of_the_table():
     assert keys.flow_key("a1") == "semcast/a1/flow"
     assert keys.channel_key("a1") == "semcast/a1/channel"
     assert keys.pose_key("a1") == "semcast/a1/pose"
+    assert keys.metric_pose_key("a1") == "semcast/a1/metric_pose"
     assert keys.map_key("a1") == "semcast/a1/map"
     assert keys.status_key("a1", "server") == "semcast/a1/status/server"
     assert keys.control_key("a1", "channel") == "semcast/a1/control/channel"

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from waiting import until
 
+from semcast.common.geometry import exp_so3, make_transform, transform_points
 from semcast.common.keys import map_key
 from semcast.common.loopback import open_hub
-from semcast.common.map_mirror import MapMirror
-from semcast.common.messages import MapMessage
+from semcast.common.map_mirror import _EMPTY, MapMirror
+from semcast.common.messages import MapMessage, MetricPose
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.transport import open_client
 from semcast.common.wire import pack
@@ -171,3 +172,27 @@ def test_a_server_that_goes_while_its_answer_is_on_its_way_is_not_taken_for_the_
     session.deliver(pack(message([7], removed=[6])))
     assert mirror.map.ids.tolist() == [1, 5, 7]
     assert mirror.map.xyz[:, 0].tolist() == [1.5, 5.5, 7.0]
+
+
+def test_a_map_is_brought_to_metres_as_a_pose_tells():
+    ids = np.arange(5)
+    change = message(ids, keyframes=(2, 4))
+    change.keyframe_poses[:] = np.eye(4)
+    change.keyframe_poses[:, :3, 3] = [[1.0, 2, 3], [3, 2, 2]]
+    before = _EMPTY.updated(change)
+    T_marker_world = make_transform(exp_so3((0.3, -1.0, 0.5)), (4.0, -2.0, 1.0))
+    pose = MetricPose(
+        agent_epoch=7, frame_id=4, t_capture_ns=0, t_source_ns=0, T_marker_cam=(0.0,) * 16, covariance=None,
+        m_per_unit=0.4, relative_sigma=0.01, T_marker_world=tuple(T_marker_world.ravel().tolist()),
+        marker_id=7, num_keyframes=3, map_epoch=0, submap=0,
+    )  # fmt: skip
+    after = before.in_metres(pose)
+    np.testing.assert_allclose(after.xyz, transform_points(T_marker_world, 0.4 * before.xyz), atol=1e-5)
+    centres = before.keyframe_poses[:, :3, 3]
+    np.testing.assert_allclose(
+        after.keyframe_poses[:, :3, 3], transform_points(T_marker_world, 0.4 * centres), atol=1e-9
+    )
+    turned = T_marker_world[:3, :3] @ before.keyframe_poses[:, :3, :3]
+    np.testing.assert_allclose(after.keyframe_poses[:, :3, :3], turned, atol=1e-9)
+    np.testing.assert_array_equal(after.ids, before.ids)
+    np.testing.assert_array_equal(before.keyframe_poses, change.keyframe_poses)

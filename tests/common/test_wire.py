@@ -19,6 +19,7 @@ from semcast.common.messages import (
     FlowMessage,
     LinkReport,
     MapMessage,
+    MetricPose,
     PoseMessage,
     StatusMessage,
     SymbolFrame,
@@ -56,6 +57,12 @@ def examples():
             agent_epoch=1, frame_id=2, t_capture_ns=3, t_source_ns=4,
             T_world_cam=tuple(np.eye(4).ravel().tolist()), state="tracking",
             num_inliers=80, covariance=None, map_epoch=0,
+        ),
+        MetricPose(
+            agent_epoch=1, frame_id=2, t_capture_ns=3, t_source_ns=4,
+            T_marker_cam=tuple(np.eye(4).ravel().tolist()), covariance=tuple(np.eye(6).ravel().tolist()),
+            m_per_unit=0.4, relative_sigma=0.01, T_marker_world=tuple(np.eye(4).ravel().tolist()),
+            marker_id=7, num_keyframes=3, map_epoch=0, submap=1,
         ),
         MapMessage(
             agent_epoch=1, map_epoch=2, ids=np.arange(n), xyz=np.ones((n, 3), np.float32),

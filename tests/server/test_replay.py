@@ -34,6 +34,7 @@ from semcast.common.run_folder import read_run
 from semcast.common.sequence import open_sequence
 from semcast.common.wire import pack, unpack
 from semcast.describe import describe_recording
+from semcast.server.marker_settings import MarkerSettings
 from semcast.server.receiver import Receiver
 from semcast.server.record import RecordSettings, StreamNotes, kind_of_key, run_record
 from semcast.server.recorded_streams import recorded_streams
@@ -167,6 +168,14 @@ def test_two_replays_give_the_same_files_and_another_channel_does_not(recording,
     assert replay(lossy)["stage_ms"]["equalise"]["p50"] > 0.0
     assert (tmp_path / "c" / "trajectory.tum").read_bytes() != first
     assert build_settings(ReplaySettings, read_toml(tmp_path / "c" / "settings.toml")) == lossy
+
+
+def test_a_replay_looks_for_the_marker_it_is_told_of(recording, whole, caplog):
+    assert whole[0]["metres"] is None
+    summary = replay(without_depth(recording, marker=MarkerSettings(side_m=0.2, marker_id=3)))
+    assert summary["metres"] == []
+    assert "the metre is not known: marker 3 of apriltag_36h11 must be in 3 images or more" in caplog.text
+    assert summary["frames"] == whole[0]["frames"]
 
 
 def test_the_command_shows_what_is_known_and_names_its_files(recording, tmp_path, capsys):

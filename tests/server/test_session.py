@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drawn_markers import draw_marker
 
 from semcast.common.camera import Intrinsics
 from semcast.common.config import build_settings, read_toml
+from semcast.common.geometry import invert_transform, make_transform
 from semcast.common.image_file import read_image
 from semcast.common.run_folder import FRAMES_NAME, read_image_paths, read_run
 from semcast.common.sequence import open_sequence
@@ -19,6 +21,7 @@ from semcast.server.decoder import Arrival
 from semcast.server.frame_rows import read_rows
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
+from semcast.server.marker_settings import MarkerSettings
 from semcast.server.reference import Reference
 from semcast.server.replay import ReplaySettings
 from semcast.server.session import Session
@@ -360,6 +363,29 @@ def test_a_resumed_session_goes_on_with_what_is_there_and_a_new_one_sets_it_asid
     assert not read_image_paths(tmp_path)
     assert list(read_image_paths(tmp_path / "previous-1")) == after
     assert (tmp_path / "previous-1" / "trajectory.tum").read_bytes() == trajectory
+
+
+def test_a_resumed_session_knows_the_metre_until_its_map_is_reset(demo, tmp_path):
+    T_world_cam = demo.groundtruth().T_world_cam
+    T_world_marker = T_world_cam[0] @ make_transform(np.diag([1.0, -1.0, -1.0]), (-4.0, -0.5, 36.0))
+
+    def with_marker(sequence, k):
+        T_cam_marker = invert_transform(T_world_cam[k]) @ T_world_marker
+        return draw_marker(sequence.image(k), sequence.intrinsics, T_cam_marker, 3.0, 5)
+
+    marker = MarkerSettings(side_m=3.0)
+    killed = run_session(demo, tmp_path, range(24), killed=True, marker=marker, picture=with_marker)
+    before = killed.metres.summary()
+    assert before[0]["marker_id"] == 5
+    identity = StreamIdentity(
+        agent_id="a", agent_epoch=5, codec="x", digest="", camera=demo.intrinsics, num_frames=None
+    )
+    session = Session(ServerSettings(bundle="inline", out=tmp_path, marker=marker), identity, tmp_path, None)
+    with contextlib.closing(session):
+        assert session.resumed
+        assert session.metres.summary() == before
+        session.restart_map()
+        assert session.metres.summary() == []
 
 
 def test_a_reset_after_a_resume_shows_nothing_of_the_map_before(demo, tmp_path):

@@ -85,7 +85,8 @@ def _placement(arguments: argparse.Namespace) -> "FindPlacement | None":
         known = read_known_path(arguments.align)
         return lambda data, _: place_by_path(data, known)
     if arguments.marker_m is not None:
-        from semcast.server.export.markers import DEFAULT_DICTIONARY, place_by_marker
+        from semcast.server.export.markers import place_by_marker
+        from semcast.server.marker_settings import DEFAULT_DICTIONARY
 
         dictionary = arguments.marker_dictionary or DEFAULT_DICTIONARY
         return lambda data, images: place_by_marker(

@@ -4,23 +4,28 @@ import json
 import re
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from drawn_markers import FAMILY, draw_marker
 
 from semcast.cli import main
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError, SourceError
-from semcast.common.geometry import exp_so3, invert_transform, make_transform, rotation_angle_deg
+from semcast.common.geometry import (
+    exp_so3,
+    invert_transform,
+    make_transform,
+    rotation_angle_deg,
+    transform_points,
+)
 from semcast.common.run_folder import read_image_paths, read_run, write_run
 from semcast.common.trajectory import Trajectory, read_tum, write_tum
-from semcast.server.export.markers import dictionaries, place_by_marker
+from semcast.server.export.markers import Sightings, place_by_marker
 from semcast.server.export.outputs import write_ply
 from semcast.server.export.placement import place_by_path
 from semcast.server.image_writer import ImageWriter
 
 CAMERA = Intrinsics(fx=420.0, fy=430.0, cx=310.0, cy=235.0, width=640, height=480)
-FAMILY = "apriltag_36h11"
 #: Metres per unit of the map of these runs.
 SCALE = 0.2
 R_METRES_MAP, T_METRES_MAP = exp_so3((0.4, -1.1, 0.3)), np.array([3.0, -7.0, 2.0])
@@ -126,26 +131,6 @@ def test_a_path_of_another_time_or_of_one_place_is_refused(arc_run):
         place_by_path(data, still)
 
 
-def draw_marker(image, T_cam_world, T_world_marker, side, number):
-    """Lay a marker into an image; what is around it stays."""
-    dictionary = cv2.aruco.getPredefinedDictionary(dictionaries()[FAMILY])
-    printed = cv2.copyMakeBorder(
-        cv2.aruco.generateImageMarker(dictionary, number, 320), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=235
-    )
-    # x right and y up on paper; the side is that of the black square.
-    corners = 0.5 * side * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
-    T = T_cam_world @ T_world_marker
-    xy = CAMERA.project(corners @ T[:3, :3].T + T[:3, 3])
-    low, high = 39.5, 359.5
-    on_paper = np.array([[low, low], [high, low], [high, high], [low, high]], np.float32)
-    H = cv2.getPerspectiveTransform(on_paper, xy.astype(np.float32))
-    size_wh = (CAMERA.width, CAMERA.height)
-    fine = cv2.GaussianBlur(printed, (0, 0), 1.5)
-    warped = cv2.warpPerspective(fine, H, size_wh)
-    cover = cv2.warpPerspective(np.full_like(printed, 255), H, size_wh)[..., None] / 255.0
-    return (image * (1 - cover) + warped[..., None] * cover).astype(np.uint8)
-
-
 #: Faces the cameras, a little turned: its z points back to them.
 T_MAP_MARKER = make_transform(exp_so3((0.2, 0.1, 0.3)) @ np.diag([1.0, -1.0, -1.0]), (0.1, 0.2, 6.0))
 SIDE = 1.5
@@ -165,7 +150,7 @@ def marker_run(tmp_path, arc_run):
                 image = np.clip(noise, 0, 255).astype(np.uint8)
                 for number, place, side in markers:
                     shown = elsewhere[1] if elsewhere is not None and frame_id == elsewhere[0] else place
-                    image = draw_marker(image, T, shown, side, number)
+                    image = draw_marker(image, CAMERA, T @ shown, side, number)
                 writer.put(frame_id, image)
         return data, read_image_paths(tmp_path / "run")
 
@@ -334,3 +319,24 @@ def test_a_damaged_dense_cloud_is_named(tmp_path, marker_run, capsys, damage, sa
     assert export(tmp_path, "--format", "dense", "--out", tmp_path / "x.ply") == 1
     assert said in capsys.readouterr().err
     assert not (tmp_path / "x.ply").exists()
+
+
+def test_the_uncertainty_covers_what_corners_of_an_image_have_in_common(arc_run):
+    """Errors of poses move all four alike, and soft edges all of them outwards."""
+    data = arc_run(num_frames=6)
+    corners = 0.5 * SIDE * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    T_cam_marker = invert_transform(data.T_world_cam) @ T_MAP_MARKER
+    xy = np.stack([CAMERA.project(transform_points(T, corners)) for T in T_cam_marker])
+    outwards = xy - xy.mean(axis=1, keepdims=True)
+    outwards /= np.linalg.norm(outwards, axis=2, keepdims=True)
+    poses = dict(enumerate(data.T_world_cam))
+    rng = np.random.default_rng(0)
+    errors, sigmas = [], []
+    for _ in range(40):
+        noise = rng.normal(0, 0.2, (len(xy), 4, 2)) + rng.normal(0, 0.2, (len(xy), 1, 2))
+        sightings = Sightings(FAMILY)
+        sightings.of[7] = dict(enumerate(xy + noise + 0.1 * rng.normal() * outwards))
+        placement = sightings.place(poses, CAMERA, SIDE * SCALE, 7)
+        errors.append(placement.scale / SCALE - 1.0)
+        sigmas.append(placement.relative_sigma)
+    assert 0.7 < np.sqrt(np.mean(np.square(errors))) / np.mean(sigmas) < 1.3

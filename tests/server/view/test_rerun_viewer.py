@@ -20,6 +20,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError
 from semcast.common.geometry import make_transform
 from semcast.server.dense.cloud import DensePatch
+from semcast.server.mapping.state import Marker
 from semcast.server.settings import ServerSettings
 from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.frame_view import FrameView
@@ -66,7 +67,8 @@ def frame(k):
 class Update:
     """What the reconstruction hands over, one landmark per frame."""
 
-    def __init__(self, k):
+    def __init__(self, k, marker=None):
+        self.marker = marker
         self.ids = np.array([k], np.int64)
         self.xyz = np.array([[0.0, 0.0, 5.0 + k]])
         self.rgb = np.full((1, 3), 200, np.uint8)
@@ -112,6 +114,7 @@ def test_the_file_can_be_read_back_and_holds_everything(tmp_path):
             k, np.ones((2, 3), np.float32), np.full((2, 3), 9, np.uint8), np.ones(2, np.float32)
         )
         feed.submit(frame(k), Update(k), [points] if k < 2 else [])
+    feed.submit(None, Update(5, marker=Marker(np.eye(4)[:, :3], "1 unit of the map is 0.4 m")))
     feed.close()
     rerun_output("rrd", "verify", str(file))
     text = rerun_output("rrd", "print", "-vv", str(file))
@@ -123,6 +126,7 @@ def test_the_file_can_be_read_back_and_holds_everything(tmp_path):
         "/world/map_colour/0000",
         "/world/dense/000000",
         "/world/dense/000001",
+        "/world/marker",
         "/confidence",
         "/plots/link/psnr_db",
         "/plots/drops/stale",

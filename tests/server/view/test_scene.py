@@ -7,6 +7,7 @@ import pytest
 
 from semcast.common.geometry import exp_se3, exp_so3, make_transform
 from semcast.common.trajectory import Trajectory
+from semcast.server.mapping.state import Marker
 from semcast.server.view.frame_view import MISSING, FrameView
 from semcast.server.view.landmark_table import CHUNK_LANDMARKS, LandmarkTable
 from semcast.server.view.path_table import SEGMENT_POSES
@@ -303,3 +304,17 @@ def test_a_gap_stays_when_the_frame_after_it_is_taken_back():
     scene.withdraw_frames(np.array([3]))
     (strips,) = scene.changes_since(Cursor()).segments.values()
     assert [strip[:, 0].tolist() for strip in strips] == [[0.0, 1.0], [10.0, 11.0]]
+
+
+def test_the_marker_is_shown_once_where_it_is_and_taken_away_where_it_tells_nothing_any_more():
+    marker = Marker(np.array([[0.0, 0, 5], [1, 0, 5], [1, 1, 5], [0, 1, 5]]), "marker 7")
+    scene, cursor = Scene(), Cursor()
+    scene.set_marker(marker)
+    assert scene.changes_since(cursor).marker is marker
+    scene.set_marker(marker)
+    assert scene.changes_since(cursor).empty
+    scene.set_marker(None)
+    assert len(scene.changes_since(cursor).marker.corners_map) == 0
+    scene.start_new_map()
+    assert scene.changes_since(cursor).marker is None
+    assert scene.changes_since(Cursor()).marker is None
