@@ -1,10 +1,8 @@
 """A disk that takes no more ends the file and not the run, and who watches the run is told."""
 
-import logging
-import resource
-
 import numpy as np
 import pytest
+from full_disk import room_for
 from waiting import until
 
 from semcast.common.camera import Intrinsics
@@ -23,10 +21,8 @@ ROOM_BYTES = 50_000
 @pytest.fixture
 def full_disk(tmp_path):
     """A file of which the system takes no more than ``ROOM_BYTES``."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM_BYTES, before[1]))
-    yield tmp_path / "run.rrd"
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with room_for(ROOM_BYTES):
+        yield tmp_path / "run.rrd"
 
 
 def frame(k):
