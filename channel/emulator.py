@@ -48,7 +48,7 @@ class Emulator:
         settings: Of the process.
         metrics: Where to count. Drops: ``superseded`` by a newer frame while busy, ``lost`` on the air,
             ``missing`` (gaps in what the agent sent), ``protocol``, ``overflow`` (too many are delayed),
-            ``unsent`` (a delayed one could not be sent).
+            ``unsent`` (one that was carried could not be sent on).
     """
 
     def __init__(self, session: Session, settings: EmulatorSettings, metrics: Metrics) -> None:
@@ -170,7 +170,7 @@ class Emulator:
         try:
             (self._lossless if lossless else self._live).put(packet)
         except TransportError as err:
-            logger.debug("not sent: %s", err)
+            self._on_unsent(str(err))
 
     def _on_unsent(self, text: str) -> None:
         self._metrics.drop("unsent")

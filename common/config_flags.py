@@ -162,6 +162,19 @@ def _into_tables(cls: type, given: Mapping[str, Any], skip: frozenset[str]) -> d
     return values
 
 
+def _values_in(config: Path, cls: type, skip: frozenset[str]) -> dict[str, Any]:
+    """Return the checked values of a settings file.
+
+    Raises:
+        ConfigError: See ``given_values``; the message names the file.
+    """
+    given = read_toml(config)
+    try:
+        return check_values(cls, _into_tables(cls, given, skip))
+    except ConfigError as err:
+        raise ConfigError(f"{config}: {err}") from err
+
+
 def given_values(
     cls: type, arguments: argparse.Namespace, config: Path | None = None, skip: frozenset[str] = frozenset()
 ) -> dict[str, Any]:
@@ -180,7 +193,7 @@ def given_values(
     Raises:
         ConfigError: See ``check_values`` and ``read_toml``; or a file gives one setting two values.
     """
-    values = {} if config is None else _into_tables(cls, read_toml(config), skip)
+    values = {} if config is None else _values_in(config, cls, skip)
     for flag in _flags_of(cls, skip):
         value = getattr(arguments, flag.dotted, None)
         if value is not None:

@@ -269,6 +269,7 @@ class RecordingReader:
         check_no_ros_bag(path)
         self.path = path
         self.metadata: dict[str, dict[str, str]] = {}
+        self._is_cut_told = False
         with self._open() as stream:
             for record in RecordingScan(stream, str(path)).records():
                 if isinstance(record, RecordedMessage):
@@ -292,6 +293,8 @@ class RecordingReader:
     def messages(self, kinds: frozenset[str] | None = None) -> Iterator[RecordedMessage]:
         """Yield messages in the order they were recorded, of these kinds or of all.
 
+        Of a file that was cut off the first pass warns.
+
         Raises:
             SourceError: The file is damaged in the middle; a cut end only ends the iteration.
         """
@@ -300,7 +303,8 @@ class RecordingReader:
             for record in scan.records():
                 if isinstance(record, RecordedMessage) and (kinds is None or record.kind in kinds):
                     yield record
-            if not scan.complete:
+            if not scan.complete and not self._is_cut_told:
+                self._is_cut_told = True
                 logger.warning("%s was cut off; everything up to its last whole record was read", self.path)
 
     def info(self) -> RecordingInfo:

@@ -432,7 +432,7 @@ def _euroc_truth(path: Path, sensor: Path) -> Trajectory | None:
             times_s.append(int(t_ns) * 1e-9)
             poses.append(T_world_body @ T_body_cam)
         return Trajectory(np.array(times_s), np.array(poses).reshape(-1, 4, 4))
-    except ValueError as err:
+    except (ValueError, OverflowError) as err:
         raise SourceError(f"{path} can't be used as ground truth: {err}") from err
 
 

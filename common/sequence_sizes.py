@@ -25,7 +25,7 @@ def size_in_header_wh(path: Path) -> tuple[int, int] | None:
                 return png_size_wh(file)
             if start.startswith(JPEG_START) and _ends_with(file, _JPEG_END):
                 return jpeg_size_wh(file)
-    except (OSError, struct.error):
+    except (OSError, ValueError, struct.error):  # a path with a NUL in it is a ValueError
         return None
     return None
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.errors import SemcastError
+from semcast.common.whole_file import write_whole
 
 _CELL_WIDTH_PX = 384
 _LABEL_HEIGHT_PX = 26
@@ -68,7 +69,7 @@ def write_picture_strip(path: Path, rows: Sequence[Mapping[str, NDArray[np.uint8
 
 
 def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Save a picture as PNG or JPEG, as its name says, making the folder.
+    """Save a picture as PNG or JPEG, as its name says, making the folder; it is whole or as it was.
 
     Args:
         path: ``.png`` or ``.jpg``.
@@ -83,6 +84,6 @@ def write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
         done, data = cv2.imencode(path.suffix, picture_bgr)
         if not done:
             raise SemcastError(f"{path} can't be written as a picture")
-        path.write_bytes(data.tobytes())
+        write_whole(path, data.tobytes())
     except (OSError, cv2.error) as err:
         raise SemcastError(f"{path} can't be written as a picture: {err}") from err

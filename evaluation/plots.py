@@ -17,6 +17,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from semcast.common.errors import SemcastError
+from semcast.common.whole_file import whole_file
 
 _MARKERS = "os^Dv<>P*Xhp"
 #: Matplotlib's own ten and two more: as many as Kodak has codecs. Further curves are dashed.
@@ -47,7 +48,7 @@ def new_grid(
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure in the format its name asks for, making the folder.
+    """Write a figure in the format its name asks for, making the folder; the file is whole or as it was.
 
     Its texts are names of files and curves, never formulas: a ``$`` is a ``$``.
 
@@ -63,7 +64,8 @@ def save_figure(figure: Figure, path: Path) -> None:
         with warnings.catch_warnings():
             # Of letters that the font lacks; what stands for them is seen in the picture.
             warnings.filterwarnings("ignore", message="Glyph .* missing from")
-            figure.savefig(path, dpi=150, metadata=metadata)
+            with whole_file(path) as file:
+                figure.savefig(file, format=path.suffix[1:], dpi=150, metadata=metadata)
     except (OSError, ValueError) as err:
         raise SemcastError(f"{path} can't be written as a plot: {err}") from err
 

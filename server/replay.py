@@ -337,7 +337,11 @@ def _arrivals(
     for t_s, frame in _frames(reader, stream, settings):
         if t_s < settings.start_s or (settings.end_s is not None and t_s > settings.end_s):
             continue
-        equalised, equalise_ms, snr_db_set = _on_the_air(frame, link, t_s)
+        try:
+            equalised, equalise_ms, snr_db_set = _on_the_air(frame, link, t_s)
+        except ValueError as err:  # symbols that a channel process leaves out as well
+            logger.warning("frame %d of %s is left out: %s", frame.frame_id, reader.path, err)
+            continue
         yield ReceivedFrame(
             message=frame,
             camera=stream.camera,

@@ -87,7 +87,7 @@ class Server:
         installed = codec_loader(settings.threads, settings.device, own, only_of=self._codec)
         self._decoder = FrameDecoder(load if load is not None else installed)
         self._session: Session | None = None
-        self._views = SuccessiveViews(settings)
+        self._views = SuccessiveViews(settings, self.metrics.error)
         self._reference: Reference | None = None
         self._former_starts = FormerStarts()
         self._false_start = FalseStart()

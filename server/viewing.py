@@ -1,7 +1,7 @@
 """Whether a run is shown, where, and under which name; Rerun is imported only when something is shown."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from semcast.common.errors import ConfigError
@@ -53,6 +53,7 @@ def open_viewer(
     *,
     resumed: bool = False,
     process: "ViewerProcess | None" = None,
+    on_error: Callable[[str], None] | None = None,
 ) -> "ViewerFeed | None":
     """Open what the settings ask for; None where nothing is shown.
 
@@ -62,6 +63,7 @@ def open_viewer(
         reference: Whose true path is shown, or None.
         resumed: Keep the ``run.rrd`` that is there under another name.
         process: The viewer that showed the stream before this one, or None.
+        on_error: Is told in a line, once, why the run goes on without ``run.rrd``.
 
     Raises:
         ConfigError: The viewer can't be started or ``run.rrd`` can't be written.
@@ -82,6 +84,7 @@ def open_viewer(
         file=file,
         footer=identity.num_frames is not None and identity.num_frames <= MAX_FRAMES_WITH_FOOTER,
         process=process,
+        on_error=on_error,
     )
     if viewer.url is not None:
         logger.info("viewer: %s", viewer.url)
@@ -93,10 +96,12 @@ class SuccessiveViews:
 
     Args:
         settings: ``view`` and ``out``.
+        on_error: See ``open_viewer``.
     """
 
-    def __init__(self, settings: ServerSettings) -> None:
+    def __init__(self, settings: ServerSettings, on_error: Callable[[str], None]) -> None:
         self._settings = settings
+        self._on_error = on_error
         self._feed: ViewerFeed | None = None
         self._process: ViewerProcess | None = None
 
@@ -117,7 +122,14 @@ class SuccessiveViews:
             ConfigError: The viewer can't be started or ``run.rrd`` can't be written.
         """
         process = self._process
-        self._feed = open_viewer(self._settings, identity, reference, resumed=resumed, process=process)
+        self._feed = open_viewer(
+            self._settings,
+            identity,
+            reference,
+            resumed=resumed,
+            process=process,
+            on_error=self._on_error,
+        )
         self._process = None
 
     def submit(

@@ -1,5 +1,7 @@
 import json
+import os
 import shutil
+import signal
 import sys
 import threading
 import time
@@ -326,6 +328,18 @@ def test_an_agent_that_gives_up_ends_the_demo_with_what_came_out_so_far(tmp_path
     ]
     assert summary is not None
     assert summary["frames"]["tracked"] > 0
+
+
+def test_a_demo_that_is_stopped_before_its_first_frame_blames_no_process(tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        os.kill(os.getpid(), signal.SIGINT)
+        return None, None
+
+    monkeypatch.setattr("semcast.commands.demo.run_demo", interrupted)
+    assert main(["demo", "--out", str(tmp_path)]) == 130
+    said = capsys.readouterr().err
+    assert "stopped before the first frame was tracked: there are no results" in said
+    assert "logs" not in said
 
 
 @pytest.mark.parametrize(

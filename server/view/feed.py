@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -22,8 +22,9 @@ from semcast.common.trajectory import Trajectory
 from semcast.common.worker_guard import WorkerGuard
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.mapping.state import MapUpdate
+from semcast.server.view.file_stream import FileStream
 from semcast.server.view.frame_view import FrameView
-from semcast.server.view.live_stream import FLUSH_TIMEOUT_S, LiveStream
+from semcast.server.view.live_stream import LiveStream
 from semcast.server.view.picture import compress_picture
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary, window_display
 from semcast.server.view.rerun_viewer import RerunStream
@@ -37,7 +38,6 @@ MAX_PENDING = 4096
 PROBE_INTERVAL_S = 0.25
 SUPERVISE_INTERVAL_S = 0.2
 ALIGN_INTERVAL_S = 1.0
-FILE_FLUSH_INTERVAL_S = 1.0
 JOIN_DEADLINE_S = 5.0
 
 
@@ -101,6 +101,7 @@ class ViewerFeed:
         file: Where the recording goes, or None for no file.
         footer: Whether that ends with an index, see ``RerunStream``.
         process: The viewer to look after, perhaps handed over; None makes one as ``settings.view`` says.
+        on_error: Is told in a line, once, why the run goes on without the file.
 
     Raises:
         ConfigError: A viewer can't be started, or ``--view file`` has no file or can't write it.
@@ -118,6 +119,7 @@ class ViewerFeed:
         file: Path | None = None,
         footer: bool = True,
         process: ViewerProcess | None = None,
+        on_error: Callable[[str], None] | None = None,
     ) -> None:
         self._settings = settings
         self._camera = camera
@@ -142,7 +144,7 @@ class ViewerFeed:
         if process is None:
             check_view(settings, has_folder=file is not None)
         view = resolve_view(settings.view, has_folder=file is not None)
-        self._file = self._open_file(file) if file is not None else None
+        self._file = self._open_file(file, on_error) if file is not None else None
         self._process = process
         if process is None and view in ("native", "web"):
             kind: Literal["native", "web"] = "web" if view == "web" else "native"
@@ -228,16 +230,14 @@ class ViewerFeed:
             port=self._settings.port,
         )
 
-    def _open_file(self, file: Path) -> RerunStream:
+    def _open_file(self, file: Path, on_error: Callable[[str], None] | None) -> FileStream:
         try:
-            return self._open_stream(file)
+            return FileStream(self._open_stream(file), file, self.changes_since, on_error)
         except RuntimeError as err:
             raise ConfigError(f"{file} can't be written: {err}") from err
 
     def _run_scene(self) -> None:
         """Own the scene: take what was submitted, compress images, write the file."""
-        cursor = Cursor()
-        last_flush_s = time.monotonic()
         guard = WorkerGuard("writing what is shown")
         while True:
             self._work.wait(0.2)
@@ -246,10 +246,7 @@ class ViewerFeed:
             with guard:
                 self._take_pending(last_round)
                 if self._file is not None:
-                    self._file.write(self.changes_since(cursor))
-                    if time.monotonic() - last_flush_s > FILE_FLUSH_INTERVAL_S:
-                        self._file.flush(FLUSH_TIMEOUT_S)
-                        last_flush_s = time.monotonic()
+                    self._file.write()
             self._live_work.set()
             if last_round:
                 self._drained.set()
@@ -343,5 +340,4 @@ class ViewerFeed:
         for thread in self._threads:
             thread.join(JOIN_DEADLINE_S)
         if self._file is not None:
-            self._file.flush(JOIN_DEADLINE_S)
             self._file.close()

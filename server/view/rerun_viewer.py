@@ -15,6 +15,7 @@ from semcast.server.mapping.state import Marker
 from semcast.server.view.patch_table import PlacedPatch
 from semcast.server.view.picture import Picture, confidence_colours
 from semcast.server.view.scene import Changes, PointChunk, Row
+from semcast.server.view.state_text import state_text
 
 logger = logging.getLogger(__name__)
 
@@ -58,7 +59,7 @@ class Delivery(Enum):
 
 
 def blueprint(has_truth: bool, has_confidence: bool) -> rrb.Blueprint:
-    """Return the layout: the scene at the left, images at the right, plots below."""
+    """Return the layout: the scene at the left, state and images at the right, plots below."""
     dark = rrb.Background(color=BACKGROUND)
     scene = rrb.Spatial3DView(
         name="Camera and map" + (" (grey: ground truth)" if has_truth else ""),
@@ -82,6 +83,7 @@ def blueprint(has_truth: bool, has_confidence: bool) -> rrb.Blueprint:
                 name="Confidence (turquoise: trusted, red: not)", origin="/confidence", background=dark
             )
         )
+    state = rrb.TextDocumentView(name="State", origin="/state")
     plots = [
         rrb.TimeSeriesView(
             name=name,
@@ -100,7 +102,11 @@ def blueprint(has_truth: bool, has_confidence: bool) -> rrb.Blueprint:
     ]
     return rrb.Blueprint(
         rrb.Vertical(
-            rrb.Horizontal(scene, rrb.Vertical(*pictures), column_shares=[5, 3]),
+            rrb.Horizontal(
+                scene,
+                rrb.Vertical(state, *pictures, row_shares=[1] + [4] * len(pictures)),
+                column_shares=[5, 3],
+            ),
             rrb.Horizontal(*plots),
             row_shares=[7, 3],
         ),
@@ -160,6 +166,7 @@ class RerunStream:
             ),
             static=True,
         )
+        self._stream.log("state", rr.TextDocument.from_fields(media_type="text/markdown"), static=True)
         self._log_pinhole(0.3)
 
     def _log_pinhole(self, frustum_size: float) -> None:
@@ -247,6 +254,10 @@ class RerunStream:
 
     def _send_held(self, stream: rr.RecordingStream) -> None:
         rows, self._held = self._held, []
+        if rows:
+            texts = [state_text(row.frame_id, row.state, row.scalars) for row in rows]
+            columns = rr.TextDocument.columns(text=texts)
+            stream.send_columns("state", indexes=_time_columns(rows), columns=columns)
         for path in sorted({path for row in rows for path in row.scalars}):
             having = [row for row in rows if path in row.scalars]
             self._name_series(stream, path)

@@ -35,13 +35,14 @@ _NO_MARKER = Marker(np.zeros((0, 3)), "")
 
 @dataclass(frozen=True)
 class Row:
-    """One frame's place on the time axis, its pose and its plot values.
+    """One frame's place on the time axis, its pose, state and plot values.
 
     Attributes:
         frame_id: Index of the frame in its source.
         t_source_ns: Recorded time of the frame.
         T_world_cam: 4x4, or None where the frame has no pose.
         T_world_eye: 4x4 of the spectator who follows the camera, None as ``T_world_cam``.
+        state: Tracking state in words, or ``MISSING``.
         scalars: Plot path to value.
     """
 
@@ -49,6 +50,7 @@ class Row:
     t_source_ns: int
     T_world_cam: Array | None
     T_world_eye: Array | None
+    state: str
     scalars: dict[str, float]
 
 
@@ -161,7 +163,9 @@ class Scene:
         T_world_eye = (
             None if view.T_world_cam is None else self._spectator.follow(view.T_world_cam, self._size)
         )
-        self._rows.append(Row(view.frame_id, view.t_source_ns, view.T_world_cam, T_world_eye, view.scalars))
+        self._rows.append(
+            Row(view.frame_id, view.t_source_ns, view.T_world_cam, T_world_eye, view.state, view.scalars)
+        )
         self._num_rows += 1
         for frame_id, t_source_ns, T_world_cam in view.backfilled:
             self._insert_pose(frame_id, t_source_ns, T_world_cam)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from waiting import came_true, until
 
-from semcast.channel.emulator import run_channel, set_channel
+from semcast.channel.emulator import Emulator, run_channel, set_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
@@ -18,6 +18,7 @@ from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import channel_key, rx_key, status_key, tx_key
 from semcast.common.loopback import open_hub
 from semcast.common.messages import ChannelReport, StatusMessage, SymbolFrame
+from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.phy.qam import constellation
@@ -241,6 +242,19 @@ def test_delay_is_added(ends, make):
     e.tx.put(pack(make(0)))
     until(lambda: e.received)
     assert 0.15 <= time.monotonic() - started_s < 2.0
+
+
+@pytest.mark.parametrize("delay_ms", [0.0, 20.0])
+def test_what_can_not_be_sent_on_is_counted_and_told(make, delay_ms):
+    hub, _ = open_hub()
+    metrics = Metrics("channel")
+    emulator = Emulator(hub, EmulatorSettings(link=ChannelSettings(delay_ms=delay_ms)), metrics)
+    emulator._live._publisher.undeclare()
+    emulator._carry(make(0))
+    until(lambda: metrics.drops == {"unsent": 1}, "it is counted")
+    assert "rx/symbols can't be sent" in metrics.status(0).last_error
+    emulator.close()
+    hub.close()
 
 
 def test_bad_messages_are_counted_and_told_and_do_no_harm(ends, make, caplog):

@@ -219,6 +219,17 @@ def test_a_file_that_contradicts_itself_or_the_settings_is_one_clear_error(toml,
 
 
 @pytest.mark.parametrize(
+    "text", ["snr_bd = 4", 'snr_db = "4"', "snr_db = 4\n[radio]\nsnr_db = 5", "snr_db = "]
+)
+def test_what_is_wrong_in_a_file_is_said_with_its_name_and_what_is_wrong_in_a_flag_without(toml, text):
+    file = toml(text)
+    with pytest.raises(ConfigError, match=f"^{re.escape(str(file))}"):
+        parse([], file)
+    with pytest.raises(ConfigError, match="^snr_db must be in"):
+        parse(["--snr-db", "99"], toml("snr_db = 4"))
+
+
+@pytest.mark.parametrize(
     ("cls", "text", "words", "message"),
     [
         (Node, 'radio = "awgn"', ["--snr-db", "4"], "radio must be a table of settings, got 'awgn'"),

@@ -173,6 +173,14 @@ def test_flushed_messages_are_in_the_file_before_it_is_closed():
     assert [m.data for m in scanned(stream.getvalue())[0]] == [b"payload"]
 
 
+def test_a_cut_is_told_once_however_often_the_file_is_read(tmp_path, caplog):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(written(made_messages(), finish=False))
+    reader = RecordingReader(path)
+    assert list(reader.messages()) == list(reader.messages())
+    assert caplog.text.count("was cut off") == 1
+
+
 def test_info_counts_topics_times_and_messages_the_recorder_missed():
     messages = [("t", "pose", 5, 0, b"abc"), ("t", "pose", 6, 1, b"de"), ("t", "pose", 9, 4, b"f")]
     info = scan_info(io.BytesIO(written(messages)), "bytes")

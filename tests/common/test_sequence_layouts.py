@@ -192,6 +192,21 @@ def test_euroc_layout_gives_poses_of_the_camera_not_of_the_body(tmp_path, write_
     assert sequence.intrinsics == CAMERA, "the pinhole of the undistorted image"
     assert sequence.times_ns[0] == 1403636579763555584
     np.testing.assert_allclose(sequence.groundtruth().T_world_cam, poses(2) @ T_body_cam, atol=1e-9)
+    (truth / "data.csv").write_text(f"{'9' * 400},0,0,0,1,0,0,0\n")
+    with pytest.raises(SourceError, match="can't be used as ground truth: int too large"):
+        open_sequence(folder)
+
+
+def test_a_list_of_images_that_a_power_cut_filled_with_zeros_is_told(tmp_path, write_images):
+    folder = tmp_path / "desk"
+    write_images(folder / "rgb", 2, "{:d}.png")
+    (folder / "rgb.txt").write_text("0.5 rgb/0.png\n1.5 rgb/1.png\n2.5 rgb/\0\0\0\n")
+    sequence = open_sequence(folder)
+    messages, _ = sequence.refused_images()
+    assert len(messages) == 1
+    assert "can't be read: embedded null byte" in messages[0]
+    with pytest.raises(SourceError, match="can't be read: embedded null byte"):
+        sequence.image(2)
 
 
 def test_blender_layout_sorts_by_number_and_looks_along_z(tmp_path, write_images):

@@ -1,9 +1,11 @@
 import cv2
 import numpy as np
 import pytest
+from full_disk import room_for
 
 from semcast.common.errors import SemcastError
 from semcast.evaluation import plots
+from semcast.evaluation.picture_strip import write_picture
 from semcast.evaluation.plots import plot_against_snr, plot_pair_errors, plot_path, plot_reliability
 
 
@@ -92,6 +94,22 @@ def test_names_are_no_formulas_and_may_be_of_any_script(tmp_path, name):
 def test_an_unknown_file_type_is_one_clear_error(tmp_path):
     with pytest.raises(SemcastError, match="plot"):
         plot_path(tmp_path / "a.nonsense", {"a": np.zeros((2, 3))})
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda path: plot_path(path, {"a": np.zeros((2, 3))}),
+        lambda path: write_picture(path, np.zeros((500, 500, 3), np.uint8)),
+    ],
+)
+def test_a_full_disk_leaves_the_former_picture(tmp_path, draw):
+    path = tmp_path / "a.png"
+    path.write_bytes(b"former")
+    with room_for(100), pytest.raises(SemcastError, match="can't be written"):
+        draw(path)
+    assert path.read_bytes() == b"former"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_names_of_curves_stand_beside_the_axes_and_hide_no_point(tmp_path, monkeypatch):

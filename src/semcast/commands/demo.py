@@ -13,7 +13,7 @@ from rich.table import Table
 
 from semcast.channel.emulator import warn_of_settings
 from semcast.commands.console import plain_console
-from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
+from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings, run_until_stopped
 from semcast.common.run_folder import RUN_FILES, VIEWER_NAME
 from semcast.common.sequence import open_sequence
 from semcast.demo import DemoSettings, default_sequence, run_demo
@@ -108,7 +108,11 @@ def run(arguments: argparse.Namespace) -> int:
         talk.print(failures[0], soft_wrap=True)
         code = code or 1
     if not result:
-        talk.print("no summary was written; the logs of the three processes say why:", settings.out / "logs")
+        if code == INTERRUPTED and not failures:
+            talk.print("stopped before the first frame was tracked: there are no results")
+        else:
+            logs = settings.out / "logs"
+            talk.print("no summary was written; the logs of the three processes say why:", logs)
         return code or 1
     shown = talk if json_to_stdout else plain_console()
     shown.print(summary_table(result))

@@ -13,6 +13,9 @@ from semcast.parent import stop_with_parent
 
 S = TypeVar("S")
 
+#: Exit code of a run that Ctrl-C ended.
+INTERRUPTED = 130
+
 
 def add_settings(parser: argparse.ArgumentParser, cls: type, skip: frozenset[str] = frozenset()) -> None:
     """Add ``--config`` and one flag per setting of ``cls`` but those to skip, which are the command's own."""
@@ -72,11 +75,11 @@ def stop_on_signals(stop: threading.Event) -> Iterator[Interrupted]:
 
 
 def run_until_stopped(work: Callable[[threading.Event], object]) -> int:
-    """Call ``work(stop)`` with signals wired to ``stop``; exit code 130 after Ctrl-C, else 0.
+    """Call ``work(stop)`` with signals wired to ``stop``; exit code ``INTERRUPTED`` after Ctrl-C, else 0.
 
     A role of a demo stops with the demo, too.
     """
     stop = threading.Event()
     with stop_on_signals(stop) as interrupted, stop_with_parent(stop):
         work(stop)
-    return 130 if interrupted.by_user else 0
+    return INTERRUPTED if interrupted.by_user else 0

@@ -130,8 +130,12 @@ def test_the_file_can_be_read_back_and_holds_everything(tmp_path):
         "/confidence",
         "/plots/link/psnr_db",
         "/plots/drops/stale",
+        "/state",
     ):
         assert entity in text, entity
+    states = rerun_output("rrd", "print", "-vvv", "--entity", "/state", str(file))
+    for k in range(5):
+        assert f"**tracking**, frame {k}" in states, k
 
 
 def test_plot_values_go_out_together_and_none_is_lost(tmp_path):
@@ -161,6 +165,17 @@ def test_plot_values_of_a_stream_that_rests_go_out_all_the_same(tmp_path):
 
     until(is_out, "nothing waits")
     stream.close()
+
+
+def test_the_state_has_a_place_of_its_own_above_the_images():
+    for has_confidence, names in (
+        (True, ["State", "Received image", "Confidence"]),
+        (False, ["State", "Re"]),
+    ):
+        top, _ = blueprint(has_truth=False, has_confidence=has_confidence).root_container.contents
+        _, right = top.contents
+        assert len(right.contents) == len(names)
+        assert all(view.name.startswith(name) for view, name in zip(right.contents, names, strict=True))
 
 
 def test_a_plot_has_a_legend_where_it_has_several_curves():

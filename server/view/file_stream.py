@@ -1,0 +1,66 @@
+"""The way into ``run.rrd``: everything the scene gets, until the disk takes no more, which is told once."""
+
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from semcast.server.view.rerun_viewer import Delivery, RerunStream
+from semcast.server.view.scene import Changes, Cursor
+
+logger = logging.getLogger(__name__)
+
+_FLUSH_INTERVAL_S = 1.0
+_FLUSH_TIMEOUT_S = 1.0
+#: Longest wait at the end for a slow disk.
+_CLOSE_DEADLINE_S = 5.0
+
+
+class FileStream:
+    """Writes what a file lacks. Used from one thread at a time.
+
+    Args:
+        stream: Writes to the file.
+        path: The file, for messages.
+        changes_since: Returns what is not in the file yet and moves the cursor on.
+        on_error: Is told in a line, once, why the run goes on without the file.
+    """
+
+    def __init__(
+        self,
+        stream: RerunStream,
+        path: Path,
+        changes_since: Callable[[Cursor], Changes],
+        on_error: Callable[[str], None] | None = None,
+    ) -> None:
+        self._stream = stream
+        self._path = path
+        self._changes_since = changes_since
+        self._on_error = on_error
+        self._cursor = Cursor()
+        self._flushed_s = time.monotonic()
+        self._has_failed = False
+
+    def write(self) -> None:
+        """Write what is new; about once a second, see that it has reached the disk."""
+        if self._has_failed:
+            return
+        self._stream.write(self._changes_since(self._cursor))
+        if time.monotonic() - self._flushed_s > _FLUSH_INTERVAL_S:
+            self._flush(_FLUSH_TIMEOUT_S)
+            self._flushed_s = time.monotonic()
+
+    def _flush(self, timeout_s: float) -> None:
+        # Rerun writes on a thread of its own, which ends at the first write that fails.
+        if self._stream.flush(timeout_s) is not Delivery.SEVERED or self._has_failed:
+            return
+        self._has_failed = True
+        text = f"{self._path} can't be written to its end (is there room on the disk?)"
+        logger.error("%s, the run goes on without it", text)
+        if self._on_error is not None:
+            self._on_error(text)
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._flush(_CLOSE_DEADLINE_S)
+        self._stream.close(_CLOSE_DEADLINE_S)
