@@ -115,8 +115,10 @@ def test_a_lens_that_is_clearly_another_one_is_told_once(caplog):
         cx = shaken_views.CAMERA.cx + cx_off
         camera = replace(shaken_views.CAMERA, fx=factor * 400.0, fy=factor * 400.0, cx=cx)
         watch = ReadoutWatch(shaken_views.CAMERA, is_wanted=True)
-        for seed in range(3):  # twelve views each
-            watch.take(shaken_views.adjusted(camera, seed=seed, radial=radial))
+        for seed in range(3):  # twelve keyframes each
+            result = shaken_views.adjusted(camera, seed=seed, radial=radial)
+            others = replace(result.problem, keyframe_ids=100 * seed + result.problem.keyframe_ids)
+            watch.take(replace(result, problem=others))
             if seed == 0:
                 assert "semcast lens" not in caplog.text, "too few views"
         return caplog.text
