@@ -1,5 +1,6 @@
 """A rolling shutter that nobody told of is found while the map grows, and made up for."""
 
+import functools
 import logging
 import re
 from dataclasses import replace
@@ -26,6 +27,7 @@ def pose_at(t_s):
     return make_transform(exp_so3(turn), (0.9 * t_s, 0.04 * np.sin(8.0 * t_s), 0.3 * t_s))
 
 
+@functools.cache  # several reconstructions see the same images, and drawing them takes as long as one
 def rolled(t_s, readout_s, axis):
     """An image whose rows (axis 0) or columns (1) are read one after the other."""
     size = CAMERA.shape_hw[axis]
