@@ -18,6 +18,7 @@ from rosbags.rosbag2 import ReaderError as Reader2Error
 from rosbags.typesys import Stores, get_typestore
 
 from semcast.agent.frame_tree import StampedTransform, plain_name
+from semcast.agent.ros_bag_parts import check_times, in_order
 from semcast.agent.ros_image import compressed_image_file, raw_image_file
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
@@ -77,15 +78,21 @@ class RosBag:
         self._path = path
         if not path.exists():
             raise SourceError(f"there is no file or folder {path}")
+        parts = in_order(bag_parts(path))
         try:
             with self._said():
                 # Bags of ROS 2 before Iron don't hold the definitions of their messages.
-                self._reader = AnyReader(bag_parts(path), default_typestore=get_typestore(Stores.LATEST))
+                self._reader = AnyReader(parts, default_typestore=get_typestore(Stores.LATEST))
                 self._reader.open()
         except SourceError as err:
             if is_ros_bag(path):
                 raise
             raise SourceError(f"{path} is no ROS bag: 'semcast info' says what it is") from err
+        try:
+            check_times(parts, [(part.start_time, part.end_time) for part in self._reader.readers])
+        except SourceError:
+            self._reader.close()
+            raise
 
     def __enter__(self) -> "RosBag":
         return self
@@ -215,22 +222,28 @@ class RosBag:
 
         Args:
             near: A topic. Of several namespaces those count that it lies in, if there are such: robots of a
-                team may have frames of the same names.
+                team may have frames of the same names. Else what the root has no topic for is taken from all.
         """
-        topics = {
-            c.topic
-            for c in self._reader.connections
-            if c.msgtype in _TF_TYPES and c.topic.rpartition("/")[2] in _TF_TOPICS
-        }
-        around = {topic for topic in topics if near.startswith(topic.rpartition("/")[0] + "/")}
-        yield from _valid_transforms("tf", self._transforms(around or topics))
+        topics = {c.topic for c in self._reader.connections if c.msgtype in _TF_TYPES}
+        places = {topic: _place(topic) for topic in topics if _place(topic)[1] in _TF_TOPICS}
+        around = {topic for topic, (folder, _) in places.items() if near.startswith(folder + "/")}
+        if not any(places[topic][0] for topic in around):  # in no namespace: the root may say a part only
+            said = {places[topic][1] for topic in around}
+            around |= {topic for topic, (_, name) in places.items() if name not in said}
+        yield from _valid_transforms("tf", self._transforms(around))
 
     def _transforms(self, topics: set[str]) -> Iterator[tuple[str, str, int | None, Any]]:
         for connection, recorded_ns, message in self._messages(topics):
             for said in message.transforms:
-                is_fixed = _TF_TOPICS[connection.topic.rpartition("/")[2]]
+                is_fixed = _TF_TOPICS[_place(connection.topic)[1]]
                 time_ns = None if is_fixed else _stamp_ns(said.header) or recorded_ns
                 yield said.header.frame_id, said.child_frame_id, time_ns, said.transform
+
+
+def _place(topic: str) -> tuple[str, str]:
+    """Return the namespace of a topic, "" at the root, and its last name."""
+    namespace, _, name = topic.rpartition("/")
+    return namespace, name
 
 
 def _valid_transforms(

@@ -30,7 +30,10 @@ def is_ros_bag(path: Path) -> bool:
 
 
 def bag_parts(path: Path) -> list[Path]:
-    """Return the files of a folder of nothing but ``.bag``, as ROS 1 splits one; else the path itself."""
+    """Return the files of a folder of nothing but ``.bag``, as ROS 1 splits one; else the path itself.
+
+    Whether they belong together is told when they are opened.
+    """
     inside = sorted(path.iterdir()) if path.is_dir() else []
     is_split = all(part.suffix.lower() == ".bag" for part in inside)
     return inside if inside and is_split else [path]

@@ -29,6 +29,7 @@ from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
+from semcast.server.mapping.witnesses import Witnesses
 from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
@@ -172,18 +173,7 @@ class _Listening(InlineBundle):
         super().__init__()
         self.watch = ReadoutWatch(camera, is_wanted=True)
         self.world: WorldMap | None = None
-        self._told: dict[int, Array] = {}
-        self._num_observed = self._num_fitted = 0
-
-    @property
-    def views(self) -> list[Array]:
-        """What each keyframe's residuals say, in order of time."""
-        return [self._told[frame_id] for frame_id in sorted(self._told)]
-
-    @property
-    def share_left(self) -> float:
-        """Share of the variance of observations that is left when unknowns were fitted to them."""
-        return 1.0 - self._num_fitted / self._num_observed if self._num_observed else 1.0
+        self.witnesses = Witnesses()
 
     def submit(self, problem: BundleProblem) -> bool:
         """Adjust now."""
@@ -193,18 +183,9 @@ class _Listening(InlineBundle):
     def take(self, wait: bool = False) -> BundleResult | None:
         """Return the result of the last ``submit``, once."""
         result = super().take(wait)
-        if result is not None and result.left_over is not None:
-            self._note(result, result.left_over)
+        if result is not None:
+            self.witnesses.note(result)
         return result
-
-    def _note(self, result: BundleResult, left_over: Array) -> None:
-        """Note what an adjustment leaves. Windows overlap: what a keyframe says again is no other witness."""
-        for frame_id, told in zip(result.problem.keyframe_ids.tolist(), left_over, strict=True):
-            self._told[frame_id] = self._told.get(frame_id, 0.0) + told
-        used = np.isfinite(result.residual_px).all(axis=1)
-        num_views, num_points = (len(np.unique(k[used])) for k in (result.problem.view, result.problem.point))
-        self._num_observed += 2 * int(used.sum())
-        self._num_fitted += 6 * num_views + 3 * num_points
 
 
 def listen(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout) -> Heard:
@@ -232,4 +213,4 @@ def listen(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout)
     finally:
         reconstruction.close()
     mean_px = float(np.mean(errors_px)) if errors_px else np.inf
-    return Heard(bundle.views, mean_px, len(errors_px), bundle.share_left)
+    return Heard(bundle.witnesses.views, mean_px, len(errors_px), bundle.witnesses.share_left)

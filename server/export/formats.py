@@ -74,7 +74,7 @@ def export_run(
             raise ConfigError("--format rrd shows the map in its own frame, without --align or --marker-m")
         if parts is not None and format_name == "dense":
             raise ConfigError(
-                f"--format dense can't be in metres here: each part has its own scale ({parts}), and "
+                f"--format dense can't be placed here: each part has its own scale ({parts}), and "
                 "points of the dense cloud do not know their part"
             )
         if parts is not None and part == ALL:

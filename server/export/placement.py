@@ -103,7 +103,8 @@ def place_by_path(data: RunData, known: Trajectory) -> Placement:
         t = p_known.mean(axis=0) - scale * R @ p_map.mean(axis=0)
     rms = float(np.sqrt(((scale * p_map @ R.T + t - p_known) ** 2).sum(axis=1).mean()))
     words = (
-        f"aligned with {len(p_map)} known poses, {rms:.3g} m apart (RMS); 1 unit of the map is {scale:.4g} m"
+        f"aligned with {len(p_map)} known poses, {rms:.3g} units of the path apart (RMS); "
+        f"1 unit of the map is {scale:.4g} units of the path"
     )
     return Placement(scale, R, t, "axes and unit of the known path", words)
 

@@ -11,6 +11,7 @@ from semcast.common.camera import MAX_READOUT_MS, Intrinsics
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
 from semcast.server.mapping.lens import believed_lens
 from semcast.server.mapping.readout import Axis, Readout, body_velocity, fit_readout
+from semcast.server.mapping.witnesses import Witnesses
 from semcast.server.mapping.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
@@ -29,14 +30,14 @@ _LEAST_MS, _LEAST_CHANGE_MS = 4.0, 1.0
 #: An estimate counts when it is so many standard deviations from 0 and explains such a share of the squared
 #: residuals: those of global shutters explained up to .015, behind bad links. A change of what was found is
 #: no question of whether the shutter rolls.
-_LEAST_SIGMAS, _LEAST_EXPLAINED, _LEAST_EXPLAINED_MORE = 6.0, 0.03, 0.002
-#: From so many views on, an estimate is the last one if it is that sure. After many more there is none: a
-#: camera that hardly turns does not tell, and it matters little.
-_ENOUGH_VIEWS, _SURE_MS, _MOST_VIEWS = 40, 0.7, 600
-#: From so many views on, a focal length is called wrong that is so by this share, a distortion that displaces
-#: a pixel by this share of its distance to the centre, a principal point that is so by this share of a focal
-#: length.
-_LENS_VIEWS, _LEAST_FOCAL, _LEAST_RADIAL, _LEAST_CENTRE = 24, 0.02, 0.02, 0.01
+_LEAST_SIGMAS, _LEAST_EXPLAINED, _LEAST_EXPLAINED_MORE = 5.0, 0.03, 0.002
+#: From so many keyframes on, an estimate is the last one if it is surer than the least change. After many
+#: more there is none: a camera that hardly turns does not tell, and it matters little.
+_ENOUGH_VIEWS, _SURE_MS, _MOST_VIEWS = 24, 1.0, 170
+#: From so many keyframes on, a focal length is called wrong that is so by this share, a distortion that
+#: displaces a pixel by this share of its distance to the centre, a principal point that is so by this share
+#: of a focal length.
+_LENS_VIEWS, _LEAST_FOCAL, _LEAST_RADIAL, _LEAST_CENTRE = 16, 0.02, 0.02, 0.01
 
 
 class ReadoutWatch:
@@ -51,7 +52,7 @@ class ReadoutWatch:
         self._camera = camera
         self._is_done = not is_wanted
         self._axis: Axis | None = None
-        self._views: list[Array] = []
+        self._witnesses = Witnesses()
         self._found: Readout | None = None
         self._lens_is_told = False
         self.forget_frames()
@@ -106,48 +107,55 @@ class ReadoutWatch:
         """Take what an adjustment has told."""
         if result.left_over is None or self._is_done or self._found is not None:
             return
-        self._views += list(result.left_over)
+        self._witnesses.note(result)
         self._look_at_lens()
-        fit = fit_readout(self._views, self._axis)
+        fit = fit_readout(self._witnesses.views, self._axis)
         if fit is None:
             return
+        num_views, sigma_ms = len(self._witnesses), fit.sigma_ms * self._sigma_factor
         logger.debug(
             "readout by %d views: %s, sigma %.2f ms, explains %.4f",
-            len(self._views),
+            num_views,
             fit.readout,
-            fit.sigma_ms,
+            sigma_ms,
             fit.explained,
         )
         is_first = self._axis is None
         least_ms = _LEAST_MS if is_first else _LEAST_CHANGE_MS
         least_explained = _LEAST_EXPLAINED if is_first else _LEAST_EXPLAINED_MORE
-        is_sure = fit.readout.ms >= _LEAST_SIGMAS * fit.sigma_ms and fit.explained >= least_explained
+        is_sure = fit.readout.ms >= _LEAST_SIGMAS * sigma_ms and fit.explained >= least_explained
         # An object in the middle of the image is read in no time: what its corners do wrong would take a
         # readout longer than any camera's, and images put right for that would be spoilt.
         if is_sure and least_ms <= fit.readout.ms <= MAX_READOUT_MS:
-            self._found, self._axis, self._views = fit.readout, fit.readout.axis, []
+            self._found, self._axis, self._witnesses = fit.readout, fit.readout.axis, Witnesses()
         else:
-            is_known = len(self._views) >= _ENOUGH_VIEWS and fit.sigma_ms <= _SURE_MS
-            self._is_done = is_known or len(self._views) >= _MOST_VIEWS
+            is_known = num_views >= _ENOUGH_VIEWS and sigma_ms <= _SURE_MS
+            self._is_done = is_known or num_views >= _MOST_VIEWS
+
+    @property
+    def _sigma_factor(self) -> float:
+        """By how much estimates scatter more than residuals do, which unknowns were fitted to."""
+        return float(self._witnesses.share_left**-0.5)
 
     def _look_at_lens(self) -> None:
         """Say once if the lens is clearly another one."""
-        if self._lens_is_told or len(self._views) < _LENS_VIEWS:
+        if self._lens_is_told or len(self._witnesses) < _LENS_VIEWS:
             return
-        if (fit := believed_lens(self._views)) is None or fit.explained < _LEAST_EXPLAINED:
+        if (fit := believed_lens(self._witnesses.views)) is None or fit.explained < _LEAST_EXPLAINED:
             return
+        least_sigmas = _LEAST_SIGMAS * self._sigma_factor
         wrong = []
-        if abs(fit.focal) >= max(_LEAST_FOCAL, _LEAST_SIGMAS * fit.sigma_focal):
+        if abs(fit.focal) >= max(_LEAST_FOCAL, least_sigmas * fit.sigma_focal):
             way = "short" if fit.focal > 0.0 else "long"
             wrong.append(f"the focal length seems about {100.0 * abs(fit.focal):.0f} % too {way}")
         is_sure = any(
-            abs(k) >= _LEAST_SIGMAS * s > 0.0 for k, s in zip(fit.radial, fit.sigma_radial, strict=True)
+            abs(k) >= least_sigmas * s > 0.0 for k, s in zip(fit.radial, fit.sigma_radial, strict=True)
         )
         if is_sure and self._most_bent(fit.radial) >= _LEAST_RADIAL:
             off = (f"k{number} {k:+.3f}" for number, k in enumerate(fit.radial, 1) if k)
             wrong.append(f"the distortion seems off ({', '.join(off)})")
         centre = zip(fit.centre, fit.sigma_centre, strict=True)
-        if any(abs(c) >= max(_LEAST_CENTRE, _LEAST_SIGMAS * sigma) for c, sigma in centre):
+        if any(abs(c) >= max(_LEAST_CENTRE, least_sigmas * sigma) for c, sigma in centre):
             x_px, y_px = fit.centre[0] * self._camera.fx, fit.centre[1] * self._camera.fy
             wrong.append(f"the principal point seems off (x {x_px:+.0f}, y {y_px:+.0f} pixels)")
         if wrong:

@@ -42,6 +42,12 @@ def test_levels_are_nearest_to_the_demand_and_use_the_budget_up():
     assert [LEVELS[k] for k in levels_for(demand, 188 + 94 + 47)] != [188, 94, 48]
 
 
+def test_of_blocks_that_ask_for_the_same_the_first_get_more():
+    # Both ends of the link have to divide alike, whatever their processor sorts by.
+    levels = levels_for(np.zeros(200), 100 * LEVELS[1] + 100 * LEVELS[0])
+    assert levels.tolist() == [1] * 100 + [0] * 100
+
+
 def test_levels_without_budget_or_with_all_of_it():
     demand = np.random.default_rng(0).normal(0, 2, (3, 4))
     assert not levels_for(demand, 0).any()

@@ -196,6 +196,13 @@ def test_noise_by_hand():
     assert channel.noise_var[0] == pytest.approx(2 * 0.2**2, rel=1e-5)
 
 
+def test_a_link_without_noise_has_a_thousand_millionth_of_its_power_as_noise():
+    pilots = pilot_symbols(SlotLayout(num_slots=2, blocks_per_slot=1)).astype(np.complex128)
+    channel = estimate_channel(2.0 * pilots)
+    np.testing.assert_allclose(channel.noise_var, 4e-9, rtol=1e-6)
+    assert channel.noise_floor == pytest.approx(4e-9)
+
+
 def test_wrong_sizes_are_named():
     with pytest.raises(ValueError, match=r"slots_rx must have shape \(2 96\), got \(2, 48\)"):
         equalise(np.zeros((2, 48), np.complex64), (32, 32), "16qam")

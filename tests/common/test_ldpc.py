@@ -62,7 +62,9 @@ def test_a_block_is_as_long_as_the_standard_allows(num_info, num_sent, num_block
     assert plan_blocks(num_info, num_sent).num_blocks == num_blocks
 
 
-@pytest.mark.parametrize(("num_info", "lifting"), [(192, 32), (193, 26), (560, 72), (561, 64), (641, 72)])
+@pytest.mark.parametrize(
+    ("num_info", "lifting"), [(192, 32), (193, 26), (560, 72), (561, 64), (640, 72), (641, 72)]
+)
 def test_lifting_sizes_of_the_second_graph(num_info, lifting):
     # K_b is 6, 8, 9 or 10: 193 / 8 = 24.1, and the next size is 26.
     assert plan_blocks(num_info, 2 * num_info).graph.lifting == lifting

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import resource
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from semcast.common.trajectory import Trajectory
 from semcast.server import frame_rows
 from semcast.server.export.outputs import write_json
 from semcast.server.frame_rows import FrameRow, FrameRows, read_rows, summarise
+from semcast.server.mapping.state import DecodedFrame, FrameResult, TrackingState
 from semcast.server.sent_frames import stretches
 
 
@@ -219,3 +221,21 @@ def test_the_rate_by_arrival_survives_a_clock_that_began_anew():
     times_ns = [9_000_000_000, 9_250_000_000, 10_000_000, 260_000_000]
     summary = summary_of([row(k, t_arrival_ns=t) for k, t in enumerate(times_ns)])
     assert summary["processed_rate_hz"] == pytest.approx(4.0)
+
+
+def test_the_row_of_a_tracked_frame_is_what_was_received_and_what_came_of_it():
+    none = np.zeros((0, 2), np.float32)
+    frame = DecodedFrame(
+        4, 400, np.zeros((2, 2, 3), np.uint8), np.array([[0.2, 0.4], [0.9, 0.9]], np.float32)
+    )
+    lost = FrameResult(
+        4, 400, TrackingState.LOST, None, 30, 8, None, None, False, 2, 1, none, np.zeros(0, bool)
+    )
+    link = {"snr_set_db": 3.0, "snr_estimated_db": 2.5, "psnr_db": None, "age_ms": 50.0}
+    made = FrameRow.of(frame, lost, **link)
+    assert (made.frame_id, made.t_source_ns, made.state, made.posed) == (4, 400, "lost", False)
+    assert (made.num_tracked, made.num_inliers, made.map_epoch, made.submap) == (30, 8, 2, 1)
+    assert made.confidence_mean == pytest.approx(0.6)
+    assert (made.snr_set_db, made.age_ms) == (3.0, 50.0)
+    assert FrameRow.of(frame, replace(lost, T_world_cam=np.eye(4)), **link).posed
+    assert FrameRow.of(replace(frame, confidence=None), lost, **link).confidence_mean is None

@@ -2,12 +2,13 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.server.decoder import DecodedArrival
 from semcast.server.frame_views import missing_view
-from semcast.server.view.frame_view import MISSING
+from semcast.server.view.frame_view import MISSING, FrameView
 
 CAMERA = Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
 
@@ -48,3 +49,26 @@ def test_what_was_lost_on_the_air_leaves_the_image_before_it(missing):
     assert view.image is None
     assert view.confidence is None
     assert view.scalars == {"link/snr_set_db": 3.0, "drops/all": 1.0, "drops/lost_on_air": 1.0}
+
+
+def test_what_waits_for_the_scene_holds_no_image():
+    pose, added = np.eye(4), ((2, 200, np.eye(4)),)
+    pixels, ones = np.zeros((48, 64, 3), np.uint8), np.ones((48, 64), np.float32)
+    view = FrameView(
+        3,
+        300,
+        pose,
+        "tracking",
+        {"a": 1.0},
+        pixels,
+        ones,
+        np.ones((5, 2), np.float32),
+        np.ones(5, bool),
+        added,
+    )
+    light = view.without_image()
+    assert (light.image, light.confidence) == (None, None)
+    assert (light.keypoints_xy.shape, light.keypoint_inlier.shape) == ((0, 2), (0,))
+    assert (light.frame_id, light.t_source_ns, light.state, light.scalars) == (3, 300, "tracking", {"a": 1.0})
+    assert light.T_world_cam is pose
+    assert light.backfilled is added

@@ -459,6 +459,8 @@ def test_a_frame_that_overtakes_the_camera_of_a_new_start_waits_for_it(ends, mak
     assert e.receiver.agent_epoch == EPOCH
     e.receiver._on_camera(pack(camera(EPOCH + 1)))
     assert e.receiver.next(5).message.agent_epoch == EPOCH + 1
+    e.receiver._on_camera(pack(camera(EPOCH + 1)))
+    assert e.metrics.drops == {}, "it waited once, and does not come again"
 
 
 def test_starts_that_nobody_announced_do_not_interrupt_a_stream(ends, make):

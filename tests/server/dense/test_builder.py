@@ -231,18 +231,19 @@ def test_a_new_map_has_a_new_cloud_and_does_not_wait_for_the_old_one():
     assert runner.closed
 
 
-def test_depth_in_units_of_before_a_join_makes_no_points_after_it():
-    """What is left over from before, or under way, is half as far away as the wall is now."""
+@pytest.mark.parametrize("scale", [2.0, 0.5])
+def test_depth_in_units_of_before_a_join_makes_no_points_after_it(scale):
+    """What is left over from before, or under way, is as far away as the wall was then."""
     world, builder, runner = run(8, submap=1)
     finish(builder, world)
     for k in range(8, 12):
         add_keyframe(world, builder, k, submap=1)
         builder.advance(world)
-    world.transform_submap(1, 0, 2.0, np.eye(4))
-    runner.unit = 2.0
+    world.transform_submap(1, 0, scale, np.eye(4))
+    runner.unit = scale
     builder.follow(world, list(range(12)))
     finish(builder, world)
-    np.testing.assert_allclose(builder.points(world).xyz[:, 2], 2.0 * WALL, rtol=1e-4)
+    np.testing.assert_allclose(builder.points(world).xyz[:, 2], scale * WALL, rtol=1e-4)
 
 
 def test_the_end_of_a_stream_waits_no_longer_than_it_may():

@@ -51,8 +51,12 @@ def test_a_run_takes_over_frame_and_unit_of_a_known_path(arc_run):
     np.testing.assert_allclose(placed.T_world_cam, in_metres(data.T_world_cam), atol=1e-9)
     np.testing.assert_allclose(placed.xyz, SCALE * data.xyz @ R_METRES_MAP.T + T_METRES_MAP, atol=1e-9)
     np.testing.assert_array_equal(placed.observed_xy, data.observed_xy)
-    assert "9 known poses, " in placement.words
-    assert "1 unit of the map is 0.2 m" in placement.words
+    # Nothing says that the path is in metres.
+    assert re.fullmatch(
+        r"aligned with 9 known poses, \S+ units of the path apart \(RMS\); "
+        r"1 unit of the map is 0\.2 units of the path",
+        placement.words,
+    )
 
 
 def test_a_path_is_known_at_other_times_and_in_part_of_the_run(arc_run):
@@ -295,7 +299,7 @@ def test_placements_that_can_not_be_are_refused_in_one_line(tmp_path, marker_run
     assert export(tmp_path, "--format", "dense", "--part", "largest", *out) == 1
     assert "--part must be all for --format dense" in capsys.readouterr().err
     assert export(tmp_path, "--format", "dense", "--marker-m", 0.3, *out) == 1
-    assert "--format dense can't be in metres here: " in capsys.readouterr().err
+    assert "--format dense can't be placed here: " in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
     marker = ("--marker-m", SIDE * SCALE, "--part", "1")
     assert export(tmp_path, "--format", "tum", *marker, *out) == 0

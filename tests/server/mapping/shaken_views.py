@@ -24,7 +24,7 @@ def rolling_xy(xyz, t_s, camera):
     axis = int(camera.readout_from in ("top", "bottom"))
     readout_s = 1e-3 * Readout.of(camera).signed_ms
     xy = camera.project(transform_points(invert_transform(pose_at(t_s)), xyz))
-    for _ in range(4):
+    for _ in range(4 if readout_s else 0):
         late_s = readout_s * (xy[:, axis] / (SIZE_WH[axis] - 1) - 0.5)
         in_cam = [
             transform_points(invert_transform(pose_at(t_s + s)), p[None])[0]

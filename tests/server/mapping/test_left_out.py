@@ -94,6 +94,31 @@ def test_landmarks_whose_rays_do_not_meet_stay(monkeypatch):
     np.testing.assert_array_equal(world.landmarks.xyz[world.landmarks.rows(slipped)], before)
 
 
+def test_landmarks_that_slid_along_their_edge_are_placed_by_what_is_known_across_it(monkeypatch):
+    world, points = world_with_shaken_keyframes()
+    result, left_out = adjusted(world, monkeypatch, 400)
+    for k, keyframe in enumerate(world.keyframes):
+        keyframe.xy[left_out, 1] += 2.5 * (-1) ** k
+        keyframe.edge = np.zeros_like(keyframe.xy)
+        keyframe.edge[left_out] = (0.0, 0.5 * np.log(10.0))  # upright, known across it ten times as well
+    assert place_left_out(world, CAMERA, NOISE, result) == len(left_out)
+    assert error_of(world, left_out, points) < 0.01
+
+
+def test_landmarks_need_two_keyframes_and_one_that_was_moved(monkeypatch):
+    world, points = world_with_shaken_keyframes()
+    result, left_out = adjusted(world, monkeypatch, 400)
+    assert result.problem.fixed.tolist() == [True, True] + [False] * 6
+    by_fixed, by_one, by_two = left_out[:3]
+    for k, keyframe in enumerate(world.keyframes):
+        gone = [(by_fixed, k > 1), (by_one, k != 4), (by_two, k not in (2, 7))]
+        keyframe.drop_observations(np.isin(keyframe.ids, [track for track, is_gone in gone if is_gone]))
+    before = world.landmarks.xyz[world.landmarks.rows(left_out[:2])].copy()
+    assert place_left_out(world, CAMERA, NOISE, result) == len(left_out) - 2
+    np.testing.assert_array_equal(world.landmarks.xyz[world.landmarks.rows(left_out[:2])], before)
+    assert error_of(world, by_two[None], points) < 0.03
+
+
 def test_landmarks_born_later_and_of_other_submaps_stay(monkeypatch):
     world, _ = world_with_shaken_keyframes()
     result, left_out = adjusted(world, monkeypatch, 400)

@@ -19,7 +19,7 @@ def test_points_are_sent_once_and_moved_after():
     first = patch(4)
     table.add(first)
     assert table.changes_since(seen) == [], "nobody knows yet where they are"
-    table.place({4: np.eye(4)}, [4, 5])
+    table.place({4: np.eye(4)}, [5, 4])
     (change,) = table.changes_since(seen)
     assert change.points is first
     assert table.changes_since(seen) == []

@@ -36,6 +36,10 @@ def test_a_path_is_interrupted_where_the_camera_was_lost_and_not_where_a_frame_i
     assert lines(table) == [[0.0, 1.0, 3.0]], "the gap is before frame 6 now, which stands alone"
     table.insert(7, 7000, at(7), is_after_gap=False)
     assert lines(table) == [[0.0, 1.0, 3.0], [6.0, 7.0]]
+    table.withdraw([7])
+    assert table.frame_ids.tolist() == [0, 1, 3, 6]
+    table.withdraw(range(7))
+    assert table.poses().shape == (0, 4, 4)
 
 
 def test_frames_turn_with_their_keyframe_and_those_of_a_start_with_the_next_one():
@@ -63,6 +67,10 @@ def test_only_segments_that_changed_have_another_version():
     changed = [now != then for now, then in zip(table.segment_versions, before, strict=True)]
     assert changed == [False, True]
     assert lines(table, 1)[0][:2] == [SEGMENT_POSES - 1.0, SEGMENT_POSES], "it joins the one before"
+    before = list(table.segment_versions)
+    table.move({})
+    table.withdraw([99 * SEGMENT_POSES])
+    assert table.segment_versions == before
 
 
 def test_where_the_camera_was_last_is_a_keyframe_before_there_is_a_frame():

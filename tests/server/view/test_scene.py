@@ -206,6 +206,22 @@ def test_landmarks_in_any_order_land_at_their_own_coordinates():
     assert xyz[:, 0].tolist() == sorted(ids.tolist())
 
 
+def test_all_behind_a_landmark_that_comes_in_between_is_drawn_again():
+    table = LandmarkTable()
+    table.update(*points(np.arange(3 * CHUNK_LANDMARKS)))
+    before = list(table.chunk_versions)
+    table.remove(np.array([CHUNK_LANDMARKS]))
+    table.update(*points([CHUNK_LANDMARKS, 4 * CHUNK_LANDMARKS]))
+    assert [now != then for now, then in zip(table.chunk_versions, before, strict=False)] == [
+        False,
+        True,
+        False,
+    ], "it has its old place"
+    before = list(table.chunk_versions)
+    table.update(*points([-1, 5 * CHUNK_LANDMARKS]))
+    assert all(now > then for now, then in zip(table.chunk_versions, before, strict=True))
+
+
 def test_the_truth_is_fitted_to_the_map_even_on_a_straight_line():
     truth = Trajectory(np.arange(6) * 0.1, np.array([at(k) for k in range(6)]))
     R, t = exp_so3([0.2, 0.1, -0.4]), np.array([3.0, 2.0, 1.0])
@@ -214,8 +230,10 @@ def test_the_truth_is_fitted_to_the_map_even_on_a_straight_line():
         T = make_transform(R, 0.5 * R @ truth.positions[k] + t)
         scene.add_frame(view(k, T))
     scene.align_truth()
-    aligned = scene.changes_since(Cursor()).truth
+    cursor = Cursor()
+    aligned = scene.changes_since(cursor).truth
     np.testing.assert_allclose(aligned, 0.5 * truth.positions @ R.T + t, atol=1e-6)
+    assert scene.changes_since(cursor).truth is None, "it is sent once"
 
 
 @pytest.mark.parametrize("rate_hz", [10, 25, 4])
@@ -260,6 +278,8 @@ def test_the_spectator_looks_at_the_camera_from_behind_and_settles():
     in_eye = np.linalg.inv(T_world_eye) @ T
     assert in_eye[2, 3] > 0
     assert abs(in_eye[0, 3]) < in_eye[2, 3]
+    in_camera = (np.linalg.inv(T) @ T_world_eye)[:3, 3]
+    assert (in_camera < 0.0).all(), "to the left, above and behind"
     jumped = spectator.follow(make_transform(T[:3, :3], T[:3, 3] + [100.0, 0.0, 0.0]), 4.0)
     assert 10.0 < np.linalg.norm(jumped[:3, 3] - T_world_eye[:3, 3]) < 20.0
 

@@ -1,0 +1,93 @@
+"""What keyframes have said in several windows, and how sure an estimate from it is."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from shaken_views import CAMERA, SIZE_WH, STEP_S, pose_at
+
+from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.mapping.bundle_problem import BundleProblem, ViewMotion
+from semcast.server.mapping.left_over import information
+from semcast.server.mapping.readout import body_velocity, fit_readout
+from semcast.server.mapping.readout_watch import ReadoutWatch
+from semcast.server.mapping.witnesses import Witnesses
+
+NUM_VIEWS = 28
+#: Of ten groups, by which nine differences tell a standard deviation.
+STUDENT_95 = 2.262
+
+
+def result_of(keyframe_ids, left_over):
+    """Of 40 points in three views each, of which one observation is not used."""
+    residual_px = np.zeros((120, 2))
+    residual_px[7, 1] = np.nan
+    problem = SimpleNamespace(
+        keyframe_ids=np.array(keyframe_ids), view=np.repeat(np.arange(3), 40), point=np.tile(np.arange(40), 3)
+    )
+    return SimpleNamespace(problem=problem, residual_px=residual_px, left_over=left_over)
+
+
+def test_what_a_keyframe_says_in_two_windows_counts_as_of_one_witness():
+    witnesses = Witnesses()
+    assert (len(witnesses), witnesses.views, witnesses.share_left) == (0, [], 1.0)
+    for keyframe_ids in ([3, 1, 2], [2, 3, 4]):
+        witnesses.note(result_of(keyframe_ids, np.stack([np.full((8, 8), float(k)) for k in keyframe_ids])))
+    witnesses.note(result_of([4, 5, 6], None))
+    assert len(witnesses) == 4
+    assert [view[0, 0] for view in witnesses.views] == [1.0, 4.0, 6.0, 4.0]
+    assert witnesses.share_left == pytest.approx(1.0 - (6 * 3 + 3 * 40) / (2 * 119))
+
+
+def windows(seed, size, interval, num_points):
+    """What a global shutter's noise alone leaves in windows that overlap; linear, so nothing is adjusted."""
+    rng = np.random.default_rng(seed)
+    ms = 1e-3
+    times_s = STEP_S * np.arange(NUM_VIEWS)
+    poses = np.stack([pose_at(t) for t in times_s])
+    velocity = np.stack(
+        [body_velocity(pose_at(t - ms), pose_at(t), pose_at(t + ms), 2 * ms) for t in times_s]
+    )
+    low, high = (-2.0, -1.5, 3.0), (3.5, 1.5, 6.0)
+    xyz = rng.uniform(low, high, (num_points, 3))
+    seen = np.stack([CAMERA.project(transform_points(invert_transform(T), xyz)) for T in poses])
+    noise_px = rng.normal(0.0, 0.3, seen.shape)
+    view, point = np.divmod(np.arange(size * num_points), num_points)
+    for first in range(0, NUM_VIEWS - size + 1, interval):
+        ids = np.arange(first, first + size)
+        residual_px = noise_px[ids].reshape(-1, 2)
+        problem = BundleProblem(
+            camera=CAMERA,
+            keyframe_ids=ids,
+            T_world_cam=poses[ids],
+            fixed=np.arange(size) == 0,
+            keep_baseline=True,
+            landmark_ids=np.arange(num_points),
+            xyz=xyz,
+            view=view,
+            point=point,
+            xy=seen[ids].reshape(-1, 2) + residual_px,
+            sigma_px=np.full(len(view), 0.3),
+            confidence=np.ones(len(view)),
+        )
+        left_over = information(problem, ViewMotion(SIZE_WH, velocity[ids]), poses[ids], xyz, residual_px)
+        yield SimpleNamespace(problem=problem, left_over=left_over, residual_px=residual_px)
+
+
+@pytest.mark.parametrize(
+    ("size", "interval", "num_points"),
+    [
+        pytest.param(12, 4, 40, id="keyframes in three windows"),  # as three witnesses: .80
+        pytest.param(5, 2, 30, id="four tenths of the variance in unknowns"),  # by residuals as they are: .92
+    ],
+)
+def test_a_readout_is_as_sure_as_the_watch_says(size, interval, num_points):
+    is_covered = []
+    for seed in range(100):
+        watch = ReadoutWatch(CAMERA, is_wanted=True)
+        for result in windows(seed, size, interval, num_points):
+            watch.take(result)
+        assert watch.take_found() is None, "noise is no shutter"
+        fit = fit_readout(watch._witnesses.views, "rows")
+        is_covered.append(fit.readout.ms <= STUDENT_95 * fit.sigma_ms * watch._sigma_factor)
+    assert np.mean(is_covered) == pytest.approx(0.95, abs=0.055 if size == 12 else 0.025)
