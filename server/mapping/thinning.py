@@ -27,7 +27,7 @@ def least_needed(seen: Sequence[NDArray[np.intp]], last_seen: Ids, recent_since:
 
     First those go that no keyframe sees: nothing finds them again. Then those of the keyframes that have the
     most, a landmark being of the last one that sees it, and of these the ones that fewest keyframes see.
-    Landmarks of late stay as long as possible: the next frames rest on them.
+    Landmarks of late stay as long as possible, the last seen longest: the next frames rest on them.
 
     Args:
         seen: For each keyframe, oldest first, the rows of the landmarks it sees.
@@ -45,4 +45,6 @@ def least_needed(seen: Sequence[NDArray[np.intp]], last_seen: Ids, recent_since:
     rank = np.zeros(len(last_seen), np.int64)
     rank[order] = np.arange(len(order)) - first[inverse]
     rank[home < 0] = len(last_seen)
-    return np.lexsort((last_seen, -rank, last_seen >= recent_since))[:count]
+    of_late = last_seen >= recent_since
+    rank[of_late] = 0
+    return np.lexsort((last_seen, -rank, of_late))[:count]

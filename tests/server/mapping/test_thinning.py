@@ -43,4 +43,4 @@ def test_landmarks_of_late_stay_as_long_as_others_can_go():
     seen = [np.array([0, 1]), np.array([2, 3, 4, 5])]
     last_seen = np.array([1, 1, 8, 8, 8, 8])
     assert set(least_needed(seen, last_seen, 8, 2).tolist()) == {0, 1}
-    assert len(least_needed(seen, last_seen, 8, 4)) == 4
+    assert least_needed(seen, np.array([1, 1, 9, 8, 9, 9]), 8, 3).tolist()[2] == 3, "the last seen go last"
