@@ -9,7 +9,6 @@ part as it was, they would hide the difference.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,7 +244,10 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
     """
     mine = world.keyframes_of(submap)
     row = {k.frame_id: i for i, k in enumerate(mine)}
-    edges = [_step(world, before, now, row[now.frame_id]) for before, now in pairwise(mine)]
+    all_ids = np.array(sorted(k for k, part in world.submap_of.items() if part == submap))
+    at = np.searchsorted(all_ids, [k.frame_id for k in mine])
+    num_steps = np.diff(at).tolist()
+    edges = [_step(world, mine[k], mine[k + 1], k + 1, num) for k, num in enumerate(num_steps)]
     for new, old in world.revisits.items():
         if new in row and old in row:
             edges.append(_tie(world, mine, row[old], row[new], mine[row[new]].T_world_cam, 1.0))
@@ -257,14 +259,20 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
     return np.array([k.frame_id for k in mine], dtype=np.int64), solved
 
 
-def _step(world: WorldMap, before: Keyframe, now: Keyframe, row: int) -> Edge:
-    """What tracking says of a keyframe, in this row, and the one before."""
+def _step(world: WorldMap, before: Keyframe, now: Keyframe, row: int, num_steps: int) -> Edge:
+    """What tracking says of a keyframe, in this row, and the one before, so many steps of the way ago."""
     T = invert_transform(before.T_world_cam) @ now.T_world_cam
     turn_rad = np.radians(rotation_angle_deg(T[:3, :3]))
     way = float(np.linalg.norm(T[:3, 3]))
     depth = _depth(world, now, way)
-    sigma = _STEP_RAD + _STEP_TURN * turn_rad, _STEP_WAY * way + _STEP_DEPTH * depth, _STEP_SCALE
-    if len(np.intersect1d(before.ids, now.ids, assume_unique=True)) < _MIN_SHARED:
+    grown = np.sqrt(num_steps)
+    sigma = (
+        grown * _STEP_RAD + _STEP_TURN * turn_rad,
+        _STEP_WAY * way + grown * _STEP_DEPTH * depth,
+        grown * _STEP_SCALE,
+    )
+    # Where keyframes between them were thinned out, they were tracked all the same.
+    if num_steps == 1 and len(np.intersect1d(before.ids, now.ids, assume_unique=True)) < _MIN_SHARED:
         sigma = _GAP_RAD, way + depth, _GAP_SCALE
     return Edge(row - 1, row, T, 1.0, sigma)
 

@@ -41,7 +41,7 @@ class ReconstructionSettings:
         metadata={"help": "adjust all keyframes at once when a stream has ended, before results are written"},
     )
     max_landmarks: int = field(
-        default=20_000, metadata={"help": "landmarks kept at most; the longest unseen go first"}
+        default=20_000, metadata={"help": "landmarks kept at most; beyond that some go at every old keyframe"}
     )
     max_keyframes: int = field(
         default=300, metadata={"help": "keyframes kept with their observations; older ones are thinned out"}

@@ -12,6 +12,7 @@ from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.edges import alike, each_of
 from semcast.server.mapping.map_arrays import check_map_arrays
 from semcast.server.mapping.posed_frames import PosedFrames
+from semcast.server.mapping.thinning import evenly_thinned, least_needed
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -319,7 +320,7 @@ class WorldMap:
         self._frames_moved.update(self.frames.rescale(factor).tolist())
 
     def bound(self, max_landmarks: int, max_keyframes: int, recent: int) -> bool:
-        """Keep the map within its size: longest unseen landmarks and every second old keyframe go.
+        """Keep the map within its size: some landmarks and old keyframes go everywhere, see ``thinning``.
 
         Args:
             max_landmarks: Landmarks at most.
@@ -333,14 +334,16 @@ class WorldMap:
         if excess > 0:
             # A tenth more than needed, so that this does not run on every keyframe.
             count = min(len(self.landmarks), excess + max_landmarks // 10)
-            oldest = np.argsort(self.landmarks.last_seen, kind="stable")[:count]
+            seen = [rows[rows >= 0] for rows in (self.landmarks.rows(k.ids) for k in self.keyframes)]
+            since = self.keyframes[-recent:][0].frame_id if self.keyframes else 0
             bad = np.zeros(len(self.landmarks), bool)
-            bad[oldest] = True
+            bad[least_needed(seen, self.landmarks.last_seen, since, count)] = True
             self.remove_landmarks(bad)
         if len(self.keyframes) <= max_keyframes:
             return False
         old, young = self.keyframes[:-recent], self.keyframes[-recent:]
-        self.keyframes = old[1::2] + young
+        kept = evenly_thinned(np.array([k.frame_id for k in old]), len(old) // 2)
+        self.keyframes = [old[row] for row in kept.tolist()] + young
         self._hang_revisits_on_what_is_left()
         return True
 

@@ -242,14 +242,16 @@ def test_drift_is_shared_out_along_the_way(room, rng):
 
 
 @pytest.mark.parametrize(
-    ("num_shared", "sigma"),
+    ("num_shared", "num_steps", "sigma"),
     [
         # Turned by 0.1 rad, half a unit on, points at a depth of 5.
-        (8, (0.002 + 0.02 * 0.1, 0.02 * 0.5 + 0.002 * 5.0, 0.01)),
-        (7, (0.5, 0.5 + 5.0, 0.5)),
+        (8, 1, (0.002 + 0.02 * 0.1, 0.02 * 0.5 + 0.002 * 5.0, 0.01)),
+        (7, 1, (0.5, 0.5 + 5.0, 0.5)),
+        # Eight keyframes between the two were thinned out.
+        (0, 9, (0.006 + 0.02 * 0.1, 0.02 * 0.5 + 0.006 * 5.0, 0.03)),
     ],
 )
-def test_how_well_a_step_is_known_by_hand(num_shared, sigma):
+def test_how_well_a_step_is_known_by_hand(num_shared, num_steps, sigma):
     world, none = WorldMap(), (np.zeros(0, np.int64), np.zeros((0, 32), np.uint8))
     before = make_transform(exp_so3([0.0, 0.0, 0.3]), [1.0, 2.0, 0.0])
     now = before @ make_transform(exp_so3([0.0, 0.0, 0.1]), [0.3, 0.4, 0.0])
@@ -258,10 +260,26 @@ def test_how_well_a_step_is_known_by_hand(num_shared, sigma):
         world.add_keyframe(Keyframe(k, k, T, 0, seen, np.zeros((10, 2)), np.ones(10), *none))
     xyz = np.column_stack((np.arange(10.0), np.zeros(10), np.full(10, 5.0)))
     world.add_landmarks(ids, xyz, np.zeros((10, 3), np.uint8), np.ones(10), 0, 1)
-    edge = _step(world, *world.keyframes, 4)
+    edge = _step(world, *world.keyframes, 4, num_steps)
     assert (edge.first, edge.second, edge.scale) == (3, 4, 1.0)
     np.testing.assert_allclose(edge.T_first_second, invert_transform(before) @ now, atol=1e-12)
     assert edge.sigma == pytest.approx(sigma)
+
+
+def test_keyframes_that_were_thinned_out_leave_no_gap(room, rng):
+    world, _ = room
+    loop = look(LoopFinder(CAMERA, Recogniser(), 0), room, old_landmarks(room, HERE, rng))
+    every, wanted = share_out(world, 0, loop)
+    world.keyframes = world.keyframes[:40:10] + world.keyframes[40:]
+    shared = np.intersect1d(world.keyframes[0].ids, world.keyframes[1].ids)
+    assert len(shared) == 0, "else this tests nothing"
+    ids, solved = share_out(world, 0, loop)
+    at = np.searchsorted(every, ids)
+    moved, moved_wanted = (
+        np.linalg.norm(T[:, :3, 3] - np.stack([world.poses[k][:3, 3] for k in ids.tolist()]), axis=1)
+        for T in (solved.T_world_cam, wanted.T_world_cam[at])
+    )
+    np.testing.assert_allclose(moved, moved_wanted, atol=0.15 * moved_wanted.max())
 
 
 def test_a_gap_takes_most_of_what_has_to_be_shared_out(room, rng):

@@ -180,8 +180,22 @@ def test_the_map_is_bounded():
         assert len(world.landmarks) <= 100
         assert len(world.keyframes) <= 30
     assert [k.frame_id for k in world.keyframes[-10:]] == list(range(50, 60))
-    assert world.landmarks.ids.min() > 150
+    assert np.isin(np.arange(250, 300), world.landmarks.ids).all(), "the next frames rest on the newest"
     assert len(world.trajectory()) == 60
+
+
+def test_places_of_long_ago_keep_keyframes_and_landmarks():
+    # Twenty times as long as what the map may keep: seen last is not worth more than seen first.
+    world = WorldMap()
+    for k in range(600):
+        world.add_keyframe(make_keyframe(k, range(5 * k, 5 * k + 8)))
+        add_world(world, range(5 * k, 5 * k + 5), 0, k)
+        world.bound(max_landmarks=200, max_keyframes=30, recent=10)
+    frame_ids = np.array([k.frame_id for k in world.keyframes])
+    assert frame_ids[0] < 60
+    assert np.diff(frame_ids).max() <= 120, "twice as far apart as on average"
+    num_landmarks = [int((world.landmarks.rows(k.ids) >= 0).sum()) for k in world.keyframes]
+    assert min(num_landmarks) >= 3
 
 
 def test_revisits_outlive_the_keyframes_that_are_thinned_out():
