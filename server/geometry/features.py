@@ -303,30 +303,25 @@ def _search(
     found = np.nan_to_num(found.reshape(-1, 2), nan=-1e4, posinf=-1e4, neginf=-1e4)
     inside = (found[:, 0] >= 1) & (found[:, 1] >= 1) & (found[:, 0] < width - 2) & (found[:, 1] < height - 2)
     ok = inside & (status.ravel() == 1)
-    backward_guess = (start + (guess - found)).astype(np.float32)
-    backward_guess = np.clip(backward_guess, start - 20.0, start + 20.0)
-    back, back_status, eigen = cv2.calcOpticalFlowPyrLK(
-        grey1,
-        grey0,
-        np.ascontiguousarray(np.clip(found, 0, (width - 1, height - 1)), dtype=np.float32),
-        backward_guess,
-        None,
-        None,
-        window,
-        min(2, max_level),
-        _CRITERIA,
-        flags | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS,
-        1e-4,
-    )
-    distance = np.linalg.norm(back.reshape(-1, 2).astype(np.float64) - start, axis=1)
-    distance = np.where((back_status.ravel() == 1) & np.isfinite(distance), distance, 99.0)
+    distance, gradient = np.full(len(xy0), 99.0), np.zeros(len(xy0))
+    there = np.flatnonzero(ok)
+    if len(there):
+        begin = start[there]
+        back_guess = np.clip(begin + (guess[there] - found[there]), begin - 20.0, begin + 20.0)
+        how = (window, min(2, max_level), _CRITERIA, flags | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS, 1e-4)
+        back, back_status, eigen = cv2.calcOpticalFlowPyrLK(
+            grey1, grey0, found[there], back_guess.astype(np.float32), None, None, *how
+        )
+        away = np.linalg.norm(back.reshape(-1, 2).astype(np.float64) - begin, axis=1)
+        distance[there] = np.where((back_status.ravel() == 1) & np.isfinite(away), away, 99.0)
+        gradient[there] = _where_found(np.asarray(eigen), np.asarray(back_status)) * _EIGEN_UNIT
     ok &= distance <= max_forward_backward_px
     return TrackedPoints(
         xy=found.astype(np.float64),
         ok=ok,
         forward_backward_px=distance,
         photometric_grey=_where_found(np.asarray(error), np.asarray(status)),
-        gradient_grey2=_where_found(np.asarray(eigen), np.asarray(back_status)) * _EIGEN_UNIT,
+        gradient_grey2=gradient,
     )
 
 
