@@ -8,7 +8,6 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
-from semcast.server.geometry.brightness import brightness_change, with_brightness
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
@@ -54,11 +53,6 @@ def begin(x=20, **changes):
     return tracks
 
 
-def darker(sight, gain):
-    """The same sight through a shorter exposure."""
-    return replace(sight, grey=with_brightness(sight.grey, gain, 0.0))
-
-
 def test_usable_rows_follow_the_slots():
     frame = DecodedFrame(
         0, 0, np.zeros((40, 8, 3), np.uint8), slot_snr_db=np.array([5, -20, np.nan], np.float32)
@@ -93,27 +87,6 @@ def test_tracks_in_a_lost_slot_coast_and_come_back():
     assert np.isin(band_ids, coasting).all()
     tracks.follow(sight_at(26), tracks.xy + tracks.velocity)
     assert np.isin(band_ids, tracks.ids[tracks.visible]).mean() > 0.6
-
-
-def test_tracks_that_coast_are_followed_through_the_change_of_light_that_the_others_tell(monkeypatch):
-    tracks, asked = begin(), []
-
-    def counted(*images_and_points):
-        asked.append(len(images_and_points[2]))
-        return brightness_change(*images_and_points)
-
-    monkeypatch.setattr("semcast.server.geometry.features.brightness_change", counted)
-    in_band = (tracks.xy[:, 1] > 70) & (tracks.xy[:, 1] < 88)
-    band_ids, band_xy = tracks.ids[in_band], tracks.xy[in_band]
-    assert 5 <= len(band_ids) < 20, "so few tell no change themselves"
-    tracks.follow(darker(sight_at(23, lost=(4, 5)), 0.8), tracks.xy)
-    asked.clear()
-    tracks.follow(darker(sight_at(26), 0.5), tracks.xy + tracks.velocity)
-    came = np.isin(band_ids, tracks.ids[tracks.visible])
-    assert came.mean() > 0.6
-    off = tracks.xy[np.searchsorted(tracks.ids, band_ids[came])] - (band_xy[came] - (6, 0))
-    assert np.median(np.linalg.norm(off, axis=1)) < 0.3
-    assert min(asked) > len(band_ids), "those are not asked"
 
 
 def test_a_point_beside_a_lost_slot_is_seen():
