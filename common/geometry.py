@@ -46,13 +46,17 @@ def skew(v: ArrayLike) -> Array:
 def exp_so3(rotation_vector_rad: ArrayLike) -> Array:
     """Rodrigues' formula: rotation vector of length 3 (radians) to a 3x3 rotation."""
     w = np.asarray(rotation_vector_rad, dtype=np.float64)
-    angle_rad = float(np.linalg.norm(w))
     W = skew(w)
+    return _rodrigues(float(np.linalg.norm(w)), W, W @ W)
+
+
+def _rodrigues(angle_rad: float, W: Array, W2: Array) -> Array:
+    """Rotation of an angle and of the skew matrix of the rotation vector, with its square."""
     if angle_rad < 1e-8:
-        return np.asarray(np.eye(3) + W + 0.5 * W @ W)
+        return np.asarray(np.eye(3) + W + 0.5 * W2)
     a = np.sin(angle_rad) / angle_rad
     b = (1.0 - np.cos(angle_rad)) / angle_rad**2
-    return np.asarray(np.eye(3) + a * W + b * (W @ W))
+    return np.asarray(np.eye(3) + a * W + b * W2)
 
 
 def log_so3(R: ArrayLike) -> Array:
@@ -70,13 +74,14 @@ def exp_se3(xi: ArrayLike) -> Array:
     w, v = xi[:3], xi[3:]
     angle_rad = float(np.linalg.norm(w))
     W = skew(w)
+    W2 = W @ W
     if angle_rad < 1e-8:
         V = np.eye(3) + 0.5 * W
     else:
         b = (1.0 - np.cos(angle_rad)) / angle_rad**2
         c = (angle_rad - np.sin(angle_rad)) / angle_rad**3
-        V = np.eye(3) + b * W + c * (W @ W)
-    return make_transform(exp_so3(w), V @ v)
+        V = np.eye(3) + b * W + c * W2
+    return make_transform(_rodrigues(angle_rad, W, W2), V @ v)
 
 
 def project_to_so3(M: ArrayLike) -> Array:

@@ -12,6 +12,7 @@ whatever the shape. The zero vector is a point that is known alike in all direct
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -30,12 +31,15 @@ def edges_at(grey: NDArray[np.uint8], xy: Array) -> Array:
     height, width = grey.shape
     if len(xy) == 0 or min(height, width) <= 2 * _REACH_PX:
         return np.zeros((len(xy), 2))
-    offset = np.arange(-_REACH_PX, _REACH_PX + 1, _STEP_PX)
-    x = np.clip(np.rint(xy[:, 0]).astype(np.intp), _REACH_PX, width - 1 - _REACH_PX)
-    y = np.clip(np.rint(xy[:, 1]).astype(np.intp), _REACH_PX, height - 1 - _REACH_PX)
-    pixel = ((y[:, None] + offset) * width)[:, :, None] + (x[:, None] + offset)[:, None, :]
-    gx = cv2.Sobel(grey, cv2.CV_16S, 1, 0).ravel()[pixel].reshape(len(xy), -1).astype(np.float32)
-    gy = cv2.Sobel(grey, cv2.CV_16S, 0, 1).ravel()[pixel].reshape(len(xy), -1).astype(np.float32)
+    side = 2 * _REACH_PX + 1
+    left = np.clip(np.rint(xy[:, 0]).astype(np.intp) - _REACH_PX, 0, width - side)
+    top = np.clip(np.rint(xy[:, 1]).astype(np.intp) - _REACH_PX, 0, height - side)
+    gx, gy = (
+        sliding_window_view(slope, (side, side))[:, :, ::_STEP_PX, ::_STEP_PX][top, left]
+        .reshape(len(xy), -1)
+        .astype(np.float32)
+        for slope in cv2.spatialGradient(grey)
+    )
     xx, xy_, yy = (np.einsum("nk,nk->n", a, b).astype(np.float64) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
     half, spread = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy_)
     weak, strong = np.maximum(half - spread, 0.0), half + spread

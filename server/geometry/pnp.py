@@ -39,31 +39,29 @@ class PoseEstimate:
         return int(self.inliers.sum())
 
 
-def project_with_jacobian(camera: Intrinsics, points_cam: Array) -> tuple[Array, Array]:
+def project_with_jacobian(xyz_cam: Array, axes: Array) -> tuple[Array, Array]:
     """Project points and differentiate by a twist that moves them, ``p' = exp(xi) p``.
 
+    One coordinate of all points lies together, as for the derivatives: there are few, and many points.
+
     Args:
-        camera: Pinhole.
-        points_cam: ``(N, 3)`` with positive depth.
+        xyz_cam: ``(3, N)`` with positive depth.
+        axes: ``(2, 2, N)`` by how many pixels, or whitened ones, ``x / z`` and ``y / z`` move a projection,
+            or ``(2, 2, 1)`` for all points.
 
     Returns:
-        ``(N, 2)`` pixels and ``(N, 2, 6)`` derivatives, rotation before translation.
+        ``(2, N)`` pixels from the principal point and ``(6, 2, N)`` derivatives, rotation before translation.
     """
-    x, y, z = points_cam.T
-    inverse_z = 1.0 / z
-    u, v = x * inverse_z, y * inverse_z
-    J = np.zeros((len(points_cam), 2, 6))
-    J[:, 0, 0] = -camera.fx * u * v
-    J[:, 0, 1] = camera.fx * (1.0 + u * u)
-    J[:, 0, 2] = -camera.fx * v
-    J[:, 0, 3] = camera.fx * inverse_z
-    J[:, 0, 5] = -camera.fx * u * inverse_z
-    J[:, 1, 0] = -camera.fy * (1.0 + v * v)
-    J[:, 1, 1] = camera.fy * u * v
-    J[:, 1, 2] = camera.fy * u
-    J[:, 1, 4] = camera.fy * inverse_z
-    J[:, 1, 5] = -camera.fy * v * inverse_z
-    return np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1), J
+    inverse_z = 1.0 / xyz_cam[2]
+    u, v = xyz_cam[:2] * inverse_z
+    projected = axes[0] * u + axes[1] * v
+    J = np.empty((6, *projected.shape))
+    J[0] = -axes[1] - projected * v
+    J[1] = axes[0] + projected * u
+    J[2] = axes[1] * u - axes[0] * v
+    J[3:5] = axes * inverse_z
+    J[5] = projected * -inverse_z
+    return projected, J
 
 
 def reprojection_residual(
@@ -114,32 +112,28 @@ def refine_pose(
     """
     T_start = T_cam_world.copy()
     T = T_start.copy()
-    whitener = None if edge is None else whiteners(edge)
+    whitener = np.eye(2)[None] if edge is None else whiteners(edge)
     if spread_px is not None:
-        shape = np.eye(2) if whitener is None else whitener
-        whitener = _whitener(sigma_px, (shape @ spread_px[..., None])[..., 0]) @ shape
-    weight = sigma_px**-2.0
+        whitener = _whitener(sigma_px, (whitener @ spread_px[..., None])[..., 0]) @ whitener
+    axes = np.ascontiguousarray(whitener.transpose(2, 1, 0)) * [[[camera.fx]], [[camera.fy]]]
+    x, y = keypoints_xy[:, 0] - camera.cx, keypoints_xy[:, 1] - camera.cy
+    observed = whitener[:, :, 0].T * x + whitener[:, :, 1].T * y
+    xyz = np.ascontiguousarray(points_world.T)
+    weight, huber_px, far_px = sigma_px**-2.0, HUBER_K * sigma_px, 3.0 * gate_px
     hessian = np.zeros((6, 6))
     for iteration in range(iterations):
-        points_cam = transform_points(T, points_world)
-        used = points_cam[:, 2] > MIN_DEPTH_MAP
+        xyz_cam, used = _in_front(T, xyz)
         if int(used.sum()) < 3:
             return _without_inliers(T_start, len(points_world))
-        projected, J = project_with_jacobian(camera, points_cam[used])
-        residual = keypoints_xy[used] - projected
-        if whitener is not None:
-            residual = np.einsum("nij,nj->ni", whitener[used], residual)
-            J = whitener[used] @ J
-        length = np.linalg.norm(residual, axis=1)
+        projected, J = project_with_jacobian(xyz_cam, axes)
+        residual = observed - projected
+        length = np.sqrt(np.square(residual).sum(axis=0))
         # Early steps are more tolerant, so that a poor start does not lose the points that would mend it.
         widen = 4.0 if iteration < 2 else 1.0
-        k = HUBER_K * sigma_px[used] * widen
-        w = weight[used] * np.minimum(1.0, k / np.maximum(length, 1e-9))
-        if iteration >= 2:
-            w = np.where(length < 3.0 * gate_px[used], w, 0.0)
-        rows = J.reshape(-1, 6)
-        weighted = (rows * np.repeat(w, 2)[:, None]).T
-        hessian = weighted @ rows
+        w = weight * np.minimum(1.0, widen * huber_px / np.maximum(length, 1e-9))
+        w *= used if iteration < 2 else used & (length < far_px)
+        weighted, rows = (J * w).reshape(6, -1), J.reshape(6, -1)
+        hessian = weighted @ rows.T
         gradient = weighted @ residual.ravel()
         step = _damped_step(hessian, gradient)
         if step is None:
@@ -148,11 +142,20 @@ def refine_pose(
         if iteration >= 3 and float(np.abs(step).max()) < 1e-6:
             break
     T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
-    residual, front = reprojection_residual(camera, T, points_world, keypoints_xy)
-    if whitener is not None:
-        residual = np.einsum("nij,nj->ni", whitener, residual)
-    length = np.where(front, np.linalg.norm(residual, axis=1), np.inf)
+    xyz_cam, used = _in_front(T, xyz)
+    u, v = xyz_cam[:2] / xyz_cam[2]
+    residual = observed - axes[0] * u - axes[1] * v
+    length = np.where(used, np.sqrt(np.square(residual).sum(axis=0)), np.inf)
     return PoseEstimate(T, length < gate_px, length, _covariance(hessian))
+
+
+def _in_front(T_cam_world: Array, xyz: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Points ``(3, N)`` in a camera, and which are in front of it; the others are put on its axis."""
+    xyz_cam = T_cam_world[:3, :3] @ xyz + T_cam_world[:3, 3:]
+    used = xyz_cam[2] > MIN_DEPTH_MAP
+    if not used.all():
+        xyz_cam = np.where(used, xyz_cam, np.array([[0.0], [0.0], [1.0]]))
+    return xyz_cam, used
 
 
 def _damped_step(hessian: Array, gradient: Array) -> Array | None:

@@ -12,6 +12,7 @@ import poselib
 from numpy.typing import NDArray
 
 from semcast.server.geometry.features import Grey
+from semcast.server.geometry.square_distance import square_distances
 
 Array = NDArray[np.float64]
 
@@ -102,7 +103,7 @@ class WideMatches:
         """
         if len(xy) == 0 or len(self.from_xy) == 0:
             return np.zeros(0, np.intp), np.zeros((0, 2))
-        square = ((xy[:, None] - self.from_xy[None]) ** 2).sum(axis=2)
+        square = square_distances(xy, self.from_xy)
         next_to = square.argmin(axis=0)
         near = np.flatnonzero(square[next_to, np.arange(len(next_to))] < max_offset_px**2)
         rows, first = np.unique(next_to[near], return_index=True)
@@ -179,7 +180,7 @@ def _carried(matches: WideMatches, xy0: Array) -> Carried:
     A turning camera sees a surface beside it get narrower: where matches are says that, and a feature's own
     turn and scale don't.
     """
-    square = ((xy0[:, None] - matches.from_xy[None]) ** 2).sum(axis=2)
+    square = square_distances(xy0, matches.from_xy)
     near = np.argsort(square, axis=1, kind="stable")[:, :_FITTED]
     weight = 1.0 / (np.take_along_axis(square, near, axis=1) + _ALIKE_PX**2)
     weight /= weight.sum(axis=1, keepdims=True)

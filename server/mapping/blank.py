@@ -1,10 +1,14 @@
 """Images that show nothing: a covered lens, a white-out, bare sky, a frame that was guessed from nothing."""
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.server.mapping.state import DecodedFrame, FrameResult, TrackingState
+
+Array = NDArray[np.float64]
 
 #: Side of the cells that are averaged: the noise of a sensor is gone then.
 _CELL_PX = 8
@@ -25,10 +29,17 @@ def shows_nothing(image: NDArray[np.uint8]) -> bool:
         return True
     if min(grey.shape) < _LEAST_CELLS:
         return False
-    y, x = np.mgrid[-1.0 : 1.0 : grey.shape[0] * 1j, -1.0 : 1.0 : grey.shape[1] * 1j]
-    shades = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).reshape(6, -1)
-    shade = np.linalg.solve(shades @ shades.T, shades @ grey.ravel()) @ shades
+    shades, normal = _smooth_shades(grey.shape)
+    shade = np.linalg.solve(normal, shades @ grey.ravel()) @ shades
     return float((grey.ravel() - shade).std()) < _LEAST_SD_GREY
+
+
+@lru_cache(maxsize=8)
+def _smooth_shades(shape_hw: tuple[int, int]) -> tuple[Array, Array]:
+    """Shades ``(6, H W)`` that add up to every one of second order, and their products: one size a stream."""
+    y, x = np.mgrid[-1.0 : 1.0 : shape_hw[0] * 1j, -1.0 : 1.0 : shape_hw[1] * 1j]
+    shades = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).reshape(6, -1)
+    return shades, shades @ shades.T
 
 
 def result_of_nothing(frame: DecodedFrame, state: TrackingState, map_epoch: int, submap: int) -> FrameResult:

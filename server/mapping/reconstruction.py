@@ -115,9 +115,8 @@ class Reconstruction:
 
         Args:
             frame: The frame.
-            on_pose: Is told the result of a frame located in the map before the map is extended with it.
-                What is returned has the pose after that, which differs by what the extension corrected. Not
-                called for other frames.
+            on_pose: Is told the result of a frame that is located, and of no other, before the map is
+                extended with it. What is returned has the pose after that, and what it corrected.
 
         Raises:
             ValueError: An array has another shape than the camera's image, or another number type.
@@ -149,6 +148,7 @@ class Reconstruction:
         is_tracked = self._state is TrackingState.TRACKING
         result = self._track(sight, T_world_guess) if is_tracked else self._find(sight)
         self._passage.note(sight, result.T_world_cam, self._motion, self._map.world)
+        self._shutter.keep_up()
         return result
 
     def _lap(self, stage: str, since_ns: int) -> None:
@@ -261,9 +261,7 @@ class Reconstruction:
         self._lost_ns = []
         self._frames_since_keyframe += 1
         self._last_posed_id = frame.frame_id
-        self._moves_to(frame.frame_id, frame.t_source_ns, pose.T_world_cam, pose.ids[pose.inliers])
         self._map.world.add_frame(frame.frame_id, reference.frame_id, pose.T_world_cam)
-        mapper.note_sight(self._map.world, pose.ids, pose.inliers, frame.frame_id)
         tracks.keep(~np.isin(tracks.ids, pose.ids[~pose.inliers], assume_unique=True))
         tracks.vouch(pose.ids[pose.inliers])
         is_keyframe = self._map.wants_keyframe(
@@ -271,6 +269,9 @@ class Reconstruction:
         )
         if self._on_pose is not None:
             self._on_pose(self._result(frame, pose.T_world_cam, pose, is_keyframe=is_keyframe))
+        # The pose is on its way now, and nobody waits.
+        self._moves_to(frame.frame_id, frame.t_source_ns, pose.T_world_cam, pose.ids[pose.inliers])
+        mapper.note_sight(self._map.world, pose.ids, pose.inliers, frame.frame_id)
         if is_keyframe:
             since = time.perf_counter_ns()
             pose = self._improved(sight, pose)
@@ -321,8 +322,8 @@ class Reconstruction:
         observed = observed_of(sight, tracks, visible)
         self._initialiser.leave_out(tracks.ids[tracks.fixed])
         waits = self._state is TrackingState.LOST or float(sight.usable.mean()) < _MIN_USABLE_SHARE
-        suspect = tracks.ids[tracks.suspect]
-        start = self._initialiser.add(observed, self._map.noise.model, suspect, is_damaged=waits)
+        noise, suspect = self._map.noise.model, tracks.ids[tracks.suspect]
+        start = self._initialiser.add(observed, noise, suspect, is_damaged=waits)
         self._lap("two_view", since)
         return self._result(frame, None, None) if start is None else self._begin_map(sight, start)
 
@@ -386,8 +387,7 @@ class Reconstruction:
         self._initialiser.clear()
         self._frames_since_keyframe = 0
         self._lap("two_view", since)
-        newest = self._map.world.pose_of_frame(sight.frame.frame_id)
-        seen = self._tracks.seen()
+        newest, seen = self._map.world.pose_of_frame(sight.frame.frame_id), self._tracks.seen()
         pose = self._pose(newest, seen[self._map.world.landmarks.rows(seen.ids) >= 0])
         self._state = TrackingState.LOST if pose is None else TrackingState.TRACKING
         self._lost_ns = []

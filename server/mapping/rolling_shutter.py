@@ -10,6 +10,7 @@ import logging
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -164,6 +165,7 @@ class RollingShutter:
         self._mean: ImageFlow | None = None
         self._t_ns: int | None = None
         self._step_s = 0.0
+        self._waiting: Callable[[], None] | None = None
         self._has_begun = False
 
     def _take(self, camera: Intrinsics) -> None:
@@ -211,13 +213,14 @@ class RollingShutter:
         wants_flow = self._wants_flows()
         if self.is_global and not wants_flow:
             return sight, False
-        self._flow = self._measured(tracks, step_s)
-        self._step_s = step_s
-        if self._flow is None:
-            return sight, False
-        if wants_flow:
-            self._keep(frame.frame_id, self._flow)
+        rows = tracks.visible & (tracks.age > 1)
+        self._waiting = partial(
+            self._measure, frame.frame_id, step_s, tracks.xy[rows], tracks.velocity[rows], wants_flow
+        )
         if self.is_global:
+            return sight, False
+        self.keep_up()
+        if self._flow is None:
             return sight, False
         visible = tracks.visible
         tracks.move(visible, self._rows.put_right(self._flow, self.in_image(tracks.xy[visible])))
@@ -226,9 +229,15 @@ class RollingShutter:
         is_first, self._has_begun = not self._has_begun, True
         return sight, is_first
 
+    def keep_up(self) -> None:
+        """Find out how the newest image moved, which can wait where no image is put right by it."""
+        waiting, self._waiting = self._waiting, None
+        if waiting is not None:
+            waiting()
+
     def in_image(self, xy: Array) -> Array:
         """Return where points ``(..., 2)`` of the newest image, as put right, are in it as received."""
-        return xy if self._applied is None else self._rows.as_received(self._applied, xy)
+        return xy if self._applied is None or self.is_global else self._rows.as_received(self._applied, xy)
 
     @property
     def flows(self) -> Mapping[int, ImageFlow]:
@@ -247,14 +256,18 @@ class RollingShutter:
     def _since_s(self, frame: DecodedFrame) -> float:
         return 0.0 if self._t_ns is None else (frame.t_source_ns - self._t_ns) * 1e-9
 
-    def _measured(self, tracks: TrackTable, step_s: float) -> ImageFlow | None:
-        """Return the movement at the newest image."""
+    def _measure(self, frame_id: int, step_s: float, xy: Array, way: Array, wants_flow: bool) -> None:
+        """Take the movement at the newest image from points ``(N, 2)`` and their ways ``(N, 2)`` there."""
+        self._flow = self._measured(step_s, xy, way)
+        self._step_s = step_s
+        if self._flow is not None and wants_flow:
+            self._keep(frame_id, self._flow)
+
+    def _measured(self, step_s: float, xy: Array, way: Array) -> ImageFlow | None:
         mean_before, self._mean = self._mean, None
         if not 0.0 < step_s < _MAX_STEP_S:
             return None
-        rows = tracks.visible & (tracks.age > 1)
-        way = tracks.velocity[rows]
-        self._mean = ImageFlow.fitted(self.camera, tracks.xy[rows] - 0.5 * way, way / step_s)
+        self._mean = ImageFlow.fitted(self.camera, xy - 0.5 * way, way / step_s)
         if self._mean is None or mean_before is None or step_s > _MAX_TREND_STEP_S:
             return self._mean
         # The mean is that of half a step ago.

@@ -12,6 +12,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.projection import MIN_DEPTH_MAP
+from semcast.server.geometry.square_distance import square_distances
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.rays import rays_of
 from semcast.server.mapping.sight import Seen
@@ -124,8 +125,7 @@ def expected_positions(
         seen = seen[seen[:, 2] > MIN_DEPTH_MAP]
         if len(seen) == 0:
             continue
-        square = ((tracks.xy[unknown][:, None] - camera.project(seen)[None]) ** 2).sum(axis=2)
-        depth = seen[square.argmin(axis=1), 2]
+        depth = seen[square_distances(tracks.xy[unknown], camera.project(seen)).argmin(axis=1), 2]
         rays = camera.unproject(tracks.xy[unknown]) * depth[:, None]
         points = transform_points(T_world_then, rays)
         expected[unknown] = _project(camera, T_cam_world, points, ahead[unknown])

@@ -22,13 +22,21 @@ def refine(T, points, xy, sigma=1.0, **options):
     return refine_pose(CAMERA, T, points, xy, sigma, 3.0 * sigma, **options)
 
 
-def test_projection_jacobian_is_the_numeric_one():
+def derivatives(points_cam, whitener):
+    """Whitened pixels ``(N, 2)`` and their derivatives ``(N, 2, 6)``."""
+    axes = (whitener @ np.diag([CAMERA.fx, CAMERA.fy])).T[:, :, None]
+    projected, J = project_with_jacobian(points_cam.T, axes)
+    return projected.T + whitener @ [CAMERA.cx, CAMERA.cy], J.transpose(2, 1, 0)
+
+
+@pytest.mark.parametrize("whitener", [np.eye(2), np.array([[1.2, 0.5], [-0.3, 0.8]])])
+def test_projection_jacobian_is_the_numeric_one(whitener):
     points = np.random.default_rng(0).uniform((-2, -2, 3), (2, 2, 8), (5, 3))
-    projected, J = project_with_jacobian(CAMERA, points)
-    assert np.allclose(projected, CAMERA.project(points))
+    projected, J = derivatives(points, whitener)
+    assert np.allclose(projected, CAMERA.project(points) @ whitener.T)
     for k in range(6):
         xi = np.eye(6)[k] * 1e-6
-        moved = CAMERA.project(transform_points(exp_se3(xi), points))
+        moved = CAMERA.project(transform_points(exp_se3(xi), points)) @ whitener.T
         assert np.allclose((moved - projected) / 1e-6, J[:, :, k], atol=1e-2)
 
 
@@ -53,7 +61,7 @@ def test_outliers_do_not_move_the_pose():
 def test_covariance_of_proposition_1_is_the_inverse_of_the_information():
     T, points, exact = make_view(2, num=20)
     sigma = np.linspace(0.2, 1.5, 20)
-    _, J = project_with_jacobian(CAMERA, transform_points(T, points))
+    _, J = derivatives(transform_points(T, points), np.eye(2))
     information = sum(j.T @ j / s**2 for j, s in zip(J, sigma, strict=True))
     assert np.allclose(refine(T, points, exact, sigma).covariance @ information, np.eye(6), atol=1e-4)
 
@@ -175,7 +183,7 @@ def test_edges_and_uncertain_depths_add_up():
     edge, spread = rng.normal(0, 0.5, (8, 2)), rng.normal(0, 2.0, (8, 2))
     sigma = np.linspace(0.3, 1.0, 8)
     found = refine(T, points, exact, sigma, edge=edge, spread_px=spread)
-    _, J = project_with_jacobian(CAMERA, transform_points(T, points))
+    _, J = derivatives(transform_points(T, points), np.eye(2))
     information = np.zeros((6, 6))
     for j, e, s, size in zip(J, edge, spread, sigma, strict=True):
         W = whiteners(e[None])[0]

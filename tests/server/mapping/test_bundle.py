@@ -122,7 +122,8 @@ def test_covariance_is_the_inverse_of_the_information_where_points_are_free_and_
     jacobian = np.zeros((len(problem.xy), 2, 12 + 3 * 20))
     for row, (k, p) in enumerate(zip(problem.view, problem.point, strict=True)):
         T_cam_world = invert_transform(T_world_cam[k])
-        _, J = project_with_jacobian(CAMERA, transform_points(T_cam_world, xyz[p][None]))
+        xyz_cam, axes = transform_points(T_cam_world, xyz[p][None]).T, np.diag([CAMERA.fx, CAMERA.fy])
+        J = project_with_jacobian(xyz_cam, axes[:, :, None])[1].transpose(2, 1, 0)
         if k >= 2:
             jacobian[row, :, 6 * k - 12 : 6 * k - 6] = J[0]
         jacobian[row, :, 12 + 3 * p : 15 + 3 * p] = J[0][:, 3:] @ T_cam_world[:3, :3]

@@ -146,8 +146,11 @@ def test_movements_are_measured_only_while_they_are_wanted():
         frame = DecodedFrame(k, round(k * STEP_S * 1e9), rolled(k * STEP_S, 0.0, 0))
         sight = shutter.see(frame)
         tracks.follow(sight, tracks.xy + tracks.velocity) if len(tracks) else tracks.remember(sight)
+        before = len(shutter.flows)
         shutter.settle(frame, sight, tracks)
         tracks.refill(sight)
+        assert len(shutter.flows) == before, "no image is put right by it: it waits until there is time"
+        shutter.keep_up()
     assert sorted(shutter.flows) == [0, 1, 2, 3, 4, 5], "the first one by those after it"
     middle = np.array([[160.0, 120.0]])
     speeds = [shutter.flows[k].at(middle)[0, 0] for k in range(3)]

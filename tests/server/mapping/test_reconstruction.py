@@ -58,17 +58,19 @@ def reprojection(trajectory, points, frames, xy):
 def test_a_pose_is_told_before_the_map_is_extended_with_its_frame(room):
     _, images = room
     reconstruction = make()
-    early, keyframes_known = {}, {}
+    early, keyframes_known, landmarks_told = {}, {}, {}
 
     def tell(found):
         early[found.frame_id] = found
         seen = reconstruction.world.observations()[1]
         keyframes_known[found.frame_id] = found.frame_id in seen
+        landmarks_told[found.frame_id] = found.frame_id in reconstruction.world.landmarks.last_seen
 
     results = [reconstruction.process(frame_of(k, image), tell) for k, image in enumerate(images)]
     located = [r for r in results if r.state is TrackingState.TRACKING and not r.backfilled]
     assert sorted(early) == [r.frame_id for r in located]
     assert not any(keyframes_known.values())
+    assert not any(landmarks_told.values()), "what landmarks were seen is noted when nobody waits"
     assert any(r.is_keyframe for r in located)
     for after in located:
         before = early[after.frame_id]
