@@ -6,8 +6,9 @@ loops and joins of parts need no other care.
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -42,12 +43,20 @@ class Metres:
         settings: Which marker.
         camera: Of the decoded images.
         reconstruction: Whose map.
+        on_give_up: Is told why, when the marker is no longer looked for.
     """
 
-    def __init__(self, settings: MarkerSettings, camera: Intrinsics, reconstruction: Reconstruction) -> None:
+    def __init__(
+        self,
+        settings: MarkerSettings,
+        camera: Intrinsics,
+        reconstruction: Reconstruction,
+        on_give_up: Callable[[str], None] | None = None,
+    ) -> None:
         self._settings = settings
         self._camera = camera
         self._reconstruction = reconstruction
+        self._on_give_up = on_give_up
         self._marker_id = settings.marker_id
         self._sightings = Sightings(settings.dictionary) if settings.side_m is not None else None
         self.reset()
@@ -57,13 +66,20 @@ class Metres:
         if self._sightings is not None:
             self._sightings.of.clear()
         self._why_not = ""
-        self._told: dict[int, float] = {}
-        #: Of each part.
+        self._told: dict[int, MarkerPlacement] = {}
+        #: Of each part, by these poses of keyframes in these parts.
         self._found: dict[int, MarkerPlacement] = {}
+        self._found_by: dict[int, tuple[int, Array]] = {}
         self._shown: Marker | None = None
 
     def of(self, result: FrameResult) -> MarkerPlacement | None:
-        """Return what is known of the part of the map a frame is in."""
+        """Return the way to metres of a frame that has a pose, None where none is known.
+
+        It is that of the map as it is now: an adjustment may have moved it since the frame before.
+        """
+        if result.T_world_cam is None:
+            return None
+        self._guarded(self._place)
         return self._found.get(result.submap)
 
     def follow(
@@ -78,51 +94,63 @@ class Metres:
         """
         if self._sightings is None or update is None:
             return update
+        if frame is not None and result is not None and result.is_keyframe:
+            self._guarded(partial(self._look, frame))
+        self._guarded(self._place)
+        return replace(update, marker=self._shown)
+
+    def _guarded(self, act: Callable[[Sightings], None]) -> None:
+        """Do something with what was seen; a failure ends the search for the marker and nothing else."""
+        if self._sightings is None:
+            return
         try:
-            if frame is not None and result is not None and result.is_keyframe:
-                grey = cv2.cvtColor(self._reconstruction.put_right(frame.image), cv2.COLOR_RGB2GRAY)
-                self._sightings.look(frame.frame_id, np.asarray(grey, dtype=np.uint8))
-            moved = set(update.keyframe_ids.tolist())
-            if any(moved & seen.keys() for seen in self._sightings.of.values()):
-                self._place(self._sightings)
+            act(self._sightings)
         except Exception as err:
             logger.exception("the marker is no longer looked for")
             self._why_not, self._sightings, self._found, self._shown = str(err), None, {}, None
-        return replace(update, marker=self._shown)
+            if self._on_give_up is not None:
+                self._on_give_up(f"the marker is no longer looked for: {err}")
 
-    def _place(self, sightings: Sightings) -> None:
-        """Find the marker anew in every part that shows it."""
-        world = self._reconstruction.world
+    def _look(self, frame: DecodedFrame, sightings: Sightings) -> None:
+        grey = cv2.cvtColor(self._reconstruction.put_right(frame.image), cv2.COLOR_RGB2GRAY)
+        sightings.look(frame.frame_id, np.asarray(grey, dtype=np.uint8))
         for seen in sightings.of.values():
             if len(seen) > _MAX_SIGHTINGS:
                 for frame_id in sorted(seen)[: _MAX_SIGHTINGS // 2 : 2]:
                     del seen[frame_id]
+
+    def _place(self, sightings: Sightings) -> None:
+        """Find the marker anew in all parts, if a keyframe that shows one is new or has moved."""
+        world = self._reconstruction.world
+        frame_ids = sorted({k for seen in sightings.of.values() for k in seen} & world.poses.keys())
+        by = {k: (world.submap_of[k], world.poses[k]) for k in frame_ids}
+        if _are_alike(by, self._found_by):
+            return
+        self._found_by, self._found = {k: (part, T.copy()) for k, (part, T) in by.items()}, {}
         assert self._settings.side_m is not None
-        by_part: dict[int, dict[int, Array]] = {}
-        for frame_id in {k for seen in sightings.of.values() for k in seen}:
-            if frame_id in world.poses:
-                by_part.setdefault(world.submap_of[frame_id], {})[frame_id] = world.poses[frame_id]
-        self._found = {}
-        for part, T_world_cam in sorted(by_part.items()):
+        for part in sorted({part for part, _ in by.values()}):
+            T_world_cam = {k: T for k, (its_part, T) in by.items() if its_part == part}
             try:
                 found = sightings.place(T_world_cam, self._camera, self._settings.side_m, self._marker_id)
             except SourceError as err:
                 self._why_not = str(err)
                 continue
             self._marker_id, self._found[part] = found.marker_id, found
-            if found.relative_sigma < _MUCH_BETTER * self._told.get(part, np.inf):
-                self._told[part] = found.relative_sigma
+            told = self._told.get(part)
+            if told is None or found.relative_sigma < _MUCH_BETTER * told.relative_sigma:
                 self._tell(part, found)
         best = max(self._found.values(), key=lambda found: found.num_images, default=None)
         self._shown = None if best is None else Marker(best.corners_map, best.words)
 
     def _tell(self, part: int, found: MarkerPlacement) -> None:
+        self._told[part] = found
         logger.info("%s%s", found.words, f" (part {part})" if part else "")
 
     def tell(self) -> None:
         """Say at the end of a stream what is known, or why nothing is."""
         for part, found in self._found.items():
-            self._tell(part, found)
+            if self._told.get(part) is not found:
+                self._tell(part, found)
         if self._settings.side_m is None or self._found:
             return
         if not self._why_not and self._sightings is not None:
@@ -150,18 +178,29 @@ class Metres:
         of = {} if self._sightings is None else self._sightings.of
         rows = [(number, frame_id, xy) for number, seen in of.items() for frame_id, xy in seen.items()]
         return {
+            "marker.family": np.array(self._settings.dictionary),
+            "marker.chosen": np.array([] if self._marker_id is None else [self._marker_id], dtype=np.int64),
             "marker.ids": np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2),
             "marker.corners_xy": np.array([row[2] for row in rows]).reshape(-1, 4, 2),
         }
 
     def restore(self, arrays: Mapping[str, NDArray]) -> None:
-        """Go on with the map of a checkpoint, which may be of a server that looked for no marker.
+        """Go on with the map of a checkpoint, also of a server that looked for none or another family.
 
         Raises:
             ValueError: Arrays contradict each other.
         """
-        if self._sightings is None or "marker.ids" not in arrays:
+        if self._sightings is None or str(arrays.get("marker.family")) != self._settings.dictionary:
             return
         for (number, frame_id), xy in zip(arrays["marker.ids"], arrays["marker.corners_xy"], strict=True):
             self._sightings.of.setdefault(int(number), {})[int(frame_id)] = np.array(xy)
+        if self._marker_id is None and len(chosen := arrays["marker.chosen"]):
+            self._marker_id = int(chosen[0])
         self._place(self._sightings)
+
+
+def _are_alike(one: Mapping[int, tuple[int, Array]], other: Mapping[int, tuple[int, Array]]) -> bool:
+    """Tell whether keyframes are the same, in the same parts and at the same poses."""
+    if one.keys() != other.keys() or any(one[k][0] != other[k][0] for k in one):
+        return False
+    return np.array_equal([T for _, T in one.values()], [T for _, T in other.values()])

@@ -52,15 +52,12 @@ class Outbox:
         self._thread = threading.Thread(target=self._run, name="semcast-outbox", daemon=True)
         self._thread.start()
 
-    def put_pose(
-        self, arrival: ReceivedFrame, result: FrameResult, placement: MarkerPlacement | None = None
-    ) -> None:
+    def put_pose(self, arrival: ReceivedFrame, result: FrameResult) -> None:
         """Send what became of one frame, after the poses it gave to earlier frames.
 
         Args:
             arrival: The frame.
             result: What the tracker made of it.
-            placement: The way from its part of the map to metres, where that is known.
         """
         epoch = arrival.message.agent_epoch
         self._t_capture_ns[(epoch, result.frame_id)] = arrival.message.t_capture_ns
@@ -83,10 +80,14 @@ class Outbox:
                 submap=result.submap,
             )
             self._put(message)
-        pose = pose_message(arrival, result)
-        self._put(pose)
-        if placement is not None and pose.T_world_cam is not None:
-            self._put(metric_pose(pose, placement))
+        self._put(pose_message(arrival, result))
+
+    def put_metric_pose(
+        self, arrival: ReceivedFrame, result: FrameResult, placement: MarkerPlacement | None
+    ) -> None:
+        """Send the pose of one frame in metres, if the way there from its part of the map is known."""
+        if placement is not None:
+            self._put(metric_pose(pose_message(arrival, result), placement))
 
     def put_map(self, agent_epoch: int, update: MapUpdate) -> None:
         """Send what a frame, or the end of a stream, changed in the map."""
@@ -149,7 +150,7 @@ def pose_message(arrival: ReceivedFrame, result: FrameResult) -> PoseMessage:
 
 
 def metric_pose(pose: PoseMessage, placement: MarkerPlacement) -> MetricPose:
-    """Return a pose in metres."""
+    """Return a pose in metres; there must be one."""
     T_marker_cam = np.array(pose.T_world_cam).reshape(4, 4)
     T_marker_cam[:3, 3] = placement.points(T_marker_cam[None, :3, 3])[0]
     T_marker_cam[:3, :3] = placement.R @ T_marker_cam[:3, :3]

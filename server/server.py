@@ -32,7 +32,7 @@ from semcast.server.former_run import free_folder, output_folder
 from semcast.server.former_starts import FormerStarts
 from semcast.server.frame_views import missing_view
 from semcast.server.mapping.bundle_problem import BundleRunner
-from semcast.server.mapping.state import MapUpdate
+from semcast.server.mapping.state import FrameResult, MapUpdate
 from semcast.server.outbox import Outbox, map_message
 from semcast.server.receiver import ReceivedFrame, Receiver
 from semcast.server.record import recording
@@ -305,12 +305,13 @@ class Server:
             session = self._begin(decoded.arrival.camera)
             session.note_arrival(message.frame_id, message.seq, final=message.final)
         self._false_start.note_followed()
+
+        def tell(found: FrameResult) -> None:
+            self._outbox.put_pose(decoded.arrival, found)
+            self._outbox.put_metric_pose(decoded.arrival, found, session.metres.of(found))
+
         try:
-            outcome = session.process(
-                decoded.frame,
-                Arrival.of(decoded, self.metrics.drops),
-                lambda found: self._outbox.put_pose(decoded.arrival, found, session.metres.of(found)),
-            )
+            outcome = session.process(decoded.frame, Arrival.of(decoded, self.metrics.drops), tell)
         except Exception as err:
             logger.exception("frame %d could not be tracked and is left out", message.frame_id)
             self.metrics.drop("track")

@@ -82,7 +82,7 @@ class Session:
         bundle: A runner made ahead by ``new_bundle``, which the session closes; None makes one.
         program: Settings of the program for the run's records; None takes ``settings``.
         on_error: Is told in a line what the stream goes on without: rows, checkpoints or images that can't be
-            written, an adjustment, or more of the dense cloud.
+            written, an adjustment, more of the dense cloud, or the metre.
 
     Raises:
         OSError: The folder can't be made.
@@ -109,7 +109,7 @@ class Session:
         self._reconstruction = Reconstruction(identity.camera, settings.reconstruction, self._bundle)
         self._cloud = SessionCloud(settings, identity.camera, self._reconstruction, on_error)
         #: What a unit of each part of the map is.
-        self.metres = Metres(settings.marker, identity.camera, self._reconstruction)
+        self.metres = Metres(settings.marker, identity.camera, self._reconstruction, on_error)
         self._t_source_ns: dict[int, int] = {}
         self._numbers: dict[int, int | None] = {}
         self._num_frames = identity.num_frames
@@ -225,19 +225,19 @@ class Session:
         self._is_concluded = False
         reference = self._reference
         quality = None if reference is None else reference.psnr_db(frame.frame_id, frame.image)
-        tracked_ns = 0
+        tracked_ns, metric = 0, None
 
         def tell(found: FrameResult) -> None:
-            nonlocal tracked_ns
+            nonlocal tracked_ns, metric
             tracked_ns = time.perf_counter_ns()
             if on_pose is not None:
                 on_pose(found)
+            metric = self.metres.of(found)
 
         result = self._reconstruction.process(frame, tell)
         if not tracked_ns:
             tell(result)
         self._log_state(result)
-        metric = self.metres.of(result)
         update = self._reconstruction.take_map_update()
         patches = self._cloud.grow(frame, result, update)
         self._last_frame_id = frame.frame_id

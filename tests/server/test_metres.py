@@ -1,6 +1,7 @@
 """The metre of a map that grows and moves, from a marker in its keyframes."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,10 +33,11 @@ def T_world_cam_of(k):
 class Run:
     """A map of keyframes without landmarks, and what follows it."""
 
-    def __init__(self, **marker):
+    def __init__(self, on_give_up=None, **marker):
         self.reconstruction = Reconstruction(CAMERA, ReconstructionSettings(), InlineBundle())
         self.world = self.reconstruction.world
-        self.metres = Metres(MarkerSettings(**{"side_m": SIDE_M, **marker}), CAMERA, self.reconstruction)
+        settings = MarkerSettings(**{"side_m": SIDE_M, **marker})
+        self.metres = Metres(settings, CAMERA, self.reconstruction, on_give_up)
 
     def show(self, k, markers=((7, T_MAP_MARKER),), part=0):
         """Make a keyframe that shows markers; what is told of its frame afterwards."""
@@ -116,6 +118,24 @@ def test_metres_stay_what_they_are_when_the_map_is_moved_and_scaled():
     np.testing.assert_allclose(run.centres_m(after), expected_centres_m(), atol=0.005)
 
 
+def test_a_pose_of_a_map_that_was_adjusted_since_the_frame_before_goes_to_metres_from_where_it_is_now():
+    run = Run()
+    before = [run.show(k) for k in range(6)][-1]
+    run.world.transform_submap(0, 0, 2.5, make_transform(exp_so3((0.3, -0.2, 1.0)), (4.0, -2.0, 1.0)))
+    now = run.metres.of(result_of(6))
+    assert now.scale == pytest.approx(before.scale / 2.5, rel=1e-6)
+    np.testing.assert_allclose(run.centres_m(now), expected_centres_m(), atol=0.005)
+    run.follow()
+    assert run.metres.of(result_of(6)) is now, "what has not moved is not solved again"
+
+
+def test_a_frame_without_a_pose_has_no_way_to_metres():
+    run = Run()
+    for k in range(3):
+        run.show(k)
+    assert run.metres.of(replace(result_of(3), T_world_cam=None)) is None
+
+
 def test_the_unit_follows_a_map_that_a_loop_or_an_adjustment_bends():
     run = Run()
     before = [run.show(k) for k in range(6)][-1]
@@ -189,6 +209,21 @@ def test_a_restarted_server_knows_the_unit_at_once():
     again.metres.restore(run.reconstruction.snapshot())  # of a server that looked for none
 
 
+def test_a_restarted_server_stays_with_its_marker_and_does_not_know_those_of_another_family():
+    run = Run()
+    for k in range(3):
+        run.show(k)
+    for k in range(3, 9):
+        run.show(k, markers=((3, ELSEWHERE),))
+    kept = {**run.reconstruction.snapshot(), **run.metres.arrays()}
+    for given, marker_id in (({}, 7), ({"marker_id": 3}, 3), ({"dictionary": "4x4_50"}, None)):
+        again = Run(**given)
+        again.reconstruction.restore(kept)
+        again.metres.restore(kept)
+        found = again.metres.of(result_of(9))
+        assert (None if found is None else found.marker_id) == marker_id
+
+
 def test_a_marker_in_sight_for_hours_costs_no_more_than_one_in_sight_for_minutes(monkeypatch):
     monkeypatch.setattr("semcast.server.metres._MAX_SIGHTINGS", 5)
     run = Run()
@@ -211,6 +246,8 @@ def test_what_is_known_is_told_at_first_when_much_better_and_at_the_end(caplog):
     assert "1 unit of the map is 0.2" in first[0]
     assert 1 < between < 6
     assert caplog.records[-1].message.startswith("marker 7: 9 images, ")
+    run.metres.tell()
+    assert len(caplog.records) == between + 1, "nothing is said twice"
     (told,) = run.metres.summary()
     assert (told["part"], told["marker_id"], told["num_keyframes"]) == (0, 7, 9)
     assert told["m_per_unit"] == pytest.approx(UNIT_M, rel=0.01)
@@ -253,7 +290,8 @@ def test_nothing_is_looked_for_or_said_where_no_marker_is_asked_for(caplog):
 
 
 def test_a_failure_ends_the_search_and_not_the_stream(caplog, monkeypatch):
-    run = Run()
+    told = []
+    run = Run(on_give_up=told.append)
     for k in range(3):
         run.show(k)
 
@@ -269,6 +307,7 @@ def test_a_failure_ends_the_search_and_not_the_stream(caplog, monkeypatch):
         "the marker is no longer looked for",
         "the metre is not known: no such luck",
     ]
+    assert told == ["the marker is no longer looked for: no such luck"]
 
 
 @pytest.mark.parametrize(
