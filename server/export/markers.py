@@ -154,21 +154,25 @@ class Sightings:
             T_world_cam: Poses of images of one part of the map, by frame id; others do not count.
             camera: Of the images.
             side_m: Side of the marker's black square.
-            marker_id: Its number; None for the one in most images.
+            marker_id: Its number; None for the one that tells the scale and is in most images.
 
         Raises:
-            SourceError: No marker was found in enough images, or from too few directions to tell the scale.
+            SourceError: No marker was found in enough images, or from too few directions to tell the scale;
+                of several the one in most images is told.
         """
         ids = {k: sorted(seen.keys() & T_world_cam.keys()) for k, seen in self.of.items()}
-        if marker_id is None:
-            marker_id = max(ids, key=lambda k: (len(ids[k]), -k), default=None)
-        if marker_id is None or not ids.get(marker_id):
-            raise SourceError(self.none_found(marker_id))
-        seen = self.of[marker_id]
-        views = MarkerViews(
-            np.array([T_world_cam[k] for k in ids[marker_id]]), np.array([seen[k] for k in ids[marker_id]])
-        )
-        return _fit(views, camera, side_m, marker_id)
+        numbers = sorted(ids, key=lambda k: (-len(ids[k]), k)) if marker_id is None else [marker_id]
+        why: SourceError | None = None
+        for number in numbers:
+            if not ids.get(number):
+                break
+            corners_xy = np.array([self.of[number][k] for k in ids[number]])
+            try:
+                views = MarkerViews(np.array([T_world_cam[k] for k in ids[number]]), corners_xy)
+                return _fit(views, camera, side_m, number)
+            except SourceError as err:
+                why = why or err
+        raise why or SourceError(self.none_found(marker_id))
 
     def none_found(self, marker_id: int | None) -> str:
         """Say in a line that a marker is in no image, and what is."""
@@ -201,7 +205,7 @@ def place_by_marker(
         images: Frame id to file of the kept images.
         side_m: Side of the marker's black square.
         dictionary: OpenCV's name of its family, such as ``apriltag_36h11`` or ``4x4_50``.
-        marker_id: Its number; None for the one found in most images.
+        marker_id: Its number; None for the one that tells the scale and is in most images.
 
     Raises:
         ConfigError: ``side_m`` or ``dictionary`` is not allowed.

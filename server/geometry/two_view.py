@@ -10,7 +10,7 @@ comes a refinement whose weights are fitted to this pair's own residuals. A misl
 therefore cost time, hardly accuracy.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import get_args
 
@@ -122,30 +122,18 @@ def estimate_two_view(
     Raises:
         ValueError: Shapes disagree, the camera has distortion, or an argument is out of range.
     """
-    xy0, xy1 = _checked_matches(camera, keypoints0_xy, keypoints1_xy, confidence, mode, threshold_px)
-    for edge in edges or ():
-        check_shape(edge, f"{len(xy0)} 2", "edges")
+    xy0, xy1 = _checked_matches(camera, keypoints0_xy, keypoints1_xy, confidence, edges, mode, threshold_px)
     if len(xy0) < MIN_MATCHES or not (np.isfinite(xy0).all() and np.isfinite(xy1).all()):
         return None
     if mode == "paper" and confidence is not None:
-        found = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
-        if found is None:
-            return None
-        near = (
-            np.abs(sampson_px(fundamental_matrix(camera, found.T_cam1_cam0), xy0, xy1)) < 2.0 * threshold_px
-        )
-        T = _in_front_sign(camera, found.T_cam1_cam0, xy0[near], xy1[near])
-        return _result(camera, T, xy0, xy1, threshold_px, choose_model)
+        T_paper = _as_in_the_paper(camera, xy0, xy1, confidence, threshold_px, seed)
+        return None if T_paper is None else _result(camera, T_paper, xy0, xy1, threshold_px, choose_model)
     if confidence is not None and (mode == "off" or float(np.ptp(confidence)) <= _ALIKE):
         confidence = None
     agreement = neighbour_agreement(xy0, xy1)
     kept = _kept(agreement)
     how = {"seed": seed, "max_iterations": max_iterations, "min_iterations": min_iterations}
-    candidates = [
-        _search(camera, xy0[rows], xy1[rows], factor * threshold_px, in_order=in_order, **how)
-        for factor in _THRESHOLD_FACTORS
-        for rows, in_order in _orders_of_drawing(len(xy0), kept, confidence)
-    ]
+    candidates = _searched(camera, xy0, xy1, kept, confidence, threshold_px, how)
     candidates += _near_turning(camera, xy0[kept], xy1[kept], threshold_px)
     if choose_model:
         candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
@@ -165,6 +153,7 @@ def _checked_matches(
     keypoints0_xy: Array,
     keypoints1_xy: Array,
     confidence: Array | None,
+    edges: tuple[Array, Array] | None,
     mode: str,
     threshold_px: float,
 ) -> tuple[Array, Array]:
@@ -175,6 +164,8 @@ def _checked_matches(
     check_shape(xy1, f"{len(xy0)} 2", "keypoints1_xy")
     if confidence is not None:
         check_shape(confidence, f"{len(xy0)}", "confidence")
+    for edge in edges or ():
+        check_shape(edge, f"{len(xy0)} 2", "edges")
     if mode not in get_args(ConfidenceMode):
         raise ValueError(f"mode must be one of {', '.join(get_args(ConfidenceMode))}, got {mode!r}")
     if not threshold_px > 0.0:
@@ -182,6 +173,34 @@ def _checked_matches(
     if any(camera.distortion):
         raise ValueError(f"camera must be without distortion, got {camera.distortion}")
     return xy0, xy1
+
+
+def _as_in_the_paper(
+    camera: Intrinsics, xy0: Array, xy1: Array, confidence: Array, threshold_px: float, seed: int
+) -> Array | None:
+    """The pose of the paper's RANSAC, None where it finds none."""
+    found = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
+    if found is None:
+        return None
+    near = np.abs(sampson_px(fundamental_matrix(camera, found.T_cam1_cam0), xy0, xy1)) < 2.0 * threshold_px
+    return _in_front_sign(camera, found.T_cam1_cam0, xy0[near], xy1[near])
+
+
+def _searched(
+    camera: Intrinsics,
+    xy0: Array,
+    xy1: Array,
+    kept: NDArray[np.intp],
+    confidence: Array | None,
+    threshold_px: float,
+    how: Mapping[str, int],
+) -> list[Array | None]:
+    """What the searches find, at two thresholds each."""
+    return [
+        _search(camera, xy0[rows], xy1[rows], factor * threshold_px, in_order=in_order, **how)
+        for factor in _THRESHOLD_FACTORS
+        for rows, in_order in _orders_of_drawing(len(xy0), kept, confidence)
+    ]
 
 
 def _orders_of_drawing(

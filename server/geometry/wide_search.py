@@ -220,7 +220,7 @@ def epipolar_inliers(from_xy: Array, to_xy: Array) -> NDArray[np.bool_] | None:
 
 def _moves_like_its_neighbours(xy: Array, flow: Array, trusted: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which points move about like the median of the trusted points next to them; depth may differ much."""
-    square = ((xy[:, None] - xy[None, trusted]) ** 2).sum(axis=2)
+    square = square_distances(xy, xy[trusted])
     nearest = np.argsort(square, axis=1, kind="stable")[:, :_NEIGHBOURS]
     around = np.median(flow[trusted][nearest], axis=1)
     allowed_px = _FREE_FLOW_PX + 0.5 * np.linalg.norm(around, axis=1)

@@ -18,6 +18,7 @@ from semcast.server.geometry.features import (
 )
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.projection import depths_in
+from semcast.server.geometry.square_distance import square_distances
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -179,7 +180,7 @@ class Relocaliser:
         size = (self._camera.width, self._camera.height)
         in_view = ((expected >= 0) & (expected < size)).all(axis=1)
         ids, known, points, expected = ids[in_view], known[in_view], points[in_view], expected[in_view]
-        square = ((expected[:, None] - xy[None]) ** 2).sum(axis=2)
+        square = square_distances(expected, xy)
         point, row = np.nonzero(square < _GUIDED_RADIUS_PX**2)
         if len(point) < self._min_inliers:
             return None
@@ -252,7 +253,7 @@ def submap_similarity(
     known = row_new >= 0
     if int(known.sum()) < _MIN_SHARED or len(place.ids) < _MIN_SHARED:
         return None
-    square = ((place.xy[:, None] - xy_new[known][None]) ** 2).sum(axis=2)
+    square = square_distances(place.xy, xy_new[known])
     nearest = square.argmin(axis=1)
     close = square[np.arange(len(place.xy)), nearest] < radius_px**2
     if int(close.sum()) < _MIN_SHARED:

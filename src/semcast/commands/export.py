@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--marker-id",
         type=int,
         metavar="N",
-        help="number of the marker; by default the one that is in most images",
+        help="number of the marker; by default of those that tell the scale the one in most images",
     )
     parser.add_argument(
         "--out", type=named_path, required=True, metavar="PATH", help="file or folder to write"

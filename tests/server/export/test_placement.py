@@ -138,6 +138,7 @@ def test_a_path_of_another_time_or_of_one_place_is_refused(arc_run):
 #: Faces the cameras, a little turned: its z points back to them.
 T_MAP_MARKER = make_transform(exp_so3((0.2, 0.1, 0.3)) @ np.diag([1.0, -1.0, -1.0]), (0.1, 0.2, 6.0))
 SIDE = 1.5
+SQUARE = 0.5 * SIDE * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
 
 
 @pytest.fixture
@@ -204,6 +205,26 @@ def test_of_several_markers_one_may_be_named(marker_run):
     )
     with pytest.raises(SourceError, match=r"marker 5 of apriltag_36h11 .* got none of 12; found: 3, 7$"):
         place_by_marker(data, images, 0.3, FAMILY, marker_id=5)
+
+
+def test_of_several_markers_the_one_counts_that_tells_the_scale_and_is_in_most_images(arc_run):
+    data = arc_run(num_frames=6)
+    poses = dict(enumerate(data.T_world_cam))
+    sightings = Sightings(FAMILY)
+    for number, x, frame_ids in ((3, -2.0, range(6)), (9, 0.0, range(4)), (5, -1.0, range(5))):
+        T_map_marker = make_transform(T_MAP_MARKER[:3, :3], (x, 0.0, 6.0))
+        T_cam_marker = invert_transform(data.T_world_cam) @ T_map_marker
+        sightings.of[number] = {
+            k: CAMERA.project(transform_points(T_cam_marker[k], SQUARE)) for k in frame_ids
+        }
+    assert sightings.place(poses, CAMERA, SIDE * SCALE, None).marker_id == 3
+    for k in range(6):
+        sightings.of[3][k] = sightings.of[3][k] + 40.0 * k  # carried about
+    assert sightings.place(poses, CAMERA, SIDE * SCALE, None).marker_id == 5
+    for number in (5, 9):
+        del sightings.of[number]
+    with pytest.raises(SourceError, match="marker 3 must be seen from several places"):
+        sightings.place(poses, CAMERA, SIDE * SCALE, None)
 
 
 def test_a_marker_seen_from_one_place_tells_no_scale(marker_run, arc_run):
@@ -328,9 +349,8 @@ def test_a_damaged_dense_cloud_is_named(tmp_path, marker_run, capsys, damage, sa
 def test_the_uncertainty_covers_what_corners_of_an_image_have_in_common(arc_run):
     """Errors of poses move all four alike, and soft edges all of them outwards."""
     data = arc_run(num_frames=6)
-    corners = 0.5 * SIDE * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
     T_cam_marker = invert_transform(data.T_world_cam) @ T_MAP_MARKER
-    xy = np.stack([CAMERA.project(transform_points(T, corners)) for T in T_cam_marker])
+    xy = np.stack([CAMERA.project(transform_points(T, SQUARE)) for T in T_cam_marker])
     outwards = xy - xy.mean(axis=1, keepdims=True)
     outwards /= np.linalg.norm(outwards, axis=2, keepdims=True)
     poses = dict(enumerate(data.T_world_cam))
