@@ -67,6 +67,12 @@ _CUT_SIGMAS = 2.5
 _MIN_SIGMA_PX = 0.1
 
 
+#: Shares of the edges that errors may have.
+_SHARES = (0.25, 0.5, 0.75, 1.0)
+#: What log-likelihood a share must gain over none: what a parameter costs (Akaike).
+_SHARE_SURE = 1.0
+
+
 @dataclass(frozen=True)
 class TwoViewResult:
     """Relative pose of two images.
@@ -137,13 +143,15 @@ def estimate_two_view(
     candidates += _near_turning(camera, xy0[kept], xy1[kept], threshold_px)
     if choose_model:
         candidates += _from_plane(camera, xy0, xy1, threshold_px, seed)
-    shapes = None if edges is None else (shape_of(edges[0]), shape_of(edges[1]))
-    T_found = _likeliest(camera, candidates, xy0, xy1, shapes, _weights(agreement), threshold_px)
+    T_found = _likeliest(camera, candidates, xy0, xy1, _weights(agreement), threshold_px)
     if T_found is None:
         return None
     trusted = None if confidence is None else confidence[kept]
-    if shapes is not None:
-        shapes = shapes[0][kept], shapes[1][kept]
+    shapes = None
+    if edges is not None:
+        shapes = _shapes(
+            camera, T_found, xy0[kept], xy1[kept], (edges[0][kept], edges[1][kept]), threshold_px
+        )
     T = _refine(camera, T_found, xy0[kept], xy1[kept], shapes, trusted, threshold_px)
     return _result(camera, T, xy0, xy1, threshold_px, choose_model)
 
@@ -220,7 +228,6 @@ def _likeliest(
     candidates: Sequence[Array | None],
     xy0: Array,
     xy1: Array,
-    shapes: Shapes | None,
     weight: Array,
     threshold_px: float,
 ) -> Array | None:
@@ -232,7 +239,7 @@ def _likeliest(
         turn_cost = _TURN_COST * float(np.sqrt(rotation_angle_deg(candidate[:3, :3])) / weight.sum())
         for way in (1.0, -1.0):  # a search tells the translation up to its sign
             T = make_transform(candidate[:3, :3], way * candidate[:3, 3])
-            cost = _score(camera, T, xy0, xy1, shapes, threshold_px, weight) + turn_cost
+            cost = _score(camera, T, xy0, xy1, threshold_px, weight) + turn_cost
             judged.append((cost if k == 0 else _TO_DISPLACE * cost, k, T))
     if not judged:
         return None
@@ -253,21 +260,13 @@ def _weights(agreement: Array) -> Array:
     return np.clip((agreement - low) / (high - low), _LEAST_WEIGHT, 1.0)
 
 
-def _score(
-    camera: Intrinsics,
-    T: Array,
-    xy0: Array,
-    xy1: Array,
-    shapes: Shapes | None,
-    threshold_px: float,
-    weight: Array,
-) -> float:
+def _score(camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float, weight: Array) -> float:
     """MSAC score without confidence over the distances to epipolar half lines.
 
     It is the mean over several thresholds, because the noise of decoded images is not known beforehand.
     Which half tells the two poses of a plane apart, which fit the epipolar constraint equally well.
     """
-    residual = half_line_px(camera, T, xy0, xy1, shapes)
+    residual = half_line_px(camera, T, xy0, xy1)
     return float(np.mean([msac_score(residual, factor * threshold_px, weight) for factor in _SCORE_FACTORS]))
 
 
@@ -354,6 +353,31 @@ def _from_plane(
             starts.append(T)
     sigma_px = np.full(len(xy0), 0.5 * threshold_px)
     return [refine_relative_pose(camera, T, xy0, xy1, sigma_px) for T in starts]
+
+
+def _shapes(
+    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, edges: tuple[Array, Array], threshold_px: float
+) -> Shapes | None:
+    """Shapes of errors as far as the matches near a pose bear them out.
+
+    Where images tell a point across an edge only, its error has the shape of the structure tensor; where
+    descriptors or a blurred image place it, hardly any. Which share of the edges makes the distances to the
+    epipolar lines likeliest (Laplace) is asked of this pair, as its noise is. None where no share does.
+    """
+    distance = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
+    near = distance < 3.0 * threshold_px
+    if int(near.sum()) < MIN_MATCHES:
+        return None
+    F, xy0, xy1, distance = fundamental_matrix(camera, T), xy0[near], xy1[near], distance[near]
+    least, likeliest = float(len(distance) * np.log(distance.mean())) - _SHARE_SURE, None
+    for share in _SHARES:
+        shapes = shape_of(share * edges[0]), shape_of(share * edges[1])
+        shaped = np.abs(sampson_px(F, xy0, xy1, (shapes[0][near], shapes[1][near])))
+        stretch = np.log((shaped + 1e-9) / (distance + 1e-9))
+        cost = float(len(distance) * np.log(shaped.mean()) - stretch.sum())
+        if cost < least:
+            least, likeliest = cost, shapes
+    return likeliest
 
 
 def _refine(
