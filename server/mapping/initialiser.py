@@ -90,7 +90,6 @@ class _Pair:
         xy0: ``(N, 2)`` in the first frame.
         xy1: ``(N, 2)`` in the second.
         confidence: ``(N,)`` of both ends.
-        edges: ``(N, 2)`` in the first frame, and in the second, see ``edges``.
         left_out: ``(L,)`` suspects that both saw too.
     """
 
@@ -98,7 +97,6 @@ class _Pair:
     xy0: Array
     xy1: Array
     confidence: Array
-    edges: tuple[Array, Array]
     left_out: Ids
 
 
@@ -108,8 +106,7 @@ def _pair(first: Observed, second: Observed, suspect: Ids) -> _Pair:
     doubtful = np.isin(ids, suspect)
     left_out, ids, row0, row1 = ids[doubtful], ids[~doubtful], row0[~doubtful], row1[~doubtful]
     confidence = fuse_confidence(first.confidence[row0], second.confidence[row1])
-    edges = first.edge[row0], second.edge[row1]
-    return _Pair(ids, first.xy[row0], second.xy[row1], confidence, edges, left_out)
+    return _Pair(ids, first.xy[row0], second.xy[row1], confidence, left_out)
 
 
 class Initialiser:
@@ -224,7 +221,6 @@ class Initialiser:
             pair.xy0,
             pair.xy1,
             pair.confidence,
-            edges=pair.edges,
             mode=self._mode,
             threshold_px=threshold_px,
             seed=self._seed,
@@ -240,7 +236,6 @@ class Initialiser:
             pair.xy0,
             pair.xy1,
             pair.confidence,
-            edges=pair.edges,
             mode=self._mode,
             threshold_px=threshold_px,
             seed=self._seed,

@@ -54,7 +54,6 @@ def motion_of_scene(
     xy1: Array,
     confidence: Array,
     *,
-    edges: tuple[Array, Array],
     mode: ConfidenceMode,
     threshold_px: float,
     seed: int,
@@ -67,7 +66,6 @@ def motion_of_scene(
         xy0: ``(N, 2)`` pixels of the first image.
         xy1: ``(N, 2)`` pixels of the second one, matched row by row.
         confidence: ``(N,)`` of the matches.
-        edges: ``(N, 2)`` in the first image and in the second, see ``edges``.
         mode: Use of it.
         threshold_px: Inlier threshold ``found`` was searched with.
         seed: Of the search.
@@ -85,7 +83,6 @@ def motion_of_scene(
         xy0[rest],
         xy1[rest],
         confidence[rest],
-        edges=(edges[0][rest], edges[1][rest]),
         mode=mode,
         threshold_px=threshold_px,
         seed=seed,

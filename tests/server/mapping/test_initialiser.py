@@ -78,21 +78,6 @@ def test_no_relative_pose_is_looked_for_before_there_is_a_third_view(monkeypatch
     assert len(sizes) == 1
 
 
-def test_the_relative_pose_is_told_the_edges_of_both_frames(monkeypatch):
-    told = []
-
-    def noted(camera, xy0, xy1, *args, edges, **options):
-        told.append((xy0, xy1, edges))
-        return estimate_two_view(camera, xy0, xy1, *args, edges=edges, **options)
-
-    monkeypatch.setattr("semcast.server.mapping.initialiser.estimate_two_view", noted)
-    frames = [replace(f, edge=0.001 * (k + 1) * f.xy) for k, f in enumerate(ride(6)[0])]
-    begin(frames)
-    xy0, xy1, edges = told[-1]
-    assert np.allclose(edges[0], 0.001 * xy0)
-    assert np.allclose(edges[1], 0.003 * xy1)
-
-
 def test_few_points_wait_for_more_but_not_for_ever():
     frames, _ = ride(16, num_points=55, step_m=0.05)
     k, _ = begin(frames)

@@ -64,7 +64,7 @@ def compared(frame0, frame1):
     ids, row0, row1 = np.intersect1d(frame0.ids, frame1.ids, return_indices=True)
     xy0, xy1, confidence = frame0.xy[row0], frame1.xy[row1], np.ones(len(ids))
     found = estimate_two_view(CAMERA, xy0, xy1, threshold_px=1.0)
-    how = {"mode": "off", "threshold_px": 1.0, "seed": 0, "edges": (np.zeros_like(xy0), np.zeros_like(xy1))}
+    how = {"mode": "off", "threshold_px": 1.0, "seed": 0}
     return ids, motion_of_scene(CAMERA, found, xy0, xy1, confidence, **how), found
 
 
@@ -84,24 +84,6 @@ def test_where_all_is_at_rest_the_motion_of_most_tracks_stays():
     assert scene.motion is found
     assert not scene.alone.any()
     assert not scene.is_contested
-
-
-def test_the_rival_is_looked_for_with_the_edges_of_its_own_tracks(monkeypatch):
-    frames, _ = frames_of(3)
-    told = {}
-
-    def noted(camera, xy0, xy1, *args, edges, **options):
-        told.update(xy=(xy0, xy1), edges=edges)
-
-    monkeypatch.setattr("semcast.server.mapping.scene_motion.estimate_two_view", noted)
-    _, row0, row1 = np.intersect1d(frames[0].ids, frames[2].ids, return_indices=True)
-    xy0, xy1 = frames[0].xy[row0], frames[2].xy[row1]
-    found = estimate_two_view(CAMERA, xy0, xy1, threshold_px=1.0)
-    how = {"mode": "off", "threshold_px": 1.0, "seed": 0, "edges": (0.001 * xy0, 0.002 * xy1)}
-    motion_of_scene(CAMERA, found, xy0, xy1, np.ones(len(xy0)), **how)
-    assert 0 < len(told["xy"][0]) < len(xy0)
-    for xy, edge, factor in zip(told["xy"], told["edges"], (0.001, 0.002), strict=True):
-        assert np.array_equal(edge, factor * xy)
 
 
 def test_a_map_begins_with_the_scene_and_without_what_moves_by_itself():
