@@ -3,11 +3,11 @@
 ``robust``: PoseLib's LO-RANSAC three times, each at two thresholds: drawing uniformly from all matches,
 uniformly from those that move as their neighbours do, and among these the trusted ones first. Beside what
 they find stand the best motions near pure turning. The poses, each with its translation either way, are
-judged by how near matches are to the halves of their epipolar lines in front of the cameras, for the error
-that each has across its line; the score knows the agreement, but not confidence, and holds a little against
-turning, since few matches are often explained as well by a large turn that the camera never made. Then
-comes a refinement whose weights are fitted to this pair's own residuals. A misleading confidence can
-therefore cost time, hardly accuracy.
+judged by how near matches are to the halves of their epipolar lines in front of the cameras; the score knows
+the agreement, but not confidence, and holds a little against turning, since few matches are often explained
+as well by a large turn that the camera never made. Then comes a refinement whose weights, and as how much of
+an edge its errors count, are fitted to this pair's own residuals. A misleading confidence can therefore cost
+time, hardly accuracy.
 """
 
 from collections.abc import Mapping, Sequence
@@ -71,6 +71,8 @@ _MIN_SIGMA_PX = 0.1
 _SHARES = (0.25, 0.5, 0.75, 1.0)
 #: What log-likelihood a share must gain over none: what a parameter costs (Akaike).
 _SHARE_SURE = 1.0
+#: No match is known to lie nearer to its line than that.
+_LEAST_PX = 1e-6
 
 
 @dataclass(frozen=True)
@@ -112,8 +114,8 @@ def estimate_two_view(
         keypoints0_xy: ``(N, 2)`` pixels.
         keypoints1_xy: ``(N, 2)`` pixels, matched row by row.
         confidence: ``(N,)`` in [0, 1], from ``weighting``; None is the same as mode ``off``.
-        edges: ``(N, 2)`` of the keypoints of both images, see ``edges``: known to the choice and the
-            refinement, except in mode ``paper``. None where errors have no direction.
+        edges: ``(N, 2)`` of the keypoints of both images, see ``edges``: known to the refinement, except in
+            mode ``paper``. None where errors have no direction.
         mode: ``paper`` is the paper's RANSAC; ``off`` knows no confidence; all others search in order of it
             too and refine with fitted weights.
         threshold_px: Inlier threshold on the Sampson distance.
@@ -364,17 +366,17 @@ def _shapes(
     descriptors or a blurred image place it, hardly any. Which share of the edges makes the distances to the
     epipolar lines likeliest (Laplace) is asked of this pair, as its noise is. None where no share does.
     """
-    distance = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
+    F = fundamental_matrix(camera, T)
+    distance = np.abs(sampson_px(F, xy0, xy1))
     near = distance < 3.0 * threshold_px
     if int(near.sum()) < MIN_MATCHES:
         return None
-    F, xy0, xy1, distance = fundamental_matrix(camera, T), xy0[near], xy1[near], distance[near]
+    xy0, xy1, distance = xy0[near], xy1[near], distance[near] + _LEAST_PX
     least, likeliest = float(len(distance) * np.log(distance.mean())) - _SHARE_SURE, None
     for share in _SHARES:
         shapes = shape_of(share * edges[0]), shape_of(share * edges[1])
-        shaped = np.abs(sampson_px(F, xy0, xy1, (shapes[0][near], shapes[1][near])))
-        stretch = np.log((shaped + 1e-9) / (distance + 1e-9))
-        cost = float(len(distance) * np.log(shaped.mean()) - stretch.sum())
+        shaped = np.abs(sampson_px(F, xy0, xy1, (shapes[0][near], shapes[1][near]))) + _LEAST_PX
+        cost = float(len(distance) * np.log(shaped.mean()) - np.log(shaped / distance).sum())
         if cost < least:
             least, likeliest = cost, shapes
     return likeliest

@@ -205,20 +205,34 @@ def test_confidence_that_is_off_or_all_alike_is_none(mode, spread):
     assert np.array_equal(a.T_cam1_cam0, b.T_cam1_cam0)
 
 
-def test_of_two_motions_that_one_counts_whose_matches_are_off_along_their_edges_only():
-    # The camera moves sideways, so matches stay in their rows; three of five slid down upright edges by 2 px.
+@pytest.mark.parametrize(
+    ("slide_px", "least", "most"), [(0.1, None, None), (0.35, 0.25, 0.75), (1.0, 0.75, 1.0)]
+)
+def test_errors_have_as_much_of_their_edges_as_the_distances_bear_out(slide_px, least, most):
+    # Across an edge errors are .1 px; edges say that along it they are ten times as large.
     rng = np.random.default_rng(0)
-    points = rng.uniform((-3, -2, 5), (3, 2, 12), (100, 3))
-    T = make_transform(np.eye(3), (1.0, 0.0, 0.0))
-    xy0, xy1 = CAMERA.project(points), CAMERA.project(transform_points(T, points))
-    slid = np.arange(100) % 5 < 3
-    xy1[slid, 1] += 2.0
-    tilted = make_transform(exp_so3((-2.0 / CAMERA.fy, 0, 0)), T[:3, 3])
-    upright = shape_of(slid[:, None] * 0.5 * np.log(6.0) * np.array([0.0, 1.0]))
-    for shapes, likeliest in ((None, tilted), ((upright, upright), T)):
-        for candidates in ((T, tilted), (tilted, T)):
-            found = two_view._likeliest(CAMERA, candidates, xy0, xy1, shapes, np.ones(100), 1.0)
-            assert np.array_equal(found, likeliest)
+    T, xy0, xy1, _ = make_matches(0, num=300, noise_px=0.0, outlier_share=0.0)
+    angle = rng.uniform(0, np.pi, 300)
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    xy1 = xy1 + rng.normal(0, slide_px, (300, 1)) * along + rng.normal(0, 0.1, (300, 1)) * across
+    xy0 = xy0 + rng.normal(0, slide_px, (300, 1)) * along + rng.normal(0, 0.1, (300, 1)) * across
+    edge = 0.5 * np.log(10.0) * along
+    shapes = two_view._shapes(CAMERA, T, xy0, xy1, (edge, edge), 2.0)
+    if least is None or most is None:
+        assert shapes is None
+        return
+    assert shapes is not None
+    expected = [share for share in (0.25, 0.5, 0.75, 1.0) if np.allclose(shapes[0], shape_of(share * edge))]
+    assert len(expected) == 1
+    assert least <= expected[0] <= most
+    assert np.array_equal(shapes[1], shapes[0])
+
+
+def test_shapes_of_too_few_matches_near_a_pose_are_none():
+    T, xy0, xy1, _ = make_matches(0, num=20, noise_px=0.0, outlier_share=0.0)
+    edge = np.tile([0.5, 0.5], (20, 1))
+    assert two_view._shapes(CAMERA, T, xy0[:7], xy1[:7], (edge[:7], edge[:7]), 1.0) is None
 
 
 def test_edges_that_matches_slid_along_take_errors_off_but_not_in_the_paper():
