@@ -11,6 +11,7 @@ that of the next. What the keyframes between them told is in how far they are ap
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,10 +95,8 @@ def _hanging_together(world: WorldMap, keyframes: Sequence[Keyframe]) -> list[li
     parts: list[tuple[list[int], set[int]]] = []
     for row, keyframe in enumerate(keyframes):
         seen = set(keyframe.ids[world.landmarks.rows(keyframe.ids) >= 0].tolist())
-        linked, apart = [], []
-        for part in parts:
-            hangs = len(part[1] & seen) >= _MIN_SHARED or (row in steps and row - 1 in part[0])
-            (linked if hangs else apart).append(part)
+        hangs = [len(ids & seen) >= _MIN_SHARED or (row in steps and row - 1 in rows) for rows, ids in parts]
+        linked, apart = (list(compress(parts, mask)) for mask in (hangs, np.logical_not(hangs)))
         members = [k for part, _ in linked for k in part]
         parts = [*apart, ([*members, row], seen.union(*(ids for _, ids in linked)))]
     return [[keyframes[row] for row in rows] for rows in sorted(sorted(rows) for rows, _ in parts)]
@@ -111,10 +110,15 @@ def _steps_within(
     row = [at.get(k.frame_id) for k in keyframes]
     ends = ((edge, row[edge.first], row[edge.second]) for edge in steps.values())
     return tuple(
-        replace(edge, first=first, second=second, sigma=tuple(_SHARE_OF_DRIFT * s for s in edge.sigma))
+        Edge(first, second, edge.T_first_second, edge.scale, _tightened(edge.sigma))
         for edge, first, second in ends
         if first is not None and second is not None
     )
+
+
+def _tightened(sigma: tuple[float, float, float]) -> tuple[float, float, float]:
+    turn, way, scale = (_SHARE_OF_DRIFT * s for s in sigma)
+    return turn, way, scale
 
 
 def _adjust(
