@@ -211,6 +211,25 @@ def test_keyframes_that_share_no_landmark_hang_together_by_a_step_but_not_over_a
     assert adjust_whole_map(world, CAMERA, NOISE) == num_adjusted
 
 
+def test_steps_of_a_part_are_in_the_unit_that_the_part_before_left_it_in():
+    cut, first = 14, {}
+
+    def sees(k, ids):
+        mine = ids[(ids % 2 == 0) == (k < cut)]
+        return np.array(
+            [n for n in mine.tolist() if k < cut or k // 2 - first.setdefault(n, k // 2) <= 1], np.int64
+        )
+
+    world, _ = drifted_world(sees, step_sd=0.0003, growth=1.02)
+    world.keyframes = world.keyframes[:cut] + world.keyframes[cut::2]
+    world.gaps = {10 * cut}
+    before = way_errors(world)[cut:]
+    assert adjust_whole_map(world, CAMERA, NOISE) == cut + 11
+    grown = (1.0 + way_errors(world)[cut:]) / (1.0 + before)
+    assert grown.mean() < 0.9, "else its unit is the old one"
+    np.testing.assert_allclose(grown, grown.mean(), rtol=0.01)
+
+
 def test_a_map_larger_than_the_limit_is_adjusted_by_a_part_of_its_landmarks(monkeypatch):
     monkeypatch.setattr(whole_map, "MAX_OBSERVATIONS", 3000)
     monkeypatch.setattr(whole_map, "OBSERVATIONS_EACH", 0)
