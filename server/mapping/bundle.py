@@ -18,6 +18,7 @@ from semcast.server.geometry.weighting import HUBER_K
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
 from semcast.server.mapping.dense_bundle import Baseline, State, Window, last_covariance, minimise
 from semcast.server.mapping.left_over import information
+from semcast.server.mapping.pose_graph import Edge
 
 Array = NDArray[np.float64]
 
@@ -85,6 +86,14 @@ def _baseline(problem: BundleProblem) -> Baseline | None:
     return Baseline((0, furthest), length_map, max(1e-4 * length_map, 1e-9))
 
 
+def _step(edge: Edge) -> gtsam.BetweenFactorPose3:
+    T = edge.T_first_second
+    between = gtsam.Pose3(gtsam.Rot3(project_to_so3(T[:3, :3])), T[:3, 3])
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(edge.sigma[:2], 3))
+    robust = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K), noise)
+    return gtsam.BetweenFactorPose3(X(edge.first), X(edge.second), between, robust)
+
+
 def _build(
     problem: BundleProblem, used: NDArray[np.bool_]
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -99,6 +108,8 @@ def _build(
         noise = gtsam.noiseModel.Isotropic.Sigma(1, held.sigma_map)
         first, furthest = held.views
         graph.add(gtsam.RangeFactorPose3(X(first), X(furthest), held.length_map, noise))
+    for edge in problem.steps:
+        graph.add(_step(edge))
     for p in np.unique(problem.point[used]).tolist():
         values.insert(L(p), problem.xyz[p])
     sigmas, step = quantised_sigma(problem.sigma_px)
@@ -136,7 +147,8 @@ def optimise(problem: BundleProblem) -> BundleResult:
     solved: _Solved | None = None
     is_posed = bool(np.isfinite(problem.T_world_cam).all())
     if int(used.sum()) >= _MIN_OBSERVATIONS and problem.fixed.any() and is_posed:
-        is_dense = problem.solver == "dense" and int((~problem.fixed).sum()) <= _MAX_DENSE_VIEWS
+        is_small = not problem.steps and int((~problem.fixed).sum()) <= _MAX_DENSE_VIEWS
+        is_dense = problem.solver == "dense" and is_small
         solved = (_by_dense_algebra if is_dense else _by_gtsam)(problem, used)
     ok = solved is not None
     T_world_cam, xyz, covariance = solved or (problem.T_world_cam.copy(), problem.xyz.copy(), None)

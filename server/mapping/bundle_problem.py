@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.edges import alike, each_of, whitened
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.pose_graph import Edge
 
 Array = NDArray[np.float64]
 
@@ -60,7 +61,8 @@ class BundleProblem:
         huber_px: See ``NoiseModel``.
         edge: ``(M, 2)`` of each observation, see ``edges``.
         motion: Of the views, where it is wanted what the residuals say about shutter and lens.
-        solver: Of small problems; large ones are GTSAM's in any case.
+        solver: Of small problems; large ones, and those with ``steps``, are GTSAM's in any case.
+        steps: What is known of pairs of views besides what they saw; scales are not looked at.
     """
 
     camera: Intrinsics
@@ -83,6 +85,7 @@ class BundleProblem:
     motion: ViewMotion | None = None
     edge: Array = field(default_factory=alike)
     solver: Solver = "dense"
+    steps: tuple[Edge, ...] = ()
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""

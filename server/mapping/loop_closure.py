@@ -22,6 +22,7 @@ from semcast.server.mapping.pose_graph import Edge, SolvedGraph, solve_graph
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, tells_depth
 from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.steps import steps_of, usable_depth
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
@@ -39,11 +40,6 @@ _MAX_PENDING = 10
 _SAME_DEPTHS, _SAME_DEG, _SAME_SCALE = 0.1, 2.0, 1.15
 #: Landmarks found one by one that prove a place, as a number and as a share of those found.
 _MIN_FOUND, _MIN_FOUND_SHARE = 20, 0.6
-#: Drift from one keyframe to the next: rotation in radians and as a share of the turn, translation as a share
-#: of the way and of the depth, and the logarithm of the scale.
-_STEP_RAD, _STEP_TURN, _STEP_WAY, _STEP_DEPTH, _STEP_SCALE = 0.002, 0.02, 0.02, 0.002, 0.01
-#: Keyframes that share fewer tracks are on both sides of a gap: next to nothing is known of them.
-_MIN_SHARED, _GAP_RAD, _GAP_SCALE = 8, 0.5, 0.5
 #: How well a recognised place is known: radians, depths, logarithm of the scale.
 _PLACE_RAD, _PLACE_DEPTH, _PLACE_SCALE = 0.004, 0.02, 0.03
 #: Half the squared error in standard deviations that a loop may leave: seven errors of five deviations. What
@@ -244,10 +240,7 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
     """
     mine = world.keyframes_of(submap)
     row = {k.frame_id: i for i, k in enumerate(mine)}
-    all_ids = np.array(sorted(k for k, part in world.submap_of.items() if part == submap))
-    at = np.searchsorted(all_ids, [k.frame_id for k in mine])
-    num_steps = np.diff(at).tolist()
-    edges = [_step(world, mine[k], mine[k + 1], k + 1, num) for k, num in enumerate(num_steps)]
+    edges = [step.edge for step in steps_of(world, mine)]
     for new, old in world.revisits.items():
         if new in row and old in row:
             edges.append(_tie(world, mine, row[old], row[new], mine[row[new]].T_world_cam, 1.0))
@@ -259,34 +252,10 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
     return np.array([k.frame_id for k in mine], dtype=np.int64), solved
 
 
-def _step(world: WorldMap, before: Keyframe, now: Keyframe, row: int, num_steps: int) -> Edge:
-    """What tracking says of a keyframe, in this row, and the one before, so many steps of the way ago."""
-    T = invert_transform(before.T_world_cam) @ now.T_world_cam
-    turn_rad = np.radians(rotation_angle_deg(T[:3, :3]))
-    way = float(np.linalg.norm(T[:3, 3]))
-    depth = _depth(world, now, way)
-    grown = np.sqrt(num_steps)
-    sigma = (
-        grown * _STEP_RAD + _STEP_TURN * turn_rad,
-        _STEP_WAY * way + grown * _STEP_DEPTH * depth,
-        grown * _STEP_SCALE,
-    )
-    # Where keyframes between them were thinned out, they were tracked all the same.
-    if num_steps == 1 and len(np.intersect1d(before.ids, now.ids, assume_unique=True)) < _MIN_SHARED:
-        sigma = _GAP_RAD, way + depth, _GAP_SCALE
-    return Edge(row - 1, row, T, 1.0, sigma)
-
-
 def _tie(
     world: WorldMap, mine: Sequence[Keyframe], old: int, new: int, T_world_new: Array, scale: float
 ) -> Edge:
     """What a place that was recognised says of two keyframes."""
     T = invert_transform(mine[old].T_world_cam) @ T_world_new
-    depth = _depth(world, mine[old], float(np.linalg.norm(T[:3, 3])))
+    depth = usable_depth(world, mine[old], float(np.linalg.norm(T[:3, 3])))
     return Edge(old, new, T, scale, (_PLACE_RAD, _PLACE_DEPTH * depth, _PLACE_SCALE))
-
-
-def _depth(world: WorldMap, keyframe: Keyframe, otherwise: float) -> float:
-    """Median depth a keyframe sees, or another length where it sees no landmark any more."""
-    depth = median_depth(world, keyframe)
-    return depth if np.isfinite(depth) else max(otherwise, 1e-6)

@@ -35,7 +35,7 @@ _SHAPES = {
     "frames.T_keyframe_cam": "F 4 4",
 }
 #: Arrays that older checkpoints lack; so they do ``readout``.
-_ADDED = {"revisits": "R 2", "keyframes.edge": "O 2"}
+_ADDED = {"revisits": "R 2", "gaps": "G", "keyframes.edge": "O 2"}
 #: Keyframes and frames refer to poses by frame id.
 _OF_POSES = {"keyframes.frame_id": "keyframes", "frames.keyframe_id": "frames"}
 

@@ -5,12 +5,33 @@ longest ago is therefore worth as much as the rest: keyframes get further apart 
 some of its landmarks.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Ids = NDArray[np.int64]
+
+#: Keyframes that share fewer tracks are on both sides of a gap.
+_MIN_SHARED = 8
+
+
+class Thinned(Protocol):
+    """What is thinned out: keyframes."""
+
+    @property
+    def frame_id(self) -> int:
+        """Of its frame."""
+
+    @property
+    def submap(self) -> int:
+        """Which part of the map it belongs to."""
+
+    @property
+    def ids(self) -> Ids:
+        """``(M,)`` tracks seen."""
 
 
 def evenly_thinned(frame_ids: Ids, count: int) -> NDArray[np.intp]:
@@ -48,3 +69,42 @@ def least_needed(seen: Sequence[NDArray[np.intp]], last_seen: Ids, recent_since:
     of_late = last_seen >= recent_since
     rank[of_late] = 0
     return np.lexsort((last_seen, -rank, of_late))[:count]
+
+
+def is_gap(before: Thinned, now: Thinned) -> bool:
+    """Whether hardly a track goes from one keyframe to the one that came next."""
+    return len(np.intersect1d(before.ids, now.ids, assume_unique=True)) < _MIN_SHARED
+
+
+def gaps_among(keyframes: Sequence[Thinned], submap_of: Mapping[int, int]) -> set[int]:
+    """Frame ids of the keyframes behind a gap, and of the first ones: a submap may be joined to another.
+
+    Args:
+        keyframes: Those that are left, in order of time.
+        submap_of: Submap of every one there ever was; of two with others in between nothing is said.
+    """
+    ever: dict[int, list[int]] = {}
+    for frame_id, submap in sorted(submap_of.items()):
+        ever.setdefault(submap, []).append(frame_id)
+    left = {k.frame_id: k for k in keyframes}
+    steps = (step for mine in ever.values() for step in pairwise(mine))
+    gaps = {now for before, now in steps if {before, now} <= left.keys() and is_gap(left[before], left[now])}
+    return gaps | {mine[0] for mine in ever.values()}
+
+
+def hung_on_what_is_left(
+    revisits: Mapping[int, int], keyframes: Sequence[Thinned], submap_of: Mapping[int, int]
+) -> dict[int, int]:
+    """Let keyframes that were thinned out stand in a revisit for the kept one next in time.
+
+    A revisit ties places by how they are now; without it the next loop would part them again.
+    """
+    kept = np.array([k.frame_id for k in keyframes])
+    submap = np.array([k.submap for k in keyframes])
+
+    def next_to(frame_id: int) -> int | None:
+        near = kept[submap == submap_of[frame_id]]
+        return int(near[np.argmin(np.abs(near - frame_id))]) if len(near) else None
+
+    ends = [(next_to(new), next_to(old)) for new, old in revisits.items()]
+    return {new: old for new, old in ends if new is not None and old is not None and new != old}

@@ -2,10 +2,16 @@
 
 A window corrects what its own keyframes see. That a place seen again is where it was, and that an error of
 the start was bent into all that came after, takes all observations of the map together.
+
+Where keyframes were thinned out, those that are left share landmarks two by two, and hardly any that three of
+them see. Two views tell where the camera went, but not how far: nothing would hold the length of one step to
+that of the next. What the keyframes between them told is in how far they are apart, and is taken as known.
 """
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +21,8 @@ from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.bundle_problem import assemble_problem
 from semcast.server.mapping.mapper import drop_outliers, gather_observations, local_scales
+from semcast.server.mapping.pose_graph import Edge
+from semcast.server.mapping.steps import steps_of
 from semcast.server.mapping.window import within_limit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -32,6 +40,9 @@ MAX_KEYFRAMES = 1000
 _MIN_KEYFRAMES = 5
 #: Landmarks a keyframe shares at least with those it hangs together with: fewer don't say where it is.
 _MIN_SHARED = 12
+#: Drift that a loop has to be shared out by is meant large, the same everywhere. What tracking really errs by
+#: on a step is less, a tenth to a third of it, over clean images and over fading.
+_SHARE_OF_DRIFT = 0.3
 #: The second time without what the first one found to be outliers.
 _ROUNDS, _ITERATIONS = 2, 15
 
@@ -60,8 +71,9 @@ def adjust_whole_map(world: WorldMap, camera: Intrinsics, noise: NoiseModel) -> 
         for part in _hanging_together(world, mine):
             if len(part) < _MIN_KEYFRAMES:
                 continue
-            num_rounds = 0
-            while num_rounds < _ROUNDS and _adjust(world, part, settled, camera, noise):
+            # Not earlier: a part before this one may have changed its unit.
+            steps, num_rounds = _steps_within(_known_steps(world, mine), mine, part), 0
+            while num_rounds < _ROUNDS and _adjust(world, part, steps, settled, camera, noise):
                 num_rounds += 1
             if num_rounds:
                 settled += part
@@ -69,24 +81,53 @@ def adjust_whole_map(world: WorldMap, camera: Intrinsics, noise: NoiseModel) -> 
     return num_adjusted
 
 
+def _known_steps(world: WorldMap, keyframes: Sequence[Keyframe]) -> dict[int, Edge]:
+    """Row of a keyframe -> the step to it, where keyframes were thinned out before it."""
+    return {s.edge.second: s.edge for s in steps_of(world, keyframes) if s.is_thinned and not s.is_gap}
+
+
 def _hanging_together(world: WorldMap, keyframes: Sequence[Keyframe]) -> list[list[Keyframe]]:
-    """Sort keyframes into parts that share landmarks; each part, and the parts, in order of time.
+    """Sort keyframes into parts that share landmarks or a step; each part, and the parts, in order of time.
 
     Parts that share none can't be adjusted together: nothing would hold one's place and scale to the other's.
     """
-    parts: list[tuple[list[Keyframe], set[int]]] = []
-    for keyframe in keyframes:
+    steps = _known_steps(world, keyframes)
+    parts: list[tuple[list[int], set[int]]] = []
+    for row, keyframe in enumerate(keyframes):
         seen = set(keyframe.ids[world.landmarks.rows(keyframe.ids) >= 0].tolist())
-        linked = [part for part in parts if len(part[1] & seen) >= _MIN_SHARED]
-        parts = [part for part in parts if len(part[1] & seen) < _MIN_SHARED]
+        hangs = [len(ids & seen) >= _MIN_SHARED or (row in steps and row - 1 in rows) for rows, ids in parts]
+        linked, apart = (list(compress(parts, mask)) for mask in (hangs, np.logical_not(hangs)))
         members = [k for part, _ in linked for k in part]
-        parts.append(([*members, keyframe], seen.union(*(ids for _, ids in linked))))
-    ordered = [sorted(part, key=lambda k: k.frame_id) for part, _ in parts]
-    return sorted(ordered, key=lambda part: part[0].frame_id)
+        parts = [*apart, ([*members, row], seen.union(*(ids for _, ids in linked)))]
+    return [[keyframes[row] for row in rows] for rows in sorted(sorted(rows) for rows, _ in parts)]
+
+
+def _steps_within(
+    steps: dict[int, Edge], keyframes: Sequence[Keyframe], part: Sequence[Keyframe]
+) -> tuple[Edge, ...]:
+    """Steps between keyframes of a part, by rows of the part."""
+    at = {k.frame_id: row for row, k in enumerate(part)}
+    row = [at.get(k.frame_id) for k in keyframes]
+    ends = ((edge, row[edge.first], row[edge.second]) for edge in steps.values())
+    return tuple(
+        Edge(first, second, edge.T_first_second, edge.scale, _tightened(edge.sigma))
+        for edge, first, second in ends
+        if first is not None and second is not None
+    )
+
+
+def _tightened(sigma: tuple[float, float, float]) -> tuple[float, float, float]:
+    turn, way, scale = (_SHARE_OF_DRIFT * s for s in sigma)
+    return turn, way, scale
 
 
 def _adjust(
-    world: WorldMap, part: list[Keyframe], settled: list[Keyframe], camera: Intrinsics, noise: NoiseModel
+    world: WorldMap,
+    part: list[Keyframe],
+    steps: tuple[Edge, ...],
+    settled: list[Keyframe],
+    camera: Intrinsics,
+    noise: NoiseModel,
 ) -> bool:
     """Adjust one part and drop what does not fit it; whether that succeeded.
 
@@ -98,24 +139,22 @@ def _adjust(
     limit = max(MAX_OBSERVATIONS, OBSERVATIONS_EACH * len(part))
     taken, kept, point = within_limit(ids, seen.point, limit=limit)
     landmark_ids = ids[taken]
-    result = optimise(
-        assemble_problem(
-            camera,
-            part,
-            np.stack([k.T_world_cam for k in part]),
-            landmark_ids,
-            world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
-            seen.of_rows(kept, point),
-            noise,
-            fixed=np.arange(len(part)) == 0,
-            keep_baseline=True,
-            iterations=_ITERATIONS,
-        )
+    problem = assemble_problem(
+        camera,
+        part,
+        np.stack([k.T_world_cam for k in part]),
+        landmark_ids,
+        world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
+        seen.of_rows(kept, point),
+        noise,
+        fixed=np.arange(len(part)) == 0,
+        keep_baseline=True,
+        iterations=_ITERATIONS,
     )
+    result = optimise(replace(problem, steps=steps))
     if not result.ok:
         logger.debug("the map of %d keyframes can't be adjusted as a whole", len(part))
         return False
-    problem = result.problem
     frame_ids = np.array([k.frame_id for k in (*part, *settled)], dtype=np.int64)
     T_world_cam = np.stack([*result.T_world_cam, *(k.T_world_cam for k in settled)])
     scale = np.concatenate([local_scales(result), np.ones(len(settled))])

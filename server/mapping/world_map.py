@@ -12,7 +12,7 @@ from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.edges import alike, each_of
 from semcast.server.mapping.map_arrays import check_map_arrays
 from semcast.server.mapping.posed_frames import PosedFrames
-from semcast.server.mapping.thinning import evenly_thinned, least_needed
+from semcast.server.mapping.thinning import evenly_thinned, gaps_among, hung_on_what_is_left, least_needed
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -175,6 +175,7 @@ class WorldMap:
         submap_of: Frame id of a keyframe -> its submap.
         frames: Of each its keyframe and ``T_keyframe_cam``.
         revisits: Frame id of a keyframe -> that of an older one whose landmarks it saw again.
+        gaps: Frame ids of keyframes behind a gap in the tracks, noted when keyframes are thinned out.
     """
 
     def __init__(self) -> None:
@@ -187,6 +188,7 @@ class WorldMap:
         self.submap_of: dict[int, int] = {}
         self.frames = PosedFrames()
         self.revisits: dict[int, int] = {}
+        self.gaps: set[int] = set()
         self._changed: set[int] = set()
         self._moved_keyframes: set[int] = set()
         self._frames_moved: set[int] = set()
@@ -342,25 +344,11 @@ class WorldMap:
         if len(self.keyframes) <= max_keyframes:
             return False
         old, young = self.keyframes[:-recent], self.keyframes[-recent:]
+        self.gaps |= gaps_among(self.keyframes, self.submap_of)
         kept = evenly_thinned(np.array([k.frame_id for k in old]), len(old) // 2)
         self.keyframes = [old[row] for row in kept.tolist()] + young
-        self._hang_revisits_on_what_is_left()
+        self.revisits = hung_on_what_is_left(self.revisits, self.keyframes, self.submap_of)
         return True
-
-    def _hang_revisits_on_what_is_left(self) -> None:
-        """Let keyframes that were thinned out stand in a revisit for the kept one next in time.
-
-        A revisit ties places by how they are now; without it the next loop would part them again.
-        """
-        kept = np.array([k.frame_id for k in self.keyframes])
-        submap = np.array([k.submap for k in self.keyframes])
-
-        def next_to(frame_id: int) -> int | None:
-            near = kept[submap == self.submap_of[frame_id]]
-            return int(near[np.argmin(np.abs(near - frame_id))]) if len(near) else None
-
-        ends = [(next_to(new), next_to(old)) for new, old in self.revisits.items()]
-        self.revisits = {new: old for new, old in ends if new is not None and old is not None and new != old}
 
     def pose_of_frame(self, frame_id: int) -> Array | None:
         """Best current ``T_world_cam`` of a frame, None where it has none."""
@@ -432,6 +420,7 @@ class WorldMap:
             "frames.keyframe_id": keyframe_ids,
             "frames.T_keyframe_cam": T_keyframe_cam,
             "revisits": np.array(list(self.revisits.items()), dtype=np.int64).reshape(-1, 2),
+            "gaps": np.array(sorted(self.gaps), dtype=np.int64),
         }
 
     def restore(self, arrays: dict[str, NDArray]) -> None:
@@ -476,6 +465,7 @@ class WorldMap:
         there = {k.frame_id for k in self.keyframes}
         revisits = arrays.get("revisits", np.zeros((0, 2), np.int64))  # older checkpoints have none
         self.revisits = {new: old for new, old in revisits.tolist() if {new, old} <= there}
+        self.gaps = set(arrays.get("gaps", np.zeros(0, np.int64)).tolist())
         self._changed = set(self.landmarks.ids.tolist())
         self._moved_keyframes = set(self.poses)
 

@@ -14,6 +14,7 @@ from semcast.server.mapping import bundle, dense_bundle
 from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.bundle_process import ProcessBundle
+from semcast.server.mapping.pose_graph import Edge
 
 CAMERA = Intrinsics(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480)
 
@@ -304,6 +305,32 @@ def test_sigmas_share_sixteen_models():
     assert step.tolist()[:2] == [0, 0]
     assert step.tolist()[3:] == [15, 15]
     assert sigmas[step[2]] == pytest.approx(1.0, rel=0.2)
+
+
+def step_between(T_world_cam, first, second, sigma=(0.001, 0.001, 1.0)):
+    T = invert_transform(T_world_cam[first]) @ T_world_cam[second]
+    return Edge(first, second, T, 1.0, sigma)
+
+
+def test_a_view_that_saw_nothing_goes_where_a_step_leads():
+    problem, T_world_cam, _ = make_problem()
+    seen = problem.view != 4
+    parts = {name: getattr(problem, name)[seen] for name in ("view", "point", "xy", "sigma_px", "confidence")}
+    steps = (step_between(T_world_cam, 3, 4),)
+    result = optimise(replace(problem, **parts, edge=alike(), steps=steps))
+    assert result.ok
+    T = invert_transform(result.T_world_cam[3]) @ result.T_world_cam[4]
+    np.testing.assert_allclose(T, steps[0].T_first_second, atol=1e-4)
+    assert pose_error(result, T_world_cam) < 0.05
+
+
+def test_a_step_that_observations_contradict_does_little():
+    problem, T_world_cam, _ = make_problem()
+    alone = pose_error(optimise(problem), T_world_cam)
+    astray = T_world_cam.copy()
+    astray[4, 0, 3] += 1.0
+    steps = (step_between(astray, 3, 4, (0.01, 0.05, 1.0)),)
+    assert pose_error(optimise(replace(problem, steps=steps)), T_world_cam) < alone + 0.05
 
 
 def test_residuals_by_hand():

@@ -9,7 +9,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.features import TrackedPoints
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.loop_closure import _LOOK_INTERVAL, Loop, LoopFinder, LoopView, _step, share_out
+from semcast.server.mapping.loop_closure import _LOOK_INTERVAL, Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.revisit import Revisit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -239,31 +239,6 @@ def test_drift_is_shared_out_along_the_way(room, rng):
     error = np.linalg.norm(world.landmarks.xyz - true_xyz, axis=1)
     assert np.median(error) < 0.7 * np.median(error_before)
     assert np.linalg.norm(world.pose_of_frame(100)[:3, 3] - HERE[:3, 3]) < 0.1
-
-
-@pytest.mark.parametrize(
-    ("num_shared", "num_steps", "sigma"),
-    [
-        # Turned by 0.1 rad, half a unit on, points at a depth of 5.
-        (8, 1, (0.002 + 0.02 * 0.1, 0.02 * 0.5 + 0.002 * 5.0, 0.01)),
-        (7, 1, (0.5, 0.5 + 5.0, 0.5)),
-        # Eight keyframes between the two were thinned out.
-        (0, 9, (0.006 + 0.02 * 0.1, 0.02 * 0.5 + 0.006 * 5.0, 0.03)),
-    ],
-)
-def test_how_well_a_step_is_known_by_hand(num_shared, num_steps, sigma):
-    world, none = WorldMap(), (np.zeros(0, np.int64), np.zeros((0, 32), np.uint8))
-    before = make_transform(exp_so3([0.0, 0.0, 0.3]), [1.0, 2.0, 0.0])
-    now = before @ make_transform(exp_so3([0.0, 0.0, 0.1]), [0.3, 0.4, 0.0])
-    ids = np.arange(10)
-    for k, (T, seen) in enumerate(((before, ids + 10 - num_shared), (now, ids))):
-        world.add_keyframe(Keyframe(k, k, T, 0, seen, np.zeros((10, 2)), np.ones(10), *none))
-    xyz = np.column_stack((np.arange(10.0), np.zeros(10), np.full(10, 5.0)))
-    world.add_landmarks(ids, xyz, np.zeros((10, 3), np.uint8), np.ones(10), 0, 1)
-    edge = _step(world, *world.keyframes, 4, num_steps)
-    assert (edge.first, edge.second, edge.scale) == (3, 4, 1.0)
-    np.testing.assert_allclose(edge.T_first_second, invert_transform(before) @ now, atol=1e-12)
-    assert edge.sigma == pytest.approx(sigma)
 
 
 def test_keyframes_that_were_thinned_out_leave_no_gap(room, rng):

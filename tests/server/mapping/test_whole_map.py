@@ -167,6 +167,69 @@ def test_keyframes_that_were_thinned_out_follow_the_one_before():
     assert np.linalg.norm(world.poses[10 * gone] - place) > 1e-3
 
 
+def thinned_world(num_shared, **drift):
+    """Every second keyframe of the room is left; it shares so many landmarks with the next, none with others.
+
+    So nothing but the steps says how long one is next to another.
+    """
+    first = {}
+
+    def sees(k, ids):
+        mine = [n for n in ids.tolist() if k // 2 - first.setdefault(n, k // 2) <= 1]
+        rank = {
+            n: r for at in {first[n] for n in mine} for r, n in enumerate(n for n in first if first[n] == at)
+        }
+        return np.array([n for n in mine if rank[n] < num_shared], np.int64)
+
+    world, _ = drifted_world(sees, **drift)
+    world.keyframes = world.keyframes[::2]
+    return world
+
+
+def way_errors(world):
+    """Of the length of each step, as a share."""
+
+    def ways(places):
+        return np.linalg.norm(np.diff(places, axis=0), axis=1)
+
+    is_way = ways(np.stack([k.T_world_cam[:3, 3] for k in world.keyframes]))
+    return is_way / ways(np.stack([true_pose(k.frame_id // 10)[:3, 3] for k in world.keyframes])) - 1.0
+
+
+@pytest.mark.parametrize("num_shared", [15, 100])
+def test_how_far_thinned_out_keyframes_were_apart_is_not_forgotten(num_shared):
+    world = thinned_world(num_shared, step_sd=0.0003, growth=1.0)
+    before = np.abs(way_errors(world)).max()
+    assert adjust_whole_map(world, CAMERA, NOISE) == 18
+    assert np.abs(way_errors(world)).max() < max(0.01, 2.0 * before)
+
+
+@pytest.mark.parametrize(("gaps", "num_adjusted"), [(set(), 18), ({310}, 16), ({340}, 17)])
+def test_keyframes_that_share_no_landmark_hang_together_by_a_step_but_not_over_a_gap(gaps, num_adjusted):
+    world = thinned_world(30)  # the last three share none
+    world.gaps = gaps
+    assert adjust_whole_map(world, CAMERA, NOISE) == num_adjusted
+
+
+def test_steps_of_a_part_are_in_the_unit_that_the_part_before_left_it_in():
+    cut, first = 14, {}
+
+    def sees(k, ids):
+        mine = ids[(ids % 2 == 0) == (k < cut)]
+        return np.array(
+            [n for n in mine.tolist() if k < cut or k // 2 - first.setdefault(n, k // 2) <= 1], np.int64
+        )
+
+    world, _ = drifted_world(sees, step_sd=0.0003, growth=1.02)
+    world.keyframes = world.keyframes[:cut] + world.keyframes[cut::2]
+    world.gaps = {10 * cut}
+    before = way_errors(world)[cut:]
+    assert adjust_whole_map(world, CAMERA, NOISE) == cut + 11
+    grown = (1.0 + way_errors(world)[cut:]) / (1.0 + before)
+    assert grown.mean() < 0.9, "else its unit is the old one"
+    np.testing.assert_allclose(grown, grown.mean(), rtol=0.01)
+
+
 def test_a_map_larger_than_the_limit_is_adjusted_by_a_part_of_its_landmarks(monkeypatch):
     monkeypatch.setattr(whole_map, "MAX_OBSERVATIONS", 3000)
     monkeypatch.setattr(whole_map, "OBSERVATIONS_EACH", 0)

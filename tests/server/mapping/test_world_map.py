@@ -210,16 +210,18 @@ def test_revisits_outlive_the_keyframes_that_are_thinned_out():
     assert all({new, old} <= kept and 9 <= new - old <= 13 for new, old in world.revisits.items())
 
 
-def test_revisits_are_in_a_checkpoint_where_it_has_them():
+def test_revisits_and_gaps_are_in_a_checkpoint_where_it_has_them():
     world = make_world()
-    world.revisits = {30: 20, 20: 0}
+    world.revisits, world.gaps = {30: 20, 20: 0}, {0, 20}
     arrays = world.arrays()
     again = WorldMap()
     again.restore(arrays)
     assert again.revisits == world.revisits
-    del arrays["revisits"]
+    assert again.gaps == world.gaps
+    del arrays["revisits"], arrays["gaps"]
     again.restore(arrays)
     assert again.revisits == {}
+    assert again.gaps == set()
 
 
 def test_observations_are_those_of_landmarks():
@@ -263,10 +265,10 @@ def test_contradicting_arrays_are_refused():
 @pytest.mark.parametrize("name", sorted(make_world().arrays()))
 def test_an_array_that_does_not_fit_the_others_is_refused_before_anything_changes(name):
     world = make_world()
-    world.revisits = {30: 20, 20: 0}
+    world.revisits, world.gaps = {30: 20, 20: 0}, {20}
     arrays = world.arrays()
-    # Of revisits there may be any number.
-    wrong = [arrays[name][:-1]] if name != "revisits" else [arrays[name].ravel()]
+    # Of revisits and gaps there may be any number.
+    wrong = [arrays[name][:-1]] if name not in ("revisits", "gaps") else [arrays[name].ravel()[:, None]]
     wrong.append(np.stack([arrays[name], arrays[name]], axis=-1))
     if arrays[name].dtype.kind == "f":
         wrong.append(np.full_like(arrays[name], np.nan))

@@ -1,0 +1,74 @@
+"""What tracking says of the way from one keyframe to the next.
+
+Where keyframes between two were thinned out, and the landmarks with them, the way between the two is all that
+is remembered of what was seen there.
+"""
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from semcast.common.geometry import invert_transform, rotation_angle_deg
+from semcast.server.mapping.mapper import median_depth
+from semcast.server.mapping.pose_graph import Edge
+from semcast.server.mapping.thinning import is_gap
+from semcast.server.mapping.world_map import Keyframe, WorldMap
+
+#: Drift from one keyframe to the next: rotation in radians and as a share of the turn, translation as a share
+#: of the way and of the depth, and the logarithm of the scale.
+_STEP_RAD, _STEP_TURN, _STEP_WAY, _STEP_DEPTH, _STEP_SCALE = 0.002, 0.02, 0.02, 0.002, 0.01
+#: Next to nothing is known of the two sides of a gap.
+_GAP_RAD, _GAP_SCALE = 0.5, 0.5
+
+
+class Step(NamedTuple):
+    """The way from one keyframe to the next that is left.
+
+    Attributes:
+        edge: Of both, by their rows.
+        is_thinned: Whether keyframes between them were thinned out.
+        is_gap: Whether something else than tracking led from one to the other.
+    """
+
+    edge: Edge
+    is_thinned: bool
+    is_gap: bool
+
+
+def steps_of(world: WorldMap, keyframes: Sequence[Keyframe]) -> Iterator[Step]:
+    """Tell of each of all keyframes of a submap, in order of time, but the first, how it was come to."""
+    ever = np.array(sorted(k for k, part in world.submap_of.items() if part == keyframes[0].submap))
+    gaps = np.array(sorted(world.gaps), dtype=np.int64)
+    at = np.searchsorted(ever, [k.frame_id for k in keyframes])
+    for row, (before, now) in enumerate(pairwise(keyframes), 1):
+        num = int(at[row] - at[row - 1])
+        if num == 1:
+            missing = is_gap(before, now)
+        else:
+            missing = bool(((before.frame_id < gaps) & (gaps <= now.frame_id)).any())
+        yield Step(_edge(world, before, now, row, num, missing), num > 1, missing)
+
+
+def _edge(world: WorldMap, before: Keyframe, now: Keyframe, row: int, num_steps: int, missing: bool) -> Edge:
+    """What is known of a keyframe, in this row, and the one before, so many steps of the way ago."""
+    T = invert_transform(before.T_world_cam) @ now.T_world_cam
+    turn_rad = np.radians(rotation_angle_deg(T[:3, :3]))
+    way = float(np.linalg.norm(T[:3, 3]))
+    depth = usable_depth(world, now, way)
+    if missing:
+        return Edge(row - 1, row, T, 1.0, (_GAP_RAD, way + depth, _GAP_SCALE))
+    grown = np.sqrt(num_steps)
+    sigma = (
+        grown * _STEP_RAD + _STEP_TURN * turn_rad,
+        _STEP_WAY * way + grown * _STEP_DEPTH * depth,
+        grown * _STEP_SCALE,
+    )
+    return Edge(row - 1, row, T, 1.0, sigma)
+
+
+def usable_depth(world: WorldMap, keyframe: Keyframe, otherwise: float) -> float:
+    """Median depth a keyframe sees, or another length where it sees no landmark any more."""
+    depth = median_depth(world, keyframe)
+    return depth if np.isfinite(depth) else max(otherwise, 1e-6)
