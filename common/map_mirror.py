@@ -44,7 +44,13 @@ class MirroredMap:
         """Return the map in metres and in the frame of a marker, as a pose of the same map epoch tells.
 
         That holds for the part of the map the pose is in; place and size of other parts are guesses.
+
+        Raises:
+            ValueError: The pose is of another start of the agent or another map epoch.
         """
+        mine, its = (self.agent_epoch, self.map_epoch), (pose.agent_epoch, pose.map_epoch)
+        if its != mine:
+            raise ValueError(f"pose must be of agent_epoch and map_epoch {mine}, got {its}")
         T_marker_world = np.array(pose.T_marker_world).reshape(4, 4)
         R, t = T_marker_world[:3, :3], T_marker_world[:3, 3]
         keyframe_poses = self.keyframe_poses.copy()

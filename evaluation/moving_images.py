@@ -137,13 +137,13 @@ class Heard:
         views: ``(8, 8)`` of each keyframe, see ``left_over.information``, summed over adjustments.
         mean_px: Mean over frames of their median reprojection error, infinite without any.
         num_frames: Frames that got a pose from a map that was there.
-        share_left: Share of the variance of what was observed that adjustments leave in their residuals.
+        sigma_factor: By how much estimates scatter more than residuals do, see ``Witnesses``.
     """
 
     views: Sequence[Array]
     mean_px: float
     num_frames: int
-    share_left: float = 1.0
+    sigma_factor: float = 1.0
 
     def check(self) -> None:
         """Make sure that it is worth listening to.
@@ -163,7 +163,7 @@ class Heard:
         Groups of them say by how much an estimate scatters, but from residuals, which are less than what was
         wrong with the observations: unknowns were fitted to these.
         """
-        return student_quantile(NUM_GROUPS) * sigma / float(np.sqrt(self.share_left))
+        return student_quantile(NUM_GROUPS) * sigma * self.sigma_factor
 
 
 class _Listening(InlineBundle):
@@ -213,4 +213,4 @@ def listen(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout)
     finally:
         reconstruction.close()
     mean_px = float(np.mean(errors_px)) if errors_px else np.inf
-    return Heard(bundle.witnesses.views, mean_px, len(errors_px), bundle.witnesses.share_left)
+    return Heard(bundle.witnesses.views, mean_px, len(errors_px), bundle.witnesses.sigma_factor)

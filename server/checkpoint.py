@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import CheckpointError
 from semcast.common.mailbox import Mailbox
 from semcast.common.npz_file import read_npz, write_npz
+from semcast.server.stream_identity import StreamIdentity
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +47,21 @@ class CheckpointHeader:
     frame_id: int
     t_source_ns: int
     map_epoch: int
+
+    @classmethod
+    def of(cls, identity: StreamIdentity, frame_id: int, t_source_ns: int, map_epoch: int) -> Self:
+        """Return the header of a map of a stream."""
+        return cls(**_owner(identity), frame_id=frame_id, t_source_ns=t_source_ns, map_epoch=map_epoch)
+
+
+def _owner(identity: StreamIdentity) -> dict[str, Any]:
+    """Return the fields of a header that say whose map it is."""
+    return {
+        "agent_id": identity.agent_id,
+        "agent_epoch": identity.agent_epoch,
+        "codec_digest": identity.digest,
+        "camera": identity.camera,
+    }
 
 
 @dataclass(frozen=True)
@@ -110,6 +126,22 @@ def mismatch(header: CheckpointHeader, wanted: Mapping[str, Any]) -> str | None:
         if found != value:
             return f"{name} is {found!r}, the stream has {value!r}"
     return None
+
+
+def checkpoint_of(identity: StreamIdentity, path: Path) -> Checkpoint | None:
+    """Read the checkpoint of a stream; None where there is none, or one of another stream, which is told.
+
+    Raises:
+        CheckpointError: See ``load_checkpoint``.
+    """
+    if not path.exists():
+        return None
+    checkpoint = load_checkpoint(path)
+    reason = mismatch(checkpoint.header, _owner(identity))
+    if reason is not None:
+        logger.info("a new map is started, the checkpoint is of another stream: %s", reason)
+        return None
+    return checkpoint
 
 
 class CheckpointWriter:

@@ -128,6 +128,10 @@ class Arrival:
             drops=drops,
         )
 
+    def stages_to_pose_ms(self, tracked_ns: int) -> dict[str, float]:
+        """Return the stages before the tracker, and ``decoded_to_pose`` up to the pose at this time."""
+        return {**self.stage_ms, "decoded_to_pose": (tracked_ns - self.t_decoded_ns) * 1e-6}
+
 
 class FrameDecoder:
     """Decodes frames; codecs are loaded once. Safe to use from several threads, one at a time.

@@ -120,10 +120,11 @@ class Metres:
                     del seen[frame_id]
 
     def _place(self, sightings: Sightings) -> None:
-        """Find the marker anew in all parts, if a keyframe that shows one is new or has moved."""
+        """Find the marker anew in all parts, if a keyframe that shows it is new or has moved."""
         world = self._reconstruction.world
-        frame_ids = sorted({k for seen in sightings.of.values() for k in seen} & world.poses.keys())
-        by = {k: (world.submap_of[k], world.poses[k]) for k in frame_ids}
+        numbers = sightings.of.keys() if self._marker_id is None else {self._marker_id}
+        shown_in = {k for number in numbers for k in sightings.of.get(number, ())}
+        by = {k: (world.submap_of[k], world.poses[k]) for k in sorted(shown_in & world.poses.keys())}
         if _are_alike(by, self._found_by):
             return
         self._found_by, self._found = {k: (part, T.copy()) for k, (part, T) in by.items()}, {}
@@ -139,6 +140,8 @@ class Metres:
             told = self._told.get(part)
             if told is None or found.relative_sigma < _MUCH_BETTER * told.relative_sigma:
                 self._tell(part, found)
+        # A part that is joined leaves its number to a later one.
+        self._told = {part: told for part, told in self._told.items() if part in self._found}
         best = max(self._found.values(), key=lambda found: found.num_images, default=None)
         self._shown = None if best is None else Marker(best.corners_map, best.words)
 

@@ -27,13 +27,7 @@ from semcast.common.run_folder import (
 )
 from semcast.common.whole_file import write_whole
 from semcast.server.bundle_runner import new_bundle
-from semcast.server.checkpoint import (
-    Checkpoint,
-    CheckpointHeader,
-    CheckpointWriter,
-    load_checkpoint,
-    mismatch,
-)
+from semcast.server.checkpoint import Checkpoint, CheckpointHeader, CheckpointWriter, checkpoint_of
 from semcast.server.decoder import Arrival
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.export.outputs import EachFile, versions, write_json, write_ply
@@ -159,19 +153,9 @@ class Session:
 
     def _restore(self, path: Path) -> bool:
         """Take the map of a checkpoint that belongs to this stream; say so when there is none."""
-        if not path.exists():
-            return False
         try:
-            checkpoint = load_checkpoint(path)
-            wanted = {
-                "agent_id": self.identity.agent_id,
-                "agent_epoch": self.identity.agent_epoch,
-                "codec_digest": self.identity.digest,
-                "camera": self.identity.camera,
-            }
-            reason = mismatch(checkpoint.header, wanted)
-            if reason is not None:
-                logger.info("a new map is started, the checkpoint is of another stream: %s", reason)
+            checkpoint = checkpoint_of(self.identity, path)
+            if checkpoint is None:
                 return False
             self._reconstruction.restore(checkpoint.arrays)
             self.metres.restore(checkpoint.arrays)
@@ -244,22 +228,17 @@ class Session:
         self._t_source_ns[frame.frame_id] = frame.t_source_ns
         for frame_id, t_source_ns, _ in result.backfilled:
             self._t_source_ns.setdefault(frame_id, t_source_ns)
-        psnr = self._await(quality)
         row = FrameRow.of(
             frame,
             result,
             snr_set_db=arrival.snr_set_db,
             snr_estimated_db=arrival.snr_estimated_db,
-            psnr_db=psnr,
+            psnr_db=self._await(quality),
             m_per_unit=None if metric is None else metric.scale,
             seq=self._numbers.setdefault(frame.frame_id, None),
             t_arrival_ns=arrival.t_arrival_ns,
             age_ms=(tracked_ns - arrival.t_arrival_ns) * 1e-6,
-            stage_ms={
-                **arrival.stage_ms,
-                **result.stage_ms,
-                "decoded_to_pose": (tracked_ns - arrival.t_decoded_ns) * 1e-6,
-            },
+            stage_ms={**arrival.stages_to_pose_ms(tracked_ns), **result.stage_ms},
         )
         self._record.add(row)
         update = self.metres.follow(update, frame, result)
@@ -315,15 +294,8 @@ class Session:
         self._last_checkpoint_s = time.monotonic()
         if self._checkpoints is None or self._last_frame_id < 0:
             return
-        header = CheckpointHeader(
-            agent_id=self.identity.agent_id,
-            agent_epoch=self.identity.agent_epoch,
-            codec_digest=self.identity.digest,
-            camera=self.identity.camera,
-            frame_id=self._last_frame_id,
-            t_source_ns=self._t_source_ns.get(self._last_frame_id, 0),
-            map_epoch=self._map_epoch,
-        )
+        t_source_ns = self._t_source_ns.get(self._last_frame_id, 0)
+        header = CheckpointHeader.of(self.identity, self._last_frame_id, t_source_ns, self._map_epoch)
         arrays = {**self._reconstruction.snapshot(), **self.metres.arrays()}
         self._checkpoints.submit(Checkpoint(header, arrays))
 

@@ -19,6 +19,7 @@ from semcast.server.mapping.kept_frames import Observed, colours_of
 from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
+from semcast.server.mapping.map_update import update_of
 from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
@@ -32,7 +33,7 @@ from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.whole_map import adjust_whole_map
 from semcast.server.mapping.wide_recognition import WideRecogniser
 from semcast.server.mapping.window import build_problem
-from semcast.server.mapping.world_map import Keyframe, MapChanges, WorldMap
+from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 logger = logging.getLogger(__name__)
 
@@ -452,33 +453,11 @@ class MapBuilder:
     def take_update(self, map_epoch: int) -> MapUpdate | None:
         """What changed in the map since this was last called, None when nothing did."""
         changes = self.world.take_changes()
-        return self._update(map_epoch, changes) if any(map(len, changes)) else None
+        return update_of(self.world, changes, map_epoch) if any(map(len, changes)) else None
 
     def whole(self, map_epoch: int) -> MapUpdate:
         """All landmarks and keyframes, whether they changed or not."""
-        keyframes = np.array(sorted(self.world.poses), dtype=np.int64)
-        none = np.zeros(0, np.int64)
-        changes = MapChanges(self.world.landmarks.ids.copy(), none, keyframes, frames=none, withdrawn=none)
-        return self._update(map_epoch, changes)
-
-    def _update(self, map_epoch: int, changes: MapChanges) -> MapUpdate:
-        world = self.world
-        ids, removed, keyframes, frames, withdrawn = changes
-        row = world.landmarks.rows(ids)
-        _, frame_poses = world.poses_of_frames(frames)  # a run of hours has a hundred thousand
-        return MapUpdate(
-            map_epoch=map_epoch,
-            ids=ids,
-            xyz=world.landmarks.xyz[row].copy(),
-            rgb=world.landmarks.rgb[row].copy(),
-            confidence=world.landmarks.confidence[row].copy(),
-            removed=removed,
-            keyframe_ids=keyframes,
-            keyframe_poses=np.array([world.poses[k] for k in keyframes.tolist()]).reshape(-1, 4, 4),
-            frame_ids=frames,
-            frame_poses=frame_poses,
-            withdrawn=withdrawn,
-        )
+        return update_of(self.world, self.world.everything(), map_epoch)
 
     def pose_covariance(self, covariance_in_map: Array | None, T_world_cam: Array) -> Array | None:
         """Covariance of a frame: that of the last adjusted keyframe carried over, plus its own.

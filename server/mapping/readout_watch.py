@@ -112,7 +112,7 @@ class ReadoutWatch:
         fit = fit_readout(self._witnesses.views, self._axis)
         if fit is None:
             return
-        num_views, sigma_ms = len(self._witnesses), fit.sigma_ms * self._sigma_factor
+        num_views, sigma_ms = len(self._witnesses), fit.sigma_ms * self._witnesses.sigma_factor
         logger.debug(
             "readout by %d views: %s, sigma %.2f ms, explains %.4f",
             num_views,
@@ -132,18 +132,13 @@ class ReadoutWatch:
             is_known = num_views >= _ENOUGH_VIEWS and sigma_ms <= _SURE_MS
             self._is_done = is_known or num_views >= _MOST_VIEWS
 
-    @property
-    def _sigma_factor(self) -> float:
-        """By how much estimates scatter more than residuals do, which unknowns were fitted to."""
-        return float(self._witnesses.share_left**-0.5)
-
     def _look_at_lens(self) -> None:
         """Say once if the lens is clearly another one."""
         if self._lens_is_told or len(self._witnesses) < _LENS_VIEWS:
             return
         if (fit := believed_lens(self._witnesses.views)) is None or fit.explained < _LEAST_EXPLAINED:
             return
-        least_sigmas = _LEAST_SIGMAS * self._sigma_factor
+        least_sigmas = _LEAST_SIGMAS * self._witnesses.sigma_factor
         wrong = []
         if abs(fit.focal) >= max(_LEAST_FOCAL, least_sigmas * fit.sigma_focal):
             way = "short" if fit.focal > 0.0 else "long"

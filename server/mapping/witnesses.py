@@ -28,9 +28,13 @@ class Witnesses:
         return [self._told[frame_id] for frame_id in sorted(self._told)]
 
     @property
-    def share_left(self) -> float:
-        """Share of the variance of observations that is left when unknowns were fitted to them."""
-        return 1.0 - self._num_fitted / self._num_observed if self._num_observed else 1.0
+    def sigma_factor(self) -> float:
+        """By how much estimates scatter more than residuals do, to which unknowns were fitted.
+
+        Infinite where there are as many unknowns as observations: such residuals say nothing.
+        """
+        share_left = 1.0 - self._num_fitted / self._num_observed if self._num_observed else 1.0
+        return share_left**-0.5 if share_left > 0.0 else np.inf
 
     def note(self, result: BundleResult) -> None:
         """Hear what an adjustment leaves; nothing where it was not asked."""

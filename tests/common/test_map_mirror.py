@@ -1,5 +1,6 @@
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -196,3 +197,6 @@ def test_a_map_is_brought_to_metres_as_a_pose_tells():
     np.testing.assert_allclose(after.keyframe_poses[:, :3, :3], turned, atol=1e-9)
     np.testing.assert_array_equal(after.ids, before.ids)
     np.testing.assert_array_equal(before.keyframe_poses, change.keyframe_poses)
+    for other in ({"map_epoch": 1}, {"agent_epoch": 8}):
+        with pytest.raises(ValueError, match=r"pose must be of agent_epoch and map_epoch \(7, 0\), got"):
+            before.in_metres(replace(pose, **other))

@@ -7,11 +7,10 @@ from semcast.evaluation.moving_images import Heard
 from semcast.server.mapping.left_over import NUM_GROUPS, spread
 
 
-@pytest.mark.parametrize("share_left", [1.0, 0.64])
-def test_bounds_of_95_percent_cover_the_truth_so_often(share_left):
+@pytest.mark.parametrize("sigma_factor", [1.0, 1.25])
+def test_bounds_of_95_percent_cover_the_truth_so_often(sigma_factor):
     says = np.random.default_rng(5).normal(0.0, 3.0, (20_000, NUM_GROUPS))  # the truth is 0
     without_one = (says.sum(axis=1, keepdims=True) - says) / (NUM_GROUPS - 1)
-    heard = Heard([], 0.2, 60, share_left)
-    seen = np.sqrt(share_left)  # of the scatter, in residuals
-    reach = np.array([heard.reach_95(seen * spread(estimates)) for estimates in without_one])
+    heard = Heard([], 0.2, 60, sigma_factor)
+    reach = np.array([heard.reach_95(spread(estimates) / sigma_factor) for estimates in without_one])
     assert (np.abs(says.mean(axis=1)) <= reach).mean() == pytest.approx(0.95, abs=0.0045)

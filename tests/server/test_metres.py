@@ -161,6 +161,26 @@ def test_each_part_has_its_own_unit_until_they_are_joined():
     assert run.metres.of(result_of(14, part=1)) is None
 
 
+def test_the_unit_of_a_part_is_told_also_where_one_before_had_its_number(caplog):
+    run = Run()
+    with caplog.at_level(logging.INFO, "semcast.server.metres"):
+        for first in (10, 20):
+            for k in range(first, first + 3):
+                run.show(k, part=1)
+            run.world.transform_submap(1, 0, 1.0, np.eye(4))
+            run.follow()
+    assert sum(r.message.endswith("(part 1)") for r in caplog.records) == 2
+
+
+def test_a_marker_that_is_not_the_one_costs_nothing_where_its_keyframes_move():
+    run = Run(marker_id=7)
+    placement = [run.show(k) for k in range(3)][-1]
+    run.show(3, markers=((3, ELSEWHERE),))
+    run.world.move_keyframe(3, T_world_cam_of(4))
+    run.follow()
+    assert run.metres.of(result_of(4)) is placement
+
+
 def test_a_part_that_is_joined_before_it_saw_the_marker_has_the_unit_of_the_other():
     run = Run()
     for k in range(4):

@@ -30,13 +30,26 @@ def result_of(keyframe_ids, left_over):
 
 def test_what_a_keyframe_says_in_two_windows_counts_as_of_one_witness():
     witnesses = Witnesses()
-    assert (len(witnesses), witnesses.views, witnesses.share_left) == (0, [], 1.0)
+    assert (len(witnesses), witnesses.views, witnesses.sigma_factor) == (0, [], 1.0)
     for keyframe_ids in ([3, 1, 2], [2, 3, 4]):
         witnesses.note(result_of(keyframe_ids, np.stack([np.full((8, 8), float(k)) for k in keyframe_ids])))
     witnesses.note(result_of([4, 5, 6], None))
     assert len(witnesses) == 4
     assert [view[0, 0] for view in witnesses.views] == [1.0, 4.0, 6.0, 4.0]
-    assert witnesses.share_left == pytest.approx(1.0 - (6 * 3 + 3 * 40) / (2 * 119))
+    assert witnesses.sigma_factor == pytest.approx((1.0 - (6 * 3 + 3 * 40) / (2 * 119)) ** -0.5)
+
+
+def test_as_many_unknowns_as_observations_leave_nothing_to_be_sure_of():
+    # Sixteen landmarks in two of sixteen views each: 64 coordinates, and 6 * 16 + 3 * 16 unknowns.
+    view = np.arange(32) // 2
+    problem = SimpleNamespace(keyframe_ids=np.arange(16), view=view, point=(view + np.arange(32) % 2) % 16)
+    rows = np.random.default_rng(0).normal(0.0, 1.0, (16, 8, 60))
+    left_over = rows @ np.swapaxes(rows, 1, 2)
+    watch = ReadoutWatch(CAMERA, is_wanted=True)
+    watch.take(SimpleNamespace(problem=problem, residual_px=np.zeros((32, 2)), left_over=left_over))
+    assert fit_readout(watch._witnesses.views, None) is not None, "else this tests nothing"
+    assert watch._witnesses.sigma_factor == np.inf
+    assert watch.take_found() is None
 
 
 def windows(seed, size, interval, num_points):
@@ -89,5 +102,5 @@ def test_a_readout_is_as_sure_as_the_watch_says(size, interval, num_points):
             watch.take(result)
         assert watch.take_found() is None, "noise is no shutter"
         fit = fit_readout(watch._witnesses.views, "rows")
-        is_covered.append(fit.readout.ms <= STUDENT_95 * fit.sigma_ms * watch._sigma_factor)
+        is_covered.append(fit.readout.ms <= STUDENT_95 * fit.sigma_ms * watch._witnesses.sigma_factor)
     assert np.mean(is_covered) == pytest.approx(0.95, abs=0.055 if size == 12 else 0.025)

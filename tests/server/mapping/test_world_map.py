@@ -2,13 +2,7 @@ import numpy as np
 import pytest
 
 from semcast.common.geometry import exp_se3, invert_transform, transform_points
-from semcast.server.mapping.world_map import Keyframe, Landmarks, WorldMap
-
-
-def add(landmarks, ids, submap=0, frame_id=0):
-    ids = np.array(ids, np.int64)
-    xyz = np.stack([ids, ids, ids], axis=1).astype(float)
-    landmarks.add(ids, xyz, np.full((len(ids), 3), 7, np.uint8), np.ones(len(ids)), submap, frame_id)
+from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 
 def make_keyframe(frame_id, ids, submap=0, seed=0):
@@ -42,19 +36,6 @@ def add_world(world, ids, submap, frame_id):
     ids = np.array(ids, np.int64)
     xyz = np.random.default_rng(int(ids.sum())).normal(0, 2, (len(ids), 3))
     world.add_landmarks(ids, xyz, np.zeros((len(ids), 3), np.uint8), np.ones(len(ids)), submap, frame_id)
-
-
-def test_landmarks_stay_sorted_and_are_found_by_id():
-    landmarks = Landmarks()
-    assert landmarks.rows(np.array([4])).tolist() == [-1]
-    add(landmarks, [5, 9])
-    add(landmarks, [1, 7])
-    assert landmarks.ids.tolist() == [1, 5, 7, 9]
-    assert landmarks.xyz[:, 0].tolist() == [1, 5, 7, 9]
-    assert landmarks.rows(np.array([9, 2, 1])).tolist() == [3, -1, 0]
-    landmarks.keep(landmarks.ids > 4)
-    assert landmarks.ids.tolist() == [5, 7, 9]
-    assert len(landmarks.born) == len(landmarks) == 3
 
 
 def test_a_keyframe_is_found_by_its_id_until_it_is_thinned_out():
