@@ -110,7 +110,10 @@ def test_every_mode_finds_the_pose(mode, matches):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_every_mode_but_that_of_the_paper_is_told_the_shape_of_errors(mode, matches, rng):
-    edged = replace(matches, edge0=rng.normal(0, 1, (150, 2)), edge1=rng.normal(0, 1, (150, 2)))
+    angle = rng.uniform(0, np.pi, 150)
+    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    slid = replace(matches, keypoints1_xy=matches.keypoints1_xy + rng.normal(0, 0.8, (150, 1)) * along)
+    matches, edged = slid, replace(slid, edge0=np.log(2.0) * along, edge1=np.log(2.0) * along)
     poses = [confidence_estimator(mode)(m, CAMERA, 1.0, 0) for m in (matches, edged)]
     assert np.array_equal(*poses) == (mode == "paper")
 
