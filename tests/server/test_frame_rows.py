@@ -1,12 +1,11 @@
 """Rows survive a kill, and the summary says what happened."""
 
-import contextlib
 import json
-import resource
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from full_disk import room_for
 
 from semcast.common.errors import SemcastError
 from semcast.common.run_folder import FRAMES_NAME
@@ -96,17 +95,6 @@ def test_without_a_folder_rows_stay_in_memory():
     assert [r.frame_id for r in record.rows()] == [3]
 
 
-@contextlib.contextmanager
-def full_disk(room_bytes):
-    """Let no file grow beyond so many bytes, as on a disk that is full: of the row at its end a part fits."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room_bytes, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 def half_a_row_more(folder):
     return (folder / FRAMES_NAME).stat().st_size + 100
 
@@ -119,7 +107,7 @@ def test_rows_a_full_disk_did_not_take_are_written_when_it_has_room_again(tmp_pa
     now_s, told = 0.0, []
     record = FrameRows(tmp_path, on_error=told.append, clock=lambda: now_s)
     record.add(row(0))
-    with full_disk(half_a_row_more(tmp_path)):
+    with room_for(half_a_row_more(tmp_path)):
         for k in (1, 2, 3):
             record.add(row(k))
             now_s += 2.0
@@ -137,7 +125,7 @@ def test_rows_a_full_disk_did_not_take_are_written_when_it_has_room_again(tmp_pa
 
 def test_rows_that_wait_at_the_end_are_written_then(tmp_path):
     record = FrameRows(tmp_path)
-    with full_disk(half_a_row_more(tmp_path)):
+    with room_for(half_a_row_more(tmp_path)):
         for k in range(3):
             record.add(row(k))
     record.finish()
@@ -148,7 +136,7 @@ def test_rows_that_wait_at_the_end_are_written_then(tmp_path):
 def test_rows_that_can_not_be_written_at_the_end_are_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr(frame_rows, "MAX_ROWS_IN_MEMORY", 2)
     record = FrameRows(tmp_path)
-    with full_disk(half_a_row_more(tmp_path)):
+    with room_for(half_a_row_more(tmp_path)):
         for k in range(3):
             record.add(row(k))
         with pytest.raises(OSError, match="File too large"):
