@@ -74,7 +74,7 @@ def test_real_processes_survive_each_others_death_in_any_order(recording):
         hub, receiver = serve()
         started_s = time.monotonic()
         take(receiver, count=1)
-        assert time.monotonic() - started_s < 3.0
+        assert time.monotonic() - started_s < 10.0
         for process in running.values():
             process.send_signal(signal.SIGTERM)
             assert process.communicate(timeout=10) == ("ended\n", "")

@@ -241,7 +241,7 @@ def test_delay_is_added(ends, make):
     started_s = time.monotonic()
     e.tx.put(pack(make(0)))
     until(lambda: e.received)
-    assert 0.15 <= time.monotonic() - started_s < 2.0
+    assert 0.15 <= time.monotonic() - started_s < 5.0
 
 
 @pytest.mark.parametrize("delay_ms", [0.0, 20.0])

@@ -109,7 +109,7 @@ def test_requests_are_answered_or_time_out(pair):
     until(lambda: asking.request("semcast/a/camera", b"hello", 1.0) == b"HELLO")
     started_s = time.monotonic()
     assert asking.request("semcast/b/camera", b"hello", 0.5) is None
-    assert time.monotonic() - started_s < 2.0
+    assert time.monotonic() - started_s < 5.0
 
 
 def test_presence_is_seen_from_anywhere_and_ends_with_the_session(hub, pair):
@@ -171,7 +171,7 @@ def test_clients_survive_a_hub_that_is_killed():
             process = start()
             started_s = time.monotonic()
             until(passes)
-            assert time.monotonic() - started_s < 2.0
+            assert time.monotonic() - started_s < 5.0
             assert alive_roles(endpoint, "a") == {"agent"}
     finally:
         process.kill()

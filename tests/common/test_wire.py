@@ -224,7 +224,7 @@ def test_oversized_messages_are_refused_unread():
 def test_hostile_bytes_are_refused_at_once(data):
     started_s = time.perf_counter()
     assert refused(data, SymbolFrame).reason == "syntax"
-    assert time.perf_counter() - started_s < 0.1
+    assert time.perf_counter() - started_s < 1.0
 
 
 def test_many_lists_cost_no_memory():

@@ -69,7 +69,7 @@ def test_a_slow_reference_holds_only_the_frame_up_that_asked_it(process, monkeyp
     one = process(Reference(original))
     started_s = time.monotonic()
     assert [one(k) for k in range(6)] == [None] * 6
-    assert time.monotonic() - started_s < 3 * wait_s, "one frame waited, not six"
+    assert time.monotonic() - started_s < 5 * wait_s, "one frame waited, not six"
     readable.set()
     end_s = time.monotonic() + 20
     last = 6
