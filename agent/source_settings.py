@@ -27,7 +27,7 @@ class SourceSettings:
     )
     layout: Layout = field(
         default="auto",
-        metadata={"help": "layout of the folder: native, tum, kitti, euroc, transforms, folder"},
+        metadata={"help": "layout of the folder: native, tum, kitti, euroc, transforms, colmap, folder"},
     )
     camera: CameraSettings = field(default=CameraSettings(), metadata={"help": "intrinsics"})
     resize: float = field(default=1.0, metadata={"help": "factor on the image size; intrinsics follow"})

@@ -355,8 +355,8 @@ def open_sequence(
     """Open a recorded sequence.
 
     Args:
-        path: Folder in the native, TUM, KITTI odometry, EuRoC or NeRF layout, a folder of images, or a
-            ``transforms*.json`` file.
+        path: Folder in the native, TUM, KITTI odometry, EuRoC, NeRF or COLMAP layout, a folder of images, or
+            a ``transforms*.json`` file.
         intrinsics: Camera to use instead of what the recording says, for the images as stored.
         layout: Layout to read; ``auto`` looks.
         resize: Factor on the image size, intrinsics follow.

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transform_from_yaml
+from semcast.common.colmap_file import colmap_folder, read_colmap
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
 from semcast.common.numbered_images import lines_of_images, numbers_in_names
@@ -26,7 +27,7 @@ from semcast.common.transforms_file import read_transforms_json
 
 logger = logging.getLogger(__name__)
 
-Layout = Literal["auto", "native", "tum", "kitti", "euroc", "transforms", "folder"]
+Layout = Literal["auto", "native", "tum", "kitti", "euroc", "transforms", "colmap", "folder"]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 _TRANSFORMS_NAMES = ("transforms.json", "transforms_test.json", "transforms_train.json")
@@ -117,15 +118,18 @@ def find_layout(path: Path) -> Layout:
     if _kitti_camera(path) is not None:
         return "kitti"
     has_transforms = any((path / name).is_file() for name in _TRANSFORMS_NAMES)
-    if (path / "images").is_dir() and ((path / "intrinsics.json").is_file() or not has_transforms):
+    has_images = (path / "images").is_dir()
+    if has_images and (path / "intrinsics.json").is_file():
         return "native"
     if has_transforms:
         return "transforms"
+    if has_images:
+        return "native" if colmap_folder(path) is None else "colmap"
     if images_in(path):
         return "folder"
     raise SourceError(
         f"no sequence at {path}: expected images/ (native), rgb.txt (TUM), image_2/ or image_0/ (KITTI), "
-        "mav0/cam0/ (EuRoC), transforms.json (NeRF), or image files"
+        "mav0/cam0/ (EuRoC), transforms.json (NeRF), images/ and sparse/ (COLMAP), or image files"
     )
 
 
@@ -146,6 +150,7 @@ def read_layout(path: Path, layout: Layout, rate_hz: float) -> SequenceFiles:
         "kitti": _read_kitti,
         "euroc": _read_euroc,
         "transforms": _read_transforms,
+        "colmap": _read_colmap,
         "folder": _read_folder,
     }
     _check_there(path)
@@ -446,3 +451,25 @@ def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
     times_ns = _nominal_times_ns(len(file.image_paths), rate_hz)
     truth = Trajectory(ns_to_seconds(times_ns), file.T_world_cam)
     return SequenceFiles(path.resolve().parent.name, file.image_paths, times_ns, file.camera, truth)
+
+
+def _read_colmap(path: Path, rate_hz: float) -> SequenceFiles:
+    """Read the images that the model has a pose of; the others of the folder are left out."""
+    folder = colmap_folder(path)
+    if folder is None:
+        raise SourceError(f"{path} must have sparse/0/cameras.bin and images.bin, or .txt, of COLMAP")
+    model = read_colmap(folder)
+    order = sorted(range(len(model.names)), key=lambda k: natural_key(model.names[k]))
+    num_there = len(images_in(path / "images"))
+    if num_there > len(order):
+        logger.info(
+            "%s has %d images, of which COLMAP has posed %d: these are used", path, num_there, len(order)
+        )
+    times_ns = _nominal_times_ns(len(order), rate_hz)
+    return SequenceFiles(
+        path.resolve().name,
+        tuple(path / "images" / model.names[k] for k in order),
+        times_ns,
+        model.camera_of,
+        Trajectory(ns_to_seconds(times_ns), model.T_world_cam[order]),
+    )

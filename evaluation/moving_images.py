@@ -57,7 +57,7 @@ class ImagesSettings:
     )
     layout: Layout = field(
         default="auto",
-        metadata={"help": "layout of the folder: native, tum, kitti, euroc, transforms, folder"},
+        metadata={"help": "layout of the folder: native, tum, kitti, euroc, transforms, colmap, folder"},
     )
     camera: CameraSettings = field(default=CameraSettings(), metadata={"help": "intrinsics"})
     rate_hz: float | None = field(

@@ -49,7 +49,7 @@ class StreamSettings:
     """
 
     sequence: Path = field(
-        metadata={"help": "recorded sequence: native, TUM, KITTI, EuRoC or transforms.json"}
+        metadata={"help": "recorded sequence: native, TUM, KITTI, EuRoC, transforms.json or COLMAP"}
     )
     camera: CameraSettings = field(
         default=CameraSettings(), metadata={"help": "intrinsics, where the recording has none"}
