@@ -18,9 +18,10 @@ times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks(
 (landmark id, keyframe id, x, y), and the parts of the map that frames and landmarks are in.
 """
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,49 @@ MAX_UNPACKED_BYTES = 4 * 1024**3
 
 
 @dataclass(frozen=True, kw_only=True)
+class PartInMetres:
+    """What a unit of a part of the map is, and where the part is in the frame of a marker.
+
+    Attributes:
+        part: Its number.
+        marker_id: Number of the marker.
+        num_keyframes: That show it alike.
+        m_per_unit: Metres in a unit of the map.
+        relative_sigma: Standard deviation of that as a share of it.
+        T_marker_world: 4x4 with its translation in metres: a point of the map, times ``m_per_unit``, to the
+            marker's frame.
+    """
+
+    part: int
+    marker_id: int
+    num_keyframes: int
+    m_per_unit: float
+    relative_sigma: float
+    T_marker_world: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        """Check what an export would be made from.
+
+        Raises:
+            ValueError: A length or the transform is none.
+        """
+        T = np.asarray(self.T_marker_world, dtype=np.float64)
+        check_shape(T, "4 4", "T_marker_world")
+        object.__setattr__(self, "T_marker_world", T)
+        if not (np.isfinite(T).all() and 0.0 < self.m_per_unit < np.inf and self.relative_sigma >= 0.0):
+            raise ValueError(f"metres of part {self.part} must be finite, and a unit above 0 m")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        return {**asdict(self), "T_marker_world": self.T_marker_world.tolist()}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Take back what ``to_dict`` returned."""
+        return cls(**values)
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunData:
     """A finished reconstruction.
 
@@ -73,6 +117,7 @@ class RunData:
         observed_landmark_ids: ``(M,)`` int64, each in ``landmark_ids``.
         observed_keyframe_ids: ``(M,)`` int64, each in ``keyframe_ids``.
         observed_xy: ``(M, 2)`` float32, pixels, integer values at pixel centres.
+        metres: Of each part whose unit the run itself found.
     """
 
     intrinsics: Intrinsics
@@ -89,6 +134,7 @@ class RunData:
     observed_landmark_ids: NDArray[np.int64]
     observed_keyframe_ids: NDArray[np.int64]
     observed_xy: NDArray[np.float32]
+    metres: tuple[PartInMetres, ...] = ()
 
     def __post_init__(self) -> None:
         """Convert to the dtypes above, check shapes and references.
@@ -143,7 +189,7 @@ _ARRAYS: dict[str, tuple[Any, str]] = {
     "observed_keyframe_ids": (np.int64, "M"),
     "observed_xy": (np.float32, "M 2"),
 }
-assert {*_ARRAYS, "intrinsics"} == {f.name for f in fields(RunData)}
+assert {*_ARRAYS, "intrinsics", "metres"} == {f.name for f in fields(RunData)}
 #: Arrays that older runs lack -> those they go with; such a run counts as one part.
 _ADDED = {"frame_submap": "frame_ids", "landmark_submap": "landmark_ids"}
 
@@ -155,7 +201,11 @@ def write_run(folder: Path, data: RunData) -> None:
         SourceError: The folder can't be made or the file can't be written.
     """
     path = folder / RECONSTRUCTION_NAME
-    header = {"format": FORMAT, "intrinsics": data.intrinsics.to_dict()}
+    header = {
+        "format": FORMAT,
+        "intrinsics": data.intrinsics.to_dict(),
+        "metres": [part.to_dict() for part in data.metres],
+    }
     try:
         write_npz(path, header, {name: getattr(data, name) for name in _ARRAYS}, compressed=True)
     except OSError as err:
@@ -187,7 +237,8 @@ def read_run(folder: Path) -> RunData:
         arrays = {name: content[name] for name in _ARRAYS if name in content or name not in _ADDED}
         for name, owner in _ADDED.items():
             arrays.setdefault(name, np.zeros(len(arrays[owner]), dtype=np.int64))
-        return RunData(intrinsics=Intrinsics.from_dict(header["intrinsics"]), **arrays)
+        metres = tuple(PartInMetres.from_dict(part) for part in header.get("metres", ()))
+        return RunData(intrinsics=Intrinsics.from_dict(header["intrinsics"]), metres=metres, **arrays)
     except Exception as err:  # what is in place of an array or a number fails in many ways
         raise SourceError(f"{path} is damaged: {err}") from err
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.errors import SourceError
-from semcast.common.run_folder import FRAMES_NAME, TRAJECTORY_NAME
+from semcast.common.run_folder import FRAMES_NAME, SUMMARY_NAME, TRAJECTORY_NAME
 from semcast.common.run_summary import read_summary
 from semcast.common.trajectory import Trajectory, read_tum
 from semcast.common.trajectory_error import AteResult, ate, match_times
@@ -79,7 +79,7 @@ class RunToPlot:
         """Read a run folder.
 
         Raises:
-            SourceError: The folder is no run, or one without a decoded frame.
+            SourceError: The folder is no run, or one without a decoded frame, or its summary is no run's.
         """
         if not folder.is_dir():
             raise SourceError(f"{folder} is not a folder; give the folder that --out wrote")
@@ -93,18 +93,23 @@ class RunToPlot:
             trajectory = read_tum(path)
         if not rows and not len(trajectory):
             raise SourceError(f"{folder}: no frame was decoded: nothing to plot")
-        summary = read_summary(folder)
-        counts = summary.get("frames", {})
-        return RunToPlot(
-            name=folder.name,
-            trajectory=trajectory,
-            rows=rows,
-            truth=truth,
-            num_sent=counts.get("sent", counts.get("source")),
-            drops=summary.get("drops", {}),
-            num_parts=max(1, len(summary.get("parts") or ())),
-            unposed=[(int(first), int(last)) for first, last in summary.get("unposed_frames") or ()],
-        )
+        try:
+            told = _told_by(read_summary(folder))
+        except (AttributeError, TypeError, ValueError) as err:
+            raise SourceError(f"{folder / SUMMARY_NAME} is none that a run wrote: {err}") from err
+        return RunToPlot(name=folder.name, trajectory=trajectory, rows=rows, truth=truth, **told)
+
+
+def _told_by(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a run's summary says of its frames and parts."""
+    counts = summary.get("frames") or {}
+    num_sent = counts.get("sent", counts.get("source"))
+    return {
+        "num_sent": None if num_sent is None else int(num_sent),
+        "drops": {reason: int(number) for reason, number in (summary.get("drops") or {}).items()},
+        "num_parts": max(1, len(summary.get("parts") or ())),
+        "unposed": [(int(first), int(last)) for first, last in summary.get("unposed_frames") or ()],
+    }
 
 
 def plot_run(run: RunToPlot, out: Path, image_format: str = "png") -> list[Path]:

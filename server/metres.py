@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform
+from semcast.common.run_folder import PartInMetres
 from semcast.server.export.markers import MarkerPlacement, Sightings
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, Marker
@@ -160,21 +161,24 @@ class Metres:
             self._why_not = self._sightings.none_found(self._marker_id)
         logger.warning("the metre is not known: %s", self._why_not)
 
-    def summary(self) -> list[dict[str, Any]] | None:
-        """Return what is known of each part, as plain values; None where no marker was asked for."""
-        if self._settings.side_m is None:
-            return None
-        return [
-            {
-                "part": part,
-                "marker_id": found.marker_id,
-                "num_keyframes": found.num_images,
-                "m_per_unit": found.scale,
-                "relative_sigma": found.relative_sigma,
-                "T_marker_world": make_transform(found.R, found.t).tolist(),
-            }
+    def parts(self) -> tuple[PartInMetres, ...]:
+        """Return what is known of each part of the map as it is now, in the order of their numbers."""
+        self._guarded(self._place)
+        return tuple(
+            PartInMetres(
+                part=part,
+                marker_id=found.marker_id,
+                num_keyframes=found.num_images,
+                m_per_unit=found.scale,
+                relative_sigma=found.relative_sigma,
+                T_marker_world=make_transform(found.R, found.t),
+            )
             for part, found in sorted(self._found.items())
-        ]
+        )
+
+    def summary(self) -> list[dict[str, Any]] | None:
+        """Return the same as plain values; None where no marker was asked for."""
+        return None if self._settings.side_m is None else [part.to_dict() for part in self.parts()]
 
     def arrays(self) -> dict[str, NDArray]:
         """Return what a checkpoint keeps of it."""

@@ -80,14 +80,21 @@ class Outbox:
                 submap=result.submap,
             )
             self._put(message)
-        self._put(pose_message(arrival, result))
+        self._put(pose_message(epoch, arrival.message.t_capture_ns, result))
 
     def put_metric_pose(
-        self, arrival: ReceivedFrame, result: FrameResult, placement: MarkerPlacement | None
+        self, agent_epoch: int, result: FrameResult, placement: MarkerPlacement | None
     ) -> None:
-        """Send the pose of one frame in metres, if the way there from its part of the map is known."""
-        if placement is not None:
-            self._put(metric_pose(pose_message(arrival, result), placement))
+        """Send the pose in metres of a frame that ``put_pose`` sent, if the way there is known.
+
+        Args:
+            agent_epoch: Of the frame.
+            result: What the tracker made of it, or what an adjustment has made of that since.
+            placement: The way to metres from its part of the map.
+        """
+        t_capture_ns = self._t_capture_ns.get((agent_epoch, result.frame_id))
+        if placement is not None and t_capture_ns is not None:
+            self._put(metric_pose(pose_message(agent_epoch, t_capture_ns, result), placement))
 
     def put_map(self, agent_epoch: int, update: MapUpdate) -> None:
         """Send what a frame, or the end of a stream, changed in the map."""
@@ -131,14 +138,14 @@ class Outbox:
         self._thread.join(deadline_s)
 
 
-def pose_message(arrival: ReceivedFrame, result: FrameResult) -> PoseMessage:
+def pose_message(agent_epoch: int, t_capture_ns: int, result: FrameResult) -> PoseMessage:
     """Return the message of a frame's pose."""
     T, covariance = result.T_world_cam, result.covariance
     known = covariance is not None and bool(np.isfinite(covariance).all())
     return PoseMessage(
-        agent_epoch=arrival.message.agent_epoch,
+        agent_epoch=agent_epoch,
         frame_id=result.frame_id,
-        t_capture_ns=arrival.message.t_capture_ns,
+        t_capture_ns=t_capture_ns,
         t_source_ns=result.t_source_ns,
         T_world_cam=tuple(T.ravel().tolist()) if T is not None else None,
         state=result.state.value,

@@ -1,6 +1,7 @@
 """Replays a recording through the same decoder, tracker and outputs as the live server, without a network."""
 
 import contextlib
+import itertools
 import logging
 import math
 import threading
@@ -198,6 +199,11 @@ def _replayed(
         if settings.reference is not None
         else recording_reference(reader, camera)
     )
+    arrivals = _arrivals(reader, stream, settings)
+    # Before a former run is set aside, too.
+    first = next(arrivals, None)
+    if first is None:
+        raise SourceError(_none_in_part(reader, stream, settings))
     drops: dict[str, int] = {}
     processed = 0
     with contextlib.ExitStack() as stack:
@@ -209,15 +215,13 @@ def _replayed(
         viewer = open_viewer(server, identity, reference)
         if viewer is not None:
             stack.callback(viewer.close, leave_window=settings.view.leave_open)
-        for arrival in _paced(_arrivals(reader, stream, settings), settings.pace, stop):
+        for arrival in _paced(itertools.chain([first], arrivals), settings.pace, stop):
             if stop.is_set():
                 break
             if _take(session, decoder, arrival, viewer, drops):
                 processed += 1
                 if on_frame is not None:
                     on_frame(arrival.message.frame_id)
-        if not processed and not drops and not stop.is_set():
-            raise SourceError(_none_in_part(reader, stream, settings))
         if not processed and not stop.is_set():
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
         return _concluded(settings, session, viewer, drops, on_activity, stopped=stop.is_set())

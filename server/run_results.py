@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.run_folder import MAP_NAME, RECONSTRUCTION_NAME, TRAJECTORY_NAME, RunData, write_run
+from semcast.common.run_folder import (
+    MAP_NAME,
+    RECONSTRUCTION_NAME,
+    TRAJECTORY_NAME,
+    PartInMetres,
+    RunData,
+    write_run,
+)
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.server.export.outputs import EachFile, trajectory_of, write_ply
 from semcast.server.mapping.reconstruction import Reconstruction
@@ -60,6 +67,7 @@ def write_results(
     camera: Intrinsics,
     t_source_ns: Mapping[int, int],
     each: EachFile,
+    metres: tuple[PartInMetres, ...] = (),
 ) -> None:
     """Write trajectory, map and reconstruction, which is what exports to other tools are made from.
 
@@ -70,6 +78,7 @@ def write_results(
         camera: Of the decoded images.
         t_source_ns: Frame id to recorded time.
         each: Takes note of files that can't be written.
+        metres: Of each part whose unit is known.
     """
     ids, xyz, rgb, confidence = reconstruction.landmarks()
     landmark_ids, keyframe_ids, xy = reconstruction.world.observations()
@@ -97,5 +106,6 @@ def write_results(
                 observed_landmark_ids=landmark_ids[used],
                 observed_keyframe_ids=keyframe_ids[used],
                 observed_xy=xy[used].astype(np.float32),
+                metres=metres,
             ),
         )

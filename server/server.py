@@ -308,7 +308,7 @@ class Server:
 
         def tell(found: FrameResult) -> None:
             self._outbox.put_pose(decoded.arrival, found)
-            self._outbox.put_metric_pose(decoded.arrival, found, session.metres.of(found))
+            self._outbox.put_metric_pose(message.agent_epoch, found, session.metres.of(found))
 
         try:
             outcome = session.process(decoded.frame, Arrival.of(decoded, self.metrics.drops), tell)
@@ -397,6 +397,8 @@ class Server:
         def show(update: MapUpdate | None, patches: Sequence[DensePatch]) -> None:
             if update is not None:
                 self._outbox.put_map(session.identity.agent_epoch, update)
+                if (last := session.newest_pose()) is not None:
+                    self._outbox.put_metric_pose(session.identity.agent_epoch, last, session.metres.of(last))
             self._views.submit(None, update, patches)
 
         conclude(session, show, self._be_at, depth_budget_s, gives_way)

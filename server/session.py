@@ -109,6 +109,7 @@ class Session:
         self._num_frames = identity.num_frames
         self._map_epoch = 0
         self._last_frame_id = -1
+        self._newest_posed: FrameResult | None = None
         self._state = TrackingState.INITIALIZING
         self._is_concluded = False
         self._last_checkpoint_s = time.monotonic()
@@ -225,6 +226,8 @@ class Session:
         update = self._reconstruction.take_map_update()
         patches = self._cloud.grow(frame, result, update)
         self._last_frame_id = frame.frame_id
+        if result.T_world_cam is not None:
+            self._newest_posed = result
         self._t_source_ns[frame.frame_id] = frame.t_source_ns
         for frame_id, t_source_ns, _ in result.backfilled:
             self._t_source_ns.setdefault(frame_id, t_source_ns)
@@ -306,7 +309,7 @@ class Session:
     def restart_map(self) -> None:
         """Forget the map, as the control request ``reset`` asks."""
         self._reconstruction.reset()
-        self._restored = {}
+        self._restored, self._newest_posed = {}, None
         self._cloud.reset()
         self.metres.reset()
 
@@ -329,6 +332,17 @@ class Session:
         update = self.metres.follow(update)
         self.metres.tell()
         return update
+
+    def newest_pose(self) -> FrameResult | None:
+        """Return the newest frame that got a pose, with the one it has in the map as it is now.
+
+        None where it has none any more, or no frame got one since the server began.
+        """
+        found, now = self._newest_posed, self._reconstruction.final_trajectory()
+        if found is None or found.frame_id not in now:
+            return None
+        part = self._reconstruction.world.part_of_frames()[found.frame_id]
+        return replace(found, T_world_cam=now[found.frame_id], submap=part, covariance=None, backfilled=())
 
     @property
     def is_concluded(self) -> bool:
@@ -437,9 +451,8 @@ class Session:
             folder.mkdir(parents=True, exist_ok=True)
             with each.attempt(folder / SETTINGS_NAME) as path:
                 write_whole(path, to_toml(self._program))
-            write_results(
-                folder, self._reconstruction, results, self.identity.camera, self._t_source_ns, each
-            )
+            camera, metres = self.identity.camera, self.metres.parts()
+            write_results(folder, self._reconstruction, results, camera, self._t_source_ns, each, metres)
             cloud = self._cloud.points()
             if cloud is not None and len(cloud.xyz):
                 with each.attempt(folder / DENSE_NAME) as path:

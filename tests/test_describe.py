@@ -14,7 +14,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.nets.onnx_encoder import encoder_path
 from semcast.common.recording_writer import RecordingWriter, recording_metadata
-from semcast.common.run_folder import RECONSTRUCTION_NAME, RunData, write_run
+from semcast.common.run_folder import RECONSTRUCTION_NAME, PartInMetres, RunData, write_run
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.trajectory_error import ate
 from semcast.describe import describe
@@ -141,6 +141,13 @@ def test_a_run_of_one_part_says_nothing_of_parts_and_one_of_two_says_so(run_fold
     }
     write_run(run_folder, RunData(**values, frame_submap=np.zeros(5)))
     assert "parts" not in text_of(run_folder)
+    assert "metre" not in text_of(run_folder)
+    found = {"marker_id": 7, "num_keyframes": 5, "m_per_unit": 0.25, "relative_sigma": 0.01}
+    metres = (PartInMetres(part=0, T_marker_world=np.eye(4), **found),)
+    write_run(run_folder, RunData(**values, frame_submap=np.zeros(5), metres=metres))
+    assert "metre: a unit of the map is 0.25 m, within 2 % (95 %), by marker 7" in text_of(run_folder)
+    write_run(run_folder, RunData(**values, frame_submap=[0, 0, 0, 1, 1], metres=metres))
+    assert "metre, part 0: a unit of the map is 0.25 m" in text_of(run_folder)
     told = (
         "parts: 2 (part 0: 3 frames, part 1: 2 frames); the place and scale of all but the first are guessed"
     )

@@ -12,10 +12,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.distributed as dist
+from numpy.typing import NDArray
 
-from semcast.common.errors import CheckpointError
+from semcast.common.errors import CheckpointError, SourceError
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.codec import check_device
 from semcast.common.nets.registry import architecture
@@ -95,8 +97,9 @@ class Run:
         torch.manual_seed(settings.seed)  # layers draw their first weights from the global generator
         model: Transceiver = entry.build(entry.sizes)
         self._is_variable = model.is_variable
-        self.images = read_images(settings.data)
-        self.valid_images = read_images(settings.valid)[:_VALID_IMAGES] if settings.valid else []
+        self.images = _images_of(settings.data, "--data")
+        valid = settings.valid
+        self.valid_images = _images_of(valid, "--valid")[:_VALID_IMAGES] if valid else []
         self.step, self.elapsed_s = 0, 0.0
         self.agreed_s = 0.0  # elapsed time all processes agree on, since the schedule depends on it
         self._is_asked_to_stop = self.agreed_stop = False
@@ -435,3 +438,10 @@ def _train(
     if run.rank == 0:
         weights = run.export(valid)
     return TrainResult(run.step, run.elapsed_s, weights, valid)
+
+
+def _images_of(folder: Path, flag: str) -> list[NDArray[np.uint8]]:
+    try:
+        return read_images(folder)
+    except SourceError as err:
+        raise SourceError(f"{flag} must be a folder of images: {err}") from err

@@ -71,7 +71,9 @@ def export_run(
     placement = None
     if find_placement is not None:
         if format_name == "rrd":
-            raise ConfigError("--format rrd shows the map in its own frame, without --align or --marker-m")
+            raise ConfigError(
+                "--format rrd shows the map in its own frame, without --align, --metres or --marker-m"
+            )
         if parts is not None and format_name == "dense":
             raise ConfigError(
                 f"--format dense can't be placed here: each part has its own scale ({parts}), and "
@@ -82,6 +84,8 @@ def export_run(
         placement = find_placement(data, images)
         logger.info("%s", placement.words)
         data = placement.run(data)
+    elif data.metres and format_name != "rrd":
+        logger.info("in the map's own unit; the run knows the metre: --metres writes in it")
     frame = MAP_FRAME if placement is None else placement.frame
     if FORMATS[format_name].startswith("FILE") and out.is_dir():
         raise SourceError(f"{out} is a folder; --format {format_name} writes a file")

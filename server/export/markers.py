@@ -17,7 +17,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.geometry import align_umeyama, exp_so3, invert_transform
 from semcast.common.run_folder import RunData
-from semcast.server.export.placement import Placement
+from semcast.server.export.placement import TWO_SIDED_95, Placement
 from semcast.server.geometry.triangulation import triangulate
 
 Array = NDArray[np.float64]
@@ -36,7 +36,6 @@ _MARGIN_SHARE = 0.3
 MAX_UNCERTAINTY = 0.1
 #: Where its refinement of corners has the middle of the first pixel; ours is at 0.
 _APRILTAG_PIXEL_CENTRE = 0.5
-_TWO_SIDED_95 = 1.96
 #: What a corner behind the camera is off by.
 _BEHIND_PX = 1e4
 _ITERATIONS = 20
@@ -251,7 +250,7 @@ def _fit(views: MarkerViews, camera: Intrinsics, side_m: float, marker_id: int) 
             f"{name} must be seen alike in {MIN_IMAGES} images or more, got {len(views)} of {num_found}"
         )
     rms_px = float(np.sqrt((fit.residuals**2).mean()))
-    uncertainty = _TWO_SIDED_95 * fit.sigma_log_scale
+    uncertainty = TWO_SIDED_95 * fit.sigma_log_scale
     if not uncertainty <= MAX_UNCERTAINTY:
         by = f" by {100 * uncertainty:.0f} %" if np.isfinite(uncertainty) else ""
         raise SourceError(

@@ -26,6 +26,8 @@ from semcast.server.export.poses import rising_times
 
 Array = NDArray[np.float64]
 
+#: Standard deviations to either side that hold 95 % of a normal distribution.
+TWO_SIDED_95 = 1.96
 #: Two camera centres can always be fitted; the third says whether they should be.
 MIN_MATCHES = 3
 #: A path that is this much longer than wide says nothing about the rotation about itself.
@@ -62,6 +64,36 @@ class Placement:
         T_placed_cam[:, :3, :3] = self.R @ data.T_world_cam[:, :3, :3]
         T_placed_cam[:, :3, 3] = self.points(data.T_world_cam[:, :3, 3])
         return replace(data, T_world_cam=T_placed_cam, xyz=self.points(data.xyz))
+
+
+def place_by_run(data: RunData) -> Placement:
+    """Return the way to metres, and to the frame of a marker, that the run itself found (``--marker-m``).
+
+    Args:
+        data: The run, of one part.
+
+    Raises:
+        SourceError: The run does not know the metre of this part.
+    """
+    part = int(data.frame_submap[0]) if len(data.frame_submap) else 0
+    known = next((metres for metres in data.metres if metres.part == part), None)
+    if known is None:
+        there = (
+            f"; those of parts {', '.join(str(m.part) for m in data.metres)} are known" if data.metres else ""
+        )
+        raise SourceError(
+            f"the run does not know the metre of part {part}{there}: run again with --marker-m, or export "
+            "with --marker-m or --align"
+        )
+    T = known.T_marker_world
+    return Placement(
+        known.m_per_unit,
+        T[:3, :3],
+        T[:3, 3],
+        f"x right, y up, z out of marker {known.marker_id}; metres",
+        f"marker {known.marker_id}: {known.num_keyframes} keyframes of the run; 1 unit of the map is "
+        f"{known.m_per_unit:.4g} m, within {100 * TWO_SIDED_95 * known.relative_sigma:.2g} % (95 %)",
+    )
 
 
 def place_by_path(data: RunData, known: Trajectory) -> Placement:

@@ -12,6 +12,8 @@ from semcast.common.geometry import invert_transform
 Array = NDArray[np.float64]
 
 SEGMENT_POSES = 32
+#: Beyond it every second pose of the older half is left out.
+MAX_POSES = 20_000
 
 
 @dataclass
@@ -35,6 +37,9 @@ class _Posed:
 
 class PathTable:
     """Poses of frames by id, and of the keyframes they move with.
+
+    There are ``MAX_POSES`` at most: the older a part of an endless path is, the coarser. Keyframes all
+    stay, as the dense points of any of them may come at the end.
 
     Attributes:
         keyframes: Frame id to ``T_world_cam`` of keyframes.
@@ -100,6 +105,8 @@ class PathTable:
             place, _Posed(frame_id, t_source_ns, reference, T_ref_cam, is_after_gap and is_last)
         )
         self._touch_from(place)
+        if len(self._frames) > MAX_POSES:
+            self.withdraw([frame.frame_id for frame in self._frames[1 : MAX_POSES // 2 : 2]])
 
     def _place_of(self, frame_id: int) -> int:
         return bisect_left(self._frames, frame_id, key=lambda frame: frame.frame_id)

@@ -22,6 +22,7 @@ from semcast.common.run_folder import (
 )
 from semcast.common.run_summary import read_summary
 from semcast.server.export.parts import count_parts, parts_line
+from semcast.server.export.placement import TWO_SIDED_95
 from semcast.server.recorded_streams import RecordedStream, recorded_streams
 
 #: Heading and ``(name, value)`` lines; a name of "" goes on with the line before.
@@ -154,6 +155,14 @@ def describe_run(path: Path) -> list[Section]:
                 f"{len(data.observed_landmark_ids)} observations",
             )
         )
+        facts += [
+            (
+                f"metre, part {known.part}" if len(parts) > 1 else "metre",
+                f"a unit of the map is {known.m_per_unit:.4g} m, within "
+                f"{100 * TWO_SIDED_95 * known.relative_sigma:.2g} % (95 %), by marker {known.marker_id}",
+            )
+            for known in data.metres
+        ]
         camera = data.intrinsics
         facts.append(
             (

@@ -8,6 +8,7 @@ from semcast import SourceError
 from semcast.common.camera import Intrinsics
 from semcast.common.run_folder import (
     RECONSTRUCTION_NAME,
+    PartInMetres,
     RunData,
     read_image_paths,
     read_run,
@@ -104,6 +105,18 @@ def test_damaged_files_are_source_errors(tmp_path):
             read_run(tmp_path)
         except SourceError:
             continue
+
+
+def test_what_a_unit_is_comes_back_and_is_refused_where_it_makes_no_sense(tmp_path):
+    T = np.eye(4)
+    T[:3, 3] = 1.0, 2.0, 3.0
+    found = {"marker_id": 7, "num_keyframes": 5, "m_per_unit": 0.25, "relative_sigma": 0.01}
+    write_run(tmp_path, tiny_run(metres=(PartInMetres(part=2, T_marker_world=T, **found),)))
+    (back,) = read_run(tmp_path).metres
+    assert back.to_dict() == {"part": 2, "T_marker_world": T.tolist(), **found}
+    for wrong in ({"m_per_unit": 0.0}, {"relative_sigma": float("nan")}, {"T_marker_world": np.nan * T}):
+        with pytest.raises(ValueError, match="metres of part 2 must be finite, and a unit above 0 m"):
+            PartInMetres(**{"part": 2, "T_marker_world": T, **found, **wrong})
 
 
 def test_a_pickle_inside_is_not_executed(tmp_path):

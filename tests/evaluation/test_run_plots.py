@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semcast.cli import main
 from semcast.common.errors import SourceError
 from semcast.common.run_folder import FRAMES_NAME, SUMMARY_NAME, TRAJECTORY_NAME
 from semcast.common.trajectory import Trajectory, write_tum
@@ -228,6 +229,16 @@ def test_a_run_without_a_decoded_frame_has_nothing_to_plot(tmp_path):
         RunToPlot.read(tmp_path / "other", None)
     with pytest.raises(SourceError, match="is not a folder"):
         RunToPlot.read(tmp_path / "missing", None)
+
+
+@pytest.mark.parametrize(
+    "summary", [{"frames": 5}, {"frames": {"sent": "many"}}, {"drops": ["lost"]}, {"unposed_frames": [3]}]
+)
+def test_a_summary_that_no_run_wrote_is_named_in_one_line(tmp_path, capsys, summary):
+    write_tum(tmp_path / TRAJECTORY_NAME, line([1, 2, 3]))
+    (tmp_path / SUMMARY_NAME).write_text(json.dumps({"settings": None, **summary}))
+    assert main(["plot", str(tmp_path)]) == 1
+    assert f"{tmp_path / SUMMARY_NAME} is none that a run wrote: " in capsys.readouterr().err
 
 
 def test_from_above_is_from_above_also_where_the_true_world_has_z_up(tmp_path, monkeypatch):

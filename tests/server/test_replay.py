@@ -423,12 +423,14 @@ def test_info_lists_the_streams_of_a_recording(with_a_later_start):
     assert told_of_second.endswith("0 frames sent, 0 received")
 
 
-def test_a_time_range_without_frames_is_one_clear_error(recording):
+def test_a_time_range_without_frames_is_one_clear_error(recording, tmp_path):
     long = r"it is 1\.[0-9] s long"
+    replay(without_depth(recording, end_s=0.3, out=tmp_path / "run"))
     with pytest.raises(SourceError, match=f"no frame of .*run.mcap lies after 100 s: {long}"):
-        replay(without_depth(recording, start_s=100.0))
+        replay(without_depth(recording, start_s=100.0, out=tmp_path / "run"))
     with pytest.raises(SourceError, match=f"lies after 0.21 s and before 0.22 s: {long}"):
         replay(without_depth(recording, start_s=0.21, end_s=0.22))
+    assert not (tmp_path / "run" / "previous-1").exists()
     with pytest.raises(ValueError, match="end_s must be later"):
         ReplaySettings(file=recording, start_s=2.0, end_s=1.0)
 

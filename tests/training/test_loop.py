@@ -16,7 +16,7 @@ import torch
 import semcast.common.nets.registry as registry
 import semcast.training.loop as loop
 from semcast.common.config import build_settings, read_toml
-from semcast.common.errors import CheckpointError, ConfigError
+from semcast.common.errors import CheckpointError, ConfigError, SourceError
 from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.codec import NeuralCodec
 from semcast.common.nets.mae import build_mae
@@ -227,6 +227,13 @@ def test_a_damaged_checkpoint_is_refused(tiny_network, photos, tmp_path):
     (tmp_path / "last.pt").write_bytes(b"nothing")
     with pytest.raises(CheckpointError, match="can't be read"):
         train(settings_for(photos, tmp_path))
+
+
+@pytest.mark.parametrize("name", ["data", "valid"])
+def test_a_folder_of_images_that_is_not_there_is_named_with_its_flag(photos, tmp_path, name):
+    settings = settings_for(photos, tmp_path / "out", **{name: tmp_path / "nowhere"})
+    with pytest.raises(SourceError, match=f"--{name} must be a folder of images: .*nowhere can't be read"):
+        train(settings)
 
 
 def test_what_a_run_could_not_do_later_is_said_before_it_begins(tiny_network, photos, tmp_path):

@@ -42,6 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "or a sequence with a true path",
     )
     place.add_argument(
+        "--metres",
+        action="store_true",
+        help="export in metres and in the frame of the marker, as the run itself found them (--marker-m of "
+        "server or replay)",
+    )
+    place.add_argument(
         "--marker-m",
         type=float,
         metavar="SIDE",
@@ -73,12 +79,14 @@ def _part(word: str) -> str:
 def _placement(arguments: argparse.Namespace) -> "FindPlacement | None":
     """Return what finds the frame to export in, None for the map's own."""
     from semcast.common.errors import ConfigError
-    from semcast.server.export.placement import place_by_path
+    from semcast.server.export.placement import place_by_path, place_by_run
 
     if arguments.marker_m is None:
         for option in ("marker_dictionary", "marker_id"):
             if getattr(arguments, option) is not None:
                 raise ConfigError(f"--{option.replace('_', '-')} needs --marker-m")
+    if arguments.metres:
+        return lambda data, _: place_by_run(data)
     if arguments.align is not None:
         from semcast.common.sequence import read_known_path
 

@@ -42,7 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.truth is not None:
         truth = read_known_path(arguments.truth)
     else:
-        reference = read_summary(folder).get("settings", {}).get("reference")
+        settings = read_summary(folder).get("settings")
+        reference = settings.get("reference") if isinstance(settings, dict) else None
         if reference and Path(reference).exists():
             truth, times_ns = open_truth(Path(reference))
             if truth is not None:

@@ -18,7 +18,7 @@ from semcast.common.geometry import (
     rotation_angle_deg,
     transform_points,
 )
-from semcast.common.run_folder import read_image_paths, read_run, write_run
+from semcast.common.run_folder import PartInMetres, read_image_paths, read_run, write_run
 from semcast.common.trajectory import Trajectory, read_tum, write_tum
 from semcast.server.export.markers import Sightings, place_by_marker
 from semcast.server.export.outputs import write_ply
@@ -291,6 +291,47 @@ def test_all_files_of_an_export_are_in_metres(tmp_path, marker_run, read_ply, ca
     assert transforms["applied_transform"] == np.eye(4)[:3].tolist()
     centres = np.array([np.array(f["transform_matrix"])[:3, 3] for f in transforms["frames"]])
     np.testing.assert_allclose(centres, expected_cameras(data), atol=8e-3)
+
+
+def test_an_export_is_in_the_unit_that_the_run_itself_found(tmp_path, marker_run, read_ply, capsys):
+    data, _ = marker_run(markers=())
+    T_marker_world = invert_transform(T_MAP_MARKER)
+    T_marker_world[:3, 3] *= SCALE
+    metres = {"marker_id": 7, "num_keyframes": 5, "m_per_unit": SCALE, "relative_sigma": 0.01}
+    known = PartInMetres(part=0, T_marker_world=T_marker_world, **metres)
+    write_run(tmp_path / "run", replace(data, metres=(known,)))
+    write_ply(tmp_path / "run" / "dense.ply", data.xyz, data.rgb, data.confidence)
+
+    assert export(tmp_path, "--format", "tum", "--out", tmp_path / "u.tum") == 0
+    assert "the run knows the metre: --metres writes in it" in capsys.readouterr().err
+    np.testing.assert_allclose(read_tum(tmp_path / "u.tum").positions, data.T_world_cam[:, :3, 3], atol=1e-7)
+    assert export(tmp_path, "--format", "tum", "--metres", "--out", tmp_path / "m.tum") == 0
+    assert "1 unit of the map is 0.2 m, within 2 % (95 %)" in capsys.readouterr().err
+    np.testing.assert_allclose(read_tum(tmp_path / "m.tum").positions, expected_cameras(data), atol=1e-7)
+    assert export(tmp_path, "--format", "dense", "--metres", "--out", tmp_path / "m.ply") == 0
+    cloud = read_ply(tmp_path / "m.ply")
+    expected = SCALE * (data.xyz - T_MAP_MARKER[:3, 3]) @ T_MAP_MARKER[:3, :3]
+    np.testing.assert_allclose(np.stack([cloud[a] for a in "xyz"], axis=1), expected, atol=1e-5)
+    assert b"x right, y up, z out of marker 7; metres" in (tmp_path / "m.ply").read_bytes()
+
+
+def test_a_part_whose_unit_the_run_did_not_find_is_not_written_in_metres(tmp_path, marker_run, capsys):
+    data, _ = marker_run(markers=())
+    out = ("--format", "tum", "--metres", "--out", tmp_path / "x")
+    assert export(tmp_path, *out) == 1
+    assert "the run does not know the metre of part 0: run again with --marker-m" in capsys.readouterr().err
+    metres = {"marker_id": 7, "num_keyframes": 5, "m_per_unit": SCALE, "relative_sigma": 0.01}
+    known = PartInMetres(part=1, T_marker_world=np.eye(4), **metres)
+    write_run(tmp_path / "run", replace(data, frame_submap=np.repeat([0, 1], [6, 6]), metres=(known,)))
+    assert export(tmp_path, *out) == 1
+    assert "--part must name one part" in capsys.readouterr().err
+    assert export(tmp_path, *out, "--part", 0) == 1
+    assert "the metre of part 0; those of parts 1 are known" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+    assert export(tmp_path, *out, "--part", 1) == 0
+    np.testing.assert_allclose(
+        read_tum(tmp_path / "x").positions, SCALE * data.T_world_cam[6:, :3, 3], atol=1e-7
+    )
 
 
 def test_an_export_aligned_with_a_tum_file(tmp_path, marker_run):

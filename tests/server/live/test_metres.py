@@ -10,6 +10,8 @@ from semcast.common.keys import metric_pose_key
 from semcast.common.map_mirror import MapMirror
 from semcast.common.messages import MetricPose
 from semcast.common.network_settings import NetworkSettings
+from semcast.common.run_folder import read_run
+from semcast.common.trajectory import read_tum
 from semcast.common.transport import open_client
 from semcast.common.wire import unpack
 from semcast.server.export.markers import MAX_UNCERTAINTY
@@ -48,7 +50,11 @@ def test_poses_come_in_metres_as_soon_as_the_marker_tells_them(tmp_path, air, me
         mirror = MapMirror(client, AGENT, DEADLINE_S)
         radio.stream(range(len(images)))
         until(lambda: metric_poses and metric_poses[-1].frame_id == len(images) - 1, "the last one in metres")
+        num_on_the_way = len(metric_poses)
         summary = running.finish(stop=True)
+        until(lambda: len(metric_poses) > num_on_the_way, "the last one as the last adjustment leaves it")
+        (adjusted,) = metric_poses[num_on_the_way:]
+        del metric_poses[num_on_the_way:]
         first, last = metric_poses[0], metric_poses[-1]
         assert [m.frame_id for m in metric_poses] == list(range(first.frame_id, len(images)))
         assert 3 < first.frame_id < len(images) - 6
@@ -71,11 +77,20 @@ def test_poses_come_in_metres_as_soon_as_the_marker_tells_them(tmp_path, air, me
             in_units = np.array(pose.covariance).reshape(6, 6)
             np.testing.assert_allclose(covariance[3:, 3:], found.m_per_unit**2 * in_units[3:, 3:])
             np.testing.assert_allclose(covariance[:3, 3:], found.m_per_unit * in_units[:3, 3:])
-        in_metres = mirror.map.in_metres(last)
+        assert (adjusted.frame_id, adjusted.t_capture_ns) == (last.frame_id, last.t_capture_ns)
+        assert adjusted.covariance is None
+        T_world_last = read_tum(tmp_path / "trajectory.tum").T_world_cam[-1]
+        T_world_last[:3, 3] *= adjusted.m_per_unit
+        T_marker_world = np.array(adjusted.T_marker_world).reshape(4, 4)
+        T_marker_last = np.array(adjusted.T_marker_cam).reshape(4, 4)
+        np.testing.assert_allclose(T_marker_world @ T_world_last, T_marker_last, atol=1e-5)
+        in_metres = mirror.map.in_metres(adjusted)
         at = mirror.map.keyframe_ids.tolist()
         np.testing.assert_allclose(in_metres.keyframe_poses[:, :3, 3], truth[at][:, :3, 3], atol=1.0)
     (told,) = summary["metres"]
     assert told["marker_id"] == NUMBER
+    assert told["m_per_unit"] == adjusted.m_per_unit
+    assert [part.to_dict() for part in read_run(tmp_path).metres] == [told]
     rows = read_rows(tmp_path / "frames.jsonl")
     assert [row.frame_id for row in rows if row.m_per_unit is not None] == [m.frame_id for m in metric_poses]
     assert told["m_per_unit"] == pytest.approx(rows[-1].m_per_unit, rel=0.05)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from semcast.common.geometry import exp_so3, make_transform
+from semcast.server.view import path_table
 from semcast.server.view.path_table import SEGMENT_POSES, PathTable
 
 
@@ -40,6 +41,23 @@ def test_a_path_is_interrupted_where_the_camera_was_lost_and_not_where_a_frame_i
     assert table.frame_ids.tolist() == [0, 1, 3, 6]
     table.withdraw(range(7))
     assert table.poses().shape == (0, 4, 4)
+
+
+def test_an_endless_path_is_thinned_from_its_old_end_and_keeps_its_gaps(monkeypatch):
+    monkeypatch.setattr(path_table, "MAX_POSES", 64)
+    table = path(range(65), gaps=[11])
+    assert table.frame_ids.tolist() == [*range(0, 32, 2), *range(32, 65)]
+    assert [x[0] for x in lines(table)] == [0.0, 12.0], "the gap before frame 11 is before the next one now"
+    for k in range(65, 1000):
+        table.insert(k, 1000 * k, at(k), is_after_gap=False)
+        assert len(table) <= 64
+    assert table.frame_ids[0] == 0
+    steps = np.diff(table.frame_ids)
+    assert (np.diff(steps) <= 0).all()
+    assert (steps[-32:] == 1).all()
+    np.testing.assert_array_equal(table.poses()[:, 0, 3], table.frame_ids)
+    shown = [strip for k in range(len(table.segment_versions)) for strip in table.strips(k)]
+    assert sum(len(strip) - 1 for strip in shown) == len(table) - 2
 
 
 def test_frames_turn_with_their_keyframe_and_those_of_a_start_with_the_next_one():
