@@ -17,13 +17,17 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Along an edge a standard deviation is at most so many times that across it: nothing is known to less than
-#: a tenth of a pixel, and edges that are bent are straight for a few pixels only.
+#: Ratio of the standard deviations along and across an edge at most: nothing is known to less than a tenth of
+#: a pixel, and edges that are bent are straight for a few pixels only.
 _MOST_RATIO = 10.0
-#: Half the side of the window whose gradients count, and steps between them: they are smooth over as much.
-_REACH_PX, _STEP_PX = 8, 2
-#: Steps that ``rounded`` takes.
-_LENGTH_STEP, _ANGLE_STEP = 0.2, np.pi / 36
+#: Half the side of the window whose gradients count.
+_REACH_PX = 8
+#: Distance of the gradients that are summed: they are smooth over as much.
+_STEP_PX = 2
+#: To what ``rounded`` rounds lengths,
+_LENGTH_STEP = 0.2
+#: and directions, in radians.
+_ANGLE_STEP = np.pi / 36
 
 
 def edges_at(grey: NDArray[np.uint8], xy: Array) -> Array:

@@ -32,19 +32,24 @@ Array = NDArray[np.float64]
 
 #: Keyframes that are looked at, the newest ones.
 NUM_ANCHORS = 10
-#: Side of the patches by which tracks are put back, and every so many of their pixels that are looked at: a
-#: small one finds what is a pixel or two off, and has less of what is behind an outline.
+#: Side and stride in pixels of the patches by which tracks are put back: a small one finds what is a pixel or
+#: two off, and has less of what is behind an outline.
 _FINE_PATCH = (11, 1)
-#: And of those by which they are told from chance finds, whose correlation needs more around.
+#: Side and stride of those by which tracks are told from chance finds, whose correlation needs more around.
 _WHOLE_PATCH = (ANCHOR_PATCH_PX, 2)
-#: Places from which on their scatter tells how well a track is known.
+#: Keyframes a track must be aligned with for the scatter of the places to tell how well it is known.
 _MIN_PLACES = 4
-#: Keyframes that the tracks behind a pose are compared with, and how many of those these show must look as
-#: they did, and what share. Behind gaps of 3 to 10 frames 46 to 100 % of 11 to 122 did where the pose was
-#: right, in noisy images too, and none of 2 to 39 where it was wrong.
-_NUM_COMPARED, _MIN_ALIKE, _MIN_ALIKE_SHARE = 3, 5, 0.2
-#: Landmarks next to a track without one, by which its patch is warped, and how many a keyframe must show.
-_NEIGHBOURS, _MIN_LANDMARKS = 5, 5
+#: The newest keyframes that the tracks behind a pose are compared with.
+_NUM_COMPARED = 3
+#: Of the tracks those show, how many must look as they did. Behind gaps of 3 to 10 frames 46 to 100 % of 11
+#: to 122 did where the pose was right, in noisy images too, and none of 2 to 39 where it was wrong.
+_MIN_ALIKE = 5
+#: The same as a share.
+_MIN_ALIKE_SHARE = 0.2
+#: Landmarks next to a track without a depth, by which its patch is warped.
+_NEIGHBOURS = 5
+#: Landmarks a keyframe must show for that.
+_MIN_LANDMARKS = 5
 
 
 def anchor_tracks(

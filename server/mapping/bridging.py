@@ -17,14 +17,19 @@ _MAX_BRIDGE_S = 5.0
 _LEAST_WAY = 0.02
 #: and its unit makes things no more than so many times as far or near as they were.
 _MOST_FARTHER = 5.0
-#: Standard deviations of the logarithm of two guesses of the unit: that things are as far away as they were,
-#: and that the camera goes on at its old speed; that may change by so many depths a second too, as in a hand.
-_DEPTH_SIGMA, _SPEED_SIGMA, _SPEED_CHANGE_DEPTHS_S = 0.5, 0.03, 0.03
+#: Standard deviation of the logarithm of a new map's unit, guessed from things being as far away as before,
+_DEPTH_SIGMA = 0.5
+#: or from the camera going on at its old speed,
+_SPEED_SIGMA = 0.03
+#: to which the speed's own standard deviation is added, in depths per second: a hand changes its speed.
+_SPEED_CHANGE_DEPTHS_S = 0.03
 #: How the camera moves after a gap is told from so long a time: the shorter, the noisier.
 _LATER_NS = 500_000_000
-#: A submap turned from where it was put by more than this, and so much more for each second of the gap before
-#: it, was not recognised: the camera is in another corridor that looks the same.
-_MOST_TURNED_DEG, _MOST_TURNED_DEG_S = 30.0, 60.0
+#: A submap turned from where it was put by more than this was not recognised: the camera is in another
+#: corridor that looks the same.
+_MOST_TURNED_DEG = 30.0
+#: How much more it may be for each second of the gap before it.
+_MOST_TURNED_DEG_S = 60.0
 
 
 def bridge(

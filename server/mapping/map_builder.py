@@ -42,14 +42,16 @@ Ids = NDArray[np.int64]
 
 #: Keyframes whose images are kept: 45 MB of 640x480.
 _MAX_IMAGES = 150
-#: A keyframe has landmarks enough with one for this share of the tracks that are wanted.
+#: A keyframe has enough landmarks with this share of ``max_features``.
 _ENOUGH_SHARE = 0.2
-#: Landmarks seen again may take the tracks to so many times the number that is wanted.
+#: Landmarks seen again may raise the number of tracks to this many times ``max_features``.
 _MAX_TRACKS_SHARE = 1.2
 #: The newest keyframes, which stay where older ones are thinned out: an adjustment's window is among them.
 _MAX_RECENT = 40
-#: Steps of an adjustment: a start is far from where it ends, a window was adjusted before but for its newest.
-_START_ITERATIONS, _ITERATIONS = 15, 6
+#: Steps of the adjustments of a start, which is far from where it ends,
+_START_ITERATIONS = 15
+#: and of a window, which was adjusted before but for its newest keyframe.
+_ITERATIONS = 6
 
 
 class MapBuilder:

@@ -21,25 +21,39 @@ Ids = NDArray[np.int64]
 
 #: Root mean square error of a triangulated landmark at most, in standard deviations.
 MAX_ERROR_SIGMA = 1.8
-#: From this on, and seen twice, a track is on something that moves by itself, or slipped.
+#: RMS error in standard deviations from which on a track seen at least twice is no point at rest: it slipped,
+#: or is on something that moves by itself.
 _REFUTED_SIGMA = 4.0
 #: Landmarks further than this many median depths are as good as at infinity.
 _MAX_DEPTH_RATIO = 60.0
 #: Noise is judged by residuals that keep at least this share of its variance.
 _MIN_LEFT = 0.1
-#: Where landmarks run out, points under smaller angles do, down to this share of the usual one: a camera that
-#: turns leaves all it knows, and sees hardly anything from two sides.
+#: Where landmarks run out, points with less parallax are accepted, down to this share of the usual angle: a
+#: camera that turns leaves all it knows, and sees hardly anything from two sides.
 _LEAST_PARALLAX_SHARE = 0.3
-#: A pose soon rests on too little when fewer landmarks agree than this share of those right after the last
-#: keyframe, or than so many. New ones are wanted in time: when those, or tracks, are less than these shares.
-_FEW_SHARE, _FEW, _THINNED_SHARE, _SPARSE_SHARE = 0.45, 40, 0.75, 0.6
-#: A frame with less of its rows holds little, and its keyframes are the further apart (in frames).
-_DAMAGED_SHARE, _DAMAGED_APART = 0.5, 5
-#: Flow in image widths: below the first the camera stands, which brings neither parallax nor new views; from
-#: the second on, or so many frames after the last keyframe, another one says something new; beyond the third
-#: the view is another.
-_STANDING_WIDTHS, _CHANGING_WIDTHS, _APART, _MOVED_WIDTHS = 0.004, 0.02, 2, 0.045
-#: Ways between keyframes below this share of how far things are tell no scale.
+#: A keyframe is needed when fewer landmarks agree with the pose than this share of those right after the last
+#: keyframe: the pose soon rests on too little.
+_FEW_SHARE = 0.45
+#: The same as a number of landmarks.
+_FEW = 40
+#: A keyframe is wanted early, for new landmarks in time, at this share of those landmarks.
+_THINNED_SHARE = 0.75
+#: And with fewer tracks in sight than this share of ``max_features``.
+_SPARSE_SHARE = 0.6
+#: A frame with a smaller share of its rows is damaged and shows little.
+_DAMAGED_SHARE = 0.5
+#: Frames between the last keyframe and a damaged one, at least.
+_DAMAGED_APART = 5
+#: Flow since the last keyframe, in image widths, below which the camera stands: another keyframe would bring
+#: neither parallax nor new views.
+_STANDING_WIDTHS = 0.004
+#: Flow from which on a keyframe wanted early is worth it.
+_CHANGING_WIDTHS = 0.02
+#: Frames since the last keyframe after which it is, whatever the flow.
+_APART = 2
+#: Flow from which on the view is another one.
+_MOVED_WIDTHS = 0.045
+#: The distance between keyframes tells a scale only above this share of the scene's depth.
 _LEAST_WAY = 0.002
 #: Observations in a row that disagree before a landmark is given up.
 _MAX_MISSED = 4

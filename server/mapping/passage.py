@@ -23,9 +23,10 @@ from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
 
-#: A part is placed again when its start is so long ago, but no longer: a camera that stood since, or was
-#: elsewhere, has not gone on as before.
-_SETTLED_NS, _LATEST_NS = 1_000_000_000, 2_000_000_000
+#: A part of the map is placed again this long after its start,
+_SETTLED_NS = 1_000_000_000
+#: but not later than this: a camera that stood since, or was elsewhere, has not gone on as before.
+_LATEST_NS = 2_000_000_000
 
 
 @dataclass(frozen=True)

@@ -30,28 +30,35 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Positions found from an image of long ago are good to about this.
+#: Standard deviation of positions that were found from an image of long ago.
 OLD_SIGMA_PX = 1.0
-#: The newest keyframes are no revisit: an adjustment has most of them in its window.
+#: The newest keyframes, which are never a revisit: an adjustment has most of them in its window.
 NUM_RECENT = 12
-#: Keyframes whose landmarks are projected, as long as turn (in half fields of view) and way (in depths of the
-#: scene) together are below this, and how many of those are looked for in the image, one after the other.
-_NUM_NEAREST, _MAX_APART = 6, 2.0
+#: Old keyframes nearest to the camera whose landmarks are projected, at most.
+_NUM_NEAREST = 6
+#: How far away they may be: turn in half fields of view and distance in depths of the scene, added.
+_MAX_APART = 2.0
+#: How many of those keyframes are looked for in the image, one after the other.
 _NUM_TRIED = 2
 #: Landmarks of a keyframe that should be in sight for it to be looked at.
 _MIN_EXPECTED = 30
-#: Found landmarks that agree with the pose, as a number and as a share of those found.
-_MIN_AGREEING, _MIN_SHARE = 15, 0.6
+#: Found landmarks that must agree with the relative pose.
+_MIN_AGREEING = 15
+#: The same as a share of those found.
+_MIN_SHARE = 0.6
 _MIN_CORRELATION = 0.75
-#: Old landmarks are not exactly where they are expected; the patch puts them right by a little once they were
-#: followed there.
-_REACH_PX, _MAX_MOVE_PX = 40.0, 3.0
+#: How far from its expected place an old landmark is followed: it is not exactly where the map has it.
+_REACH_PX = 40.0
+#: How far aligning its patch may then still move it.
+_MAX_MOVE_PX = 3.0
 _KLT_LEVELS = 2
 _BORDER_PX = 10
 #: Keyframes before and after the old one that help to triangulate.
 _NEIGHBOURS = 6
-#: Rays that are further apart than this tell the depth; all must meet to so many standard deviations.
-_MIN_PARALLAX_DEG, _MAX_ERROR_SIGMA = 1.0, 1.8
+#: Rays must be further apart than this to tell a depth.
+_MIN_PARALLAX_DEG = 1.0
+#: RMS error at most, in standard deviations, with which the rays of a landmark must meet.
+_MAX_ERROR_SIGMA = 1.8
 #: A depth that changes by more than this factor (as a logarithm) is that of another point along the line.
 _MAX_LOG_DEPTH = 0.7
 

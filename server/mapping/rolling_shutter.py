@@ -29,8 +29,10 @@ Array = NDArray[np.float64]
 #: x and y of each pixel, ``(H, W)`` each.
 Places = tuple[NDArray[np.float32], NDArray[np.float32]]
 
-#: Tracks a movement is fitted to at least, and steps of reweighting (Huber).
-_MIN_TRACKS, _ITERATIONS = 30, 6
+#: Tracks a movement is fitted to, at least.
+_MIN_TRACKS = 30
+#: Steps of reweighting (Huber).
+_ITERATIONS = 6
 #: Images further apart than this say little about how the camera moved during an exposure.
 _MAX_STEP_S = 0.5
 #: A hand shakes several times a second: from images further apart no trend of the movement is read.

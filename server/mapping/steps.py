@@ -16,11 +16,20 @@ from semcast.server.mapping.pose_graph import Edge
 from semcast.server.mapping.thinning import is_gap
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
-#: Drift from one keyframe to the next: rotation in radians and as a share of the turn, translation as a share
-#: of the way and of the depth, and the logarithm of the scale.
-_STEP_RAD, _STEP_TURN, _STEP_WAY, _STEP_DEPTH, _STEP_SCALE = 0.002, 0.02, 0.02, 0.002, 0.01
-#: Next to nothing is known of the two sides of a gap.
-_GAP_RAD, _GAP_SCALE = 0.5, 0.5
+#: Standard deviations of the drift from one keyframe to the next. Rotation, in radians,
+_STEP_RAD = 0.002
+#: and as a share of the turn between the two;
+_STEP_TURN = 0.02
+#: translation, as a share of the distance between the two,
+_STEP_WAY = 0.02
+#: and of the median depth;
+_STEP_DEPTH = 0.002
+#: logarithm of the scale.
+_STEP_SCALE = 0.01
+#: The same across a gap in the tracks, where next to nothing is known: rotation in radians,
+_GAP_RAD = 0.5
+#: and logarithm of the scale.
+_GAP_SCALE = 0.5
 
 
 class Step(NamedTuple):
