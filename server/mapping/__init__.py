@@ -1,8 +1,8 @@
 """The reconstruction: decoded frames in, camera poses and a map out.
 
 Start at ``reconstruction.Reconstruction``: one object per stream, one call per frame. It follows tracks, asks
-``tracker`` for the pose and hands keyframes to ``map_builder.MapBuilder``, which owns the map. What follows is
-where things are; ``docs/architecture.md`` tells why they are done as they are.
+``tracker`` for the pose and hands keyframes to ``map_builder.MapBuilder``, which owns the map. What follows
+tells where things are; ``docs/architecture.md`` tells why they are done as they are.
 
 The frame
     reconstruction    the state machine: initialising, tracking, lost; what each frame goes through
