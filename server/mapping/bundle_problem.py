@@ -134,11 +134,8 @@ def assemble_problem(
     fixed: NDArray[np.bool_],
     keep_baseline: bool,
     iterations: int,
-    map_version: int = 0,
-    num_anchors: int = 0,
-    with_covariance: bool = False,
 ) -> BundleProblem:
-    """Put a problem together from what views saw; the noise model gives each observation its sigma.
+    """Put a problem together from what views saw; no covariance is asked for.
 
     Args:
         camera: Pinhole.
@@ -147,13 +144,10 @@ def assemble_problem(
         landmark_ids: ``(P,)``.
         xyz: ``(P, 3)`` where they are.
         seen: Observations, with rows into ``landmark_ids``.
-        noise: Of the observations.
-        fixed: See ``BundleProblem``, as the others.
-        keep_baseline: The same.
-        iterations: The same.
-        map_version: The same.
-        num_anchors: The same.
-        with_covariance: The same.
+        noise: Gives each observation its sigma, and Huber's threshold.
+        fixed: ``(K,)`` bool, see ``BundleProblem``.
+        keep_baseline: See ``BundleProblem``.
+        iterations: Levenberg-Marquardt steps at most.
     """
     return BundleProblem(
         camera=camera,
@@ -169,9 +163,7 @@ def assemble_problem(
         sigma_px=noise.sigma_px(seen.confidence),
         confidence=seen.confidence,
         iterations=iterations,
-        map_version=map_version,
-        num_anchors=num_anchors,
-        with_covariance=with_covariance,
+        with_covariance=False,
         huber_px=noise.huber_px,
         edge=seen.edge,
     )

@@ -276,13 +276,13 @@ class MapBuilder:
             num_inliers: Landmarks its pose rests on.
             frames_since: Frames since the newest keyframe.
         """
-        cues = mapper.keyframe_cues(
-            reference,
-            tracks.ids[tracks.visible],
-            tracks.xy[tracks.visible],
+        ids, xy = tracks.ids[tracks.visible], tracks.xy[tracks.visible]
+        cues = mapper.KeyframeCues(
             num_inliers=num_inliers,
             num_inliers_at_keyframe=self.num_inliers_at_keyframe,
+            num_visible=len(ids),
             max_features=self._settings.max_features,
+            median_flow_px=mapper.median_flow_px(reference, ids, xy),
             width_px=self._camera.width,
             frames_since=frames_since,
             usable_share=float(sight.usable.mean()),

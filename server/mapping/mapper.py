@@ -68,7 +68,7 @@ class KeyframeCues:
         num_inliers_at_keyframe: The same right after the last keyframe.
         num_visible: Tracks in sight.
         max_features: Tracks wanted.
-        median_flow_px: Median way of tracks since the last keyframe.
+        median_flow_px: How far tracks have moved since the last keyframe, see ``median_flow_px``.
         width_px: Of the image.
         frames_since: Frames since the last keyframe.
         usable_share: Share of image rows that arrived.
@@ -101,44 +101,21 @@ def wants_keyframe(cues: KeyframeCues) -> bool:
     return few or moved or ((thinned or sparse) and changing)
 
 
-def keyframe_cues(
-    reference: Keyframe,
-    ids: Ids,
-    xy: Array,
-    *,
-    num_inliers: int,
-    num_inliers_at_keyframe: int,
-    max_features: int,
-    width_px: int,
-    frames_since: int,
-    usable_share: float,
-) -> KeyframeCues:
-    """Cues of a frame against its reference keyframe.
+def median_flow_px(reference: Keyframe, ids: Ids, xy: Array) -> float:
+    """How far tracks have moved since a keyframe, without those on something large that moves by itself.
 
     Args:
         reference: The keyframe.
         ids: ``(N,)`` tracks in sight, ascending.
         xy: ``(N, 2)`` where.
-        num_inliers: As in ``KeyframeCues``, like all that follow.
-        num_inliers_at_keyframe: See there.
-        max_features: See there.
-        width_px: See there; taken for the flow where no track is shared with the keyframe.
-        frames_since: See there.
-        usable_share: See there.
+
+    Returns:
+        Median in pixels; infinite where the keyframe saw none of the tracks.
     """
     _, row, row_k = np.intersect1d(ids, reference.ids, assume_unique=True, return_indices=True)
     at_rest = ~np.isin(ids[row], on_something_large(reference))
     flow_px = np.linalg.norm(xy[row[at_rest]] - reference.xy[row_k[at_rest]], axis=1)
-    return KeyframeCues(
-        num_inliers=num_inliers,
-        num_inliers_at_keyframe=num_inliers_at_keyframe,
-        num_visible=len(ids),
-        max_features=max_features,
-        median_flow_px=float(np.median(flow_px)) if len(flow_px) else float(width_px),
-        width_px=width_px,
-        frames_since=frames_since,
-        usable_share=usable_share,
-    )
+    return float(np.median(flow_px)) if len(flow_px) else float("inf")
 
 
 def add_landmarks(

@@ -6,6 +6,7 @@ keyframes correct for longer what the start of a map got wrong than ten do, and 
 counts is the number of observations.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,7 @@ def build_problem(
     fixed = np.zeros(len(views), bool)
     fixed[: len(anchors) + (1 if start or held.sum() >= 2 else 2)] = True
     landmark_ids = ids[used_points]
-    return assemble_problem(
+    problem = assemble_problem(
         camera,
         views,
         np.stack([k.T_world_cam for k in views]),
@@ -103,10 +104,8 @@ def build_problem(
         fixed=fixed,
         keep_baseline=start,
         iterations=iterations,
-        map_version=map_version,
-        num_anchors=len(anchors),
-        with_covariance=True,
     )
+    return replace(problem, map_version=map_version, num_anchors=len(anchors), with_covariance=True)
 
 
 def _order_of_choice(
