@@ -44,6 +44,7 @@ The map
     map_builder       owns the map: keyframes, adjustments, joining of submaps
     mapper            when to take a keyframe, new landmarks, applying adjustments, culling
     thinning          what goes when the map reaches its limits
+    keyframe_images   images of keyframes, kept to look for landmarks by how they looked there
     map_arrays        checks the arrays of a checkpoint
     map_update        what of the map goes out to those who follow it
 

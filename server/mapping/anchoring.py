@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.patch_alignment import (
     ANCHOR_PATCH_PX,
@@ -23,7 +22,7 @@ from semcast.server.geometry.patch_alignment import (
 )
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.weighting import MAD_TO_SIGMA
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom
+from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -52,36 +51,24 @@ _NEIGHBOURS = 5
 _MIN_LANDMARKS = 5
 
 
-def anchor_tracks(
-    camera: Intrinsics,
-    world: WorldMap,
-    images: KeyframeImages,
-    tracks: TrackTable,
-    sight: Sight,
-    T_world_cam: Array,
-    *,
-    submap: int,
-) -> int:
+def anchor_tracks(mapped: ImagedMap, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> int:
     """Align the tracks in sight with the kept keyframes that saw them.
 
     Of each track the median of the positions that fit is taken, and their scatter for how well it is known;
     one that fits nowhere stays where it is.
 
     Args:
-        camera: Pinhole.
-        world: The map.
-        images: Of keyframes.
+        mapped: Keyframes, their images and landmarks.
         tracks: Followed to the new image; moved.
         sight: The new image.
         T_world_cam: Its pose.
-        submap: The current one.
 
     Returns:
         How many tracks were aligned.
     """
-    views = _views(world, images, submap, NUM_ANCHORS)
+    views = mapped.newest_views(NUM_ANCHORS)
     all_rows = np.flatnonzero(tracks.visible)
-    aligned = _align(camera, world, views, tracks, all_rows, sight, T_world_cam, _FINE_PATCH)
+    aligned = _align(mapped, views, tracks, all_rows, sight, T_world_cam, _FINE_PATCH)
     if aligned is None:
         return 0
     rows, anchor, found = aligned
@@ -95,33 +82,22 @@ def anchor_tracks(
 
 
 def resembles(
-    camera: Intrinsics,
-    world: WorldMap,
-    images: KeyframeImages,
-    tracks: TrackTable,
-    sight: Sight,
-    T_world_cam: Array,
-    ids: NDArray[np.int64],
-    *,
-    submap: int,
+    mapped: ImagedMap, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: NDArray[np.int64]
 ) -> bool:
     """Tell whether tracks that agree with a pose show what the newest keyframes saw.
 
     KLT finds something near almost any guess, and all that was found near one guess agrees with its pose.
 
     Args:
-        camera: Pinhole.
-        world: The map.
-        images: Of keyframes.
+        mapped: Keyframes, their images and landmarks.
         tracks: Followed to the new image.
         sight: The new image.
         T_world_cam: Its pose.
         ids: ``(N,)`` the tracks that agree.
-        submap: The current one.
     """
-    views = _views(world, images, submap, _NUM_COMPARED)
+    views = mapped.newest_views(_NUM_COMPARED)
     rows = np.flatnonzero(tracks.visible & np.isin(tracks.ids, ids))
-    aligned = _align(camera, world, views, tracks, rows, sight, T_world_cam, _WHOLE_PATCH)
+    aligned = _align(mapped, views, tracks, rows, sight, T_world_cam, _WHOLE_PATCH)
     if aligned is None:
         return False
     rows, _, found = aligned
@@ -129,17 +105,8 @@ def resembles(
     return num_alike >= max(_MIN_ALIKE, _MIN_ALIKE_SHARE * len(np.unique(rows)))
 
 
-def _views(
-    world: WorldMap, images: KeyframeImages, submap: int, count: int
-) -> list[tuple[SeenFrom, Keyframe]]:
-    """Newest kept keyframes of a submap with their images, oldest first."""
-    there = [(image, world.keyframe(image.frame_id)) for image in images.newest(count)]
-    return [(image, k) for image, k in there if k is not None and k.submap == submap]
-
-
 def _align(
-    camera: Intrinsics,
-    world: WorldMap,
+    mapped: ImagedMap,
     views: Sequence[tuple[SeenFrom, Keyframe]],
     tracks: TrackTable,
     wanted: NDArray[np.intp],
@@ -157,10 +124,10 @@ def _align(
     parts: list[tuple[NDArray[np.intp], Array, Templates]] = []
     for image, keyframe in views:
         rows, xy0 = _shared(tracks, wanted, keyframe)
-        depth = _depths(world, keyframe, tracks.ids[rows], xy0)
+        depth = _depths(mapped.world, keyframe, tracks.ids[rows], xy0)
         told = depth > 0.0
         rows, xy0, depth = rows[told], xy0[told], depth[told]
-        warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
+        warps, depth_now = affine_warps(mapped.camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
         alike = seen_alike(warps, depth_now)
         parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike], *patch)))
     if not any(len(part[0]) for part in parts):

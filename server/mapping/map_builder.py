@@ -16,13 +16,14 @@ from semcast.server.mapping.bridging import may_turn
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, colours_of
+from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
 from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.map_update import update_of
 from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.readout_watch import ReadoutWatch
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
+from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, place_anew
 from semcast.server.mapping.rolling_shutter import ImageFlow
@@ -90,6 +91,10 @@ class MapBuilder:
         if self._bundle.busy:
             self._bundle.take(wait=True)
         self._version += 1
+
+    @property
+    def _mapped(self) -> ImagedMap:
+        return ImagedMap(self._camera, self.world, self.images, self.submap)
 
     def reference_keyframe(self) -> Keyframe | None:
         """Newest keyframe of the current submap."""
@@ -167,9 +172,7 @@ class MapBuilder:
 
     def anchor(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> int:
         """Align tracks with how earlier keyframes of this submap saw them; the number aligned."""
-        return anchor_tracks(
-            self._camera, self.world, self.images, tracks, sight, T_world_cam, submap=self.submap
-        )
+        return anchor_tracks(self._mapped, tracks, sight, T_world_cam)
 
     def recognise(self, sight: Sight) -> Place | None:
         """Look for the place of an image whose camera is lost."""
@@ -179,18 +182,13 @@ class MapBuilder:
 
     def resembles(self, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: Ids) -> bool:
         """Tell whether tracks that agree with a pose show what the newest keyframes saw."""
-        return resembles(
-            self._camera, self.world, self.images, tracks, sight, T_world_cam, ids, submap=self.submap
-        )
+        return resembles(self._mapped, tracks, sight, T_world_cam, ids)
 
     def recall(
         self, tracks: TrackTable, sight: Sight, T_world_cam: Array, *, wanted: int, reach_px: float
     ) -> Ids:
         """Give lost landmarks of the newest keyframes their tracks back; ids of those found."""
-        how = {"submap": self.submap, "wanted": wanted}
-        return recall_landmarks(
-            self._camera, self.world, self.images, tracks, sight, T_world_cam, reach_px=reach_px, **how
-        )
+        return recall_landmarks(self._mapped, tracks, sight, T_world_cam, reach_px=reach_px, wanted=wanted)
 
     def revisit(
         self, tracks: TrackTable, sight: Sight, T_world_cam: Array, on_moved: Callable[[float], None]
@@ -220,16 +218,8 @@ class MapBuilder:
         return (found is not None and self._take_up(found, tracks, sight, T_world_cam) > 0) or closed
 
     def _find_revisit(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> Revisit | None:
-        return find_revisit(
-            self._camera,
-            self.world,
-            self.images,
-            tracks.ids,
-            sight,
-            T_world_cam,
-            submap=self.submap,
-            gate_px=GATE_SIGMAS * max(OLD_SIGMA_PX, self.noise.model.sigma0_px),
-        )
+        gate_px = GATE_SIGMAS * max(OLD_SIGMA_PX, self.noise.model.sigma0_px)
+        return find_revisit(self._mapped, tracks.ids, sight, T_world_cam, gate_px=gate_px)
 
     def _close(self, loop: Loop, on_moved: Callable[[float], None]) -> bool:
         """Share out what drifted since the camera was at the loop's place; whether that was possible."""

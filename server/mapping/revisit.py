@@ -22,8 +22,8 @@ from semcast.server.geometry.pnp import reprojection_residual
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
+from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.mapper import gather_observations, median_depth
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -90,26 +90,15 @@ class _Expected:
 
 
 def find_revisit(
-    camera: Intrinsics,
-    world: WorldMap,
-    images: KeyframeImages,
-    tracked_ids: Ids,
-    sight: Sight,
-    T_world_cam: Array,
-    *,
-    submap: int,
-    gate_px: float,
+    mapped: ImagedMap, tracked_ids: Ids, sight: Sight, T_world_cam: Array, *, gate_px: float
 ) -> Revisit | None:
     """Look for landmarks of an old keyframe that should be in sight.
 
     Args:
-        camera: Pinhole.
-        world: The map.
-        images: Of keyframes.
+        mapped: Keyframes, their images and landmarks.
         tracked_ids: Tracks that are alive: they need not be found.
         sight: The newest image.
         T_world_cam: Its pose.
-        submap: The current one.
         gate_px: Distance from the epipolar line up to which a point agrees with the pose.
 
     Returns:
@@ -117,25 +106,24 @@ def find_revisit(
     """
     T_cam_world = invert_transform(T_world_cam)
     candidates = [
-        _expected(camera, world, keyframe, image, tracked_ids, sight, T_cam_world)
-        for keyframe, image in _nearest(camera, world, images, T_world_cam, submap)
+        _expected(mapped, keyframe, image, tracked_ids, sight, T_cam_world)
+        for keyframe, image in _nearest(mapped, T_world_cam)
     ]
     candidates = [c for c in candidates if len(c.rows) >= _MIN_EXPECTED]
     candidates.sort(key=lambda c: -len(c.rows))
     for candidate in candidates[:_NUM_TRIED]:
-        found = _look(camera, candidate, sight, T_world_cam, gate_px)
+        found = _look(mapped.camera, candidate, sight, T_world_cam, gate_px)
         if found is not None:
             return found
     return None
 
 
-def _nearest(
-    camera: Intrinsics, world: WorldMap, images: KeyframeImages, T_world_cam: Array, submap: int
-) -> list[tuple[Keyframe, SeenFrom]]:
+def _nearest(mapped: ImagedMap, T_world_cam: Array) -> list[tuple[Keyframe, SeenFrom]]:
     """Old keyframes that looked at about the same from about there."""
-    mine = world.keyframes_of(submap)
+    camera, world = mapped.camera, mapped.world
+    mine = world.keyframes_of(mapped.submap)
     by_id = {k.frame_id: k for k in mine[:-NUM_RECENT]}
-    known = [(by_id[image.frame_id], image) for image in images if image.frame_id in by_id]
+    known = [(by_id[image.frame_id], image) for image in mapped.images if image.frame_id in by_id]
     if not known:
         return []
     T_world_old = np.stack([keyframe.T_world_cam for keyframe, _ in known])
@@ -148,14 +136,14 @@ def _nearest(
 
 
 def _expected(
-    camera: Intrinsics,
-    world: WorldMap,
+    mapped: ImagedMap,
     keyframe: Keyframe,
     image: SeenFrom,
     tracked_ids: Ids,
     sight: Sight,
     T_cam_world: Array,
 ) -> _Expected:
+    camera, world = mapped.camera, mapped.world
     row = world.landmarks.rows(keyframe.ids)
     rows = np.flatnonzero((row >= 0) & ~np.isin(keyframe.ids, tracked_ids, assume_unique=True))
     depth = depths_in(invert_transform(keyframe.T_world_cam), world.landmarks.xyz[row[rows]])

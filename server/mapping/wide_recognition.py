@@ -22,7 +22,7 @@ from semcast.server.geometry.patch_alignment import (
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.geometry.wide_search import WideFeatures, match_wide
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom
+from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
