@@ -38,7 +38,7 @@ _NUM_STORED = 300
 #: Depths that are off by a larger share than this, since the unit has changed, are left out.
 _SCALE_CHANGE = 0.01
 _POLL_S = 0.01
-#: After so many later keyframes those that are there have to do.
+#: Later keyframes that are waited for: after them, those that are there have to do.
 _MAX_LATER = 4
 #: Keyframes that may wait where there is no time for all.
 _MAX_WAITING = 2

@@ -23,7 +23,7 @@ _NEAR = (2.0, 1.0 / 1.3)
 _FAR = (98.0, 1.5)
 #: Keyframes with fewer landmarks tell no range of depths.
 _MIN_LANDMARKS = 10
-#: Depth of so many keyframes on either side confirms one, two of them where there are three or more.
+#: Keyframes on either side whose depth may confirm one; two of them must where there are three or more.
 NUM_CONFIRMING = 3
 #: Keyframes before, whose points are not added once more.
 NUM_COVERING = 4

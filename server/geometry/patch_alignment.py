@@ -148,7 +148,7 @@ def affine_warps(
 
 
 def seen_alike(warps: Array, depth1_map: Array) -> NDArray[np.bool_]:
-    """Which patches the second camera sees in front of it, and at so much of their area that details stay.
+    """Which patches the second camera sees, not so much smaller or larger that details differ.
 
     Args:
         warps: ``(N, 2, 2)`` as ``affine_warps`` gives them.

@@ -1,4 +1,4 @@
-"""Tracks against how earlier keyframes saw them: their drift is taken out, and chance finds are told.
+"""Aligns tracks with patches of earlier keyframes: takes out their drift, and detects false matches.
 
 Following a point from image to image makes a small error at every step, and a larger one where images are
 noisy: about a pixel in a dozen decoded frames. At a keyframe the pose is known, so that patches of older

@@ -1,4 +1,4 @@
-"""What bundle adjustment is asked and what it answers: plain arrays that travel between processes."""
+"""Bundle adjustment problems and results, as plain arrays that travel between processes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from semcast.server.mapping.pose_graph import Edge
 
 Array = NDArray[np.float64]
 
-#: By what a window is solved; both end in the same place.
+#: What solves a window; both converge to the same minimum.
 Solver = Literal["dense", "gtsam"]
 
 
@@ -93,7 +93,7 @@ class BundleProblem:
 
 
 class Frame(Protocol):
-    """What saw something."""
+    """Anything with a frame id: a keyframe, or a frame that waits for a map."""
 
     @property
     def frame_id(self) -> int:
@@ -101,7 +101,7 @@ class Frame(Protocol):
 
 
 class Observations(NamedTuple):
-    """What views saw of some tracks.
+    """Observations of tracks in views, one a row.
 
     Attributes:
         view: ``(M,)`` which view.
@@ -118,7 +118,7 @@ class Observations(NamedTuple):
     edge: Array
 
     def of_rows(self, kept: NDArray[np.bool_], point: NDArray[np.intp]) -> "Observations":
-        """Return those that are ``kept (M,)``, with the rows their tracks have then."""
+        """Return the observations in the mask ``kept (M,)``, with new track rows ``point``."""
         return Observations(self.view[kept], point, self.xy[kept], self.confidence[kept], self.edge[kept])
 
 
@@ -196,7 +196,7 @@ class BundleResult:
 
     @cached_property
     def whitened_px(self) -> Array:
-        """``(M, 2)`` the residuals as if observations were known alike in all directions, see ``edges``."""
+        """``(M, 2)`` residuals scaled so that their noise is isotropic, see ``edges``."""
         return whitened(self.problem.edge, self.residual_px)
 
 

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 #: A camera stops at once when the image moves by less than this share of what was expected of it ...
 _STILL_SHARE = 0.15
-#: ... and that was at least so many pixels: less is within the error of poses.
+#: ... and that was at least this many pixels: less is within the error of poses.
 _LEAST_EXPECTED_PX = 2.0
 #: It went on when the image has moved by this share of what it would have moved all the while,
 _GONE_SHARE = 0.67
@@ -37,7 +37,7 @@ _LEAST_DEPTH_SHARE = 0.05
 _REST_NS = 1_000_000_000
 #: How far the image may move in that time, as a share of its width: a hand that rests sways by less.
 _REST_SHARE = 0.03
-#: A frame that comes after so many intervals of those before it comes after a gap.
+#: A frame comes after a gap if it comes after this many intervals of the frames before it.
 _GAP_INTERVALS = 3.0
 _S_PER_NS = 1e-9
 

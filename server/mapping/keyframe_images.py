@@ -78,6 +78,6 @@ class ImagedMap(NamedTuple):
     submap: int
 
     def newest_views(self, count: int) -> list[tuple[SeenFrom, Keyframe]]:
-        """Of the newest images so many, oldest first, with their keyframes: those of this part of the map."""
+        """Return those of the newest ``count`` images whose keyframes are in the submap, oldest first."""
         there = [(image, self.world.keyframe(image.frame_id)) for image in self.images.newest(count)]
         return [(image, k) for image, k in there if k is not None and k.submap == self.submap]

@@ -1,4 +1,4 @@
-"""A camera's focal length, radial distortion and principal point, from what adjustments leave over."""
+"""A camera's focal length, radial distortion and principal point, from the residuals of adjustments."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A new map grows into the past, over the frames that waited for it, as it later grows into the future.
+"""Extends a new map backwards in time, over the frames that waited for it.
 
 A map starts from the oldest frame that still shares tracks with the newest one. Of what earlier frames saw it
 has little: posed by the few landmarks left in their sight they would err several times as much as later

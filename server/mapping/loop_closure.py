@@ -242,7 +242,7 @@ class LoopFinder:
 
 
 def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGraph] | None:
-    """Find how the keyframes of a submap have to move for a loop to close.
+    """Distribute the drift of a loop over the keyframes of a submap (pose graph).
 
     Args:
         world: The map; it is not changed.

@@ -60,7 +60,7 @@ class MapBuilder:
 
     Args:
         camera: Pinhole.
-        settings: How.
+        settings: Of the reconstruction.
         bundle: Runs the adjustments.
     """
 
@@ -105,11 +105,11 @@ class MapBuilder:
         return {k.submap for k in self.world.keyframes} - {self.submap}
 
     def begin_submap(self) -> None:
-        """Let the next start be a submap of its own."""
+        """Begin a new submap, which the next start will fill."""
         self.enter(1 + max(self.world.submap_of.values(), default=-1))
 
     def enter(self, submap: int) -> None:
-        """Go on in a submap."""
+        """Make a submap the current one."""
         self._adjusted = None  # of a keyframe elsewhere, or in another unit
         self._recognised: int | None = None
         self.loops = LoopFinder(self._camera, self.relocaliser, self._settings.seed)
@@ -319,7 +319,7 @@ class MapBuilder:
 
     @property
     def enough(self) -> int:
-        """Landmarks that a keyframe has enough with."""
+        """Number of landmarks with which a keyframe has enough."""
         return round(_ENOUGH_SHARE * self._settings.max_features)
 
     def _add_landmarks(self, image: NDArray[np.uint8]) -> None:

@@ -1,4 +1,4 @@
-"""Keyframes into map: when to take one, new landmarks, what an adjustment brings, and culling."""
+"""From keyframes to the map: when to take one, triangulation, applying an adjustment, and culling."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -128,7 +128,7 @@ def add_landmarks(
     enough: int = 0,
     num_keyframes: int = 12,
 ) -> int:
-    """Triangulate the tracks of the newest keyframe that are no landmarks yet; the number added.
+    """Triangulate the tracks of the newest keyframe that are no landmarks yet; returns the number added.
 
     Args:
         world: The map, grown.
@@ -136,8 +136,8 @@ def add_landmarks(
         noise: Of the observations.
         image: The newest keyframe's, ``(H, W, 3)``, for the colours.
         min_parallax_deg: Angle between the rays of a point.
-        enough: Landmarks in sight, with fewer of which smaller angles do.
-        num_keyframes: That may have seen the points, the newest ones.
+        enough: With fewer landmarks in sight than this, smaller angles are accepted.
+        num_keyframes: The newest keyframes whose observations are used.
     """
     newest = world.keyframes[-1]
     is_new = world.landmarks.rows(newest.ids) < 0
@@ -196,7 +196,7 @@ def new_landmarks(
     Args:
         camera: Pinhole.
         views: Keyframes that may have seen them.
-        seen_from: The one of them that is to see more.
+        seen_from: The one of them whose landmarks they will be.
         wanted: ``(W,)`` ids of the tracks, ascending.
         noise: Of the observations.
         min_parallax_deg: Angle between rays.
@@ -302,7 +302,7 @@ def median_depth_of(keyframe: Keyframe, ids: Ids, xyz: Array) -> float:
 
 
 def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> None:
-    """Bring an adjustment into the map, which may have grown since it was asked.
+    """Bring an adjustment into the map, which may have grown since it was submitted.
 
     Keyframes and landmarks that came later move rigidly with the last keyframe of the window. Frames that are
     no keyframes move with theirs, and take over what has become of the scale around it. Observations
@@ -346,11 +346,11 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
 
 
 def local_scales(result: BundleResult) -> Array:
-    """Factor on lengths around each keyframe, ``(K,)``: on the ways to those before and after it.
+    """By how much an adjustment has scaled the map around each keyframe, ``(K,)``.
 
-    It is 1 if the keyframe is fixed, or if these ways are next to nothing, as of a camera that turns on the
-    spot: how they change is chance. Depths of landmarks tell less: they change by what the camera itself is
-    moved by, too.
+    It is the factor on the distances to the keyframes before and after it. It is 1 if the keyframe is fixed,
+    or if these distances are next to nothing, as of a camera that turns on the spot: how they change is
+    chance. Depths of landmarks tell less, as they change with the motion of the camera itself, too.
     """
     problem = result.problem
     depth = float(

@@ -1,4 +1,4 @@
-"""Landmarks that are in sight but have lost their track are looked for again, where the pose expects them.
+"""Looks again for landmarks that are in sight but have lost their track, where the pose expects them.
 
 Rows that did not arrive, a blur or a jerk end tracks; their landmarks are still in the map. They are followed
 from the newest keyframes they were seen in, whose images are kept.
@@ -37,7 +37,7 @@ def recall_landmarks(
         sight: The new image.
         T_world_cam: Its pose, or the expected one.
         reach_px: A point found further than this from where it is expected is another one.
-        wanted: With so many found, older keyframes are not looked at any more.
+        wanted: Once this many are found, no older keyframe is looked at.
 
     Returns:
         Ids of the tracks that were found.

@@ -1,4 +1,4 @@
-"""Something large that moves by itself, such as a lorry ahead: the tracks on it, once there is a map.
+"""Tracks on something large that moves by itself, such as a lorry ahead, once there is a map.
 
 Keyframes refute tracks that no point at rest explains (``mapper.new_landmarks``). Where they are many, two
 things would go wrong without more care: tracks that have just begun beside them would hold the camera's

@@ -1,6 +1,6 @@
-"""A part of the map that was seen long ago and is in sight again: its landmarks are found and used anew.
+"""Finds and uses landmarks of old keyframes again when the camera comes back to where it has been.
 
-Without that every return makes new landmarks where there are some already. Where the camera should see a
+Otherwise every return would make new landmarks where there are some already. Where the camera should see a
 keyframe of long ago, that keyframe's landmarks are looked for: first by following them from its image, then
 by aligning its patches, warped by pose and depth. What was found must agree with the relative pose of the two
 images. It need not agree with the landmark's old position: seen under small angles in its time, a landmark

@@ -41,7 +41,7 @@ _MAX_TREND_STEP_S = 0.06
 _MAX_SHARE = 0.2
 #: Images whose movement is kept: a minute and more of video.
 _MAX_FLOWS = 2000
-#: How far the image is moved is computed at every so many pixels.
+#: Distance of the pixels at which it is computed how far the image is moved.
 _GRID_PX = 16
 
 

@@ -1,4 +1,4 @@
-"""What a bundle adjustment is asked: the newest keyframes, those that hold them, and what they see.
+"""Chooses the keyframes and observations of a window: the newest ones, and older ones that hold them.
 
 Only landmarks are points of it: tracks that are none yet help where images are clean and harm where they are
 not. Two poses are fixed, for a single one and a distance hold an orbit better, but a drive worse. Twenty

@@ -28,7 +28,7 @@ _USABLE = 0.5
 _OTHER_WORK = 4.5
 #: The share of it that does not depend on the image size.
 _FIXED_SHARE = 0.6
-#: So many cores at most are of use to one stream.
+#: Cores that are of use to one stream, at most.
 _MAX_CORES = 4
 #: A recording is played slower only if it is worth it: the measurement is no better.
 _FULL_PACE = 0.9
