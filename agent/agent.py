@@ -34,7 +34,7 @@ _PEERS = frozenset({"channel", "server"})
 _POLL_S = 0.1
 _FLOW_POLL_S = 0.05
 _BUSY_POLL_S = 0.005
-#: Live: the last frame is repeated until the receiver reports on it, for at most so long.
+#: Live: the last frame is repeated until the receiver reports on it, for at most this long.
 _FAREWELL_S = 2.0
 #: Longest wait for a server that is alive but does not say it is ready.
 _READY_S = 5.0

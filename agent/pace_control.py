@@ -16,9 +16,13 @@ logger = logging.getLogger(__name__)
 #: Frames a second that two cores can decode, track and map, about: a stream begins with so many.
 START_HZ = 12.0
 MAX_STRIDE = 10
-#: Reports a decision is made from, at least and at most, and how many of the worst count for nothing: a
-#: busy moment, such as the start of a map, says nothing about the pace.
-_MIN_REPORTS, _MAX_REPORTS, _NUM_WORST = 12, 16, 3
+#: Reports a decision is made from, at least,
+_MIN_REPORTS = 12
+#: and at most.
+_MAX_REPORTS = 16
+#: How many of the worst count for nothing: a busy moment, such as the start of a map, says nothing about the
+#: pace.
+_NUM_WORST = 3
 #: The first reports of a stream count for nothing: beginning a map takes longer than following.
 _WARM_UP = 20
 #: Part of a frame by which the stride that is needed may exceed a whole number. Some frames passed over are

@@ -22,7 +22,7 @@ from semcast.common.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 
-#: So many unreadable images in a row end a source; fewer are left out.
+#: Unreadable images in a row that end a source; fewer are left out.
 MAX_BAD_IN_A_ROW = 10
 
 

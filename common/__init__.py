@@ -1,1 +1,71 @@
-"""What both ends share: images, geometry, codecs, physical layer, messages, transport."""
+"""What both ends share: images, geometry, codecs, physical layer, messages, transport.
+
+Images and cameras
+    image                   PSNR of two images
+    image_file              image files as RGB arrays
+    image_header            size of an image from its header
+    tiff_alpha              whether OpenCV has applied the transparency of a TIFF
+    levels                  grey levels, stretched before encoding
+    camera                  pinhole, lens distortion, readout of the shutter
+    camera_file             calibration files of many tools
+    camera_settings         the camera on the command line
+    lens                    names of distortion coefficients
+
+Geometry and trajectories
+    geometry                rotations, rigid and similarity transforms
+    trajectory              timed poses; TUM files
+    trajectory_error        ATE after Sim(3), RPE, completeness
+
+Codecs (networks are in ``nets``, the physical layer in ``phy``)
+    codec                   the interface of all codecs
+    codecs                  codecs by name
+    rate                    channel uses per frame; several rates from one model
+    conventional            JPEG, WebP or AVIF over LDPC and QAM
+    conventional_source     its image compression
+    conventional_transport  its bytes on the symbols of a frame
+    symbol_payload          symbols as bytes of a message
+    link_report             what a receiver reports about the link
+
+Messages and transport
+    messages                all messages, as frozen dataclasses
+    message_fields          what each field may hold
+    wire                    messages to bytes and back
+    keys                    key expressions
+    transport               Zenoh sessions
+    network_settings        where processes meet
+    reachability            why a hub is not reached
+    loopback                hubs on free loopback ports
+    mailbox                 bounded queues with named policies
+    status_beat             status of a process, once a second
+    metrics                 what a process counts about itself
+    complaints              warnings about bad messages
+    map_mirror              the map of a running server in another process
+
+Recorded sequences and recordings
+    sequence                a recorded sequence with random access
+    sequence_layouts        the folder layouts it is read from
+    sequence_sizes          sizes of its image files
+    numbered_images         lines of a file, matched with images
+    transforms_file         transforms.json
+    ros_bag_files           tells ROS bags by how they look
+    playback                which frames are played, and how fast
+    recorder                records messages beside a running system
+    recording_writer        MCAP files
+    recording_reader        reads them, also cut off ones
+
+Settings, files, processes
+    config                  settings as frozen dataclasses, TOML
+    config_flags            settings from flags and TOML files
+    argument_order          the order of words on a command line
+    errors                  errors a user can act on
+    shapes                  shape checks
+    run_folder              the folder of a run
+    run_summary             the figures of a finished run
+    new_folder              folders for output
+    former_file             keeps a file that would be written over
+    whole_file              files that are never half written
+    npz_file                arrays with a header
+    cores                   processor cores and threads
+    interrupts              Ctrl-C
+    worker_guard            unexpected exceptions in worker threads
+"""

@@ -14,7 +14,7 @@ from semcast.common.tiff_alpha import is_laid_on_black
 _OVERSHOOT = 2.0
 #: Bits of a 16-bit image that cameras use, always the lower ones.
 _BIT_DEPTHS = (8, 10, 12, 14, 16)
-#: So many images, spread over a recording, tell its bit depth: a dark beginning alone would mislead.
+#: Images, spread over a recording, that tell its bit depth: a dark beginning alone would mislead.
 _MAX_DEPTH_IMAGES = 9
 
 

@@ -26,7 +26,7 @@ _HIGHEST_KNEE = 96
 _LAMP_COST = 8.0
 #: Share of the noise that is left with a knee, at most; images of which more is left stay as they are.
 _MOST_COST = 0.5
-#: Every so many rows and columns are looked at.
+#: Distance of the rows and columns that are looked at.
 _STEP = 2
 
 

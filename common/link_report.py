@@ -21,7 +21,7 @@ from semcast.common.phy.mutual_information import mutual_information, snr_db_tha
 _MAX_FRAMES = 8
 #: Fewer don't tell a link that has changed from one whose slots fade together.
 _MIN_FRAMES = 3
-#: A frame so many standard errors off those before it is of a link that has changed.
+#: A frame this many standard errors off those before it is of a link that has changed.
 _JUMP = 4.0
 #: Quantiles of the normal distribution.
 _ONE_IN_TWENTY = 1.645

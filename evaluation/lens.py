@@ -22,17 +22,22 @@ from semcast.server.mapping.readout import Readout
 
 Array = NDArray[np.float64]
 
-#: Steps at most, and where to begin again if the first one leads nowhere.
-_MAX_STEPS, _FAR_FACTORS = 8, (0.83, 1.2)
-#: A change by less than this (of the focal length, a coefficient, in focal lengths), or than so many standard
-#: deviations, ends the search.
-_NOTHING, _NOTHING_SIGMAS = 0.001, 0.5
+#: Steps of the search at most.
+_MAX_STEPS = 8
+#: Factors on the focal length with which it begins again if the first one leads nowhere.
+_FAR_FACTORS = (0.83, 1.2)
+#: A smaller change ends the search: of the focal length as a share, of a coefficient, or of the principal
+#: point in focal lengths.
+_NOTHING = 0.001
+#: So does one of fewer standard deviations.
+_NOTHING_SIGMAS = 0.5
 #: No bounds are closer than this share: reconstructions with nearly the same lens speak for changes that
 #: differ by as much.
 _MIN_REACH = 0.004
-#: Near the right lens, with changes of no more than this (as above), what a reconstruction's error grows by
-#: may be chance up to this factor.
-_NEAR, _WORSE = 0.01, 1.02
+#: The lens is nearly right where changes are no larger than this (units as above);
+_NEAR = 0.01
+#: up to this factor a reconstruction's error may then grow by chance.
+_WORSE = 1.02
 #: One step changes the focal length by this share at most.
 _MAX_STEP = 0.2
 #: Powers of the focal length by which k1, k2, p1, p2, k3 ... k6 grow where the distortion in pixels stays.

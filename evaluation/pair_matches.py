@@ -22,7 +22,7 @@ from semcast.server.geometry.weighting import fuse_confidence
 Array = NDArray[np.float64]
 Features = Literal["klt", "orb", "sift"]
 
-#: Lowe's test: the best descriptor must be so much nearer than the second best.
+#: Lowe's test: the best descriptor must be nearer than the second best by this factor.
 _RATIO = {"orb": 0.85, "sift": 0.8}
 #: Matches nearer than this to another one say nothing new and would weigh twice.
 _DUPLICATE_PX = 1.0

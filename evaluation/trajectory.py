@@ -113,13 +113,7 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     """
     sequence, codec = open_stream(settings, codec)
     truth = sequence.groundtruth()
-    if truth is None:
-        logger.warning("%s has no true path: how far its poses are off is unknown", sequence.name)
-    elif not _measures(truth):
-        logger.warning(
-            "%s has a true path of %d poses and %.3g m: too short to say how far its poses are off",
-            *(sequence.name, len(truth), truth.path_length),
-        )
+    has_truth = _is_usable(truth, sequence.name)
     chosen = select_frames(sequence, settings)
     # Without a link neither SNR nor channel seed changes an image: one SNR stands for all.
     snrs_db = settings.snr_db if codec is not None else settings.snr_db[:1]
@@ -138,7 +132,6 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
                     label = CLEAN if codec is None else snr_file_label(snr_db, settings.link)
                     _write_files(settings.out, f"{label}_{mode}", run)
         level = None if codec is None else stated_snr_db(snr_db, settings.link)
-        has_truth = truth is not None and _measures(truth)
         cells += [_cell(level, mode, runs[mode], has_truth=has_truth) for mode in settings.confidence]
     report = {
         **provenance(VERB, settings),
@@ -170,9 +163,21 @@ def median_or_none(values: Sequence[float | None]) -> float | None:
     return median if np.isfinite(median) else None
 
 
-def _measures(truth: Trajectory) -> bool:
-    """Whether a path can be held against this one at all; if not, no run is to blame for having no error."""
-    return len(truth) >= MIN_MATCHES and truth.path_length > 0.0
+def _is_usable(truth: Trajectory | None, name: str) -> bool:
+    """Whether errors against this true path mean something; if not, that is told as a warning.
+
+    Then no run is to blame for having no error.
+    """
+    if truth is None:
+        logger.warning("%s has no true path: how far its poses are off is unknown", name)
+        return False
+    if len(truth) < MIN_MATCHES or truth.path_length <= 0.0:
+        logger.warning(
+            "%s has a true path of %d poses and %.3g m: too short to say how far its poses are off",
+            *(name, len(truth), truth.path_length),
+        )
+        return False
+    return True
 
 
 def _has_failed(run: Mapping[str, Any], *, has_truth: bool) -> bool:

@@ -11,8 +11,10 @@ _OFFSET_WINDOW_NS = 10_000_000_000
 #: A frame that was captured so much later than others, by their arrival, has a wrong time.
 _MAX_LEAD_NS = 1_000_000_000
 _REMEMBERED = 256
-#: A live agent sends fewer frames a second, and no more between two that arrive without a break.
-_MAX_RATE_HZ, _MAX_GAP = 1000.0, 1000
+#: A live agent sends fewer frames a second than this,
+_MAX_RATE_HZ = 1000.0
+#: and leaves out no more frames than this between two that arrive without a break.
+_MAX_GAP = 1000
 #: Frames in a row whose numbers rise, or whose times are ahead, and follow on nothing, before they are taken
 #: for the stream; so many, too, show that the one they don't follow on was wrong.
 _BELIEVED = 3

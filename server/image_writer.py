@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 #: Frames that may wait for a map to begin, whose start can make keyframes of them.
 MAX_PROVISIONAL = 300
-#: After an image that could not be written others are left out for so long, before it is tried again.
+#: How long no image is written after one that could not be.
 RETRY_S = 5.0
 
 

@@ -8,8 +8,10 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-#: Frames with other ids that are looked at behind each, and how many of them must lie below it.
-_AHEAD, _AGAINST = 4, 3
+#: Frames with other ids that are looked at behind each frame.
+_AHEAD = 4
+#: How many of their ids must be lower for the frame to be out of order.
+_AGAINST = 3
 
 
 def in_order(frames: Iterable[T], id_of: Callable[[T], int]) -> Iterator[T]:

@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import re
 import tomllib
 from pathlib import Path
 
@@ -87,6 +88,14 @@ def test_the_servers_folders_are_layers(folder, may_import):
             if parts[:2] == ["semcast", "server"] and not set(parts[2:3]) <= may_import | below:
                 wrong.append(f"{path.relative_to(ROOT)} imports {name}")
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("folder", ["common", "evaluation", "server", "server/geometry", "server/mapping"])
+def test_the_guide_to_a_large_folder_names_each_of_its_modules_once(folder):
+    docstring = ast.get_docstring(ast.parse((ROOT / folder / "__init__.py").read_text(encoding="utf-8")))
+    named = re.findall(r"^ {4}(\w+) +\S", docstring, re.MULTILINE)
+    modules = [path.stem for path in (ROOT / folder).glob("*.py") if path.stem != "__init__"]
+    assert sorted(named) == sorted(modules)
 
 
 @pytest.mark.parametrize("library", sorted(HOMES))

@@ -29,14 +29,16 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Keyframes whose images are kept, and those of them whose depth is.
-_NUM_VIEWS, _NUM_MAPS = 12, 8
-#: The same where depth is estimated at the end: half a megabyte each. Beyond it every second one goes.
+#: The newest keyframes whose images are kept,
+_NUM_VIEWS = 12
+#: and those whose depth maps are.
+_NUM_MAPS = 8
+#: Images kept where depth is estimated at the end: half a megabyte each. Beyond it every second one goes.
 _NUM_STORED = 300
 #: Depths that are off by a larger share than this, since the unit has changed, are left out.
 _SCALE_CHANGE = 0.01
 _POLL_S = 0.01
-#: After so many later keyframes those that are there have to do.
+#: Later keyframes that are waited for: after them, those that are there have to do.
 _MAX_LATER = 4
 #: Keyframes that may wait where there is no time for all.
 _MAX_WAITING = 2

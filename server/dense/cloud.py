@@ -17,7 +17,7 @@ Ids = NDArray[np.int64]
 MAX_POINTS = 1_000_000
 #: A patch is handed out again where its scale has changed by more than this share.
 _SCALE_CHANGE = 1e-3
-#: So many landmarks of a keyframe have to be left to tell its scale.
+#: Landmarks of a keyframe that must be left to tell its scale.
 _MIN_LANDMARKS = 5
 
 

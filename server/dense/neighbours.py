@@ -17,11 +17,13 @@ NUM_NEIGHBOURS = 2
 _BASELINE = 0.04
 #: Neighbours whose view is turned by more see too little of the same, and that too differently.
 _MAX_TURN_DEG = 40.0
-#: Depth is sought between these percentiles of a keyframe's landmarks, and somewhat beyond.
-_NEAR, _FAR = (2.0, 1.0 / 1.3), (98.0, 1.5)
+#: Percentile of the depths of a keyframe's landmarks, and factor on it, at which the search for depth begins
+_NEAR = (2.0, 1.0 / 1.3)
+#: and ends.
+_FAR = (98.0, 1.5)
 #: Keyframes with fewer landmarks tell no range of depths.
 _MIN_LANDMARKS = 10
-#: Depth of so many keyframes on either side confirms one, two of them where there are three or more.
+#: Keyframes on either side whose depth may confirm one; two of them must where there are three or more.
 NUM_CONFIRMING = 3
 #: Keyframes before, whose points are not added once more.
 NUM_COVERING = 4

@@ -13,9 +13,11 @@ Array = NDArray[np.float64]
 Volume = NDArray[np.uint8]
 Image = NDArray[np.float32]
 
-#: Side of the window that is compared, and where the median noise of the reference is above so many grey
-#: levels: noise asks for more pixels, which blur the outlines of things.
-WINDOW, WINDOW_OF_NOISY = 5, 7
+#: Side of the window that is compared, in pixels,
+WINDOW = 5
+#: and where the reference is noisy: noise asks for more pixels, which blur the outlines of things.
+WINDOW_OF_NOISY = 7
+#: Median noise of the reference, in grey levels, from which on it is noisy.
 _NOISY_LEVELS = 3.75
 #: Cost of windows that have nothing in common, and of what no neighbour sees; no cost is larger.
 UNKNOWN_COST = 100
@@ -24,9 +26,11 @@ _FAINT_LEVELS = 1.0
 #: Correlation that windows of noise have now and then: below it there is nothing in common. Otherwise depths
 #: at which more neighbours see a pixel would cost less, having more chances.
 _CHANCE = 0.2
-#: Side of a window's middle, and the share of the window's variance there from which on it counts fully: one
-#: on plain ground that reaches a thing's outline is alike at the thing's depth, where the ground is not.
-_MIDDLE, _ENOUGH = 3, 0.5
+#: Side of a window's middle.
+_MIDDLE = 3
+#: Share of the window's variance in its middle from which on the window counts fully: one on plain ground
+#: that reaches a thing's outline is alike at the thing's depth, where the ground is not.
+_ENOUGH = 0.5
 #: No pixel has this value, nor one near it: what lies beside a warped image.
 _BESIDE = -1e4
 _WHITE = 255.0

@@ -70,27 +70,14 @@ def export_run(
     images = read_image_paths(folder)
     placement = None
     if find_placement is not None:
-        if format_name == "rrd":
-            raise ConfigError(
-                "--format rrd shows the map in its own frame, without --align, --metres or --marker-m"
-            )
-        if parts is not None and format_name == "dense":
-            raise ConfigError(
-                f"--format dense can't be placed here: each part has its own scale ({parts}), and "
-                "points of the dense cloud do not know their part"
-            )
-        if parts is not None and part == ALL:
-            raise ConfigError(f"--part must name one part, each has its own scale: {parts}")
+        _check_placeable(format_name, part, parts)
         placement = find_placement(data, images)
         logger.info("%s", placement.words)
         data = placement.run(data)
     elif data.metres and format_name != "rrd":
         logger.info("in the map's own unit; the run knows the metre: --metres writes in it")
     frame = MAP_FRAME if placement is None else placement.frame
-    if FORMATS[format_name].startswith("FILE") and out.is_dir():
-        raise SourceError(f"{out} is a folder; --format {format_name} writes a file")
-    if FORMATS[format_name].startswith("FOLDER") and out.is_file():
-        raise SourceError(f"{out} is a file; --format {format_name} writes a folder")
+    _check_kind(out, format_name)
     writers: dict[str, Callable[[], list[Path]]] = {
         "tum": lambda: write_run_tum(out, data),
         "kitti": lambda: write_run_kitti(out, data),
@@ -109,6 +96,35 @@ def export_run(
         return writers[format_name]()
     except OSError as err:
         raise SemcastError(f"{out} can't be written: {err}") from err
+
+
+def _check_placeable(format_name: str, part: str, parts: str | None) -> None:
+    """Refuse what can't be moved to another frame and unit.
+
+    Args:
+        format_name: One of ``FORMATS``.
+        part: As asked for.
+        parts: The parts of the map in words; None where it is of one.
+    """
+    if format_name == "rrd":
+        raise ConfigError(
+            "--format rrd shows the map in its own frame, without --align, --metres or --marker-m"
+        )
+    if parts is not None and format_name == "dense":
+        raise ConfigError(
+            f"--format dense can't be placed here: each part has its own scale ({parts}), and "
+            "points of the dense cloud do not know their part"
+        )
+    if parts is not None and part == ALL:
+        raise ConfigError(f"--part must name one part, each has its own scale: {parts}")
+
+
+def _check_kind(out: Path, format_name: str) -> None:
+    """Refuse a folder where the format is a file, and the other way round."""
+    if FORMATS[format_name].startswith("FILE") and out.is_dir():
+        raise SourceError(f"{out} is a folder; --format {format_name} writes a file")
+    if FORMATS[format_name].startswith("FOLDER") and out.is_file():
+        raise SourceError(f"{out} is a file; --format {format_name} writes a folder")
 
 
 def _check_not_foreign(out: Path, format_name: str, images: Mapping[int, Path]) -> None:

@@ -1,1 +1,31 @@
-"""Estimators without a state: two views, pose from points, triangulation, features, weights."""
+"""Estimators without a state: arrays in, arrays out.
+
+Pixels are ``(N, 2)``, camera axes x right, y down, z forward, and ``T_a_b`` maps points of b to a.
+
+Observations and their noise
+    weighting        from confidence to standard deviations; fits the noise model to residuals
+    edges            anisotropic errors: how much better a point is known across an edge than along it
+
+Points in images
+    features         corners, KLT, binary descriptors
+    warped_points    KLT in windows that are turned, scaled or sheared
+    patch_alignment  patches of two images, aligned to a fraction of a pixel
+    wide_search      matches by SIFT, however far points moved
+    brightness       change of exposure between two images
+    cells            cells of an image by one number each
+    square_distance  squared distances, all with all
+
+Two views
+    two_view         relative pose from matches: searches, choice, refinement
+    epipolar         residuals of a relative pose, cheirality, refinement
+    agreement        how far each match moves like its neighbours
+    lo_ransac        PoseLib's LO-RANSAC
+    ransac           the paper's confidence-weighted RANSAC
+    turning          rotation between two images by small blurred versions of them
+
+Pose and structure
+    pnp              pose from landmarks
+    triangulation    points from rays
+    projection       world points in a camera
+    motion           constant-velocity prior
+"""

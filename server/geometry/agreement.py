@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 _NEIGHBOURS = 10
 #: Moves may differ by this share of the distance, which turns, zooms and slanted surfaces do ...
 _TOLERANCE_SHARE = 0.4
-#: ... and by so many pixels in any case.
+#: ... and by this many pixels in any case.
 _TOLERANCE_PX = 8.0
 #: OpenCV's number of a single k-d tree that is searched exactly.
 _EXACT_KD_TREE = 4

@@ -1,13 +1,13 @@
-"""How much better a point is known across an edge than along it.
+"""Anisotropic errors: how much better a point is known across an edge than along it.
 
-The error of an aligned window is distributed as the inverse of its structure tensor. How large it is, the
-noise model says of the point's confidence; what shape it has is told here. A point on the frame of a door
-slides along it by a pixel or two, and is as well known across it as the best corner. Taken for alike in all
-directions it would count for little, or mislead.
+The covariance of an aligned window is proportional to the inverse of its structure tensor. The noise model
+(``weighting``) tells its size from the point's confidence; this module tells its shape. A point on the frame
+of a door slides along it by a pixel or two, and is as well known across it as the best corner. With an
+isotropic error it would count for little, or mislead.
 
 An *edge* is a vector along the edge whose length ``a`` is half the logarithm of the ratio of the two
 standard deviations: the covariance is ``sigma^2 (e^2a u u^T + e^-2a n n^T)``, of the same determinant
-whatever the shape. The zero vector is a point that is known alike in all directions.
+whatever the shape. The zero vector is an isotropic error.
 """
 
 import cv2
@@ -17,17 +17,21 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Along an edge a standard deviation is at most so many times that across it: nothing is known to less than
-#: a tenth of a pixel, and edges that are bent are straight for a few pixels only.
+#: Ratio of the standard deviations along and across an edge at most: nothing is known to less than a tenth of
+#: a pixel, and edges that are bent are straight for a few pixels only.
 _MOST_RATIO = 10.0
-#: Half the side of the window whose gradients count, and steps between them: they are smooth over as much.
-_REACH_PX, _STEP_PX = 8, 2
-#: Steps that ``rounded`` takes.
-_LENGTH_STEP, _ANGLE_STEP = 0.2, np.pi / 36
+#: Half the side of the window whose gradients count.
+_REACH_PX = 8
+#: Distance of the gradients that are summed: they are smooth over as much.
+_STEP_PX = 2
+#: To what ``rounded`` rounds lengths,
+_LENGTH_STEP = 0.2
+#: and directions, in radians.
+_ANGLE_STEP = np.pi / 36
 
 
 def edges_at(grey: NDArray[np.uint8], xy: Array) -> Array:
-    """Edges at points ``(N, 2)`` of an ``(H, W)`` image, ``(N, 2)``; their sign has no meaning."""
+    """Compute the edges ``(N, 2)`` at points ``(N, 2)`` of an ``(H, W)`` image; their sign has no meaning."""
     height, width = grey.shape
     if len(xy) == 0 or min(height, width) <= 2 * _REACH_PX:
         return np.zeros((len(xy), 2))
@@ -50,9 +54,9 @@ def edges_at(grey: NDArray[np.uint8], xy: Array) -> Array:
 
 
 def whiteners(edge: Array) -> Array:
-    """``(N, 2, 2)`` that give errors at points with edges ``(N, 2)`` the same size in all directions.
+    """Whitening matrices ``(N, 2, 2)`` of points with edges ``(N, 2)``: they make errors isotropic.
 
-    They are symmetric and of determinant 1: what is left has the noise model's sigma.
+    They are symmetric and of determinant 1, so whitened errors have the noise model's sigma.
     """
     length = np.linalg.norm(edge, axis=1)
     along = edge / np.maximum(length, 1e-12)[:, None]
@@ -61,22 +65,22 @@ def whiteners(edge: Array) -> Array:
 
 
 def whitened(edge: Array, error_px: Array) -> Array:
-    """Errors ``(N, 2)`` at points with edges ``(N, 2)`` as if they were known alike in all directions."""
+    """Whiten errors ``(N, 2)`` at points with edges ``(N, 2)``."""
     return np.asarray((whiteners(edge) @ error_px[..., None])[..., 0])
 
 
 def rounded(edge: Array) -> Array:
-    """Edges ``(N, 2)`` of which few differ: of some lengths and directions."""
+    """Round edges ``(N, 2)`` to a few lengths and directions, so that many are equal."""
     length = np.rint(np.linalg.norm(edge, axis=1) / _LENGTH_STEP) * _LENGTH_STEP
     angle = np.rint(np.arctan2(edge[:, 1], edge[:, 0]) % np.pi / _ANGLE_STEP) * _ANGLE_STEP
     return np.asarray(length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]))
 
 
 def alike() -> Array:
-    """Stand for any number of points that are known alike in all directions, ``(1, 2)``."""
+    """Return the edge ``(1, 2)`` that stands for any number of points with isotropic errors."""
     return np.zeros((1, 2))
 
 
 def each_of(edge: Array, count: int) -> Array:
-    """Return the edges ``(N, 2)`` of so many points: what ``alike`` stands for is told one by one."""
+    """Return the edges ``(count, 2)`` of points, ``alike`` repeated for each of them."""
     return edge if len(edge) == count else np.broadcast_to(edge, (count, 2))

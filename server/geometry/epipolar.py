@@ -299,24 +299,8 @@ def refine_relative_pose(
     Returns:
         The refined pose; the start where it got no better.
     """
-
-    def linearised(T: Array) -> tuple[float, Array, Array, Array]:
-        """Cost, tangent of the translation, and the normal equations of a step."""
-        tangent = _tangent(T[:3, 3])
-        across, J = sampson_jacobian(camera, T, tangent, xy0, xy1, shapes)
-        beyond, J_beyond = beyond_infinity_jacobian(camera, T, tangent, xy0, xy1)
-        size = np.hypot(across, beyond) / sigma_px
-        a = np.minimum(size, cut_sigmas)
-        cost = float(np.where(a < HUBER_K, 0.5 * a * a, HUBER_K * (a - 0.5 * HUBER_K)).sum())
-        w = np.where(size < cut_sigmas, np.minimum(1.0, HUBER_K / np.maximum(size, 1e-9)), 0.0)
-        w /= sigma_px * sigma_px
-        J_w, J_beyond_w = J * w[:, None], J_beyond * w[:, None]
-        H = J_w.T @ J + J_beyond_w.T @ J_beyond
-        g = -J_w.T @ across - J_beyond_w.T @ beyond
-        return cost, tangent, H, g
-
     T = T_cam1_cam0.copy()
-    cost, tangent, H, g = linearised(T)
+    cost, tangent, H, g = _linearised(camera, T, xy0, xy1, sigma_px, shapes, cut_sigmas)
     damping = 1e-4
     for _ in range(iterations):
         try:
@@ -326,7 +310,7 @@ def refine_relative_pose(
         if not np.isfinite(step).all() or float(np.abs(step).max()) > 1.0:
             break
         candidate = _moved(T, np.asarray(step), tangent)
-        at_candidate = linearised(candidate)
+        at_candidate = _linearised(camera, candidate, xy0, xy1, sigma_px, shapes, cut_sigmas)
         if at_candidate[0] < cost:
             gain = cost - at_candidate[0]
             T, damping = candidate, damping * 0.3
@@ -338,3 +322,32 @@ def refine_relative_pose(
             if damping > 1e3:
                 break
     return make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
+
+
+def _linearised(
+    camera: Intrinsics,
+    T_cam1_cam0: Array,
+    xy0: Array,
+    xy1: Array,
+    sigma_px: Array,
+    shapes: Shapes | None,
+    cut_sigmas: float,
+) -> tuple[float, Array, Array, Array]:
+    """Linearise the cost of ``refine_relative_pose`` at a pose.
+
+    Returns:
+        Cost; ``(2, 3)`` directions across the translation; Hessian ``(5, 5)`` and gradient ``(5,)`` of the
+        normal equations of a Gauss-Newton step.
+    """
+    tangent = _tangent(T_cam1_cam0[:3, 3])
+    across, J = sampson_jacobian(camera, T_cam1_cam0, tangent, xy0, xy1, shapes)
+    beyond, J_beyond = beyond_infinity_jacobian(camera, T_cam1_cam0, tangent, xy0, xy1)
+    size = np.hypot(across, beyond) / sigma_px
+    a = np.minimum(size, cut_sigmas)
+    cost = float(np.where(a < HUBER_K, 0.5 * a * a, HUBER_K * (a - 0.5 * HUBER_K)).sum())
+    w = np.where(size < cut_sigmas, np.minimum(1.0, HUBER_K / np.maximum(size, 1e-9)), 0.0)
+    w /= sigma_px * sigma_px
+    J_w, J_beyond_w = J * w[:, None], J_beyond * w[:, None]
+    H = J_w.T @ J + J_beyond_w.T @ J_beyond
+    g = -J_w.T @ across - J_beyond_w.T @ beyond
+    return cost, tangent, H, g

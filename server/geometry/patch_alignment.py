@@ -22,9 +22,11 @@ Values = NDArray[np.float32]
 #: face the camera: on floors, ceilings and walls beside the way larger ones err by more than they average
 #: noise out.
 ANCHOR_PATCH_PX = 17
-#: A track that would move further than this has found something else, as has one that fits less well.
-_MAX_MOVE_PX, _MIN_CORRELATION = 3.0, 0.7
-#: Every so many pixels of the window are looked at: noise of decoded images is alike over several.
+#: A track that would move further than this has found something else,
+_MAX_MOVE_PX = 3.0
+#: as has one whose normalised correlation is lower than this.
+_MIN_CORRELATION = 0.7
+#: Distance of the pixels of a window that are compared: noise of decoded images is alike over several.
 _STRIDE_PX = 2
 #: Range of the contrast of one patch against the other.
 _GAIN_RANGE = (0.5, 2.0)
@@ -146,7 +148,7 @@ def affine_warps(
 
 
 def seen_alike(warps: Array, depth1_map: Array) -> NDArray[np.bool_]:
-    """Which patches the second camera sees in front of it, and at so much of their area that details stay.
+    """Which patches the second camera sees, not so much smaller or larger that details differ.
 
     Args:
         warps: ``(N, 2, 2)`` as ``affine_warps`` gives them.

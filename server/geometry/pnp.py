@@ -110,8 +110,86 @@ def refine_pose(
     Returns:
         The refined pose; the start with no inlier where nothing could be solved.
     """
-    T_start = T_cam_world.copy()
-    T = T_start.copy()
+    seen = _whitened_observations(camera, points_world, keypoints_xy, sigma_px, spread_px, edge)
+    far_px = 3.0 * gate_px
+    T = T_cam_world.copy()
+    hessian = np.zeros((6, 6))
+    for iteration in range(iterations):
+        # Early steps are more tolerant, so that a poor start does not lose the points that would mend it.
+        is_early = iteration < 2
+        equations = seen.normal_equations(T, 4.0 if is_early else 1.0, None if is_early else far_px)
+        step = None
+        if equations is not None:
+            hessian, gradient = equations
+            step = _damped_step(hessian, gradient)
+        if step is None:
+            return _without_inliers(T_cam_world.copy(), len(points_world))
+        T = exp_se3(step) @ T
+        if iteration >= 3 and float(np.abs(step).max()) < 1e-6:
+            break
+    T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
+    length = seen.errors_px(T)
+    return PoseEstimate(T, length < gate_px, length, _covariance(hessian))
+
+
+@dataclass(frozen=True)
+class _WhitenedObservations:
+    """Observations of landmarks, scaled so that each has the same standard deviation in all directions.
+
+    Coordinates lead, so that numpy sums over contiguous rows.
+
+    Attributes:
+        xyz: ``(3, N)`` landmarks, world frame.
+        observed: ``(2, N)`` whitened pixels from the principal point.
+        axes: ``(2, 2, N)`` or ``(2, 2, 1)``, see ``project_with_jacobian``.
+        weight: ``(N,)`` inverse variance of each.
+        huber_px: ``(N,)`` error beyond which its loss grows linearly.
+    """
+
+    xyz: Array
+    observed: Array
+    axes: Array
+    weight: Array
+    huber_px: Array
+
+    def normal_equations(
+        self, T_cam_world: Array, tolerance: float, far_px: Array | None
+    ) -> tuple[Array, Array] | None:
+        """Hessian ``(6, 6)`` and gradient ``(6,)`` of a Gauss-Newton step; None with fewer than 3 points.
+
+        Args:
+            T_cam_world: Pose to linearise at.
+            tolerance: By what the Huber threshold is multiplied.
+            far_px: ``(N,)`` errors from which on an observation is left out; None to leave out none.
+        """
+        xyz_cam, used = _in_front(T_cam_world, self.xyz)
+        if int(used.sum()) < 3:
+            return None
+        projected, J = project_with_jacobian(xyz_cam, self.axes)
+        residual = self.observed - projected
+        length = np.sqrt(np.square(residual).sum(axis=0))
+        w = self.weight * np.minimum(1.0, tolerance * self.huber_px / np.maximum(length, 1e-9))
+        w *= used if far_px is None else used & (length < far_px)
+        weighted, rows = (J * w).reshape(6, -1), J.reshape(6, -1)
+        return weighted @ rows.T, weighted @ residual.ravel()
+
+    def errors_px(self, T_cam_world: Array) -> Array:
+        """Whitened reprojection errors ``(N,)``; infinite behind the camera."""
+        xyz_cam, used = _in_front(T_cam_world, self.xyz)
+        u, v = xyz_cam[:2] / xyz_cam[2]
+        residual = self.observed - self.axes[0] * u - self.axes[1] * v
+        return np.where(used, np.sqrt(np.square(residual).sum(axis=0)), np.inf)
+
+
+def _whitened_observations(
+    camera: Intrinsics,
+    points_world: Array,
+    keypoints_xy: Array,
+    sigma_px: Array,
+    spread_px: Array | None,
+    edge: Array | None,
+) -> _WhitenedObservations:
+    """Prepare the arguments of ``refine_pose``."""
     whitener = np.eye(2)[None] if edge is None else whiteners(edge)
     if spread_px is not None:
         whitener = _whitener(sigma_px, (whitener @ spread_px[..., None])[..., 0]) @ whitener
@@ -119,34 +197,7 @@ def refine_pose(
     x, y = keypoints_xy[:, 0] - camera.cx, keypoints_xy[:, 1] - camera.cy
     observed = whitener[:, :, 0].T * x + whitener[:, :, 1].T * y
     xyz = np.ascontiguousarray(points_world.T)
-    weight, huber_px, far_px = sigma_px**-2.0, HUBER_K * sigma_px, 3.0 * gate_px
-    hessian = np.zeros((6, 6))
-    for iteration in range(iterations):
-        xyz_cam, used = _in_front(T, xyz)
-        if int(used.sum()) < 3:
-            return _without_inliers(T_start, len(points_world))
-        projected, J = project_with_jacobian(xyz_cam, axes)
-        residual = observed - projected
-        length = np.sqrt(np.square(residual).sum(axis=0))
-        # Early steps are more tolerant, so that a poor start does not lose the points that would mend it.
-        widen = 4.0 if iteration < 2 else 1.0
-        w = weight * np.minimum(1.0, widen * huber_px / np.maximum(length, 1e-9))
-        w *= used if iteration < 2 else used & (length < far_px)
-        weighted, rows = (J * w).reshape(6, -1), J.reshape(6, -1)
-        hessian = weighted @ rows.T
-        gradient = weighted @ residual.ravel()
-        step = _damped_step(hessian, gradient)
-        if step is None:
-            return _without_inliers(T_start, len(points_world))
-        T = exp_se3(step) @ T
-        if iteration >= 3 and float(np.abs(step).max()) < 1e-6:
-            break
-    T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
-    xyz_cam, used = _in_front(T, xyz)
-    u, v = xyz_cam[:2] / xyz_cam[2]
-    residual = observed - axes[0] * u - axes[1] * v
-    length = np.where(used, np.sqrt(np.square(residual).sum(axis=0)), np.inf)
-    return PoseEstimate(T, length < gate_px, length, _covariance(hessian))
+    return _WhitenedObservations(xyz, observed, axes, sigma_px**-2.0, HUBER_K * sigma_px)
 
 
 def _in_front(T_cam_world: Array, xyz: Array) -> tuple[Array, NDArray[np.bool_]]:

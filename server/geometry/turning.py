@@ -16,14 +16,22 @@ from semcast.server.geometry.features import Grey
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
 
-#: Widths of the small images, one after the other, and their blur in pixels: what went by a tenth of the
-#: image is within reach of the first.
-_WIDTHS_PX, _BLUR_PX = (40, 80), 1.0
-_ITERATIONS, _SETTLED_RAD = 10, 1e-4
-#: Share of the small image that must be in both, and the correlation of the two there: less is another view.
-_MIN_SHARED, _MIN_CORRELATION = 0.3, 0.8
-#: Errors beyond so many standard deviations count less: what is near moves otherwise.
-_HUBER_SIGMAS, _LEAST_SD_GREY = 1.5, 0.3
+#: Widths of the small images, one after the other: what went by a tenth of the image is within reach of the
+#: first.
+_WIDTHS_PX = (40, 80)
+#: Standard deviation of their blur.
+_BLUR_PX = 1.0
+_ITERATIONS = 10
+#: The search ends with a smaller step.
+_SETTLED_RAD = 1e-4
+#: Share of the small image that must be in both,
+_MIN_SHARED = 0.3
+#: and normalised correlation there, at least: less is another view.
+_MIN_CORRELATION = 0.8
+#: Errors beyond this many standard deviations count less: what is near moves otherwise.
+_HUBER_SIGMAS = 1.5
+#: Standard deviation of the errors in grey levels, at least.
+_LEAST_SD_GREY = 0.3
 #: Root mean square change in grey levels that a turn by a radian must make, about every axis: less is noise.
 _LEAST_GREY_PER_RAD = 5.0
 

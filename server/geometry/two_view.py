@@ -49,17 +49,21 @@ _SCORE_FACTORS = (0.5, 1.0, 2.0, 4.0)
 _MIN_AGREEMENT = 0.25
 #: Where more than this share of the matches agree, a search among these alone is the first one over again.
 _NEARLY_ALL = 0.9
-#: Weight in the score against agreement: from the least at the first value to 1 at the second.
-_AGREEMENT_RANGE, _LEAST_WEIGHT = (0.1, 0.4), 0.05
+#: Agreement from which on the weight of a match in the score rises, and where it reaches 1.
+_AGREEMENT_RANGE = (0.1, 0.4)
+#: The weight below that.
+_LEAST_WEIGHT = 0.05
 #: What turning costs a pose in the choice among several, in matches of full weight per root of a degree:
 #: frames follow one another, and where two motions explain the matches alike the smaller turn is likelier.
 _TURN_COST = 0.3
-#: A later candidate displaces the first one only by more than the score's own noise.
+#: Factor by which a later candidate must be better than the first one: the score's own noise.
 _TO_DISPLACE = 1.001
 #: Confidences that differ by no more than this are all alike and give no order.
 _ALIKE = 1e-6
-#: Matches that the motions near pure turning are sought by at most, and steps of each search.
-_MAX_TURNING_MATCHES, _TURNING_STEPS = 100, 6
+#: Matches by which the motions near pure turning are sought, at most.
+_MAX_TURNING_MATCHES = 100
+#: Steps of each of those searches.
+_TURNING_STEPS = 6
 #: Points near the camera have larger errors and most of the information: the fitted beta overstates what
 #: confidence is worth, half of it does best.
 _BETA_SHARE = 0.5
@@ -69,7 +73,7 @@ _MIN_SIGMA_PX = 0.1
 
 #: Shares of the edges that errors may have.
 _SHARES = (0.25, 0.5, 0.75, 1.0)
-#: What log-likelihood a share must gain over none: what a parameter costs (Akaike).
+#: Log-likelihood that a share must gain over none: what a parameter costs (Akaike).
 _SHARE_SURE = 1.0
 #: No match is known to lie nearer to its line than that.
 _LEAST_PX = 1e-6

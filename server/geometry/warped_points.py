@@ -22,8 +22,10 @@ Array = NDArray[np.float64]
 
 #: A point further from its guess than this is another one.
 MAX_FROM_GUESS_PX = 25.0
-#: So is a warped window that looks less alike, or whose way back ends elsewhere.
-_MIN_CORRELATION, _MAX_FORWARD_BACKWARD_PX = 0.7, 1.5
+#: So is one whose warped window looks less alike, by normalised correlation,
+_MIN_CORRELATION = 0.7
+#: or that does not come back to where it began when it is followed backwards.
+_MAX_FORWARD_BACKWARD_PX = 1.5
 #: Guesses are rough: the search takes more steps than one that begins within a pixel or two.
 _ITERATIONS = 15
 #: A window that is seen at less than this share of its area, or more than its inverse, has other details.

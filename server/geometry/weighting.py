@@ -32,8 +32,10 @@ SIGMA0_RANGE_PX = (0.25, 6.0)
 #: A gate is never narrower than that of this sigma: landmarks have errors of their own, and a gate that
 #: follows the residuals it lets through would close by itself.
 _MIN_GATE_SIGMA_PX = 0.6
-#: What tracking errs by without a link, and the expected error from which a position is worth nothing.
-_TRACKING_PX, _MOST_PX = 0.3, 5.0
+#: Error of tracking without a link.
+_TRACKING_PX = 0.3
+#: Expected error from which on a position is worth nothing.
+_MOST_PX = 5.0
 #: Median of |x| / sigma under normal noise.
 MAD_TO_SIGMA = 1.0 / 0.67449
 

@@ -16,18 +16,23 @@ from semcast.server.geometry.square_distance import square_distances
 
 Array = NDArray[np.float64]
 
-#: Of images with no smaller side features are looked for at half the width: SIFT doubles it again, in a third
-#: of the time, and what is finer is noise in decoded images.
+#: Images whose sides are all at least this long are searched for features at half their width: SIFT doubles
+#: it again, in a third of the time, and what is finer is noise in decoded images.
 _MIN_REDUCED_PX = 320
-#: Features of an image at most, the strongest; decoded images are soft, so that weak ones count.
-_NUM_FEATURES, _MIN_CONTRAST = 2000, 0.015
+#: Features of an image at most, the strongest.
+_NUM_FEATURES = 2000
+#: SIFT's contrast threshold: decoded images are soft, so that weak features count.
+_MIN_CONTRAST = 0.015
 #: By this ratio of distances a nearest descriptor is clearly the nearest (Lowe 2004).
 _MAX_RATIO = 0.8
 _EPIPOLAR_PX = 3.0
 _NEIGHBOURS = 7
-#: The warp around a point is fitted to so many matches next to it; those within the distance count alike.
-#: A share of their spread holds it near the turns of the features: they may lie on a line.
-_FITTED, _ALIKE_PX, _HELD_SHARE = 6, 30.0, 0.2
+#: Matches next to a point that the warp around it is fitted to.
+_FITTED = 6
+#: Those within this distance count alike.
+_ALIKE_PX = 30.0
+#: Share of their spread that holds the warp near the turns of the features: they may lie on a line.
+_HELD_SHARE = 0.2
 _FREE_FLOW_PX = 15.0
 #: Matches that agree, at least; fewer prove nothing.
 _MIN_AGREEING = 15

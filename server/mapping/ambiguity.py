@@ -29,18 +29,22 @@ from semcast.server.mapping.reversal import mirrored
 
 Array = NDArray[np.float64]
 
-#: An observation further off than this counts as this: it belongs to neither structure.
+#: Errors are cut off here, in standard deviations: an observation further off belongs to neither structure.
 _CUT_SIGMAS = 3.0
-#: The worse structure must cost so many times the better one, in one attempt or as the product over several.
-#: Less where the cameras of both go the same way: a relief that is too deep, with some of its points on the
-#: wrong side, shares most of them with the true one. Chosen on starts in synthetic rooms and over poor links.
-_CLEAR_RATIO, _CLEAR_RATIO_SAME_WAY = 1.4, 1.2
-#: One structure: directions of the last camera nearer to each other than this, and its rotations nearer than
-#: this share of the parallax. A relief that is three times too deep needs a third of the turn.
-_SAME_WAY_DEG, _SAME_TURN_SHARE = 20.0, 0.4
+#: How many times the better structure the worse one must cost, in one attempt or as the product over several.
+#: Chosen on starts in synthetic rooms and over poor links, like the next one.
+_CLEAR_RATIO = 1.4
+#: The same where the cameras of both go the same way: a relief that is too deep, with some of its points on
+#: the wrong side, shares most of them with the true one.
+_CLEAR_RATIO_SAME_WAY = 1.2
+#: Two structures are the same where directions to the last camera are nearer to each other than this,
+_SAME_WAY_DEG = 20.0
+#: and its rotations nearer than this share of the parallax: a relief three times too deep needs a third of
+#: the turn.
+_SAME_TURN_SHARE = 0.4
 #: How many times nearer the scene may be than it is found.
 _NEARER = (3.0, 1.0 / 3.0)
-#: A structure that costs so many times the cheapest one needs no search for others next to it.
+#: A structure that costs this many times the cheapest one needs no search for others next to it.
 _HOPELESS_RATIO = np.e
 
 

@@ -1,4 +1,4 @@
-"""Tracks against how earlier keyframes saw them: their drift is taken out, and chance finds are told.
+"""Aligns tracks with patches of earlier keyframes: takes out their drift, and detects false matches.
 
 Following a point from image to image makes a small error at every step, and a larger one where images are
 noisy: about a pixel in a dozen decoded frames. At a keyframe the pose is known, so that patches of older
@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.patch_alignment import (
     ANCHOR_PATCH_PX,
@@ -23,7 +22,7 @@ from semcast.server.geometry.patch_alignment import (
 )
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.weighting import MAD_TO_SIGMA
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom
+from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -32,51 +31,44 @@ Array = NDArray[np.float64]
 
 #: Keyframes that are looked at, the newest ones.
 NUM_ANCHORS = 10
-#: Side of the patches by which tracks are put back, and every so many of their pixels that are looked at: a
-#: small one finds what is a pixel or two off, and has less of what is behind an outline.
+#: Side and stride in pixels of the patches by which tracks are put back: a small one finds what is a pixel or
+#: two off, and has less of what is behind an outline.
 _FINE_PATCH = (11, 1)
-#: And of those by which they are told from chance finds, whose correlation needs more around.
+#: Side and stride of those by which tracks are told from chance finds, whose correlation needs more around.
 _WHOLE_PATCH = (ANCHOR_PATCH_PX, 2)
-#: Places from which on their scatter tells how well a track is known.
+#: Keyframes a track must be aligned with for the scatter of the places to tell how well it is known.
 _MIN_PLACES = 4
-#: Keyframes that the tracks behind a pose are compared with, and how many of those these show must look as
-#: they did, and what share. Behind gaps of 3 to 10 frames 46 to 100 % of 11 to 122 did where the pose was
-#: right, in noisy images too, and none of 2 to 39 where it was wrong.
-_NUM_COMPARED, _MIN_ALIKE, _MIN_ALIKE_SHARE = 3, 5, 0.2
-#: Landmarks next to a track without one, by which its patch is warped, and how many a keyframe must show.
-_NEIGHBOURS, _MIN_LANDMARKS = 5, 5
+#: The newest keyframes that the tracks behind a pose are compared with.
+_NUM_COMPARED = 3
+#: Of the tracks those show, how many must look as they did. Behind gaps of 3 to 10 frames 46 to 100 % of 11
+#: to 122 did where the pose was right, in noisy images too, and none of 2 to 39 where it was wrong.
+_MIN_ALIKE = 5
+#: The same as a share.
+_MIN_ALIKE_SHARE = 0.2
+#: Landmarks next to a track without a depth, by which its patch is warped.
+_NEIGHBOURS = 5
+#: Landmarks a keyframe must show for that.
+_MIN_LANDMARKS = 5
 
 
-def anchor_tracks(
-    camera: Intrinsics,
-    world: WorldMap,
-    images: KeyframeImages,
-    tracks: TrackTable,
-    sight: Sight,
-    T_world_cam: Array,
-    *,
-    submap: int,
-) -> int:
+def anchor_tracks(mapped: ImagedMap, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> int:
     """Align the tracks in sight with the kept keyframes that saw them.
 
     Of each track the median of the positions that fit is taken, and their scatter for how well it is known;
     one that fits nowhere stays where it is.
 
     Args:
-        camera: Pinhole.
-        world: The map.
-        images: Of keyframes.
+        mapped: Keyframes, their images and landmarks.
         tracks: Followed to the new image; moved.
         sight: The new image.
         T_world_cam: Its pose.
-        submap: The current one.
 
     Returns:
         How many tracks were aligned.
     """
-    views = _views(world, images, submap, NUM_ANCHORS)
+    views = mapped.newest_views(NUM_ANCHORS)
     all_rows = np.flatnonzero(tracks.visible)
-    aligned = _align(camera, world, views, tracks, all_rows, sight, T_world_cam, _FINE_PATCH)
+    aligned = _align(mapped, views, tracks, all_rows, sight, T_world_cam, _FINE_PATCH)
     if aligned is None:
         return 0
     rows, anchor, found = aligned
@@ -90,33 +82,22 @@ def anchor_tracks(
 
 
 def resembles(
-    camera: Intrinsics,
-    world: WorldMap,
-    images: KeyframeImages,
-    tracks: TrackTable,
-    sight: Sight,
-    T_world_cam: Array,
-    ids: NDArray[np.int64],
-    *,
-    submap: int,
+    mapped: ImagedMap, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: NDArray[np.int64]
 ) -> bool:
     """Tell whether tracks that agree with a pose show what the newest keyframes saw.
 
     KLT finds something near almost any guess, and all that was found near one guess agrees with its pose.
 
     Args:
-        camera: Pinhole.
-        world: The map.
-        images: Of keyframes.
+        mapped: Keyframes, their images and landmarks.
         tracks: Followed to the new image.
         sight: The new image.
         T_world_cam: Its pose.
         ids: ``(N,)`` the tracks that agree.
-        submap: The current one.
     """
-    views = _views(world, images, submap, _NUM_COMPARED)
+    views = mapped.newest_views(_NUM_COMPARED)
     rows = np.flatnonzero(tracks.visible & np.isin(tracks.ids, ids))
-    aligned = _align(camera, world, views, tracks, rows, sight, T_world_cam, _WHOLE_PATCH)
+    aligned = _align(mapped, views, tracks, rows, sight, T_world_cam, _WHOLE_PATCH)
     if aligned is None:
         return False
     rows, _, found = aligned
@@ -124,17 +105,8 @@ def resembles(
     return num_alike >= max(_MIN_ALIKE, _MIN_ALIKE_SHARE * len(np.unique(rows)))
 
 
-def _views(
-    world: WorldMap, images: KeyframeImages, submap: int, count: int
-) -> list[tuple[SeenFrom, Keyframe]]:
-    """Newest kept keyframes of a submap with their images, oldest first."""
-    there = [(image, world.keyframe(image.frame_id)) for image in images.newest(count)]
-    return [(image, k) for image, k in there if k is not None and k.submap == submap]
-
-
 def _align(
-    camera: Intrinsics,
-    world: WorldMap,
+    mapped: ImagedMap,
     views: Sequence[tuple[SeenFrom, Keyframe]],
     tracks: TrackTable,
     wanted: NDArray[np.intp],
@@ -152,10 +124,10 @@ def _align(
     parts: list[tuple[NDArray[np.intp], Array, Templates]] = []
     for image, keyframe in views:
         rows, xy0 = _shared(tracks, wanted, keyframe)
-        depth = _depths(world, keyframe, tracks.ids[rows], xy0)
+        depth = _depths(mapped.world, keyframe, tracks.ids[rows], xy0)
         told = depth > 0.0
         rows, xy0, depth = rows[told], xy0[told], depth[told]
-        warps, depth_now = affine_warps(camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
+        warps, depth_now = affine_warps(mapped.camera, T_cam_world @ keyframe.T_world_cam, xy0, depth)
         alike = seen_alike(warps, depth_now)
         parts.append((rows[alike], warps[alike], Templates.cut(image.grey, xy0[alike], *patch)))
     if not any(len(part[0]) for part in parts):

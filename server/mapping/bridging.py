@@ -1,4 +1,4 @@
-"""Where a new submap is put, and how large its unit is, as long as nothing better is known."""
+"""Pose and scale of a new submap, extrapolated from the camera's motion until something better is known."""
 
 from collections.abc import Sequence
 
@@ -15,16 +15,21 @@ Array = NDArray[np.float64]
 _MAX_BRIDGE_S = 5.0
 #: The camera moved, where a new map's length is that of more than this share of the depth,
 _LEAST_WAY = 0.02
-#: and its unit makes things no more than so many times as far or near as they were.
+#: and its unit makes things at most this many times as far or as near as they were.
 _MOST_FARTHER = 5.0
-#: Standard deviations of the logarithm of two guesses of the unit: that things are as far away as they were,
-#: and that the camera goes on at its old speed; that may change by so many depths a second too, as in a hand.
-_DEPTH_SIGMA, _SPEED_SIGMA, _SPEED_CHANGE_DEPTHS_S = 0.5, 0.03, 0.03
-#: How the camera moves after a gap is told from so long a time: the shorter, the noisier.
+#: Standard deviation of the logarithm of a new map's unit, guessed from things being as far away as before,
+_DEPTH_SIGMA = 0.5
+#: or from the camera going on at its old speed,
+_SPEED_SIGMA = 0.03
+#: to which the speed's own standard deviation is added, in depths per second: a hand changes its speed.
+_SPEED_CHANGE_DEPTHS_S = 0.03
+#: Time after a gap from which it is told how the camera moves then: the shorter, the noisier.
 _LATER_NS = 500_000_000
-#: A submap turned from where it was put by more than this, and so much more for each second of the gap before
-#: it, was not recognised: the camera is in another corridor that looks the same.
-_MOST_TURNED_DEG, _MOST_TURNED_DEG_S = 30.0, 60.0
+#: A submap turned from where it was put by more than this was not recognised: the camera is in another
+#: corridor that looks the same.
+_MOST_TURNED_DEG = 30.0
+#: How much more it may be for each second of the gap before it.
+_MOST_TURNED_DEG_S = 60.0
 
 
 def bridge(
@@ -35,19 +40,22 @@ def bridge(
     depth: float,
     turned: Sequence[tuple[int, Array]] = (),
 ) -> tuple[Array, float]:
-    """Lay a way from what is known to where a new submap begins.
+    """Estimate pose and scale of a new submap from how the camera moved before and after the gap.
 
-    Its unit makes the camera go on at its old speed; the slower that was, the more things are as far away as
-    they were, and where it stood, or too long ago, they are just that. It begins where the camera got to:
-    it turned as its images say, else turning and moving change evenly from what they were to what the submap
-    says, or, where its unit isn't told by the speed, go on as they were.
+    The scale is a weighted mean of two guesses: that the camera goes on at its old speed, and that the scene
+    is as far away as it was. The slower the camera was, the more the second one counts; it alone counts where
+    the camera stood or the gap is long.
+
+    The pose is where the camera must have got to. Its rotation is the one that images of the gap showed,
+    where there are any. Otherwise velocities change evenly from those before the gap to those of the submap
+    or, where the speed does not tell the scale, stay what they were.
 
     Args:
         motion: Of the camera so far.
-        start: The new submap. It alone tells the unit: before it, the camera may have stood still.
-        grown: The same and what came before.
+        start: The new submap. It alone tells the scale: before it, the camera may have stood still.
+        grown: The same with the earlier frames it was extended by.
         last_ns: Time of the newest keyframe of the map, None where there is none.
-        depth: How far things were, in the map's unit.
+        depth: Median depth of the scene before the gap, in the map's unit.
         turned: How the camera turned since its last pose, see ``VisualGyroscope``.
 
     Returns:
@@ -80,9 +88,10 @@ def bridge(
 
 
 def may_turn(R_join: Array, older_ns: NDArray[np.int64], newer_ns: NDArray[np.int64]) -> bool:
-    """Tell whether a submap may be turned so much against where ``bridge`` put it.
+    """Whether a recognised place may turn a submap by ``R_join`` from where ``bridge`` put it.
 
-    How a camera turns is known well before and after a gap, so short ones leave little doubt about it.
+    The angular velocity is known well before and after a gap, so after a short one the rotation can't be far
+    off.
 
     Args:
         R_join: ``(3, 3)`` rotation that a recognised place asks for.

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 #: Poses, points and the covariance of the last pose, or None.
 _Solved = tuple[Array, Array, Array | None]
 
-#: Observations share noise models: their sigmas are rounded to so many steps.
+#: Observations share noise models: their sigmas are rounded to this many steps.
 NUM_SIGMAS = 16
 SIGMA_RANGE_PX = (0.1, 12.0)
 #: Free views that dense algebra is for: its time grows with their square and the number of points.

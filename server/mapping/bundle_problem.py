@@ -1,4 +1,4 @@
-"""What bundle adjustment is asked and what it answers: plain arrays that travel between processes."""
+"""Bundle adjustment problems and results, as plain arrays that travel between processes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from semcast.server.mapping.pose_graph import Edge
 
 Array = NDArray[np.float64]
 
-#: By what a window is solved; both end in the same place.
+#: What solves a window; both converge to the same minimum.
 Solver = Literal["dense", "gtsam"]
 
 
@@ -93,7 +93,7 @@ class BundleProblem:
 
 
 class Frame(Protocol):
-    """What saw something."""
+    """Anything with a frame id: a keyframe, or a frame that waits for a map."""
 
     @property
     def frame_id(self) -> int:
@@ -101,7 +101,7 @@ class Frame(Protocol):
 
 
 class Observations(NamedTuple):
-    """What views saw of some tracks.
+    """Observations of tracks in views, one a row.
 
     Attributes:
         view: ``(M,)`` which view.
@@ -118,7 +118,7 @@ class Observations(NamedTuple):
     edge: Array
 
     def of_rows(self, kept: NDArray[np.bool_], point: NDArray[np.intp]) -> "Observations":
-        """Return those that are ``kept (M,)``, with the rows their tracks have then."""
+        """Return the observations in the mask ``kept (M,)``, with new track rows ``point``."""
         return Observations(self.view[kept], point, self.xy[kept], self.confidence[kept], self.edge[kept])
 
 
@@ -134,11 +134,8 @@ def assemble_problem(
     fixed: NDArray[np.bool_],
     keep_baseline: bool,
     iterations: int,
-    map_version: int = 0,
-    num_anchors: int = 0,
-    with_covariance: bool = False,
 ) -> BundleProblem:
-    """Put a problem together from what views saw; the noise model gives each observation its sigma.
+    """Put a problem together from what views saw; no covariance is asked for.
 
     Args:
         camera: Pinhole.
@@ -147,13 +144,10 @@ def assemble_problem(
         landmark_ids: ``(P,)``.
         xyz: ``(P, 3)`` where they are.
         seen: Observations, with rows into ``landmark_ids``.
-        noise: Of the observations.
-        fixed: See ``BundleProblem``, as the others.
-        keep_baseline: The same.
-        iterations: The same.
-        map_version: The same.
-        num_anchors: The same.
-        with_covariance: The same.
+        noise: Gives each observation its sigma, and Huber's threshold.
+        fixed: ``(K,)`` bool, see ``BundleProblem``.
+        keep_baseline: See ``BundleProblem``.
+        iterations: Levenberg-Marquardt steps at most.
     """
     return BundleProblem(
         camera=camera,
@@ -169,9 +163,7 @@ def assemble_problem(
         sigma_px=noise.sigma_px(seen.confidence),
         confidence=seen.confidence,
         iterations=iterations,
-        map_version=map_version,
-        num_anchors=num_anchors,
-        with_covariance=with_covariance,
+        with_covariance=False,
         huber_px=noise.huber_px,
         edge=seen.edge,
     )
@@ -204,7 +196,7 @@ class BundleResult:
 
     @cached_property
     def whitened_px(self) -> Array:
-        """``(M, 2)`` the residuals as if observations were known alike in all directions, see ``edges``."""
+        """``(M, 2)`` residuals scaled so that their noise is isotropic, see ``edges``."""
         return whitened(self.problem.edge, self.residual_px)
 
 

@@ -19,11 +19,13 @@ Array = NDArray[np.float64]
 
 #: A camera stops at once when the image moves by less than this share of what was expected of it ...
 _STILL_SHARE = 0.15
-#: ... and that was at least so many pixels: less is within the error of poses.
+#: ... and that was at least this many pixels: less is within the error of poses.
 _LEAST_EXPECTED_PX = 2.0
-#: It went on when the image has moved by this share of what it would have moved all the while, or by so many
-#: times what it moved from one frame to the next: nothing sets off three times as fast as it came.
-_GONE_SHARE, _GONE_STEPS = 0.67, 3.0
+#: It went on when the image has moved by this share of what it would have moved all the while,
+_GONE_SHARE = 0.67
+#: or by this many times what it moved from one frame to the next: nothing sets off three times as fast as it
+#: came.
+_GONE_STEPS = 3.0
 #: And in the same direction: least cosine between the two motions in the image.
 _SAME_DIRECTION = 0.5
 #: After so few frames the motion is told from before the stay: a video that repeats every image would seem to
@@ -31,10 +33,11 @@ _SAME_DIRECTION = 0.5
 _SHORT_STAY = 2
 #: Points must lie so far in front of the camera, as share of their usual depth.
 _LEAST_DEPTH_SHARE = 0.05
-#: A camera rests when the image has moved by no more than this share of its width for so long. A hand that
-#: rests sways by less.
-_REST_NS, _REST_SHARE = 1_000_000_000, 0.03
-#: A frame that comes after so many intervals of those before it comes after a gap.
+#: Time over which a camera must rest to be called at rest.
+_REST_NS = 1_000_000_000
+#: How far the image may move in that time, as a share of its width: a hand that rests sways by less.
+_REST_SHARE = 0.03
+#: A frame comes after a gap if it comes after this many intervals of the frames before it.
 _GAP_INTERVALS = 3.0
 _S_PER_NS = 1e-9
 

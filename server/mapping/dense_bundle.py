@@ -18,12 +18,18 @@ from semcast.common.geometry import exp_se3, invert_transform
 
 Array = NDArray[np.float64]
 
-#: Damping at the start, by what it changes after a step was taken or not, and where the search for one ends.
-_FIRST_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-4, 10.0, 1e5
+#: Levenberg-Marquardt damping at the start,
+_FIRST_DAMPING = 1e-4
+#: the factor it changes by after each step, down for one that was taken and up for one that was not,
+_DAMPING_FACTOR = 10.0
+#: and where the search for a step ends.
+_MAX_DAMPING = 1e5
 #: A step is taken if it lowers the cost by this share of what the linear system promised.
 _MIN_KEPT_PROMISE = 1e-3
-#: The search ends when a step lowers the cost by less than this share, or this much.
-_SMALL_SHARE, _SMALL = 1e-3, 1e-5
+#: The search ends when a step lowers the cost by less than this share,
+_SMALL_SHARE = 1e-3
+#: or by less than this.
+_SMALL = 1e-5
 #: A shorter way has no direction.
 _LEAST_LENGTH = 1e-12
 

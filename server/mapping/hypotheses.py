@@ -24,9 +24,11 @@ from semcast.server.mapping.mapper import gather_observations
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Points (the longest tracks) and steps for telling structures apart.
-_MAX_DECIDING, _DECIDING_ITERATIONS = 90, 15
-#: A point of a structure must fit its views to so many standard deviations to pose further views.
+#: Points by which structures are told apart, at most: the longest tracks.
+_MAX_DECIDING = 90
+#: Steps of the adjustments that decide.
+_DECIDING_ITERATIONS = 15
+#: RMS error at most, in standard deviations, of a point by which further views are posed.
 _MAX_ERROR_SIGMAS = 3.0
 
 

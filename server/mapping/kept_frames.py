@@ -64,7 +64,7 @@ class Observed:
 
 
 def observed_of(sight: Sight, tracks: TrackTable, rows: NDArray[np.bool_]) -> Observed:
-    """Return some tracks of the newest image, with that."""
+    """Return some tracks of the newest image, with the image."""
     return Observed(
         sight.frame.frame_id,
         sight.frame.t_source_ns,

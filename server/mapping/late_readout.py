@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, invert_transform, transform_points
 from semcast.server.geometry.projection import MIN_DEPTH_MAP
+from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
 from semcast.server.mapping.readout import lean
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.rolling_shutter import ImageFlow, RowTimes, taken_from
 from semcast.server.mapping.world_map import WorldMap
 

@@ -1,9 +1,10 @@
-"""What the residuals of an adjustment say about what it took for given: the shutter and the lens.
+"""What the residuals of a bundle adjustment say about its assumptions: a global shutter and a known lens.
 
-An adjustment gives all rows of an image one pose, and believes in a focal length. Where that is wrong, points
-are off by a pattern that is known but for its size. Poses and points take some of it over; the rest stays in
-the residuals, in proportion. Its size is then one unknown in a linear least squares problem: the residuals
-are compared with the pattern, after poses and points had a chance to explain either.
+An adjustment gives all rows of an image one pose and takes the lens for known. Where that is wrong, points
+are displaced by a pattern that is known but for its size, such as their flow times the time at which their
+row was read. Poses and points explain some of the pattern; the rest stays in the residuals, in proportion to
+its size. The size is therefore the one unknown of a linear least squares problem: both residuals and pattern
+are projected onto what poses and points can't explain (Schur complement), and then compared.
 """
 
 from collections.abc import Sequence
@@ -25,25 +26,25 @@ Array = NDArray[np.float64]
 #: right and down, by a focal length.
 RESIDUAL, ROWS, COLUMNS, FOCAL, RADIAL, RADIAL_2, CENTRE_X, CENTRE_Y = range(8)
 NUM_PATTERNS = 8
-#: Residuals beyond so many medians count less (Huber).
+#: Residuals beyond this many medians count less (Huber).
 _HUBER_MEDIANS = 1.5
-#: Holds what nothing else does, as share of the mean of the diagonal: the gauge.
+#: Damping that holds the gauge, as a share of the mean of the diagonal.
 _DAMPING = 1e-6
-#: Of the numerical slope of a distortion, in rays.
+#: Step of the numerical derivative of a distortion, in normalised image coordinates.
 _STEP = 1e-5
-#: Groups of views, one left out at a time, that say how sure an estimate is.
+#: Groups of views, one left out at a time, by which an estimate's standard deviation is found (jackknife).
 NUM_GROUPS = 10
 
 
 def information(
     problem: BundleProblem, motion: ViewMotion, T_world_cam: Array, xyz: Array, residual_px: Array
 ) -> Array:
-    """Return what each view's residuals say: sums of the products of all patterns with each other.
+    """Return what each view's residuals say: inner products of all patterns, residuals included.
 
-    Each pattern is without what a change of poses and points explains of it.
+    From each pattern, what a change of poses and points explains of it is subtracted first.
 
     Args:
-        problem: That was adjusted; dense algebra, for a window's number of views.
+        problem: The one that was adjusted, of a window's number of views: the algebra is dense.
         motion: Of its views.
         T_world_cam: ``(K, 4, 4)`` after the adjustment.
         xyz: ``(P, 3)`` after the adjustment.
@@ -87,11 +88,11 @@ def information(
 
 
 def _lens_patterns(focal_px: tuple[float, float], distortion: tuple[float, ...], ray: Array) -> list[Array]:
-    """Return the change of pixels with the lens, ``(M, 2)`` each: from ``FOCAL`` to ``CENTRE_Y``.
+    """Return the derivatives of pixels by the lens, ``(M, 2)`` each, from ``FOCAL`` to ``CENTRE_Y``.
 
-    Images were freed of the distortion as it is believed to be: where the lens is another one, they were
-    freed of it in the wrong places, which the slope of the distortion makes up for. With another focal length
-    distortion stays what it is in pixels.
+    Images were undistorted with the lens that was assumed. Where it is another one, that was done at the
+    wrong places, which the inverse derivative of the distortion makes up for. A change of focal length leaves
+    distortion as it is in pixels.
 
     Args:
         focal_px: fx, fy.
@@ -109,7 +110,7 @@ def _lens_patterns(focal_px: tuple[float, float], distortion: tuple[float, ...],
 
 
 def _slope(ray: Array, distortion: tuple[float, ...]) -> Array:
-    """Return how where a lens sees rays, ``(M, 2)`` with unit depth, changes with them, ``(M, 2, 2)``."""
+    """Return the derivative of distortion, ``(M, 2, 2)``, at rays ``(M, 2)`` of unit depth."""
     lens, still = np.array(distortion), np.zeros(3)
 
     def seen(at: Array) -> Array:
@@ -122,18 +123,21 @@ def _slope(ray: Array, distortion: tuple[float, ...]) -> Array:
 
 
 def shares_of_readout(size_wh: tuple[int, int], xy: Array) -> Array:
-    """Return which share of the readout after the middle each pixel is read, ``(M, 2)`` by column and row."""
+    """Return when each pixel is read, ``(M, 2)`` if columns or rows are read in turn.
+
+    In shares of the readout after the middle one: from -0.5 to 0.5.
+    """
     last = np.maximum(np.array(size_wh, dtype=np.float64) - 1.0, 1.0)
     return np.asarray(xy / last - 0.5)
 
 
 def by_poses(by_point: Array, points_cam: Array) -> Array:
-    """Return the change of pixels with the camera's pose in its own frame, ``(M, 2, 6)``."""
+    """Return the derivatives of pixels by the camera's pose in its own frame, ``(M, 2, 6)``."""
     return np.concatenate([by_point @ _skews(points_cam), -by_point], axis=2)
 
 
 def by_points(camera: Intrinsics, points_cam: Array) -> Array:
-    """Return the change of pixels with points in the camera's frame, ``(M, 2, 3)``."""
+    """Return the derivatives of pixels by points in the camera's frame, ``(M, 2, 3)``."""
     x, y, z = points_cam.T
     jacobian = np.zeros((len(points_cam), 2, 3))
     jacobian[:, 0, 0], jacobian[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
@@ -195,7 +199,7 @@ def _unexplained(
 
 
 def grouped(views: Sequence[Array] | Array) -> Array | None:
-    """Return sums over groups of views after each other, ``(G, 8, 8)``; None where too few say something.
+    """Return sums over groups of consecutive views, ``(G, 8, 8)``; None where fewer than three say something.
 
     Args:
         views: ``(8, 8)`` of each, as ``information`` gives them.

@@ -1,4 +1,4 @@
-"""A camera's focal length, radial distortion and principal point, from what adjustments leave over."""
+"""A camera's focal length, radial distortion and principal point, from the residuals of adjustments."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,12 +23,14 @@ Array = NDArray[np.float64]
 _ALL = [FOCAL, RADIAL, RADIAL_2, CENTRE_X, CENTRE_Y]
 #: Keeps them apart where images say nothing about one of them, as share of its square.
 _DAMPING = 1e-9
-#: What is more than a wrong focal length is believed where it is surer than so many standard deviations, and
-#: explains this much more of what is left.
-_MORE_SIGMAS, _MORE_EXPLAINED = 3.0, 0.01
-#: The principal point is looked for once the others change by no more than this: far from the right lens it
-#: takes their place.
-_NEAR_FOCAL, _NEAR_RADIAL = 0.08, 0.1
+#: More parameters than the focal length are believed where they are this many standard deviations from 0,
+_MORE_SIGMAS = 3.0
+#: and explain at least this much more of the squared residuals, as a share.
+_MORE_EXPLAINED = 0.01
+#: The principal point is looked for once the focal length changes by no more than this share,
+_NEAR_FOCAL = 0.08
+#: and radial distortion by no more than this: far from the right lens it takes their place.
+_NEAR_RADIAL = 0.1
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A new map grows into the past, over the frames that waited for it, as it later grows into the future.
+"""Extends a new map backwards in time, over the frames that waited for it.
 
 A map starts from the oldest frame that still shares tracks with the newest one. Of what earlier frames saw it
 has little: posed by the few landmarks left in their sight they would err several times as much as later
@@ -33,11 +33,14 @@ Array = NDArray[np.float64]
 _MAX_EARLIER = 10
 #: Frames in a row without a pose, from which on the camera was somewhere else.
 _MAX_MISSED = 15
-#: Keyframes and steps of one adjustment: there is one for each of them, while the camera waits.
-_WINDOW, _ITERATIONS = 8, 5
-#: A frame becomes a keyframe where it sees less than this share of the landmarks of the one after it, or
-#: where tracks have gone further than this share of the image width.
-_FEW_KNOWN_SHARE, _FAR_FLOW_SHARE = 0.6, 0.1
+#: Keyframes of one adjustment: there is one for each earlier keyframe, while the camera waits.
+_WINDOW = 8
+#: Steps of it.
+_ITERATIONS = 5
+#: A frame becomes a keyframe where it sees less than this share of the landmarks of the one after it,
+_FEW_KNOWN_SHARE = 0.6
+#: or where tracks have moved further than this share of the image's width.
+_FAR_FLOW_SHARE = 0.1
 
 
 def look_back(

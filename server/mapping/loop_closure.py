@@ -28,20 +28,35 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: The newest keyframes are no loop. Where one was closed, or nothing has drifted, none is looked for so long.
+#: The newest keyframes, which are never a loop. It is also how many keyframes pass without a look after one
+#: was closed, or nothing had drifted.
 _NUM_RECENT = 20
-#: Keyframes between two looks, and old keyframes considered in each.
-_LOOK_INTERVAL, _MAX_CONSIDERED = 4, 40
-#: The camera may have drifted by this share of the way since; it must have come back to this share of it.
-_MAX_DRIFT, _MAX_APART = 0.1, 0.3
+#: Keyframes from one look to the next.
+_LOOK_INTERVAL = 4
+#: Old keyframes considered in each look, at most.
+_MAX_CONSIDERED = 40
+#: Drift at most, as a share of the distance travelled since.
+_MAX_DRIFT = 0.1
+#: How near to the old keyframe the camera must have come back, as a share of that distance.
+_MAX_APART = 0.3
 #: Keyframes after which a place recognised once no longer counts.
 _MAX_PENDING = 10
-#: Two recognitions agree up to this: in median depths, degrees, and as a factor of the scale.
-_SAME_DEPTHS, _SAME_DEG, _SAME_SCALE = 0.1, 2.0, 1.15
-#: Landmarks found one by one that prove a place, as a number and as a share of those found.
-_MIN_FOUND, _MIN_FOUND_SHARE = 20, 0.6
-#: How well a recognised place is known: radians, depths, logarithm of the scale.
-_PLACE_RAD, _PLACE_DEPTH, _PLACE_SCALE = 0.004, 0.02, 0.03
+#: Two recognitions of a place agree up to this distance, in median depths,
+_SAME_DEPTHS = 0.1
+#: this angle,
+_SAME_DEG = 2.0
+#: and this factor between their scales.
+_SAME_SCALE = 1.15
+#: Landmarks found one by one that prove a place.
+_MIN_FOUND = 20
+#: The same as a share of those found.
+_MIN_FOUND_SHARE = 0.6
+#: Standard deviations of a recognised place: rotation in radians,
+_PLACE_RAD = 0.004
+#: translation in median depths,
+_PLACE_DEPTH = 0.02
+#: and logarithm of the scale.
+_PLACE_SCALE = 0.03
 #: Half the squared error in standard deviations that a loop may leave: seven errors of five deviations. What
 #: takes more is no drift but a wrong place: landmarks of poor depth may be agreed with from 30 degrees off.
 _MAX_COST = 0.5 * 7 * 5.0**2
@@ -227,7 +242,7 @@ class LoopFinder:
 
 
 def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGraph] | None:
-    """Find how the keyframes of a submap have to move for a loop to close.
+    """Distribute the drift of a loop over the keyframes of a submap (pose graph).
 
     Args:
         world: The map; it is not changed.

@@ -16,13 +16,14 @@ from semcast.server.mapping.bridging import may_turn
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, colours_of
+from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
 from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.map_update import update_of
 from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.readout_watch import ReadoutWatch
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
+from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, place_anew
 from semcast.server.mapping.rolling_shutter import ImageFlow
@@ -42,14 +43,16 @@ Ids = NDArray[np.int64]
 
 #: Keyframes whose images are kept: 45 MB of 640x480.
 _MAX_IMAGES = 150
-#: A keyframe has landmarks enough with one for this share of the tracks that are wanted.
+#: A keyframe has enough landmarks with this share of ``max_features``.
 _ENOUGH_SHARE = 0.2
-#: Landmarks seen again may take the tracks to so many times the number that is wanted.
+#: Landmarks seen again may raise the number of tracks to this many times ``max_features``.
 _MAX_TRACKS_SHARE = 1.2
 #: The newest keyframes, which stay where older ones are thinned out: an adjustment's window is among them.
 _MAX_RECENT = 40
-#: Steps of an adjustment: a start is far from where it ends, a window was adjusted before but for its newest.
-_START_ITERATIONS, _ITERATIONS = 15, 6
+#: Steps of the adjustments of a start, which is far from where it ends,
+_START_ITERATIONS = 15
+#: and of a window, which was adjusted before but for its newest keyframe.
+_ITERATIONS = 6
 
 
 class MapBuilder:
@@ -57,7 +60,7 @@ class MapBuilder:
 
     Args:
         camera: Pinhole.
-        settings: How.
+        settings: Of the reconstruction.
         bundle: Runs the adjustments.
     """
 
@@ -89,6 +92,10 @@ class MapBuilder:
             self._bundle.take(wait=True)
         self._version += 1
 
+    @property
+    def _mapped(self) -> ImagedMap:
+        return ImagedMap(self._camera, self.world, self.images, self.submap)
+
     def reference_keyframe(self) -> Keyframe | None:
         """Newest keyframe of the current submap."""
         return next((k for k in reversed(self.world.keyframes) if k.submap == self.submap), None)
@@ -98,11 +105,11 @@ class MapBuilder:
         return {k.submap for k in self.world.keyframes} - {self.submap}
 
     def begin_submap(self) -> None:
-        """Let the next start be a submap of its own."""
+        """Begin a new submap, which the next start will fill."""
         self.enter(1 + max(self.world.submap_of.values(), default=-1))
 
     def enter(self, submap: int) -> None:
-        """Go on in a submap."""
+        """Make a submap the current one."""
         self._adjusted = None  # of a keyframe elsewhere, or in another unit
         self._recognised: int | None = None
         self.loops = LoopFinder(self._camera, self.relocaliser, self._settings.seed)
@@ -165,9 +172,7 @@ class MapBuilder:
 
     def anchor(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> int:
         """Align tracks with how earlier keyframes of this submap saw them; the number aligned."""
-        return anchor_tracks(
-            self._camera, self.world, self.images, tracks, sight, T_world_cam, submap=self.submap
-        )
+        return anchor_tracks(self._mapped, tracks, sight, T_world_cam)
 
     def recognise(self, sight: Sight) -> Place | None:
         """Look for the place of an image whose camera is lost."""
@@ -177,18 +182,13 @@ class MapBuilder:
 
     def resembles(self, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: Ids) -> bool:
         """Tell whether tracks that agree with a pose show what the newest keyframes saw."""
-        return resembles(
-            self._camera, self.world, self.images, tracks, sight, T_world_cam, ids, submap=self.submap
-        )
+        return resembles(self._mapped, tracks, sight, T_world_cam, ids)
 
     def recall(
         self, tracks: TrackTable, sight: Sight, T_world_cam: Array, *, wanted: int, reach_px: float
     ) -> Ids:
         """Give lost landmarks of the newest keyframes their tracks back; ids of those found."""
-        how = {"submap": self.submap, "wanted": wanted}
-        return recall_landmarks(
-            self._camera, self.world, self.images, tracks, sight, T_world_cam, reach_px=reach_px, **how
-        )
+        return recall_landmarks(self._mapped, tracks, sight, T_world_cam, reach_px=reach_px, wanted=wanted)
 
     def revisit(
         self, tracks: TrackTable, sight: Sight, T_world_cam: Array, on_moved: Callable[[float], None]
@@ -218,16 +218,8 @@ class MapBuilder:
         return (found is not None and self._take_up(found, tracks, sight, T_world_cam) > 0) or closed
 
     def _find_revisit(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> Revisit | None:
-        return find_revisit(
-            self._camera,
-            self.world,
-            self.images,
-            tracks.ids,
-            sight,
-            T_world_cam,
-            submap=self.submap,
-            gate_px=GATE_SIGMAS * max(OLD_SIGMA_PX, self.noise.model.sigma0_px),
-        )
+        gate_px = GATE_SIGMAS * max(OLD_SIGMA_PX, self.noise.model.sigma0_px)
+        return find_revisit(self._mapped, tracks.ids, sight, T_world_cam, gate_px=gate_px)
 
     def _close(self, loop: Loop, on_moved: Callable[[float], None]) -> bool:
         """Share out what drifted since the camera was at the loop's place; whether that was possible."""
@@ -274,13 +266,13 @@ class MapBuilder:
             num_inliers: Landmarks its pose rests on.
             frames_since: Frames since the newest keyframe.
         """
-        cues = mapper.keyframe_cues(
-            reference,
-            tracks.ids[tracks.visible],
-            tracks.xy[tracks.visible],
+        ids, xy = tracks.ids[tracks.visible], tracks.xy[tracks.visible]
+        cues = mapper.KeyframeCues(
             num_inliers=num_inliers,
             num_inliers_at_keyframe=self.num_inliers_at_keyframe,
+            num_visible=len(ids),
             max_features=self._settings.max_features,
+            median_flow_px=mapper.median_flow_px(reference, ids, xy),
             width_px=self._camera.width,
             frames_since=frames_since,
             usable_share=float(sight.usable.mean()),
@@ -327,7 +319,7 @@ class MapBuilder:
 
     @property
     def enough(self) -> int:
-        """Landmarks that a keyframe has enough with."""
+        """Number of landmarks with which a keyframe has enough."""
         return round(_ENOUGH_SHARE * self._settings.max_features)
 
     def _add_landmarks(self, image: NDArray[np.uint8]) -> None:

@@ -1,4 +1,4 @@
-"""Keyframes into map: when to take one, new landmarks, what an adjustment brings, and culling."""
+"""From keyframes to the map: when to take one, triangulation, applying an adjustment, and culling."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,25 +21,39 @@ Ids = NDArray[np.int64]
 
 #: Root mean square error of a triangulated landmark at most, in standard deviations.
 MAX_ERROR_SIGMA = 1.8
-#: From this on, and seen twice, a track is on something that moves by itself, or slipped.
+#: RMS error in standard deviations from which on a track seen at least twice is no point at rest: it slipped,
+#: or is on something that moves by itself.
 _REFUTED_SIGMA = 4.0
 #: Landmarks further than this many median depths are as good as at infinity.
 _MAX_DEPTH_RATIO = 60.0
 #: Noise is judged by residuals that keep at least this share of its variance.
 _MIN_LEFT = 0.1
-#: Where landmarks run out, points under smaller angles do, down to this share of the usual one: a camera that
-#: turns leaves all it knows, and sees hardly anything from two sides.
+#: Where landmarks run out, points with less parallax are accepted, down to this share of the usual angle: a
+#: camera that turns leaves all it knows, and sees hardly anything from two sides.
 _LEAST_PARALLAX_SHARE = 0.3
-#: A pose soon rests on too little when fewer landmarks agree than this share of those right after the last
-#: keyframe, or than so many. New ones are wanted in time: when those, or tracks, are less than these shares.
-_FEW_SHARE, _FEW, _THINNED_SHARE, _SPARSE_SHARE = 0.45, 40, 0.75, 0.6
-#: A frame with less of its rows holds little, and its keyframes are the further apart (in frames).
-_DAMAGED_SHARE, _DAMAGED_APART = 0.5, 5
-#: Flow in image widths: below the first the camera stands, which brings neither parallax nor new views; from
-#: the second on, or so many frames after the last keyframe, another one says something new; beyond the third
-#: the view is another.
-_STANDING_WIDTHS, _CHANGING_WIDTHS, _APART, _MOVED_WIDTHS = 0.004, 0.02, 2, 0.045
-#: Ways between keyframes below this share of how far things are tell no scale.
+#: A keyframe is needed when fewer landmarks agree with the pose than this share of those right after the last
+#: keyframe: the pose soon rests on too little.
+_FEW_SHARE = 0.45
+#: The same as a number of landmarks.
+_FEW = 40
+#: A keyframe is wanted early, for new landmarks in time, at this share of those landmarks.
+_THINNED_SHARE = 0.75
+#: And with fewer tracks in sight than this share of ``max_features``.
+_SPARSE_SHARE = 0.6
+#: A frame with a smaller share of its rows is damaged and shows little.
+_DAMAGED_SHARE = 0.5
+#: Frames between the last keyframe and a damaged one, at least.
+_DAMAGED_APART = 5
+#: Flow since the last keyframe, in image widths, below which the camera stands: another keyframe would bring
+#: neither parallax nor new views.
+_STANDING_WIDTHS = 0.004
+#: Flow from which on a keyframe wanted early is worth it.
+_CHANGING_WIDTHS = 0.02
+#: Frames since the last keyframe after which it is, whatever the flow.
+_APART = 2
+#: Flow from which on the view is another one.
+_MOVED_WIDTHS = 0.045
+#: The distance between keyframes tells a scale only above this share of the scene's depth.
 _LEAST_WAY = 0.002
 #: Observations in a row that disagree before a landmark is given up.
 _MAX_MISSED = 4
@@ -54,7 +68,7 @@ class KeyframeCues:
         num_inliers_at_keyframe: The same right after the last keyframe.
         num_visible: Tracks in sight.
         max_features: Tracks wanted.
-        median_flow_px: Median way of tracks since the last keyframe.
+        median_flow_px: How far tracks have moved since the last keyframe, see ``median_flow_px``.
         width_px: Of the image.
         frames_since: Frames since the last keyframe.
         usable_share: Share of image rows that arrived.
@@ -87,44 +101,21 @@ def wants_keyframe(cues: KeyframeCues) -> bool:
     return few or moved or ((thinned or sparse) and changing)
 
 
-def keyframe_cues(
-    reference: Keyframe,
-    ids: Ids,
-    xy: Array,
-    *,
-    num_inliers: int,
-    num_inliers_at_keyframe: int,
-    max_features: int,
-    width_px: int,
-    frames_since: int,
-    usable_share: float,
-) -> KeyframeCues:
-    """Cues of a frame against its reference keyframe.
+def median_flow_px(reference: Keyframe, ids: Ids, xy: Array) -> float:
+    """How far tracks have moved since a keyframe, without those on something large that moves by itself.
 
     Args:
         reference: The keyframe.
         ids: ``(N,)`` tracks in sight, ascending.
         xy: ``(N, 2)`` where.
-        num_inliers: As in ``KeyframeCues``, like all that follow.
-        num_inliers_at_keyframe: See there.
-        max_features: See there.
-        width_px: See there; taken for the flow where no track is shared with the keyframe.
-        frames_since: See there.
-        usable_share: See there.
+
+    Returns:
+        Median in pixels; infinite where the keyframe saw none of the tracks.
     """
     _, row, row_k = np.intersect1d(ids, reference.ids, assume_unique=True, return_indices=True)
     at_rest = ~np.isin(ids[row], on_something_large(reference))
     flow_px = np.linalg.norm(xy[row[at_rest]] - reference.xy[row_k[at_rest]], axis=1)
-    return KeyframeCues(
-        num_inliers=num_inliers,
-        num_inliers_at_keyframe=num_inliers_at_keyframe,
-        num_visible=len(ids),
-        max_features=max_features,
-        median_flow_px=float(np.median(flow_px)) if len(flow_px) else float(width_px),
-        width_px=width_px,
-        frames_since=frames_since,
-        usable_share=usable_share,
-    )
+    return float(np.median(flow_px)) if len(flow_px) else float("inf")
 
 
 def add_landmarks(
@@ -137,7 +128,7 @@ def add_landmarks(
     enough: int = 0,
     num_keyframes: int = 12,
 ) -> int:
-    """Triangulate the tracks of the newest keyframe that are no landmarks yet; the number added.
+    """Triangulate the tracks of the newest keyframe that are no landmarks yet; returns the number added.
 
     Args:
         world: The map, grown.
@@ -145,8 +136,8 @@ def add_landmarks(
         noise: Of the observations.
         image: The newest keyframe's, ``(H, W, 3)``, for the colours.
         min_parallax_deg: Angle between the rays of a point.
-        enough: Landmarks in sight, with fewer of which smaller angles do.
-        num_keyframes: That may have seen the points, the newest ones.
+        enough: With fewer landmarks in sight than this, smaller angles are accepted.
+        num_keyframes: The newest keyframes whose observations are used.
     """
     newest = world.keyframes[-1]
     is_new = world.landmarks.rows(newest.ids) < 0
@@ -205,7 +196,7 @@ def new_landmarks(
     Args:
         camera: Pinhole.
         views: Keyframes that may have seen them.
-        seen_from: The one of them that is to see more.
+        seen_from: The one of them whose landmarks they will be.
         wanted: ``(W,)`` ids of the tracks, ascending.
         noise: Of the observations.
         min_parallax_deg: Angle between rays.
@@ -311,7 +302,7 @@ def median_depth_of(keyframe: Keyframe, ids: Ids, xyz: Array) -> float:
 
 
 def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> None:
-    """Bring an adjustment into the map, which may have grown since it was asked.
+    """Bring an adjustment into the map, which may have grown since it was submitted.
 
     Keyframes and landmarks that came later move rigidly with the last keyframe of the window. Frames that are
     no keyframes move with theirs, and take over what has become of the scale around it. Observations
@@ -355,11 +346,11 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
 
 
 def local_scales(result: BundleResult) -> Array:
-    """Factor on lengths around each keyframe, ``(K,)``: on the ways to those before and after it.
+    """By how much an adjustment has scaled the map around each keyframe, ``(K,)``.
 
-    It is 1 if the keyframe is fixed, or if these ways are next to nothing, as of a camera that turns on the
-    spot: how they change is chance. Depths of landmarks tell less: they change by what the camera itself is
-    moved by, too.
+    It is the factor on the distances to the keyframes before and after it. It is 1 if the keyframe is fixed,
+    or if these distances are next to nothing, as of a camera that turns on the spot: how they change is
+    chance. Depths of landmarks tell less, as they change with the motion of the camera itself, too.
     """
     problem = result.problem
     depth = float(

@@ -1,8 +1,8 @@
-"""From the last pose in one part of the map to the first in the next one, which shares nothing with it.
+"""Places a new submap after a gap, and again once its scale has settled.
 
-Where a new part begins, and how large its unit is, is told by how the camera moved before and after, and how
-it turned meanwhile, see ``bridging``. A start has few views close to each other, and its unit changes in the
-first adjustments: after a second the part is placed again, by the way of that second.
+Its pose and scale come from the camera's motion before and after the gap and its rotation meanwhile, see
+``bridging``. The views of a start are close to each other, and the first adjustments change its scale; so the
+submap is placed once more after a second, by the camera's path in that second.
 """
 
 from copy import deepcopy
@@ -23,22 +23,23 @@ from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
 
-#: A part is placed again when its start is so long ago, but no longer: a camera that stood since, or was
-#: elsewhere, has not gone on as before.
-_SETTLED_NS, _LATEST_NS = 1_000_000_000, 2_000_000_000
+#: A part of the map is placed again this long after its start,
+_SETTLED_NS = 1_000_000_000
+#: but not later than this: a camera that stood since, or was elsewhere, has not gone on as before.
+_LATEST_NS = 2_000_000_000
 
 
 @dataclass(frozen=True)
 class _Before:
-    """What a new part was placed by.
+    """What a submap was placed by.
 
     Attributes:
         motion: Of the camera before.
         last_ns: Time of the newest keyframe before.
-        depth: How far things were.
-        turned: How the camera turned since.
-        submap: The part.
-        start_ns: Time of the first view that told its unit.
+        depth: Median depth before, map units.
+        turned: Rotation of the camera since, see ``VisualGyroscope``.
+        submap: Number of the new submap.
+        start_ns: Time of the first view that told its scale.
     """
 
     motion: CameraMotion
@@ -50,7 +51,7 @@ class _Before:
 
 
 class Passage:
-    """Follows a camera from one part of the map to the next.
+    """Follows a camera from one submap to the next.
 
     Args:
         camera: Pinhole.
@@ -72,7 +73,7 @@ class Passage:
     def lay(
         self, motion: CameraMotion, start: Start, grown: Start, world: WorldMap, submap: int
     ) -> tuple[Array, float]:
-        """Where a new part begins and its unit, see ``bridging.bridge``."""
+        """Pose and scale of a new submap, see ``bridging.bridge``."""
         depth = usual_depth(world, self._enough)
         self._before = None
         if not world.keyframes or motion.predict(grown.keyframes[0].t_source_ns) is None:
@@ -84,15 +85,15 @@ class Passage:
         return bridge(motion, start, grown, last_ns, depth, turned)
 
     def lay_again(self, world: WorldMap, submap: int) -> tuple[float, Array] | None:
-        """Similarity that moves a part to where its first second says it is.
+        """Similarity that moves a submap to where its first second says it is.
 
         Args:
-            world: The map; its newest keyframe is of the part.
-            submap: The part.
+            world: The map; its newest keyframe is of the submap.
+            submap: The one that was placed last.
 
         Returns:
-            ``(scale, T)`` with ``x_new = T @ (scale * x)``, once for each part; None while it is too young or
-            when it is too old, and where it is one with an older part.
+            ``(scale, T)`` with ``x_new = T @ (scale * x)``, once for each submap; None while it is too young,
+            when it is too old, and when it has been joined with an older one.
         """
         before = self._before
         if before is None or before.submap != submap:

@@ -24,9 +24,11 @@ from semcast.server.mapping.bundle_problem import BundleProblem
 
 Array = NDArray[np.float64]
 
-#: A scene may be flat where a homography explains so many of the points, each to so many standard deviations.
-#: Generous, since a twin that does not fit is found out by its cost.
-_MIN_SHARE, _CUT_SIGMAS = 0.5, 4.0
+#: A scene may be flat where a homography explains this share of the points. Generous, since a twin that does
+#: not fit is found out by its cost.
+_MIN_SHARE = 0.5
+#: Standard deviations within which a point is explained.
+_CUT_SIGMAS = 4.0
 _MIN_POINTS = 12
 #: Share of the points that must lie in front of both cameras: noise tilts a plane seen at a low angle.
 _MIN_IN_FRONT = 0.75

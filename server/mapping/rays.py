@@ -1,9 +1,9 @@
-"""Tracks without a depth: each is a ray from the keyframe that saw it, and holds the camera's rotation.
+"""Tracks without a depth, as rays from the keyframe that saw them: they hold the camera's rotation.
 
 While a camera turns, most of what it sees is new, and the few landmarks left lie on one side of the image,
 where turning and moving look alike. The new tracks are many and everywhere. How far their points are is known
 roughly, as far as others: that much uncertainty moves a projection only along one line, and hardly at all
-while the camera is near the keyframe (inverse depth with its doubt: Civera, Davison and Montiel 2008).
+while the camera is near the keyframe (inverse depth with its uncertainty: Civera, Davison and Montiel 2008).
 Something large that moves by itself has such tracks too, many, and for long: keyframes tell them by that no
 point at rest explains where they were seen.
 """
@@ -60,7 +60,7 @@ def rays_of(
         world: The map.
         noise: Of the observations in keyframes.
         ids: ``(M,)`` tracks.
-        T_world_cam: About where the camera is.
+        T_world_cam: Approximate pose of the camera.
         submap: Part of the map whose keyframes count.
 
     Returns:

@@ -1,4 +1,4 @@
-"""A rolling shutter's readout time, from what adjustments leave over.
+"""A rolling shutter's readout time, from the residuals of adjustments.
 
 A row that is read ``t`` seconds after the middle one is seen from a pose further on: its points are off by
 ``t`` times their flow.

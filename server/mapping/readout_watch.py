@@ -24,20 +24,31 @@ _MAX_FRAMES = 2000
 _MAX_STEP_S = 0.25
 #: New keyframes from one look to the next, that each counts about once.
 _INTERVAL = 8
-#: A shutter is believed to be rolling from so many milliseconds on: 2.6 of a phone change its path's error by
-#: less than a tenth. And what was found is changed by so much at least.
-_LEAST_MS, _LEAST_CHANGE_MS = 4.0, 1.0
-#: An estimate counts when it is so many standard deviations from 0 and explains such a share of the squared
-#: residuals: those of global shutters explained up to .015, behind bad links. A change of what was found is
-#: no question of whether the shutter rolls.
-_LEAST_SIGMAS, _LEAST_EXPLAINED, _LEAST_EXPLAINED_MORE = 5.0, 0.03, 0.002
-#: From so many keyframes on, an estimate is the last one if it is surer than the least change. After many
-#: more there is none: a camera that hardly turns does not tell, and it matters little.
-_ENOUGH_VIEWS, _SURE_MS, _MOST_VIEWS = 24, 1.0, 170
-#: From so many keyframes on, a focal length is called wrong that is so by this share, a distortion that
-#: displaces a pixel by this share of its distance to the centre, a principal point that is so by this share
-#: of a focal length.
-_LENS_VIEWS, _LEAST_FOCAL, _LEAST_RADIAL, _LEAST_CENTRE = 16, 0.02, 0.02, 0.01
+#: Readout from which on a shutter is called rolling: 2.6 ms of a phone change its path's error by less than a
+#: tenth.
+_LEAST_MS = 4.0
+#: Change of a readout that was found before, at least.
+_LEAST_CHANGE_MS = 1.0
+#: An estimate counts when it is this many standard deviations from 0,
+_LEAST_SIGMAS = 5.0
+#: and explains this share of the squared residuals: global shutters explained up to .015, behind bad links.
+_LEAST_EXPLAINED = 0.03
+#: That share for a change of what was found: whether the shutter rolls is then no question any more.
+_LEAST_EXPLAINED_MORE = 0.002
+#: From this many keyframes on, an estimate is the last one if it is sure,
+_ENOUGH_VIEWS = 24
+#: which is a standard deviation below this.
+_SURE_MS = 1.0
+#: After this many there is none: a camera that hardly turns does not tell, and it matters little.
+_MOST_VIEWS = 170
+#: Keyframes from which on the lens of the calibration may be called wrong:
+_LENS_VIEWS = 16
+#: its focal length where it is off by this share,
+_LEAST_FOCAL = 0.02
+#: its distortion where it displaces a pixel by this share of the distance to the centre,
+_LEAST_RADIAL = 0.02
+#: its principal point where it is off by this share of a focal length.
+_LEAST_CENTRE = 0.01
 
 
 class ReadoutWatch:

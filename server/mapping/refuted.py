@@ -1,4 +1,4 @@
-"""Something large that moves by itself, such as a lorry ahead: the tracks on it, once there is a map.
+"""Tracks on something large that moves by itself, such as a lorry ahead, once there is a map.
 
 Keyframes refute tracks that no point at rest explains (``mapper.new_landmarks``). Where they are many, two
 things would go wrong without more care: tracks that have just begun beside them would hold the camera's
@@ -13,11 +13,16 @@ from semcast.server.mapping.world_map import Keyframe
 
 Ids = NDArray[np.int64]
 
-#: So many refuted tracks, and that share of all, are something large. Single ones have slipped.
-_MIN_REFUTED, _MIN_SHARE = 30, 0.2
-#: A track is on it if so many of its nearest judged neighbours are refuted, and no farther away than this
-#: share of the image's width.
-_NUM_NEIGHBOURS, _MIN_NUM_REFUTED, _MAX_DISTANCE_SHARE = 5, 4, 0.04
+#: Refuted tracks that are taken for something large, at least: single ones have slipped.
+_MIN_REFUTED = 30
+#: The same as a share of all tracks of the keyframe.
+_MIN_SHARE = 0.2
+#: Nearest judged neighbours by which it is decided whether a track is on something large.
+_NUM_NEIGHBOURS = 5
+#: Of those, how many must be refuted.
+_MIN_NUM_REFUTED = 4
+#: How far away they may be, as a share of the image's width.
+_MAX_DISTANCE_SHARE = 0.04
 
 
 def on_something_large(keyframe: Keyframe) -> Ids:

@@ -26,32 +26,45 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: The newest keyframes are tried on every frame, and of so many others the likeliest; the rest have to wait.
-_NUM_NEWEST, _MAX_CONSIDERED, _NUM_LIKELIEST = 2, 40, 2
-#: Descriptors of the image by which likely keyframes are told, and how many of them must be found there.
-_NUM_COMPARED, _MIN_ALIKE = 200, 4
-#: Agreeing matches that are worth a closer look.
+#: The newest keyframes, which are tried on every frame.
+_NUM_NEWEST = 2
+#: Older keyframes that are compared with an image, at most.
+_MAX_CONSIDERED = 40
+#: The likeliest of those, which are tried too.
+_NUM_LIKELIEST = 2
+#: Descriptors of the image by which likely keyframes are told.
+_NUM_COMPARED = 200
+#: How many of them a likely keyframe must have.
+_MIN_ALIKE = 4
+#: Inlier matches of the first search that are worth a closer look.
 _MIN_FIRST = 9
-#: Agreeing landmarks that prove a place, as a share of the keypoints followed at most, and its limits: fewer
-#: were found by chance where texture repeats.
-_MIN_INLIERS, _MAX_MIN_INLIERS, _MIN_INLIER_SHARE = 20, 45, 0.09
+#: Inlier landmarks that prove a place, as a share of ``max_features``,
+_MIN_INLIER_SHARE = 0.09
+#: but no fewer than this: fewer were found by chance where texture repeats.
+_MIN_INLIERS = 20
+#: This many are enough in any case.
+_MAX_MIN_INLIERS = 45
 #: Keyframes around the recognised one whose landmarks are looked for.
 _NEIGHBOURS = 5
 _SEARCH_ITERATIONS = 400
 _GUIDED_RADIUS_PX = 14.0
 _GUIDED_MAX_BITS = 70
 _MIN_GUIDED_SHARE = 0.35
-#: A wrong one of a row of equal houses has none of what stands around it. Found landmarks must lie as those
-#: in view lie, by the Bhattacharyya coefficient over fields of the image. In 650 measurements it was at most
-#: 0.73 at wrong places, and at 6 of 618 right ones.
-_LEAST_ALIKE, _FIELDS_XY = 0.73, (12, 5)
+#: A wrong one of a row of equal houses has none of what stands around it. Found landmarks must be distributed
+#: over the image like those that should be in view: this is the Bhattacharyya coefficient they need. In 650
+#: measurements it was at most 0.73 at wrong places, and at 6 of 618 right ones.
+_LEAST_ALIKE = 0.73
+#: Fields of the image, across and down, over which that is measured.
+_FIELDS_XY = (12, 5)
 #: Octaves of the query, so that a view from nearer or further still matches.
 _OCTAVES = (0, 2, 4)
 #: Binary descriptors do not know the noise model: a match is good to about this.
 _MATCH_SIGMA_PX = 1.5
-#: Points that two submaps share at least to tell the ratio of their units, and how far ratios of depths may
-#: be from each other (median, as a logarithm): at wrong places they are of all sizes.
-_MIN_SHARED, _MAX_LOG_SPREAD = 8, 0.25
+#: Points that two submaps must share to tell the ratio of their units.
+_MIN_SHARED = 8
+#: Median deviation, as a logarithm, of the depth ratios of those points at most: at wrong places ratios are
+#: of all sizes.
+_MAX_LOG_SPREAD = 0.25
 
 
 @dataclass(frozen=True)

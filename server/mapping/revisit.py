@@ -1,6 +1,6 @@
-"""A part of the map that was seen long ago and is in sight again: its landmarks are found and used anew.
+"""Finds and uses landmarks of old keyframes again when the camera comes back to where it has been.
 
-Without that every return makes new landmarks where there are some already. Where the camera should see a
+Otherwise every return would make new landmarks where there are some already. Where the camera should see a
 keyframe of long ago, that keyframe's landmarks are looked for: first by following them from its image, then
 by aligning its patches, warped by pose and depth. What was found must agree with the relative pose of the two
 images. It need not agree with the landmark's old position: seen under small angles in its time, a landmark
@@ -22,36 +22,43 @@ from semcast.server.geometry.pnp import reprojection_residual
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
+from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.mapper import gather_observations, median_depth
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Positions found from an image of long ago are good to about this.
+#: Standard deviation of positions that were found from an image of long ago.
 OLD_SIGMA_PX = 1.0
-#: The newest keyframes are no revisit: an adjustment has most of them in its window.
+#: The newest keyframes, which are never a revisit: an adjustment has most of them in its window.
 NUM_RECENT = 12
-#: Keyframes whose landmarks are projected, as long as turn (in half fields of view) and way (in depths of the
-#: scene) together are below this, and how many of those are looked for in the image, one after the other.
-_NUM_NEAREST, _MAX_APART = 6, 2.0
+#: Old keyframes nearest to the camera whose landmarks are projected, at most.
+_NUM_NEAREST = 6
+#: How far away they may be: turn in half fields of view and distance in depths of the scene, added.
+_MAX_APART = 2.0
+#: How many of those keyframes are looked for in the image, one after the other.
 _NUM_TRIED = 2
 #: Landmarks of a keyframe that should be in sight for it to be looked at.
 _MIN_EXPECTED = 30
-#: Found landmarks that agree with the pose, as a number and as a share of those found.
-_MIN_AGREEING, _MIN_SHARE = 15, 0.6
+#: Found landmarks that must agree with the relative pose.
+_MIN_AGREEING = 15
+#: The same as a share of those found.
+_MIN_SHARE = 0.6
 _MIN_CORRELATION = 0.75
-#: Old landmarks are not exactly where they are expected; the patch puts them right by a little once they were
-#: followed there.
-_REACH_PX, _MAX_MOVE_PX = 40.0, 3.0
+#: How far from its expected place an old landmark is followed: it is not exactly where the map has it.
+_REACH_PX = 40.0
+#: How far aligning its patch may then still move it.
+_MAX_MOVE_PX = 3.0
 _KLT_LEVELS = 2
 _BORDER_PX = 10
 #: Keyframes before and after the old one that help to triangulate.
 _NEIGHBOURS = 6
-#: Rays that are further apart than this tell the depth; all must meet to so many standard deviations.
-_MIN_PARALLAX_DEG, _MAX_ERROR_SIGMA = 1.0, 1.8
+#: Rays must be further apart than this to tell a depth.
+_MIN_PARALLAX_DEG = 1.0
+#: RMS error at most, in standard deviations, with which the rays of a landmark must meet.
+_MAX_ERROR_SIGMA = 1.8
 #: A depth that changes by more than this factor (as a logarithm) is that of another point along the line.
 _MAX_LOG_DEPTH = 0.7
 
@@ -83,26 +90,15 @@ class _Expected:
 
 
 def find_revisit(
-    camera: Intrinsics,
-    world: WorldMap,
-    images: KeyframeImages,
-    tracked_ids: Ids,
-    sight: Sight,
-    T_world_cam: Array,
-    *,
-    submap: int,
-    gate_px: float,
+    mapped: ImagedMap, tracked_ids: Ids, sight: Sight, T_world_cam: Array, *, gate_px: float
 ) -> Revisit | None:
     """Look for landmarks of an old keyframe that should be in sight.
 
     Args:
-        camera: Pinhole.
-        world: The map.
-        images: Of keyframes.
+        mapped: Keyframes, their images and landmarks.
         tracked_ids: Tracks that are alive: they need not be found.
         sight: The newest image.
         T_world_cam: Its pose.
-        submap: The current one.
         gate_px: Distance from the epipolar line up to which a point agrees with the pose.
 
     Returns:
@@ -110,25 +106,24 @@ def find_revisit(
     """
     T_cam_world = invert_transform(T_world_cam)
     candidates = [
-        _expected(camera, world, keyframe, image, tracked_ids, sight, T_cam_world)
-        for keyframe, image in _nearest(camera, world, images, T_world_cam, submap)
+        _expected(mapped, keyframe, image, tracked_ids, sight, T_cam_world)
+        for keyframe, image in _nearest(mapped, T_world_cam)
     ]
     candidates = [c for c in candidates if len(c.rows) >= _MIN_EXPECTED]
     candidates.sort(key=lambda c: -len(c.rows))
     for candidate in candidates[:_NUM_TRIED]:
-        found = _look(camera, candidate, sight, T_world_cam, gate_px)
+        found = _look(mapped.camera, candidate, sight, T_world_cam, gate_px)
         if found is not None:
             return found
     return None
 
 
-def _nearest(
-    camera: Intrinsics, world: WorldMap, images: KeyframeImages, T_world_cam: Array, submap: int
-) -> list[tuple[Keyframe, SeenFrom]]:
+def _nearest(mapped: ImagedMap, T_world_cam: Array) -> list[tuple[Keyframe, SeenFrom]]:
     """Old keyframes that looked at about the same from about there."""
-    mine = world.keyframes_of(submap)
+    camera, world = mapped.camera, mapped.world
+    mine = world.keyframes_of(mapped.submap)
     by_id = {k.frame_id: k for k in mine[:-NUM_RECENT]}
-    known = [(by_id[image.frame_id], image) for image in images if image.frame_id in by_id]
+    known = [(by_id[image.frame_id], image) for image in mapped.images if image.frame_id in by_id]
     if not known:
         return []
     T_world_old = np.stack([keyframe.T_world_cam for keyframe, _ in known])
@@ -141,14 +136,14 @@ def _nearest(
 
 
 def _expected(
-    camera: Intrinsics,
-    world: WorldMap,
+    mapped: ImagedMap,
     keyframe: Keyframe,
     image: SeenFrom,
     tracked_ids: Ids,
     sight: Sight,
     T_cam_world: Array,
 ) -> _Expected:
+    camera, world = mapped.camera, mapped.world
     row = world.landmarks.rows(keyframe.ids)
     rows = np.flatnonzero((row >= 0) & ~np.isin(keyframe.ids, tracked_ids, assume_unique=True))
     depth = depths_in(invert_transform(keyframe.T_world_cam), world.landmarks.xyz[row[rows]])

@@ -29,8 +29,10 @@ Array = NDArray[np.float64]
 #: x and y of each pixel, ``(H, W)`` each.
 Places = tuple[NDArray[np.float32], NDArray[np.float32]]
 
-#: Tracks a movement is fitted to at least, and steps of reweighting (Huber).
-_MIN_TRACKS, _ITERATIONS = 30, 6
+#: Tracks a movement is fitted to, at least.
+_MIN_TRACKS = 30
+#: Steps of reweighting (Huber).
+_ITERATIONS = 6
 #: Images further apart than this say little about how the camera moved during an exposure.
 _MAX_STEP_S = 0.5
 #: A hand shakes several times a second: from images further apart no trend of the movement is read.
@@ -39,7 +41,7 @@ _MAX_TREND_STEP_S = 0.06
 _MAX_SHARE = 0.2
 #: Images whose movement is kept: a minute and more of video.
 _MAX_FLOWS = 2000
-#: How far the image is moved is computed at every so many pixels.
+#: Distance of the pixels at which it is computed how far the image is moved.
 _GRID_PX = 16
 
 

@@ -14,16 +14,20 @@ from semcast.server.geometry.cells import cell_keys
 
 Array = NDArray[np.float64]
 
-#: A track stands as long as it is no further from where it began to: share of the width, at least pixels.
-_STANDING_SHARE, _STANDING_PX = 0.0015, 1.0
-#: And as long as its noise, so many standard deviations, explains what it moved.
+#: A track stands while it is no further from where it began than this share of the image's width,
+_STANDING_SHARE = 0.0015
+#: or than this, whichever is more,
+_STANDING_PX = 1.0
+#: or than what its noise explains, in standard deviations.
 _NOISE_SIGMAS = 2.0
-#: The scene must go so many image widths while a track stands. A point so far away that it does the same is
-#: in the direction the camera moves, and few are.
+#: How far the scene must move, in image widths, while a track stands for it to be fixed to the camera. A
+#: point so far away that it stands as long is in the direction the camera moves, and few are.
 _SCENE_WIDTHS = 0.1
-#: From so many on a track may belong to the camera, where more than this share of all do: of what is at
-#: rest, a twentieth stands in images of a car that goes straight on, and less elsewhere.
-_SUSPECT_WIDTHS, _MANY_SHARE = 0.006, 0.1
+#: From this motion of the scene on a standing track is suspected to be fixed to the camera,
+_SUSPECT_WIDTHS = 0.006
+#: where more than this share of all tracks are: of what is at rest, a twentieth stands in images of a car
+#: that goes straight on, and less elsewhere.
+_MANY_SHARE = 0.1
 #: Cells along the width by which the area counts.
 _COLUMNS = 12
 #: Less than this from one frame to the next is no motion, but noise.

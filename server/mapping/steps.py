@@ -1,7 +1,7 @@
-"""What tracking says of the way from one keyframe to the next.
+"""Relative poses between consecutive keyframes, as tracking found them, with the drift they may have.
 
-Where keyframes between two were thinned out, and the landmarks with them, the way between the two is all that
-is remembered of what was seen there.
+Where keyframes between two were thinned out, and the landmarks with them, the relative pose of the two is all
+that is left of what was seen there.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,18 +16,27 @@ from semcast.server.mapping.pose_graph import Edge
 from semcast.server.mapping.thinning import is_gap
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
-#: Drift from one keyframe to the next: rotation in radians and as a share of the turn, translation as a share
-#: of the way and of the depth, and the logarithm of the scale.
-_STEP_RAD, _STEP_TURN, _STEP_WAY, _STEP_DEPTH, _STEP_SCALE = 0.002, 0.02, 0.02, 0.002, 0.01
-#: Next to nothing is known of the two sides of a gap.
-_GAP_RAD, _GAP_SCALE = 0.5, 0.5
+#: Standard deviations of the drift from one keyframe to the next. Rotation, in radians,
+_STEP_RAD = 0.002
+#: and as a share of the turn between the two;
+_STEP_TURN = 0.02
+#: translation, as a share of the distance between the two,
+_STEP_WAY = 0.02
+#: and of the median depth;
+_STEP_DEPTH = 0.002
+#: logarithm of the scale.
+_STEP_SCALE = 0.01
+#: The same across a gap in the tracks, where next to nothing is known: rotation in radians,
+_GAP_RAD = 0.5
+#: and logarithm of the scale.
+_GAP_SCALE = 0.5
 
 
 class Step(NamedTuple):
-    """The way from one keyframe to the next that is left.
+    """A constraint between two keyframes that are next to each other in the map.
 
     Attributes:
-        edge: Of both, by their rows.
+        edge: Relative pose and its standard deviations; keyframes are numbered by their rows.
         is_thinned: Whether keyframes between them were thinned out.
         is_gap: Whether something else than tracking led from one to the other.
     """
@@ -38,7 +47,12 @@ class Step(NamedTuple):
 
 
 def steps_of(world: WorldMap, keyframes: Sequence[Keyframe]) -> Iterator[Step]:
-    """Tell of each of all keyframes of a submap, in order of time, but the first, how it was come to."""
+    """Yield the step to each keyframe of a submap from the one before it.
+
+    Args:
+        world: The map.
+        keyframes: All of the submap, in order of time.
+    """
     ever = np.array(sorted(k for k, part in world.submap_of.items() if part == keyframes[0].submap))
     gaps = np.array(sorted(world.gaps), dtype=np.int64)
     at = np.searchsorted(ever, [k.frame_id for k in keyframes])
@@ -52,7 +66,7 @@ def steps_of(world: WorldMap, keyframes: Sequence[Keyframe]) -> Iterator[Step]:
 
 
 def _edge(world: WorldMap, before: Keyframe, now: Keyframe, row: int, num_steps: int, missing: bool) -> Edge:
-    """What is known of a keyframe, in this row, and the one before, so many steps of the way ago."""
+    """Relative pose of the keyframe in ``row`` and the one before, which was ``num_steps`` keyframes ago."""
     T = invert_transform(before.T_world_cam) @ now.T_world_cam
     turn_rad = np.radians(rotation_angle_deg(T[:3, :3]))
     way = float(np.linalg.norm(T[:3, 3]))
@@ -69,6 +83,6 @@ def _edge(world: WorldMap, before: Keyframe, now: Keyframe, row: int, num_steps:
 
 
 def usable_depth(world: WorldMap, keyframe: Keyframe, otherwise: float) -> float:
-    """Median depth a keyframe sees, or another length where it sees no landmark any more."""
+    """Median depth of a keyframe's landmarks; ``otherwise`` where it sees none any more."""
     depth = median_depth(world, keyframe)
     return depth if np.isfinite(depth) else max(otherwise, 1e-6)

@@ -24,28 +24,36 @@ Ids = NDArray[np.int64]
 
 #: Agreeing landmarks a pose needs.
 MIN_INLIERS = 15
-#: With fewer inliers than this share, the start was poor: search without it.
+#: When a smaller share of the landmarks agrees with the refined guess, the guess was poor: search without it.
 _MIN_INLIER_SHARE = 0.5
 #: Share of the landmarks in sight that must agree with a pose, when the frame before had one.
 MIN_BELIEVED_SHARE = 0.25
-#: So many, and that share, must agree when frames are missing since then and the pose was searched for: a row
-#: of equal houses fits itself one house on as well, with all that is seen of it.
+#: Number of landmarks, and share of those in sight, that must agree with a pose that was searched for after
+#: missing frames: a row of equal houses fits itself one house on as well, with all that is seen of it.
 _BELIEVED_AFTER_GAP = (30, 0.5)
-#: So many rays, and that share of them, must agree to steady a pose, and that share of its landmarks still.
-_STEADY, _MIN_KEPT_SHARE = (10, 0.5), 0.8
-#: Rays that steady a pose may raise the cost of its landmarks, errors cut off at so many standard deviations,
-#: by so much in all, as noise does with six unknowns, and so much for each. What moves by itself has rays as
-#: well, and takes 0.2 to 8 for each, where at rest it is up to 0.18.
-_MOST_TAKEN, _MOST_TAKEN_EACH, _CUT_SIGMAS = 12.0, 0.2, 3.0
-#: Where fewer landmarks than this are in sight, so many rays, and that share of them, carry the pose on with
-#: the few landmarks that are left: without any, turning and moving are told apart by nothing.
-_RUN_OUT, _CARRY, _MIN_LEFT = 30, (60, 0.6), 4
-#: The gate of a ray is so many times as wide at most for what the keyframe's observation is in doubt.
+#: Number and share of rays that must agree for them to steady a pose.
+_STEADY = (10, 0.5)
+#: Share of the inlier landmarks of a pose that must still agree once rays have steadied it.
+_MIN_KEPT_SHARE = 0.8
+#: Landmark errors are cut off here, in standard deviations, when the costs of two poses are compared.
+_CUT_SIGMAS = 3.0
+#: How much rays may raise that cost in all: what noise does with six unknowns.
+_MOST_TAKEN = 12.0
+#: And how much more for each landmark: in a scene at rest it is up to 0.18, and 0.2 to 8 where the rays are
+#: of something that moves by itself.
+_MOST_TAKEN_EACH = 0.2
+#: With fewer landmarks in sight than this, rays may carry the pose on.
+_RUN_OUT = 30
+#: Number and share of rays that must agree for that.
+_CARRY = (60, 0.6)
+#: Landmarks that must be left and agree: without any, nothing tells turning from moving.
+_MIN_LEFT = 4
+#: The gate of a ray is widened by at most this factor for the uncertainty of the keyframe's observation.
 _MOST_WIDER = 3.0
 
 
 class Believing(TypedDict, total=False):
-    """When a pose is believed, arguments of ``track_pose``."""
+    """When a pose is believed; see the arguments of ``track_pose`` of the same names."""
 
     min_share: float
     may_carry: bool
@@ -172,37 +180,70 @@ def track_pose(
         The pose, or None when too few landmarks agree with any.
     """
     known = world.landmarks.rows(seen.ids) >= 0
-    marks, others = seen[known], seen[~known]
-    points = world.landmarks.xyz[world.landmarks.rows(marks.ids)]
-    sigma, gate = noise.sigma_px(marks.confidence), noise.threshold_px(marks.confidence)
-    best: PoseEstimate | None = None
-    if T_world_guess is not None and len(points) >= min_inliers:
-        best = refine_pose(
-            camera, invert_transform(T_world_guess), points, marks.xy, sigma, gate, edge=marks.edge
-        )
-    if best is None or best.num_inliers < max(min_inliers, _MIN_INLIER_SHARE * len(points)):
-        count, share = _BELIEVED_AFTER_GAP if is_after_gap else (0, 0.0)
-        least = max(min_inliers, count, math.ceil(share * len(points)))
-        how = {"seed": seed, "min_inliers": least}
-        searched = search_pose(camera, points, marks.xy, sigma, gate, edge=marks.edge, **how)
-        if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
-            best = searched
-    enough = max(min_inliers, min_share * len(points))
+    marks, others = _SeenLandmarks.of(seen[known], world, noise), seen[~known]
+    best = _pose_from_landmarks(camera, marks, T_world_guess, seed, min_inliers, is_after_gap=is_after_gap)
+    enough = max(min_inliers, min_share * len(marks.xyz))
     if best is not None and (best.num_inliers < enough or not np.isfinite(best.T_cam_world).all()):
         best = None
-    if best is None and may_carry and T_world_guess is not None and len(points) < _RUN_OUT:
-        left = max(_MIN_LEFT, min_share * len(points))
+    if best is None and may_carry and T_world_guess is not None and len(marks.xyz) < _RUN_OUT:
+        left = max(_MIN_LEFT, min_share * len(marks.xyz))
         best = _steadied(camera, world, noise, marks, others, T_world_guess, submap, _CARRY, left)
     elif best is not None and len(others):
         T, kept = invert_transform(best.T_cam_world), max(enough, _MIN_KEPT_SHARE * best.num_inliers)
         steadied = _steadied(camera, world, noise, marks, others, T, submap, _STEADY, kept)
-        most_taken = _MOST_TAKEN + _MOST_TAKEN_EACH * len(marks)
-        if steadied is not None and _cost(steadied, sigma) < _cost(best, sigma) + most_taken:
+        most = _cost(best, marks.sigma_px) + (_MOST_TAKEN + _MOST_TAKEN_EACH * len(marks.xyz))
+        if steadied is not None and _cost(steadied, marks.sigma_px) < most:
             best = steadied
     if best is None:
         return None
     T_world_cam = invert_transform(best.T_cam_world)
-    return TrackedPose(T_world_cam, best.covariance, marks.ids, best.inliers, best.residual_px)
+    return TrackedPose(T_world_cam, best.covariance, marks.tracks.ids, best.inliers, best.residual_px)
+
+
+@dataclass(frozen=True)
+class _SeenLandmarks:
+    """Tracks in sight that have a landmark.
+
+    Attributes:
+        tracks: ``N`` tracks.
+        xyz: ``(N, 3)`` their landmarks, world frame.
+        sigma_px: ``(N,)`` standard deviation of each observation per coordinate.
+        gate_px: ``(N,)`` reprojection error up to which an observation is an inlier.
+    """
+
+    tracks: Seen
+    xyz: Array
+    sigma_px: Array
+    gate_px: Array
+
+    @classmethod
+    def of(cls, tracks: Seen, world: WorldMap, noise: NoiseModel) -> "_SeenLandmarks":
+        xyz = world.landmarks.xyz[world.landmarks.rows(tracks.ids)]
+        return cls(tracks, xyz, noise.sigma_px(tracks.confidence), noise.threshold_px(tracks.confidence))
+
+
+def _pose_from_landmarks(
+    camera: Intrinsics,
+    marks: _SeenLandmarks,
+    T_world_guess: Array | None,
+    seed: int,
+    min_inliers: int,
+    *,
+    is_after_gap: bool,
+) -> PoseEstimate | None:
+    """Refine the guess; search without it where there is none or few landmarks agree with the outcome."""
+    observed = (marks.xyz, marks.tracks.xy, marks.sigma_px, marks.gate_px)
+    edge, count = marks.tracks.edge, len(marks.xyz)
+    best: PoseEstimate | None = None
+    if T_world_guess is not None and count >= min_inliers:
+        best = refine_pose(camera, invert_transform(T_world_guess), *observed, edge=edge)
+    if best is None or best.num_inliers < max(min_inliers, _MIN_INLIER_SHARE * count):
+        least, share = _BELIEVED_AFTER_GAP if is_after_gap else (0, 0.0)
+        needed = max(min_inliers, least, math.ceil(share * count))
+        searched = search_pose(camera, *observed, seed=seed, min_inliers=needed, edge=edge)
+        if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
+            best = searched
+    return best
 
 
 def _cost(pose: PoseEstimate, sigma_px: Array) -> float:
@@ -214,7 +255,7 @@ def _steadied(
     camera: Intrinsics,
     world: WorldMap,
     noise: NoiseModel,
-    marks: Seen,
+    marks: _SeenLandmarks,
     others: Seen,
     T_world_cam: Array,
     submap: int,
@@ -231,7 +272,7 @@ def _steadied(
         others: Those that have none.
         T_world_cam: Where to begin.
         submap: Part of the map the camera is in.
-        needed: Rays that must agree, and their share.
+        needed: Number of rays that must agree, and the share of all rays.
         min_inliers: Landmarks that must agree.
 
     Returns:
@@ -240,17 +281,16 @@ def _steadied(
     rays = rays_of(camera, world, noise, others.ids, T_world_cam, submap)
     if rays is None or len(rays.row) < needed[0]:
         return None
-    count, with_ray = len(marks), others[rays.row]
-    points = np.concatenate([world.landmarks.xyz[world.landmarks.rows(marks.ids)], rays.xyz])
-    observed = np.concatenate([marks.xy, with_ray.xy])
-    confidence = np.concatenate([marks.confidence, with_ray.confidence])
-    sigma, gate = noise.sigma_px(confidence), noise.threshold_px(confidence)
+    count, with_ray = len(marks.xyz), others[rays.row]
+    points = np.concatenate([marks.xyz, rays.xyz])
+    observed = np.concatenate([marks.tracks.xy, with_ray.xy])
+    ray_sigma, ray_gate = noise.sigma_px(with_ray.confidence), noise.threshold_px(with_ray.confidence)
     # Both ends of a ray are observed, the keyframe's and this one.
-    wider = np.hypot(sigma[count:], rays.sigma_px) / sigma[count:]
-    sigma[count:] *= wider
-    gate[count:] *= np.minimum(wider, _MOST_WIDER)
+    wider = np.hypot(ray_sigma, rays.sigma_px) / ray_sigma
+    sigma = np.concatenate([marks.sigma_px, ray_sigma * wider])
+    gate = np.concatenate([marks.gate_px, ray_gate * np.minimum(wider, _MOST_WIDER)])
     spread = np.concatenate([np.zeros((count, 2)), rays.spread_px])
-    edge = np.concatenate([marks.edge, with_ray.edge])
+    edge = np.concatenate([marks.tracks.edge, with_ray.edge])
     start = invert_transform(T_world_cam)
     pose = refine_pose(
         camera, start, points, observed, sigma, gate, iterations=6, spread_px=spread, edge=edge

@@ -31,20 +31,24 @@ logger = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Observations at most, for a stream to end within seconds: those of a hundred to two hundred keyframes; and
-#: where there are more keyframes than by default, so many each, for with fewer they go astray.
-MAX_OBSERVATIONS, OBSERVATIONS_EACH = 60_000, 200
+#: Observations of one adjustment at most, for a stream to end within seconds: those of a hundred to two
+#: hundred keyframes.
+MAX_OBSERVATIONS = 60_000
+#: Observations for each keyframe where there are more keyframes than by default: with fewer they go astray.
+OBSERVATIONS_EACH = 200
 #: Keyframes at most: so many take ten seconds, and several times as many minutes and gigabytes.
 MAX_KEYFRAMES = 1000
-#: Below that many keyframes a window held them all, most of the time.
+#: A map of fewer keyframes is left as it is: a window held them all, most of the time.
 _MIN_KEYFRAMES = 5
-#: Landmarks a keyframe shares at least with those it hangs together with: fewer don't say where it is.
+#: Landmarks that connect a keyframe to its part of the map, at least: fewer don't say where it is.
 _MIN_SHARED = 12
 #: Drift that a loop has to be shared out by is meant large, the same everywhere. What tracking really errs by
 #: on a step is less, a tenth to a third of it, over clean images and over fading.
 _SHARE_OF_DRIFT = 0.3
-#: The second time without what the first one found to be outliers.
-_ROUNDS, _ITERATIONS = 2, 15
+#: Adjustments, the second one without what the first one found to be outliers.
+_ROUNDS = 2
+#: Steps of each.
+_ITERATIONS = 15
 
 
 def adjust_whole_map(world: WorldMap, camera: Intrinsics, noise: NoiseModel) -> int:

@@ -22,7 +22,7 @@ from semcast.server.geometry.patch_alignment import (
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.geometry.wide_search import WideFeatures, match_wide
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom
+from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -30,18 +30,24 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Keyframes that are looked at, the newest ones, and frames after which a camera that was not found with them
-#: is somewhere else: a look takes as long as everything else of a frame.
-_NUM_KEYFRAMES, _MAX_FRAMES = 3, 8
+#: Keyframes that are looked at, the newest ones.
+_NUM_KEYFRAMES = 3
+#: Frames after which a camera that was not found with them is somewhere else: a look takes as long as
+#: everything else of a frame.
+_MAX_FRAMES = 8
 #: Ratio of distances up to which a nearest descriptor counts: landmarks tell wrong matches surely.
 _MAX_RATIO = 0.85
-#: A landmark further from its match goes elsewhere, and a place by such a match is good to about this.
-_MAX_OFFSET_PX, _CARRIED_SIGMA_PX = 15.0, 2.5
+#: A landmark must be this near to a match to go where the match goes,
+_MAX_OFFSET_PX = 15.0
+#: and its place is then good to this standard deviation.
+_CARRIED_SIGMA_PX = 2.5
 #: Landmarks that must agree with a pose. Of a few dozen wrong matches hardly two are within pixels of any.
 _MIN_FIRST = 8
-#: Share of a keyframe's landmarks that must look as they did where the pose has them, in rounds: the first
-#: pose is a rough one. And the share of those that must agree with the next pose.
-_LEAST_SHARES, _MIN_AGREEING_SHARE = (0.0, 0.0, 0.2), 0.5
+#: Share of a keyframe's landmarks that must look as they did where the pose has them, one for each round of
+#: looking: the first pose is a rough one.
+_LEAST_SHARES = (0.0, 0.0, 0.2)
+#: Share of those that must agree with the pose of the next round.
+_MIN_AGREEING_SHARE = 0.5
 _ALIGNED_SIGMA_PX = 1.0
 _BORDER_PX = 8
 _SEARCH_ITERATIONS = 400

@@ -1,4 +1,4 @@
-"""What a bundle adjustment is asked: the newest keyframes, those that hold them, and what they see.
+"""Chooses the keyframes and observations of a window: the newest ones, and older ones that hold them.
 
 Only landmarks are points of it: tracks that are none yet help where images are clean and harm where they are
 not. Two poses are fixed, for a single one and a distance hold an orbit better, but a drive worse. Twenty
@@ -6,6 +6,7 @@ keyframes correct for longer what the start of a map got wrong than ten do, and 
 counts is the number of observations.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,22 +22,30 @@ Ids = NDArray[np.int64]
 
 #: Observations one adjustment takes at most; it has to be done before the next keyframe.
 MAX_OBSERVATIONS = 4500
-#: Landmarks of a window: with fewer its poses are better left as the frames found them.
+#: Landmarks of a window at least: with fewer, its poses are better left as tracking found them.
 _MIN_LANDMARKS = 8
-#: Keyframes that see a landmark, from which on it matters to an adjustment as much as any other.
+#: A landmark seen by this many keyframes matters to an adjustment as much as one seen by more.
 _WELL_SEEN = 4
-#: Shares of the room that what the newest keyframe sees, and what older keyframes outside the window saw, get
-#: before everything else.
-_NEWEST_SHARE, _ANCHORED_SHARE = 0.4, 0.3
-#: Keyframes of long ago that were recognised in one adjustment at most, and how many of those before and
-#: after each hold their landmarks with it: rays from one place alone would leave them free in depth.
-_MAX_REVISITED, _NEIGHBOURS = 3, 1
-#: Keyframes right before the window that hold it too, among so many: those that saw enough of its landmarks.
-_MAX_BEFORE, _REACH_BACK, _MIN_SHARED = 6, 60, 6
-#: Extent of a window, in median depths, from which on it knows its scale, and how many of a submap's first
-#: keyframes do not hold it then: those of the start, or the furthest before it, which were placed with the
-#: least to go by.
-_MIN_EXTENT, _NUM_UNSURE = 0.2, 5
+#: Share of the observations that is reserved for landmarks in the newest keyframe.
+_NEWEST_SHARE = 0.4
+#: Share reserved for landmarks that older keyframes outside the window saw.
+_ANCHORED_SHARE = 0.3
+#: Keyframes of a place seen again that hold one adjustment, at most.
+_MAX_REVISITED = 3
+#: Keyframes before and after each of those that hold it too: rays from one place alone would leave landmarks
+#: free in depth.
+_NEIGHBOURS = 1
+#: Keyframes right before the window that hold it too, at most.
+_MAX_BEFORE = 6
+#: Keyframes before the window among which those are chosen.
+_REACH_BACK = 60
+#: Landmarks of the window that such a keyframe must have seen.
+_MIN_SHARED = 6
+#: Extent of a window, in median depths, from which on it knows its own scale.
+_MIN_EXTENT = 0.2
+#: The first keyframes of a submap that do not hold such a window: those of the start, or the furthest before
+#: it, which were placed with the least to go by.
+_NUM_UNSURE = 5
 
 
 def build_problem(
@@ -84,7 +93,7 @@ def build_problem(
     fixed = np.zeros(len(views), bool)
     fixed[: len(anchors) + (1 if start or held.sum() >= 2 else 2)] = True
     landmark_ids = ids[used_points]
-    return assemble_problem(
+    problem = assemble_problem(
         camera,
         views,
         np.stack([k.T_world_cam for k in views]),
@@ -95,10 +104,8 @@ def build_problem(
         fixed=fixed,
         keep_baseline=start,
         iterations=iterations,
-        map_version=map_version,
-        num_anchors=len(anchors),
-        with_covariance=True,
     )
+    return replace(problem, map_version=map_version, num_anchors=len(anchors), with_covariance=True)
 
 
 def _order_of_choice(

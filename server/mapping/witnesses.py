@@ -1,4 +1,4 @@
-"""What adjustments have left over so far, by keyframe, and how much of it the unknowns took."""
+"""What the residuals of all adjustments so far say about shutter and lens, by keyframe."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +9,11 @@ Array = NDArray[np.float64]
 
 
 class Witnesses:
-    """Keyframes, each with what its residuals say.
+    """Collects ``left_over.information`` of keyframes.
 
-    Windows overlap: what a keyframe says again adds to what it said, and makes it no second witness.
-    Residuals are less than what was wrong with the observations, to which unknowns were fitted.
+    Windows overlap: what a keyframe says in several adjustments is added up, and it stays one independent
+    witness. Also counts observations and unknowns, since unknowns that were fitted to the observations have
+    made residuals smaller than the errors they stand for.
     """
 
     def __init__(self) -> None:
@@ -29,7 +30,7 @@ class Witnesses:
 
     @property
     def sigma_factor(self) -> float:
-        """By how much estimates scatter more than residuals do, to which unknowns were fitted.
+        """Factor on standard deviations for the degrees of freedom that fitted unknowns have taken.
 
         Infinite where there are as many unknowns as observations: such residuals say nothing.
         """
@@ -37,7 +38,7 @@ class Witnesses:
         return share_left**-0.5 if share_left > 0.0 else np.inf
 
     def note(self, result: BundleResult) -> None:
-        """Hear what an adjustment leaves; nothing where it was not asked."""
+        """Add the residuals of an adjustment, if it was asked for their information."""
         if result.left_over is None:
             return
         for frame_id, told in zip(result.problem.keyframe_ids.tolist(), result.left_over, strict=True):

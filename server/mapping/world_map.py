@@ -21,7 +21,7 @@ Ids = NDArray[np.int64]
 
 @dataclass
 class Keyframe:
-    """A frame the map rests on.
+    """A keyframe: a frame whose observations the map is made from.
 
     Attributes:
         frame_id: Of the frame.
@@ -203,7 +203,7 @@ class WorldMap:
         self._frames_moved.update(self.frames)
 
     def bend(self, keyframe_ids: Ids, T_world_cam: Array, scale: Array) -> None:
-        """Move keyframes of one submap, and with each what it made: landmarks and frames, in its scale.
+        """Move keyframes of one submap, each with its landmarks and frames, scaled.
 
         Keyframes that were thinned out move with the one before them.
 

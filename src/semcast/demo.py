@@ -6,7 +6,7 @@ import shlex
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -228,11 +228,7 @@ def run_demo(
                 tell(text)
             command = agent_command(settings, sequence, endpoint, playback)
             children["agent"] = Role("agent", command, logs / "agent.log")
-            for name, child in children.items():
-                if name == "agent":
-                    child.start()
-                alive.wait_for(name, child, stop)
-                tell(f"{name} is up: {shlex.join(child.command)}")
+            _bring_up(children, alive, stop, tell)
             error = watch(settings.out, children, alive, stop, tell, progress)
             _keep_settings(settings, sequence, playback, tell)
             children["agent"].stop()  # what it says last counts
@@ -273,6 +269,17 @@ def _prepare(settings: DemoSettings, sequence: Path) -> tuple[Sequence, Path]:
             raise ConfigError(f"{logs} can't be made a folder for logs: {err}") from err
         discard(settings.out)
     return recorded, logs
+
+
+def _bring_up(
+    children: Mapping[str, Role], alive: Alive, stop: threading.Event, tell: Callable[[str], None]
+) -> None:
+    """Start the agent once server and channel are there, and tell the command line of each."""
+    for name, child in children.items():
+        if name == "agent":
+            child.start()
+        alive.wait_for(name, child, stop)
+        tell(f"{name} is up: {shlex.join(child.command)}")
 
 
 def _keep_settings(

@@ -24,10 +24,11 @@ MAX_PIXELS = 250_000
 _MIN_SHARE = 0.6
 #: Share of the cores' time that may be planned: beyond it frames have to wait for each other.
 _USABLE = 0.5
-#: Everything but coding (tracker, bundle adjustment, viewer, transport) in units of following 500 points, and
-#: the share of it that does not depend on the image size.
-_OTHER_WORK, _FIXED_SHARE = 4.5, 0.6
-#: So many cores at most are of use to one stream.
+#: Everything but coding (tracker, bundle adjustment, viewer, transport), in units of following 500 points.
+_OTHER_WORK = 4.5
+#: The share of it that does not depend on the image size.
+_FIXED_SHARE = 0.6
+#: Cores that are of use to one stream, at most.
 _MAX_CORES = 4
 #: A recording is played slower only if it is worth it: the measurement is no better.
 _FULL_PACE = 0.9

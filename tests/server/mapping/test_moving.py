@@ -10,7 +10,7 @@ from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import ate
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
-from semcast.server.mapping.mapper import add_landmarks, keyframe_cues
+from semcast.server.mapping.mapper import add_landmarks, median_flow_px
 from semcast.server.mapping.rays import rays_of
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
 from semcast.server.mapping.refuted import on_something_large, with_neighbours
@@ -185,13 +185,14 @@ def test_a_few_refuted_tracks_say_nothing_about_their_neighbours(num_refuted, is
 def test_what_stands_still_in_the_image_and_moves_by_itself_does_not_keep_keyframes_away():
     seen, is_landmark, _ = lorry(num_refuted=200)
     now = seen.xy + np.where(is_landmark[:, None], (20.0, 0.0), 0.0)
-    figures = {
-        "num_inliers": 90, "num_inliers_at_keyframe": 100, "max_features": 300,
-        "width_px": WIDTH, "frames_since": 2, "usable_share": 1.0,
-    }  # fmt: skip
-    assert keyframe_cues(seen, seen.ids, now, **figures).median_flow_px == 20.0
+    assert median_flow_px(seen, seen.ids, now) == 20.0
     seen.refuted = seen.refuted[:29]
-    assert keyframe_cues(seen, seen.ids, now, **figures).median_flow_px == 0.0
+    assert median_flow_px(seen, seen.ids, now) == 0.0
+
+
+def test_a_keyframe_that_saw_none_of_the_tracks_is_infinitely_far():
+    seen, _, _ = lorry(num_refuted=0)
+    assert median_flow_px(seen, seen.ids + 10_000, seen.xy) == np.inf
 
 
 def test_a_young_track_on_something_large_becomes_no_landmark():

@@ -12,8 +12,8 @@ from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.features import TrackedPoints, to_grey
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
 from semcast.server.mapping.map_builder import MapBuilder
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom
 from semcast.server.mapping.revisit import NUM_RECENT, find_revisit, place_anew
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight, usable_rows
@@ -90,7 +90,7 @@ def look(mapped, T_world_cam, T_believed=None, tracked=(), submap=0):
     T_believed = T_world_cam if T_believed is None else T_believed
     sight = sight_from(T_world_cam, 100)
     ids = np.array(sorted(tracked), dtype=np.int64)
-    return find_revisit(CAMERA, world, images, ids, sight, T_believed, submap=submap, gate_px=3.0)
+    return find_revisit(ImagedMap(CAMERA, world, images, submap), ids, sight, T_believed, gate_px=3.0)
 
 
 def test_landmarks_of_long_ago_are_found_where_they_are(mapped):

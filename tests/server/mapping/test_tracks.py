@@ -10,7 +10,8 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.anchoring import anchor_tracks
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom, recall_landmarks
+from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
+from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracker import expected_positions
@@ -312,8 +313,8 @@ def mapped():
 
 def recall(mapped, sight, x, reach_px=6.0, wanted=1000, submap=0):
     world, images, tracks = mapped
-    how = {"submap": submap, "reach_px": reach_px, "wanted": wanted}
-    found = recall_landmarks(CAMERA, world, images, tracks, sight, pose_at(x), **how)
+    imaged = ImagedMap(CAMERA, world, images, submap)
+    found = recall_landmarks(imaged, tracks, sight, pose_at(x), reach_px=reach_px, wanted=wanted)
     assert np.isin(found, tracks.ids).all()
     return len(found)
 
@@ -396,7 +397,7 @@ def test_landmarks_of_another_submap_stay_where_they_are(mapped):
 
 def anchor(mapped, sight, x, submap=0):
     world, images, tracks = mapped
-    return anchor_tracks(CAMERA, world, images, tracks, sight, pose_at(x), submap=submap)
+    return anchor_tracks(ImagedMap(CAMERA, world, images, submap), tracks, sight, pose_at(x))
 
 
 def test_drift_is_taken_out_at_a_keyframe(mapped, rng):

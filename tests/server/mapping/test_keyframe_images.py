@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from semcast.server.mapping.recall import KeyframeImages, SeenFrom
+from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
 
 GREY = np.zeros((4, 6), np.uint8)
 
