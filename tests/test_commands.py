@@ -152,7 +152,7 @@ def channel():
         assert time.monotonic() < end_s, "the channel did not start"
     yield endpoint
     stop.set()
-    thread.join(10)
+    thread.join(60)
     hub.close()
 
 

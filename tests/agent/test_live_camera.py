@@ -26,7 +26,7 @@ class Camera:
 
     def __init__(self, frames_per_connection, at_once=1, interval_s=0.0):
         self.jpegs = [
-            cv2.imencode(".jpg", np.full((48, 64, 3), 20 * k % 255, np.uint8))[1].tobytes() for k in range(12)
+            cv2.imencode(".jpg", np.full((48, 64, 3), 6 * k, np.uint8))[1].tobytes() for k in range(40)
         ]
         self.connections = 0
         camera = self
@@ -39,14 +39,16 @@ class Camera:
                 self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
                 self.end_headers()
                 try:
-                    for k in range(frames_per_connection):
-                        time.sleep(interval_s if k >= at_once else 0.0)
-                        jpeg = jpegs[k % len(jpegs)]
-                        self.wfile.write(
-                            b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
-                            + jpeg
-                            + b"\r\n"
-                        )
+                    parts = [
+                        b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
+                        + jpeg
+                        + b"\r\n"
+                        for jpeg in jpegs
+                    ]
+                    self.wfile.write(b"".join(parts[k % len(parts)] for k in range(at_once)))
+                    for k in range(at_once, frames_per_connection):
+                        time.sleep(interval_s)
+                        self.wfile.write(parts[k % len(parts)])
                 except OSError:
                     pass
 
@@ -183,7 +185,7 @@ def test_images_that_waited_before_the_start_are_thrown_away(make_camera):
     source = open_source(SourceSettings(source=camera.address, camera=PINHOLE, max_frames=1))
     (frame,) = source.frames(threading.Event())
     source.close()
-    assert round(frame.image.mean() / 20) in (8, 9, 10)  # the eight before came at once
+    assert round(frame.image.mean() / 6) >= 8  # the eight before came at once
 
 
 def test_a_camera_is_slowed_down_and_nothing_is_made_up_for(make_camera):

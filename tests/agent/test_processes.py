@@ -63,7 +63,7 @@ def test_real_processes_survive_each_others_death_in_any_order(recording):
         epoch = take(receiver, count=3)[-1].message.agent_epoch
         for role in ("channel", "agent"):
             running[role].kill()
-            running[role].communicate(timeout=10)
+            running[role].communicate(timeout=60)
             until(lambda role=role: role not in receiver.roles_alive)
             start(role)
             until(lambda role=role: role in receiver.roles_alive)
@@ -77,7 +77,7 @@ def test_real_processes_survive_each_others_death_in_any_order(recording):
         assert time.monotonic() - started_s < 10.0
         for process in running.values():
             process.send_signal(signal.SIGTERM)
-            assert process.communicate(timeout=10) == ("ended\n", "")
+            assert process.communicate(timeout=60) == ("ended\n", "")
             assert process.returncode == 0
         receiver.close()
         hub.close()

@@ -192,6 +192,7 @@ def test_a_recording_ends_with_its_last_readable_image(recording, tmp_path, capl
     assert (source.num_frames, source.last_frame_id) == (12 - damaged, 11 - damaged)
     left_out = [record.getMessage().split(":")[0] for record in caplog.records]
     assert left_out == [f"frame {k} is left out" for k in range(12 - damaged, 12)]
+    assert source.num_unreadable == damaged
 
 
 @pytest.mark.parametrize("repeat", ["loop", "swing"])

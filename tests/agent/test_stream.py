@@ -51,7 +51,7 @@ class Thread(threading.Thread):
 
     def end(self):
         self.stop.set()
-        self.join(10)
+        self.join(60)
         assert not self.is_alive()
 
 

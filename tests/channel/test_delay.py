@@ -30,19 +30,19 @@ def test_without_delay_a_packet_is_sent_at_once_by_the_caller(ends):
 
 def test_a_packet_takes_as_long_as_set_and_packets_overlap(ends):
     start_s = time.monotonic()
-    for k in range(10):
+    for k in range(100):
         ends.line.put(bytes([k]), False, 400.0)
-    came = [ends.out.get(timeout=10) for _ in range(10)]
-    assert [packet[0] for packet, _ in came] == list(range(10))
+    came = [ends.out.get(timeout=60) for _ in range(100)]
+    assert [packet[0] for packet, _ in came] == list(range(100))
     assert came[0][1] - start_s >= 0.4
-    assert came[-1][1] - came[0][1] < 3.0, "ten delays of 0.4 s pass at the same time"
+    assert came[-1][1] - came[0][1] < 20.0, "a hundred delays of 0.4 s pass at the same time"
 
 
 def test_jitter_delays_but_never_reorders(ends):
     start_s = time.monotonic()
     for k in range(50):
         ends.line.put(bytes([k]), False, extra_delay_ms(20.0, 0, k))
-    came = [ends.out.get(timeout=10) for _ in range(50)]
+    came = [ends.out.get(timeout=60) for _ in range(50)]
     assert [packet[0] for packet, _ in came] == list(range(50))
     longest_s = 1e-3 * max(extra_delay_ms(20.0, 0, k) for k in range(50))
     assert came[-1][1] - start_s >= longest_s > 0.025
@@ -61,7 +61,7 @@ def test_jitter_belongs_to_the_frame_and_is_exponential():
 def test_a_delay_taken_back_does_not_let_packets_overtake(ends):
     ends.line.put(b"slow", False, 80.0)
     ends.line.put(b"fast", False, 0.0)
-    assert [ends.out.get(timeout=10)[0] for _ in range(2)] == [b"slow", b"fast"]
+    assert [ends.out.get(timeout=60)[0] for _ in range(2)] == [b"slow", b"fast"]
 
 
 def test_a_packet_without_delay_waits_for_one_that_is_being_sent_and_for_no_other():
@@ -78,13 +78,13 @@ def test_a_packet_without_delay_waits_for_one_that_is_being_sent_and_for_no_othe
     assert began.wait(10)
     line.put(b"fast", False, 0.0)
     may_end.set()
-    assert [sent.get(timeout=10)[0] for _ in range(2)] == [b"slow", b"fast"]
+    assert [sent.get(timeout=60)[0] for _ in range(2)] == [b"slow", b"fast"]
     # Once the thread has seen that nothing is left, the caller sends again.
     deadline_s = time.monotonic() + 10
     sender = None
     while sender is not threading.current_thread() and time.monotonic() < deadline_s:
         line.put(b"later", False, 0.0)
-        sender = sent.get(timeout=10)[1]
+        sender = sent.get(timeout=60)[1]
     assert sender is threading.current_thread()
     line.close()
     assert not line._thread.is_alive(), "a line where nothing waits ends too"
@@ -109,7 +109,7 @@ def test_a_packet_that_can_not_be_sent_costs_itself_alone():
     line = DelayLine(send, failed.append)
     for packet in (b"bad", b"good"):
         assert line.put(packet, False, 1.0)
-    assert sent.get(timeout=10) == b"good"
+    assert sent.get(timeout=60) == b"good"
     assert failed == ["sending a delayed packet failed: no such packet"]
     line.close()
     assert not line.put(b"late", False, 1.0)

@@ -27,7 +27,7 @@ def test_all_keeps_order_and_makes_the_sender_wait():
     thread.start()
     assert all(box.put(k, timeout_s=5) == 0 for k in range(2, 200))
     box.close()
-    thread.join(5)
+    thread.join(60)
     assert received == list(range(200))
     assert box.dropped == 0
 
@@ -40,7 +40,7 @@ def test_closing_wakes_whoever_waits_and_keeps_what_is_inside():
     thread.start()
     box.close()
     box.close()
-    thread.join(5)
+    thread.join(60)
     assert results == [None]
     assert box.get() == "last"
     assert box.get() is None
@@ -54,7 +54,7 @@ def test_a_getter_waits_until_something_comes():
     thread = threading.Thread(target=lambda: results.append(box.get(5)))
     thread.start()
     box.put("here")
-    thread.join(5)
+    thread.join(60)
     assert results == ["here"]
     assert box.get(0.01) is None
 

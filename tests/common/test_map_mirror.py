@@ -42,7 +42,7 @@ def hub():
 
 @pytest.fixture
 def client(hub):
-    with open_client(NetworkSettings(connect=(hub[1],)), 5) as session:
+    with open_client(NetworkSettings(connect=(hub[1],)), 60) as session:
         yield session
 
 
@@ -86,7 +86,7 @@ def test_changes_that_come_before_the_answer_are_the_last_word(hub, client):
     hub[0].answer(map_key("late"), late)
     serving.publisher = hub[0].publisher(map_key("late"), "every")
     mirror = MapMirror(client, "late")
-    assert mirror.map.ids.tolist() == [1, 2, 5]
+    until(lambda: mirror.map.ids.tolist() == [1, 2, 5])
 
 
 def test_a_new_map_replaces_the_one_before(hub, client):
@@ -103,11 +103,11 @@ def test_a_server_that_was_away_is_asked_again(hub, client, caplog):
     mirror = MapMirror(client, AGENT)
     assert len(mirror.map.ids) == 0
     serving.whole = message([1, 2])
-    with open_client(NetworkSettings(connect=(hub[1],)), 5) as server:
+    with open_client(NetworkSettings(connect=(hub[1],)), 60) as server:
         server.declare_alive(AGENT, "server")
         until(lambda: mirror.map.ids.tolist() == [1, 2])
     serving.whole = message([1, 8])
-    with open_client(NetworkSettings(connect=(hub[1],)), 5) as server:
+    with open_client(NetworkSettings(connect=(hub[1],)), 60) as server:
         server.declare_alive(AGENT, "server")
         until(lambda: mirror.map.ids.tolist() == [1, 8])
     serving.publisher.put(b"\x93garbage")
@@ -117,7 +117,7 @@ def test_a_server_that_was_away_is_asked_again(hub, client, caplog):
 
 def test_nothing_is_left_of_a_former_server_whose_successor_had_no_map_at_first(hub, client):
     serving = Serving(hub[0], message([1, 8], keyframes=[0, 10]))
-    with open_client(NetworkSettings(connect=(hub[1],)), 5) as server:
+    with open_client(NetworkSettings(connect=(hub[1],)), 60) as server:
         server.declare_alive(AGENT, "server")
         mirror = MapMirror(client, AGENT)
         assert mirror.map.ids.tolist() == [1, 8]
@@ -125,7 +125,7 @@ def test_nothing_is_left_of_a_former_server_whose_successor_had_no_map_at_first(
     asked = []
     serving.whole = None
     hub[0].answer(map_key(AGENT), lambda _: asked.append(1))
-    with open_client(NetworkSettings(connect=(hub[1],)), 5) as server:
+    with open_client(NetworkSettings(connect=(hub[1],)), 60) as server:
         server.declare_alive(AGENT, "server")
         until(lambda: asked)
         # It restored a map of before 8 and keyframe 10, takes up the stream and says what it has.
@@ -154,7 +154,7 @@ class ScriptedSession:
         # As in life, on the thread that watches who is alive.
         watching = threading.Thread(target=self.on_the_way)
         watching.start()
-        watching.join(10)
+        watching.join(60)
         return answer
 
 

@@ -43,7 +43,7 @@ def hub():
 @pytest.fixture
 def pair(hub):
     network = NetworkSettings(connect=(hub[1],))
-    with open_client(network, 5) as one, open_client(network, 5) as other:
+    with open_client(network, 60) as one, open_client(network, 60) as other:
         yield one, other
 
 
@@ -109,7 +109,7 @@ def test_requests_are_answered_or_time_out(pair):
     until(lambda: asking.request("semcast/a/camera", b"hello", 1.0) == b"HELLO")
     started_s = time.monotonic()
     assert asking.request("semcast/b/camera", b"hello", 0.5) is None
-    assert time.monotonic() - started_s < 5.0
+    assert time.monotonic() - started_s < 9.0, "Zenoh itself waits for 10 s"
 
 
 def test_presence_is_seen_from_anywhere_and_ends_with_the_session(hub, pair):
@@ -117,7 +117,7 @@ def test_presence_is_seen_from_anywhere_and_ends_with_the_session(hub, pair):
     changes = []
     other.watch_alive("a", lambda role, alive: changes.append((role, alive)))
     hub[0].declare_alive("a", "server")
-    with open_client(NetworkSettings(connect=(hub[1],)), 5) as third:
+    with open_client(NetworkSettings(connect=(hub[1],)), 60) as third:
         third.declare_alive("a", "agent")
         until(lambda: one.alive_roles("a") == {"agent", "server"})
         assert one.alive_agents() == ["a"]
@@ -152,7 +152,7 @@ def test_clients_survive_a_hub_that_is_killed():
 
     process = start()
     try:
-        with open_client(network, 5) as sender, open_client(network, 5) as receiver:
+        with open_client(network, 60) as sender, open_client(network, 60) as receiver:
             received = []
             receiver.subscribe("semcast/a/rx/symbols", "newest", received.append)
             sender.declare_alive("a", "agent")
@@ -171,7 +171,7 @@ def test_clients_survive_a_hub_that_is_killed():
             process = start()
             started_s = time.monotonic()
             until(passes)
-            assert time.monotonic() - started_s < 5.0
+            assert time.monotonic() - started_s < 15.0
             assert alive_roles(endpoint, "a") == {"agent"}
     finally:
         process.kill()
@@ -185,7 +185,7 @@ def test_a_client_waits_for_its_hub_until_it_is_stopped():
     thread = threading.Thread(target=lambda: result.append(open_session(network, stop)))
     thread.start()
     stop.set()
-    thread.join(5)
+    thread.join(60)
     assert result == [None]
 
 
@@ -193,12 +193,12 @@ def test_a_client_started_first_finds_a_hub_started_later():
     endpoint = free_endpoint()
     result = []
     thread = threading.Thread(
-        target=lambda: result.append(open_session(NetworkSettings(connect=(endpoint,)), deadline_s=20))
+        target=lambda: result.append(open_session(NetworkSettings(connect=(endpoint,)), deadline_s=60))
     )
     thread.start()
     with open_session(NetworkSettings(listen=(endpoint,), connect=())) as hub:
         hub.declare_alive("a", "server")
-        thread.join(10)
+        thread.join(60)
         assert "server" in result[0].alive_roles("a")
         result[0].close()
 
@@ -225,7 +225,7 @@ def test_what_answers_but_is_no_hub_is_said_once(caplog, monkeypatch):
         ):
             open_client(network, 0.5)
         stop.set()
-        waiting.join(10)
+        waiting.join(60)
     assert caplog.text.count("something answers") == 1
 
 
@@ -247,7 +247,7 @@ def test_a_hub_behind_a_slow_network_is_met(hub):
     async def meet():
         async with await asyncio.start_server(on_connection, "127.0.0.1", 0) as network:
             endpoint = f"tcp/127.0.0.1:{network.sockets[0].getsockname()[1]}"
-            session = await asyncio.to_thread(open_client, NetworkSettings(connect=(endpoint,)), 5)
+            session = await asyncio.to_thread(open_client, NetworkSettings(connect=(endpoint,)), 60)
             assert "server" in await asyncio.to_thread(session.alive_roles, "a", 5)
             session.close()
 
@@ -350,7 +350,7 @@ def test_listening_beyond_loopback_is_warned_about(caplog):
 
 
 def test_a_round_trip_over_loopback_takes_milliseconds():
-    assert 0.0 < loopback_round_trip_ms() < 500.0
+    assert 0.0 < loopback_round_trip_ms(60.0) < 500.0
 
 
 def test_a_hub_with_users_lets_only_them_in(tmp_path):
@@ -365,7 +365,7 @@ def test_a_hub_with_users_lets_only_them_in(tmp_path):
     hub = file("hub.json5", dictionary_file=str(tmp_path / "users.txt"))
     alice, mallory = file("a.json5", user="alice", password="secret"), file("m.json5", user="m", password="x")
     with open_session(NetworkSettings(listen=(endpoint,), connect=(), zenoh_config=hub)):
-        with open_client(NetworkSettings(connect=(endpoint,), zenoh_config=alice), 5) as session:
+        with open_client(NetworkSettings(connect=(endpoint,), zenoh_config=alice), 60) as session:
             session.declare_alive("a", "agent")
             assert alive_roles(endpoint, "a", alice) == {"agent"}
         for stranger in (mallory, None):
@@ -404,7 +404,7 @@ def test_of_two_that_answer_a_request_each_can_be_heard():
     hub, endpoint = open_hub()
     with hub, contextlib.ExitStack() as stack:
         for answer in (b"0", b"1"):
-            client = stack.enter_context(open_client(NetworkSettings(connect=(endpoint,)), 5))
+            client = stack.enter_context(open_client(NetworkSettings(connect=(endpoint,)), 60))
             client.answer("semcast/a/camera", lambda request, answer=answer: answer)
             deadline_s = time.monotonic() + 10.0
             while hub.request("semcast/a/camera", b"", 1.0, lambda got, answer=answer: got == answer) is None:

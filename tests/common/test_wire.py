@@ -222,9 +222,9 @@ def test_oversized_messages_are_refused_unread():
     ],
 )
 def test_hostile_bytes_are_refused_at_once(data):
-    started_s = time.perf_counter()
+    started_s = time.thread_time()
     assert refused(data, SymbolFrame).reason == "syntax"
-    assert time.perf_counter() - started_s < 1.0
+    assert time.thread_time() - started_s < 1.0
 
 
 def test_many_lists_cost_no_memory():

@@ -112,7 +112,7 @@ def test_closing_wakes_whoever_waits_and_keeps_what_is_inside():
     consumer.start()
     waiting.put("last")
     waiting.close()
-    consumer.join(5)
+    consumer.join(60)
     assert taken == ["last", None]
     waiting.put("never")
     assert waiting.get(0) is None

@@ -116,7 +116,7 @@ def test_whatever_an_image_can_not_be_written_for_holds_nobody_up(tmp_path, monk
     writer = ImageWriter(tmp_path, lossless=True, capacity=1)
     putting = threading.Thread(target=lambda: [writer.put(k, picture(0)) for k in range(6)], daemon=True)
     putting.start()
-    putting.join(10)
+    putting.join(60)
     assert not putting.is_alive()
     writer.close()
     assert (writer.num_written, writer.num_dropped) == (0, 6)
@@ -138,7 +138,7 @@ def test_a_disk_that_hangs_keeps_nobody_longer_than_the_deadline(tmp_path, monke
     writer.put(2, picture(2))
     closing = threading.Thread(target=lambda: writer.close(0.05), daemon=True)
     closing.start()
-    closing.join(10)
+    closing.join(60)
     assert not closing.is_alive()
     assert writer.num_dropped == 2
     writer.put(3, picture(3))

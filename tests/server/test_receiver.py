@@ -66,7 +66,7 @@ class Ends:
         self.hub, self.endpoint = open_hub()
         self.metrics = Metrics("server")
         self.receiver = Receiver(self.hub, "a", mode, self.metrics, **changes)
-        self.client = open_client(NetworkSettings(connect=(self.endpoint,)), 5)
+        self.client = open_client(NetworkSettings(connect=(self.endpoint,)), 60)
         self.rx = self.client.publisher(rx_key("a"), "every")
         until(lambda: self.rx.has_receiver)
 
@@ -103,7 +103,7 @@ def test_a_row_is_as_good_as_the_slots_its_values_are_in(ends, make):
     levels = np.full((4, 8), 1, np.uint8)
     levels[0] = 4  # twice the usual values: they fill the first two slots
     e.put(make(3, lost=[1], allocation=Allocation(levels).code))
-    frame = e.receiver.next(5)
+    frame = e.receiver.next(60)
     assert frame.received.allocation == Allocation(levels).code
     assert frame.slot_snr_db[0] == pytest.approx(0.0, abs=0.1)  # half of it arrived
     assert (frame.slot_snr_db[1:] > 15.0).all()
@@ -116,7 +116,7 @@ def test_a_frame_whose_allocation_is_none_is_dropped(ends, make):
     values = {**msgpack.unpackb(pack(good)), "allocation": b"\x01"}
     e.rx.put(msgpack.packb(values))
     e.put(make(4))
-    assert e.receiver.next(5).message.seq == 4
+    assert e.receiver.next(60).message.seq == 4
     assert e.metrics.drops["protocol"] == 1
 
 
@@ -134,7 +134,7 @@ def test_a_frame_is_equalised_and_reported(ends, make, sent):
     until(lambda: e.receiver._snr_set)
     message = make(3, lost=[2], levels=(5, 255, 60, 180))
     e.put(message)
-    frame = e.receiver.next(5)
+    frame = e.receiver.next(60)
     assert frame.received.levels == Levels(5, 255, 60, 180)
     assert frame.message == message
     assert frame.camera == camera()
@@ -157,7 +157,7 @@ def test_a_busy_live_consumer_loses_nothing(ends, make):
     e.answer_camera(camera())
     e.put(*(make(seq) for seq in range(5)))
     until(lambda: e.metrics.counts.get("received") == 5)
-    assert [e.receiver.next(5).message.seq for _ in range(5)] == list(range(5))
+    assert [e.receiver.next(60).message.seq for _ in range(5)] == list(range(5))
     assert e.metrics.drops == {}
 
 
@@ -167,7 +167,7 @@ def test_what_gave_way_to_newer_frames_after_the_last_one_came_is_counted_too(en
     e.put(make(0), make(1))
     until(lambda: e.metrics.counts.get("received") == 2)
     monkeypatch.setattr(backlog, "MAX_WAIT_S", 0.0)
-    assert e.receiver.next(5).message.seq == 1
+    assert e.receiver.next(60).message.seq == 1
     assert e.metrics.drops == {"superseded": 1}
 
 
@@ -184,7 +184,7 @@ def test_a_slow_live_consumer_gets_the_newest_and_drops_are_counted_exactly(ends
     for burst in range(4):
         e.put(*(make(25 * burst + k) for k in range(int(burst == 0), 25)))
         until(lambda burst=burst: e.receiver._arrivals.arrived_seq == 25 * (burst + 1))
-        ids.append(e.receiver.next(5).message.seq)
+        ids.append(e.receiver.next(60).message.seq)
     assert ids == [24, 49, 74, 99]
     # What the ring itself threw away, should this machine be that busy, shows as missing.
     drops = e.metrics.drops
@@ -199,52 +199,37 @@ def test_age_stays_within_two_frames_behind_a_consumer_five_times_too_slow(ends,
     monkeypatch.setattr(backlog, "CATCH_UP_S", 0.1)
     e = ends()
     e.answer_camera(camera())
-    period_s = 0.01
-    stop = threading.Event()
-
-    def send():
-        seq = 0
-        while not stop.wait(period_s):
-            e.put(make(seq))
-            seq += 1
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    ages_ms = []
-    busy = threading.Event()
-    try:
-        while len(ages_ms) < 15:
-            frame = e.receiver.next(5)
-            ages_ms.append((time.monotonic_ns() - frame.message.t_capture_ns) * 1e-6)
-            busy.wait(5 * period_s)
-    finally:
-        stop.set()
-        sender.join(5)
-    assert np.percentile(ages_ms[4:], 75) <= 2 * period_s * 1e3 + 30
+    behind, busy = [], threading.Event()
+    for newest in range(4, 75, 5):
+        e.put(*(make(seq) for seq in range(newest - 4, newest + 1)))
+        until(lambda newest=newest: e.metrics.counts.get("received") == newest + 1)
+        behind.append(newest - e.receiver.next(60).message.seq)
+        busy.wait(0.05)
+    assert max(behind[4:]) <= 2
     assert e.metrics.drops["superseded"] > 20
 
 
 def test_old_live_frames_are_dropped(ends, make):
-    e = ends(max_age_ms=200.0)
+    e = ends(max_age_ms=20_000.0)
     e.answer_camera(camera())
     e.put(make(0))
-    assert e.receiver.next(5).message.seq == 0
-    e.put(make(1, t_capture_ns=time.monotonic_ns() - 10**9), make(2))
+    assert e.receiver.next(60).message.seq == 0
+    e.put(make(1, t_capture_ns=time.monotonic_ns() - 30 * 10**9), make(2))
     until(lambda: e.metrics.counts["received"] == 3)
-    assert e.receiver.next(5).message.seq == 2
+    assert e.receiver.next(60).message.seq == 2
     assert e.metrics.drops["too_old"] == 1
-    e.put(make(3, t_capture_ns=time.monotonic_ns() - 10**9))
+    e.put(make(3, t_capture_ns=time.monotonic_ns() - 30 * 10**9))
     assert e.receiver.next(0.2) is None
     assert e.metrics.drops == {"too_old": 2}
 
 
 def test_the_last_frame_of_a_source_is_never_too_old(ends, make):
-    e = ends(max_age_ms=200.0)
+    e = ends(max_age_ms=20_000.0)
     e.answer_camera(camera())
     e.put(make(0))
-    assert e.receiver.next(5).message.seq == 0
-    e.put(make(1, t_capture_ns=time.monotonic_ns() - 10**9, final=True))
-    last = e.receiver.next(5)
+    assert e.receiver.next(60).message.seq == 0
+    e.put(make(1, t_capture_ns=time.monotonic_ns() - 30 * 10**9, final=True))
+    last = e.receiver.next(60)
     assert last is not None, "without it the server would never end"
     assert last.message.final
     assert "too_old" not in e.metrics.drops
@@ -259,7 +244,7 @@ def test_a_late_receiver_learns_the_camera_by_asking(ends, make):
     e.answer_camera(camera())
     until(lambda: e.hub.request(camera_key("a"), b"", 0.5) is not None)
     e.put(make(1))
-    assert e.receiver.next(5).camera == camera()
+    assert e.receiver.next(60).camera == camera()
 
 
 def test_no_frame_is_delivered_twice_and_a_new_agent_is_followed(ends, make):
@@ -289,7 +274,7 @@ def test_the_camera_of_an_agent_whose_clock_went_back_is_kept_beside_many_later_
         publisher.put(pack(camera(epoch)))
     until(lambda: EPOCH in e.receiver._cameras)
     e.put(make(0))
-    assert e.receiver.next(5).camera == camera(EPOCH)
+    assert e.receiver.next(60).camera == camera(EPOCH)
     assert len(e.receiver._cameras) <= 16
 
 
@@ -305,7 +290,7 @@ def test_bad_messages_are_counted_and_do_no_harm(ends, make):
     assert e.receiver.next(0.2) is None, "the image is not of the camera's size"
     assert e.metrics.drops["protocol"] == 7
     e.put(replace(nan, seq=2))
-    frame = e.receiver.next(5)
+    frame = e.receiver.next(60)
     assert not frame.received.symbols.any()
     assert (frame.slot_snr_db == -20.0).all(), "samples that are no numbers count as not arrived"
     assert {k for k in e.metrics.counts if k.startswith("protocol_")} == {"protocol_syntax", "protocol_kind"}
@@ -330,7 +315,7 @@ def test_a_frame_id_out_of_nowhere_is_in_the_status(ends, make):
     e = ends()
     e.answer_camera(camera())
     e.put(make(0), make(1, frame_id=2**62), make(1))
-    assert [e.receiver.next(5).message.frame_id for _ in range(2)] == [0, 2]
+    assert [e.receiver.next(60).message.frame_id for _ in range(2)] == [0, 2]
     assert e.metrics.drops == {"ahead": 1}
     assert e.metrics.status(0).last_error == f"frame {2**62} is left out: it can't follow frame 0"
 
@@ -357,7 +342,7 @@ def test_replay_delivers_in_order_and_says_how_far_it_is(ends, make):
     assert flows[0] == FlowMessage(agent_epoch=0, next_seq=0, arrived_seq=0, window=WINDOW)
     e.put(*(make(k, lossless=True) for k in (0, 2, 1, 1, 2)))
     until(lambda: flows and flows[-1].arrived_seq == 3)
-    taken = [e.receiver.next(5).message for _ in range(3)]
+    taken = [e.receiver.next(60).message for _ in range(3)]
     assert [message.seq for message in taken] == [0, 1, 2]
     e.receiver.done(taken[0])
     until(lambda: flows[-1].next_seq > 0)
@@ -372,7 +357,7 @@ def test_a_frame_lost_on_the_air_still_counts_as_delivered_in_replay(ends, make)
     e = ends("replay")
     e.answer_camera(camera(lossless=True))
     e.put(make(0, lossless=True, payload_format="lost", payload=b"", lost=range(4)), make(1, lossless=True))
-    first, second = e.receiver.next(5), e.receiver.next(5)
+    first, second = e.receiver.next(60), e.receiver.next(60)
     assert (first.received, first.snr_db, first.slot_snr_db) == (None, None, None)
     assert second.received is not None
     assert e.metrics.counts["lost_on_air"] == 1
@@ -383,7 +368,7 @@ def test_replay_keeps_a_frame_until_the_camera_is_known(ends, make):
     e.put(make(0, lossless=True))
     assert e.receiver.next(0.05) is None
     e.answer_camera(camera(lossless=True))
-    assert e.receiver.next(5).message.seq == 0
+    assert e.receiver.next(60).message.seq == 0
     assert e.metrics.drops == {}
 
 
@@ -405,7 +390,7 @@ def test_replay_drops_a_frame_whose_agent_was_restarted_before_its_camera_was_kn
     assert e.receiver.next(0.05) is None
     e.answer_camera(camera(EPOCH + 1, lossless=True))
     e.put(make(0, epoch=EPOCH + 1, lossless=True))
-    assert e.receiver.next(5).message.agent_epoch == EPOCH + 1
+    assert e.receiver.next(60).message.agent_epoch == EPOCH + 1
     assert e.metrics.drops == {"epoch": 2}
 
 
@@ -453,12 +438,12 @@ def test_a_frame_that_overtakes_the_camera_of_a_new_start_waits_for_it(ends, mak
     e = ends()
     e.answer_camera(camera())
     e.put(make(0))
-    assert e.receiver.next(5).message.seq == 0
+    assert e.receiver.next(60).message.seq == 0
     e.put(make(0, epoch=EPOCH + 1))
     until(lambda: len(e.receiver._early) == 1)
     assert e.receiver.agent_epoch == EPOCH
     e.receiver._on_camera(pack(camera(EPOCH + 1)))
-    assert e.receiver.next(5).message.agent_epoch == EPOCH + 1
+    assert e.receiver.next(60).message.agent_epoch == EPOCH + 1
     e.receiver._on_camera(pack(camera(EPOCH + 1)))
     assert e.metrics.drops == {}, "it waited once, and does not come again"
 
@@ -468,7 +453,7 @@ def test_starts_that_nobody_announced_do_not_interrupt_a_stream(ends, make):
     e.answer_camera(camera())
     for k in range(30):
         e.put(make(k))
-        assert e.receiver.next(5).message.seq == k
+        assert e.receiver.next(60).message.seq == k
         e.put(make(0, epoch=2**62 + k))
     until(lambda: e.metrics.counts.get("received") == 60 or e.metrics.drops.get("camera") == 14)
     assert e.metrics.drops == {"camera": 14}

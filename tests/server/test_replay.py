@@ -489,7 +489,7 @@ def test_a_recorder_whose_disk_is_full_ends_with_an_error(tmp_path, monkeypatch)
     finally:
         stop.set()
         timer.cancel()
-        sender.join(5)
+        sender.join(60)
         hub.close()
 
 

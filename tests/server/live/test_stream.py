@@ -156,12 +156,13 @@ def test_a_frame_that_waited_too_long_for_the_tracker_is_dropped(air, monkeypatc
         return process(session, frame, *rest)
 
     monkeypatch.setattr(Session, "process", hold_up)
-    running = air.serve(max_age_ms=1000.0)
+    running = air.serve(max_age_ms=20_000.0)
     radio = air.agent(100)
     radio.stream([0])
     radio.send(1)
     assert begun.wait(DEADLINE_S)
-    radio.send(2)
+    # Old when it comes: those before and after it have all the time that a busy machine takes.
+    radio.send(2, t_capture_ns=time.monotonic_ns() - 19 * 10**9)
     deadline_s = time.monotonic() + DEADLINE_S
     while running.server._ahead._slot is None:
         assert time.monotonic() < deadline_s
@@ -189,8 +190,8 @@ def test_a_server_that_hears_nothing_ends_with_its_time_limit(air):
 def test_a_silent_stream_ends_with_the_idle_limit_and_its_outputs(tmp_path, air):
     running = air.serve(out=tmp_path, idle_timeout_s=0.3)
     radio = air.agent(100)
-    radio.stream(range(3))
-    assert running.finish()["frames"]["tracked"] == 3
+    radio.send(0)  # a busy machine could be silent for as long before a second one
+    assert running.finish()["frames"]["tracked"] == 1
     assert (tmp_path / "summary.json").exists()
 
 
@@ -201,8 +202,8 @@ def test_the_idle_limit_counts_from_the_first_frame_however_long_ago_the_server_
     radio.wait(lambda: radio.allowed > 0, "word that the server is ready")
     assert not running.stop.wait(0.4)
     assert running.thread.is_alive()
-    radio.stream(range(3))
-    assert running.finish()["frames"]["tracked"] == 3
+    radio.send(0)
+    assert running.finish()["frames"]["tracked"] == 1
 
 
 def test_a_server_decodes_with_weights_of_ones_own(tiny_weights):

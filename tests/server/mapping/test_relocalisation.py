@@ -1,5 +1,7 @@
 """A place is recognised by enough landmarks, and not by a chance find of a few."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -87,6 +89,25 @@ def test_a_house_like_another_is_no_place(looks_alike, is_place):
     world = wall(relocaliser, 300, looks_alike)
     assert looks_alike(world.keyframes[0].xy).sum() > 30
     assert (relocaliser.find(SIGHT, world, NOISE) is not None) == is_place
+
+
+def test_all_keyframes_have_their_turn_and_of_those_the_likeliest_is_looked_at(rng):
+    """The place is the first of 91 keyframes: forty at a time, from the newest on, it is in the third."""
+    relocaliser = Relocaliser(CAMERA, 0, 500)
+    world = wall(relocaliser, 120)
+    place = world.keyframes[0]
+    for k in range(1, 91):
+        world.add_keyframe(
+            replace(
+                place,
+                frame_id=k,
+                ids=place.ids + 1000 * k,
+                descriptor_ids=place.ids + 1000 * k,
+                descriptors=rng.integers(0, 256, place.descriptors.shape, dtype=np.uint8),
+            )
+        )
+    found = [relocaliser.find(SIGHT, world, NOISE) for _ in range(3)]
+    assert [place and place.keyframe_id for place in found] == [None, None, 0]
 
 
 def test_another_image_is_no_place():

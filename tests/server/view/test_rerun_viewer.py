@@ -40,7 +40,7 @@ from semcast.server.viewing import check_viewer, open_viewer
 pytestmark = pytest.mark.xdist_group("real-time")
 
 CAMERA = Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
-DEADLINE_S = 20.0
+DEADLINE_S = 60.0
 
 
 def free_port():
@@ -266,20 +266,17 @@ def test_a_frozen_viewer_never_holds_up_the_tracker(feed_and_proxy):
     feed, process, _ = feed_and_proxy
     until(lambda: feed.num_connections == 1, "first connection")
     os.kill(process.pid, signal.SIGSTOP)
-    slowest_s = 0.0
-    started_s = time.monotonic()
-    k = 0
-    while time.monotonic() - started_s < 1.0:
+    took_s = []
+    for k in range(80):
         before = time.perf_counter()
         feed.submit(frame(k), Update(k))
-        slowest_s = max(slowest_s, time.perf_counter() - before)
-        k += 1
+        took_s.append(time.perf_counter() - before)
         time.sleep(0.01)
-    assert k > 20
-    assert slowest_s < 0.5  # a full pipe to a frozen viewer would hold it for ever
+    # A full pipe to a frozen viewer would hold each one up; other processes hold up one or the other.
+    assert np.percentile(took_s, 90) < 0.1
     closing_s = time.monotonic()
     feed.close()
-    assert time.monotonic() - closing_s < 10.0
+    assert time.monotonic() - closing_s < 20.0
     assert process.pid is None
 
 
