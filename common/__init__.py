@@ -44,6 +44,7 @@ Messages and transport
 Recorded sequences and recordings
     sequence                a recorded sequence with random access
     sequence_layouts        the folder layouts it is read from
+    colmap_file             cameras and poses of a COLMAP model
     sequence_sizes          sizes of its image files
     numbered_images         lines of a file, matched with images
     transforms_file         transforms.json
