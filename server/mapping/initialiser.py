@@ -205,11 +205,7 @@ class Initialiser:
         scene = self._scene_of(pair, noise)
         agreeing = 0.0 if scene is None else float(scene.motion.inliers.mean())
         self._agreeing = max(_LEAST_AGREEING, agreeing)
-        if (
-            scene is None
-            or not self._is_good(scene)
-            or not self._has_gone(pair, scene.motion, evidence_px[1])
-        ):
+        if scene is None or not self._is_good(scene) or not self._has_gone(pair, scene):
             return None
         if scene.is_contested and self._may_wait_for_the_other():
             return None
@@ -300,17 +296,13 @@ class Initialiser:
             and found.parallax_deg > _MIN_MEDIAN_PARALLAX_DEG
         )
 
-    def _has_gone(self, pair: _Pair, found: TwoViewResult, relief_px: float) -> bool:
-        """Whether it takes a way of the camera to explain two views, and not only a turn and errors.
-
-        Args:
-            pair: The views.
-            found: Their relative pose.
-            relief_px: What turning leaves of the tracks' way.
-        """
+    def _has_gone(self, pair: _Pair, scene: SceneMotion) -> bool:
+        """Whether it takes a way of the camera to explain two views, and not only a turn and errors."""
+        found, of_scene = scene.motion, ~scene.alone
+        xy0, xy1 = pair.xy0[of_scene], pair.xy1[of_scene]
         F = fundamental_matrix(self._camera, found.T_cam1_cam0)
-        sigma_px = MAD_TO_SIGMA * float(np.median(np.abs(sampson_px(F, pair.xy0, pair.xy1))))
-        if relief_px < _MIN_RELIEF_SIGMAS * sigma_px:
+        sigma_px = MAD_TO_SIGMA * float(np.median(np.abs(sampson_px(F, xy0, xy1))))
+        if self._relief_px(xy0, xy1) < _MIN_RELIEF_SIGMAS * sigma_px:
             return False
         xy0, xy1 = pair.xy0[found.inliers], pair.xy1[found.inliers]
         doubt_deg = turn_in_doubt_deg(self._camera, found.T_cam1_cam0, xy0, xy1)
