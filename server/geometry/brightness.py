@@ -23,6 +23,8 @@ _OFFSET_SIGMA_GREY = 10.0
 _MAX_GAIN = 4.0
 #: A change that moves the typical point by less does not matter to Lucas-Kanade.
 _MIN_CHANGE_GREY = 1.5
+#: Nor is a change told by points of which so many standard errors are as much: most of them were not found.
+_CHANCE_SIGMAS = 4.0
 
 
 def brightness_change(grey0: Grey, grey1: Grey, xy0: Array, xy1: Array) -> tuple[float, float] | None:
@@ -53,7 +55,8 @@ def brightness_change(grey0: Grey, grey1: Grey, xy0: Array, xy1: Array) -> tuple
         model = np.linalg.solve(normal, design.T @ (weight * after))
     gain, offset = float(model[0]), float(model[1])
     change = float(np.median(np.abs(design @ model - before)))
-    if not 1.0 / _MAX_GAIN < gain < _MAX_GAIN or change < _MIN_CHANGE_GREY:
+    by_chance = _CHANCE_SIGMAS * scale / np.sqrt(len(before))
+    if not 1.0 / _MAX_GAIN < gain < _MAX_GAIN or change < max(_MIN_CHANGE_GREY, by_chance):
         return None
     return gain, offset
 

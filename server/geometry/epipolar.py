@@ -273,6 +273,23 @@ def sampson_jacobian(
     return residual, J.T
 
 
+def turn_in_doubt_deg(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> float:
+    """Standard deviation in degrees of a relative pose's turn about its least certain axis.
+
+    Across a narrow strip of the image, a camera that goes sideways looks like one that turns.
+
+    Args:
+        camera: Of both images.
+        T_cam1_cam0: Pose, translation of length 1.
+        xy0: ``(N, 2)`` of matches that agree with it, each with an error of one pixel across its line.
+        xy1: ``(N, 2)``.
+    """
+    _, J = sampson_jacobian(camera, T_cam1_cam0, _tangent(T_cam1_cam0[:3, 3]), xy0, xy1)
+    # With next to nothing added, what the matches do not tell at all is in great doubt, and no error.
+    covariance = np.linalg.inv(J.T @ J + 1e-6 * np.eye(5))[:3, :3]
+    return float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[-1])))
+
+
 def refine_relative_pose(
     camera: Intrinsics,
     T_cam1_cam0: Array,

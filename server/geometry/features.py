@@ -215,10 +215,37 @@ def track_points(
         max_level: Pyramid levels above the full image.
         window_px: Side of the window.
     """
+    return track_through_light(
+        grey0,
+        grey1,
+        xy0,
+        guess1_xy,
+        max_forward_backward_px=max_forward_backward_px,
+        max_level=max_level,
+        window_px=window_px,
+    )[0]
+
+
+def track_through_light(
+    grey0: Grey,
+    grey1: Grey,
+    xy0: Array,
+    guess1_xy: Array,
+    *,
+    max_forward_backward_px: float = 1.5,
+    max_level: int = 3,
+    window_px: int = KLT_WINDOW_PX,
+) -> tuple[TrackedPoints, tuple[float, float] | None]:
+    """Follow points as ``track_points`` does, and tell the change of brightness that was made up for.
+
+    Returns:
+        The points; gain and offset from the first image to the second, None where there is no change.
+    """
     count = len(xy0)
     if count == 0 or grey0.shape != grey1.shape:
-        return TrackedPoints.none(count)
-    found = _track_alike(grey0, grey1, xy0, guess1_xy, max_forward_backward_px, max_level, window_px)
+        return TrackedPoints.none(count), None
+    found = _search(grey0, grey1, xy0, guess1_xy, max_forward_backward_px, max_level, window_px)
+    like_second, told = grey0, None
     for _ in range(2):
         # Where hardly any was found, the guesses are near enough for a first idea of the change.
         is_sure = bool(found.ok.mean() >= _MOSTLY_FOUND)
@@ -228,17 +255,34 @@ def track_points(
         if change is None:
             break
         levels = min(_LEVELS_ANEW, max_level) if is_sure else max_level
-        like_second = with_brightness(grey0, *change)
-        anew = _track_alike(like_second, grey1, xy0, xy1, max_forward_backward_px, levels, window_px)
+        alike = with_brightness(grey0, *change)
+        anew = _search(alike, grey1, xy0, xy1, max_forward_backward_px, levels, window_px)
         if anew.ok.sum() < (1.0 if is_sure else _CLEARLY_MORE) * found.ok.sum():
             break
-        found = anew
+        found, like_second, told = anew, alike, change
         if is_sure:
             break
-    return found
+    return _placed(like_second, grey1, xy0, found), told
 
 
-def _track_alike(
+def track_alike(
+    grey0: Grey,
+    grey1: Grey,
+    xy0: Array,
+    guess1_xy: Array,
+    *,
+    max_forward_backward_px: float = 1.5,
+    max_level: int = 3,
+    window_px: int = KLT_WINDOW_PX,
+) -> TrackedPoints:
+    """Follow points as ``track_points`` does between images that are known to have the same brightness."""
+    if len(xy0) == 0 or grey0.shape != grey1.shape:
+        return TrackedPoints.none(len(xy0))
+    found = _search(grey0, grey1, xy0, guess1_xy, max_forward_backward_px, max_level, window_px)
+    return _placed(grey0, grey1, xy0, found)
+
+
+def _search(
     grey0: Grey,
     grey1: Grey,
     xy0: Array,
@@ -247,7 +291,7 @@ def _track_alike(
     max_level: int,
     window_px: int,
 ) -> TrackedPoints:
-    """Follow points between images of the same brightness."""
+    """Find points by a large window, there and back, between images of the same brightness."""
     height, width = grey1.shape
     start = np.ascontiguousarray(xy0, dtype=np.float32)
     guess = np.clip(np.nan_to_num(guess1_xy), (0, 0), (width - 1, height - 1)).astype(np.float32)
@@ -259,49 +303,43 @@ def _track_alike(
     found = np.nan_to_num(found.reshape(-1, 2), nan=-1e4, posinf=-1e4, neginf=-1e4)
     inside = (found[:, 0] >= 1) & (found[:, 1] >= 1) & (found[:, 0] < width - 2) & (found[:, 1] < height - 2)
     ok = inside & (status.ravel() == 1)
-    backward_guess = (start + (guess - found)).astype(np.float32)
-    backward_guess = np.clip(backward_guess, start - 20.0, start + 20.0)
-    back, back_status, eigen = cv2.calcOpticalFlowPyrLK(
-        grey1,
-        grey0,
-        np.ascontiguousarray(np.clip(found, 0, (width - 1, height - 1)), dtype=np.float32),
-        backward_guess,
-        None,
-        None,
-        window,
-        min(2, max_level),
-        _CRITERIA,
-        flags | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS,
-        1e-4,
-    )
-    distance = np.linalg.norm(back.reshape(-1, 2).astype(np.float64) - start, axis=1)
-    distance = np.where((back_status.ravel() == 1) & np.isfinite(distance), distance, 99.0)
+    distance, gradient = np.full(len(xy0), 99.0), np.zeros(len(xy0))
+    there = np.flatnonzero(ok)
+    if len(there):
+        begin = start[there]
+        back_guess = np.clip(begin + (guess[there] - found[there]), begin - 20.0, begin + 20.0)
+        how = (window, min(2, max_level), _CRITERIA, flags | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS, 1e-4)
+        back, back_status, eigen = cv2.calcOpticalFlowPyrLK(
+            grey1, grey0, found[there], back_guess.astype(np.float32), None, None, *how
+        )
+        away = np.linalg.norm(back.reshape(-1, 2).astype(np.float64) - begin, axis=1)
+        distance[there] = np.where((back_status.ravel() == 1) & np.isfinite(away), away, 99.0)
+        gradient[there] = _where_found(np.asarray(eigen), np.asarray(back_status)) * _EIGEN_UNIT
     ok &= distance <= max_forward_backward_px
     return TrackedPoints(
-        xy=_placed(grey0, grey1, start, np.asarray(found, dtype=np.float32), ok),
+        xy=found.astype(np.float64),
         ok=ok,
         forward_backward_px=distance,
         photometric_grey=_where_found(np.asarray(error), np.asarray(status)),
-        gradient_grey2=_where_found(np.asarray(eigen), np.asarray(back_status)) * _EIGEN_UNIT,
+        gradient_grey2=gradient,
     )
 
 
-def _placed(
-    grey0: Grey, grey1: Grey, start: NDArray[np.float32], found: NDArray[np.float32], ok: NDArray[np.bool_]
-) -> Array:
-    """Where the points that are ``ok`` are by a small window, the others by the large one."""
-    rows = np.flatnonzero(ok)
-    xy = found.astype(np.float64)
+def _placed(grey0: Grey, grey1: Grey, xy0: Array, found: TrackedPoints) -> TrackedPoints:
+    """Put the points that are ``ok`` where a small window has them."""
+    rows = np.flatnonzero(found.ok)
     if len(rows) == 0:
-        return xy
+        return found
+    start, large = xy0[rows].astype(np.float32), found.xy[rows].astype(np.float32)
     window, flags = (_FINE_WINDOW_PX, _FINE_WINDOW_PX), cv2.OPTFLOW_USE_INITIAL_FLOW
-    placed, status, _ = cv2.calcOpticalFlowPyrLK(
-        grey0, grey1, start[rows], found[rows].copy(), None, None, window, 0, _CRITERIA, flags, 1e-4
+    small, status, _ = cv2.calcOpticalFlowPyrLK(
+        grey0, grey1, start, large.copy(), None, None, window, 0, _CRITERIA, flags, 1e-4
     )
-    placed = placed.reshape(-1, 2)
-    near = (status.ravel() == 1) & (np.abs(placed - found[rows]).max(axis=1) < _MAX_FINE_MOVE_PX)
-    xy[rows[near]] = placed[near]
-    return xy
+    small = small.reshape(-1, 2)
+    near = (status.ravel() == 1) & (np.abs(small - large).max(axis=1) < _MAX_FINE_MOVE_PX)
+    xy = found.xy.copy()
+    xy[rows[near]] = small[near]
+    return replace(found, xy=xy)
 
 
 def _where_found(values: NDArray[Any], status: NDArray[Any]) -> Array:

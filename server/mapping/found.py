@@ -5,9 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.server.geometry.features import TrackedPoints
+from semcast.server.geometry.features import Grey, TrackedPoints, track_alike
+from semcast.server.geometry.square_distance import square_distances
 
 Array = NDArray[np.float64]
+
+#: Found tracks next to one that was missed, by whose error of the guess it is looked for again.
+_NEIGHBOURS, _MIN_NEIGHBOURS = 5, 8
 
 
 @dataclass
@@ -41,3 +45,25 @@ class Found:
         self.forward_backward[rows] = points.forward_backward_px
         self.photometric[rows] = points.photometric_grey
         self.gradient[rows] = points.gradient_grey2
+
+    def look_again(
+        self, grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, rows: NDArray[np.intp]
+    ) -> None:
+        """Look for the missed ones of some tracks where those found next to them say they should be.
+
+        Rows that did not arrive spoil the coarse levels of a pyramid, which make up for a poor guess.
+
+        Args:
+            grey0: Image in which these tracks were seen last, as bright as the new one.
+            grey1: The new one.
+            xy0: ``(N, 2)`` where all tracks were.
+            guess1_xy: ``(N, 2)`` where they were expected.
+            rows: ``(M,)`` the tracks.
+        """
+        missed, seen = rows[~self.ok[rows]], rows[self.ok[rows]]
+        if len(missed) == 0 or len(seen) < _MIN_NEIGHBOURS:
+            return
+        square = square_distances(xy0[missed], xy0[seen])
+        near = seen[np.argsort(square, axis=1, kind="stable")[:, :_NEIGHBOURS]]
+        better = guess1_xy[missed] + np.median(self.xy[near] - guess1_xy[near], axis=1)
+        self.take(missed, track_alike(grey0, grey1, xy0[missed], better, max_level=2))

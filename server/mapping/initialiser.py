@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import interpolate_pose, invert_transform
-from semcast.server.geometry.epipolar import fit_rotation, rotation_residual_px
+from semcast.server.geometry.epipolar import (
+    fit_rotation,
+    fundamental_matrix,
+    rotation_residual_px,
+    sampson_px,
+    turn_in_doubt_deg,
+)
 from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import MIN_MATCHES, TwoViewResult, estimate_two_view
-from semcast.server.geometry.weighting import ConfidenceMode, NoiseModel, fuse_confidence
+from semcast.server.geometry.weighting import MAD_TO_SIGMA, ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.ambiguity import Side, decide
 from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
 from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
@@ -57,6 +63,14 @@ _LEAST_AGREEING = 0.5
 _MIN_FLOW_SHARE = 0.012
 #: Median angle between the rays of the two views.
 _MIN_MEDIAN_PARALLAX_DEG = 0.7
+#: It must be so many times what the turn between them is in doubt by. It has been four times and more, over
+#: poor links too; at the edges of views that a turn led apart, where a flat scene's other structure was taken
+#: for the true one, it was 1.0 to 1.2 times.
+_MIN_PARALLAX_DOUBTS = 2.0
+#: Median way that turning leaves of the tracks, in standard deviations of their distance to epipolar lines.
+#: Where the camera only turned and tracks err alike in all directions, that is 1.7, and was up to 3.3 after a
+#: search for lines along which they err; at starts it has been 5.4 and more, over poor links too.
+_MIN_RELIEF_SIGMAS = 4.0
 #: Inlier threshold of the search, in standard deviations of the noise, and its limits.
 _THRESHOLD_SIGMAS, _THRESHOLD_RANGE_PX = 2.0, (1.0, 3.0)
 #: A start takes points under half of the angle that is asked for later, and of larger errors than a landmark
@@ -191,7 +205,7 @@ class Initialiser:
         scene = self._scene_of(pair, noise)
         agreeing = 0.0 if scene is None else float(scene.motion.inliers.mean())
         self._agreeing = max(_LEAST_AGREEING, agreeing)
-        if scene is None or not self._is_good(scene):
+        if scene is None or not self._is_good(scene) or not self._has_gone(pair, scene):
             return None
         if scene.is_contested and self._may_wait_for_the_other():
             return None
@@ -281,6 +295,18 @@ class Initialiser:
             and not found.is_rotation
             and found.parallax_deg > _MIN_MEDIAN_PARALLAX_DEG
         )
+
+    def _has_gone(self, pair: _Pair, scene: SceneMotion) -> bool:
+        """Whether it takes a way of the camera to explain two views, and not only a turn and errors."""
+        found, of_scene = scene.motion, ~scene.alone
+        xy0, xy1 = pair.xy0[of_scene], pair.xy1[of_scene]
+        F = fundamental_matrix(self._camera, found.T_cam1_cam0)
+        sigma_px = MAD_TO_SIGMA * float(np.median(np.abs(sampson_px(F, xy0, xy1))))
+        if self._relief_px(xy0, xy1) < _MIN_RELIEF_SIGMAS * sigma_px:
+            return False
+        xy0, xy1 = pair.xy0[found.inliers], pair.xy1[found.inliers]
+        doubt_deg = turn_in_doubt_deg(self._camera, found.T_cam1_cam0, xy0, xy1)
+        return found.parallax_deg > _MIN_PARALLAX_DOUBTS * doubt_deg
 
     def _may_wait_for_the_other(self) -> bool:
         """Whether to wait until it is clear which motion is the scene's; asked, and counted, each time."""

@@ -216,7 +216,7 @@ class Reconstruction:
             pose = self._pose(T_world_on)
         if pose is None and self._tracks.follow_jump(sight):
             pose = self._pose(T_world_guess)
-        is_vague = pose is None or self._is_after_gap
+        is_vague = pose is None or self._is_after_gap or pose.num_inliers < 2 * MIN_INLIERS
         pose = self._with_more(sight, pose, T_world_guess)
         if pose is not None and is_vague and not self._resembles(sight, pose):
             self._tracks.clear()  # nothing that was found is kept
@@ -249,7 +249,7 @@ class Reconstruction:
         return pose
 
     def _resembles(self, sight: Sight, pose: TrackedPose) -> bool:
-        """Tell whether tracks that agree with a pose look as they did."""
+        """Tell whether tracks that agree with a pose look as they did: in noise some fit any guess."""
         return self._map.resembles(self._tracks, sight, pose.T_world_cam, pose.ids[pose.inliers])
 
     def _accept(self, sight: Sight, pose: TrackedPose) -> FrameResult:

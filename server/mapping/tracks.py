@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import KLT_WINDOW_PX
+from semcast.server.geometry.brightness import with_brightness
 from semcast.server.geometry.cells import cell_keys
 from semcast.server.geometry.features import (
     Grey,
@@ -15,7 +16,9 @@ from semcast.server.geometry.features import (
     deduplicate,
     detect_corners,
     sample_map,
+    track_alike,
     track_points,
+    track_through_light,
 )
 from semcast.server.geometry.warped_points import MAX_FROM_GUESS_PX, track_warped
 from semcast.server.geometry.weighting import (
@@ -39,8 +42,6 @@ MAX_COAST = 3
 #: A point nearer than this to rows that did not arrive counts as hidden. What the decoder makes of such rows
 #: fits what is around them: a window may reach into them, and does until only its middle row is left.
 _LOST_MARGIN_PX = 1
-#: Found tracks next to one that was missed, by whose error of the guess it is looked for again.
-_NEIGHBOURS, _MIN_NEIGHBOURS = 5, 8
 #: Share of tracks that must be found again; below, the frame counts as damaged and all tracks coast.
 _MIN_FOUND_SHARE = 0.35
 #: So many matches tell how what is around most tracks was warped.
@@ -197,15 +198,21 @@ class TrackTable:
         self._jumped = False
         found = Found.nothing(self.xy)
         guess_xy = np.where(self.fixed[:, None], self.xy, guess_xy)
+        is_in_light = False
         for back in range(min(len(self._greys), MAX_COAST + 1)):
             rows = np.flatnonzero(self.missed == back)
             if len(rows) == 0:
                 continue
-            grey = self._greys[-1 - back]
-            points = track_points(grey, sight.grey, self.xy[rows], guess_xy[rows], max_level=max_level)
+            grey, way = self._greys[-1 - back], (self.xy[rows], guess_xy[rows])
+            if is_in_light:
+                points = track_alike(grey, sight.grey, *way, max_level=max_level)
+            else:
+                points, change = track_through_light(grey, sight.grey, *way, max_level=max_level)
+                self._bring_to_light(change)
+                grey, is_in_light = self._greys[-1 - back], True
             found.take(rows, points)
             if not sight.usable.all():
-                self._look_again(grey, sight, found, guess_xy, rows)
+                found.look_again(grey, sight.grey, self.xy, guess_xy, rows)
         hidden = self._hidden(sight, found, guess_xy)
         coasting = hidden & ~found.ok
         of_scene = ~self.fixed
@@ -216,20 +223,13 @@ class TrackTable:
         self._settle(sight, found, coasting)
         self.remember(sight)
 
-    def _look_again(
-        self, grey: Grey, sight: Sight, found: Found, guess_xy: Array, rows: NDArray[np.intp]
-    ) -> None:
-        """Look for the missed ones of some tracks where those found next to them say they should be.
+    def _bring_to_light(self, change: tuple[float, float] | None) -> None:
+        """Let the images that tracks are followed from be as bright as the newest one, if they are not.
 
-        Rows that did not arrive spoil the coarse levels of a pyramid, which make up for a poor guess.
+        All of them were as bright as the last one, so what most tracks tell of it holds for all.
         """
-        missed, seen = rows[~found.ok[rows]], rows[found.ok[rows]]
-        if len(missed) == 0 or len(seen) < _MIN_NEIGHBOURS:
-            return
-        square = ((self.xy[missed][:, None] - self.xy[seen][None]) ** 2).sum(axis=2)
-        near = seen[np.argsort(square, axis=1, kind="stable")[:, :_NEIGHBOURS]]
-        better = guess_xy[missed] + np.median(found.xy[near] - guess_xy[near], axis=1)
-        found.take(missed, track_points(grey, sight.grey, self.xy[missed], better, max_level=2))
+        if change is not None:
+            self._greys = [with_brightness(grey, *change) for grey in self._greys]
 
     def follow_again(self, sight: Sight, guess: Callable[["TrackTable"], Array]) -> bool:
         """Look again for what ``follow`` just looked for, from another guess.

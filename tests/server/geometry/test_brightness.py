@@ -36,6 +36,9 @@ def test_a_change_that_does_not_matter_is_none(grey, rng):
     assert brightness_change(grey, noisy, xy, xy) is None
     assert brightness_change(grey, with_brightness(grey, 0.5, 0.0), xy[:19], xy[:19]) is None
     black = np.zeros_like(grey)
+    lost = [rng.uniform((10, 10), (309, 229), (2, 40, 2)) for _ in range(40)]
+    told = [brightness_change(grey, grey, *pairs) for pairs in lost]
+    assert sum(change is not None for change in told) <= 8, "points that are elsewhere tell nothing"
     assert brightness_change(black, grey, xy, xy) is None
 
 

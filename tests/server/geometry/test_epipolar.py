@@ -24,6 +24,7 @@ from semcast.server.geometry.epipolar import (
     sampson_jacobian,
     sampson_px,
     shape_of,
+    turn_in_doubt_deg,
 )
 
 CAMERA = Intrinsics(fx=500, fy=480, cx=320, cy=240, width=640, height=480)
@@ -198,6 +199,36 @@ def test_refinement_reaches_the_truth_on_exact_matches(seed):
     )
     assert rotation_angle_deg(found[:3, :3] @ T[:3, :3].T) < 1e-3
     assert angle_between_deg(found[:3, 3], T[:3, 3]) < 1e-2
+
+
+def sideways_pair(width, depth, num=150):
+    """A square to the right of the middle of the image, and a camera that has gone to the right."""
+    rng = np.random.default_rng(0)
+    z = rng.uniform(*depth, num)
+    xy0 = np.column_stack([rng.uniform(420, 420 + width, num), rng.uniform(60, 420, num)])
+    T = make_transform(np.eye(3), (-1, 0, 0))
+    return T, xy0, CAMERA.project(transform_points(T, CAMERA.unproject(xy0) * z[:, None]))
+
+
+def test_the_turn_of_a_relative_pose_errs_as_much_as_it_is_in_doubt():
+    T, xy0, xy1 = sideways_pair(200, (5, 12))
+    turned = []
+    for seed in range(200):
+        noise0, noise1 = 0.1 * np.random.default_rng(seed).normal(size=(2, *xy0.shape))
+        found = refine_relative_pose(CAMERA, T, xy0 + noise0, xy1 + noise1, np.full(len(xy0), 1.0))
+        turned.append(found[:3, :3] - np.eye(3))
+    turned = np.array(turned)
+    errors = np.degrees(np.column_stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]]))
+    largest = np.sqrt(np.linalg.eigvalsh(np.cov(errors.T))[-1])
+    assert 0.1 * turn_in_doubt_deg(CAMERA, T, xy0, xy1) == pytest.approx(largest, rel=0.15)
+
+
+def test_a_turn_is_in_doubt_across_a_narrow_strip_and_without_enough_matches():
+    T, xy0, xy1 = sideways_pair(200, (8, 9))
+    whole = turn_in_doubt_deg(CAMERA, T, xy0, xy1)
+    strip = turn_in_doubt_deg(CAMERA, *sideways_pair(40, (8, 9)))
+    assert strip > 4.0 * whole
+    assert turn_in_doubt_deg(CAMERA, T, xy0[:4], xy1[:4]) > 1e3
 
 
 def test_weights_help_when_they_are_right():

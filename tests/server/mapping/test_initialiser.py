@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
@@ -106,6 +107,22 @@ def test_standing_still_and_damaged_images_begin_nothing():
     frames, _ = ride(6)
     k, _ = begin(frames, is_damaged=lambda k: k == 2)
     assert k == 3
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_camera_that_turns_begins_nothing_with_tracks_that_err_by_pixels(seed):
+    """A way of the camera is always found along which most of them err."""
+    rng = np.random.default_rng(seed)
+    camera = Intrinsics(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240)
+    bearing = rng.uniform(-0.8, 1.6, 750)
+    rays = np.column_stack([np.sin(bearing), rng.uniform(-0.5, 0.5, 750), np.cos(bearing)])
+    initialiser = Initialiser(camera, "off", 1.0, 0)
+    for k in range(14):
+        turned = rays @ exp_so3(np.array([0.0, 0.06 * k, 0.0]))
+        xy = camera.project(turned) + 2.5 * rng.standard_normal((750, 2))
+        seen = (turned[:, 2] > 0.1) & ((xy > 0) & (xy < [320, 240])).all(axis=1)
+        frame = Observed(k, k * 10**8, np.flatnonzero(seen), xy[seen], np.ones(int(seen.sum())))
+        assert initialiser.add(frame, NOISE) is None
 
 
 def never_decided(monkeypatch):

@@ -1,5 +1,6 @@
 """A camera that loses its map: parts begun anew, joined again, and turns that leave all landmarks behind."""
 
+import functools
 from dataclasses import replace
 
 import cv2
@@ -263,8 +264,24 @@ def test_a_part_begun_after_a_turn_is_not_taken_for_the_old_one(caplog, monkeypa
         assert (world.landmarks.submap[row[row >= 0]] == keyframe.submap).all()
 
 
+@functools.cache
+def turn_in_bad_images(num_frames):
+    """The camera turns by 56 degrees after nine steps; the true poses, and what it sees while it turns."""
+    on, turning = (make_transform(exp_so3((0, np.radians(a), 0)), (0.12, 0, 0)) for a in (0.0, 3.5))
+    truth = [np.eye(4)]
+    for step in ([on] * 9 + [turning] * 16 + [on] * 16)[: num_frames - 1]:
+        truth.append(truth[-1] @ step)
+    return truth, [render(T) for T in truth]
+
+
+def made_bad(image, rng):
+    """Blurred, and noisier than what is left of its contrast."""
+    noise = rng.normal(0.0, 30.0, (*CAMERA.shape_hw, 1))
+    return np.clip(cv2.GaussianBlur(image, None, 10.0) + noise, 0, 255).astype(np.uint8)
+
+
 def test_a_part_after_a_turn_in_bad_images_begins_as_they_say_and_gets_its_unit_after_a_second(monkeypatch):
-    """The camera turns by 56 degrees where no point can be followed; a start makes the part too large."""
+    """No point can be followed while the camera turns; a start makes the part too large."""
     lay, rng = Passage.lay, np.random.default_rng(0)
 
     def laid_too_large(passage, *how):
@@ -272,17 +289,10 @@ def test_a_part_after_a_turn_in_bad_images_begins_as_they_say_and_gets_its_unit_
         return T_world_ref, scale if passage._before is None else 1.5 * scale
 
     monkeypatch.setattr(Passage, "lay", laid_too_large)
-    on, turning = (make_transform(exp_so3((0, np.radians(a), 0)), (0.12, 0, 0)) for a in (0.0, 3.5))
-    truth = [np.eye(4)]
-    for step in [on] * 9 + [turning] * 16 + [on] * 16:
-        truth.append(truth[-1] @ step)
+    truth, images = turn_in_bad_images(42)
     core, results = make(lost_after_s=0.05), []
-    for k, T in enumerate(truth):
-        image = render(T)
-        if 10 <= k < 26:
-            noise = rng.normal(0.0, 30.0, (*CAMERA.shape_hw, 1))
-            image = np.clip(cv2.GaussianBlur(image, None, 10.0) + noise, 0, 255).astype(np.uint8)
-        results.append(core.process(frame_of(k, image)))
+    for k, image in enumerate(images):
+        results.append(core.process(frame_of(k, made_bad(image, rng) if 10 <= k < 26 else image)))
     assert all(r.T_world_cam is None for r in results[11:26])
     assert (results[9].submap, results[-1].submap, results[-1].state) == (0, 1, TrackingState.TRACKING)
     found = core.final_trajectory()
@@ -290,6 +300,17 @@ def test_a_part_after_a_turn_in_bad_images_begins_as_they_say_and_gets_its_unit_
     assert rotation_angle_deg(turned.T @ truly_turned) < 16.0, "without a look at them half of it is missed"
     before, after = (np.linalg.norm(found[k + 6][:3, 3] - found[k][:3, 3]) for k in (2, 34))
     assert after == pytest.approx(before, rel=0.2)
+
+
+SLOW_DRAWS = [pytest.param(seed, marks=pytest.mark.slow) for seed in (*range(4), *range(5, 10), 11)]
+
+
+@pytest.mark.parametrize("seed", [4, 10, *SLOW_DRAWS])
+def test_noise_tells_no_pose_and_begins_no_part(seed):
+    core, rng = make(lost_after_s=0.05), np.random.default_rng(seed)
+    for k, image in enumerate(turn_in_bad_images(26)[1]):
+        result = core.process(frame_of(k, made_bad(image, rng) if k >= 10 else image))
+        assert (result.T_world_cam is None) == (k < 2 or k >= 10), k
 
 
 def test_a_place_without_a_pose_gives_nothing_up(room, monkeypatch):
