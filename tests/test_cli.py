@@ -91,6 +91,13 @@ def test_an_unknown_option_is_wrong_usage(capsys):
     assert exit_info.value.code == 2
 
 
+@pytest.mark.parametrize("verb", [["demo"], ["channel", "run"], ["eval", "pairs"]])
+def test_a_shortened_option_is_refused_with_the_whole_one_as_a_hint(verb, capsys):
+    with pytest.raises(SystemExit):
+        main([*verb, "--snr", "3"])
+    assert "unrecognized arguments: --snr 3, did you mean '--snr-db'?" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [["channel", "--snr-db", "much"], ["eval", "codec", "--snr-db", "much"]])
 def test_wrong_usage_is_one_line_that_names_the_help(words, capsys):
     with pytest.raises(SystemExit):

@@ -10,12 +10,13 @@ import importlib
 import io
 import logging
 import os
+import re
 import shutil
 import sys
 import textwrap
 import traceback
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NoReturn
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from semcast import SemcastError, __version__
 from semcast.common.argument_order import arguments_last
@@ -62,17 +63,32 @@ EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 class _Parser(argparse.ArgumentParser):
     """A parser that says what is wrong in a line, without the usage of dozens of options before it.
 
-    Its help fails where standard output can't be written; argparse keeps that to itself.
+    Options are written in full: what is short for one of them today may be short for two tomorrow. Its help
+    fails where standard output can't be written; argparse keeps that to itself.
     """
 
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(allow_abbrev=False, **settings)
+
     def error(self, message: str) -> NoReturn:
-        self.exit(EXIT_USAGE, f"{self.prog}: {message} ('{self.prog} --help' lists the options)\n")
+        unknown = re.search(r"unrecognized arguments: (--[\w-]+)", message)
+        hint = near_match(unknown[1], list(_long_options(self))) if unknown else ""
+        self.exit(EXIT_USAGE, f"{self.prog}: {message}{hint} ('{self.prog} --help' lists the options)\n")
 
     def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
         if sys.stdout is not None and file is sys.stdout:
             file.write(message)
         else:
             super()._print_message(message, file)
+
+
+def _long_options(parser: argparse.ArgumentParser) -> Iterator[str]:
+    """Return the options of a verb and of its sub-verbs: argparse complains of unknown ones as the verb."""
+    for action in parser._actions:
+        yield from (option for option in action.option_strings if option.startswith("--"))
+        if isinstance(action, argparse._SubParsersAction):
+            for child in action.choices.values():
+                yield from _long_options(child)
 
 
 def _overview() -> argparse.ArgumentParser:
