@@ -288,12 +288,29 @@ def test_doctor_tells_by_its_exit_code_whether_required_roles_are_alive(capsys, 
         assert capsys.readouterr().out == "alive (cam0): server\n"
         assert main([*words, "server,agent,channel"]) == 1
         assert capsys.readouterr().out == (
-            "agent (cam0) is not seen: start it with 'semcast agent'\n"
-            "channel (cam0) is not seen: start it with 'semcast channel'\n"
+            "agent (cam0) is not seen: start it with 'semcast agent --agent-id cam0'\n"
+            "channel (cam0) is not seen: start it with 'semcast channel --agent-id cam0'\n"
         )
         with pytest.raises(SystemExit):
             main([*words, "server,camera"])
         assert "must be some of agent,channel,server, got 'server,camera'" in capsys.readouterr().err
+
+
+def test_doctor_names_the_agents_that_go_by_another_name():
+    hub, endpoint = open_hub()
+    with hub:
+        hub.declare_alive("cam1", "agent")
+        *roles, others = check_system(endpoint, "agent0")
+        assert [finding.text for finding in roles] == [
+            f"not seen: start it with 'semcast {role}'" for role in ("agent", "channel", "server")
+        ]
+        assert (others.what, others.verdict) == ("other agents", "note")
+        assert others.text == "cam1: --agent-id says which of them is meant"
+        hub.declare_alive("agent0", "agent")
+        assert [finding.what for finding in check_system(endpoint, "cam1")][-1] == "other agents"
+        for role in ("agent", "channel", "server"):
+            hub.declare_alive("cam0", role)
+        assert len(list(check_system(endpoint, "cam0"))) == 3, "who finds all roles asked for the right one"
 
 
 def test_doctor_tells_what_a_running_system_says_of_itself():
@@ -310,7 +327,7 @@ def test_doctor_tells_what_a_running_system_says_of_itself():
         assert re.fullmatch(words, agent.text)
         assert channel.verdict == "note"
         assert channel.text.startswith("alive, but says nothing of itself")
-        assert "start it with 'semcast server'" in server.text
+        assert "start it with 'semcast server --agent-id cam0'" in server.text
         metrics.be_at("waiting")
         metrics.error("the disk is full")
         agent = next(check_system(endpoint, "cam0"))

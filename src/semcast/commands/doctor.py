@@ -10,10 +10,10 @@ import platform
 import shutil
 import socket
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.table import Table
 from rich.text import Text
@@ -22,10 +22,14 @@ from semcast.commands.console import plain_console
 from semcast.commands.paths import named_path
 from semcast.common.cores import usable_cores
 from semcast.common.errors import ConfigError, TransportError
+from semcast.common.keys import DEFAULT_AGENT_ID
 from semcast.common.messages import ROLES, StatusMessage
 from semcast.common.metrics import frames_in_words
 from semcast.common.network_settings import NetworkSettings
 from semcast.server.view.process import window_display
+
+if TYPE_CHECKING:
+    from semcast.common.transport import Session
 
 Verdict = Literal["good", "note", "bad"]
 _STYLE = {"good": "green", "note": "yellow", "bad": "red"}
@@ -170,6 +174,7 @@ def check_system(connect: str, agent_id: str, zenoh_config: Path | None = None) 
         with open_client(_network(connect, zenoh_config), _CONNECT_S) as session:
             roles = session.alive_roles(agent_id, _CONNECT_S)
             statuses = hear_statuses(session, agent_id, roles)
+            others = _others(session, agent_id, roles)
     except TransportError as err:
         yield Finding(f"system at {connect}", "bad", str(err))
         return
@@ -180,7 +185,22 @@ def check_system(connect: str, agent_id: str, zenoh_config: Path | None = None) 
         elif role in roles:
             yield Finding(what, "note", "alive, but says nothing of itself: it hangs, or is just ending")
         else:
-            yield Finding(what, "note", f"not seen: start it with 'semcast {role}'")
+            yield Finding(what, "note", f"not seen: start it with '{_start(role, agent_id)}'")
+    if others:
+        yield Finding("other agents", "note", others)
+
+
+def _start(role: str, agent_id: str) -> str:
+    """Return the command that starts a role, short of what only its user knows."""
+    named = "" if agent_id == DEFAULT_AGENT_ID else f" --agent-id {agent_id}"
+    return f"semcast {role}{named}"
+
+
+def _others(session: "Session", agent_id: str, roles: Collection[str]) -> str:
+    """Name the agents that are there under other names, where a role of the one asked for is not seen."""
+    others = [] if len(roles) == len(ROLES) else session.alive_agents(_CONNECT_S)
+    names = [name for name in others if name != agent_id]
+    return f"{', '.join(names)}: --agent-id says which of them is meant" if names else ""
 
 
 def _in_words(status: StatusMessage) -> str:
@@ -218,7 +238,7 @@ def print_required(connect: str, agent_id: str, required: Iterable[str], zenoh_c
     missing = [role for role in required if role not in roles]
     for role in missing:
         plain_console().print(
-            f"{role} ({agent_id}) is not seen: start it with 'semcast {role}'", soft_wrap=True
+            f"{role} ({agent_id}) is not seen: start it with '{_start(role, agent_id)}'", soft_wrap=True
         )
     if not missing:
         plain_console().print(f"alive ({agent_id}): {', '.join(required)}", soft_wrap=True)
@@ -245,7 +265,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also check a running system, such as tcp/127.0.0.1:7447: what its roles count, and last errors",
     )
     parser.add_argument(
-        "--agent-id", default="agent0", metavar="NAME", help="whose roles to look for (default agent0)"
+        "--agent-id",
+        default=DEFAULT_AGENT_ID,
+        metavar="NAME",
+        help=f"whose roles to look for (default {DEFAULT_AGENT_ID})",
     )
     parser.add_argument(
         "--require",
