@@ -33,8 +33,10 @@ class MissingSettingError(ConfigError):
 
 def near_match(word: str, allowed: list[str]) -> str:
     """Return ``", did you mean 'x'?"`` for a close name in ``allowed``, or an empty string."""
-    # "snr" is close to "snr_db" (0.67), and "resize" to "trace_file" (0.5) is not.
-    close = difflib.get_close_matches(word, allowed, n=1, cutoff=0.65)
+    # "snr" is close to "snr_db" (0.67), and "resize" to "trace_file" (0.5) is not. A word cut short
+    # is one that begins so: "seq" is closer to "seed" than to "sequence".
+    begun = [name for name in allowed if word and name.startswith(word)]
+    close = difflib.get_close_matches(word, begun or allowed, n=1, cutoff=0.0 if begun else 0.65)
     return f", did you mean {close[0]!r}?" if close else ""
 
 

@@ -98,6 +98,20 @@ def test_a_shortened_option_is_refused_with_the_whole_one_as_a_hint(verb, capsys
     assert "unrecognized arguments: --snr 3, did you mean '--snr-db'?" in capsys.readouterr().err
 
 
+def test_what_a_sub_verb_does_not_know_is_answered_with_its_own_options(capsys):
+    with pytest.raises(SystemExit):
+        main(["eval", "codec", "--seq=room", "-x"])  # other sub-verbs have a --sequence
+    assert capsys.readouterr().err == (
+        "semcast eval codec: unrecognized arguments: --seq=room -x, did you mean '--seed'? "
+        "('semcast eval codec --help' lists the options)\n"
+    )
+    with pytest.raises(SystemExit):
+        main(["eval", "trajectory", "--seq", "room"])
+    assert "semcast eval trajectory: unrecognized arguments: --seq room, did you mean '--sequence'?" in (
+        capsys.readouterr().err
+    )
+
+
 @pytest.mark.parametrize("words", [["channel", "--snr-db", "much"], ["eval", "codec", "--snr-db", "much"]])
 def test_wrong_usage_is_one_line_that_names_the_help(words, capsys):
     with pytest.raises(SystemExit):

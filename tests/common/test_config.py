@@ -129,6 +129,9 @@ def test_only_a_close_name_is_proposed():
     names = ["trace_file", "snr_db", "seed"]
     assert near_match("snr", names) == ", did you mean 'snr_db'?"
     assert near_match("resize", names) == ""
+    assert near_match("tra", names) == ", did you mean 'trace_file'?", "it begins so"
+    assert near_match("seq", [*names, "sequence"]) == ", did you mean 'sequence'?"
+    assert near_match("", names) == ""
 
 
 @pytest.mark.parametrize("text", ["name = ", "count = " + 5000 * "9", "levels = " + 5000 * "["])
