@@ -251,7 +251,9 @@ def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, 
         stack.callback(beat.close)
         stack.callback(emulator.close)
         session.declare_alive(settings.agent_id, ROLE)
-        logger.info("channel %s at %g dB", settings.link.channel, settings.link.snr_db)
+        link = settings.link
+        snr = f"that of {link.trace_file}" if link.has_own_snr else link.snr_label
+        logger.info("channel %s, SNR: %s", link.channel, snr)
         warn_of_settings(settings.link)
         emulator.work(stop)
     return metrics.summary()

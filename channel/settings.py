@@ -132,6 +132,18 @@ class ChannelSettings:
             raise ValueError("trace_file must be given for trace 'file', got None")
 
     @property
+    def has_own_snr(self) -> bool:
+        """Whether the SNR comes from a file alone."""
+        return self.channel == "trace" and self.trace == "file"
+
+    @property
+    def snr_label(self) -> str:
+        """What stands for the SNR: ``6 dB``, ``ramp from 6 dB`` or ``trace``, that of a file."""
+        if self.has_own_snr:
+            return "trace"
+        return f"{self.trace} from {self.snr_db:g} dB" if self.channel == "trace" else f"{self.snr_db:g} dB"
+
+    @property
     def fades_over_time(self) -> bool:
         """Whether gains depend on when a slot is sent."""
         return self.channel in _CHANNELS_OF["doppler_hz"] and self.doppler_hz > 0.0

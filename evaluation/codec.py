@@ -43,7 +43,7 @@ from semcast.evaluation.plots import plot_against_snr
 from semcast.evaluation.report import json_ready, provenance, write_json
 from semcast.evaluation.sounding import told_at_first
 from semcast.evaluation.statistics import finite_mean, percentiles, spearman
-from semcast.evaluation.trace_snr import check_snrs, is_of_file, snr_file_label, stated_snr_db
+from semcast.evaluation.trace_snr import check_snrs, snr_file_label, stated_snr_db
 from semcast.evaluation.uncertainty_maps import block_means, pixel_label
 
 logger = logging.getLogger(__name__)
@@ -115,7 +115,7 @@ class CodecSettings:
     @property
     def links(self) -> dict[float, ChannelSettings]:
         """Channel settings by the SNR that is set; a trace from a file is one link."""
-        snrs_db = self.snr_db[:1] if is_of_file(self.link) else self.snr_db
+        snrs_db = self.snr_db[:1] if self.link.has_own_snr else self.snr_db
         return {snr_db: replace(self.link, snr_db=snr_db) for snr_db in snrs_db}
 
 

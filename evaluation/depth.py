@@ -36,7 +36,7 @@ from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.render import SCENES, RenderSettings, SceneName, render_scene
 from semcast.evaluation.scenes.surfaces import exact_depth
 from semcast.evaluation.statistics import finite_mean
-from semcast.evaluation.trace_snr import check_snrs, is_of_file, snr_label, stated_snr_db
+from semcast.evaluation.trace_snr import check_snrs, snr_label, stated_snr_db
 from semcast.server.dense.depth_map import DepthImage
 from semcast.server.dense.view import View, view_of
 from semcast.server.export.outputs import trajectory_of
@@ -172,7 +172,7 @@ def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = Non
         shown = sorted(views)[len(views) // 2]
         strip = [against.pictures(shown, views[shown])]
         results = [] if scene.truth is None else [_row(CLEAN, None, "off", against, [clean], [], 0.0)]
-        for snr_db in settings.snr_db[:1] if is_of_file(settings.link) else settings.snr_db:
+        for snr_db in settings.snr_db[:1] if settings.link.has_own_snr else settings.snr_db:
             pictures = {}
             for name, codec in under_name.items():
                 rows, picture = _measured(settings, scene, against, name, codec, snr_db, shown)

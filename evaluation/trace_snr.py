@@ -1,14 +1,10 @@
 """What an SNR that is set says about a link whose SNR follows a trace: at most where the trace starts."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from semcast.channel.settings import ChannelSettings
-
-
-def is_of_file(link: ChannelSettings) -> bool:
-    """Tell whether the SNR comes from a file alone."""
-    return link.channel == "trace" and link.trace == "file"
 
 
 def check_snrs(snr_db: Sequence[float], link: ChannelSettings) -> None:
@@ -17,21 +13,19 @@ def check_snrs(snr_db: Sequence[float], link: ChannelSettings) -> None:
     Raises:
         ValueError: There are several SNRs, and a file has its own.
     """
-    if len(snr_db) > 1 and is_of_file(link):
+    if len(snr_db) > 1 and link.has_own_snr:
         values = " ".join(f"{value:g}" for value in snr_db)
         raise ValueError(f"snr_db must be a single value with --trace file, which sets the SNR, got {values}")
 
 
 def stated_snr_db(snr_db: float, link: ChannelSettings) -> float | None:
     """Return the SNR in dB that a result states: as set, None where a file sets it."""
-    return None if is_of_file(link) else snr_db
+    return None if link.has_own_snr else snr_db
 
 
 def snr_label(snr_db: float, link: ChannelSettings) -> str:
     """Return what stands for an SNR in a figure: ``6 dB``, ``ramp from 6 dB`` or ``trace``."""
-    if is_of_file(link):
-        return "trace"
-    return f"{link.trace} from {snr_db:g} dB" if link.channel == "trace" else f"{snr_db:g} dB"
+    return replace(link, snr_db=snr_db).snr_label
 
 
 def snr_file_label(snr_db: float, link: ChannelSettings) -> str:

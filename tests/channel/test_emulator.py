@@ -334,6 +334,21 @@ def test_a_trace_that_is_not_there_is_told_before_waiting_for_a_hub(tmp_path):
         run_channel(settings, threading.Event())
 
 
+def test_the_log_names_the_file_that_the_snr_is_of(tmp_path, caplog):
+    file = tmp_path / "drive.csv"
+    file.write_text("t_s,snr_db\n0,12\n")
+    caplog.set_level("INFO", "semcast.channel.emulator")
+    for link in (
+        ChannelSettings(channel="trace", trace="file", trace_file=file),
+        ChannelSettings(channel="trace", snr_db=8.0),
+        ChannelSettings(channel="rayleigh", snr_db=8.0),
+    ):
+        Ends(link).close()
+    said = [record.getMessage() for record in caplog.records]
+    for words in (f"channel trace, SNR: that of {file}", "trace, SNR: ramp from 8 dB", "rayleigh, SNR: 8 dB"):
+        assert any(line.endswith(words) for line in said), words
+
+
 def test_settings_are_checked():
     with pytest.raises(ValueError, match="seed must be at least 0, got -1"):
         EmulatorSettings(seed=-1)

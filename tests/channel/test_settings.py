@@ -110,3 +110,11 @@ def test_values_of_other_traces_and_of_motion_are_named():
     assert by_file.without_effect() == ["snr_db"]
     assert ChannelSettings(channel="rayleigh", slot_ms=2.0).without_effect() == ["slot_ms"]
     assert ChannelSettings(channel="rayleigh", slot_ms=2.0, doppler_hz=9.0).without_effect() == []
+
+
+def test_the_snr_of_a_link_is_named_as_what_it_is():
+    assert ChannelSettings(snr_db=6.5).snr_label == "6.5 dB"
+    assert ChannelSettings(channel="trace", snr_db=12.0).snr_label == "ramp from 12 dB"
+    by_file = ChannelSettings(channel="trace", trace="file", trace_file=Path("x.csv"))
+    assert (by_file.snr_label, by_file.has_own_snr) == ("trace", True)
+    assert not ChannelSettings(trace="file", trace_file=Path("x.csv")).has_own_snr, "the channel has no trace"
