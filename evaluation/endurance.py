@@ -5,6 +5,7 @@ coming back. Frames are sent and decoded once; only estimation is measured, as i
 adjustment in its own process.
 """
 
+import logging
 import os
 import time
 from collections.abc import Iterator
@@ -35,6 +36,8 @@ from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
+
+logger = logging.getLogger(__name__)
 
 VERB = "eval endurance"
 #: One run; its seed is also that of the search.
@@ -164,6 +167,8 @@ def _measure(
                 row = _row(reconstruction, times_ms, seen, frames, truth, interval_ns)
                 row["bundle_memory_mb"] = resident_mb(bundle.pid) if bundle.pid is not None else 0.0
                 rows.append(row)
+                told = (k + 1, settings.frames, row["frame_ms_p50"], row["memory_mb"])
+                logger.info("%d of %d frames: p50 %.1f ms a frame, %.0f MB", *told)
                 times_ms, seen = [], []
     finally:
         reconstruction.close()

@@ -195,7 +195,7 @@ LAYOUTS: dict[str, _Layout] = {
             "runs on": ("ran_share", ".0%"),
             "share of time": ("time_share", ".0%"),
         },
-        lambda report: [f"Bottleneck: {report['bottleneck']}"],
+        lambda report: [f"{report['num_frames']} frames. Bottleneck: {report['bottleneck']}"],
     ),
     "endurance": _Layout(
         lambda report: report["results"],

@@ -1,3 +1,4 @@
+import re
 import socket
 import time
 
@@ -106,6 +107,8 @@ def test_rendered_pictures_give_the_camera_they_were_rendered_with(tmp_path, pic
     assert found.distortion[:2] == pytest.approx(TRUE.distortion[:2], abs=0.03)
     captured = capsys.readouterr()
     assert "12 views" in captured.out
+    for name in ("fx", "fy", "cx", "cy"):
+        assert re.search(rf"\b{name} \d+\.\d\d \+- \d\.\d\d px\b", captured.out), name
     assert "doubtful" not in captured.err
     assert cv2.imread(str(out.with_suffix(".png"))).shape == (360, 960, 3)
 

@@ -86,6 +86,10 @@ def test_a_long_name_takes_several_lines_and_cuts_no_other_column():
     assert body[0].split()[1:] == table.rows[0][1:]
 
 
+def test_times_say_over_how_many_frames_they_are():
+    assert result_table("latency", shipped("latency")).notes == ["46 frames. Bottleneck: decode"]
+
+
 def test_figures_that_are_not_there_are_dashes():
     report = shipped("confidence")
     del report["results"][0]["keypoint"]["maps"]["keypoint_confidence"]

@@ -221,8 +221,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise SemcastError(f"{picture} can't be written")
     c, deviation = result.intrinsics, result.deviations
     print(f"{c.width}x{c.height}, {len(result.views)} views, reprojection error {result.rms_px:.3f} px rms")
-    print(f"fx {c.fx:.2f} +- {deviation[0]:.2f}, fy {c.fy:.2f} +- {deviation[1]:.2f}")
-    print(f"cx {c.cx:.2f} +- {deviation[2]:.2f}, cy {c.cy:.2f} +- {deviation[3]:.2f}")
+    print(f"fx {c.fx:.2f} +- {deviation[0]:.2f} px, fy {c.fy:.2f} +- {deviation[1]:.2f} px")
+    print(f"cx {c.cx:.2f} +- {deviation[2]:.2f} px, cy {c.cy:.2f} +- {deviation[3]:.2f} px")
     print("distortion " + (" ".join(f"{k:.5f}" for k in c.distortion) or "none"))
     print(f"{arguments.out}\n{picture}")
     for name in result.rejected:
