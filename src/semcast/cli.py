@@ -10,12 +10,11 @@ import importlib
 import io
 import logging
 import os
-import re
 import shutil
 import sys
 import textwrap
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from semcast import SemcastError, __version__
@@ -70,25 +69,23 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any) -> None:
         super().__init__(allow_abbrev=False, **settings)
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse words that are not known here: argparse would complain of a sub-verb's as the verb."""
+        known, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            options = [o for action in self._actions for o in action.option_strings if o.startswith("--")]
+            option = next((word.partition("=")[0] for word in unknown if word.startswith("--")), "")
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{near_match(option, options)}")
+        return known, unknown
+
     def error(self, message: str) -> NoReturn:
-        unknown = re.search(r"unrecognized arguments: (--[\w-]+)", message)
-        hint = near_match(unknown[1], list(_long_options(self))) if unknown else ""
-        self.exit(EXIT_USAGE, f"{self.prog}: {message}{hint} ('{self.prog} --help' lists the options)\n")
+        self.exit(EXIT_USAGE, f"{self.prog}: {message} ('{self.prog} --help' lists the options)\n")
 
     def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
         if sys.stdout is not None and file is sys.stdout:
             file.write(message)
         else:
             super()._print_message(message, file)
-
-
-def _long_options(parser: argparse.ArgumentParser) -> Iterator[str]:
-    """Return the options of a verb and of its sub-verbs: argparse complains of unknown ones as the verb."""
-    for action in parser._actions:
-        yield from (option for option in action.option_strings if option.startswith("--"))
-        if isinstance(action, argparse._SubParsersAction):
-            for child in action.choices.values():
-                yield from _long_options(child)
 
 
 def _overview() -> argparse.ArgumentParser:
