@@ -118,7 +118,9 @@ def _read(
         if path.suffix == ".bin":
             return list(from_bin(path.read_bytes()))
         return list(from_text(path.read_text(encoding="utf-8-sig")))
-    except (OSError, ValueError, KeyError, IndexError, struct.error) as err:
+    except struct.error as err:
+        raise SourceError(f"{path} can't be used as COLMAP's: it ends too early") from err
+    except (OSError, ValueError) as err:
         raise SourceError(f"{path} can't be used as COLMAP's: {err}") from err
 
 

@@ -204,7 +204,7 @@ DAMAGES = {
     "images cut off": (
         _write_binary,
         lambda f: _cut(f / "images.bin", 90),
-        "images.bin can't be used as COLMAP's",
+        "images.bin can't be used as COLMAP's: it ends too early",
     ),
     "a name cut off": (
         _write_binary,
@@ -216,7 +216,11 @@ DAMAGES = {
         lambda f: _put(f / "images.bin", b"000000.png\0", struct.pack("<Q", 2**63)),
         "images.bin can't be used as COLMAP's: it ends within the points of 000000.png",
     ),
-    "cameras cut off": (_write_binary, lambda f: _cut(f / "cameras.bin", 40), "cameras.bin can't be used"),
+    "cameras cut off": (
+        _write_binary,
+        lambda f: _cut(f / "cameras.bin", 40),
+        "cameras.bin can't be used as COLMAP's: it ends too early",
+    ),
     "unknown number": (
         _write_binary,
         lambda f: (f / "cameras.bin").write_bytes(struct.pack("<QiiQQ", 1, 1, 77, 32, 24)),
