@@ -102,7 +102,7 @@ def read_colmap(folder: Path) -> ColmapModel:
         _check_one_camera(used)
     except KeyError as err:
         raise SourceError(f"{folder} has no camera {err}, which took one of its images") from err
-    except ValueError as err:
+    except (ValueError, OverflowError) as err:
         raise SourceError(f"{folder} holds no usable intrinsics: {err}") from err
     T_cam_world = np.stack([image.T_cam_world for image in images])
     return ColmapModel(tuple(image.name for image in images), invert_transform(T_cam_world), used[0])
@@ -118,7 +118,9 @@ def _read(
         if path.suffix == ".bin":
             return list(from_bin(path.read_bytes()))
         return list(from_text(path.read_text(encoding="utf-8-sig")))
-    except (OSError, ValueError, KeyError, IndexError, struct.error) as err:
+    except struct.error as err:
+        raise SourceError(f"{path} can't be used as COLMAP's: it ends too early") from err
+    except (OSError, ValueError) as err:
         raise SourceError(f"{path} can't be used as COLMAP's: {err}") from err
 
 
@@ -145,10 +147,14 @@ def _images_in_bin(data: bytes) -> Iterator[_Image]:
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(count):
         _, *pose, camera_id = struct.unpack_from("<i7di", data, at)
-        end = data.index(b"\0", at + 64)
+        end = data.find(b"\0", at + 64)
+        if end < 0:
+            raise ValueError("it ends within the name of an image")
         name = data[at + 64 : end].decode()
         (num_points,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9 + 24 * num_points  # x, y and the number of the point in space
+        if at > len(data):
+            raise ValueError(f"it ends within the points of {name}")
         yield _image(name, camera_id, pose)
 
 
@@ -157,9 +163,15 @@ def _images_in_text(text: str) -> Iterator[_Image]:
     for line in lines:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        _, *pose, camera_id, name = line.split(maxsplit=9)
-        yield _image(name.strip(), int(camera_id), list(map(float, pose)))
-        next(lines, None)  # its points, an empty line where it has none
+        values = line.split(maxsplit=9)
+        if len(values) < 10:
+            raise ValueError(f"an image must have a number, a pose of 7, a camera and a name, got {line!r}")
+        _, *pose, camera_id, name = values
+        name = name.strip()
+        # Where the lines of images without points were left out, every second image would be lost.
+        if len(next(lines, "").split()) % 3:
+            raise ValueError(f"after the line of {name} must come that of its points, 3 values each, or none")
+        yield _image(name, int(camera_id), list(map(float, pose)))
 
 
 def _image(name: str, camera_id: int, pose: list[float]) -> _Image:

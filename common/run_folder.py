@@ -79,13 +79,17 @@ class PartInMetres:
         """Check what an export would be made from.
 
         Raises:
-            ValueError: A length or the transform is none.
+            ValueError: A number is not finite, the unit is not above 0 m, or the transform has no rotation.
         """
         T = np.asarray(self.T_marker_world, dtype=np.float64)
         check_shape(T, "4 4", "T_marker_world")
         object.__setattr__(self, "T_marker_world", T)
-        if not (np.isfinite(T).all() and 0.0 < self.m_per_unit < np.inf and self.relative_sigma >= 0.0):
+        is_finite = np.isfinite(T).all() and 0.0 <= self.relative_sigma < np.inf
+        if not (is_finite and 0.0 < self.m_per_unit < np.inf):
             raise ValueError(f"metres of part {self.part} must be finite, and a unit above 0 m")
+        R = T[:3, :3]
+        if not (np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0.0):
+            raise ValueError(f"T_marker_world of part {self.part} must hold a rotation, got {R.tolist()}")
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""

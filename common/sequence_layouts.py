@@ -32,6 +32,10 @@ Layout = Literal["auto", "native", "tum", "kitti", "euroc", "transforms", "colma
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp")
 _TRANSFORMS_NAMES = ("transforms.json", "transforms_test.json", "transforms_train.json")
 _CALIBRATION_NAMES = ("intrinsics.json", "intrinsics.yaml", "camera.yaml", "calibration.yaml", "sensor.yaml")
+_TIMES_NAME = "times.txt"
+_TRUTH_NAME = "groundtruth.txt"
+#: Files of semcast's own layout, beside ``images/``.
+_NATIVE_NAMES = (*_CALIBRATION_NAMES, _TIMES_NAME, _TRUTH_NAME)
 #: Calibration published with the TUM RGB-D benchmark (Sturm et al. 2012), which its folders don't hold.
 _TUM_CAMERAS = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -124,7 +128,8 @@ def find_layout(path: Path) -> Layout:
     if has_transforms:
         return "transforms"
     if has_images:
-        return "native" if colmap_folder(path) is None else "colmap"
+        is_native = any((path / name).is_file() for name in _NATIVE_NAMES)
+        return "native" if is_native or colmap_folder(path) is None else "colmap"
     if images_in(path):
         return "folder"
     raise SourceError(
@@ -253,7 +258,7 @@ def _calibration_beside(folder: Path) -> Callable[[int, int], Intrinsics | None]
 
 
 def _truth_beside(folder: Path) -> Trajectory | None:
-    path = folder / "groundtruth.txt"
+    path = folder / _TRUTH_NAME
     truth = read_tum(path) if path.is_file() else None
     if truth is not None and len(truth) and np.abs(truth.t_s).max() > _MAX_TIME_S:
         latest = float(np.abs(truth.t_s).max())
@@ -262,7 +267,7 @@ def _truth_beside(folder: Path) -> Trajectory | None:
 
 
 def _times_beside(folder: Path, num_images: int, rate_hz: float) -> NDArray[np.int64]:
-    path = folder / "times.txt"
+    path = folder / _TIMES_NAME
     return _read_times_ns(path) if path.is_file() else _nominal_times_ns(num_images, rate_hz)
 
 

@@ -95,7 +95,7 @@ class RunToPlot:
             raise SourceError(f"{folder}: no frame was decoded: nothing to plot")
         try:
             told = _told_by(read_summary(folder))
-        except (AttributeError, TypeError, ValueError) as err:
+        except (AttributeError, TypeError, ValueError, OverflowError) as err:
             raise SourceError(f"{folder / SUMMARY_NAME} is none that a run wrote: {err}") from err
         return RunToPlot(name=folder.name, trajectory=trajectory, rows=rows, truth=truth, **told)
 

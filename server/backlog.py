@@ -14,9 +14,11 @@ T = TypeVar("T")
 MAX_WAIT_S = 0.5
 #: A consumer that has not caught up after so long will not: from then on only the newest waits,
 CATCH_UP_S = 1.0
-#: until nothing had to give way for so long. It is not too slow if all that came in that time takes it no
-#: more than a share of it: on a link with jitter frames come in bursts, and some would give way for ever.
-RECOVERY_S, KEEPS_UP_SHARE = 2.0, 0.8
+#: until nothing had to give way for so long,
+RECOVERY_S = 2.0
+#: or until all that came in that time takes the consumer no more than this share of it, so that it is not too
+#: slow: on a link with jitter frames come in bursts, and some would give way for ever.
+KEEPS_UP_SHARE = 0.8
 #: Whatever their rate, no more are kept.
 MAX_WAITING = 64
 

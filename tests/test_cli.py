@@ -91,11 +91,20 @@ def test_an_unknown_option_is_wrong_usage(capsys):
     assert exit_info.value.code == 2
 
 
-@pytest.mark.parametrize("verb", [["demo"], ["channel", "run"], ["eval", "pairs"]])
+@pytest.mark.parametrize("verb", ["demo", "eval pairs"])
 def test_a_shortened_option_is_refused_with_the_whole_one_as_a_hint(verb, capsys):
     with pytest.raises(SystemExit):
-        main([*verb, "--snr", "3"])
-    assert "unrecognized arguments: --snr 3, did you mean '--snr-db'?" in capsys.readouterr().err
+        main([*verb.split(), "--snr", "3"])
+    assert capsys.readouterr().err == (
+        f"semcast {verb}: unrecognized arguments: --snr 3, did you mean '--snr-db'? "
+        f"('semcast {verb} --help' lists the options)\n"
+    )
+
+
+def test_an_option_of_another_sub_verb_is_no_hint(capsys):
+    with pytest.raises(SystemExit):
+        main(["eval", "latency", "--images=x"])
+    assert "unrecognized arguments: --images=x ('semcast eval latency --help'" in capsys.readouterr().err
 
 
 def test_what_a_sub_verb_does_not_know_is_answered_with_its_own_options(capsys):

@@ -74,7 +74,7 @@ def export_run(
         placement = find_placement(data, images)
         logger.info("%s", placement.words)
         data = placement.run(data)
-    elif data.metres and format_name != "rrd":
+    elif format_name != "rrd" and any(known.part in data.frame_submap for known in data.metres):
         logger.info("in the map's own unit; the run knows the metre: --metres writes in it")
     frame = MAP_FRAME if placement is None else placement.frame
     _check_kind(out, format_name)

@@ -78,9 +78,8 @@ def place_by_run(data: RunData) -> Placement:
     part = int(data.frame_submap[0]) if len(data.frame_submap) else 0
     known = next((metres for metres in data.metres if metres.part == part), None)
     if known is None:
-        there = (
-            f"; those of parts {', '.join(str(m.part) for m in data.metres)} are known" if data.metres else ""
-        )
+        others = ", ".join(str(metres.part) for metres in data.metres)
+        there = f", only of part {others}" if others else ""
         raise SourceError(
             f"the run does not know the metre of part {part}{there}: run again with --marker-m, or export "
             "with --marker-m or --align"

@@ -14,7 +14,8 @@ Grey = NDArray[np.uint8]
 #: Side of the patch a point's brightness is the mean of: a corner is dark on one side.
 _PATCH_PX = 7
 #: Patches outside these grey levels may be clipped.
-_DARKEST, _BRIGHTEST = 8.0, 247.0
+_DARKEST = 8.0
+_BRIGHTEST = 247.0
 _MIN_POINTS = 20
 _ITERATIONS = 5
 #: An exposure is a gain: an offset is taken to be no larger than about this, and matters for tone curves.
@@ -23,7 +24,7 @@ _OFFSET_SIGMA_GREY = 10.0
 _MAX_GAIN = 4.0
 #: A change that moves the typical point by less does not matter to Lucas-Kanade.
 _MIN_CHANGE_GREY = 1.5
-#: Nor is a change told by points of which so many standard errors are as much: most of them were not found.
+#: Nor does one count that is below this many standard errors of the fit: most points are not what they were.
 _CHANCE_SIGMAS = 4.0
 
 
@@ -37,7 +38,8 @@ def brightness_change(grey0: Grey, grey1: Grey, xy0: Array, xy1: Array) -> tuple
         xy1: ``(N, 2)`` the same in the second image; some may be wrong.
 
     Returns:
-        Gain and offset in grey levels; None where points are too few, or the change is too small to matter.
+        Gain and offset in grey levels; None where points are too few, or where the change is too small to
+        matter or no larger than chance would have it.
     """
     before, after = _patch_means(grey0, xy0), _patch_means(grey1, xy1)
     inside = (np.minimum(before, after) > _DARKEST) & (np.maximum(before, after) < _BRIGHTEST)

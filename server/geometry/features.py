@@ -16,13 +16,14 @@ Grey = NDArray[np.uint8]
 
 #: Points nearer to the border have no whole window.
 BORDER_PX = 8
-#: A corner is the strongest within so many pixels to each side, and is so far from points that are followed:
-#: first where there are enough of such, then where all that can be followed is small in the picture.
-_FAR_APART, _CLOSE_TOGETHER = (3, 7), (1, 3)
+#: Pixels to each side within which a corner is the strongest, and its distance from points that are followed,
+_FAR_APART = (3, 7)
+#: and the same where all that can be followed is small in the picture, and there are too few of the others.
+_CLOSE_TOGETHER = (1, 3)
 #: Side of the window by which a point that was found is placed. The large one finds it, and tells whether it
 #: is the same; but it reaches past the outline of what the point is on, and over surfaces turned otherwise.
 _FINE_WINDOW_PX = 15
-#: When a search ends: so many steps, or one so small.
+#: When a search ends: its steps, and the length of one in pixels.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 #: A small window that ends further from there has found something else.
 _MAX_FINE_MOVE_PX = 1.5
@@ -34,17 +35,21 @@ _EIGEN_UNIT = 1024.0
 _MIN_EIGEN_GREY2 = 0.5
 #: Nor are corners weaker than this share of the strongest worth following.
 _MIN_EIGEN_SHARE = 0.0005
-#: What the noise of the sensor makes of plain ground is weaker than so many times its gradient energy.
+#: Corners that sensor noise makes on plain ground are weaker than this factor times its gradient energy.
 _NOISE_FACTOR = 3.0
 #: Nor has a sensor more than that of four grey levels: what is rougher all over is gravel or grass.
 _MOST_NOISE_GREY2 = 12.0 / 64.0 * 4.0**2
-#: Side of the cells of which the share with the least roughness is plain.
-_NOISE_CELL_PX, _PLAIN_SHARE = 16, 0.2
+#: Side of the cells by which noise is told,
+_NOISE_CELL_PX = 16
+#: and the share of them, of the least roughness, that is taken for plain ground.
+_PLAIN_SHARE = 0.2
 _ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _ORB_SCALE = 1.2
-#: Where so many points were found in spite of another exposure, they tell it, and few levels put them right.
-_MOSTLY_FOUND, _LEVELS_ANEW = 0.6, 1
-#: A first idea of the change is right if it finds so many times as many.
+#: Share of the points that must be found in spite of another exposure for them to tell it surely,
+_MOSTLY_FOUND = 0.6
+#: and pyramid levels of the second search then.
+_LEVELS_ANEW = 1
+#: With fewer, what they tell is right if it finds this factor as many.
 _CLEARLY_MORE = 1.2
 
 

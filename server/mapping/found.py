@@ -11,7 +11,9 @@ from semcast.server.geometry.square_distance import square_distances
 Array = NDArray[np.float64]
 
 #: Found tracks next to one that was missed, by whose error of the guess it is looked for again.
-_NEIGHBOURS, _MIN_NEIGHBOURS = 5, 8
+_NEIGHBOURS = 5
+#: Tracks that must be found for that.
+_MIN_NEIGHBOURS = 8
 
 
 @dataclass

@@ -41,20 +41,27 @@ _MAX_IMAGES = 32
 START_KEYFRAMES = 5
 #: Points of a new map at least.
 MIN_POINTS = 40
-#: Two views of a scene with little perspective can't tell it from its mirror image in depth. They have to do
-#: where tracks don't last for three, as so many attempts have shown.
-_MIN_VIEWS, _MAX_TOO_SHORT = 3, 2
-#: After so many starts that could have been one or the other, or so many frames, the better one is taken.
-_MAX_UNDECIDED, _MAX_UNDECIDED_FRAMES = 12, 60
-#: After so many attempts in which another motion explained almost as much of the image, that does not hinder.
+#: Views of a start: two of a scene with little perspective can't tell it from its mirror image in depth.
+_MIN_VIEWS = 3
+#: Attempts in which tracks did not last for that many views, after which two have to do.
+_MAX_TOO_SHORT = 2
+#: Attempts after which the best structure is taken though none is clearly better than the others.
+_MAX_UNDECIDED = 12
+#: The same as a number of frames.
+_MAX_UNDECIDED_FRAMES = 60
+#: Attempts in which another motion explained almost as much of the image, after which that does not hinder.
 _MAX_CONTESTED = 12
-#: What decides grows with the way of the tracks, and with what turning leaves of it: it is looked at again
-#: when one of them is so many times as long.
+#: The evidence grows with the motion of the tracks, and with what of it is not the camera's rotation: the
+#: decision is taken again when one of them has grown by this factor.
 _RETRY_GROWTH = 1.15
-#: So many structures go on to the next attempt, none that is so much more doubtful than the best one.
-_MAX_HYPOTHESES, _HOPELESS = 3, 1.0
-#: A start is better from so many points; fewer do when so many frames have waited for it.
-_PLENTY_OF_POINTS, _PATIENCE_FRAMES = 60, 12
+#: Structures that go on to the next attempt, at most.
+_MAX_HYPOTHESES = 3
+#: Those that are more doubtful than the best one by this do not go on.
+_HOPELESS = 1.0
+#: Points from which a start is made, as long as few frames wait for it; after that ``MIN_POINTS`` do.
+_PLENTY_OF_POINTS = 60
+#: Frames that have waited by then.
+_PATIENCE_FRAMES = 12
 #: Share of the reference's tracks that must still be there; else the reference moves on.
 _MIN_SHARED = 0.12
 #: Share of the tracks two views share that must agree with a relative pose.
@@ -63,19 +70,24 @@ _LEAST_AGREEING = 0.5
 _MIN_FLOW_SHARE = 0.012
 #: Median angle between the rays of the two views.
 _MIN_MEDIAN_PARALLAX_DEG = 0.7
-#: It must be so many times what the turn between them is in doubt by. It has been four times and more, over
-#: poor links too; at the edges of views that a turn led apart, where a flat scene's other structure was taken
-#: for the true one, it was 1.0 to 1.2 times.
+#: How many times the standard deviation of the turn between them that angle must be, with matches that err by
+#: a pixel. It has been four times and more, over poor links too; at the edges of views that a turn led apart,
+#: where a flat scene's other structure was taken for the true one, it was 1.0 to 1.2 times.
 _MIN_PARALLAX_DOUBTS = 2.0
 #: Median way that turning leaves of the tracks, in standard deviations of their distance to epipolar lines.
 #: Where the camera only turned and tracks err alike in all directions, that is 1.7, and was up to 3.3 after a
 #: search for lines along which they err; at starts it has been 5.4 and more, over poor links too.
 _MIN_RELIEF_SIGMAS = 4.0
-#: Inlier threshold of the search, in standard deviations of the noise, and its limits.
-_THRESHOLD_SIGMAS, _THRESHOLD_RANGE_PX = 2.0, (1.0, 3.0)
-#: A start takes points under half of the angle that is asked for later, and of larger errors than a landmark
-#: may have (``mapper.MAX_ERROR_SIGMA``): its views are near each other, and it is adjusted at once.
-_PARALLAX_SHARE, _MAX_ERROR_SIGMA = 0.5, 2.5
+#: Inlier threshold of the search, in standard deviations of the noise,
+_THRESHOLD_SIGMAS = 2.0
+#: and its limits.
+_THRESHOLD_RANGE_PX = (1.0, 3.0)
+#: Least angle between the rays of a point of a start, as a share of the one that is asked for later: its
+#: views are near each other.
+_PARALLAX_SHARE = 0.5
+#: RMS error of such a point at most, in standard deviations. It is larger than a landmark's may be
+#: (``mapper.MAX_ERROR_SIGMA``), as a start is adjusted at once.
+_MAX_ERROR_SIGMA = 2.5
 
 
 @dataclass(frozen=True)
@@ -297,7 +309,7 @@ class Initialiser:
         )
 
     def _has_gone(self, pair: _Pair, scene: SceneMotion) -> bool:
-        """Whether it takes a way of the camera to explain two views, and not only a turn and errors."""
+        """Whether it takes a translation of the camera to explain two views, and not a turn and errors."""
         found, of_scene = scene.motion, ~scene.alone
         xy0, xy1 = pair.xy0[of_scene], pair.xy1[of_scene]
         F = fundamental_matrix(self._camera, found.T_cam1_cam0)

@@ -22,8 +22,8 @@ Mask = NDArray[np.bool_]
 #: What explains this share of the area is the scene. At rest it has been 0.87 and more, over poor links too;
 #: something that moves by itself has left it 0.81 and less.
 _SURE_SHARE = 0.85
-#: Another motion that explains so many times the area of the first is no chance find. At rest, what tracks
-#: that slipped agree on has reached 0.65.
+#: Another motion that explains this share of the area that the first one does is no chance find.
+#: At rest, what tracks that slipped agree on has reached 0.65.
 _RIVAL_RATIO = 0.5
 #: Tracks that another motion is looked for in.
 _MIN_TRACKS = 12

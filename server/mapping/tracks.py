@@ -37,14 +37,14 @@ from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: A track may be out of sight for so many frames, as long as the image is what is missing.
+#: Frames for which a track may be out of sight, as long as the image is what is missing.
 MAX_COAST = 3
 #: A point nearer than this to rows that did not arrive counts as hidden. What the decoder makes of such rows
 #: fits what is around them: a window may reach into them, and does until only its middle row is left.
 _LOST_MARGIN_PX = 1
 #: Share of tracks that must be found again; below, the frame counts as damaged and all tracks coast.
 _MIN_FOUND_SHARE = 0.35
-#: So many matches tell how what is around most tracks was warped.
+#: Number of matches that tell how what is around most tracks was warped.
 _PLENTY_OF_MATCHES = 80
 #: A track this far from where descriptors lead to has found something else.
 _REFUTED_PX = 3.0

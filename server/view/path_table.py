@@ -12,7 +12,7 @@ from semcast.common.geometry import invert_transform
 Array = NDArray[np.float64]
 
 SEGMENT_POSES = 32
-#: Beyond it every second pose of the older half is left out.
+#: Beyond it an eighth is left out, of the older half, where poses are closest.
 MAX_POSES = 20_000
 
 
@@ -38,8 +38,8 @@ class _Posed:
 class PathTable:
     """Poses of frames by id, and of the keyframes they move with.
 
-    There are ``MAX_POSES`` at most: the older a part of an endless path is, the coarser. Keyframes all
-    stay, as the dense points of any of them may come at the end.
+    There are ``MAX_POSES`` at most: of an endless path the newer half is complete, and the older one is
+    thinned about evenly. Keyframes all stay, as the dense points of any of them may come at the end.
 
     Attributes:
         keyframes: Frame id to ``T_world_cam`` of keyframes.
@@ -106,7 +106,14 @@ class PathTable:
         )
         self._touch_from(place)
         if len(self._frames) > MAX_POSES:
-            self.withdraw([frame.frame_id for frame in self._frames[1 : MAX_POSES // 2 : 2]])
+            self._thin_out()
+
+    def _thin_out(self) -> None:
+        """Leave out poses of the older half, never two next to each other."""
+        ids = self.frame_ids[: MAX_POSES // 2 + 1]
+        around = ids[2::2] - ids[:-2:2]  # how far apart the neighbours of every second one are
+        closest = np.argsort(around, kind="stable")[: MAX_POSES // 8]
+        self.withdraw(ids[1 + 2 * closest].tolist())
 
     def _place_of(self, frame_id: int) -> int:
         return bisect_left(self._frames, frame_id, key=lambda frame: frame.frame_id)

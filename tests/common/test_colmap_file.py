@@ -138,6 +138,21 @@ def test_a_calibration_or_transforms_of_its_own_go_before_the_model(tmp_path, wr
     assert len(open_sequence(tmp_path, layout="colmap")) == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("camera.yaml", "fx: 30\nfy: 31\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\n"),
+        ("times.txt", "0.0\n0.5\n1.5\n"),
+        ("groundtruth.txt", "0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n"),
+    ],
+)
+def test_a_folder_of_semcast_s_own_stays_one_when_colmap_ran_in_it(tmp_path, write_images, poses, name, text):
+    write_images(tmp_path / "images", 3)
+    _write_binary(tmp_path / "sparse" / "0", [PINHOLE], _images(poses(1), ["000000.png"]))
+    (tmp_path / name).write_text(text)
+    assert len(open_sequence(tmp_path, intrinsics=CAMERA)) == 3
+
+
 def test_photos_that_were_not_posed_are_left_out_and_counted(tmp_path, write_images, poses, caplog):
     write_images(tmp_path / "images", 3)
     _write_text(tmp_path / "sparse" / "0", [PINHOLE], _images(poses(1), ["000000.png"]))
@@ -175,6 +190,12 @@ def _cut(path, count):
     path.write_bytes(path.read_bytes()[:count])
 
 
+def _put(path, behind, new):
+    data = path.read_bytes()
+    at = data.index(behind) + len(behind)
+    path.write_bytes(data[:at] + new + data[at + len(new) :])
+
+
 def _replace(path, old, new):
     path.write_text(path.read_text().replace(old, new))
 
@@ -183,9 +204,23 @@ DAMAGES = {
     "images cut off": (
         _write_binary,
         lambda f: _cut(f / "images.bin", 90),
-        "images.bin can't be used as COLMAP's",
+        "images.bin can't be used as COLMAP's: it ends too early",
     ),
-    "cameras cut off": (_write_binary, lambda f: _cut(f / "cameras.bin", 40), "cameras.bin can't be used"),
+    "a name cut off": (
+        _write_binary,
+        lambda f: _cut(f / "images.bin", 80),
+        "images.bin can't be used as COLMAP's: it ends within the name of an image",
+    ),
+    "points without end": (
+        _write_binary,
+        lambda f: _put(f / "images.bin", b"000000.png\0", struct.pack("<Q", 2**63)),
+        "images.bin can't be used as COLMAP's: it ends within the points of 000000.png",
+    ),
+    "cameras cut off": (
+        _write_binary,
+        lambda f: _cut(f / "cameras.bin", 40),
+        "cameras.bin can't be used as COLMAP's: it ends too early",
+    ),
     "unknown number": (
         _write_binary,
         lambda f: (f / "cameras.bin").write_bytes(struct.pack("<QiiQQ", 1, 1, 77, 32, 24)),
@@ -210,6 +245,21 @@ DAMAGES = {
         _write_text,
         lambda f: _replace(f / "images.txt", "7 1.0", "7 nan"),
         "the pose of 000000.png must be finite",
+    ),
+    "no name": (
+        _write_text,
+        lambda f: _replace(f / "images.txt", " 000000.png", ""),
+        "an image must have a number, a pose of 7, a camera and a name, got '7 1.0 ",
+    ),
+    "no lines of points": (
+        _write_text,
+        lambda f: _replace(f / "images.txt", "\n\n", "\n"),
+        "after the line of 000000.png must come that of its points",
+    ),
+    "a width beyond all bounds": (
+        _write_text,
+        lambda f: _replace(f / "cameras.txt", " 32 ", f" 1{400 * '0'} "),
+        "holds no usable intrinsics: ",
     ),
     "a parameter short": (
         _write_text,

@@ -114,9 +114,18 @@ def test_what_a_unit_is_comes_back_and_is_refused_where_it_makes_no_sense(tmp_pa
     write_run(tmp_path, tiny_run(metres=(PartInMetres(part=2, T_marker_world=T, **found),)))
     (back,) = read_run(tmp_path).metres
     assert back.to_dict() == {"part": 2, "T_marker_world": T.tolist(), **found}
-    for wrong in ({"m_per_unit": 0.0}, {"relative_sigma": float("nan")}, {"T_marker_world": np.nan * T}):
+    values = {"part": 2, "T_marker_world": T, **found}
+    for name, wrong in (
+        ("m_per_unit", 0.0),
+        ("relative_sigma", np.nan),
+        ("relative_sigma", np.inf),
+        ("T_marker_world", np.nan * T),
+    ):
         with pytest.raises(ValueError, match="metres of part 2 must be finite, and a unit above 0 m"):
-            PartInMetres(**{"part": 2, "T_marker_world": T, **found, **wrong})
+            PartInMetres(**{**values, name: wrong})
+    for wrong in (2.0 * T, np.diag([1.0, 1.0, -1.0, 1.0])):
+        with pytest.raises(ValueError, match="T_marker_world of part 2 must hold a rotation"):
+            PartInMetres(**{**values, "T_marker_world": wrong})
 
 
 def test_a_pickle_inside_is_not_executed(tmp_path):

@@ -232,7 +232,14 @@ def test_a_run_without_a_decoded_frame_has_nothing_to_plot(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "summary", [{"frames": 5}, {"frames": {"sent": "many"}}, {"drops": ["lost"]}, {"unposed_frames": [3]}]
+    "summary",
+    [
+        {"frames": 5},
+        {"frames": {"sent": "many"}},
+        {"frames": {"sent": float("inf")}},
+        {"drops": ["lost"]},
+        {"unposed_frames": [3]},
+    ],
 )
 def test_a_summary_that_no_run_wrote_is_named_in_one_line(tmp_path, capsys, summary):
     write_tum(tmp_path / TRAJECTORY_NAME, line([1, 2, 3]))

@@ -326,8 +326,10 @@ def test_a_part_whose_unit_the_run_did_not_find_is_not_written_in_metres(tmp_pat
     assert export(tmp_path, *out) == 1
     assert "--part must name one part" in capsys.readouterr().err
     assert export(tmp_path, *out, "--part", 0) == 1
-    assert "the metre of part 0; those of parts 1 are known" in capsys.readouterr().err
+    assert "the metre of part 0, only of part 1: run again" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
+    assert export(tmp_path, "--format", "tum", "--part", 0, "--out", tmp_path / "y") == 0
+    assert "the run knows the metre" not in capsys.readouterr().err
     assert export(tmp_path, *out, "--part", 1) == 0
     np.testing.assert_allclose(
         read_tum(tmp_path / "x").positions, SCALE * data.T_world_cam[6:, :3, 3], atol=1e-7

@@ -43,17 +43,17 @@ def test_a_path_is_interrupted_where_the_camera_was_lost_and_not_where_a_frame_i
     assert table.poses().shape == (0, 4, 4)
 
 
-def test_an_endless_path_is_thinned_from_its_old_end_and_keeps_its_gaps(monkeypatch):
+def test_the_older_half_of_an_endless_path_is_thinned_evenly_and_keeps_its_gaps(monkeypatch):
     monkeypatch.setattr(path_table, "MAX_POSES", 64)
     table = path(range(65), gaps=[11])
-    assert table.frame_ids.tolist() == [*range(0, 32, 2), *range(32, 65)]
+    assert table.frame_ids.tolist() == [*range(0, 16, 2), *range(16, 65)]
     assert [x[0] for x in lines(table)] == [0.0, 12.0], "the gap before frame 11 is before the next one now"
     for k in range(65, 1000):
         table.insert(k, 1000 * k, at(k), is_after_gap=False)
         assert len(table) <= 64
     assert table.frame_ids[0] == 0
     steps = np.diff(table.frame_ids)
-    assert (np.diff(steps) <= 0).all()
+    assert steps.max() <= 100, "a few times the mean: no part of the path is lost"
     assert (steps[-32:] == 1).all()
     np.testing.assert_array_equal(table.poses()[:, 0, 3], table.frame_ids)
     shown = [strip for k in range(len(table.segment_versions)) for strip in table.strips(k)]
