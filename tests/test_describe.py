@@ -336,6 +336,16 @@ def test_a_plot_takes_the_true_path_of_the_frames_whatever_their_camera_and_time
     assert len(ate(run.trajectory, run.truth).t_s) == 6
 
 
+@pytest.mark.parametrize("reference", [3, "/gone"])
+def test_a_plot_without_the_sequence_it_was_of_has_no_true_path(run_folder, monkeypatch, capsys, reference):
+    (run_folder / "summary.json").write_text(json.dumps({"settings": {"reference": reference}}))
+    monkeypatch.setattr("semcast.evaluation.run_plots.plot_run", lambda run, out, form: [])
+    assert main(["plot", str(run_folder)]) == 0
+    told = capsys.readouterr().err
+    assert f"the sequence {reference} is gone" in told
+    assert "no true path is known" in told
+
+
 def test_a_folder_that_is_no_run_is_one_clear_error(tmp_path, capsys):
     assert main(["plot", str(tmp_path)]) == 1
     assert "there is nothing to plot" in capsys.readouterr().err

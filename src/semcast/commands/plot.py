@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         settings = read_summary(folder).get("settings")
         reference = settings.get("reference") if isinstance(settings, dict) else None
-        if reference and Path(reference).exists():
+        if isinstance(reference, str) and reference and Path(reference).exists():
             truth, times_ns = open_truth(Path(reference))
             if truth is not None:
                 rows = read_rows(folder / FRAMES_NAME)
