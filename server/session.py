@@ -338,7 +338,8 @@ class Session:
 
         None where it has none any more, or no frame got one since the server began.
         """
-        found, now = self._newest_posed, self._reconstruction.final_trajectory()
+        found = self._newest_posed
+        now = {} if found is None else self._reconstruction.final_trajectory()
         if found is None or found.frame_id not in now:
             return None
         part = self._reconstruction.world.part_of_frames()[found.frame_id]

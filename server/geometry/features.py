@@ -25,6 +25,8 @@ _CLOSE_TOGETHER = (1, 3)
 _FINE_WINDOW_PX = 15
 #: When a search ends: its steps, and the length of one in pixels.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
+#: Distance in pixels within which a point that is followed forth and back must be back.
+_MAX_FORWARD_BACKWARD_PX = 1.5
 #: A small window that ends further from there has found something else.
 _MAX_FINE_MOVE_PX = 1.5
 #: OpenCV's KLT gives the smaller eigenvalue of the mean structure tensor in units of 32^2 / 2^20 grey^2.
@@ -202,9 +204,8 @@ def track_points(
     xy0: Array,
     guess1_xy: Array,
     *,
-    max_forward_backward_px: float = 1.5,
+    max_forward_backward_px: float = _MAX_FORWARD_BACKWARD_PX,
     max_level: int = 3,
-    window_px: int = KLT_WINDOW_PX,
 ) -> TrackedPoints:
     """Follow points by Lucas-Kanade, there and back.
 
@@ -218,17 +219,16 @@ def track_points(
         guess1_xy: ``(N, 2)`` where they are expected in ``grey1``.
         max_forward_backward_px: Points that come back further off are not ``ok``.
         max_level: Pyramid levels above the full image.
-        window_px: Side of the window.
     """
-    return track_through_light(
+    found, _ = track_through_light(
         grey0,
         grey1,
         xy0,
         guess1_xy,
         max_forward_backward_px=max_forward_backward_px,
         max_level=max_level,
-        window_px=window_px,
-    )[0]
+    )
+    return found
 
 
 def track_through_light(
@@ -237,9 +237,8 @@ def track_through_light(
     xy0: Array,
     guess1_xy: Array,
     *,
-    max_forward_backward_px: float = 1.5,
+    max_forward_backward_px: float = _MAX_FORWARD_BACKWARD_PX,
     max_level: int = 3,
-    window_px: int = KLT_WINDOW_PX,
 ) -> tuple[TrackedPoints, tuple[float, float] | None]:
     """Follow points as ``track_points`` does, and tell the change of brightness that was made up for.
 
@@ -249,7 +248,7 @@ def track_through_light(
     count = len(xy0)
     if count == 0 or grey0.shape != grey1.shape:
         return TrackedPoints.none(count), None
-    found = _search(grey0, grey1, xy0, guess1_xy, max_forward_backward_px, max_level, window_px)
+    found = _search(grey0, grey1, xy0, guess1_xy, max_forward_backward_px, max_level)
     like_second, told = grey0, None
     for _ in range(2):
         # Where hardly any was found, the guesses are near enough for a first idea of the change.
@@ -261,7 +260,7 @@ def track_through_light(
             break
         levels = min(_LEVELS_ANEW, max_level) if is_sure else max_level
         alike = with_brightness(grey0, *change)
-        anew = _search(alike, grey1, xy0, xy1, max_forward_backward_px, levels, window_px)
+        anew = _search(alike, grey1, xy0, xy1, max_forward_backward_px, levels)
         if anew.ok.sum() < (1.0 if is_sure else _CLEARLY_MORE) * found.ok.sum():
             break
         found, like_second, told = anew, alike, change
@@ -276,14 +275,12 @@ def track_alike(
     xy0: Array,
     guess1_xy: Array,
     *,
-    max_forward_backward_px: float = 1.5,
     max_level: int = 3,
-    window_px: int = KLT_WINDOW_PX,
 ) -> TrackedPoints:
     """Follow points as ``track_points`` does between images that are known to have the same brightness."""
     if len(xy0) == 0 or grey0.shape != grey1.shape:
         return TrackedPoints.none(len(xy0))
-    found = _search(grey0, grey1, xy0, guess1_xy, max_forward_backward_px, max_level, window_px)
+    found = _search(grey0, grey1, xy0, guess1_xy, _MAX_FORWARD_BACKWARD_PX, max_level)
     return _placed(grey0, grey1, xy0, found)
 
 
@@ -294,13 +291,12 @@ def _search(
     guess1_xy: Array,
     max_forward_backward_px: float,
     max_level: int,
-    window_px: int,
 ) -> TrackedPoints:
     """Find points by a large window, there and back, between images of the same brightness."""
     height, width = grey1.shape
     start = np.ascontiguousarray(xy0, dtype=np.float32)
     guess = np.clip(np.nan_to_num(guess1_xy), (0, 0), (width - 1, height - 1)).astype(np.float32)
-    window = (window_px, window_px)
+    window = (KLT_WINDOW_PX, KLT_WINDOW_PX)
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
     found, status, error = cv2.calcOpticalFlowPyrLK(
         grey0, grey1, start, guess.copy(), None, None, window, max_level, _CRITERIA, flags, 1e-4

@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semcast.common.codec import KLT_WINDOW_PX
 from semcast.server.geometry.features import (
     BORDER_PX,
     Describer,
@@ -147,8 +148,8 @@ def test_points_near_an_outline_are_placed_by_what_is_inside_it():
 def test_gradient_of_tracking_is_that_of_the_corner_strength():
     grey = texture()
     corners = detect_corners(grey, 100).astype(np.float64)
-    found = track_points(grey, grey, corners, corners, window_px=21)
-    strength = sample_map(corner_strength(grey, block_px=21), corners)
+    found = track_points(grey, grey, corners, corners)
+    strength = sample_map(corner_strength(grey, block_px=KLT_WINDOW_PX), corners)
     ratio = found.gradient_grey2[found.ok] / strength[found.ok]
     assert np.median(ratio) == pytest.approx(1.0, rel=0.15)
 
