@@ -26,6 +26,7 @@ Arrival of frames
 Beginning and end of a stream
     announcement      streams that agents announce
     stream_identity   what one start of one agent is
+    succession        the session of each stream, after the one before is written
     former_starts     late frames of an agent that was started again
     former_run        what an earlier run left in the output folder
     false_start       a checkpoint whose newest frame the stream has not reached

@@ -128,8 +128,8 @@ def test_the_reference_follows_the_camera_of_a_restarted_agent(session):
     try:
         for epoch, sequence in enumerate(sequences, start=1):
             info = camera_info(agent, RecordedSource(sequence, agent.source), codec, epoch)
-            server._begin(info)
-            assert server._reference.psnr_db(3, sequence.image(3)).result(20) == 100.0
+            server._sessions.begin(info)
+            assert server._sessions._reference.psnr_db(3, sequence.image(3)).result(20) == 100.0
     finally:
         server.close()
 

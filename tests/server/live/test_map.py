@@ -73,7 +73,7 @@ def test_a_map_of_many_hours_is_sent_and_one_that_cannot_be_ends_no_stream(air, 
     running = air.serve()
     radio = air.agent(100)
     radio.stream(range(8))
-    world = running.server._session._reconstruction._map.world
+    world = running.server._sessions.current._reconstruction.world
     for frame_id in range(100, 100 + 70_000):  # thinned out since
         world.poses[frame_id], world.submap_of[frame_id] = np.eye(4), 0
     with open_client(NetworkSettings(connect=(air.endpoint,)), DEADLINE_S) as client:

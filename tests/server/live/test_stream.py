@@ -122,7 +122,7 @@ def test_an_adjustment_is_applied_while_no_frame_comes(air):
     radio = air.agent(100)
     for k in range(10):
         radio.stream([k])
-        session = running.server._session
+        session = running.server._sessions.current
         until(lambda k=k, session=session: session.last_frame_id == k and not session.is_adjusting)
     running.finish(stop=True)
 
@@ -177,7 +177,7 @@ def test_a_frame_that_waited_too_long_for_the_tracker_is_dropped(air, monkeypatc
 
 def test_a_bundle_adjustment_that_gave_up_is_in_the_status(air):
     running = air.serve(bundle="process", duration_s=0.1)
-    running.server._spare_bundle._give_up()
+    running.server._sessions._spare_bundle._give_up()
     assert running.server.metrics.status(0).last_error == GIVEN_UP
     running.finish()
 
