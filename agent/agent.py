@@ -4,7 +4,6 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 from semcast.agent.capture import Capture
@@ -268,19 +267,13 @@ def _wait_until_ready(session: Session, agent_id: str, agent_epoch: int, stop: t
         pass
 
 
-def run_agent(
-    settings: AgentSettings,
-    stop: threading.Event,
-    codec: Codec | None = None,
-    on_source: Callable[[Source], None] | None = None,
-) -> dict[str, Any]:
+def run_agent(settings: AgentSettings, stop: threading.Event, codec: Codec | None = None) -> dict[str, Any]:
     """Run the agent process until its source ends or ``stop`` is set.
 
     Args:
         settings: Of the process.
         stop: Ends it.
         codec: Used instead of the one ``settings`` names.
-        on_source: Is told the source once it is open.
 
     Returns:
         Counts, drops by reason and stage times, with ``agent_epoch``, ``source`` and ``complete``.
@@ -296,8 +289,6 @@ def run_agent(
         source = open_source(settings.source)
         unread = stack.enter_context(contextlib.ExitStack())
         unread.callback(source.close)
-        if on_source is not None:
-            on_source(source)
         codec = codec if codec is not None else _codec_of(settings)
         session = open_session(settings.network, stop)
         summary: dict[str, Any] = {"agent_epoch": 0, "source": source.name, "complete": False}

@@ -7,6 +7,9 @@ from semcast.common.errors import TransportError
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.transport import Session, open_client, open_session
 
+#: Another program may take a port that was free a moment ago.
+_ATTEMPTS = 5
+
 
 def free_endpoint() -> str:
     """Return a loopback endpoint with a port that was free a moment ago."""
@@ -15,23 +18,24 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def open_hub(attempts: int = 5) -> tuple[Session, str]:
+def open_hub() -> tuple[Session, str]:
     """Open a hub on a free loopback port, and return it with its endpoint.
 
     Raises:
         TransportError: No port could be opened.
     """
-    for attempt in range(attempts):
+    num_failed = 0
+    while True:
         endpoint = free_endpoint()
         try:
             session = open_session(NetworkSettings(listen=(endpoint,), connect=()))
         except TransportError:
-            if attempt == attempts - 1:
+            num_failed += 1
+            if num_failed == _ATTEMPTS:
                 raise
             continue
         assert session is not None, "a hub does not wait"
         return session, endpoint
-    raise TransportError(f"attempts must be at least 1, got {attempts}")
 
 
 def loopback_round_trip_ms(timeout_s: float = 3.0) -> float:

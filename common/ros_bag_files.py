@@ -50,6 +50,6 @@ def check_no_ros_bag(path: Path) -> None:
         raise SourceError(f"{path} is a ROS bag: a sequence is made of it by: {way}")
 
 
-def _start_of(path: Path, size: int = 4096) -> bytes:
+def _start_of(path: Path) -> bytes:
     with path.open("rb") as file:
-        return file.read(size)
+        return file.read(4096)

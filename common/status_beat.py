@@ -57,9 +57,7 @@ class StatusBeat:
             self.send()
 
 
-def hear_statuses(
-    session: Session, agent_id: str, roles: Collection[str], wait_s: float = 2.5 * STATUS_INTERVAL_S
-) -> dict[str, StatusMessage]:
+def hear_statuses(session: Session, agent_id: str, roles: Collection[str]) -> dict[str, StatusMessage]:
     """Return the next status of each of some roles; those that send none in time are not in it.
 
     Raises:
@@ -81,5 +79,5 @@ def hear_statuses(
     for role in roles:
         session.subscribe(status_key(agent_id, role), "newest", hear)
     with changed:
-        changed.wait_for(lambda: set(roles) <= heard.keys(), wait_s)
+        changed.wait_for(lambda: set(roles) <= heard.keys(), 2.5 * STATUS_INTERVAL_S)
         return {role: heard[role] for role in roles if role in heard}

@@ -56,16 +56,15 @@ class RpeResult:
     rot_deg: float
 
 
-def match_times(
-    estimate_s: Array, truth_s: Array, max_gap_s: float | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def match_times(estimate_s: Array, truth_s: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pair every estimated time with the nearest true time, each true time at most once.
+
+    Those further apart than half the median interval of the denser one are left out: a true pose at every
+    tenth frame is not that of the frames around where its own has no estimate.
 
     Args:
         estimate_s: ``(N,)`` increasing seconds.
         truth_s: ``(M,)`` increasing seconds.
-        max_gap_s: Pairs further apart are left out; None takes half the median interval of the denser one:
-            a true pose at every tenth frame is not that of the frames around where its own has no estimate.
 
     Returns:
         Indices into ``estimate_s`` and ``truth_s``, both increasing.
@@ -73,9 +72,8 @@ def match_times(
     empty = np.zeros(0, dtype=np.int64)
     if len(estimate_s) == 0 or len(truth_s) == 0:
         return empty, empty
-    if max_gap_s is None:
-        steps_s = [float(np.median(np.diff(t_s))) for t_s in (estimate_s, truth_s) if len(t_s) > 1]
-        max_gap_s = min(steps_s, default=0.0) / 2
+    steps_s = [float(np.median(np.diff(t_s))) for t_s in (estimate_s, truth_s) if len(t_s) > 1]
+    max_gap_s = min(steps_s, default=0.0) / 2
     after = np.clip(np.searchsorted(truth_s, estimate_s), 0, len(truth_s) - 1)
     before = np.maximum(after - 1, 0)
     nearest = np.where(estimate_s - truth_s[before] < np.abs(truth_s[after] - estimate_s), before, after)
@@ -88,19 +86,18 @@ def match_times(
     return kept.astype(np.int64), nearest[kept].astype(np.int64)
 
 
-def ate(estimate: Trajectory, truth: Trajectory, max_gap_s: float | None = None) -> AteResult | None:
+def ate(estimate: Trajectory, truth: Trajectory) -> AteResult | None:
     """Return the absolute trajectory error after Sim(3) alignment of matched camera centres.
 
     Args:
         estimate: Poses in the map's frame and unit.
         truth: Reference poses in metres.
-        max_gap_s: See ``match_times``.
 
     Returns:
         None where the error has no meaning: fewer than ``MIN_MATCHES`` matched poses, a true camera
         that never moves, or an estimate that never moves.
     """
-    estimate_idx, truth_idx = match_times(estimate.t_s, truth.t_s, max_gap_s)
+    estimate_idx, truth_idx = match_times(estimate.t_s, truth.t_s)
     p_map, p_truth = estimate.positions[estimate_idx], truth.positions[truth_idx]
     if len(p_map) < MIN_MATCHES or truth.path_length == 0.0 or not _has_extent(p_map):
         return None
@@ -119,21 +116,18 @@ def ate(estimate: Trajectory, truth: Trajectory, max_gap_s: float | None = None)
     )
 
 
-def rpe(
-    estimate: Trajectory, truth: Trajectory, scale: float, max_gap_s: float | None = None
-) -> RpeResult | None:
+def rpe(estimate: Trajectory, truth: Trajectory, scale: float) -> RpeResult | None:
     """Return the error of each step between consecutive matched poses.
 
     Args:
         estimate: Poses in the map's frame and unit.
         truth: Reference poses in metres.
         scale: Metres per map unit, from ``ate``.
-        max_gap_s: See ``match_times``.
 
     Returns:
         None with fewer than two matched poses or a true camera that never moves.
     """
-    estimate_idx, truth_idx = match_times(estimate.t_s, truth.t_s, max_gap_s)
+    estimate_idx, truth_idx = match_times(estimate.t_s, truth.t_s)
     if len(estimate_idx) < 2:
         return None
     T_world_cam = estimate.T_world_cam[estimate_idx].copy()

@@ -386,4 +386,4 @@ def _draw(folder: Path, snr_db: Sequence[float], results: list[dict[str, Any]]) 
         values = {(row["codec"], row["snr_db"]): row[key] for row in results}
         curves = {name: [values[name, s] for s in order] for name in names}
         if any(v is not None for curve in curves.values() for v in curve):
-            plot_against_snr(folder / file_name, order, curves, label, from_zero=False)
+            plot_against_snr(folder / file_name, order, curves, label)

@@ -5,18 +5,20 @@ from typing import Any
 
 from semcast.evaluation.markdown import table
 
+#: Whose rows.
+_CODEC = "3dcsc"
 
-def depth_summary(report: Mapping[str, Any], codec: str = "3dcsc") -> str:
+
+def depth_summary(report: Mapping[str, Any]) -> str:
     """Return coverage, wrong depths and the median error with confidence and without as a Markdown table.
 
     Args:
         report: A result of ``semcast eval depth`` with both modes.
-        codec: Whose rows.
     """
     of = {
         (row["snr_db"], row["confidence"]): row
         for row in report["results"]
-        if row["codec"] == codec and row["coverage"]
+        if row["codec"] == _CODEC and row["coverage"]
     }
     snrs_db = sorted({snr_db for snr_db, mode in of if mode == "on" and (snr_db, "off") in of})
     figures = {"coverage": ".1%", "outlier_share": ".1%", "median_error": ".2%"}
@@ -32,5 +34,5 @@ def depth_summary(report: Mapping[str, Any], codec: str = "3dcsc") -> str:
         for snr_db in snrs_db
     ]
     names = ("pixels with a depth", "of these off by more than 5 %", "median error")
-    head = [codec, *(f"{name}{mode}" for name in names for mode in ("", ", without confidence"))]
+    head = [_CODEC, *(f"{name}{mode}" for name in names for mode in ("", ", without confidence"))]
     return "\n".join(table(head, rows))

@@ -80,9 +80,9 @@ class Cell:
         value = self.values["results"].get(method, {}).get(figure)
         return None if value is None else float(value)
 
-    def interval(self, mode: str, against: str, figure: str = "tdir_deg_mean") -> Mapping[str, Any] | None:
-        """Return the paired comparison of a mode to a rival."""
-        wanted = {"mode": mode, "against": against, "figure": figure}
+    def interval(self, mode: str, against: str) -> Mapping[str, Any] | None:
+        """Return the paired comparison of a mode's translation direction to a rival's."""
+        wanted = {"mode": mode, "against": against, "figure": "tdir_deg_mean"}
         for comparison in self.values["comparisons"]:
             if wanted.items() <= comparison.items():
                 paired: Mapping[str, Any] | None = comparison["paired"]

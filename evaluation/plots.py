@@ -27,7 +27,7 @@ _COLOURS = (*(f"C{k}" for k in range(10)), "black", "goldenrod")
 _LEAST_SHARE = 0.001
 
 
-def _new_figure(width_in: float = 5.0, height_in: float = 3.6) -> tuple[Figure, Axes]:
+def _new_figure(width_in: float, height_in: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -71,13 +71,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def plot_against_snr(
-    path: Path,
-    snr_db: Sequence[float],
-    curves: Mapping[str, Sequence[float | None]],
-    y_label: str,
-    *,
-    title: str = "",
-    from_zero: bool = True,
+    path: Path, snr_db: Sequence[float], curves: Mapping[str, Sequence[float | None]], y_label: str
 ) -> None:
     """Draw one curve per name over the SNR and save it.
 
@@ -86,14 +80,12 @@ def plot_against_snr(
         snr_db: ``(N,)`` abscissae.
         curves: Name to N values; None leaves a gap.
         y_label: Quantity and unit.
-        title: Above the axes.
-        from_zero: Start the ordinate at 0, right for errors and wrong for decibels.
 
     Raises:
         ValueError: A curve has another length than ``snr_db``.
         SemcastError: The file can't be written.
     """
-    figure, axes = _new_figure(6.4)
+    figure, axes = _new_figure(6.4, 3.6)
     for k, (name, values) in enumerate(curves.items()):
         if len(values) != len(snr_db):
             raise ValueError(f"curve {name!r} must have {len(snr_db)} values, got {len(values)}")
@@ -101,9 +93,7 @@ def plot_against_snr(
         colour, marker = _COLOURS[k % len(_COLOURS)], _MARKERS[k % len(_MARKERS)]
         style = "-" if k < len(_COLOURS) else "--"
         axes.plot(snr_db, y, style, color=colour, marker=marker, markersize=4, label=name)
-    axes.set(xlabel="SNR (dB)", ylabel=y_label, title=title)
-    if from_zero:
-        axes.set_ylim(bottom=0.0)
+    axes.set(xlabel="SNR (dB)", ylabel=y_label)
     # Inside the axes the names would hide points of the curves.
     figure.legend(fontsize="small", loc="outside right upper")
     save_figure(figure, path)
@@ -218,16 +208,14 @@ def plot_path(
     *,
     axes_names: tuple[str, str] = ("x", "z"),
     title: str = "",
-    unit: str = "m",
 ) -> None:
-    """Draw camera positions along one world axis and save them.
+    """Draw camera positions in metres along one world axis and save them.
 
     Args:
         path: Image file.
         trajectories: Name to ``(N, 3)`` positions, all in one world frame.
         axes_names: The two world axes shown, of ``x``, ``y``, ``z``; a camera-style world looks best in x, z.
         title: Above the axes.
-        unit: Unit of the axes.
     """
     columns = ["xyz".index(name) for name in axes_names]
     figure, axes = _new_figure(4.6, 4.6)
@@ -237,7 +225,7 @@ def plot_path(
         if name != "ground truth":
             style = {"linewidth": 1.3}
         axes.plot(positions[:, columns[0]], positions[:, columns[1]], label=name, **style)
-    axes.set(xlabel=f"{axes_names[0]} ({unit})", ylabel=f"{axes_names[1]} ({unit})", title=title)
+    axes.set(xlabel=f"{axes_names[0]} (m)", ylabel=f"{axes_names[1]} (m)", title=title)
     axes.set_aspect("equal", adjustable="datalim")
     figure.legend(fontsize="small", loc="outside lower center", ncols=len(trajectories))
     save_figure(figure, path)

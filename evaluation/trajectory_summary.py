@@ -43,9 +43,7 @@ class Pairing:
     num_failed: int = 0
 
 
-def pairings_of(
-    reports: Iterable[Mapping[str, Any]], ours: str = "robust", theirs: str = "off"
-) -> list[Pairing]:
+def pairings_of(reports: Iterable[Mapping[str, Any]]) -> list[Pairing]:
     """Return all cells of reports of ``semcast eval trajectory`` that have both modes and enough seeds.
 
     Those over a trace are left out: their SNR is but its start.
@@ -60,7 +58,7 @@ def pairings_of(
                 of_mode = {run["seed"]: run for run in cell["runs"]}
                 runs.setdefault(cell["snr_db"], {})[cell["confidence"]] = of_mode
         for snr_db, modes in runs.items():
-            a, b = modes.get(ours, {}), modes.get(theirs, {})
+            a, b = modes.get("robust", {}), modes.get("off", {})
             shared = sorted(a.keys() & b.keys())
             both = [(a[s]["ate_percent"], b[s]["ate_percent"]) for s in shared]
             known = [pair for pair in both if None not in pair]

@@ -338,12 +338,12 @@ class Session:
 
         None where it has none any more, or no frame got one since the server began.
         """
-        found = self._newest_posed
-        now = {} if found is None else self._reconstruction.final_trajectory()
-        if found is None or found.frame_id not in now:
+        found, world = self._newest_posed, self._reconstruction.world
+        T_world_cam = None if found is None else world.pose_of_frame(found.frame_id)
+        if found is None or T_world_cam is None:
             return None
-        part = self._reconstruction.world.part_of_frames()[found.frame_id]
-        return replace(found, T_world_cam=now[found.frame_id], submap=part, covariance=None, backfilled=())
+        part = world.submap_of[world.frames[found.frame_id][0]]
+        return replace(found, T_world_cam=T_world_cam, submap=part, covariance=None, backfilled=())
 
     @property
     def is_concluded(self) -> bool:

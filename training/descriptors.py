@@ -9,14 +9,15 @@ from torch.nn.functional import avg_pool2d, interpolate, normalize, unfold
 from semcast.training.displacement import gradients
 
 NUM_ORIENTATIONS = 8
+#: Side of a cell, and the distance between descriptors.
+_CELL_PX = 4
 
 
-def dense_descriptors(image: Tensor, cell_px: int = 4) -> tuple[Tensor, Tensor]:
+def dense_descriptors(image: Tensor) -> tuple[Tensor, Tensor]:
     """Describe every cell position by 4x4 cells of 8 gradient orientations each.
 
     Args:
         image: ``(B, 1, H, W)`` grey image in [0, 1].
-        cell_px: Side of a cell, and the distance between descriptors.
 
     Returns:
         Unit descriptors ``(B, 128, N)`` and the gradient energy under each, ``(B, N)``.
@@ -27,7 +28,7 @@ def dense_descriptors(image: Tensor, cell_px: int = 4) -> tuple[Tensor, Tensor]:
     # |g| cos^4((theta - angle) / 2) is a smooth binning that needs no arctangent.
     along = ix * angles.cos().view(1, -1, 1, 1) + iy * angles.sin().view(1, -1, 1, 1)
     bins = (magnitude + along).square() / (4.0 * magnitude)
-    cells = avg_pool2d(bins, cell_px)
+    cells = avg_pool2d(bins, _CELL_PX)
     energy = cells.sum(dim=1, keepdim=True)
     described = unfold(cells, 4)
     return normalize(described, dim=1, eps=1e-3), unfold(energy, 4).mean(dim=1)

@@ -5,15 +5,17 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
+#: Of the iteration.
+_NUM_STEPS = 5
 
-def orthogonalise(matrices: Tensor, steps: int = 5) -> Tensor:
+
+def orthogonalise(matrices: Tensor) -> Tensor:
     """Bring all singular values of each matrix close to 1 by a quintic Newton-Schulz iteration.
 
     They end between about 0.7 and 1.2, which is all the optimiser needs. Runs in bfloat16.
 
     Args:
         matrices: ``(N, rows, columns)``; a whole stack costs a GPU hardly more than one.
-        steps: Of the iteration.
     """
     a, b, c = 3.4445, -4.7750, 2.0315
     x = matrices.bfloat16()
@@ -21,7 +23,7 @@ def orthogonalise(matrices: Tensor, steps: int = 5) -> Tensor:
     if is_tall:
         x = x.mT
     x = x / (x.norm(dim=(1, 2), keepdim=True) + 1e-7)
-    for _ in range(steps):
+    for _ in range(_NUM_STEPS):
         gram = x @ x.mT
         poly = torch.baddbmm(gram, gram, gram, beta=b, alpha=c)
         x = torch.baddbmm(x, poly, x, beta=a)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 Pyramid = tuple[NDArray[np.float32], ...]
 
 _SIDE_PX = 512
+_NUM_LEAVES = 1500
 
 
 def pyramid(texture: NDArray[np.uint8]) -> Pyramid:
@@ -25,15 +26,12 @@ def pyramid(texture: NDArray[np.uint8]) -> Pyramid:
     return tuple(levels)
 
 
-def dead_leaves(
-    rng: np.random.Generator, contrast: float = 1.0, num: int = 1500, max_radius_share: float = 0.25
-) -> Pyramid:
+def dead_leaves(rng: np.random.Generator, contrast: float = 1.0, max_radius_share: float = 0.25) -> Pyramid:
     """Return shapes of power-law sizes in colours of a small palette.
 
     Args:
         rng: Source of shapes and colours.
         contrast: Spread of the colours about their mean, 1 for the full range.
-        num: Shapes laid down.
         max_radius_share: Radius of the largest shape as a share of the side.
     """
     mean = _colours(rng, 1, 80, 170)[0]
@@ -41,7 +39,7 @@ def dead_leaves(
     image = np.full((_SIDE_PX, _SIDE_PX, 3), mean, np.uint8)
     # Between many small ones (density r^-3, equal at all scales) and clear large ones: r^-2.5.
     least, most = 2.0, max_radius_share * _SIDE_PX
-    shares = rng.uniform(0, 1, num)
+    shares = rng.uniform(0, 1, _NUM_LEAVES)
     radii = ((1 - shares) * least**-1.5 + shares * most**-1.5) ** (-1 / 1.5)
     for radius in radii:
         colour = _as_tuple(palette[rng.integers(12)] + rng.normal(0, 9 * contrast))

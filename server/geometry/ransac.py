@@ -68,7 +68,6 @@ def confidence_ransac(
     keypoints1_xy: Array,
     confidence: Array,
     *,
-    delta0: float | None = None,
     num_trials: int = 500,
     seed: int = 0,
 ) -> RansacResult | None:
@@ -79,8 +78,6 @@ def confidence_ransac(
         keypoints0_xy: ``(N, 2)``.
         keypoints1_xy: ``(N, 2)``, matched row by row.
         confidence: ``(N,)`` fused confidence in [0, 1].
-        delta0: Base threshold of the algebraic residual on normalised coordinates; None takes one pixel
-            over the focal length.
         num_trials: Subsets drawn.
         seed: Of the sampler.
 
@@ -89,9 +86,9 @@ def confidence_ransac(
     """
     if len(confidence) < SUBSET_SIZE + 1:
         return None
-    delta0 = 1.0 / camera.fx if delta0 is None else delta0
     rays0, rays1 = camera.unproject(keypoints0_xy), camera.unproject(keypoints1_xy)
-    delta = adaptive_threshold(confidence, delta0)
+    # On normalised coordinates a pixel is one over the focal length.
+    delta = adaptive_threshold(confidence, 1.0 / camera.fx)
     unit0 = rays0 / np.linalg.norm(rays0, axis=1, keepdims=True)
     unit1 = rays1 / np.linalg.norm(rays1, axis=1, keepdims=True)
     rng = np.random.default_rng(seed)

@@ -20,6 +20,9 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
+#: Landmarks that must agree with the pose of a kept frame.
+_MIN_INLIERS = 15
+
 
 @dataclass(frozen=True)
 class Observed:
@@ -111,7 +114,6 @@ def pose_of(
     noise: NoiseModel,
     T_world_guess: Array,
     seed: int,
-    min_inliers: int = 15,
 ) -> Array | None:
     """Pose of a kept frame from landmarks.
 
@@ -123,13 +125,12 @@ def pose_of(
         noise: Of the observations.
         T_world_guess: ``(4, 4)`` pose to begin with; where fewer than half agree, it is searched for without.
         seed: Of the search.
-        min_inliers: Landmarks that must agree.
 
     Returns:
         ``T_world_cam (4, 4)``, None where too few agree.
     """
     _, row, row_o = np.intersect1d(ids, observed.ids, assume_unique=True, return_indices=True)
-    if len(row) < min_inliers:
+    if len(row) < _MIN_INLIERS:
         return None
     sigma = noise.sigma_px(observed.confidence[row_o])
     gate = noise.threshold_px(observed.confidence[row_o])
@@ -137,11 +138,11 @@ def pose_of(
     estimate = refine_pose(camera, T_cam_world, xyz[row], observed.xy[row_o], sigma, gate, edge=edge)
     if estimate.num_inliers < 0.5 * len(row):
         searched = search_pose(
-            camera, xyz[row], observed.xy[row_o], sigma, gate, seed=seed, min_inliers=min_inliers, edge=edge
+            camera, xyz[row], observed.xy[row_o], sigma, gate, seed=seed, min_inliers=_MIN_INLIERS, edge=edge
         )
         if searched is not None and searched.num_inliers > estimate.num_inliers:
             estimate = searched
-    if estimate.num_inliers < min_inliers:
+    if estimate.num_inliers < _MIN_INLIERS:
         return None
     return invert_transform(estimate.T_cam_world)
 

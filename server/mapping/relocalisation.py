@@ -56,6 +56,8 @@ _MIN_GUIDED_SHARE = 0.35
 _LEAST_ALIKE = 0.73
 #: Fields of the image, across and down, over which that is measured.
 _FIELDS_XY = (12, 5)
+#: Of one frame's points in two submaps, those nearer than this in the image are the same.
+_SAME_PX = 3.0
 #: Octaves of the query, so that a view from nearer or further still matches.
 _OCTAVES = (0, 2, 4)
 #: Binary descriptors do not know the noise model: a match is good to about this.
@@ -245,7 +247,7 @@ def _pool(world: WorldMap, keyframes: list[Keyframe]) -> tuple[Ids, NDArray[np.u
 
 
 def submap_similarity(
-    place: Place, world: WorldMap, T_world_cam_new: Array, ids_new: Ids, xy_new: Array, radius_px: float = 3.0
+    place: Place, world: WorldMap, T_world_cam_new: Array, ids_new: Ids, xy_new: Array
 ) -> tuple[float, Array] | None:
     """Similarity that brings the newer submap onto the older one, from one frame that sees both.
 
@@ -257,7 +259,6 @@ def submap_similarity(
         T_world_cam_new: The frame's pose in the newer submap.
         ids_new: ``(M,)`` tracks of the frame.
         xy_new: ``(M, 2)`` where they are.
-        radius_px: Points nearer than this in the image are the same.
 
     Returns:
         ``(scale, T)`` with ``x_old = T @ (scale * x_new)``, or None when too few points are in both.
@@ -268,7 +269,7 @@ def submap_similarity(
         return None
     square = square_distances(place.xy, xy_new[known])
     nearest = square.argmin(axis=1)
-    close = square[np.arange(len(place.xy)), nearest] < radius_px**2
+    close = square[np.arange(len(place.xy)), nearest] < _SAME_PX**2
     if int(close.sum()) < _MIN_SHARED:
         return None
     xyz_old = world.landmarks.xyz[world.landmarks.rows(place.ids[close])]

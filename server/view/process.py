@@ -46,10 +46,10 @@ def window_display() -> str | None:
     return os.environ.get("WAYLAND_DISPLAY") or os.environ.get("DISPLAY") or None
 
 
-def is_listening(port: int, timeout_s: float = 0.2) -> bool:
+def is_listening(port: int) -> bool:
     """Tell whether something accepts connections on a loopback port; a frozen process still does."""
     try:
-        with socket.create_connection((LOOPBACK, port), timeout=timeout_s):
+        with socket.create_connection((LOOPBACK, port), timeout=0.2):
             return True
     except OSError:
         return False

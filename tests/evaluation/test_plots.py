@@ -87,7 +87,7 @@ def test_path_and_reliability_are_drawn(tmp_path):
 
 @pytest.mark.parametrize("name", [r"run $\foo$", "\u8d70\u308b"])
 def test_names_are_no_formulas_and_may_be_of_any_script(tmp_path, name):
-    plot_against_snr(tmp_path / "a.svg", [2, 4], {name: [1.0, 2.0]}, "y", title=name)
+    plot_against_snr(tmp_path / "a.svg", [2, 4], {name: [1.0, 2.0]}, "y")
     assert f"<!-- {name} -->" in (tmp_path / "a.svg").read_text("utf-8")
 
 
