@@ -54,7 +54,6 @@ class BundleProblem:
         sigma_px: ``(M,)`` standard deviation per coordinate.
         confidence: ``(M,)`` of each observation, handed through.
         iterations: Levenberg-Marquardt steps at most.
-        map_version: Handed through; a result for another map is not applied.
         num_anchors: So many of the first keyframes are of long ago; they are held, and only what the others
             see is adjusted.
         with_covariance: Whether the covariance of the last pose is wanted.
@@ -78,7 +77,6 @@ class BundleProblem:
     sigma_px: Array
     confidence: Array
     iterations: int = 6
-    map_version: int = 0
     num_anchors: int = 0
     with_covariance: bool = True
     huber_px: float | None = None

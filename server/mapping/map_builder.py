@@ -68,7 +68,6 @@ class MapBuilder:
         self._camera = camera
         self._settings = settings
         self._bundle = bundle
-        self._version = 0
         self.watch = ReadoutWatch(camera, is_wanted=settings.watches_readout(camera))
         self.clear()
 
@@ -90,7 +89,6 @@ class MapBuilder:
         """Free the runner before the map changes; what it was asked before does not apply any more."""
         if self._bundle.busy:
             self._bundle.take(wait=True)
-        self._version += 1
 
     @property
     def _mapped(self) -> ImagedMap:
@@ -343,7 +341,6 @@ class MapBuilder:
             self._settings.window_size,
             start=start or mine <= self._settings.window_size // 2,
             iterations=_START_ITERATIONS if start else _ITERATIONS,
-            map_version=self._version,
         )
         if problem is not None:
             motion = self.watch.motion(self.world, problem)
@@ -352,7 +349,7 @@ class MapBuilder:
     def collect(self, *, wait: bool = False) -> BundleResult | None:
         """Bring a finished adjustment into the map; the result, or None where there is none."""
         result = self._bundle.take(wait=wait)
-        if result is None or result.problem.map_version != self._version:
+        if result is None:
             return None
         mapper.apply_result(self.world, result, self.noise)
         place_left_out(self.world, self._camera, self.noise.model, result)
@@ -380,7 +377,6 @@ class MapBuilder:
             return 0
         num_adjusted = adjust_whole_map(self.world, self._camera, self.noise.model)
         if num_adjusted:
-            self._version += 1
             self._adjusted = None
         return num_adjusted
 

@@ -56,7 +56,6 @@ def build_problem(
     *,
     start: bool = False,
     iterations: int = 6,
-    map_version: int = 0,
 ) -> BundleProblem | None:
     """Collect the newest keyframes of the current submap and what they see.
 
@@ -70,7 +69,6 @@ def build_problem(
         window_size: Keyframes at most.
         start: The first adjustment of a new map: one pose and the baseline are held instead of two poses.
         iterations: Steps at most.
-        map_version: Handed through.
 
     Returns:
         The problem, or None when there is nothing to adjust.
@@ -105,7 +103,7 @@ def build_problem(
         keep_baseline=start,
         iterations=iterations,
     )
-    return replace(problem, map_version=map_version, num_anchors=len(anchors), with_covariance=True)
+    return replace(problem, num_anchors=len(anchors), with_covariance=True)
 
 
 def _order_of_choice(
