@@ -15,6 +15,7 @@ Process
 
 Arrival of frames
     receiver          frames in order, equalised and ready for the decoder
+    feedback          what the agent is told: the link's quality, how far the server is
     arrival           which frames count: epochs, duplicates, order, gaps, age
     backlog           frames that wait for the decoder
     decoder           from symbols to an image with confidence

@@ -14,27 +14,23 @@ from numpy.typing import NDArray
 from semcast.common.codec import ReceivedImage
 from semcast.common.complaints import Complaints
 from semcast.common.errors import TransportError
-from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
-from semcast.common.link_report import LinkReporter
+from semcast.common.keys import camera_key, channel_key, rx_key
 from semcast.common.mailbox import Mailbox
-from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
+from semcast.common.messages import CameraInfo, ChannelReport, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.rate import belongs_to, slots_at
 from semcast.common.symbol_payload import equalise_frame
 from semcast.common.transport import FRAME_RING_CAPACITY, Session
-from semcast.common.wire import WireError, pack, unpack
-from semcast.common.worker_guard import WorkerGuard
+from semcast.common.wire import WireError, unpack
 from semcast.server.announcement import answered_camera
 from semcast.server.arrival import Arrivals
 from semcast.server.backlog import Backlog
+from semcast.server.feedback import WINDOW, Feedback
 
 logger = logging.getLogger(__name__)
 
 Mode = Literal["live", "replay"]
 
-#: Frames under way at most in replay: enough to keep agent, channel, decoder and tracker busy at once.
-WINDOW = 6
-FLOW_INTERVAL_S = 0.2
 #: Between two questions for a camera: where nobody is there to answer, each comes back at once.
 _CAMERA_PAUSE_S = 0.05
 _KEPT_REPORTS = 256
@@ -125,21 +121,15 @@ class Receiver:
         self._early: deque[tuple[SymbolFrame, int]] = deque()
         self._snr_set: OrderedDict[tuple[int, int], float] = OrderedDict()
         self._num_superseded = self._num_given_way = 0
-        self._reporter: tuple[tuple[int, str], LinkReporter] | None = None
         self._roles: set[str] = set()
         #: Of a stream that has ended: epoch, frames sent, and how many behind the newest count as missing.
         self._end = (0, 0, 0)
-        self._link = session.publisher(link_key(agent_id), "newest")
-        self._flow = session.publisher(flow_key(agent_id), "newest")
+        self._feedback = Feedback(session, agent_id, metrics, self._how_far if mode == "replay" else None)
         self._stopping = threading.Event()
         session.subscribe(camera_key(agent_id), "every", self._on_camera)
         session.subscribe(channel_key(agent_id), "newest", self._on_report, FRAME_RING_CAPACITY)
         session.watch_alive(agent_id, self._on_alive)
         session.subscribe(rx_key(agent_id), "newest", self._on_symbols, FRAME_RING_CAPACITY)
-        self._thread: threading.Thread | None = None
-        if mode == "replay":
-            self._thread = threading.Thread(target=self._beat, name="semcast-flow", daemon=True)
-            self._thread.start()
 
     def __enter__(self) -> Self:
         return self
@@ -257,8 +247,7 @@ class Receiver:
             if taken:
                 self._box.put((frame, arrival_ns))
                 self._count_superseded()
-        if self._mode == "replay":
-            self._send_flow()
+        self._feedback.send_flow()
 
     def _keep_early(self, frame: SymbolFrame, arrival_ns: int) -> None:
         """Keep a frame that overtook what its agent says about itself; the lock is held."""
@@ -275,32 +264,13 @@ class Receiver:
         self._num_superseded += superseded
         self._metrics.drop("superseded", superseded)
 
-    def _beat(self) -> None:
-        guard = WorkerGuard("sending how far the server is", self._metrics.error)
-        while not self._stopping.wait(FLOW_INTERVAL_S):
-            with guard:
-                self._send_flow()
-
     def announce_ready(self, agent_epoch: int) -> None:
         """Tell a live agent that everything is set up for its first frame; it waits for this."""
-        self._put_flow(FlowMessage(agent_epoch=agent_epoch, next_seq=0, arrived_seq=0, window=WINDOW))
+        self._feedback.announce_ready(agent_epoch)
 
-    def _send_flow(self) -> None:
+    def _how_far(self) -> tuple[int, int, int]:
         with self._lock:
-            arrivals = self._arrivals
-            flow = FlowMessage(
-                agent_epoch=arrivals.epoch,
-                next_seq=arrivals.next_seq,
-                arrived_seq=arrivals.arrived_seq,
-                window=WINDOW,
-            )
-        self._put_flow(flow)
-
-    def _put_flow(self, flow: FlowMessage) -> None:
-        try:
-            self._flow.put(pack(flow))
-        except TransportError as err:
-            logger.debug("flow not sent: %s", err)
+            return self._arrivals.epoch, self._arrivals.next_seq, self._arrivals.arrived_seq
 
     def next(self, timeout_s: float) -> ReceivedFrame | None:
         """Return the next frame, None when there is none in time; tell when it is ``done``."""
@@ -375,7 +345,7 @@ class Receiver:
             equalise_ms = (time.perf_counter_ns() - started_ns) * 1e-6
             received, snr_db = equalised.received, float(equalised.snr_db)
             self._metrics.observe("equalise", equalise_ms)
-            self._report(message, self._reporter_of(message).snr_db(equalised))
+            self._feedback.report(message, equalised, self._num_superseded_of(message))
         self._metrics.count("delivered")
         with self._lock:
             snr_db_set = self._snr_set.get((message.agent_epoch, message.frame_id))
@@ -398,8 +368,7 @@ class Receiver:
         """
         with self._lock:
             self._arrivals.done(message)
-        if self._mode == "replay":
-            self._send_flow()
+        self._feedback.send_flow()
 
     def _camera_of(self, epoch: int) -> CameraInfo | None:
         with self._lock:
@@ -414,31 +383,12 @@ class Receiver:
             self._keep(camera)
         return camera
 
-    def _reporter_of(self, message: SymbolFrame) -> LinkReporter:
-        stream = (message.agent_epoch, message.codec)
-        if self._reporter is None or self._reporter[0] != stream:
-            self._reporter = (stream, LinkReporter(message.codec))
-        return self._reporter[1]
-
-    def _report(self, message: SymbolFrame, snr_db: float) -> None:
+    def _num_superseded_of(self, message: SymbolFrame) -> int:
         with self._lock:
-            current = message.agent_epoch == self._arrivals.epoch
-            num_superseded = self._num_superseded if current else 0
-        report = LinkReport(
-            agent_epoch=message.agent_epoch,
-            frame_id=message.frame_id,
-            snr_db_estimate=float(np.clip(snr_db, -100.0, 100.0)),
-            t_capture_ns=message.t_capture_ns,
-            num_superseded=num_superseded,
-        )
-        try:
-            self._link.put(pack(report))
-        except TransportError as err:
-            logger.debug("link report not sent: %s", err)
+            return self._num_superseded if message.agent_epoch == self._arrivals.epoch else 0
 
     def close(self) -> None:
         """Take no more frames. Idempotent; subscriptions end with the session."""
         self._stopping.set()
         self._box.close()
-        if self._thread is not None:
-            self._thread.join(2.0)
+        self._feedback.close()

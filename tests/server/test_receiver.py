@@ -21,7 +21,8 @@ from semcast.common.symbol_payload import pack_iq, pack_lost
 from semcast.common.transport import open_client
 from semcast.common.wire import pack, unpack
 from semcast.server import backlog
-from semcast.server.receiver import WINDOW, Receiver
+from semcast.server.feedback import WINDOW
+from semcast.server.receiver import Receiver
 
 HW = (64, 128)
 EPOCH = 10**18
@@ -424,9 +425,9 @@ def test_bad_arguments_are_refused(ends):
 
 
 def test_a_receiver_that_fails_to_say_how_far_it_is_says_it_the_next_time(ends, monkeypatch):
-    monkeypatch.setattr("semcast.server.receiver.FLOW_INTERVAL_S", 0.01)
+    monkeypatch.setattr("semcast.server.feedback.FLOW_INTERVAL_S", 0.01)
     with monkeypatch.context() as patch:
-        patch.setattr("semcast.server.receiver.pack", lambda message: 1 / 0)
+        patch.setattr("semcast.server.feedback.pack", lambda message: 1 / 0)
         both = ends("replay")
         until(lambda: both.metrics.counts.get("errors", 0) >= 2)
     came = threading.Event()

@@ -14,7 +14,7 @@ from semcast.common.recording_reader import RecordingReader
 from semcast.common.run_folder import read_run
 from semcast.common.wire import pack
 from semcast.server.export.outputs import write_ply
-from semcast.server.receiver import WINDOW
+from semcast.server.feedback import WINDOW
 from semcast.server.recorded_streams import recorded_streams
 from semcast.server.view.rerun_viewer import RerunStream
 from semcast.server.view.settings import ViewSettings
