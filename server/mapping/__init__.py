@@ -1,7 +1,7 @@
 """The reconstruction: decoded frames in, camera poses and a map out.
 
 Start at ``reconstruction.Reconstruction``: one object per stream, one call per frame. It follows tracks, asks
-``tracker`` for the pose and hands keyframes to ``map_builder.MapBuilder``, which owns the map. What follows
+``locator`` for the pose and hands keyframes to ``map_builder.MapBuilder``, which owns the map. What follows
 tells where things are; ``docs/architecture.md`` tells why they are done as they are.
 
 The frame
@@ -21,6 +21,7 @@ Tracks (2D)
     anchoring         drift of tracks, taken out by alignment with patches of keyframes
 
 Pose of a frame
+    locator           what is tried for a frame's pose: its tracks, then landmarks that lost theirs
     tracker           pose from landmarks (PnP), steadied by rays
     rays              tracks without a depth: inverse depth with its uncertainty
     recall            lost landmarks, looked for again where the pose expects them

@@ -4,8 +4,6 @@ import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
-from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +15,7 @@ from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import MIN_POINTS, Initialiser, Start
 from semcast.server.mapping.kept_frames import backfill, observed_of
+from semcast.server.mapping.locator import Locator
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
@@ -26,7 +25,7 @@ from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
-from semcast.server.mapping.tracker import MIN_INLIERS, Believing, TrackedPose, expected_positions, track_pose
+from semcast.server.mapping.tracker import TrackedPose
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import WorldMap
 
@@ -39,15 +38,8 @@ Ids = NDArray[np.int64]
 _MIN_USABLE_SHARE = 0.5
 #: Keyframes between two attempts to recognise an older submap.
 _JOIN_INTERVAL = 3
-_START_LEVELS = 5
-#: A pose that rests on fewer landmarks than this share of the tracks asks for more.
-_FEW_INLIERS_SHARE = 0.2
-#: How far from where they are expected lost landmarks are looked for, with a pose and with a prediction.
-_REACH_PX, _REACH_BLIND_PX = 6.0, 20.0
 #: Share of the landmarks in sight that must agree with a pose found without a prior.
 _MIN_SHARE_WHEN_LOST = 0.5
-#: Landmarks a camera that was hidden is posed by: the first strip that comes into sight tells little.
-_LEAST_UNHIDDEN = 30
 #: Of a keypoint by which a place was recognised, until it is followed.
 _RECOGNISED_CONFIDENCE = 0.5
 
@@ -79,6 +71,7 @@ class Reconstruction:
         self._tracks = TrackTable(s.confidence, s.max_features, s.seed, turntable=s.turntable)
         self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
         self._motion = CameraMotion(self._camera)
+        self._locator = Locator(self._camera, s, self._map, self._tracks, self._motion)
         self._passage = Passage(self._camera, self._map.enough)
         self._shutter = RollingShutter(camera, lambda: self._map.watch.is_on)
         self._state = TrackingState.INITIALIZING
@@ -86,7 +79,6 @@ class Reconstruction:
         self._last_posed_id: int | None = None
         self._lost_ns: list[int] = []
         self._frames_since_keyframe = self._keyframes_since_join = 0
-        self._is_after_gap = False
         self._stage_ms: dict[str, float] = {}
         self._on_pose: Callable[[FrameResult], None] | None = None
 
@@ -139,13 +131,12 @@ class Reconstruction:
         since = time.perf_counter_ns()
         sight = self._shutter.see(frame)
         T_world_guess = self._motion.predict(frame.t_source_ns)
-        self._is_after_gap = self._motion.comes_after_gap(frame.t_source_ns)
-        self._follow(sight, T_world_guess)
+        is_tracked = self._state is TrackingState.TRACKING
+        self._locator.follow(sight, T_world_guess if is_tracked else None)
         sight, is_first = self._shutter.settle(frame, sight, self._tracks)
         if is_first:
             self._initialiser.clear()
         self._lap("track", since)
-        is_tracked = self._state is TrackingState.TRACKING
         result = self._track(sight, T_world_guess) if is_tracked else self._find(sight)
         self._passage.note(sight, result.T_world_cam, self._motion, self._map.world)
         self._shutter.keep_up()
@@ -177,50 +168,12 @@ class Reconstruction:
         self._map.watch.note(frame_id, t_source_ns)
         self._map.world.forget_frames(self._motion.observe(frame_id, t_source_ns, T_world_cam, xyz))
 
-    def _follow(self, sight: Sight, T_world_guess: Array | None) -> None:
-        tracks = self._tracks
-        if len(tracks) == 0:
-            tracks.remember(sight)
-            return
-        if self._state is TrackingState.TRACKING and T_world_guess is not None:
-            tracks.follow(sight, self._expected(T_world_guess, tracks))
-        else:
-            ahead = tracks.xy + tracks.velocity * (tracks.missed + 1)[:, None]
-            tracks.follow(sight, ahead, max_level=_START_LEVELS)
-
-    def _expected(self, T_world_cam: Array, tracks: TrackTable) -> Array:
-        world = self._map.world
-        T_world_seen = [world.pose_of_frame(frame_id) for frame_id in tracks.frame_ids]
-        return expected_positions(self._camera, world, tracks, T_world_cam, T_world_seen)
-
     def _last_pose(self) -> Array | None:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
 
-    def _pose(
-        self, T_world_guess: Array | None, seen: Seen | None = None, **how: Unpack[Believing]
-    ) -> TrackedPose | None:
-        seen = self._tracks.seen() if seen is None else seen
-        how["is_after_gap"] = self._is_after_gap
-        known = {"submap": self._map.submap, "seed": self._settings.seed}
-        noise = self._map.noise.model
-        return track_pose(self._camera, self._map.world, noise, seen, T_world_guess, **known, **how)
-
     def _track(self, sight: Sight, T_world_guess: Array | None) -> FrameResult:
         since = time.perf_counter_ns()
-        pose = self._pose(T_world_guess, may_carry=True)
-        if (
-            pose is None
-            and (T_world_on := self._motion.predict_on(sight.frame.t_source_ns)) is not None
-            and self._tracks.follow_again(sight, partial(self._expected, T_world_on))
-        ):
-            pose = self._pose(T_world_on)
-        if pose is None and self._tracks.follow_jump(sight):
-            pose = self._pose(T_world_guess)
-        is_vague = pose is None or self._is_after_gap or pose.num_inliers < 2 * MIN_INLIERS
-        pose = self._with_more(sight, pose, T_world_guess)
-        if pose is not None and is_vague and not self._resembles(sight, pose):
-            self._tracks.clear()  # nothing that was found is kept
-            pose = None
+        pose = self._locator.track(sight, T_world_guess)
         self._lap("pose", since)
         if pose is not None:
             return self._accept(sight, pose)
@@ -229,28 +182,6 @@ class Reconstruction:
         self._lost_ns = []
         self._initialiser.clear()
         return self._find(sight)
-
-    def _with_more(
-        self, sight: Sight, pose: TrackedPose | None, T_world_guess: Array | None
-    ) -> TrackedPose | None:
-        """Look for landmarks that lost their track where a pose rests on few, and estimate it again."""
-        T_world_cam = T_world_guess if pose is None else pose.T_world_cam
-        few = _FEW_INLIERS_SHARE * self._settings.max_features
-        if T_world_cam is None or (pose is not None and pose.num_inliers >= few):
-            return pose
-        wanted = round(few) - (0 if pose is None else pose.num_inliers)
-        reach_px = _REACH_PX if pose is not None and pose.num_inliers >= MIN_INLIERS else _REACH_BLIND_PX
-        recalled = self._map.recall(self._tracks, sight, T_world_cam, wanted=wanted, reach_px=reach_px)
-        again = self._pose(T_world_cam) if len(recalled) else None
-        if again is not None and (pose is None or again.num_inliers > pose.num_inliers):
-            return again
-        # What was recalled has proved nothing.
-        self._tracks.keep(~np.isin(self._tracks.ids, recalled))
-        return pose
-
-    def _resembles(self, sight: Sight, pose: TrackedPose) -> bool:
-        """Tell whether tracks that agree with a pose look as they did: in noise some fit any guess."""
-        return self._map.resembles(self._tracks, sight, pose.T_world_cam, pose.ids[pose.inliers])
 
     def _accept(self, sight: Sight, pose: TrackedPose) -> FrameResult:
         """Take a pose: note it, weed out tracks that slipped, and make a keyframe where one is due."""
@@ -295,7 +226,7 @@ class Reconstruction:
 
     def _posed_anew(self, sight: Sight, T_world_guess: Array) -> TrackedPose | None:
         """Estimate the pose of a frame again whose tracks or landmarks have moved."""
-        anew, reference = self._pose(T_world_guess), self._map.reference_keyframe()
+        anew, reference = self._locator.pose(T_world_guess), self._map.reference_keyframe()
         if anew is None or reference is None:
             return None
         self._map.world.add_frame(sight.frame.frame_id, reference.frame_id, anew.T_world_cam)
@@ -342,27 +273,20 @@ class Reconstruction:
             return None
         since = time.perf_counter_ns()
         is_lost = self._state is TrackingState.LOST
-        pose = self._pose(None, min_share=_MIN_SHARE_WHEN_LOST) if is_lost else None
+        pose = self._locator.pose(None, min_share=_MIN_SHARE_WHEN_LOST) if is_lost else None
         if pose is None:
-            pose = (self._unhidden(sight) if is_lost else None) or self._recognise(sight)
+            T_world_rest = self._last_pose() if is_lost and self._motion.rests else None
+            pose = None if T_world_rest is None else self._locator.unhidden(sight, T_world_rest)
+            pose = pose or self._recognise(sight)
         self._lap("relocalise", since)
         return pose
-
-    def _unhidden(self, sight: Sight) -> TrackedPose | None:
-        """Pose of a camera that rested and lost sight of everything, by what can be seen again from there."""
-        T_world_cam = self._last_pose() if self._motion.rests else None
-        pose = None if T_world_cam is None else self._with_more(sight, None, T_world_cam)
-        if pose is None or (pose.num_inliers >= _LEAST_UNHIDDEN and self._resembles(sight, pose)):
-            return pose
-        self._tracks.keep(self._map.world.landmarks.rows(self._tracks.ids) < 0)
-        return None
 
     def _recognise(self, sight: Sight) -> TrackedPose | None:
         if (place := self._map.recognise(sight)) is None:
             return None
         # Nothing is given up for a place before there is a pose in it.
         seen = Seen(place.ids, place.xy, np.full(len(place.ids), _RECOGNISED_CONFIDENCE))
-        pose = self._pose(place.T_world_cam, seen)
+        pose = self._locator.pose(place.T_world_cam, seen)
         if pose is not None:
             self._map.go_on_from(place)
             self._tracks.adopt(place.ids, place.xy, _RECOGNISED_CONFIDENCE)
@@ -388,7 +312,7 @@ class Reconstruction:
         self._frames_since_keyframe = 0
         self._lap("two_view", since)
         newest, seen = self._map.world.pose_of_frame(sight.frame.frame_id), self._tracks.seen()
-        pose = self._pose(newest, seen[self._map.world.landmarks.rows(seen.ids) >= 0])
+        pose = self._locator.pose(newest, seen[self._map.world.landmarks.rows(seen.ids) >= 0])
         self._state = TrackingState.LOST if pose is None else TrackingState.TRACKING
         self._lost_ns = []
         self._last_posed_id = sight.frame.frame_id

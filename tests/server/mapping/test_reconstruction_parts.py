@@ -17,10 +17,10 @@ from semcast.common.geometry import (
 from semcast.server.mapping import reconstruction, settings
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.initialiser import MIN_POINTS
+from semcast.server.mapping.locator import Locator
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.passage import Passage
-from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.relocalisation import Place, Relocaliser
 from semcast.server.mapping.state import TrackingState
 
@@ -334,12 +334,12 @@ def test_a_part_that_is_lost_as_it_begins_has_its_time_to_be_found_again(room, m
     _, images = room
     reconstruction = make(lost_after_s=0.25)
     other = [np.ascontiguousarray(image[:, ::-1]) for image in images]
-    posed = Reconstruction._pose
+    posed = Locator.pose
 
     def no_pose_in_the_second_part(self, *args, **how):
         return None if self._map.submap == 1 else posed(self, *args, **how)
 
-    monkeypatch.setattr(Reconstruction, "_pose", no_pose_in_the_second_part)
+    monkeypatch.setattr(Locator, "pose", no_pose_in_the_second_part)
     results = [reconstruction.process(frame_of(k, image)) for k, image in enumerate(images[:8] + other[:14])]
     begun = next(k for k, r in enumerate(results) if r.is_keyframe and r.submap == 1)
     assert [r.state for r in results[begun : begun + 4]] == [TrackingState.LOST] * 4

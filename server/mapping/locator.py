@@ -1,0 +1,127 @@
+"""Where the camera of a frame is in the map: by its tracks, and by landmarks that are looked for again."""
+
+from functools import partial
+from typing import Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.common.camera import Intrinsics
+from semcast.server.mapping.camera_motion import CameraMotion
+from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.sight import Seen, Sight
+from semcast.server.mapping.tracker import MIN_INLIERS, Believing, TrackedPose, expected_positions, track_pose
+from semcast.server.mapping.tracks import TrackTable
+
+Array = NDArray[np.float64]
+
+_START_LEVELS = 5
+#: A pose that rests on fewer landmarks than this share of the tracks asks for more.
+_FEW_INLIERS_SHARE = 0.2
+#: How far from where they are expected lost landmarks are looked for, with a pose and with a prediction.
+_REACH_PX, _REACH_BLIND_PX = 6.0, 20.0
+#: Landmarks a camera that was hidden is posed by: the first strip that comes into sight tells little.
+_LEAST_UNHIDDEN = 30
+
+
+class Locator:
+    """Poses one frame after the other by what its tracks show of the map.
+
+    Args:
+        camera: Pinhole.
+        settings: Of the reconstruction.
+        builder: Owns the map.
+        tracks: Followed into each frame.
+        motion: Tells where the camera is expected.
+    """
+
+    def __init__(
+        self,
+        camera: Intrinsics,
+        settings: ReconstructionSettings,
+        builder: MapBuilder,
+        tracks: TrackTable,
+        motion: CameraMotion,
+    ) -> None:
+        self._camera = camera
+        self._settings = settings
+        self._map = builder
+        self._tracks = tracks
+        self._motion = motion
+        self._is_after_gap = False
+
+    def follow(self, sight: Sight, T_world_guess: Array | None) -> None:
+        """Follow the tracks into an image: to where a pose expects them, or on as they went so far."""
+        tracks = self._tracks
+        self._is_after_gap = self._motion.comes_after_gap(sight.frame.t_source_ns)
+        if len(tracks) == 0:
+            tracks.remember(sight)
+        elif T_world_guess is not None:
+            tracks.follow(sight, self._expected(T_world_guess, tracks))
+        else:
+            ahead = tracks.xy + tracks.velocity * (tracks.missed + 1)[:, None]
+            tracks.follow(sight, ahead, max_level=_START_LEVELS)
+
+    def _expected(self, T_world_cam: Array, tracks: TrackTable) -> Array:
+        world = self._map.world
+        T_world_seen = [world.pose_of_frame(frame_id) for frame_id in tracks.frame_ids]
+        return expected_positions(self._camera, world, tracks, T_world_cam, T_world_seen)
+
+    def pose(
+        self, T_world_guess: Array | None, seen: Seen | None = None, **how: Unpack[Believing]
+    ) -> TrackedPose | None:
+        """Estimate the pose by the landmarks among what is seen, all tracks by default: ``track_pose``."""
+        seen = self._tracks.seen() if seen is None else seen
+        how["is_after_gap"] = self._is_after_gap
+        known = {"submap": self._map.submap, "seed": self._settings.seed}
+        noise = self._map.noise.model
+        return track_pose(self._camera, self._map.world, noise, seen, T_world_guess, **known, **how)
+
+    def track(self, sight: Sight, T_world_guess: Array | None) -> TrackedPose | None:
+        """Pose of a frame whose tracks were followed; None where it is not sure, and they may be gone."""
+        pose = self.pose(T_world_guess, may_carry=True)
+        if (
+            pose is None
+            and (T_world_on := self._motion.predict_on(sight.frame.t_source_ns)) is not None
+            and self._tracks.follow_again(sight, partial(self._expected, T_world_on))
+        ):
+            pose = self.pose(T_world_on)
+        if pose is None and self._tracks.follow_jump(sight):
+            pose = self.pose(T_world_guess)
+        is_vague = pose is None or self._is_after_gap or pose.num_inliers < 2 * MIN_INLIERS
+        pose = self._with_more(sight, pose, T_world_guess)
+        if pose is not None and is_vague and not self._resembles(sight, pose):
+            self._tracks.clear()  # nothing that was found is kept
+            return None
+        return pose
+
+    def _with_more(
+        self, sight: Sight, pose: TrackedPose | None, T_world_guess: Array | None
+    ) -> TrackedPose | None:
+        """Look for landmarks that lost their track where a pose rests on few, and estimate it again."""
+        T_world_cam = T_world_guess if pose is None else pose.T_world_cam
+        few = _FEW_INLIERS_SHARE * self._settings.max_features
+        if T_world_cam is None or (pose is not None and pose.num_inliers >= few):
+            return pose
+        wanted = round(few) - (0 if pose is None else pose.num_inliers)
+        reach_px = _REACH_PX if pose is not None and pose.num_inliers >= MIN_INLIERS else _REACH_BLIND_PX
+        recalled = self._map.recall(self._tracks, sight, T_world_cam, wanted=wanted, reach_px=reach_px)
+        again = self.pose(T_world_cam) if len(recalled) else None
+        if again is not None and (pose is None or again.num_inliers > pose.num_inliers):
+            return again
+        # What was recalled has proved nothing.
+        self._tracks.keep(~np.isin(self._tracks.ids, recalled))
+        return pose
+
+    def _resembles(self, sight: Sight, pose: TrackedPose) -> bool:
+        """Tell whether tracks that agree with a pose look as they did: in noise some fit any guess."""
+        return self._map.resembles(self._tracks, sight, pose.T_world_cam, pose.ids[pose.inliers])
+
+    def unhidden(self, sight: Sight, T_world_rest: Array) -> TrackedPose | None:
+        """Pose of a camera that rests and lost sight of everything, by what can be seen again from there."""
+        pose = self._with_more(sight, None, T_world_rest)
+        if pose is None or (pose.num_inliers >= _LEAST_UNHIDDEN and self._resembles(sight, pose)):
+            return pose
+        self._tracks.keep(self._map.world.landmarks.rows(self._tracks.ids) < 0)
+        return None
