@@ -40,7 +40,7 @@ from semcast.evaluation.image_quality import ms_ssim, ssim
 from semcast.evaluation.picture_strip import write_picture_strip
 from semcast.evaluation.pipeline import UNUSED_LINK_FIELDS
 from semcast.evaluation.plots import plot_against_snr
-from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.report import json_ready, provenance, write_result
 from semcast.evaluation.sounding import told_at_first
 from semcast.evaluation.statistics import finite_mean, percentiles, spearman
 from semcast.evaluation.trace_snr import check_snrs, snr_file_label, stated_snr_db
@@ -241,7 +241,7 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         }
     )
     if settings.json is not None:
-        write_json(settings.json, report)
+        write_result(settings.json, report)
     if settings.out is not None:
         if settings.link.channel != "trace":
             _draw(settings.out, settings.snr_db, results)

@@ -18,7 +18,7 @@ from semcast.evaluation.pipeline import (
     select_frames,
 )
 from semcast.evaluation.plots import plot_reliability
-from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.report import json_ready, provenance, write_result
 from semcast.evaluation.statistics import finite_mean
 from semcast.evaluation.trace_snr import snr_label, stated_snr_db
 
@@ -76,7 +76,7 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
         "results": json_ready(results),
     }
     if settings.json is not None:
-        write_json(settings.json, report)
+        write_result(settings.json, report)
     if settings.out is not None:
         tables = {
             snr_label(snr_db, settings.link): result["pixel"]["reliability"]

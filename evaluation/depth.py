@@ -31,7 +31,7 @@ from semcast.evaluation.cloud_error import CloudError, TrueView, cloud_error
 from semcast.evaluation.keyframe_depth import DepthKeyframe, cloud_points, confirmed_depths, reconstructed
 from semcast.evaluation.picture_strip import write_picture_strip
 from semcast.evaluation.pipeline import CLEAN, UNUSED_LINK_FIELDS, run_frames
-from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.report import json_ready, provenance, write_result
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.render import SCENES, RenderSettings, SceneName, render_scene
 from semcast.evaluation.scenes.surfaces import exact_depth
@@ -189,7 +189,7 @@ def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = Non
         }
     )
     if settings.json is not None:
-        write_json(settings.json, report)
+        write_result(settings.json, report)
     if settings.out is not None:
         write_picture_strip(settings.out / "depth.png", strip)
     return dict(report)

@@ -29,7 +29,7 @@ from semcast.evaluation.pipeline import (
     select_frames,
 )
 from semcast.evaluation.reconstruct import as_received, cut_to_frames
-from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.report import json_ready, provenance, write_result
 from semcast.evaluation.trace_snr import snr_label
 from semcast.server.export.outputs import trajectory_of
 from semcast.server.mapping.bundle_process import ProcessBundle
@@ -123,7 +123,7 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
         }
     )
     if settings.json is not None:
-        write_json(settings.json, report)
+        write_result(settings.json, report)
     return dict(report)
 
 

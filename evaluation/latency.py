@@ -20,7 +20,7 @@ from semcast.evaluation.pipeline import (
     select_frames,
 )
 from semcast.evaluation.reconstruct import reconstruct
-from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.report import json_ready, provenance, write_result
 from semcast.evaluation.trace_snr import snr_label
 from semcast.server.frame_rows import FrameRow
 from semcast.server.frame_views import frame_view
@@ -177,5 +177,5 @@ def evaluate_latency(settings: LatencySettings, codec: Codec | None = None) -> d
         }
     )
     if settings.json is not None:
-        write_json(settings.json, report)
+        write_result(settings.json, report)
     return dict(report)

@@ -16,7 +16,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError
 from semcast.common.sequence import ImageRectifier
 from semcast.evaluation.moving_images import Heard, Images, ImagesSettings, listen, load_images
-from semcast.evaluation.report import provenance, write_json
+from semcast.evaluation.report import provenance, write_result
 from semcast.server.mapping.lens import LensFit, believed_lens
 from semcast.server.mapping.readout import Readout
 
@@ -176,7 +176,7 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
         tuple(trials),
     )
     if settings.json is not None:
-        write_json(settings.json, _report(settings, images, found))
+        write_result(settings.json, _report(settings, images, found))
     return found
 
 

@@ -21,7 +21,7 @@ from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
 from semcast.evaluation.calibration import reliability
-from semcast.evaluation.report import check_outputs, json_ready, machine_kind, source_commit, write_json
+from semcast.evaluation.report import check_outputs, json_ready, machine_kind, source_commit, write_result
 from semcast.evaluation.statistics import spearman
 from semcast.training.channel import LinkDrawSettings, draw_links, through_link
 from semcast.training.data import read_images
@@ -140,7 +140,7 @@ def main() -> None:
         "what": f"{len(images)} validation photos, 16-QAM, fading and sometimes lost slots, {_SNR_DB:g} dB",
         "results": results,
     }
-    write_json(arguments.json, json_ready(report))
+    write_result(arguments.json, json_ready(report))
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ from semcast.evaluation.pipeline import (
 )
 from semcast.evaluation.plots import plot_pair_errors
 from semcast.evaluation.pose_error import relative_pose_error
-from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.report import json_ready, provenance, write_result
 from semcast.evaluation.statistics import finite_mean, percentiles
 from semcast.evaluation.trace_snr import stated_snr_db
 from semcast.server.geometry.agreement import neighbour_agreement
@@ -193,7 +193,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
         }
     )
     if settings.json is not None:
-        write_json(settings.json, report)
+        write_result(settings.json, report)
     if settings.out is not None and codec is not None and settings.link.channel != "trace":
         plot_pair_errors(settings.out, report)
     return dict(report)

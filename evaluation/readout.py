@@ -14,7 +14,7 @@ import numpy as np
 from semcast.common.camera import MAX_READOUT_MS, Intrinsics
 from semcast.common.errors import SemcastError, SourceError
 from semcast.evaluation.moving_images import MIN_FRAMES, Heard, Images, ImagesSettings, listen, load_images
-from semcast.evaluation.report import provenance, write_json
+from semcast.evaluation.report import provenance, write_result
 from semcast.server.mapping.readout import Readout, ReadoutFit, fit_readout
 
 #: Reconstructions at most, and the factor by which each has to make errors smaller for its readout to be
@@ -117,7 +117,7 @@ def find_readout(
     )
     estimate = ReadoutEstimate(readout, low_ms, high_ms, found, tuple(trials))
     if settings.json is not None:
-        write_json(settings.json, _report(settings, images.name, estimate))
+        write_result(settings.json, _report(settings, images.name, estimate))
     return estimate
 
 

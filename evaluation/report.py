@@ -1,25 +1,19 @@
 """Results as JSON with their provenance: command, settings, seeds, versions, commit and kind of machine."""
 
-import dataclasses
-import importlib.metadata
-import json
-import math
 import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from enum import Enum
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 import semcast
 from semcast.common.config_flags import flag_words
 from semcast.common.cores import usable_cores
 from semcast.common.errors import ConfigError, SemcastError
-from semcast.common.whole_file import check_writable, whole_file
+from semcast.common.whole_file import check_writable
+from semcast.server.export.outputs import plain, versions_of, write_json
 
 #: File of a result in the folder its pictures go to.
 RESULT_NAME = "result.json"
@@ -32,33 +26,12 @@ _CPU_FLAGS = (("avx2", "AVX2"), ("avx512f", "AVX512"), ("amx_tile", "AMX"))
 
 
 def json_ready(value: Any) -> Any:
-    """Return plain JSON values: arrays as lists, NaN and infinities as None, settings as mappings.
+    """Return plain JSON values, see ``plain``.
 
     An absolute path is cut to its last part, so a result says which sequence it used and not where a
     machine keeps it.
-
-    Raises:
-        TypeError: A value has no JSON form.
     """
-    if value is None or (isinstance(value, (str, bool, int)) and not isinstance(value, Enum)):
-        return value
-    if isinstance(value, Enum):
-        return json_ready(value.value)
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, np.generic):
-        return json_ready(value.item())
-    if isinstance(value, np.ndarray):
-        return json_ready(value.tolist())
-    if isinstance(value, Path):
-        return value.name if value.is_absolute() else str(value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: json_ready(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(k): json_ready(v) for k, v in value.items()}
-    if isinstance(value, Sequence):
-        return [json_ready(v) for v in value]
-    raise TypeError(f"a result can't hold {type(value).__name__}")
+    return plain(value, lambda path: path.name if path.is_absolute() else str(path))
 
 
 def check_outputs(json: Path | None, out: Path | None) -> None:
@@ -82,17 +55,15 @@ def check_outputs(json: Path | None, out: Path | None) -> None:
         raise ConfigError(f"{err.filename} can't be written: {err.strerror}") from err
 
 
-def write_json(path: Path, result: Mapping[str, Any]) -> None:
+def write_result(path: Path, result: Mapping[str, Any]) -> None:
     """Write a result; the file is complete or absent, never half written.
 
     Raises:
         SemcastError: The folder can't be made or the file can't be written.
     """
-    text = json.dumps(json_ready(result), indent=1, allow_nan=False) + "\n"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as file:
-            file.write(text.encode())
+        write_json(path, json_ready(result))
     except OSError as err:
         raise SemcastError(f"{path} can't be written: {err}") from err
 
@@ -107,17 +78,6 @@ def machine_kind() -> str:
         flags = set()
     sets = "/".join(name for flag, name in _CPU_FLAGS if flag in flags)
     return f"{cores}-core {architecture}" + (f", {sets}" if sets else "")
-
-
-def library_versions() -> dict[str, str]:
-    """Return versions of semcast, Python and the libraries a result depends on, those installed."""
-    versions = {"semcast": semcast.__version__, "python": platform.python_version()}
-    for library in LIBRARIES:
-        try:
-            versions[library] = importlib.metadata.version(library)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return versions
 
 
 def source_commit() -> str:
@@ -162,5 +122,5 @@ def provenance(verb: str, settings: Any) -> dict[str, Any]:
         "commit": source_commit(),
         "machine": machine_kind(),
         "platform": sys.platform,
-        "versions": library_versions(),
+        "versions": versions_of(LIBRARIES),
     }

@@ -14,7 +14,7 @@ from semcast.common.codec import DEFAULT_CODEC
 from semcast.common.codecs import LEARNED_CODECS, available_codecs
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SemcastError
-from semcast.evaluation.report import json_ready, provenance, write_json
+from semcast.evaluation.report import json_ready, provenance, write_result
 
 VERB = "eval runtime"
 UNUSED_FIELDS: frozenset[str] = frozenset()
@@ -149,7 +149,7 @@ def evaluate_runtime(settings: RuntimeSettings) -> dict[str, Any]:
         raise SemcastError(f"no variant ran: {children[0].error}")
     report = {"results": [_row(child) for child in children], **provenance(VERB, settings)}
     if settings.json is not None:
-        write_json(settings.json, report)
+        write_result(settings.json, report)
     return dict(json_ready(report))
 
 

@@ -1,10 +1,12 @@
 """What a run leaves behind: its files, each on its own, as PLY map, timed trajectory, JSON without NaN."""
 
+import dataclasses
 import json
 import math
 import platform
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from enum import Enum
 from importlib import metadata
 from pathlib import Path
 from types import TracebackType
@@ -166,21 +168,35 @@ def trajectory_of(poses: Mapping[int, NDArray[np.float64]], t_source_ns: Mapping
     return Trajectory(ns_to_seconds(exactly), np.array(kept, dtype=np.float64).reshape(-1, 4, 4), exactly)
 
 
-def plain(value: Any) -> Any:
-    """Return a value as JSON knows it: numpy becomes Python, NaN and infinity become None."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
+def plain(value: Any, path_text: Callable[[Path], str] = str) -> Any:
+    """Return a value as JSON knows it: numpy becomes Python, settings mappings, NaN and infinity None.
+
+    Args:
+        value: Of plain values, arrays, paths, settings, and mappings and sequences of them.
+        path_text: What stands for a path.
+
+    Raises:
+        TypeError: A value has no JSON form.
+    """
+    if value is None or (isinstance(value, (str, bool, int)) and not isinstance(value, Enum)):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     if isinstance(value, Path):
-        return str(value)
-    return value
+        return path_text(value)
+    if isinstance(value, Enum):
+        return plain(value.value, path_text)
+    if isinstance(value, np.generic):
+        return plain(value.item(), path_text)
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist(), path_text)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name), path_text) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): plain(v, path_text) for k, v in value.items()}
+    if isinstance(value, Sequence):
+        return [plain(v, path_text) for v in value]
+    raise TypeError(f"JSON can't hold {type(value).__name__}")
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
@@ -197,12 +213,17 @@ def percentiles(values_ms: Iterable[float]) -> dict[str, float] | None:
     return {"p50": float(p50), "p95": float(p95), "max": float(values.max())}
 
 
-def versions() -> dict[str, str]:
-    """Return the versions a figure depends on; packages that are not installed are left out."""
-    found = {"semcast": __version__, "python": platform.python_version(), "machine": platform.machine()}
-    for package in PACKAGES:
+def versions_of(packages: Iterable[str]) -> dict[str, str]:
+    """Return the versions of semcast, of Python and of those of some packages that are installed."""
+    found = {"semcast": __version__, "python": platform.python_version()}
+    for package in packages:
         try:
             found[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
     return found
+
+
+def versions() -> dict[str, str]:
+    """Return what the figures of a run depend on: versions, and the kind of machine."""
+    return {**versions_of(PACKAGES), "machine": platform.machine()}

@@ -17,7 +17,7 @@ from semcast.commands.running import INTERRUPTED, add_settings, read_given, read
 from semcast.common.run_folder import RUN_FILES, VIEWER_NAME
 from semcast.common.sequence import open_sequence
 from semcast.demo import DemoSettings, default_sequence, run_demo
-from semcast.evaluation.report import STDOUT, provenance, write_json
+from semcast.evaluation.report import STDOUT, provenance, write_result
 from semcast.server.export.parts import parts_line
 
 
@@ -126,7 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
     if json_to_stdout:
         print(json.dumps(report, indent=1))
     elif settings.json is not None:
-        write_json(settings.json, report)
+        write_result(settings.json, report)
     if not code and not result.get("completeness"):
         talk.print(f"semcast demo: {why_no_pose(result)}", soft_wrap=True)
         return 1
