@@ -272,7 +272,13 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
 def test_a_link_that_nothing_can_be_decoded_on_is_said(tmp_path):
     told = []
     settings = DemoSettings(
-        codec="jpeg-ldpc", link=ChannelSettings(snr_db=0.0), view="file", resize=0.3, out=tmp_path
+        codec="jpeg-ldpc",
+        link=ChannelSettings(snr_db=0.0),
+        view="file",
+        resize=0.3,
+        rate_hz=5.0,
+        stride=2,
+        out=tmp_path,
     )
     summary, error = run_demo(
         settings, threading.Event(), lambda line: None, lambda done, text: told.append((done, text))
@@ -317,7 +323,7 @@ def test_an_agent_that_gives_up_ends_the_demo_with_what_came_out_so_far(tmp_path
     for image in images[25:]:
         image.write_bytes(b"no image")
     settings = DemoSettings(
-        sequence=sequence, codec="jpeg-ldpc", view="none", resize=0.4, out=tmp_path / "out"
+        sequence=sequence, codec="jpeg-ldpc", view="none", resize=0.4, rate_hz=10.0, out=tmp_path / "out"
     )
     told = []
     summary, error = run_demo(settings, threading.Event(), told.append, lambda done, text: None)
