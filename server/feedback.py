@@ -11,7 +11,7 @@ from semcast.common.keys import flow_key, link_key
 from semcast.common.link_report import LinkReporter
 from semcast.common.messages import FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
-from semcast.common.symbol_payload import Equalised
+from semcast.common.phy.equaliser import Equalised
 from semcast.common.transport import Session
 from semcast.common.wire import pack
 from semcast.common.worker_guard import WorkerGuard
