@@ -2,6 +2,7 @@ import contextlib
 import json
 import math
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -312,9 +313,10 @@ def test_a_variable_rate_is_trained_from_a_fixed_one(photos, tmp_path, monkeypat
 def test_a_variable_rate_can_start_from_the_images_alone(photos, tmp_path, monkeypatch):
     variable = registry.Architecture("3dcsc-vr", TINY.sizes, build_variable_3dcsc)
     monkeypatch.setattr(registry, "_entries", lambda: (variable,))
+    valid = shutil.copytree(photos, tmp_path / "valid")
     for k in range(6):  # enough blocks for 282 directions
         cv2.imwrite(str(photos / f"large{k}.png"), np.random.default_rng(k).integers(0, 256, (512, 512, 3)))
-    settings = settings_for(photos, tmp_path / "run", architecture="3dcsc-vr", steps=2, valid=photos)
+    settings = settings_for(photos, tmp_path / "run", architecture="3dcsc-vr", steps=2, valid=valid)
     linear = train(settings).valid["psnr_10db"]
     assert linear > train(replace(settings, start="random", out=tmp_path / "r")).valid["psnr_10db"] + 1.0
 
