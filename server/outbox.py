@@ -65,21 +65,16 @@ class Outbox:
             self._t_capture_ns.popitem(last=False)
         for frame_id, t_source_ns, T_world_cam in result.backfilled:
             t_capture_ns = self._t_capture_ns.get((epoch, frame_id))
-            if t_capture_ns is None:
-                continue
-            message = PoseMessage(
-                agent_epoch=epoch,
-                frame_id=frame_id,
-                t_capture_ns=t_capture_ns,
-                t_source_ns=t_source_ns,
-                T_world_cam=tuple(T_world_cam.ravel().tolist()),
-                state=result.state.value,
-                num_inliers=0,
-                covariance=None,
-                map_epoch=result.map_epoch,
-                submap=result.submap,
-            )
-            self._put(message)
+            if t_capture_ns is not None:
+                late = replace(
+                    result,
+                    frame_id=frame_id,
+                    t_source_ns=t_source_ns,
+                    T_world_cam=T_world_cam,
+                    num_inliers=0,
+                    covariance=None,
+                )
+                self._put(pose_message(epoch, t_capture_ns, late))
         self._put(pose_message(epoch, arrival.message.t_capture_ns, result))
 
     def put_metric_pose(
