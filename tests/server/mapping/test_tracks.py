@@ -170,6 +170,7 @@ def test_adopted_points_replace_all_tracks():
     assert tracks.ids.tolist() == [4, 9]
     assert tracks.xy.tolist() == [[2, 2], [1, 1]]
     assert tracks.visible.all()
+    assert tracks.velocity.tolist() == tracks.edge.tolist() == [[0, 0], [0, 0]]
 
 
 def test_off_ignores_the_maps():
@@ -247,7 +248,9 @@ def test_a_second_look_that_finds_less_changes_nothing():
     assert coasting > 20
     assert visible > 20
     before = {name: getattr(tracks, name).copy() for name in ("ids", "xy", "missed")}
+    frame_ids = tracks.frame_ids
     assert not tracks.follow_jump(lost)
+    assert tracks.frame_ids == frame_ids, "the image too is one that tracks are followed from"
     for name, values in before.items():
         np.testing.assert_array_equal(getattr(tracks, name), values)
 
