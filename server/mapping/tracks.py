@@ -199,10 +199,10 @@ class TrackTable:
         found = Found.nothing(self.xy)
         guess_xy = np.where(self.fixed[:, None], self.xy, guess_xy)
         is_in_light = False
-        for back in range(min(len(self._greys), MAX_COAST + 1)):
+        behind, count = np.unique(self.missed[self.missed < len(self._greys)], return_counts=True)
+        # Those that are most come first: of one image all the others may be, and a few can't tell the light.
+        for back in behind[np.argsort(-count, kind="stable")]:
             rows = np.flatnonzero(self.missed == back)
-            if len(rows) == 0:
-                continue
             grey, way = self._greys[-1 - back], (self.xy[rows], guess_xy[rows])
             if is_in_light:
                 points = track_alike(grey, sight.grey, *way, max_level=max_level)

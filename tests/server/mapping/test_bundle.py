@@ -291,6 +291,26 @@ def test_a_last_pose_that_is_held_or_unseen_has_no_covariance(fixed_last):
     assert np.linalg.norm(result.T_world_cam[2:5, :3, 3] - T_world_cam[2:5, :3, 3], axis=1).max() < 0.05
 
 
+def test_a_last_pose_that_saw_a_single_point_has_no_covariance():
+    problem, _, _ = make_problem(noise_px=0.1)
+    seen = (problem.view != 5) | (problem.point == 0)
+    names = ("view", "point", "xy", "sigma_px", "confidence", "edge")
+    kept = {name: vars(problem)[name][seen] for name in names}
+    result = optimise(BundleProblem(**{**vars(problem), **kept}))
+    assert result.ok
+    assert result.covariance is None
+
+
+@pytest.mark.parametrize(("solver", "other"), [("dense", "_by_gtsam"), ("gtsam", "_by_dense_algebra")])
+def test_the_solver_is_the_one_that_is_set_and_gives_a_covariance_where_it_is_wanted(
+    monkeypatch, solver, other
+):
+    monkeypatch.setattr(bundle, other, None)
+    problem, _, _ = make_problem(solver=solver)
+    assert optimise(problem).covariance is not None
+    assert optimise(replace(problem, with_covariance=False)).covariance is None
+
+
 def test_points_are_adjusted_where_all_poses_are_held():
     problem, _, xyz = make_problem(noise_px=0.0, shake=0.0)
     moved = BundleProblem(**{**vars(problem), "fixed": np.ones(6, bool), "xyz": xyz + 0.02})

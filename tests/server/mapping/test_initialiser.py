@@ -193,14 +193,17 @@ def test_a_camera_that_stops_too_early_gets_the_better_start_in_the_end(monkeypa
     assert asked[-1] is True
 
 
-def test_structures_go_on_to_the_next_attempt_with_their_doubt(monkeypatch):
+@pytest.mark.parametrize(
+    "hopeless", [{"doubt": 3.0}, {"doubt": 0.5, "ok": False}], ids=["doubtful", "failed"]
+)
+def test_structures_go_on_to_the_next_attempt_with_their_doubt(monkeypatch, hopeless):
     frames, poses = ride(8, step_m=0.05)
     asked = []
 
     def undecided(problem, carried, *, at_last):
         asked.append((problem, carried))
         side = adjusted(problem)
-        return None, [side, replace(side, doubt=0.4), replace(side, doubt=3.0)]
+        return None, [side, replace(side, doubt=0.4), replace(side, **hopeless)]
 
     monkeypatch.setattr("semcast.server.mapping.initialiser.decide", undecided)
     assert begin(frames) is None

@@ -170,6 +170,7 @@ def test_adopted_points_replace_all_tracks():
     assert tracks.ids.tolist() == [4, 9]
     assert tracks.xy.tolist() == [[2, 2], [1, 1]]
     assert tracks.visible.all()
+    assert tracks.velocity.tolist() == tracks.edge.tolist() == [[0, 0], [0, 0]]
 
 
 def test_off_ignores_the_maps():
@@ -228,6 +229,17 @@ def test_a_second_look_starts_from_the_image_before():
     np.testing.assert_array_equal(tracks.xy, before)
 
 
+def test_a_second_look_leaves_out_what_was_last_seen_in_an_image_that_is_kept_no_longer():
+    tracks = begin()
+    for k in range(MAX_COAST):
+        tracks.follow(sight_at(23 + 3 * k, lost=(4, 5)), tracks.xy + tracks.velocity)
+    assert (tracks.missed == MAX_COAST).sum() > 5
+    sight = sight_at(23 + 3 * MAX_COAST)
+    tracks.follow(sight, tracks.xy + tracks.velocity)
+    assert tracks.follow_again(sight, lambda before: before.xy + before.velocity)
+    assert tracks.visible.sum() > 50
+
+
 def test_a_second_look_that_finds_less_changes_nothing():
     tracks = begin()
     lost = sight_at(24, lost=(0, 1, 2, 3, 4, 5))  # half of the image
@@ -236,7 +248,9 @@ def test_a_second_look_that_finds_less_changes_nothing():
     assert coasting > 20
     assert visible > 20
     before = {name: getattr(tracks, name).copy() for name in ("ids", "xy", "missed")}
+    frame_ids = tracks.frame_ids
     assert not tracks.follow_jump(lost)
+    assert tracks.frame_ids == frame_ids, "the image too is one that tracks are followed from"
     for name, values in before.items():
         np.testing.assert_array_equal(getattr(tracks, name), values)
 

@@ -57,3 +57,16 @@ def test_tracks_that_coast_are_followed_through_the_change_of_light_that_the_oth
     off = tracks.xy[np.searchsorted(tracks.ids, band_ids[came])] - (band_xy[came] - (6, 0))
     assert np.median(np.linalg.norm(off, axis=1)) < 0.3
     assert min(asked) > len(band_ids), "those are not asked"
+
+
+@pytest.mark.parametrize("gain", [0.8, 0.5])
+def test_a_few_tracks_that_are_left_do_not_tell_the_light_for_those_that_coast(gain):
+    tracks = begin()
+    ids, xy = tracks.ids, tracks.xy
+    tracks.follow(sight_at(23, lost=range(1, 11)), tracks.xy)
+    assert 0 < tracks.visible.sum() < 20 < (tracks.missed == 1).sum()
+    tracks.follow(darker(sight_at(26), gain), tracks.xy + tracks.velocity)
+    came = np.isin(ids, tracks.ids[tracks.visible])
+    assert came.mean() > 0.9
+    off = tracks.xy[np.searchsorted(tracks.ids, ids[came])] - (xy[came] - (6, 0))
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.25
