@@ -28,8 +28,8 @@ _MIXED_SHARE = 0.15
 #: What a place counts that has changed hands, as a share of what it counted with the frame before.
 _KEPT = 0.85
 #: So much must be counted, and this share of the places that stood last. Before crossing traffic it rises to
-#: 0.4 and more; with 0.3 that is too late for a start among fast cars. Along the outline of a dashboard it has
-#: been 0.28 for a second of a drive: what that delays is done by then.
+#: 0.4 and more; with 0.3 that is too late for a start among fast cars. Along the outline of a dashboard it
+#: has been 0.28 for a second of a drive: what that delays is done by then.
 _LEAST_TURNED, _TURNED_SHARE = 8.0, 0.2
 #: For how long that is remembered while what stood goes on to stand, or is hidden.
 _MEMORY_NS = 2_000_000_000

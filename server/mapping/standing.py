@@ -72,7 +72,7 @@ def least_motion_px(width: int, sd_px: Array | float) -> Array:
     """How far a track may move and still stands: for a standard deviation of a position per coordinate."""
     # Both ends of what it moved are noisy.
     noise_px = _NOISE_SIGMAS * np.sqrt(2.0) * np.asarray(sd_px)
-    return np.maximum(max(_STANDING_PX, _STANDING_SHARE * width), noise_px)
+    return np.asarray(np.maximum(max(_STANDING_PX, _STANDING_SHARE * width), noise_px))
 
 
 def stood(
