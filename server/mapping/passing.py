@@ -34,7 +34,7 @@ _LEAST_TURNED, _TURNED_SHARE = 8.0, 0.2
 #: For how long that is remembered while what stood goes on to stand, or is hidden.
 _MEMORY_NS = 2_000_000_000
 #: Share of what stood that must be seen to tell whether it still does.
-_LEAST_LEFT = 0.33
+_LEAST_LEFT = 0.2
 _NOTHING, _STANDS, _PASSES = 0, 1, 2
 
 
