@@ -17,6 +17,7 @@ Tracks (2D)
     tracks            the table of tracks: KLT from image to image, new corners, confidence
     found             where tracks were found in an image, as one search follows another
     standing          tracks fixed in the image: a bonnet, a watermark, dirt on the lens
+    passing           what passes before a camera at rest, and is no motion of the scene
     refuted           tracks on something large that moves by itself
     anchoring         drift of tracks, taken out by alignment with patches of keyframes
 

@@ -118,7 +118,9 @@ class CameraMotion:
         self._came_ns = [*self._came_ns[-1:], t_source_ns]
         return self._has_gap
 
-    def observe(self, frame_id: int, t_source_ns: int, T_world_cam: Array, xyz: Array) -> list[int]:
+    def observe(
+        self, frame_id: int, t_source_ns: int, T_world_cam: Array, xyz: Array, *, stands: bool = False
+    ) -> list[int]:
         """Take the pose of a frame.
 
         Args:
@@ -126,12 +128,14 @@ class CameraMotion:
             t_source_ns: Its time.
             T_world_cam: Its pose.
             xyz: ``(N, 3)`` points of the map that are in sight.
+            stands: Something passes in front of the camera, by which it is known to be at rest already.
 
         Returns:
             Earlier frames whose poses are of another time: their image was an older one.
         """
         self._has_gap = False
         self._note_rest(t_source_ns, T_world_cam, xyz)
+        self._rests |= stands
         T_world_go = self._motion.predict(t_source_ns)
         if self._moving is None or T_world_go is None:
             self._go_on(t_source_ns, T_world_cam)

@@ -184,7 +184,7 @@ class Initialiser:
             self._undecided_px = np.zeros(2)
 
     def add(
-        self, observed: Observed, noise: NoiseModel, suspect: Ids = _NONE, *, is_damaged: bool = False
+        self, observed: Observed, noise: NoiseModel, suspect: Ids = _NONE, *, waits: bool = False
     ) -> Start | None:
         """Take a frame and try to start a map with it.
 
@@ -193,7 +193,8 @@ class Initialiser:
             noise: Of the observations.
             suspect: Tracks that stand in the image and may be of no scene. No start rests on them: it would
                 take what moves with the camera for what is far away, and the camera for not turning.
-            is_damaged: Much of the image is missing: keep the frame, but do not start from it.
+            waits: Keep the frame, but do not start from it: much of its image is missing, or the camera
+                stands.
 
         Returns:
             The start, or None for now. On success ``history`` still holds the frames to be posed.
@@ -201,7 +202,7 @@ class Initialiser:
         if len(observed.ids) < MIN_MATCHES:
             return None
         self._remember(observed, suspect)
-        if is_damaged or self._reference == len(self.history) - 1:
+        if waits or self._reference == len(self.history) - 1:
             return None
         pair = _pair(self.history[self._reference], observed, suspect)
         if len(pair.ids) < self._min_points():

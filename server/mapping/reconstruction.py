@@ -164,9 +164,10 @@ class Reconstruction:
 
     def _moves_to(self, frame_id: int, t_source_ns: int, T_world_cam: Array, ids: Ids) -> None:
         """Let the motion go on; frames that now turn out to have shown an older image have no pose."""
-        xyz = self._map.world.landmarks.xyz_of(ids)
+        xyz, stands = self._map.world.landmarks.xyz_of(ids), self._tracks.passing.camera_stands
         self._map.watch.note(frame_id, t_source_ns)
-        self._map.world.forget_frames(self._motion.observe(frame_id, t_source_ns, T_world_cam, xyz))
+        gone = self._motion.observe(frame_id, t_source_ns, T_world_cam, xyz, stands=stands)
+        self._map.world.forget_frames(gone)
 
     def _last_pose(self) -> Array | None:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
@@ -178,8 +179,7 @@ class Reconstruction:
         if pose is not None:
             return self._accept(sight, pose)
         logger.debug("frame %d: tracking is lost", sight.frame.frame_id)
-        self._state = TrackingState.LOST
-        self._lost_ns = []
+        self._state, self._lost_ns = TrackingState.LOST, []
         self._initialiser.clear()
         return self._find(sight)
 
@@ -188,8 +188,7 @@ class Reconstruction:
         frame, tracks = sight.frame, self._tracks
         reference = self._map.reference_keyframe()
         assert reference is not None
-        self._state = TrackingState.TRACKING
-        self._lost_ns = []
+        self._state, self._lost_ns = TrackingState.TRACKING, []
         self._frames_since_keyframe += 1
         self._last_posed_id = frame.frame_id
         self._map.world.add_frame(frame.frame_id, reference.frame_id, pose.T_world_cam)
@@ -252,9 +251,10 @@ class Reconstruction:
         visible = tracks.visible & (self._map.world.landmarks.rows(tracks.ids) < 0)
         observed = observed_of(sight, tracks, visible)
         self._initialiser.leave_out(tracks.ids[tracks.fixed])
-        waits = self._state is TrackingState.LOST or float(sight.usable.mean()) < _MIN_USABLE_SHARE
+        waits = self._state is TrackingState.LOST or tracks.passing.camera_stands
+        waits |= float(sight.usable.mean()) < _MIN_USABLE_SHARE
         noise, suspect = self._map.noise.model, tracks.ids[tracks.suspect]
-        start = self._initialiser.add(observed, noise, suspect, is_damaged=waits)
+        start = self._initialiser.add(observed, noise, suspect, waits=waits)
         self._lap("two_view", since)
         return self._result(frame, None, None) if start is None else self._begin_map(sight, start)
 

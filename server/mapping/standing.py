@@ -68,6 +68,13 @@ def scene_motion_px(xy: Array, motion_px: Array, width: int, moving_sd_px: Array
     return motion if motion >= _LEAST_MOTION_PX else 0.0
 
 
+def least_motion_px(width: int, sd_px: Array | float) -> Array:
+    """How far a track may move and still stands: for a standard deviation of a position per coordinate."""
+    # Both ends of what it moved are noisy.
+    noise_px = _NOISE_SIGMAS * np.sqrt(2.0) * np.asarray(sd_px)
+    return np.asarray(np.maximum(max(_STANDING_PX, _STANDING_SHARE * width), noise_px))
+
+
 def stood(
     xy: Array,
     anchor_xy: Array,
@@ -89,9 +96,7 @@ def stood(
     Returns:
         The new ``anchor_xy`` and ``widths``: a track that moved begins anew where it is.
     """
-    # Both ends of what it moved are noisy.
-    least_px = np.maximum(max(_STANDING_PX, _STANDING_SHARE * width), _NOISE_SIGMAS * np.sqrt(2.0) * sd_px)
-    stands = np.linalg.norm(xy - anchor_xy, axis=1) <= least_px
+    stands = np.linalg.norm(xy - anchor_xy, axis=1) <= least_motion_px(width, sd_px)
     return np.where(stands[:, None], anchor_xy, xy), np.where(stands, widths + scene_px / width, 0.0)
 
 

@@ -31,8 +31,9 @@ from semcast.server.geometry.weighting import (
 )
 from semcast.server.geometry.wide_search import Carried, WideFeatures, search_wide
 from semcast.server.mapping.found import Found
+from semcast.server.mapping.passing import Passing
 from semcast.server.mapping.sight import Seen, Sight
-from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood
+from semcast.server.mapping.standing import is_fixed, may_be_fixed, stood
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -72,10 +73,10 @@ class TrackTable:
         anchor_xy: ``(N, 2)`` where it began to stand still in the image.
         stood_widths: ``(N,)`` image widths the scene went since then.
         edge: ``(N, 2)`` of the newest position, see ``edges``.
+        passing: What passes before the scene.
     """
 
     def __init__(self, mode: ConfidenceMode, max_features: int, seed: int, turntable: bool = False) -> None:
-        self._turntable = turntable
         self._mode: ConfidenceMode = mode
         self._max_features = max_features
         self._rng = np.random.default_rng(seed)
@@ -84,6 +85,7 @@ class TrackTable:
         self._frame_ids: list[int] = []
         self._before: dict[str, Array] | None = None
         self._jumped = False
+        self.passing = Passing(max_features, turntable)
         self.clear()
 
     def clear(self) -> None:
@@ -324,14 +326,12 @@ class TrackTable:
         self.velocity = np.where(ok[:, None], (found.xy - self.xy) / steps, self.velocity)
         self.xy = np.where(ok[:, None], found.xy, self.xy)
         self.age = self.age + ok
-        width = sight.grey.shape[1]
         motion_px, sd_px = np.linalg.norm(self.velocity[ok], axis=1), np.sqrt(self.variance_px2)
-        moving_sd_px = sd_px[ok] if self._turntable else None
-        scene_px = scene_motion_px(self.xy[ok], motion_px, width, moving_sd_px)
+        of_ok = self.ids[ok], self.xy[ok], motion_px, sd_px[ok], self.fixed[ok]
+        scene_px = self.passing.scene_motion_px(sight, *of_ok)
         passed = np.where(ok, scene_px, 0.0)  # where a track that coasts is, nobody knows
-        self.anchor_xy, self.stood_widths = stood(
-            self.xy, self.anchor_xy, self.stood_widths, passed, width, sd_px
-        )
+        still = self.anchor_xy, self.stood_widths
+        self.anchor_xy, self.stood_widths = stood(self.xy, *still, passed, sight.grey.shape[1], sd_px)
         self.missed = np.where(ok, 0, self.missed + 1)
         cues = replace(
             self._cues(

@@ -187,6 +187,14 @@ def test_a_camera_rests_when_the_image_has_hardly_moved_for_a_second():
     assert not motion.rests
 
 
+def test_a_camera_before_which_something_passes_rests_at_once():
+    motion = CameraMotion(CAMERA)
+    go(motion, [0.0, 0.3, 0.5, 0.6])
+    assert not motion.rests
+    motion.observe(4, 4 * FRAME_NS, at(0.65), POINTS, stands=True)
+    assert motion.rests
+
+
 def test_a_camera_that_moves_does_not_rest_where_the_map_gets_another_unit():
     """A quarter as large, the map has the camera pass where it was a second ago, in the unit of before."""
     motion = CameraMotion(CAMERA)

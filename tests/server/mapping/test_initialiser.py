@@ -35,11 +35,11 @@ def ride(num_frames, num_points=150, step_m=0.12, noise_px=0.3, seed=0, turn_rad
     return frames, poses
 
 
-def begin(frames, *, is_damaged=lambda k: False):
+def begin(frames, *, waits=lambda k: False):
     """Index of the frame a map began with, and the map; None without one."""
     initialiser = Initialiser(CAMERA, "off", 1.0, 0)
     for k, frame in enumerate(frames):
-        start = initialiser.add(frame, NOISE, is_damaged=is_damaged(k))
+        start = initialiser.add(frame, NOISE, waits=waits(k))
         if start is not None:
             return k, start
     return None
@@ -105,7 +105,7 @@ def test_standing_still_and_damaged_images_begin_nothing():
     ]
     assert begin(still) is None
     frames, _ = ride(6)
-    k, _ = begin(frames, is_damaged=lambda k: k == 2)
+    k, _ = begin(frames, waits=lambda k: k == 2)
     assert k == 3
 
 
@@ -180,7 +180,7 @@ def test_a_few_tracks_that_last_long_do_not_tie_the_start_to_an_old_frame():
         replace(f, ids=np.where(np.isin(f.ids, last), f.ids, 1000 + f.ids), xy=f.xy + k * own_way[f.ids])
         for k, f in enumerate(frames[3:], start=3)
     ]
-    k, start = begin([*frames[:3], *later], is_damaged=lambda k: k < 3)
+    k, start = begin([*frames[:3], *later], waits=lambda k: k < 3)
     assert start.keyframes[0].frame_id >= 3
     assert k < 16
 
