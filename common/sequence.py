@@ -320,7 +320,7 @@ def truth_at_frames(truth: Trajectory, times_ns: NDArray[np.int64], period_s: fl
         else:
             continue
         kept.append(k)
-    return Trajectory(times_s[kept], np.array(poses)) if kept else None
+    return Trajectory(times_s[kept], np.array(poses), in_metres=truth.in_metres) if kept else None
 
 
 def retimed(truth: Trajectory, times_ns: NDArray[np.int64], t_source_ns: Mapping[int, int]) -> Trajectory:
@@ -340,7 +340,8 @@ def retimed(truth: Trajectory, times_ns: NDArray[np.int64], t_source_ns: Mapping
     if len(ids) < 2 or np.array_equal(own_s, stream_s) or not (np.diff(stream_s) > 0).all():
         return truth
     between = (truth.t_s >= own_s[0]) & (truth.t_s <= own_s[-1])
-    return Trajectory(np.interp(truth.t_s[between], own_s, stream_s), truth.T_world_cam[between])
+    t_s = np.interp(truth.t_s[between], own_s, stream_s)
+    return Trajectory(t_s, truth.T_world_cam[between], in_metres=truth.in_metres)
 
 
 def open_sequence(

@@ -54,7 +54,8 @@ class SequenceFiles:
         times_ns: ``(N,)`` int64, strictly increasing.
         camera: Returns the intrinsics, distortion included, of images of a given width and height, or None
             where the layout says nothing.
-        groundtruth: Poses of this camera at their own times, or None.
+        groundtruth: Poses of this camera at their own times, or None. In metres but for a COLMAP model and a
+            ``transforms.json``, which don't say their unit.
     """
 
     name: str
@@ -454,7 +455,7 @@ def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
         path = found
     file = read_transforms_json(path, IMAGE_SUFFIXES, natural_key)
     times_ns = _nominal_times_ns(len(file.image_paths), rate_hz)
-    truth = Trajectory(ns_to_seconds(times_ns), file.T_world_cam)
+    truth = Trajectory(ns_to_seconds(times_ns), file.T_world_cam, in_metres=False)
     return SequenceFiles(path.resolve().parent.name, file.image_paths, times_ns, file.camera, truth)
 
 
@@ -476,5 +477,5 @@ def _read_colmap(path: Path, rate_hz: float) -> SequenceFiles:
         tuple(path / "images" / model.names[k] for k in order),
         times_ns,
         model.camera_of,
-        Trajectory(ns_to_seconds(times_ns), model.T_world_cam[order]),
+        Trajectory(ns_to_seconds(times_ns), model.T_world_cam[order], in_metres=False),
     )

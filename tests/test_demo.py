@@ -346,10 +346,12 @@ def test_a_demo_that_is_stopped_before_its_first_frame_blames_no_process(tmp_pat
     ("value", "told"), [(0.003312, "0.00331 m"), (12.345, "12.3 m"), (1234.5, "1230 m"), (0.0, "0 m")]
 )
 def test_errors_are_shown_with_three_digits(value, told):
-    table = summary_table({"completeness": 0.98765, "ate_rmse_m": value, "ate_percent": None})
+    table = summary_table({"completeness": 0.98765, "ate_rmse_m": value, "ate_percent": 0.1234})
     names, values = ([str(cell) for cell in column.cells] for column in table.columns)
-    assert values == ["98.8%", told]
-    assert len(names) == 2
+    assert values == ["98.8%", "0.123 % of the path", told]
+    assert names[1:] == ["position error (ATE RMSE after Sim(3))", "  in metres"]
+    in_no_metres = summary_table({"completeness": 0.98765, "ate_rmse_m": None, "ate_percent": 0.1234})
+    assert [str(cell) for cell in in_no_metres.columns[1].cells] == ["98.8%", "0.123 % of the path"]
 
 
 @pytest.mark.parametrize(("readout_ms", "told"), [(19.62, ["100.0%", "19.6 ms from top"]), (0.0, ["100.0%"])])

@@ -29,8 +29,8 @@ def _measure(unit: str) -> Callable[[float], str]:
 #: Rows of the final table: key of the summary, name, what writes the value.
 _FIGURES: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
     ("completeness", "frames with a pose", "{:.1%}".format),
-    ("ate_rmse_m", "position error (ATE RMSE after Sim(3))", _measure("m")),
-    ("ate_percent", "  in percent of the path", _measure("%")),
+    ("ate_percent", "position error (ATE RMSE after Sim(3))", _measure("% of the path")),
+    ("ate_rmse_m", "  in metres", _measure("m")),
     ("rpe_trans_percent", "step error, translation", _measure("%")),
     ("rpe_rot_deg", "step error, rotation", _measure("deg")),
     ("psnr_db", "image quality (PSNR)", "{:.2f} dB".format),
