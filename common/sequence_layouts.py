@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transform_from_yaml
-from semcast.common.colmap_file import colmap_folder, read_colmap
+from semcast.common.colmap_file import colmap_folder, half_a_model, read_colmap
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
 from semcast.common.numbered_images import lines_of_images, numbers_in_names
@@ -130,6 +130,8 @@ def find_layout(path: Path) -> Layout:
         return "transforms"
     if has_images:
         is_native = any((path / name).is_file() for name in _NATIVE_NAMES)
+        if not is_native and (lack := half_a_model(path)):
+            logger.warning("%s: images are read without it, and so without camera and poses", lack)
         return "native" if is_native or colmap_folder(path) is None else "colmap"
     if images_in(path):
         return "folder"

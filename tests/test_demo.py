@@ -14,7 +14,7 @@ import pytest
 from semcast import demo
 from semcast.channel.settings import ChannelSettings
 from semcast.cli import main
-from semcast.commands.demo import summary_table, why_no_pose
+from semcast.commands.demo import few_poses, summary_table, why_no_pose
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.config import build_settings, read_toml
@@ -382,6 +382,12 @@ def test_the_summary_may_have_stdout_for_itself(tmp_path, monkeypatch, capsys):
     assert json.loads(shown.out)["num_landmarks"] == 7
     assert "landmarks" in shown.err
     assert not Path("-").exists()
+
+
+def test_few_poses_are_said_not_to_be_those_of_a_stream():
+    assert "only 17% of the frames have a pose: are the images" in few_poses({"completeness": 0.17})
+    assert few_poses({"completeness": 0.9}) is None
+    assert few_poses({"completeness": 0.0}) is None, "that has a line of its own"
 
 
 def test_a_demo_without_a_pose_says_why():

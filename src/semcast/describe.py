@@ -64,7 +64,10 @@ def describe(path: Path) -> list[Section]:
         "a ROS bag, or weights (.safetensors, .onnx or a shipped name)"
     )
     if path.exists():
-        way = f"a video is read by: {shlex.join(('semcast', 'agent', '--source', str(path)))}"
+        way = f"a video is read by: {shlex.join(('semcast', 'agent', '--source', str(path)))}, with its "
+        way += (
+            "camera as --intrinsics FILE, --focal-35mm 26 (a phone's), or a .json of its name beside it"
+        )
         raise SourceError(f"{path} is another kind of file: {known}; {way}")
     raise SourceError(f"there is no file or folder {path}: {known}")
 
@@ -242,6 +245,8 @@ def describe_sequence(path: Path) -> list[Section]:
         facts.append(("camera", f"unknown: {HOW_TO_GIVE}"))
     truth = sequence.groundtruth()
     facts.append(("true path", "none" if truth is None else _path(truth)))
+    if doubt := sequence.doubt:
+        facts.append(("order", doubt))
     return [(f"sequence {path}", facts)]
 
 
