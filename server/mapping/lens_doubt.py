@@ -18,6 +18,8 @@ _LEAST_SIGMAS = 5.0
 #: and a focal length where it seems off by this share: one that is off by 2 %, which makes the path through a
 #: drawn room ten times worse, seems off by 1.2 to 1.9, as the map has come to terms with some of it;
 _LEAST_FOCAL = 0.012
+#: named alone up to this share, beyond which untold distortion has been taken for it,
+_MOST_FOCAL = 0.1
 #: and this share of that is left when distortion may explain it too;
 _LEAST_LEFT = 0.5
 #: distortion where it displaces a pixel by this share of the distance to the centre,
@@ -51,7 +53,7 @@ def lens_doubt(views: Sequence[Array], sigma_factor: float, camera: Intrinsics) 
     is_off_centre = any(abs(c) >= max(_LEAST_CENTRE, least_sigmas * sigma) for c, sigma in centre)
     if not (is_focal or is_bent or is_off_centre):
         return None
-    if any(fit.radial):
+    if any(fit.radial) or abs(fit.focal) > _MOST_FOCAL:
         return "the lens seems to be another one (distortion, and perhaps focal length and principal point)"
     if is_off_centre:
         return "the principal point seems off" + (", and the focal length" if is_focal else "")
