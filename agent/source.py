@@ -158,6 +158,8 @@ class RecordedSource:
         self._sequence = sequence
         self._settings = settings
         self._intrinsics = sequence.intrinsics
+        if doubt := sequence.doubt:
+            logger.warning("%s is %s", sequence.name, doubt)
         self._num_unreadable = 0
         # Repeated, there is always another frame for one that is left out.
         self._length = self._readable_length() if settings.repeat == "once" else len(sequence)

@@ -16,7 +16,7 @@ from semcast.agent.source import Pacer, SourceFrame, is_camera_device, is_camera
 from semcast.agent.source_settings import SourceSettings
 from semcast.agent.video_times import VideoTimes
 from semcast.common.camera import Intrinsics
-from semcast.common.camera_settings import HOW_TO_GIVE
+from semcast.common.camera_settings import HOW_TO_GIVE, check_size
 from semcast.common.errors import SourceError
 from semcast.common.image_file import as_rgb
 from semcast.common.sequence import ImageRectifier, resized_wh
@@ -112,10 +112,7 @@ class _Captured:
                 camera = Intrinsics.load(beside)
             if camera is None:
                 raise SourceError(f"the camera of {name} is unknown: {HOW_TO_GIVE}")
-            if (camera.width, camera.height) != (width, height):
-                raise SourceError(
-                    f"intrinsics are for {camera.width}x{camera.height} images, {name} gives {width}x{height}"
-                )
+            check_size(camera, width, height, name)
             camera.check_possible(name)
             self._size_wh = resized_wh(width, height, settings.resize)
         except SourceError:

@@ -133,6 +133,10 @@ class Intrinsics:
         """Image height and width in pixels."""
         return self.height, self.width
 
+    def has_shape_of(self, width: int, height: int) -> bool:
+        """Whether images of this size have the shape of the camera's, up to a pixel of rounding."""
+        return abs(width * self.height - height * self.width) <= max(self.width, width)
+
     def scaled_to(self, width: int, height: int) -> "Intrinsics":
         """Return the intrinsics of the same image resized to ``width x height``.
 

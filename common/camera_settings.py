@@ -14,8 +14,43 @@ HOW_TO_GIVE = (
     "them from pictures of a chessboard; --focal-35mm 26 (a phone's main camera) is a rough start without, "
     "and 'semcast lens' makes it better from images alone"
 )
+#: What a pinhole's numbers become as flags.
+_FLAGS = ("fx", "fy", "cx", "cy")
 #: Diagonal of a 35 mm film frame, 36 x 24 mm.
 _FILM_DIAGONAL_MM = 43.27
+
+
+def check_size(camera: Intrinsics, width: int, height: int, name: str) -> None:
+    """Check that intrinsics are for images of this size.
+
+    Args:
+        camera: Intrinsics of the images as stored.
+        width: Of the images.
+        height: Of the images.
+        name: Of what the images are from, for the message.
+
+    Raises:
+        SourceError: They are for another one; the message says what to do.
+    """
+    if (camera.width, camera.height) == (width, height):
+        return
+    if camera.has_shape_of(width, height):
+        same = camera.scaled_to(width, height)
+        numbers = " ".join(f"--{flag} {getattr(same, flag):.6g}" for flag in _FLAGS)
+        if camera.distortion:
+            numbers += " --distortion " + " ".join(f"{k:.6g}" for k in camera.distortion)
+        way = f"if they are the same images at another size, give {numbers}"
+    elif camera.has_shape_of(height, width):
+        way = "are they turned by 90 degrees? Calibrate with images as they are stored"
+    else:
+        way = (
+            "they must be of the size that was calibrated, neither cut nor stretched: 'semcast calibrate' or "
+            "'semcast lens' with these, or --focal-35mm"
+        )
+    raise SourceError(
+        f"intrinsics of {name} are for {camera.width}x{camera.height} images, "
+        f"its images are {width}x{height}: {way}"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +82,7 @@ class CameraSettings:
     )
 
     def __post_init__(self) -> None:
-        given = [name for name in ("fx", "fy", "cx", "cy") if getattr(self, name) is not None]
+        given = [name for name in _FLAGS if getattr(self, name) is not None]
         if given and len(given) < 4:
             raise ValueError(f"fx, fy, cx and cy must be given together, got only {', '.join(given)}")
         if given and self.intrinsics is not None:

@@ -71,8 +71,8 @@ class ColmapModel:
 
     def camera_of(self, width: int, height: int) -> Intrinsics:
         """Return the camera of images of a size: data sets hold small copies beside a model of large ones."""
-        has_shape = abs(width * self.camera.height - height * self.camera.width) <= self.camera.width
-        return self.camera.scaled_to(width, height) if has_shape else self.camera
+        camera = self.camera
+        return camera.scaled_to(width, height) if camera.has_shape_of(width, height) else camera
 
 
 def colmap_folder(path: Path) -> Path | None:
@@ -80,6 +80,17 @@ def colmap_folder(path: Path) -> Path | None:
     return next(
         (path / p for p in _PLACES if _file_of(path / p, "cameras") and _file_of(path / p, "images")), None
     )
+
+
+def half_a_model(path: Path) -> str | None:
+    """Say what is missing of the model beside a folder of images; None where it is whole or not there."""
+    if colmap_folder(path) is not None:
+        return None
+    for place in _PLACES:
+        for there, missing in (("cameras", "images"), ("images", "cameras")):
+            if file := _file_of(path / place, there):
+                return f"{file} is half a model of COLMAP's, without {missing}.bin or {missing}.txt"
+    return None
 
 
 def _file_of(folder: Path, name: str) -> Path | None:

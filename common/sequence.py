@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.camera_settings import HOW_TO_GIVE, CameraSettings
+from semcast.common.camera_settings import HOW_TO_GIVE, CameraSettings, check_size
 from semcast.common.errors import SourceError
 from semcast.common.geometry import interpolate_pose
 from semcast.common.image_file import bit_depth_of, read_image
@@ -24,6 +24,9 @@ logger = logging.getLogger(__name__)
 
 #: Poses further apart than this many frames are not interpolated between.
 _MAX_GAP_FRAMES = 2.0
+#: Median turn between consecutive images of a stream, at most: a view hardly overlaps with one that is turned
+#: by half its width, and few hands turn a camera by 200 degrees a second at 10 images a second.
+_MOST_TURN_DEG = 20.0
 #: The first image that can be read tells the size; so many unreadable ones may come before it.
 _MAX_BAD_AT_START = 9
 
@@ -222,6 +225,22 @@ class Sequence:
                 f"the first readable image of the sequence is {self._stored_wh[0]}x{self._stored_wh[1]}"
             )
 
+    @property
+    def doubt(self) -> str | None:
+        """Why images can't be those of a moving camera in order of time, by true poses; None if fine."""
+        truth = self._truth
+        if truth is None or len(truth) < 2:
+            return None
+        forward = truth.T_world_cam[:, :3, 2]
+        cosines = np.clip((forward[1:] * forward[:-1]).sum(axis=1), -1.0, 1.0)
+        turn_deg = float(np.degrees(np.median(np.arccos(cosines))))
+        if turn_deg <= _MOST_TURN_DEG:
+            return None
+        return (
+            f"no stream: from one image to the next the camera turns by {turn_deg:.0f} degrees (median), and "
+            "tracking needs images that show much the same, in the order in which they were taken"
+        )
+
     def groundtruth(self) -> Trajectory | None:
         """Return the true camera poses, None where there are none.
 
@@ -320,7 +339,7 @@ def truth_at_frames(truth: Trajectory, times_ns: NDArray[np.int64], period_s: fl
         else:
             continue
         kept.append(k)
-    return Trajectory(times_s[kept], np.array(poses)) if kept else None
+    return Trajectory(times_s[kept], np.array(poses), in_metres=truth.in_metres) if kept else None
 
 
 def retimed(truth: Trajectory, times_ns: NDArray[np.int64], t_source_ns: Mapping[int, int]) -> Trajectory:
@@ -340,7 +359,8 @@ def retimed(truth: Trajectory, times_ns: NDArray[np.int64], t_source_ns: Mapping
     if len(ids) < 2 or np.array_equal(own_s, stream_s) or not (np.diff(stream_s) > 0).all():
         return truth
     between = (truth.t_s >= own_s[0]) & (truth.t_s <= own_s[-1])
-    return Trajectory(np.interp(truth.t_s[between], own_s, stream_s), truth.T_world_cam[between])
+    t_s = np.interp(truth.t_s[between], own_s, stream_s)
+    return Trajectory(t_s, truth.T_world_cam[between], in_metres=truth.in_metres)
 
 
 def open_sequence(
@@ -377,12 +397,8 @@ def open_sequence(
     camera = intrinsics.resolve(width, height) if isinstance(intrinsics, CameraSettings) else intrinsics
     if camera is None:
         camera = files.camera(width, height)
-    if camera is not None and (camera.width, camera.height) != (width, height):
-        raise SourceError(
-            f"intrinsics of {files.name} are for {camera.width}x{camera.height} images, "
-            f"its images are {width}x{height}"
-        )
     if camera is not None:
+        check_size(camera, width, height, files.name)
         camera.check_possible(files.name)
     stop = None if max_frames is None else max_frames * stride
     return Sequence(files, camera, first, resize, slice(None, stop, stride))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_file import read_flat_yaml, read_intrinsics, transform_from_yaml
-from semcast.common.colmap_file import colmap_folder, read_colmap
+from semcast.common.colmap_file import colmap_folder, half_a_model, read_colmap
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
 from semcast.common.numbered_images import lines_of_images, numbers_in_names
@@ -54,7 +54,8 @@ class SequenceFiles:
         times_ns: ``(N,)`` int64, strictly increasing.
         camera: Returns the intrinsics, distortion included, of images of a given width and height, or None
             where the layout says nothing.
-        groundtruth: Poses of this camera at their own times, or None.
+        groundtruth: Poses of this camera at their own times, or None. In metres but for a COLMAP model and a
+            ``transforms.json``, which don't say their unit.
     """
 
     name: str
@@ -129,6 +130,8 @@ def find_layout(path: Path) -> Layout:
         return "transforms"
     if has_images:
         is_native = any((path / name).is_file() for name in _NATIVE_NAMES)
+        if not is_native and (lack := half_a_model(path)):
+            logger.warning("%s: images are read without it, and so without camera and poses", lack)
         return "native" if is_native or colmap_folder(path) is None else "colmap"
     if images_in(path):
         return "folder"
@@ -454,7 +457,7 @@ def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:
         path = found
     file = read_transforms_json(path, IMAGE_SUFFIXES, natural_key)
     times_ns = _nominal_times_ns(len(file.image_paths), rate_hz)
-    truth = Trajectory(ns_to_seconds(times_ns), file.T_world_cam)
+    truth = Trajectory(ns_to_seconds(times_ns), file.T_world_cam, in_metres=False)
     return SequenceFiles(path.resolve().parent.name, file.image_paths, times_ns, file.camera, truth)
 
 
@@ -476,5 +479,5 @@ def _read_colmap(path: Path, rate_hz: float) -> SequenceFiles:
         tuple(path / "images" / model.names[k] for k in order),
         times_ns,
         model.camera_of,
-        Trajectory(ns_to_seconds(times_ns), model.T_world_cam[order]),
+        Trajectory(ns_to_seconds(times_ns), model.T_world_cam[order], in_metres=False),
     )

@@ -1,6 +1,6 @@
 """Timed camera poses and the TUM text format."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +20,14 @@ class Trajectory:
         T_world_cam: ``(N, 4, 4)``, camera axes x right, y down, z forward.
         times_ns: ``(N,)`` the same times exactly, where they came as nanoseconds: seconds since 1970 as a
             float are some 200 ns off.
+        in_metres: False where nobody knows the unit, as of a path that was itself found from images. Is asked
+            of paths that others are compared with.
     """
 
     t_s: NDArray[np.float64]
     T_world_cam: NDArray[np.float64]
     times_ns: NDArray[np.int64] | None = None
+    in_metres: bool = True
 
     def __post_init__(self) -> None:
         """Check shapes and order.
@@ -58,7 +61,7 @@ class Trajectory:
         last = int(np.searchsorted(self.t_s, end_s, side="left"))
         span = slice(first, last + 1)
         times_ns = None if self.times_ns is None else self.times_ns[span]
-        return Trajectory(self.t_s[span], self.T_world_cam[span], times_ns)
+        return replace(self, t_s=self.t_s[span], T_world_cam=self.T_world_cam[span], times_ns=times_ns)
 
 
 def seconds_of(time_ns: int) -> str:

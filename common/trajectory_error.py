@@ -23,24 +23,31 @@ class AteResult:
     """Absolute trajectory error after Sim(3) alignment.
 
     Attributes:
-        rmse_m: Root mean square distance between matched camera centres, in the truth's unit.
-        percent: ``rmse_m`` as percentage of the truth's whole path.
-        path_length_m: Length of the truth's whole path.
-        scale: Metres per map unit: ``p_truth = scale * R_truth_map @ p_map + t_truth_map``.
+        rmse: Root mean square distance between matched camera centres, in the truth's unit.
+        percent: ``rmse`` as percentage of the truth's whole path.
+        path_length: Length of the truth's whole path, in its unit.
+        scale: Units of the truth per map unit: ``p_truth = scale * R_truth_map @ p_map + t_truth_map``.
         R_truth_map: 3x3 rotation of the alignment.
         t_truth_map: Translation of the alignment, length 3.
         t_s: ``(N,)`` times of the matched poses.
-        error_m: ``(N,)`` distances.
+        error: ``(N,)`` distances in the truth's unit.
+        in_metres: Whether that unit is the metre; else it is not known.
     """
 
-    rmse_m: float
+    rmse: float
     percent: float
-    path_length_m: float
+    path_length: float
     scale: float
     R_truth_map: Array
     t_truth_map: Array
     t_s: Array
-    error_m: Array
+    error: Array
+    in_metres: bool
+
+    @property
+    def unit(self) -> str:
+        """The truth's unit in words."""
+        return "m" if self.in_metres else "units of the truth"
 
 
 @dataclass(frozen=True)
@@ -91,7 +98,7 @@ def ate(estimate: Trajectory, truth: Trajectory) -> AteResult | None:
 
     Args:
         estimate: Poses in the map's frame and unit.
-        truth: Reference poses in metres.
+        truth: Reference poses.
 
     Returns:
         None where the error has no meaning: fewer than ``MIN_MATCHES`` matched poses, a true camera
@@ -102,17 +109,18 @@ def ate(estimate: Trajectory, truth: Trajectory) -> AteResult | None:
     if len(p_map) < MIN_MATCHES or truth.path_length == 0.0 or not _has_extent(p_map):
         return None
     scale, R, t = align_umeyama(p_map, p_truth)
-    error_m = np.linalg.norm(scale * p_map @ R.T + t - p_truth, axis=1)
-    rmse_m = float(np.sqrt(np.mean(error_m**2)))
+    error = np.linalg.norm(scale * p_map @ R.T + t - p_truth, axis=1)
+    rmse = float(np.sqrt(np.mean(error**2)))
     return AteResult(
-        rmse_m=rmse_m,
-        percent=100.0 * rmse_m / truth.path_length,
-        path_length_m=truth.path_length,
+        rmse=rmse,
+        percent=100.0 * rmse / truth.path_length,
+        path_length=truth.path_length,
         scale=scale,
         R_truth_map=R,
         t_truth_map=t,
         t_s=estimate.t_s[estimate_idx],
-        error_m=error_m,
+        error=error,
+        in_metres=truth.in_metres,
     )
 
 
@@ -121,8 +129,8 @@ def rpe(estimate: Trajectory, truth: Trajectory, scale: float) -> RpeResult | No
 
     Args:
         estimate: Poses in the map's frame and unit.
-        truth: Reference poses in metres.
-        scale: Metres per map unit, from ``ate``.
+        truth: Reference poses.
+        scale: Units of the truth per map unit, from ``ate``.
 
     Returns:
         None with fewer than two matched poses or a true camera that never moves.
@@ -165,24 +173,26 @@ def trajectory_summary(
 
     Args:
         estimate: All posed frames in the map's frame.
-        truth: Reference poses in metres, or None where unknown.
+        truth: Reference poses, or None where unknown.
         num_frames: Frames of the source, posed or not.
 
     Returns:
         ``ate_rmse_m``, ``ate_percent``, ``path_length_m``, ``completeness``, ``rpe_trans_percent``,
-        ``rpe_rot_deg``, ``num_posed``, ``num_matched``.
+        ``rpe_rot_deg``, ``num_posed``, ``num_matched``. Those in metres are None where the truth's unit is
+        not known.
     """
+    is_metric = truth is not None and truth.in_metres
     absolute = ate(estimate, truth) if truth is not None else None
     relative = rpe(estimate, truth, absolute.scale) if truth is not None and absolute is not None else None
     return {
-        "ate_rmse_m": absolute.rmse_m if absolute else None,
+        "ate_rmse_m": absolute.rmse if absolute and is_metric else None,
         "ate_percent": absolute.percent if absolute else None,
-        "path_length_m": truth.path_length if truth is not None else None,
+        "path_length_m": truth.path_length if truth is not None and is_metric else None,
         "completeness": completeness(len(estimate), max(num_frames, len(estimate))),
         "rpe_trans_percent": relative.trans_percent if relative else None,
         "rpe_rot_deg": relative.rot_deg if relative else None,
         "num_posed": len(estimate),
-        "num_matched": len(absolute.error_m) if absolute else 0,
+        "num_matched": len(absolute.error) if absolute else 0,
     }
 
 

@@ -200,10 +200,11 @@ def _row(
         true_poses = dict(zip(truth.t_s.tolist(), truth.T_world_cam, strict=True))
         own_s = {k: frames[index].t_source_ns * 1e-9 for k, index in seen}
         places = {k: true_poses[t_s] for k, t_s in own_s.items() if t_s in true_poses}
-        summary = trajectory_summary(trajectory_of(posed, at_ns), trajectory_of(places, at_ns), len(seen))
+        ridden = replace(trajectory_of(places, at_ns), in_metres=truth.in_metres)
+        summary = trajectory_summary(trajectory_of(posed, at_ns), ridden, len(seen))
         row["ate_rmse_m"] = summary["ate_rmse_m"]
         # Of one pass, as for a run that ends there: ridden back and forth, the path grows and errors do not.
-        one_pass_m = cut_to_frames(truth, {f.frame_id: f.t_source_ns for f in frames}).path_length
-        if summary["ate_rmse_m"] is not None and one_pass_m > 0:
-            row["ate_percent"] = 100.0 * summary["ate_rmse_m"] / one_pass_m
+        one_pass = cut_to_frames(truth, {f.frame_id: f.t_source_ns for f in frames}).path_length
+        if summary["ate_percent"] is not None and one_pass > 0:
+            row["ate_percent"] = summary["ate_percent"] * ridden.path_length / one_pass
     return row

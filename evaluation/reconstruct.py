@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -61,7 +61,8 @@ class ReconstructedRun:
     Attributes:
         summary: The figures ``semcast demo`` reports, ``ate_rmse_m``, ``stage_ms`` and so on, which are of
             the path after all corrections, and those of ``at_once``.
-        rows: One mapping per frame that reached the tracker, with ``error_m`` after alignment where known.
+        rows: One mapping per frame that reached the tracker, with ``error_m`` after alignment where known,
+            metres included.
         trajectory: All posed frames in the map's frame and unit.
         num_landmarks: Landmarks at the end.
         truth: Reference poses of the frames that were sent, or None.
@@ -102,7 +103,7 @@ def reconstruct(
         frames: Frames in order.
         camera: Camera of the decoded images, without distortion.
         settings: How to reconstruct.
-        truth: Reference poses in metres, or None.
+        truth: Reference poses, or None.
         on_frame: Sees each processed frame, such as a viewer.
     """
     rows: list[FrameRow] = []
@@ -168,7 +169,7 @@ def at_once(published: Trajectory, truth: Trajectory | None, num_sent: int) -> d
 
     Args:
         published: Pose of each frame that had one at once, all taken for one world.
-        truth: Reference poses in metres, or None.
+        truth: Reference poses, or None.
         num_sent: Frames that were sent.
 
     Returns:
@@ -203,12 +204,13 @@ def cut_to_frames(truth: Trajectory, frame_times_ns: dict[int, int]) -> Trajecto
     """Return the true poses of the frames that were sent: the path that errors are a percentage of."""
     times_s = np.array(sorted(frame_times_ns.values()), dtype=np.float64) * 1e-9
     _, kept = match_times(times_s, truth.t_s)
-    return Trajectory(truth.t_s[kept], truth.T_world_cam[kept])
+    return replace(truth, t_s=truth.t_s[kept], T_world_cam=truth.T_world_cam[kept], times_ns=None)
 
 
 def _plain_rows(
     rows: list[FrameRow], trajectory: Trajectory, truth: Trajectory | None
 ) -> list[dict[str, Any]]:
     absolute = ate(trajectory, truth) if truth is not None else None
-    error_m = dict(zip(absolute.t_s, absolute.error_m, strict=True)) if absolute is not None else {}
+    is_known = absolute is not None and absolute.in_metres
+    error_m = dict(zip(absolute.t_s, absolute.error, strict=True)) if absolute and is_known else {}
     return [{**vars(row), "error_m": error_m.get(row.t_source_ns * 1e-9)} for row in rows]

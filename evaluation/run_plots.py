@@ -138,7 +138,7 @@ def _plot_path(run: RunToPlot, path: Path) -> Path:
     on_the_way = run.truth_on_the_way
     result = ate(run.trajectory, on_the_way) if on_the_way is not None else None
     estimate, truth = _in_camera_axes(run, result)
-    unit = "map units" if result is None else "m"
+    unit = "map units" if result is None else result.unit
     doubt = time_span_doubt(run.trajectory, run.truth, run.missing_s) if run.truth is not None else None
     if doubt is not None:
         logger.warning("%s: %s", run.name, doubt)
@@ -189,7 +189,8 @@ def path_title(run: RunToPlot, result: AteResult | None) -> str:
         return f"{run.name}: {num_matched} of {num_poses} poses matched, not enough for an ATE"
     num_matched = len(result.t_s)
     matched = "" if num_matched == num_poses else f"\n{num_matched} of {num_poses} poses matched"
-    error = f"ATE {result.rmse_m:.3g} m RMSE, {result.percent:.2f} % of {result.path_length_m:.3g} m"
+    rmse = f"{result.rmse:.3g} m RMSE, " if result.in_metres else ""
+    error = f"ATE {rmse}{result.percent:.2f} % of {result.path_length:.3g} {result.unit}"
     return f"{run.name}: {error}{matched}"
 
 
@@ -216,12 +217,14 @@ def time_span_doubt(trajectory: Trajectory, truth: Trajectory, missing_s: Array 
 def _plot_error(row: Sequence[Any], result: AteResult) -> None:
     over_time, histogram = row
     t_s = result.t_s - result.t_s[0]
-    over_time.plot(t_s, result.error_m, color="#d05050", linewidth=1.2)
-    over_time.axhline(result.rmse_m, color="k", linestyle=":", linewidth=1.0)
-    over_time.set(xlabel="time (s)", ylabel="position error (m)", title="error over time, dotted: RMSE")
+    over_time.plot(t_s, result.error, color="#d05050", linewidth=1.2)
+    over_time.axhline(result.rmse, color="k", linestyle=":", linewidth=1.0)
+    over_time.set(
+        xlabel="time (s)", ylabel=f"position error ({result.unit})", title="error over time, dotted: RMSE"
+    )
     over_time.set_ylim(bottom=0.0)
-    histogram.hist(result.error_m, bins=min(30, max(5, len(result.error_m) // 4)), color="#d05050")
-    histogram.set(xlabel="position error (m)", ylabel="frames", title="how the error is spread")
+    histogram.hist(result.error, bins=min(30, max(5, len(result.error) // 4)), color="#d05050")
+    histogram.set(xlabel=f"position error ({result.unit})", ylabel="frames", title="how the error is spread")
     histogram.locator_params(axis="x", nbins=_MAX_TICKS - 1)
     histogram.locator_params(axis="y", integer=True)
 

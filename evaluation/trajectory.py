@@ -173,7 +173,7 @@ def _is_usable(truth: Trajectory | None, name: str) -> bool:
         return False
     if len(truth) < MIN_MATCHES or truth.path_length <= 0.0:
         logger.warning(
-            "%s has a true path of %d poses and %.3g m: too short to say how far its poses are off",
+            "%s has a true path of %d poses and length %.3g: too short to say how far its poses are off",
             *(name, len(truth), truth.path_length),
         )
         return False
@@ -182,7 +182,7 @@ def _is_usable(truth: Trajectory | None, name: str) -> bool:
 
 def _has_failed(run: Mapping[str, Any], *, has_truth: bool) -> bool:
     """Whether a run has no path to speak of; without a truth all that is known is how many poses it has."""
-    return run["ate_rmse_m"] is None if has_truth else run["num_posed"] < MIN_MATCHES
+    return run["ate_percent"] is None if has_truth else run["num_posed"] < MIN_MATCHES
 
 
 def _cell(snr_db: float | None, mode: str, runs: list[dict[str, Any]], *, has_truth: bool) -> dict[str, Any]:
@@ -209,9 +209,9 @@ def _comparisons(cells: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]
         if rival is None or cell is rival:
             continue
         pairs = [
-            (a["ate_rmse_m"], b["ate_rmse_m"])
+            (a["ate_percent"], b["ate_percent"])
             for a, b in zip(cell["runs"], rival["runs"], strict=True)
-            if a["ate_rmse_m"] is not None and b["ate_rmse_m"] is not None
+            if a["ate_percent"] is not None and b["ate_percent"] is not None
         ]
         ours, theirs = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
         found.append(
@@ -219,7 +219,7 @@ def _comparisons(cells: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]
                 "snr_db": cell["snr_db"],
                 "confidence": cell["confidence"],
                 "against": "off",
-                "figure": "ate_rmse_m",
+                "figure": "ate_percent",
                 "paired": paired_bootstrap(ours, theirs, np.random.default_rng(seed)),
                 "num_left_out": len(cell["runs"]) - len(pairs),
             }
@@ -243,5 +243,6 @@ def _write_files(folder: Path, label: str, run: ReconstructedRun) -> None:
         folder / f"path_{label}.png",
         {"ground truth": truth.positions, "semcast": aligned},
         axes_names=("xyz"[widest[0]], "xyz"[widest[1]]),
-        title=f"ATE {absolute.rmse_m:.3g} m ({absolute.percent:.2g} %)",
+        title=f"ATE {absolute.percent:.2g} % of {absolute.path_length:.3g} {absolute.unit}",
+        unit=absolute.unit,
     )

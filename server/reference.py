@@ -31,7 +31,7 @@ class Reference:
 
     Args:
         originals: Asked on that thread, with increasing frame ids.
-        truth: True path in metres, None where it is not known.
+        truth: True path, None where it is not known.
         times_ns: ``(N,)`` times by frame id on the clock of ``truth``; None where that is the stream's.
     """
 

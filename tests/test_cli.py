@@ -121,6 +121,20 @@ def test_what_a_sub_verb_does_not_know_is_answered_with_its_own_options(capsys):
     )
 
 
+def test_a_word_that_is_none_of_a_few_is_answered_with_these(capsys):
+    with pytest.raises(SystemExit):
+        main(["channel", "st", "--snr-db", "3"])
+    assert capsys.readouterr().err == (
+        "semcast channel: action must be one of run, set, got st, did you mean 'set'? "
+        "('semcast channel --help' lists the options)\n"
+    )
+    with pytest.raises(SystemExit):
+        main(["export", "run", "--format", "colmapp", "--out", "x"])
+    told = capsys.readouterr().err
+    assert "semcast export: --format must be one of " in told
+    assert "got colmapp, did you mean 'colmap'?" in told
+
+
 @pytest.mark.parametrize("words", [["channel", "--snr-db", "much"], ["eval", "codec", "--snr-db", "much"]])
 def test_wrong_usage_is_one_line_that_names_the_help(words, capsys):
     with pytest.raises(SystemExit):

@@ -14,7 +14,7 @@ import pytest
 from semcast import demo
 from semcast.channel.settings import ChannelSettings
 from semcast.cli import main
-from semcast.commands.demo import summary_table, why_no_pose
+from semcast.commands.demo import few_poses, summary_table, why_no_pose
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.config import build_settings, read_toml
@@ -352,10 +352,12 @@ def test_a_demo_that_is_stopped_before_its_first_frame_blames_no_process(tmp_pat
     ("value", "told"), [(0.003312, "0.00331 m"), (12.345, "12.3 m"), (1234.5, "1230 m"), (0.0, "0 m")]
 )
 def test_errors_are_shown_with_three_digits(value, told):
-    table = summary_table({"completeness": 0.98765, "ate_rmse_m": value, "ate_percent": None})
+    table = summary_table({"completeness": 0.98765, "ate_rmse_m": value, "ate_percent": 0.1234})
     names, values = ([str(cell) for cell in column.cells] for column in table.columns)
-    assert values == ["98.8%", told]
-    assert len(names) == 2
+    assert values == ["98.8%", "0.123 % of the path", told]
+    assert names[1:] == ["position error (ATE RMSE after Sim(3))", "  in metres"]
+    in_no_metres = summary_table({"completeness": 0.98765, "ate_rmse_m": None, "ate_percent": 0.1234})
+    assert [str(cell) for cell in in_no_metres.columns[1].cells] == ["98.8%", "0.123 % of the path"]
 
 
 @pytest.mark.parametrize(("readout_ms", "told"), [(19.62, ["100.0%", "19.6 ms from top"]), (0.0, ["100.0%"])])
@@ -386,6 +388,12 @@ def test_the_summary_may_have_stdout_for_itself(tmp_path, monkeypatch, capsys):
     assert json.loads(shown.out)["num_landmarks"] == 7
     assert "landmarks" in shown.err
     assert not Path("-").exists()
+
+
+def test_few_poses_are_said_not_to_be_those_of_a_stream():
+    assert "only 17% of the frames have a pose: are the images" in few_poses({"completeness": 0.17})
+    assert few_poses({"completeness": 0.9}) is None
+    assert few_poses({"completeness": 0.0}) is None, "that has a line of its own"
 
 
 def test_a_demo_without_a_pose_says_why():

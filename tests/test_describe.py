@@ -219,6 +219,7 @@ def test_a_transforms_file_is_described_like_its_folder(tmp_path):
     (tmp_path / "transforms_test.json").write_text(json.dumps(document))
     text = text_of(tmp_path / "transforms_test.json")
     assert "images: 2, 64x48 px" in text
+    assert "true path: 2 poses, 0.00 in a unit that the recording does not tell" in text
     assert text.splitlines()[1:] == text_of(tmp_path).splitlines()[1:]
 
 

@@ -75,6 +75,7 @@ What residuals say about the camera
     witnesses         what adjustments have said so far, by keyframe
     readout           the readout time of a rolling shutter
     lens              focal length, radial distortion and principal point
+    lens_doubt        whether the lens of the calibration is another one, in words
     readout_watch     asks for both as the map grows
     late_readout      puts a map right that was begun before its shutter was known
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import MAX_READOUT_MS, Intrinsics
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
-from semcast.server.mapping.lens import believed_lens
+from semcast.server.mapping.lens_doubt import lens_doubt
 from semcast.server.mapping.readout import Axis, Readout, body_velocity, fit_readout
 from semcast.server.mapping.witnesses import Witnesses
 from semcast.server.mapping.world_map import WorldMap
@@ -41,14 +41,8 @@ _ENOUGH_VIEWS = 24
 _SURE_MS = 1.0
 #: After this many there is none: a camera that hardly turns does not tell, and it matters little.
 _MOST_VIEWS = 170
-#: Keyframes from which on the lens of the calibration may be called wrong:
+#: Keyframes from which on the lens of the calibration may be called wrong.
 _LENS_VIEWS = 16
-#: its focal length where it is off by this share,
-_LEAST_FOCAL = 0.02
-#: its distortion where it displaces a pixel by this share of the distance to the centre,
-_LEAST_RADIAL = 0.02
-#: its principal point where it is off by this share of a focal length.
-_LEAST_CENTRE = 0.01
 
 
 class ReadoutWatch:
@@ -147,34 +141,10 @@ class ReadoutWatch:
         """Say once if the lens is clearly another one."""
         if self._lens_is_told or len(self._witnesses) < _LENS_VIEWS:
             return
-        if (fit := believed_lens(self._witnesses.views)) is None or fit.explained < _LEAST_EXPLAINED:
-            return
-        least_sigmas = _LEAST_SIGMAS * self._witnesses.sigma_factor
-        wrong = []
-        if abs(fit.focal) >= max(_LEAST_FOCAL, least_sigmas * fit.sigma_focal):
-            way = "short" if fit.focal > 0.0 else "long"
-            wrong.append(f"the focal length seems about {100.0 * abs(fit.focal):.0f} % too {way}")
-        is_sure = any(
-            abs(k) >= least_sigmas * s > 0.0 for k, s in zip(fit.radial, fit.sigma_radial, strict=True)
-        )
-        if is_sure and self._most_bent(fit.radial) >= _LEAST_RADIAL:
-            off = (f"k{number} {k:+.3f}" for number, k in enumerate(fit.radial, 1) if k)
-            wrong.append(f"the distortion seems off ({', '.join(off)})")
-        centre = zip(fit.centre, fit.sigma_centre, strict=True)
-        if any(abs(c) >= max(_LEAST_CENTRE, least_sigmas * sigma) for c, sigma in centre):
-            x_px, y_px = fit.centre[0] * self._camera.fx, fit.centre[1] * self._camera.fy
-            wrong.append(f"the principal point seems off (x {x_px:+.0f}, y {y_px:+.0f} pixels)")
-        if wrong:
+        doubt = lens_doubt(self._witnesses.views, self._witnesses.sigma_factor, self._camera)
+        if doubt is not None:
             self._lens_is_told = True
-            logger.warning("%s for what is seen: semcast lens measures it", " and ".join(wrong))
-
-    def _most_bent(self, radial: tuple[float, float]) -> float:
-        """Return by which share of its distance to the centre a pixel is displaced at most."""
-        camera = self._camera
-        corner = (max(camera.cx, camera.width - camera.cx) / camera.fx) ** 2
-        corner += (max(camera.cy, camera.height - camera.cy) / camera.fy) ** 2
-        r2 = corner * np.linspace(0.0, 1.0, 11)
-        return float(np.abs(radial[0] * r2 + radial[1] * r2**2).max())
+            logger.warning("%s, by what is seen: semcast lens measures it", doubt)
 
     def take_found(self) -> Readout | None:
         """Return, once, the readout to be added to what images are put right for; views to come have it."""

@@ -10,6 +10,7 @@ import importlib
 import io
 import logging
 import os
+import re
 import shutil
 import sys
 import textwrap
@@ -59,6 +60,10 @@ _EXTRAS = {"agent": "agent", "unpack": "ros", "train": "train", "onnx": "train"}
 EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
 
+#: How argparse says that a word is none of some.
+_WRONG_CHOICE = re.compile(r"argument (\S+): invalid choice: (.*) \(choose from (.*)\)")
+
+
 class _Parser(argparse.ArgumentParser):
     """A parser that says what is wrong in a line, without the usage of dozens of options before it.
 
@@ -79,6 +84,9 @@ class _Parser(argparse.ArgumentParser):
         return found, unknown
 
     def error(self, message: str) -> NoReturn:
+        if found := _WRONG_CHOICE.fullmatch(message):
+            name, got, names = (text.replace("'", "") for text in found.groups())
+            message = f"{name} must be one of {names}, got {got}{near_match(got, names.split(', '))}"
         self.exit(EXIT_USAGE, f"{self.prog}: {message} ('{self.prog} --help' lists the options)\n")
 
     def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:

@@ -206,6 +206,8 @@ def run_demo(
     """
     sequence = settings.sequence or default_sequence()
     recorded, logs = _prepare(settings, sequence)
+    if doubt := recorded.doubt:
+        tell(f"{recorded.name} is {doubt}")
     summary_file = settings.out / SUMMARY_NAME
     endpoint = free_endpoint()
     commands = role_commands(settings, sequence, endpoint)

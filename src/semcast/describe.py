@@ -21,6 +21,7 @@ from semcast.common.run_folder import (
     read_run,
 )
 from semcast.common.run_summary import read_summary
+from semcast.common.trajectory import Trajectory
 from semcast.server.export.parts import count_parts, parts_line
 from semcast.server.export.placement import TWO_SIDED_95
 from semcast.server.recorded_streams import RecordedStream, recorded_streams
@@ -63,7 +64,10 @@ def describe(path: Path) -> list[Section]:
         "a ROS bag, or weights (.safetensors, .onnx or a shipped name)"
     )
     if path.exists():
-        way = f"a video is read by: {shlex.join(('semcast', 'agent', '--source', str(path)))}"
+        way = f"a video is read by: {shlex.join(('semcast', 'agent', '--source', str(path)))}, with its "
+        way += (
+            "camera as --intrinsics FILE, --focal-35mm 26 (a phone's), or a .json of its name beside it"
+        )
         raise SourceError(f"{path} is another kind of file: {known}; {way}")
     raise SourceError(f"there is no file or folder {path}: {known}")
 
@@ -240,8 +244,15 @@ def describe_sequence(path: Path) -> list[Section]:
     except SourceError:
         facts.append(("camera", f"unknown: {HOW_TO_GIVE}"))
     truth = sequence.groundtruth()
-    facts.append(("true path", "none" if truth is None else f"{len(truth)} poses, {truth.path_length:.2f} m"))
+    facts.append(("true path", "none" if truth is None else _path(truth)))
+    if doubt := sequence.doubt:
+        facts.append(("order", doubt))
     return [(f"sequence {path}", facts)]
+
+
+def _path(truth: Trajectory) -> str:
+    length = f"{len(truth)} poses, {truth.path_length:.2f}"
+    return f"{length} m" if truth.in_metres else f"{length} in a unit that the recording does not tell"
 
 
 def _refused(messages: list[str], num_skipped: int, most: int = 5) -> list[tuple[str, str]]:

@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 import pytest
 
 from semcast.common.camera import Intrinsics
-from semcast.common.camera_settings import CameraSettings
+from semcast.common.camera_settings import CameraSettings, check_size
 from semcast.common.errors import SourceError
 
 CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
@@ -60,3 +62,20 @@ def test_a_phone_s_focal_length_gives_a_rough_camera():
         CameraSettings(focal_35mm=26.0, fx=1.0, fy=1.0, cx=1.0, cy=1.0)
     with pytest.raises(ValueError, match=r"focal_35mm must be in \[5, 1000\], got 0.02"):
         CameraSettings(focal_35mm=0.02)
+
+
+def test_intrinsics_of_another_size_are_refused_with_what_to_do():
+    check_size(CAMERA, 32, 24, "walk")
+    bent = replace(CAMERA, distortion=(0.1, -0.2, 0.0, 0.0))
+    with pytest.raises(SourceError, match="its images are 64x48") as told:
+        check_size(bent, 64, 48, "walk")
+    words = str(told.value).split(" give ")[1].split()
+    flags = dict(zip(words[0:8:2], map(float, words[1:8:2]), strict=True))
+    assert flags == {"--fx": 60.0, "--fy": 62.0, "--cx": 31.5, "--cy": 23.5}
+    assert words[8:] == ["--distortion", "0.1", "-0.2", "0", "0"]
+    with pytest.raises(SourceError, match="its images are 64x48: .* --cy 23.5$"):
+        check_size(CAMERA, 64, 48, "walk")
+    with pytest.raises(SourceError, match="turned by 90 degrees"):
+        check_size(CAMERA, 24, 32, "walk")
+    with pytest.raises(SourceError, match="neither cut nor stretched: 'semcast calibrate'"):
+        check_size(CAMERA, 32, 18, "walk")

@@ -119,6 +119,21 @@ def test_a_model_of_large_images_serves_small_copies_of_them(tmp_path, write_ima
     assert (found.fx, found.fy, found.cx, found.cy) == (15.0, 15.5, 7.5, 5.5)
 
 
+@pytest.mark.parametrize(("gone", "kept"), [("images", "cameras"), ("cameras", "images")])
+def test_half_a_model_is_said_not_to_be_used(tmp_path, write_images, poses, caplog, gone, kept):
+    write_images(tmp_path / "images", 1)
+    _write_binary(tmp_path / "sparse" / "0", [PINHOLE], _images(poses(1), ["000000.png"]))
+    assert open_sequence(tmp_path).intrinsics == CAMERA
+    assert not caplog.records
+    (tmp_path / "sparse" / "0" / f"{gone}.bin").unlink()
+    assert open_sequence(tmp_path).groundtruth() is None
+    assert f"{kept}.bin is half a model of COLMAP's, without {gone}.bin or {gone}.txt: images" in caplog.text
+    caplog.clear()
+    CAMERA.save(tmp_path / "intrinsics.json")
+    assert open_sequence(tmp_path).intrinsics == CAMERA
+    assert not caplog.records, "files of its own go before a model, whole or half"
+
+
 def test_images_of_another_shape_than_the_model_s_are_refused(tmp_path, write_images, poses):
     write_images(tmp_path / "images", 1, size=(16, 16))
     _write_binary(tmp_path / "sparse" / "0", [PINHOLE], _images(poses(1), ["000000.png"]))

@@ -7,6 +7,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
+from semcast.common.geometry import exp_so3
 from semcast.common.sequence import open_sequence, retimed
 from semcast.common.sequence_layouts import natural_key
 from semcast.common.trajectory import Trajectory, write_tum
@@ -268,7 +269,7 @@ def damage_number(folder):
     [
         (damage_missing, "there is no such file or folder"),
         (damage_empty, "expected images/ .native."),
-        (damage_size, "intrinsics of walk are for 64x48 images, its images are 32x24"),
+        (damage_size, "intrinsics of walk are for 64x48 images, its images are 32x24: if they are the same"),
         (damage_all_images, "000000.png is not a readable image"),
         (damage_times, "one time per image, got 2 times and 5 images"),
         (damage_order, "times of .*walk must strictly increase, image 3 has 1 s after 1 s"),
@@ -279,6 +280,20 @@ def damage_number(folder):
 def test_what_is_wrong_with_a_recording_is_said(native, damage, message):
     with pytest.raises(SourceError, match=message):
         open_sequence(damage(native))
+
+
+def test_images_of_which_each_looks_elsewhere_are_no_stream(native, poses):
+    def turning(turn_deg):
+        turned = poses(5)
+        for k, T in enumerate(turned):
+            T[:3, :3] = exp_so3([0.0, np.radians(turn_deg * k), 0.0])
+        write_tum(native / "groundtruth.txt", Trajectory(0.1 * np.arange(5), turned))
+        return open_sequence(native).doubt
+
+    assert turning(15.0) is None
+    assert "no stream: from one image to the next the camera turns by 60 degrees" in turning(60.0)
+    (native / "groundtruth.txt").unlink()
+    assert open_sequence(native).doubt is None
 
 
 def test_true_poses_of_another_time_are_said_not_to_be_used(native, poses, caplog):

@@ -1,5 +1,7 @@
 """Trajectory errors against hand-computed values and against evo."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -34,7 +36,7 @@ def test_a_similarity_copy_has_no_error_and_gives_its_scale_back():
     truth = wandering(30, 1)
     estimate = moved(truth, 0.2, exp_so3([0.3, -1.0, 2.0]), [5.0, 6.0, 7.0])
     result = ate(estimate, truth)
-    assert result.rmse_m < 1e-9
+    assert result.rmse < 1e-9
     assert result.scale == pytest.approx(5.0)
     relative = rpe(estimate, truth, result.scale)
     assert relative.trans_percent < 1e-6
@@ -51,7 +53,7 @@ def test_the_error_of_a_square_with_one_corner_off_is_what_paper_and_pencil_say(
     x = np.array([-1.5, -0.5, 0.5, 1.5])
     expected = np.sqrt(np.mean((scale * x - x) ** 2 + (scale * h) ** 2))
     assert result.scale == pytest.approx(scale)
-    assert result.rmse_m == pytest.approx(expected)
+    assert result.rmse == pytest.approx(expected)
     assert result.percent == pytest.approx(100 * expected / 3.0)
 
 
@@ -83,8 +85,8 @@ def test_ate_and_rpe_agree_with_evo():
         relative.process_data((evo_truth, evo_estimate))
         expected[name] = relative.get_statistic(metrics.StatisticsType.rmse)
     ours = ate(estimate, truth)
-    assert ours.rmse_m == pytest.approx(absolute.get_statistic(metrics.StatisticsType.rmse), rel=1e-9)
-    assert np.median(ours.error_m) == pytest.approx(
+    assert ours.rmse == pytest.approx(absolute.get_statistic(metrics.StatisticsType.rmse), rel=1e-9)
+    assert np.median(ours.error) == pytest.approx(
         absolute.get_statistic(metrics.StatisticsType.median), rel=1e-9
     )
     steps = rpe(estimate, truth, ours.scale)
@@ -108,7 +110,7 @@ def test_a_sparse_truth_is_not_taken_for_that_of_frames_around_one_without_a_pos
     posed = np.delete(np.arange(100), [30, 31, 50])
     estimate = Trajectory(times_s[posed], line(x_m[posed]).T_world_cam)
     error = ate(estimate, at_tenth)
-    assert error.rmse_m < 1e-9
+    assert error.rmse < 1e-9
     assert len(error.t_s) == 8
 
 
@@ -166,6 +168,17 @@ def test_the_figures_of_a_run_are_in_metres_of_the_truth():
         "num_posed": 4,
         "num_matched": 4,
     }
+
+
+def test_a_truth_whose_unit_nobody_knows_gives_errors_in_percent_alone():
+    zigzag, truth = line([0.0, 0.5, 1.0, 1.5], [0.05, -0.05, -0.05, 0.05]), line([0.0, 1.0, 2.0, 3.0])
+    known = trajectory_summary(zigzag, truth, num_frames=5)
+    found = trajectory_summary(zigzag, replace(truth, in_metres=False), num_frames=5)
+    assert found == {**known, "ate_rmse_m": None, "path_length_m": None}
+    assert [ate(zigzag, t).unit for t in (truth, replace(truth, in_metres=False))] == [
+        "m",
+        "units of the truth",
+    ]
 
 
 def test_without_truth_only_counts_remain():

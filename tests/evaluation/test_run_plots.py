@@ -149,14 +149,16 @@ def test_a_stage_outside_the_time_to_the_pose_is_no_part_of_it(stage, tmp_path):
     assert (timeline(part, tmp_path, "part") != expected).any()
 
 
-def to_plot(frame_ids, truth_ids):
-    trajectory, truth = line(frame_ids), line(truth_ids)
+def to_plot(frame_ids, truth_ids, *, in_metres=True):
+    trajectory, truth = line(frame_ids), replace(line(truth_ids), in_metres=in_metres)
     return RunToPlot(name="run", trajectory=trajectory, rows=[], truth=truth), ate(trajectory, truth)
 
 
 def test_the_title_says_how_many_poses_its_error_is_about():
     assert path_title(*to_plot(range(10), range(10))) == "run: ATE 0 m RMSE, 0.00 % of 9 m"
     assert path_title(*to_plot(range(44), range(12, 60))).endswith(" of 47 m\n32 of 44 poses matched")
+    unknown = to_plot(range(10), range(10), in_metres=False)
+    assert path_title(*unknown) == "run: ATE 0.00 % of 9 units of the truth"
     # Two poses are fitted without an error.
     assert path_title(*to_plot(range(10), range(8, 20))) == (
         "run: 2 of 10 poses matched, not enough for an ATE"

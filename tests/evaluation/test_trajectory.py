@@ -1,10 +1,13 @@
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import pytest
 
 from semcast.channel.settings import ChannelSettings
+from semcast.common.geometry import T_opencv_opengl
+from semcast.common.sequence import open_sequence
 from semcast.common.trajectory import read_tum
 from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory, median_or_none
 
@@ -99,7 +102,7 @@ def test_modes_and_seeds_share_decoded_images_and_are_compared(room, phase_codec
     (comparison,) = report["comparisons"]
     assert (comparison["confidence"], comparison["against"]) == ("robust", "off")
     assert comparison["paired"]["num_samples"] == 2
-    mean = [sum(run["ate_rmse_m"] for run in cell["runs"]) / 2 for cell in (robust, off)]
+    mean = [sum(run["ate_percent"] for run in cell["runs"]) / 2 for cell in (robust, off)]
     assert comparison["paired"]["difference"] == pytest.approx(mean[0] - mean[1])
 
 
@@ -130,6 +133,29 @@ def test_without_a_truth_a_run_is_judged_by_its_poses(room, tmp_path, caplog):
     assert (report["ate_rmse_m"], report["num_failed"]) == (None, 0)
     assert report["completeness"] >= 0.9
     assert "blind has no true path: how far its poses are off is unknown" in caplog.text
+
+
+def test_a_truth_in_an_unknown_unit_gives_errors_in_percent_and_no_metres(room, tmp_path):
+    native = open_sequence(room)
+    truth = native.groundtruth()
+    frames = [
+        {"file_path": f"images/{path.name}", "transform_matrix": (T @ T_opencv_opengl).tolist()}
+        for path, T in zip(sorted((room / "images").iterdir()), truth.T_world_cam, strict=True)
+    ]
+    camera = native.intrinsics
+    document = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx + 0.5, "cy": camera.cy + 0.5}
+    (tmp_path / "images").symlink_to((room / "images").resolve())
+    (tmp_path / "transforms.json").write_text(json.dumps({**document, "frames": frames}))
+    settings = TrajectorySettings(
+        sequence=tmp_path, codec="none", seeds=2, max_frames=10, confidence=("robust", "off"), rows=True
+    )
+    report = evaluate_trajectory(settings)
+    known = evaluate_trajectory(replace(settings, sequence=room))
+    for cell, of_known in zip(report["cells"], known["cells"], strict=True):
+        assert (cell["ate_rmse_m"], cell["num_failed"]) == (None, 0)
+        assert cell["ate_percent"] == pytest.approx(of_known["ate_percent"], rel=1e-3)
+        assert {row["error_m"] for row in cell["runs"][0]["rows"]} == {None}
+    assert report["comparisons"][0]["paired"]["num_samples"] == 2
 
 
 @pytest.mark.parametrize("truth", ["100 0 0 0 0 0 0 1\n100.1 1 0 0 0 0 0 1\n", "still"])

@@ -29,14 +29,16 @@ def _measure(unit: str) -> Callable[[float], str]:
 #: Rows of the final table: key of the summary, name, what writes the value.
 _FIGURES: tuple[tuple[str, str, Callable[[Any], str]], ...] = (
     ("completeness", "frames with a pose", "{:.1%}".format),
-    ("ate_rmse_m", "position error (ATE RMSE after Sim(3))", _measure("m")),
-    ("ate_percent", "  in percent of the path", _measure("%")),
+    ("ate_percent", "position error (ATE RMSE after Sim(3))", _measure("% of the path")),
+    ("ate_rmse_m", "  in metres", _measure("m")),
     ("rpe_trans_percent", "step error, translation", _measure("%")),
     ("rpe_rot_deg", "step error, rotation", _measure("deg")),
     ("psnr_db", "image quality (PSNR)", "{:.2f} dB".format),
     ("num_landmarks", "landmarks", str),
     ("num_dense_points", "points of the dense cloud", str),
 )
+#: Share of frames with a pose below which something is wrong with the images rather than with the link.
+_FEW = 0.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,6 +74,17 @@ def why_no_pose(summary: Mapping[str, Any]) -> str:
     return (
         "no frame has a pose: the camera must move sideways and see things with texture, large "
         "enough in the images, and consecutive images must show much the same"
+    )
+
+
+def few_poses(summary: Mapping[str, Any]) -> str | None:
+    """Say in a line what is likely of a run in which most frames got no pose; None where they did."""
+    share = summary.get("completeness") or 0.0
+    if not 0.0 < share < _FEW:
+        return None
+    return (
+        f"only {share:.0%} of the frames have a pose: are the images those of one moving camera, in the "
+        "order in which they were taken? Consecutive ones must show much the same"
     )
 
 
@@ -130,4 +143,6 @@ def run(arguments: argparse.Namespace) -> int:
     if not code and not result.get("completeness"):
         talk.print(f"semcast demo: {why_no_pose(result)}", soft_wrap=True)
         return 1
+    if not code and (words := few_poses(result)):
+        talk.print(f"semcast demo: {words}", soft_wrap=True)
     return code

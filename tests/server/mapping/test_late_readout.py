@@ -2,7 +2,6 @@
 
 import functools
 import logging
-import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -112,30 +111,14 @@ def test_a_readout_longer_than_any_camera_has_is_not_believed():
 
 
 def test_a_lens_that_is_clearly_another_one_is_told_once(caplog):
-    def told(factor, radial=0.0, cx_off=0.0):
-        caplog.clear()
-        cx = shaken_views.CAMERA.cx + cx_off
-        camera = replace(shaken_views.CAMERA, fx=factor * 400.0, fy=factor * 400.0, cx=cx)
-        watch = ReadoutWatch(shaken_views.CAMERA, is_wanted=True)
-        for seed in range(3):  # twelve keyframes each
-            result = shaken_views.adjusted(camera, seed=seed, radial=radial)
-            others = replace(result.problem, keyframe_ids=100 * seed + result.problem.keyframe_ids)
-            watch.take(replace(result, problem=others))
-            if seed == 0:
-                assert "semcast lens" not in caplog.text, "too few views"
-        return caplog.text
-
-    assert "semcast lens" not in told(1.0)
-    text = told(1.06)
-    assert text.count("the focal length seems") == 1
-    assert re.search(r"about [567] % too short for what is seen: semcast lens measures it", text)
-    text = told(1.0, radial=-0.1)
-    assert text.count("the distortion seems off (k1 -0.1") == 1
-    assert "focal length" not in text
-    assert "semcast lens" not in told(1.0, radial=-0.015), "sure, but it moves no pixel by 2 %"
-    text = told(1.0, cx_off=12.0)
-    assert text.count("the principal point seems off (x +1") == 1
-    assert "distortion" not in text
+    camera = replace(shaken_views.CAMERA, fx=1.06 * 400.0, fy=1.06 * 400.0)
+    watch = ReadoutWatch(shaken_views.CAMERA, is_wanted=True)
+    for seed in range(3):  # twelve keyframes each
+        result = shaken_views.adjusted(camera, seed=seed)
+        others = replace(result.problem, keyframe_ids=100 * seed + result.problem.keyframe_ids)
+        watch.take(replace(result, problem=others))
+        told = caplog.text.count("too short, by about 5 % or more, by what is seen: semcast lens measures it")
+        assert told == (seed > 0), "sixteen keyframes are enough"
 
 
 def test_movements_are_measured_only_while_they_are_wanted():

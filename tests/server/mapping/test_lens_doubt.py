@@ -1,0 +1,56 @@
+"""What is said of a lens that is not the one of the calibration, and of one that is."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from shaken_views import CAMERA, adjusted
+
+from semcast.server.mapping.lens_doubt import lens_doubt
+
+
+def doubt(focal=1.0, radial=0.0, centre_px=0.0, noise_px=0.2):
+    """What is said of ``CAMERA`` by 24 views of another one."""
+    camera = replace(CAMERA, fx=focal * CAMERA.fx, fy=focal * CAMERA.fy, cx=CAMERA.cx + centre_px)
+    views = [adjusted(camera, noise_px, seed, radial=radial).left_over for seed in range(2)]
+    return lens_doubt(np.concatenate(views), 1.1, CAMERA)
+
+
+@pytest.mark.parametrize("noise_px", [0.1, 0.3, 1.0])
+def test_a_lens_that_is_right_gives_no_doubt(noise_px):
+    assert doubt(noise_px=noise_px) is None
+
+
+@pytest.mark.parametrize(
+    ("focal", "told"), [(1.06, "too short, by about [56] %"), (0.98, "too long, by about 2 %")]
+)
+def test_a_focal_length_alone_is_told_with_its_least_error(focal, told):
+    assert re.fullmatch(f"the focal length seems {told} or more", doubt(focal))
+
+
+def test_changes_that_do_no_harm_are_not_told():
+    assert doubt(focal=1.005) is None
+    assert doubt(radial=-0.009) is None, "it moves no pixel by 1.2 %, and no focal length is blamed for it"
+    assert doubt(centre_px=2.0) is None
+    assert doubt(focal=1.02, noise_px=3.0) is None, "it is lost in the noise"
+
+
+@pytest.mark.parametrize(
+    ("focal", "radial"), [(1.0, -0.02), (1.0, -0.1), (0.95, -0.1), (1.05, 0.1), (1.2, 0.0)]
+)
+def test_where_distortion_may_have_a_part_in_it_no_value_is_told(focal, radial):
+    told = doubt(focal, radial)
+    assert (
+        told == "the lens seems to be another one (distortion, and perhaps focal length and principal point)"
+    )
+
+
+def test_a_principal_point_is_told_from_distortion():
+    assert doubt(centre_px=12.0) == "the principal point seems off"
+    assert doubt(focal=1.04, centre_px=12.0) == "the principal point seems off, and the focal length"
+
+
+def test_views_that_say_nothing_give_no_doubt():
+    assert lens_doubt(np.zeros((20, 8, 8)), 1.0, CAMERA) is None
+    assert lens_doubt([], 1.0, CAMERA) is None
