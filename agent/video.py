@@ -51,9 +51,7 @@ def _why_not(source: str, live: bool) -> str:
     if not live:
         return ": 'semcast replay' takes recordings of a stream" if source.endswith(".mcap") else ""
     if "://" in source:
-        return (
-            f": no stream came within {_OPEN_TIMEOUT_MS // 1000} s; is the address right, with its password?"
-        )
+        return f": no stream came within {_OPEN_TIMEOUT_MS // 1000} s; are address and password right?"
     device = Path(f"/dev/video{int(source)}" if is_camera_number(source) else source)
     if sys.platform != "linux":
         return ""
