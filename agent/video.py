@@ -2,7 +2,9 @@
 
 import contextlib
 import logging
+import os
 import re
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -44,6 +46,22 @@ def public_name(source: str) -> str:
     return f"{scheme}://{shown}"
 
 
+def _why_not(source: str, live: bool) -> str:
+    """Return what can be told about why a source can't be opened, to end the sentence that says so."""
+    if not live:
+        return ": 'semcast replay' takes recordings of a stream" if source.endswith(".mcap") else ""
+    if "://" in source:
+        return f": no stream came within {_OPEN_TIMEOUT_MS // 1000} s; are address and password right?"
+    device = Path(f"/dev/video{int(source)}" if is_camera_number(source) else source)
+    if sys.platform != "linux":
+        return ""
+    if not device.exists():
+        return f": there is no {device}"
+    if not os.access(device, os.R_OK | os.W_OK):
+        return f": this user may not use {device}, which mostly takes being in the group 'video'"
+    return f": {device} gives no images; it may be in use, or no camera"
+
+
 def open_capture(source: str, *, live: bool) -> cv2.VideoCapture:
     """Open a video file, or a camera by its number, device or address.
 
@@ -72,8 +90,7 @@ def open_capture(source: str, *, live: bool) -> cv2.VideoCapture:
     if not capture.isOpened():
         capture.release()
         what = "camera" if live else "video"
-        way = ": 'semcast replay' takes recordings of a stream" if source.endswith(".mcap") else ""
-        raise SourceError(f"{what} {public_name(source)} can't be opened{way}")
+        raise SourceError(f"{what} {public_name(source)} can't be opened{_why_not(source, live)}")
     if live:
         # The driver's queue only makes frames older.
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)

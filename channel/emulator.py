@@ -187,7 +187,7 @@ class Emulator:
         if request.op not in ("get", "set"):
             raise ConfigError(f"op must be get or set, got {request.op!r}")
         with self._control_lock:
-            if request.op == "set":
+            if request.op == "set" and request.settings:
                 current = settings_to_dict(self._link.settings)
                 changed = build_settings(ChannelSettings, {**current, **request.settings})
                 model = build_channel(changed, self._settings.seed)

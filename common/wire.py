@@ -78,12 +78,16 @@ def unpack(data: bytes, expected: type[M]) -> M:
         WireError: The bytes are not such a message. No more memory than their own size was allocated, or a
             few hundred kilobytes.
     """
-    _check_size(data)
-    values = _parse(data)
+    wanted = _kind_of(expected)
+    try:
+        _check_size(data)
+        values = _parse(data)
+    except WireError as err:
+        raise WireError(err.reason, f"{wanted}: {err}") from err
     version = values.get("version")
     if type(version) is not int or version != PROTOCOL_VERSION:
-        raise WireError("version", f"protocol version must be {PROTOCOL_VERSION}, got {str(version)[:20]}")
-    wanted = _kind_of(expected)
+        text = f"{wanted}: protocol version must be {PROTOCOL_VERSION}, got {str(version)[:20]}"
+        raise WireError("version", text)
     kind = values.get("kind")
     if type(kind) is not str or kind != wanted:
         raise WireError("kind", f"kind must be {wanted!r}, got {str(kind)[:40]!r}")

@@ -54,4 +54,7 @@ def conclude(
             logger.info("%s", how_far)
         if gives_way():
             break
+    else:
+        if num_left := session.num_without_depth:
+            logger.info("no time was left for the depth of %d keyframes: dense.ply is without them", num_left)
     tell("writing results")

@@ -1,4 +1,5 @@
 import shutil
+import sys
 import threading
 import time
 
@@ -343,6 +344,20 @@ def test_a_device_is_a_camera_whether_it_is_plugged_in_or_not(tmp_path):
     # A folder in memory is none, and neither is what is missing there.
     assert not is_live("/dev/shm")
     assert not is_live("/dev/shm/none")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="devices have other names")
+def test_why_a_camera_can_not_be_opened_is_said(monkeypatch):
+    def why(source):
+        with pytest.raises(SourceError) as caught:
+            open_source(fast(source, camera=PINHOLE))
+        return str(caught.value).partition(" can't be opened: ")[2]
+
+    assert why("2025") == "there is no /dev/video2025"
+    assert why("/dev/video99") == "there is no /dev/video99"
+    assert why("/dev/null") == "/dev/null gives no images; it may be in use, or no camera"
+    monkeypatch.setattr("semcast.agent.video.os.access", lambda path, mode: False)
+    assert "may not use /dev/null" in why("/dev/null")
 
 
 def test_an_address_is_shown_without_its_password():

@@ -123,7 +123,8 @@ def test_frames_come_out_as_the_link_model_makes_them(ends, make, symbols):
     assert (e.reports[0].snr_db_set, e.reports[0].channel) == (6.0, "erasure")
 
 
-def test_settings_change_while_it_runs_and_bad_ones_are_refused(ends, make):
+def test_settings_change_while_it_runs_and_bad_ones_are_refused(ends, make, caplog):
+    caplog.set_level("INFO", logger="semcast.channel.emulator")
     e = ends(snr_db=10.0)
     e.pass_one(make(0))
     assert set_channel(e.network, "a", {"snr_db": 4.0})["snr_db"] == 4.0
@@ -140,6 +141,8 @@ def test_settings_change_while_it_runs_and_bad_ones_are_refused(ends, make):
     now = set_channel(e.network, "a", {})
     assert (now["snr_db"], now["channel"]) == (4.0, "awgn")
     assert set_channel(e.network, "a", {"channel": "rayleigh"})["channel"] == "rayleigh"
+    changed = [line for line in caplog.messages if line.startswith("channel set")]
+    assert changed == ["channel set: snr_db=4.0", "channel set: channel=rayleigh"]
     e.pass_one(make(2))
     assert e.reports[-1].channel == "rayleigh"
 
@@ -263,7 +266,7 @@ def test_bad_messages_are_counted_and_told_and_do_no_harm(ends, make, caplog):
     for bad in (b"", b"junk", pack(make(0))[:-2], pack(nan)):
         e.tx.put(bad)
     until(lambda: e.status and e.status[-1].drops.get("protocol") == 4)
-    assert "a message was refused: bytes are not a message" in caplog.text
+    assert "a message was refused: symbols: bytes are not a message" in caplog.text
     assert "frame 0 is left out: symbols must be finite" in caplog.text
     silent = make(1, epoch=3, payload_format="iq16", payload=bytes(4 * 4 * 47 * 8))
     e.pass_one(silent)

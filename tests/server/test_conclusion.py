@@ -71,6 +71,24 @@ def test_what_changed_is_shown_and_what_is_going_on_is_told_step_by_step(monkeyp
     ]
 
 
+class Hurried(Ended):
+    """One whose time is up after the first depth."""
+
+    def complete_cloud(self, budget_s):
+        self.num_without_depth -= 1
+        yield ()
+
+
+def test_depth_that_is_left_out_is_told_unless_it_comes_later(caplog):
+    caplog.set_level("INFO", logger="semcast.server.conclusion")
+    conclude(Hurried(), lambda *shown: None, lambda text: None, gives_way=lambda: True)
+    assert not caplog.records
+    conclude(Hurried(), lambda *shown: None, lambda text: None, 2.0)
+    assert [record.getMessage() for record in caplog.records] == [
+        "no time was left for the depth of 2 keyframes: dense.ply is without them"
+    ]
+
+
 def test_a_short_end_is_not_logged_and_one_without_anything_to_do_is_not_told(caplog):
     caplog.set_level("INFO", logger="semcast.server.conclusion")
     told, session = [], Ended()
