@@ -65,9 +65,7 @@ def describe(path: Path) -> list[Section]:
     )
     if path.exists():
         way = f"a video is read by: {shlex.join(('semcast', 'agent', '--source', str(path)))}, with its "
-        way += (
-            "camera as --intrinsics FILE, --focal-35mm 26 (a phone's), or a .json of its name beside it"
-        )
+        way += "camera as --intrinsics FILE, --focal-35mm 26 (a phone's), or a .json of its name beside it"
         raise SourceError(f"{path} is another kind of file: {known}; {way}")
     raise SourceError(f"there is no file or folder {path}: {known}")
 
