@@ -208,14 +208,16 @@ def plot_path(
     *,
     axes_names: tuple[str, str] = ("x", "z"),
     title: str = "",
+    unit: str,
 ) -> None:
-    """Draw camera positions in metres along one world axis and save them.
+    """Draw camera positions along one world axis and save them.
 
     Args:
         path: Image file.
         trajectories: Name to ``(N, 3)`` positions, all in one world frame.
         axes_names: The two world axes shown, of ``x``, ``y``, ``z``; a camera-style world looks best in x, z.
         title: Above the axes.
+        unit: Unit of the axes.
     """
     columns = ["xyz".index(name) for name in axes_names]
     figure, axes = _new_figure(4.6, 4.6)
@@ -225,7 +227,7 @@ def plot_path(
         if name != "ground truth":
             style = {"linewidth": 1.3}
         axes.plot(positions[:, columns[0]], positions[:, columns[1]], label=name, **style)
-    axes.set(xlabel=f"{axes_names[0]} (m)", ylabel=f"{axes_names[1]} (m)", title=title)
+    axes.set(xlabel=f"{axes_names[0]} ({unit})", ylabel=f"{axes_names[1]} ({unit})", title=title)
     axes.set_aspect("equal", adjustable="datalim")
     figure.legend(fontsize="small", loc="outside lower center", ncols=len(trajectories))
     save_figure(figure, path)

@@ -79,7 +79,7 @@ def test_curves_with_gaps_draw_and_wrong_lengths_raise(tmp_path):
 def test_path_and_reliability_are_drawn(tmp_path):
     path = tmp_path / "top.svg"
     line = np.stack([np.arange(5.0), np.zeros(5), np.arange(5.0)], axis=1)
-    plot_path(path, {"ground truth": line, "semcast": line + 0.1}, title="t")
+    plot_path(path, {"ground truth": line, "semcast": line + 0.1}, title="t", unit="m")
     assert "<svg" in path.read_text()
     plot_reliability(tmp_path / "r.png", {"c": reliability_of([0.2, 0.8], [0.3, 0.7])}, "what was")
     assert cv2.imread(str(tmp_path / "r.png")) is not None
@@ -93,13 +93,13 @@ def test_names_are_no_formulas_and_may_be_of_any_script(tmp_path, name):
 
 def test_an_unknown_file_type_is_one_clear_error(tmp_path):
     with pytest.raises(SemcastError, match="plot"):
-        plot_path(tmp_path / "a.nonsense", {"a": np.zeros((2, 3))})
+        plot_path(tmp_path / "a.nonsense", {"a": np.zeros((2, 3))}, unit="m")
 
 
 @pytest.mark.parametrize(
     "draw",
     [
-        lambda path: plot_path(path, {"a": np.zeros((2, 3))}),
+        lambda path: plot_path(path, {"a": np.zeros((2, 3))}, unit="m"),
         lambda path: write_picture(path, np.zeros((500, 500, 3), np.uint8)),
     ],
 )
@@ -118,7 +118,7 @@ def test_names_of_curves_stand_beside_the_axes_and_hide_no_point(tmp_path, monke
         plot_against_snr(tmp_path / "a.png", [2, 4, 6], curves, "PSNR (dB)")
         corner = reliability_of([0.1, 0.9], [0.9, 0.1])
         plot_reliability(tmp_path / "b.png", dict.fromkeys("abcde", corner), "what was")
-        plot_path(tmp_path / "c.png", {"ground truth": np.eye(3), "semcast": -np.eye(3)})
+        plot_path(tmp_path / "c.png", {"ground truth": np.eye(3), "semcast": -np.eye(3)}, unit="m")
 
     drawn = drawn_by(monkeypatch, draw)
     assert len(drawn) == 3
