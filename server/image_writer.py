@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import shutil
 import threading
 import time
 from collections import deque
@@ -23,6 +24,8 @@ logger = logging.getLogger(__name__)
 MAX_PROVISIONAL = 300
 #: How long no image is written after one that could not be.
 RETRY_S = 5.0
+#: What images leave free of a disk: the path, the map and the dense cloud, up to some 50 MB, come last.
+RESERVED_BYTES = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -35,8 +38,9 @@ class _Image:
 class ImageWriter:
     """Writes decoded images into ``images/``.
 
-    A full disk, or whatever else keeps an image from being written, is reported; the stream goes on, images
-    are left out and counted as dropped, and it is tried again every ``RETRY_S``.
+    A disk with less than ``RESERVED_BYTES`` free, or whatever else keeps an image from being written, is
+    reported; the stream goes on, images are left out and counted as dropped, and it is tried again every
+    ``RETRY_S``.
 
     Args:
         folder: The run folder.
@@ -124,6 +128,11 @@ class ImageWriter:
         self._drop_provisional(frozenset())
 
     def _write(self, item: _Image) -> None:
+        if (free := shutil.disk_usage(self._images).free) < RESERVED_BYTES:
+            raise OSError(
+                f"{free / 1e6:.0f} MB of the disk are free, of which {RESERVED_BYTES / 1e6:.0f} are kept for "
+                "results"
+            )
         bgr = cv2.cvtColor(item.image, cv2.COLOR_RGB2BGR)
         good, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])
         if not good:

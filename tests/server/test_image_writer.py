@@ -1,4 +1,6 @@
+import itertools
 import threading
+import types
 from pathlib import Path
 
 import cv2
@@ -106,6 +108,16 @@ def test_an_image_that_finds_no_room_leaves_no_part_of_itself(tmp_path, monkeypa
             writer.put(k, picture(k))
     assert list(read_image_paths(tmp_path)) == [0]
     assert (writer.num_written, writer.num_dropped) == (1, 2)
+
+
+def test_images_leave_the_end_of_a_disk_to_the_results(tmp_path, monkeypatch, caplog):
+    free = iter((101_000_000, 99_000_000, 101_000_000))
+    monkeypatch.setattr("shutil.disk_usage", lambda path: types.SimpleNamespace(free=next(free)))
+    with ImageWriter(tmp_path, lossless=True, clock_s=itertools.count(0.0, 10.0).__next__) as writer:
+        for k in range(3):
+            writer.put(k, picture(k))
+    assert list(read_image_paths(tmp_path)) == [0, 2]
+    assert "99 MB of the disk are free, of which 100 are kept for results" in caplog.text
 
 
 def test_whatever_an_image_can_not_be_written_for_holds_nobody_up(tmp_path, monkeypatch, caplog):
