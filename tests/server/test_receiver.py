@@ -440,12 +440,13 @@ def test_a_receiver_that_can_not_listen_leaves_no_thread(monkeypatch):
     def refuse(*_):
         raise TransportError("no")
 
-    before = set(threading.enumerate())
     hub, _ = open_hub()
-    with hub, monkeypatch.context() as patch, pytest.raises(TransportError, match="no"):
-        patch.setattr(hub, "watch_alive", refuse)
-        Receiver(hub, "a", "replay", Metrics("server"))
-    assert {thread.name for thread in set(threading.enumerate()) - before} <= {"pyo3-closure"}
+    with hub:
+        monkeypatch.setattr(hub, "watch_alive", refuse)
+        before = set(threading.enumerate())
+        with pytest.raises(TransportError, match="no"):
+            Receiver(hub, "a", "replay", Metrics("server"))
+        assert "semcast-flow" not in {thread.name for thread in set(threading.enumerate()) - before}
 
 
 def test_a_frame_that_overtakes_the_camera_of_a_new_start_waits_for_it(ends, make):

@@ -116,7 +116,7 @@ def test_a_row_of_equal_houses_does_not_hold_the_camera_back_after_a_gap():
     poses = reconstruction.final_trajectory()
     reconstruction.close()
     assert set(poses) == set(times_ns)
-    assert ate(trajectory_of(poses, times_ns), sequence.groundtruth()).rmse_m < 1.0
+    assert ate(trajectory_of(poses, times_ns), sequence.groundtruth()).rmse < 1.0
 
 
 def test_less_than_the_error_of_poses_is_no_stop():
@@ -143,7 +143,7 @@ def test_a_road_is_driven_past_a_grabber_that_hangs(num_hung, parts):
     assert len(submaps) == parts
     assert sorted(set(range(num)) - set(poses)) == list(hung)
     error = ate(trajectory_of(poses, times_ns), sequence.groundtruth())
-    assert error.rmse_m < 0.2
+    assert error.rmse < 0.2
 
 
 def test_an_image_is_looked_at_again_from_where_the_camera_would_have_got_to():
