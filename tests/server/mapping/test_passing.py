@@ -94,7 +94,7 @@ def test_what_near_posts_hide_and_what_drifts_by_slowly_is_no_proof_that_the_cam
         # Where a post was, the hills come back as new tracks.
         ids = np.where(is_post, 10_000 + k * len(IDS) + IDS, 100_000 * ((PLACES[:, 0] - 12 * k) // 120) + IDS)
         ids, row = np.unique(ids.astype(np.int64), return_index=True)
-        xy = (PLACES + [0.7 * k, 0.0])[row]
+        xy = (PLACES + np.array([0.7 * k, 0.0]))[row]
         tell(passing, k, np.where(is_post, 12.0, 0.7)[row], xy=xy, ids=ids)
         since = since + 1 if passing.camera_stands else 0
         most = max(most, since)
