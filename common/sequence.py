@@ -231,9 +231,11 @@ class Sequence:
         truth = self._truth
         if truth is None or len(truth) < 2:
             return None
+        # Where few images have a true pose, a turn from one to the next may be that of a second.
+        is_next = np.diff(np.searchsorted(ns_to_seconds(self.times_ns), truth.t_s)) == 1
         forward = truth.T_world_cam[:, :3, 2]
-        cosines = np.clip((forward[1:] * forward[:-1]).sum(axis=1), -1.0, 1.0)
-        turn_deg = float(np.degrees(np.median(np.arccos(cosines))))
+        cosines = np.clip((forward[1:] * forward[:-1]).sum(axis=1)[is_next], -1.0, 1.0)
+        turn_deg = float(np.degrees(np.median(np.arccos(cosines)))) if is_next.any() else 0.0
         if turn_deg <= _MOST_TURN_DEG:
             return None
         return (

@@ -50,7 +50,10 @@ class Feedback:
         self._flow = session.publisher(flow_key(agent_id), "newest")
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
-        if how_far is not None:
+
+    def begin(self) -> None:
+        """Say from time to time how far a lossless stream is, until ``close``."""
+        if self._how_far is not None:
             self._thread = threading.Thread(target=self._beat, name="semcast-flow", daemon=True)
             self._thread.start()
 

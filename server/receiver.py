@@ -130,6 +130,7 @@ class Receiver:
         session.subscribe(channel_key(agent_id), "newest", self._on_report, FRAME_RING_CAPACITY)
         session.watch_alive(agent_id, self._on_alive)
         session.subscribe(rx_key(agent_id), "newest", self._on_symbols, FRAME_RING_CAPACITY)
+        self._feedback.begin()  # where nothing can fail any more: nobody could close it
 
     def __enter__(self) -> Self:
         return self

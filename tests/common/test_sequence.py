@@ -283,15 +283,16 @@ def test_what_is_wrong_with_a_recording_is_said(native, damage, message):
 
 
 def test_images_of_which_each_looks_elsewhere_are_no_stream(native, poses):
-    def turning(turn_deg):
+    def turning(turn_deg, step=1):
         turned = poses(5)
         for k, T in enumerate(turned):
             T[:3, :3] = exp_so3([0.0, np.radians(turn_deg * k), 0.0])
-        write_tum(native / "groundtruth.txt", Trajectory(0.1 * np.arange(5), turned))
+        write_tum(native / "groundtruth.txt", Trajectory(0.1 * np.arange(5)[::step], turned[::step]))
         return open_sequence(native).doubt
 
     assert turning(15.0) is None
     assert "no stream: from one image to the next the camera turns by 60 degrees" in turning(60.0)
+    assert turning(15.0, step=2) is None, "every other image has a true pose: it turns by 15 degrees still"
     (native / "groundtruth.txt").unlink()
     assert open_sequence(native).doubt is None
 

@@ -8,6 +8,7 @@ import pytest
 from waiting import until
 
 from semcast.channel.awgn import complex_noise
+from semcast.common.errors import TransportError
 from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.levels import Levels
 from semcast.common.loopback import open_hub
@@ -433,6 +434,19 @@ def test_a_receiver_that_fails_to_say_how_far_it_is_says_it_the_next_time(ends, 
     came = threading.Event()
     both.client.subscribe(flow_key("a"), "newest", lambda payload: came.set())
     assert came.wait(10)
+
+
+def test_a_receiver_that_can_not_listen_leaves_no_thread(monkeypatch):
+    def refuse(*_):
+        raise TransportError("no")
+
+    hub, _ = open_hub()
+    with hub:
+        monkeypatch.setattr(hub, "watch_alive", refuse)
+        before = set(threading.enumerate())
+        with pytest.raises(TransportError, match="no"):
+            Receiver(hub, "a", "replay", Metrics("server"))
+        assert "semcast-flow" not in {thread.name for thread in set(threading.enumerate()) - before}
 
 
 def test_a_frame_that_overtakes_the_camera_of_a_new_start_waits_for_it(ends, make):
