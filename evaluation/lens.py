@@ -143,7 +143,7 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
 
     best, num_steps = tried(Lens()), 0
     while True:
-        best.heard.check()
+        best.heard.check(images)
         if (change := best.change) is None:
             raise SemcastError(_NOT_TOLD)
         reaches = _reaches(best.heard, change)

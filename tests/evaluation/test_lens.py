@@ -120,8 +120,10 @@ def test_images_that_do_not_tell_are_refused(images, monkeypatch):
     with pytest.raises(SemcastError, match="these images don't tell the focal length"):
         lens.find_lens(settings_of(images))
     monkeypatch.setattr(lens, "_tried", world_of(1.0, num_frames=29))
-    with pytest.raises(SemcastError, match="only 29 frames got a pose, 30 are needed"):
+    with pytest.raises(SemcastError, match="only 29 of 31 frames got a pose, 30 are needed: take images"):
         lens.find_lens(settings_of(images))
+    with pytest.raises(SemcastError, match=r"30 are needed: allow for more \(--frames\), or take images"):
+        lens.find_lens(ImagesSettings(source=str(images), frames=31))
 
 
 def test_a_last_step_that_makes_it_worse_widens_the_bounds(images, monkeypatch):
