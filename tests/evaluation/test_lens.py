@@ -216,6 +216,26 @@ def test_a_principal_point_that_was_moved_is_told(images, tmp_path, capsys, monk
     assert json.loads(result.read_text())["centre_reach_px"] == pytest.approx([0.13, 0.07], abs=0.02)
 
 
+def test_bounds_hold_what_is_not_modelled_besides_chance(images, monkeypatch):
+    def told(unit):
+        change = LensFit(
+            0.0, sigma_focal=0.005, sigma_radial=(0.002, 0.0), sigma_centre=(0.001, 0.001), unit=unit
+        )
+        bent = Lens(1.0, (0.05, 0.0), (0.01, 0.0))
+        trial = LensTrial(bent, Heard([], 0.2, 60), change)
+        monkeypatch.setattr(lens, "_tried", lambda *_: trial)
+        return lens.find_lens(settings_of(images))
+
+    chance, both = told((0.0,) * 5), told((0.2, 0.5, 0.0, 0.1, 0.3))
+    share = np.sqrt(0.002)
+    assert both.focal_reach == pytest.approx(chance.focal_reach + 0.2 * share)
+    assert both.radial_reach == pytest.approx((chance.radial_reach[0] + 0.5 * share,))
+    more_px = np.subtract(both.centre_reach_px, chance.centre_reach_px)
+    assert more_px == pytest.approx(26.5 * share * np.array([0.1, 0.3]))
+    with pytest.raises(SemcastError, match="these images don't tell the focal length"):
+        told((1.6, 0.0, 0.0, 0.0, 0.0))
+
+
 def test_in_pixels_everything_else_stays_when_the_focal_length_changes():
     lens_before = Lens(1.2, (0.1, 0.02), (0.03, -0.01))
     after = lens._changed(lens_before, LensFit(0.1, (0.05, 0.0), (0.01, 0.0)))
