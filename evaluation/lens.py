@@ -32,7 +32,7 @@ _NOTHING = 0.001
 #: So does one of fewer standard deviations.
 _NOTHING_SIGMAS = 0.5
 #: Residuals are not noise alone: blur, patches with a depth of their own and all else that is not modelled
-#: speak for a lens too. In 41 reconstructions of seven recordings with the right lens it was within bounds of
+#: speak for a lens too. In 41 reconstructions of eight recordings with the right lens it was within bounds of
 #: scatter in 61 to 93 % (by value), and in 98 to 100 % with the change added that explains this share of the
 #: squared residuals.
 _NOT_MODELLED = 0.002
