@@ -81,6 +81,7 @@ class Images:
         camera: Of the small images.
         stored: Of the images as stored.
         period_ms: Median time from one to the next.
+        is_cut: Whether they end because no more were asked for, and the source may have more.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Images:
     camera: Intrinsics
     stored: Intrinsics
     period_ms: float
+    is_cut: bool = False
 
 
 def load_images(settings: ImagesSettings) -> Images:
@@ -114,7 +116,7 @@ def load_images(settings: ImagesSettings) -> Images:
     if len(frames) <= MIN_FRAMES:
         raise SourceError(f"{source.name} must have more than {MIN_FRAMES} images, got {len(frames)}")
     period_ms = usual_period_ns(np.array([frame.t_source_ns for frame in frames])) * 1e-6
-    return Images(source.name, frames, camera, stored, period_ms)
+    return Images(source.name, frames, camera, stored, period_ms, is_cut=len(frames) == settings.frames)
 
 
 def _small_frames(source: Source) -> tuple[list[DecodedFrame], Intrinsics]:
@@ -145,16 +147,20 @@ class Heard:
     num_frames: int
     sigma_factor: float = 1.0
 
-    def check(self) -> None:
+    def check(self, images: Images) -> None:
         """Make sure that it is worth listening to.
+
+        Args:
+            images: What was reconstructed.
 
         Raises:
             SemcastError: Too few frames got a pose.
         """
         if self.num_frames < MIN_FRAMES:
+            more = "allow for more (--frames), or " if images.is_cut else ""
             raise SemcastError(
-                f"only {self.num_frames} frames got a pose, {MIN_FRAMES} are needed: take images of a place "
-                "with much to see, while the camera moves sideways and turns"
+                f"only {self.num_frames} of {len(images.frames)} frames got a pose, {MIN_FRAMES} are needed: "
+                f"{more}take images of a place with much to see, while the camera moves sideways and turns"
             )
 
     def reach_95(self, sigma: float) -> float:

@@ -94,7 +94,7 @@ def find_readout(
         )
     limit_ms = min(images.period_ms, MAX_READOUT_MS)
     trials = [_seen(_tried(images, Readout("rows", 0.0)), on_trial)]
-    more = _checked(trials[0])
+    more = _checked(trials[0], images)
     readout, reach_ms = Readout("rows", 0.0), trials[0].heard.reach_95(more.sigma_ms)
     while more.readout.ms >= max(_NOTHING_MS, more.sigma_ms) and len(trials) < _MAX_TRIALS:
         longer = readout.with_more(more.readout)
@@ -105,7 +105,7 @@ def find_readout(
         if trial.heard.num_frames < MIN_FRAMES or not is_better:
             break
         readout, reach_ms = longer, trials[-2].heard.reach_95(more.sigma_ms)
-        more = _checked(trial)
+        more = _checked(trial, images)
     low_ms, high_ms = readout.signed_ms - reach_ms, readout.signed_ms + reach_ms
     if high_ms - low_ms > _MAX_INTERVAL_MS:
         raise SemcastError(_NOT_TOLD)
@@ -153,13 +153,13 @@ def _seen(trial: Trial, on_trial: Callable[[Trial], None] | None) -> Trial:
     return trial
 
 
-def _checked(trial: Trial) -> ReadoutFit:
+def _checked(trial: Trial, images: Images) -> ReadoutFit:
     """Return what a trial says.
 
     Raises:
         SemcastError: Too few frames got a pose, or they say nothing.
     """
-    trial.heard.check()
+    trial.heard.check(images)
     if trial.more is None:
         raise SemcastError(_NOT_TOLD)
     return trial.more

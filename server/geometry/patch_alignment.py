@@ -37,7 +37,7 @@ _SMALL_STEP_PX = 0.03
 #: A structure tensor whose determinant is smaller than this share of its squared trace is an edge.
 _MIN_CORNERNESS = 1e-6
 #: A patch that is seen at less than this share of its area, or more than its inverse, has other details.
-_MIN_AREA_RATIO = 0.4
+MIN_AREA_RATIO = 0.4
 
 
 @dataclass(frozen=True)
@@ -155,9 +155,7 @@ def seen_alike(warps: Array, depth1_map: Array) -> NDArray[np.bool_]:
         depth1_map: ``(N,)`` depths, as well.
     """
     area = np.linalg.det(warps)
-    return np.asarray(
-        (depth1_map > MIN_DEPTH_MAP) & (area > _MIN_AREA_RATIO) & (area < 1.0 / _MIN_AREA_RATIO)
-    )
+    return np.asarray((depth1_map > MIN_DEPTH_MAP) & (area > MIN_AREA_RATIO) & (area < 1.0 / MIN_AREA_RATIO))
 
 
 def align_patches(

@@ -45,6 +45,8 @@ class LensFit:
         sigma_radial: The same.
         sigma_centre: The same.
         explained: Share of the squared residuals that the change explains.
+        unit: Of focal length, k1, k2, x and y in turn, the change that would double the squared residuals
+            while the others make up for it as well as they can.
     """
 
     focal: float = 0.0
@@ -54,6 +56,7 @@ class LensFit:
     sigma_radial: tuple[float, float] = (0.0, 0.0)
     sigma_centre: tuple[float, float] = (0.0, 0.0)
     explained: float = 0.0
+    unit: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def fit_lens(views: Sequence[Array] | Array, num_radial: int, with_centre: bool = False) -> LensFit | None:
@@ -71,14 +74,16 @@ def fit_lens(views: Sequence[Array] | Array, num_radial: int, with_centre: bool 
     total = parts.sum(axis=0)
     if not (np.diag(total)[columns] > 0.0).all():
         return None
-    change, sigma = np.zeros((2, NUM_PATTERNS))
+    change, sigma, unit = np.zeros((3, NUM_PATTERNS))
     change[columns] = _solved(total, columns)
     without = np.stack([_solved(total - part, columns) for part in parts], axis=1)
     sigma[columns] = [spread(each) for each in without]
+    unit[columns] = np.sqrt(total[RESIDUAL, RESIDUAL] * np.diag(np.linalg.inv(_normal(total, columns))))
     focal, k1, k2, x, y = change[_ALL].tolist()
     sigma_focal, sigma_k1, sigma_k2, sigma_x, sigma_y = sigma[_ALL].tolist()
     explained = float(change @ total[:, RESIDUAL] / total[RESIDUAL, RESIDUAL])
-    return LensFit(focal, (k1, k2), (x, y), sigma_focal, (sigma_k1, sigma_k2), (sigma_x, sigma_y), explained)
+    sigmas = (sigma_focal, (sigma_k1, sigma_k2), (sigma_x, sigma_y))
+    return LensFit(focal, (k1, k2), (x, y), *sigmas, explained, tuple(unit[_ALL].tolist()))
 
 
 def believed_lens(
@@ -121,8 +126,10 @@ def _is_more(
     return best is not None and is_sure and fit.explained >= best.explained + _MORE_EXPLAINED
 
 
-def _solved(total: Array, columns: list[int]) -> Array:
+def _normal(total: Array, columns: list[int]) -> Array:
     normal = total[np.ix_(columns, columns)]
-    return np.asarray(
-        np.linalg.solve(normal + _DAMPING * np.diag(np.diag(normal)) + 1e-12, total[columns, RESIDUAL])
-    )
+    return np.asarray(normal + _DAMPING * np.diag(np.diag(normal)) + 1e-12)
+
+
+def _solved(total: Array, columns: list[int]) -> Array:
+    return np.asarray(np.linalg.solve(_normal(total, columns), total[columns, RESIDUAL]))

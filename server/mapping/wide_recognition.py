@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
+from semcast.common.sequence import resized
+from semcast.server.geometry.features import Grey
 from semcast.server.geometry.patch_alignment import (
     ANCHOR_PATCH_PX,
+    MIN_AREA_RATIO,
     Templates,
     affine_warps,
     align_patches,
@@ -208,15 +211,42 @@ class WideRecogniser:
         rows = np.flatnonzero(sight.shows(expected, _BORDER_PX) & (depth0 > 0.0))
         T_cam_keyframe = T_cam_world @ view.keyframe.T_world_cam
         warps, depth1 = affine_warps(self._camera, T_cam_keyframe, view.xy[rows], depth0[rows])
+        there, here = _reductions(warps)
+        warps = warps * (there / here)
         alike = seen_alike(warps, depth1)
         rows, warps = rows[alike], warps[alike]
-        templates = Templates.cut(view.image.grey, view.xy[rows], ANCHOR_PATCH_PX)
-        patches = align_patches(templates, sight.grey, expected[rows], warps)
-        fits = patches.fits(expected[rows])
+        expected_xy = _in_reduced(expected[rows], here)
+        centres_xy = _in_reduced(view.xy[rows], there)
+        templates = Templates.cut(_reduced(view.image.grey, there), centres_xy, ANCHOR_PATCH_PX)
+        patches = align_patches(templates, _reduced(sight.grey, here), expected_xy, warps)
+        fits = patches.fits(expected_xy)
         kept = rows[fits]
-        return _Aligned(view.ids[kept], view.xyz[kept], patches.xy[fits], len(rows))
+        # Back to pixels of the whole image.
+        xy = _in_reduced(patches.xy[fits], 1.0 / here)
+        return _Aligned(view.ids[kept], view.xyz[kept], xy, len(rows))
 
     def _refined(self, found: PoseEstimate, xyz: Array, xy: Array, noise: NoiseModel) -> PoseEstimate:
         """Pose of landmarks that were found."""
         sigma = np.full(len(xyz), max(_ALIGNED_SIGMA_PX, noise.sigma0_px))
         return refine_pose(self._camera, found.T_cam_world, xyz, xy, sigma, GATE_SIGMAS * sigma)
+
+
+def _reductions(warps: Array) -> tuple[int, int]:
+    """Return by what keyframe and image are reduced, so that their patches show the same details.
+
+    A camera that is twice as near sees what the keyframe did not, and the keyframe what one that is twice as
+    far away does not: the larger picture at half its size is like the other.
+    """
+    area_ratio = float(np.median(np.linalg.det(warps))) if len(warps) else 1.0
+    return 2 if area_ratio < MIN_AREA_RATIO else 1, 2 if area_ratio > 1.0 / MIN_AREA_RATIO else 1
+
+
+def _reduced(grey: Grey, by: int) -> Grey:
+    """Return an image whose sides are so many times shorter, up to pixels that are left over."""
+    height, width = grey.shape[0] // by, grey.shape[1] // by
+    return resized(grey[: by * height, : by * width], (width, height))
+
+
+def _in_reduced(xy: Array, by: float) -> Array:
+    """Return where pixels are in an image that was reduced."""
+    return np.asarray((xy + 0.5) / by - 0.5)

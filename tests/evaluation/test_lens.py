@@ -120,8 +120,10 @@ def test_images_that_do_not_tell_are_refused(images, monkeypatch):
     with pytest.raises(SemcastError, match="these images don't tell the focal length"):
         lens.find_lens(settings_of(images))
     monkeypatch.setattr(lens, "_tried", world_of(1.0, num_frames=29))
-    with pytest.raises(SemcastError, match="only 29 frames got a pose, 30 are needed"):
+    with pytest.raises(SemcastError, match="only 29 of 31 frames got a pose, 30 are needed: take images"):
         lens.find_lens(settings_of(images))
+    with pytest.raises(SemcastError, match=r"30 are needed: allow for more \(--frames\), or take images"):
+        lens.find_lens(ImagesSettings(source=str(images), frames=31))
 
 
 def test_a_last_step_that_makes_it_worse_widens_the_bounds(images, monkeypatch):
@@ -212,6 +214,26 @@ def test_a_principal_point_that_was_moved_is_told(images, tmp_path, capsys, monk
     assert "principal point: 16.6 (+- 0.1), 11.0 (+- 0.1) px" in said.out
     assert "focal length x 1.1000, centre +0.0400 -0.0200: 60 frames with a pose" in said.err
     assert json.loads(result.read_text())["centre_reach_px"] == pytest.approx([0.13, 0.07], abs=0.02)
+
+
+def test_bounds_hold_what_is_not_modelled_besides_chance(images, monkeypatch):
+    def told(unit):
+        change = LensFit(
+            0.0, sigma_focal=0.005, sigma_radial=(0.002, 0.0), sigma_centre=(0.001, 0.001), unit=unit
+        )
+        bent = Lens(1.0, (0.05, 0.0), (0.01, 0.0))
+        trial = LensTrial(bent, Heard([], 0.2, 60), change)
+        monkeypatch.setattr(lens, "_tried", lambda *_: trial)
+        return lens.find_lens(settings_of(images))
+
+    chance, both = told((0.0,) * 5), told((0.2, 0.5, 0.0, 0.1, 0.3))
+    share = np.sqrt(0.002)
+    assert both.focal_reach == pytest.approx(chance.focal_reach + 0.2 * share)
+    assert both.radial_reach == pytest.approx((chance.radial_reach[0] + 0.5 * share,))
+    more_px = np.subtract(both.centre_reach_px, chance.centre_reach_px)
+    assert more_px == pytest.approx(26.5 * share * np.array([0.1, 0.3]))
+    with pytest.raises(SemcastError, match="these images don't tell the focal length"):
+        told((1.6, 0.0, 0.0, 0.0, 0.0))
 
 
 def test_in_pixels_everything_else_stays_when_the_focal_length_changes():

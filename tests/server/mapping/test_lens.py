@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from shaken_views import CAMERA, adjusted
 
-from semcast.server.mapping.left_over import FOCAL, RESIDUAL, _lens_patterns, grouped, spread
+from semcast.server.mapping.left_over import FOCAL, RADIAL, RESIDUAL, _lens_patterns, grouped, spread
 from semcast.server.mapping.lens import believed_lens, fit_lens
 
 
@@ -116,10 +116,24 @@ def test_by_hand_the_change_is_the_slope_and_its_spread_that_of_what_is_left():
     assert fit.focal == pytest.approx(0.012)
     assert fit.sigma_focal == pytest.approx(0.0, abs=1e-12)
     assert fit.explained == pytest.approx(0.012**2 * 100.0 / 4.0)
+    assert fit.unit == pytest.approx((np.sqrt(4.0 / 100.0), 0.0, 0.0, 0.0, 0.0))
     # Leaving one of 1, 2, 3 out leaves means of 2.5, 2, 1.5: the jackknife has the error of the mean.
     fit = fit_lens([view(0.01), view(0.02), view(0.03)], num_radial=0)
     assert fit.sigma_focal == pytest.approx(0.01 / np.sqrt(3))
     assert spread(np.array([2.5, 2.0, 1.5])) == pytest.approx(1 / np.sqrt(3))
+
+
+def test_a_unit_of_change_doubles_the_squared_residuals_the_others_following():
+    views = adjusted(CAMERA, radial=-0.05).left_over
+    fit, total = fit_lens(views, num_radial=1), grouped(views).sum(axis=0)
+    at = [FOCAL, RADIAL]
+    for k, other in ((0, 1), (1, 0)):
+        moved = np.zeros(2)
+        moved[k] = fit.unit[k]
+        moved[other] = -total[at[0], at[1]] * moved[k] / total[at[other], at[other]]
+        more = moved @ total[np.ix_(at, at)] @ moved
+        assert more == pytest.approx(total[RESIDUAL, RESIDUAL], rel=1e-4)
+    assert fit.unit[2:] == (0.0, 0.0, 0.0)
 
 
 def test_views_that_say_nothing_are_no_lens():

@@ -5,6 +5,8 @@ import pytest
 
 from semcast.common.geometry import invert_transform, rotation_angle_deg, transform_points
 from semcast.common.sequence import open_sequence
+from semcast.evaluation.scenes.orbit import Orbit
+from semcast.evaluation.scenes.render import frame_of
 from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
@@ -15,6 +17,8 @@ from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.wide_recognition import WideRecogniser
 
 NUM_MAPPED = 14
+#: Of the still life that is drawn.
+SEED = 0
 NOISE = NoiseModel(0.7, 0.0)
 
 
@@ -60,6 +64,41 @@ def test_the_place_is_found_from_20_degrees_on(mapped, num_lost_rows):
     T = invert_transform(place.T_world_cam)
     xyz = world.landmarks.xyz[world.landmarks.rows(place.ids)] @ T[:3, :3].T + T[:3, 3]
     assert np.median(np.linalg.norm(camera.project(xyz) - place.xy, axis=1)) < 1.5
+
+
+class _Moved(Orbit):
+    """The still life from nearer or further away."""
+
+    def __init__(self, further_m: float) -> None:
+        super().__init__(SEED, "normal")
+        self._further_m = further_m
+
+    def T_world_cam(self, t_s: float) -> np.ndarray:
+        T_world_cam = super().T_world_cam(t_s)
+        T_world_cam[:3, 3] -= self._further_m * T_world_cam[:3, 2]
+        return T_world_cam
+
+
+@pytest.mark.parametrize("further_m", [-0.6, 2.4])
+def test_the_place_is_found_from_where_things_are_twice_as_large_or_half_as_large(mapped, further_m):
+    k = NUM_MAPPED + 1
+    sequence, reconstruction = mapped
+    image = frame_of(_Moved(further_m), 0.1 * k, 1.5, np.random.default_rng(0))
+    place = find(mapped, sight_of(image, k))
+    assert place is not None
+    assert len(place.ids) > 20
+    world, camera = reconstruction.world, sequence.intrinsics
+    seen_from, truth = world.keyframe(place.keyframe_id), sequence.groundtruth().T_world_cam
+    ours = seen_from.T_world_cam[:3, :3].T @ place.T_world_cam[:3, :3]
+    assert rotation_angle_deg(ours.T @ truth[place.keyframe_id][:3, :3].T @ truth[k][:3, :3]) < 1.0
+    T_cam_world, landmarks = invert_transform(place.T_world_cam), world.landmarks
+    points = transform_points(T_cam_world, landmarks.xyz[landmarks.rows(place.ids)])
+    before = transform_points(
+        invert_transform(seen_from.T_world_cam), landmarks.xyz[landmarks.rows(seen_from.ids)]
+    )
+    times = np.median(points[:, 2]) / np.median(before[:, 2])
+    assert times < 0.65 if further_m < 0.0 else times > 2.0
+    assert np.median(np.linalg.norm(camera.project(points) - place.xy, axis=1)) < 1.5
 
 
 def test_landmarks_that_only_other_keyframes_saw_are_found_too(mapped):
