@@ -44,7 +44,10 @@ The map
     landmarks         landmarks as columns
     posed_frames      poses of frames relative to their keyframes, as arrays
     map_builder       owns the map: keyframes, adjustments, joining of submaps
-    mapper            when to take a keyframe, new landmarks, applying adjustments, culling
+    keyframe_rule     when a frame becomes a keyframe
+    new_landmarks     tracks of keyframes, triangulated
+    observations      what keyframes saw of some tracks
+    scene_depth       how far away the scene is
     thinning          what goes when the map reaches its limits
     keyframe_images   images of keyframes, kept to look for landmarks by how they looked there
     map_arrays        checks the arrays of a checkpoint
@@ -56,7 +59,7 @@ Bundle adjustment
     bundle            solves a problem: dense for small ones, GTSAM for the rest
     dense_bundle      Levenberg-Marquardt with the Schur complement in numpy
     bundle_process    the same in a process of its own
-    left_out          landmarks an adjustment had no room for
+    adjustment        brings the result into the map, and lets what it had no room for follow
     whole_map         the adjustment of all keyframes at the end of a stream
     steps             relative poses that tracking found, as constraints between keyframes
 

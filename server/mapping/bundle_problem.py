@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.edges import alike, each_of, whitened
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.observations import Observations
 from semcast.server.mapping.pose_graph import Edge
 
 Array = NDArray[np.float64]
@@ -96,28 +97,6 @@ class Frame(Protocol):
     @property
     def frame_id(self) -> int:
         """Its number in the stream."""
-
-
-class Observations(NamedTuple):
-    """Observations of tracks in views, one a row.
-
-    Attributes:
-        view: ``(M,)`` which view.
-        point: ``(M,)`` row of the track among those asked for.
-        xy: ``(M, 2)`` pixels.
-        confidence: ``(M,)`` in [0, 1].
-        edge: ``(M, 2)`` see ``edges``.
-    """
-
-    view: NDArray[np.intp]
-    point: NDArray[np.intp]
-    xy: Array
-    confidence: Array
-    edge: Array
-
-    def of_rows(self, kept: NDArray[np.bool_], point: NDArray[np.intp]) -> "Observations":
-        """Return the observations in the mask ``kept (M,)``, with new track rows ``point``."""
-        return Observations(self.view[kept], point, self.xy[kept], self.confidence[kept], self.edge[kept])
 
 
 def assemble_problem(

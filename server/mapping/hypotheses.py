@@ -19,7 +19,7 @@ from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.ambiguity import Side
 from semcast.server.mapping.bundle_problem import BundleProblem, assemble_problem
 from semcast.server.mapping.kept_frames import Observed, pose_of
-from semcast.server.mapping.mapper import gather_observations
+from semcast.server.mapping.observations import gather_observations
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]

@@ -24,7 +24,7 @@ from semcast.server.geometry.weighting import MAD_TO_SIGMA, ConfidenceMode, Nois
 from semcast.server.mapping.ambiguity import Side, decide
 from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
 from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
-from semcast.server.mapping.mapper import gather_observations
+from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.scene_motion import ITERATIONS, SceneMotion, motion_of_scene
 from semcast.server.mapping.start_alignment import aligned_views
 from semcast.server.mapping.world_map import Keyframe
@@ -86,7 +86,7 @@ _THRESHOLD_RANGE_PX = (1.0, 3.0)
 #: views are near each other.
 _PARALLAX_SHARE = 0.5
 #: RMS error of such a point at most, in standard deviations. It is larger than a landmark's may be
-#: (``mapper.MAX_ERROR_SIGMA``), as a start is adjusted at once.
+#: (``new_landmarks.MAX_ERROR_SIGMA``), as a start is adjusted at once.
 _MAX_ERROR_SIGMA = 2.5
 
 

@@ -17,10 +17,10 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, rotation_angle_deg
 from semcast.server.geometry.pnp import reprojection_residual, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
-from semcast.server.mapping.mapper import median_depth
 from semcast.server.mapping.pose_graph import Edge, SolvedGraph, solve_graph
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, tells_depth
+from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.steps import steps_of, usable_depth
 from semcast.server.mapping.world_map import Keyframe, WorldMap

@@ -10,17 +10,18 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, make_transform, skew, transform_points
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
-from semcast.server.mapping import mapper
+from semcast.server.mapping.adjustment import apply_result, place_left_out
 from semcast.server.mapping.anchoring import anchor_tracks, resembles
 from semcast.server.mapping.bridging import may_turn
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, colours_of
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
+from semcast.server.mapping.keyframe_rule import KeyframeCues, median_flow_px, wants_keyframe
 from semcast.server.mapping.late_readout import put_map_right
-from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.map_update import update_of
+from semcast.server.mapping.new_landmarks import add_landmarks
 from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.recall import recall_landmarks
@@ -247,7 +248,7 @@ class MapBuilder:
             return 0
         frame_id = sight.frame.frame_id
         logger.debug("frame %d: %d landmarks of keyframe %d again", frame_id, len(ids), found.keyframe_id)
-        mapper.note_sight(world, ids, np.ones(len(ids), bool), frame_id)
+        world.note_sight(ids, np.ones(len(ids), bool), frame_id)
         world.revisits[frame_id] = found.keyframe_id
         self.loops.note_tie()
         return len(ids)
@@ -265,17 +266,17 @@ class MapBuilder:
             frames_since: Frames since the newest keyframe.
         """
         ids, xy = tracks.ids[tracks.visible], tracks.xy[tracks.visible]
-        cues = mapper.KeyframeCues(
+        cues = KeyframeCues(
             num_inliers=num_inliers,
             num_inliers_at_keyframe=self.num_inliers_at_keyframe,
             num_visible=len(ids),
             max_features=self._settings.max_features,
-            median_flow_px=mapper.median_flow_px(reference, ids, xy),
+            median_flow_px=median_flow_px(reference, ids, xy),
             width_px=self._camera.width,
             frames_since=frames_since,
             usable_share=float(sight.usable.mean()),
         )
-        return mapper.wants_keyframe(cues)
+        return wants_keyframe(cues)
 
     def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
         """Turn the newest frame into a keyframe, triangulate, and ask for an adjustment."""
@@ -322,7 +323,7 @@ class MapBuilder:
 
     def _add_landmarks(self, image: NDArray[np.uint8]) -> None:
         parallax_deg, noise = self._settings.min_parallax_deg, self.noise.model
-        mapper.add_landmarks(self.world, self._camera, noise, image, parallax_deg, enough=self.enough)
+        add_landmarks(self.world, self._camera, noise, image, parallax_deg, enough=self.enough)
 
     def _bound(self) -> None:
         """Keep the map, and the images of its keyframes, within its size."""
@@ -351,7 +352,7 @@ class MapBuilder:
         result = self._bundle.take(wait=wait)
         if result is None:
             return None
-        mapper.apply_result(self.world, result, self.noise)
+        apply_result(self.world, result, self.noise)
         place_left_out(self.world, self._camera, self.noise.model, result)
         if result.covariance is not None:
             self._adjusted = (int(result.problem.keyframe_ids[-1]), result.covariance)

@@ -16,7 +16,7 @@ from semcast.common.geometry import invert_transform
 from semcast.server.mapping.bridging import bridge
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Start
-from semcast.server.mapping.mapper import median_depth, usual_depth
+from semcast.server.mapping.scene_depth import median_depth, usual_depth
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.visual_gyroscope import VisualGyroscope
 from semcast.server.mapping.world_map import WorldMap

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.server.mapping import mapper
 from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.camera_motion import CameraMotion
@@ -201,7 +200,7 @@ class Reconstruction:
             self._on_pose(self._result(frame, pose.T_world_cam, pose, is_keyframe=is_keyframe))
         # The pose is on its way now, and nobody waits.
         self._moves_to(frame.frame_id, frame.t_source_ns, pose.T_world_cam, pose.ids[pose.inliers])
-        mapper.note_sight(self._map.world, pose.ids, pose.inliers, frame.frame_id)
+        self._map.world.note_sight(pose.ids, pose.inliers, frame.frame_id)
         if is_keyframe:
             since = time.perf_counter_ns()
             pose = self._improved(sight, pose)

@@ -23,7 +23,8 @@ from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
-from semcast.server.mapping.mapper import gather_observations, median_depth
+from semcast.server.mapping.observations import gather_observations
+from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from semcast.common.geometry import invert_transform, rotation_angle_deg
-from semcast.server.mapping.mapper import median_depth
 from semcast.server.mapping.pose_graph import Edge
+from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.thinning import is_gap
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.adjustment import drop_outliers, local_scales
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.bundle_problem import assemble_problem
-from semcast.server.mapping.mapper import drop_outliers, gather_observations, local_scales
+from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.pose_graph import Edge
 from semcast.server.mapping.steps import steps_of
 from semcast.server.mapping.window import within_limit
