@@ -67,8 +67,8 @@ Getting lost, and places seen again
     relocalisation    binary descriptors against keyframes, then PnP; joining two submaps
     wide_recognition  the same by SIFT and warped patches, from further off
     visual_gyroscope  how a camera without a pose turns
-    bridging          where a new submap begins, and its unit, by how the camera moved
-    passage           the same anew once the submap has settled
+    bridging          where a new submap begins and its unit, told by how the camera moved
+    submap_placement  puts it there, and again once it has settled
     revisit           old landmarks that are in sight again get their tracks back
     loop_closure      finds loops and shares out the drift
     pose_graph        graph of similarities (Sim(3)) between keyframes, by GTSAM

@@ -22,7 +22,6 @@ from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.map_update import update_of
 from semcast.server.mapping.new_landmarks import add_landmarks
-from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
@@ -31,6 +30,7 @@ from semcast.server.mapping.rolling_shutter import ImageFlow
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import MapUpdate
+from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.whole_map import adjust_whole_map
 from semcast.server.mapping.wide_recognition import WideRecogniser
@@ -381,12 +381,12 @@ class MapBuilder:
             self._adjusted = None
         return num_adjusted
 
-    def place_again(self, passage: Passage, on_moved: Callable[[float], None]) -> float:
+    def place_again(self, placement: SubmapPlacement, on_moved: Callable[[float], None]) -> float:
         """Move the current submap to where it is by now known to begin; the factor on lengths, else 1.
 
         ``on_moved`` is called with it after the map has moved.
         """
-        found = passage.lay_again(self.world, self.submap)
+        found = placement.place_again(self.world, self.submap)
         if found is None:
             return 1.0
         self._abandon_adjustment()

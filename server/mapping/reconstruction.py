@@ -18,12 +18,12 @@ from semcast.server.mapping.locator import Locator
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
-from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
+from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.tracker import TrackedPose
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import WorldMap
@@ -71,7 +71,7 @@ class Reconstruction:
         self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
         self._motion = CameraMotion(self._camera)
         self._locator = Locator(self._camera, s, self._map, self._tracks, self._motion)
-        self._passage = Passage(self._camera, self._map.enough)
+        self._placement = SubmapPlacement(self._camera, self._map.enough)
         self._shutter = RollingShutter(camera, lambda: self._map.watch.is_on)
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
@@ -137,7 +137,7 @@ class Reconstruction:
             self._initialiser.clear()
         self._lap("track", since)
         result = self._track(sight, T_world_guess) if is_tracked else self._find(sight)
-        self._passage.note(sight, result.T_world_cam, self._motion, self._map.world)
+        self._placement.note(sight, result.T_world_cam, self._motion, self._map.world)
         self._shutter.keep_up()
         return result
 
@@ -209,7 +209,7 @@ class Reconstruction:
             self._frames_since_keyframe = 0
             self._lap("map", since)
             pose = pose.with_unit(self._try_to_join(sight, pose.T_world_cam))
-            pose = pose.with_unit(self._map.place_again(self._passage, self._moved))
+            pose = pose.with_unit(self._map.place_again(self._placement, self._moved))
         return self._result(frame, self._last_pose(), pose, is_keyframe=is_keyframe)
 
     def _improved(self, sight: Sight, pose: TrackedPose) -> TrackedPose:
@@ -299,7 +299,9 @@ class Reconstruction:
         history = self._initialiser.history
         self._map.finish(self._moved)  # a new part is placed by where the old one ends
         grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
-        T_world_ref, scale = self._passage.lay(self._motion, start, grown, self._map.world, self._map.submap)
+        T_world_ref, scale = self._placement.place(
+            self._motion, start, grown, self._map.world, self._map.submap
+        )
         self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, history)
         noise, seed = self._map.noise.model, self._settings.seed
         backfilled = backfill(self._camera, self._map.world, grown.keyframes, history[:-1], noise, seed)
