@@ -63,12 +63,20 @@ class MapBuilder:
         camera: Pinhole.
         settings: Of the reconstruction.
         bundle: Runs the adjustments.
+        on_moved: Called after the map has moved under the camera, with the factor on lengths around it.
     """
 
-    def __init__(self, camera: Intrinsics, settings: ReconstructionSettings, bundle: BundleRunner) -> None:
+    def __init__(
+        self,
+        camera: Intrinsics,
+        settings: ReconstructionSettings,
+        bundle: BundleRunner,
+        on_moved: Callable[[float], None],
+    ) -> None:
         self._camera = camera
         self._settings = settings
         self._bundle = bundle
+        self._on_moved = on_moved
         self.watch = ReadoutWatch(camera, is_wanted=settings.watches_readout(camera))
         self.clear()
 
@@ -189,16 +197,13 @@ class MapBuilder:
         """Give lost landmarks of the newest keyframes their tracks back; ids of those found."""
         return recall_landmarks(self._mapped, tracks, sight, T_world_cam, reach_px=reach_px, wanted=wanted)
 
-    def revisit(
-        self, tracks: TrackTable, sight: Sight, T_world_cam: Array, on_moved: Callable[[float], None]
-    ) -> bool:
+    def revisit(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> bool:
         """Use what was seen long ago and is in sight again: close a loop, take up landmarks.
 
         Args:
             tracks: Of a frame that becomes a keyframe; found landmarks get their tracks back.
             sight: Its image.
             T_world_cam: Its pose.
-            on_moved: Called with the scale of the newest keyframe after a loop has moved the map.
 
         Returns:
             Whether the map or the tracks have changed.
@@ -207,7 +212,7 @@ class MapBuilder:
         seen = tracks.visible
         view = LoopView(sight, T_world_cam, tracks.ids[seen], tracks.xy[seen])
         loop = self.loops.look(view, self.world, self.noise.model, self.submap, found)
-        closed = loop is not None and self._close(loop, on_moved)
+        closed = loop is not None and self._close(loop)
         if closed:
             T_now = self.world.pose_of_frame(sight.frame.frame_id)
             T_world_cam = T_world_cam if T_now is None else T_now
@@ -220,7 +225,7 @@ class MapBuilder:
         gate_px = GATE_SIGMAS * max(OLD_SIGMA_PX, self.noise.model.sigma0_px)
         return find_revisit(self._mapped, tracks.ids, sight, T_world_cam, gate_px=gate_px)
 
-    def _close(self, loop: Loop, on_moved: Callable[[float], None]) -> bool:
+    def _close(self, loop: Loop) -> bool:
         """Share out what drifted since the camera was at the loop's place; whether that was possible."""
         found = share_out(self.world, self.submap, loop)
         if found is None:
@@ -230,7 +235,7 @@ class MapBuilder:
         self.world.bend(keyframe_ids, solved.T_world_cam, solved.scale)
         self.world.revisits[loop.keyframe_id] = loop.place.keyframe_id
         self._adjusted = None
-        on_moved(float(solved.scale[-1]))
+        self._on_moved(float(solved.scale[-1]))
         logger.info("keyframe %d: a loop is closed, to keyframe %d", loop.keyframe_id, loop.place.keyframe_id)
         return True
 
@@ -359,10 +364,10 @@ class MapBuilder:
         self.watch.take(result)
         return result
 
-    def finish(self, on_moved: Callable[[float], None]) -> None:
-        """Wait for an adjustment under way; ``on_moved`` is called after it has moved the map."""
+    def finish(self) -> None:
+        """Wait for an adjustment under way."""
         if self.collect(wait=True) is not None:
-            on_moved(1.0)
+            self._on_moved(1.0)
 
     def put_right(self, camera: Intrinsics, flows: Mapping[int, ImageFlow]) -> None:
         """Make up for a rolling shutter that was not known of, see ``put_map_right``, and adjust the map."""
@@ -373,35 +378,27 @@ class MapBuilder:
 
     def adjust_whole(self) -> int:
         """Adjust all keyframes with all they see, and say how many. Takes seconds where there are many."""
-        self.collect(wait=True)
+        self.finish()
         if not self._settings.final_adjustment:
             return 0
         num_adjusted = adjust_whole_map(self.world, self._camera, self.noise.model)
         if num_adjusted:
             self._adjusted = None
+            self._on_moved(1.0)
         return num_adjusted
 
-    def place_again(self, placement: SubmapPlacement, on_moved: Callable[[float], None]) -> float:
-        """Move the current submap to where it is by now known to begin; the factor on lengths, else 1.
-
-        ``on_moved`` is called with it after the map has moved.
-        """
+    def place_again(self, placement: SubmapPlacement) -> float:
+        """Move the current submap to where it is by now known to begin; the factor on lengths, else 1."""
         found = placement.place_again(self.world, self.submap)
         if found is None:
             return 1.0
         self._abandon_adjustment()
         self.world.transform_submap(self.submap, self.submap, *found)
         self._adjusted = None
-        on_moved(found[0])
+        self._on_moved(found[0])
         return found[0]
 
-    def join(
-        self,
-        place: Place,
-        T_world_cam: Array,
-        tracks: TrackTable,
-        on_moved: Callable[[float], None],
-    ) -> float | None:
+    def join(self, place: Place, T_world_cam: Array, tracks: TrackTable) -> float | None:
         """Join the current submap and the one a place was recognised in.
 
         The older of the two stays where it is, for its place in the world was not guessed.
@@ -410,7 +407,6 @@ class MapBuilder:
             place: The newest frame's place in the other submap.
             T_world_cam: Its pose in the current one.
             tracks: Its tracks.
-            on_moved: Called with the scale that is returned, after the map has moved.
 
         Returns:
             The scale of the similarity that moved the current submap, 1 if it stayed; None if none was found.
@@ -436,7 +432,7 @@ class MapBuilder:
             scale = 1.0
         self.enter(min(self.submap, place.submap))
         self.world.revisits[self.world.keyframes[-1].frame_id] = place.keyframe_id
-        on_moved(scale)
+        self._on_moved(scale)
         return scale
 
     def take_update(self, map_epoch: int) -> MapUpdate | None:

@@ -61,7 +61,7 @@ class Reconstruction:
         self._camera = camera
         self._settings = settings
         self._bundle = bundle
-        self._map = MapBuilder(camera, settings, bundle)
+        self._map = MapBuilder(camera, settings, bundle, self._moved)
         self._map_epoch = 0
         self._begin(settings.with_readout(camera))
 
@@ -209,14 +209,14 @@ class Reconstruction:
             self._frames_since_keyframe = 0
             self._lap("map", since)
             pose = pose.with_unit(self._try_to_join(sight, pose.T_world_cam))
-            pose = pose.with_unit(self._map.place_again(self._placement, self._moved))
+            pose = pose.with_unit(self._map.place_again(self._placement))
         return self._result(frame, self._last_pose(), pose, is_keyframe=is_keyframe)
 
     def _improved(self, sight: Sight, pose: TrackedPose) -> TrackedPose:
         """Take drift out of a keyframe to be: out of its tracks, and where the camera has been before."""
         if self._map.anchor(self._tracks, sight, pose.T_world_cam):
             pose = self._posed_anew(sight, pose.T_world_cam) or pose
-        if self._map.revisit(self._tracks, sight, pose.T_world_cam, self._moved):
+        if self._map.revisit(self._tracks, sight, pose.T_world_cam):
             T_world_guess = self._map.world.pose_of_frame(sight.frame.frame_id)
             assert T_world_guess is not None
             pose = self._posed_anew(sight, T_world_guess) or replace(pose, T_world_cam=T_world_guess)
@@ -297,7 +297,7 @@ class Reconstruction:
         """Bring a start into the map and pose the frames that waited for it."""
         since = time.perf_counter_ns()
         history = self._initialiser.history
-        self._map.finish(self._moved)  # a new part is placed by where the old one ends
+        self._map.finish()  # a new part is placed by where the old one ends
         grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
         T_world_ref, scale = self._placement.place(
             self._motion, start, grown, self._map.world, self._map.submap
@@ -330,7 +330,7 @@ class Reconstruction:
         since = time.perf_counter_ns()
         self._keyframes_since_join = 0
         place = self._map.relocaliser.find(sight, self._map.world, self._map.noise.model, others)
-        scale = None if place is None else self._map.join(place, T_world_cam, self._tracks, self._moved)
+        scale = None if place is None else self._map.join(place, T_world_cam, self._tracks)
         if scale is not None:
             logger.info("frame %d: submaps are joined", sight.frame.frame_id)
         self._lap("relocalise", since)
@@ -383,13 +383,11 @@ class Reconstruction:
 
     def conclude(self) -> int:
         """Adjust the whole map of a stream that has ended, if settings want it; the number of keyframes."""
-        if num_adjusted := self._map.adjust_whole():
-            self._moved(1.0)
-        return num_adjusted
+        return self._map.adjust_whole()
 
     def final_trajectory(self) -> dict[int, Array]:
         """Best current ``T_world_cam`` of all posed frames, by frame id; waits for a running adjustment."""
-        self._map.finish(self._moved)
+        self._map.finish()
         return self._map.world.trajectory()
 
     def landmarks(self) -> tuple[Ids, Array, NDArray[np.uint8], NDArray[np.float32]]:

@@ -183,7 +183,7 @@ def reused(mapped, T_world_cam, T_believed=None, max_landmarks=20_000, young=40)
     """A map builder after a frame that came back, its tracks, and the landmarks taken up."""
     world, images = mapped
     settings = ReconstructionSettings(confidence="off", max_features=120, max_landmarks=max_landmarks)
-    builder = MapBuilder(CAMERA, settings, InlineBundle())
+    builder = MapBuilder(CAMERA, settings, InlineBundle(), on_moved=print)
     builder.world, builder.images = world, images
     sight = sight_from(T_world_cam, 100)
     tracks = TrackTable("off", young, 0)
@@ -191,7 +191,7 @@ def reused(mapped, T_world_cam, T_believed=None, max_landmarks=20_000, young=40)
     tracks.remember(sight)
     tracks.refill(sight)
     T_believed = T_world_cam if T_believed is None else T_believed
-    changed = builder.revisit(tracks, sight, T_believed, lambda scale: None)
+    changed = builder.revisit(tracks, sight, T_believed)
     again = tracks.ids[world.landmarks.rows(tracks.ids) >= 0]
     assert changed == (len(again) > 0)
     assert np.all(np.diff(tracks.ids) > 0)
@@ -293,7 +293,8 @@ def test_an_adjustment_with_them_takes_the_drift_out_of_the_newest_pose(mapped):
 
 def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped):
     world, images = mapped
-    builder = MapBuilder(CAMERA, ReconstructionSettings(confidence="off", max_features=120), InlineBundle())
+    settings, moved = ReconstructionSettings(confidence="off", max_features=120), []
+    builder = MapBuilder(CAMERA, settings, InlineBundle(), on_moved=moved.append)
     builder.world, builder.images = world, images
     true, scale = pose(0.1, 0.05), 1.1
     drift = pose(0.02, 0.03, 0.02, (0.3, 0.4, 0.0))
@@ -313,8 +314,7 @@ def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped
     world.add_landmarks(young_ids, young, colour, np.ones(len(young)), 0, newest)
     world.add_frame(100, newest, believed)
     before = world.landmarks.xyz[world.landmarks.born == 0].copy()
-    moved = []
-    assert builder.revisit(tracks, sight, believed, moved.append)
+    assert builder.revisit(tracks, sight, believed)
     assert moved == [pytest.approx(1 / scale, rel=0.04)]
     np.testing.assert_allclose(world.pose_of_frame(100)[:3, 3], true[:3, 3], atol=0.03)
     xyz_young = world.landmarks.xyz[world.landmarks.rows(young_ids)]
