@@ -74,8 +74,7 @@ Getting lost, and places seen again
     pose_graph        graph of similarities (Sim(3)) between keyframes, by GTSAM
 
 What residuals say about the camera
-    left_over         how residuals depend on shutter and lens, with poses and points eliminated
-    witnesses         what adjustments have said so far, by keyframe
+    residual_patterns how residuals depend on shutter and lens, with poses and points eliminated
     readout           the readout time of a rolling shutter
     lens              focal length, radial distortion and principal point
     lens_doubt        whether the lens of the calibration is another one, in words

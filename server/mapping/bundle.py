@@ -17,8 +17,8 @@ from semcast.server.geometry.projection import project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
 from semcast.server.mapping.dense_bundle import Baseline, State, Window, last_covariance, minimise
-from semcast.server.mapping.left_over import information
 from semcast.server.mapping.pose_graph import Edge
+from semcast.server.mapping.residual_patterns import pattern_products_of
 
 Array = NDArray[np.float64]
 
@@ -154,11 +154,11 @@ def optimise(problem: BundleProblem) -> BundleResult:
     T_world_cam, xyz, covariance = solved or (problem.T_world_cam.copy(), problem.xyz.copy(), None)
     residual, _ = residuals_px(problem, T_world_cam, xyz)
     residual[~used] = np.nan
-    left_over = None
+    pattern_products = None
     if ok and problem.motion is not None:
-        left_over = information(problem, problem.motion, T_world_cam, xyz, residual)
+        pattern_products = pattern_products_of(problem, problem.motion, T_world_cam, xyz, residual)
     elapsed_ms = (time.perf_counter_ns() - started) * 1e-6
-    return BundleResult(problem, ok, T_world_cam, xyz, residual, covariance, elapsed_ms, left_over)
+    return BundleResult(problem, ok, T_world_cam, xyz, residual, covariance, elapsed_ms, pattern_products)
 
 
 def _window_of(problem: BundleProblem, used: NDArray[np.bool_]) -> tuple[Window, State, NDArray[np.intp]]:

@@ -159,7 +159,7 @@ class BundleResult:
         covariance: ``(6, 6)`` marginal covariance of the last keyframe's pose in its own frame, rotation
             before translation, or None.
         elapsed_ms: Time it took.
-        left_over: ``(K, 8, 8)``, see ``left_over.information``; None where it was not asked for.
+        pattern_products: ``(K, 8, 8)``, see ``residual_patterns``; None where ``motion`` was not given.
     """
 
     problem: BundleProblem
@@ -169,7 +169,7 @@ class BundleResult:
     residual_px: Array
     covariance: Array | None
     elapsed_ms: float
-    left_over: Array | None = None
+    pattern_products: Array | None = None
 
     @cached_property
     def whitened_px(self) -> Array:
