@@ -235,16 +235,24 @@ class Reconstruction:
         """A frame without a running track: recognise a place, or work towards a new map."""
         if (found := self._recover(sight)) is not None:
             return self._accept(sight, found)
-        frame, tracks = sight.frame, self._tracks
         if self._state is TrackingState.LOST:
-            # An empty image is no sign of another place: only frames that a map could begin with count.
-            self._lost_ns += [frame.t_source_ns] if len(tracks) >= MIN_POINTS else []
-            if self._settings.gives_up(self._lost_ns, rested=self._motion.rests):
-                logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
-                self._state = TrackingState.INITIALIZING
-                self._map.world.forget_frames(self._motion.give_up())
-                self._begin_submap()
-        since = time.perf_counter_ns()
+            self._give_up_in_time(sight.frame)
+        start = self._look_for_start(sight)
+        return self._result(sight.frame, None, None) if start is None else self._begin_map(sight, start)
+
+    def _give_up_in_time(self, frame: DecodedFrame) -> None:
+        """Begin a new submap where the map has not been in sight for long."""
+        # An empty image is no sign of another place: only frames that a map could begin with count.
+        self._lost_ns += [frame.t_source_ns] if len(self._tracks) >= MIN_POINTS else []
+        if self._settings.gives_up(self._lost_ns, rested=self._motion.rests):
+            logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
+            self._state = TrackingState.INITIALIZING
+            self._map.world.forget_frames(self._motion.give_up())
+            self._begin_submap()
+
+    def _look_for_start(self, sight: Sight) -> Start | None:
+        """Keep a frame without a pose for the start of a map, and try to start one with it."""
+        since, tracks = time.perf_counter_ns(), self._tracks
         tracks.refill(sight)
         # Tracks of old landmarks serve to find back, not to start anew: a landmark has one id.
         visible = tracks.visible & (self._map.world.landmarks.rows(tracks.ids) < 0)
@@ -255,7 +263,7 @@ class Reconstruction:
         noise, suspect = self._map.noise.model, tracks.ids[tracks.suspect]
         start = self._initialiser.add(observed, noise, suspect, waits=waits)
         self._lap("two_view", since)
-        return self._result(frame, None, None) if start is None else self._begin_map(sight, start)
+        return start
 
     def _begin_submap(self) -> None:
         """Let the next start be a part of its own that shares no track with what came before.
