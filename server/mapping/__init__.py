@@ -32,9 +32,9 @@ Start of a map
     scene_motion      whether a relative pose is that of the scene or of a large moving thing
     start_alignment   drift of the tracks a map begins with
     ambiguity         which of several structures that fit the first views is right
-    reversal          the one mirrored in depth (Necker reversal)
-    planar            the second pose and plane of a homography
-    relief            the bas-relief ambiguity
+    depth_reversal    the one mirrored in depth (Necker reversal)
+    planar_ambiguity  the second pose and plane of a homography
+    bas_relief        the bas-relief ambiguity
     hypotheses        structures kept from one attempt to the next
     kept_frames       frames that wait for a map, and their poses once there is one
     look_back         the map grows backwards over those frames
