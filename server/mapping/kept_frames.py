@@ -101,8 +101,6 @@ def keyframe_of(observed: Observed, T_world_cam: Array) -> Keyframe:
         xy=observed.xy,
         confidence=observed.confidence,
         edge=observed.edge,
-        descriptor_ids=np.zeros(0, np.int64),
-        descriptors=np.zeros((0, 32), np.uint8),
     )
 
 

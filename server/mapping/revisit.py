@@ -22,7 +22,8 @@ from semcast.server.geometry.pnp import reprojection_residual
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
-from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
+from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImage
+from semcast.server.mapping.new_landmarks import MAX_ERROR_SIGMA
 from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.sight import Sight
@@ -58,8 +59,6 @@ _BORDER_PX = 10
 _NEIGHBOURS = 6
 #: Rays must be further apart than this to tell a depth.
 _MIN_PARALLAX_DEG = 1.0
-#: RMS error at most, in standard deviations, with which the rays of a landmark must meet.
-_MAX_ERROR_SIGMA = 1.8
 #: A depth that changes by more than this factor (as a logarithm) is that of another point along the line.
 _MAX_LOG_DEPTH = 0.7
 
@@ -84,7 +83,7 @@ class _Expected:
     """Landmarks of a keyframe that should be in sight."""
 
     keyframe: Keyframe
-    image: SeenFrom
+    image: KeyframeImage
     rows: NDArray[np.intp]
     xy: Array
     warps: Array
@@ -119,7 +118,7 @@ def find_revisit(
     return None
 
 
-def _nearest(mapped: ImagedMap, T_world_cam: Array) -> list[tuple[Keyframe, SeenFrom]]:
+def _nearest(mapped: ImagedMap, T_world_cam: Array) -> list[tuple[Keyframe, KeyframeImage]]:
     """Old keyframes that looked at about the same from about there."""
     camera, world = mapped.camera, mapped.world
     mine = world.keyframes_of(mapped.submap)
@@ -139,7 +138,7 @@ def _nearest(mapped: ImagedMap, T_world_cam: Array) -> list[tuple[Keyframe, Seen
 def _expected(
     mapped: ImagedMap,
     keyframe: Keyframe,
-    image: SeenFrom,
+    image: KeyframeImage,
     tracked_ids: Ids,
     sight: Sight,
     T_cam_world: Array,
@@ -242,7 +241,7 @@ def place_anew(
     at_old = world.poses[found.keyframe_id][:3, 3]
     depth, depth_before = (np.linalg.norm(x - at_old, axis=1) for x in (xyz, before))
     change = np.abs(np.log(np.maximum(depth, 1e-9) / np.maximum(depth_before, 1e-9)))
-    sound = placed.in_front & (placed.error_sigma < _MAX_ERROR_SIGMA) & (change < _MAX_LOG_DEPTH)
+    sound = placed.in_front & (placed.error_sigma < MAX_ERROR_SIGMA) & (change < _MAX_LOG_DEPTH)
     good &= ~told | sound
     world.move_landmarks(ids[good & told], xyz[good & told])
     ok = found.points.ok.copy()

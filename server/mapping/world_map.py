@@ -47,8 +47,8 @@ class Keyframe:
     ids: Ids
     xy: Array
     confidence: Array
-    descriptor_ids: Ids
-    descriptors: NDArray[np.uint8]
+    descriptor_ids: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
+    descriptors: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
     refuted: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
     edge: Array = field(default_factory=alike)
 

@@ -34,8 +34,6 @@ def make_world(num_keyframes=5, num_points=80, noise_px=0.2, step=0.3, seed=0, s
                 ids=np.arange(num_points),
                 xy=xy,
                 confidence=np.full(num_points, 0.8),
-                descriptor_ids=np.zeros(0, np.int64),
-                descriptors=np.zeros((0, 32), np.uint8),
             )
         )
     return world, points, np.stack(truth)

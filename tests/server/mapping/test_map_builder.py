@@ -90,8 +90,6 @@ def keyframe(frame_id, submap, ids, T_world_cam, xyz):
         ids=ids,
         xy=seen(xyz, T_world_cam),
         confidence=np.full(len(ids), 0.8),
-        descriptor_ids=np.zeros(0, np.int64),
-        descriptors=np.zeros((0, 32), np.uint8),
     )
 
 

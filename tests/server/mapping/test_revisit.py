@@ -12,7 +12,7 @@ from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.features import TrackedPoints, to_grey
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
-from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
+from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImage, KeyframeImages
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.revisit import NUM_RECENT, find_revisit, place_anew
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -73,15 +73,14 @@ def mapped():
         tracks.adopt(again, xy[again], 1.0)
         tracks.next_id = next_id
         tracks.refill(sight)
-        none = np.zeros(0, np.int64), np.zeros((0, 32), np.uint8)
-        world.add_keyframe(Keyframe(k, k * 10**8, T, 0, tracks.ids, tracks.xy, tracks.confidence, *none))
+        world.add_keyframe(Keyframe(k, k * 10**8, T, 0, tracks.ids, tracks.xy, tracks.confidence))
         new = tracks.ids >= next_id
         next_id = tracks.next_id
         xyz = on_wall(T, tracks.xy[new])
         xyz_of = np.concatenate([xyz_of, xyz])
         count = len(xyz)
         world.add_landmarks(tracks.ids[new], xyz, np.zeros((count, 3), np.uint8), np.ones(count), 0, k)
-        images.append(SeenFrom(k, sight.grey))
+        images.append(KeyframeImage(k, sight.grey))
     return world, images
 
 
@@ -307,9 +306,8 @@ def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped
     # The young tracks have landmarks already, in the drifted part's place and unit.
     young = scale * on_wall(true, tracks.xy) @ drift[:3, :3].T + drift[:3, 3]
     newest, young_ids = 90, tracks.ids
-    none = np.zeros(0, np.int64), np.zeros((0, 32), np.uint8)
     seen = tracks.ids, tracks.xy, tracks.confidence
-    world.add_keyframe(Keyframe(newest, newest * 10**8, drift @ pose(0.2 * scale), 0, *seen, *none))
+    world.add_keyframe(Keyframe(newest, newest * 10**8, drift @ pose(0.2 * scale), 0, *seen))
     colour = np.zeros((len(young), 3), np.uint8)
     world.add_landmarks(young_ids, young, colour, np.ones(len(young)), 0, newest)
     world.add_frame(100, newest, believed)
@@ -327,7 +325,7 @@ def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped
 def test_images_are_thinned_out_from_the_old_end():
     images = KeyframeImages(10)
     for k in range(30):
-        images.append(SeenFrom(k, np.zeros((2, 2), np.uint8)))
+        images.append(KeyframeImage(k, np.zeros((2, 2), np.uint8)))
     ids = [image.frame_id for image in images]
     assert len(images) == len(ids) <= 10
     assert ids == sorted(ids)

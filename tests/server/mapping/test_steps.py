@@ -9,8 +9,7 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 
 def make_keyframe(frame_id, T_world_cam, ids):
-    none = np.zeros(0, np.int64), np.zeros((0, 32), np.uint8)
-    return Keyframe(frame_id, frame_id, T_world_cam, 0, ids, np.zeros((10, 2)), np.ones(10), *none)
+    return Keyframe(frame_id, frame_id, T_world_cam, 0, ids, np.zeros((10, 2)), np.ones(10))
 
 
 @pytest.mark.parametrize(

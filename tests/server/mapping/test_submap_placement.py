@@ -22,9 +22,8 @@ def path(frame):
 
 
 def keyframe(frame, T_world_cam, submap):
-    xy, no_descriptors = np.zeros((len(IDS), 2)), (np.zeros(0, np.int64), np.zeros((0, 32), np.uint8))
-    ids = IDS + 100 * submap
-    return Keyframe(frame, frame * FRAME_NS, T_world_cam, submap, ids, xy, np.ones(len(ids)), *no_descriptors)
+    xy, ids = np.zeros((len(IDS), 2)), IDS + 100 * submap
+    return Keyframe(frame, frame * FRAME_NS, T_world_cam, submap, ids, xy, np.ones(len(ids)))
 
 
 def add(world, frames, T_of, submap, xyz):

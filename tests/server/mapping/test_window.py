@@ -69,8 +69,6 @@ def _keyframe(number: int, ids: Ids) -> Keyframe:
         ids=ids,
         xy=np.full((len(ids), 2), 100.0),
         confidence=np.ones(len(ids)),
-        descriptor_ids=np.zeros(0, np.int64),
-        descriptors=np.zeros((0, 32), np.uint8),
     )
 
 
