@@ -28,6 +28,7 @@ HUBER_K = 1.345
 GATE_SIGMAS = 3.035
 #: Range of beta the fit may give.
 BETA_RANGE = (0.0, 8.0)
+#: And of sigma0.
 SIGMA0_RANGE_PX = (0.25, 6.0)
 #: Residuals that a group of like confidence needs for the fit,
 _MIN_PER_BIN = 12
@@ -40,7 +41,7 @@ _MIN_GATE_SIGMA_PX = 0.6
 _TRACKING_PX = 0.3
 #: Expected error from which on a position is worth nothing.
 _MOST_PX = 5.0
-#: Median of |x| / sigma under normal noise.
+#: Sigma over the median of |x|, under normal noise.
 MAD_TO_SIGMA = 1.0 / 0.67449
 
 

@@ -27,6 +27,7 @@ _Solved = tuple[Array, Array, Array | None]
 
 #: Observations share noise models: their sigmas are rounded to this many steps.
 NUM_SIGMAS = 16
+#: in equal ratios within this range.
 SIGMA_RANGE_PX = (0.1, 12.0)
 #: Free views that dense algebra is for: its time grows with their square and the number of points.
 _MAX_DENSE_VIEWS = 60

@@ -21,6 +21,7 @@ from semcast.server.mapping.tracks import TrackTable
 
 Array = NDArray[np.float64]
 
+#: Pyramid levels by which tracks are followed where no pose is expected: they may have gone far.
 _START_LEVELS = 5
 #: A pose that rests on fewer landmarks than this share of the tracks asks for more.
 _FEW_INLIERS_SHARE = 0.2

@@ -48,12 +48,15 @@ _MIN_EXPECTED = 30
 _MIN_AGREEING = 15
 #: The same as a share of those found.
 _MIN_SHARE = 0.6
+#: How alike the patches of a landmark must be, as their correlation.
 _MIN_CORRELATION = 0.75
 #: How far from its expected place an old landmark is followed: it is not exactly where the map has it.
 _REACH_PX = 40.0
 #: How far aligning its patch may then still move it.
 _MAX_MOVE_PX = 3.0
+#: Pyramid levels that reach so far.
 _KLT_LEVELS = 2
+#: A landmark is looked for no nearer to the border than this.
 _BORDER_PX = 10
 #: Keyframes before and after the old one that help to triangulate.
 _NEIGHBOURS = 6
