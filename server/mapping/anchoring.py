@@ -22,7 +22,7 @@ from semcast.server.geometry.patch_alignment import (
 )
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.weighting import MAD_TO_SIGMA
-from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImage
+from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -107,7 +107,7 @@ def resembles(
 
 def _align(
     mapped: ImagedMap,
-    views: Sequence[tuple[KeyframeImage, Keyframe]],
+    views: Sequence[tuple[SeenFrom, Keyframe]],
     tracks: TrackTable,
     wanted: NDArray[np.intp],
     sight: Sight,

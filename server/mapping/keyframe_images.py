@@ -12,7 +12,7 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 
 @dataclass(frozen=True)
-class KeyframeImage:
+class SeenFrom:
     """The image of a keyframe.
 
     Attributes:
@@ -38,23 +38,23 @@ class KeyframeImages:
         if capacity < 3:
             raise ValueError(f"capacity must be at least 3, got {capacity}")
         self._capacity = capacity
-        self._images: list[KeyframeImage] = []
+        self._images: list[SeenFrom] = []
 
     def __len__(self) -> int:
         return len(self._images)
 
-    def __iter__(self) -> Iterator[KeyframeImage]:
+    def __iter__(self) -> Iterator[SeenFrom]:
         """Yield them, oldest first."""
         return iter(self._images)
 
-    def append(self, image: KeyframeImage) -> None:
+    def append(self, image: SeenFrom) -> None:
         """Keep the image of the newest keyframe."""
         self._images.append(image)
         if len(self._images) > self._capacity:
             ids = np.array([image.frame_id for image in self._images[: len(self._images) // 2 + 1]])
             del self._images[1 + int(np.argmin(ids[2:] - ids[:-2]))]
 
-    def replace(self, image: KeyframeImage) -> None:
+    def replace(self, image: SeenFrom) -> None:
         """Take another version of a keyframe's image, if it is kept."""
         self._images = [image if kept.frame_id == image.frame_id else kept for kept in self._images]
 
@@ -62,7 +62,7 @@ class KeyframeImages:
         """Forget images of other keyframes."""
         self._images = [image for image in self._images if image.frame_id in keyframe_ids]
 
-    def newest(self, count: int) -> list[KeyframeImage]:
+    def newest(self, count: int) -> list[SeenFrom]:
         """Return the newest ones, oldest first."""
         return self._images[-count:]
 
@@ -82,7 +82,7 @@ class ImagedMap(NamedTuple):
     images: KeyframeImages
     submap: int
 
-    def newest_views(self, count: int) -> list[tuple[KeyframeImage, Keyframe]]:
+    def newest_views(self, count: int) -> list[tuple[SeenFrom, Keyframe]]:
         """Return those of the newest ``count`` images whose keyframes are in the submap, oldest first."""
         there = [(image, self.world.keyframe(image.frame_id)) for image in self.images.newest(count)]
         return [(image, k) for image, k in there if k is not None and k.submap == self.submap]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, invert_transform, transform_points
 from semcast.server.geometry.projection import MIN_DEPTH_MAP
-from semcast.server.mapping.keyframe_images import KeyframeImage, KeyframeImages
+from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
 from semcast.server.mapping.readout import lean
 from semcast.server.mapping.rolling_shutter import ImageFlow, RowTimes, taken_from
 from semcast.server.mapping.world_map import WorldMap
@@ -44,7 +44,7 @@ def put_map_right(
         keyframe.xy = rows.put_right(flow, keyframe.xy)
         if (grey := greys.get(frame_id)) is not None:
             right = np.asarray(taken_from(grey, rows.places(flow, camera.shape_hw)), np.uint8)
-            images.replace(KeyframeImage(frame_id, right))
+            images.replace(SeenFrom(frame_id, right))
         if frame_id in poses:
             world.move_keyframe(frame_id, poses[frame_id])
     for frame_id, keyframe_id in hang_on.items():

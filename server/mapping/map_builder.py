@@ -16,7 +16,7 @@ from semcast.server.mapping.bridging import may_turn
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, colours_of
-from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImage, KeyframeImages
+from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
 from semcast.server.mapping.keyframe_rule import KeyframeCues, median_flow_px, wants_keyframe
 from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
@@ -155,7 +155,7 @@ class MapBuilder:
             self.world.add_keyframe(keyframe)
         for observed in history:
             if observed.grey is not None and any(k.frame_id == observed.frame_id for k in start.keyframes):
-                self.images.append(KeyframeImage(observed.frame_id, observed.grey))
+                self.images.append(SeenFrom(observed.frame_id, observed.grey))
         newest = start.keyframes[-1]
         _, row, row_k = np.intersect1d(tracks.ids, newest.ids, assume_unique=True, return_indices=True)
         tracks.settle_at(row, newest.xy[row_k], np.full(len(row), np.nan))
@@ -288,7 +288,7 @@ class MapBuilder:
         frame, world = sight.frame, self.world
         visible = tracks.visible & ~tracks.suspect
         ids, xy = tracks.ids[visible], tracks.xy[visible]
-        self.images.append(KeyframeImage(frame.frame_id, sight.grey))
+        self.images.append(SeenFrom(frame.frame_id, sight.grey))
         descriptor_ids, descriptors = self.relocaliser.describe(sight.grey, ids, xy)
         self._tie_to_recognised(frame.frame_id)
         world.add_keyframe(

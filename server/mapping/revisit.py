@@ -22,7 +22,7 @@ from semcast.server.geometry.pnp import reprojection_residual
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
-from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImage
+from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.new_landmarks import MAX_ERROR_SIGMA
 from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.scene_depth import median_depth
@@ -86,7 +86,7 @@ class _Expected:
     """Landmarks of a keyframe that should be in sight."""
 
     keyframe: Keyframe
-    image: KeyframeImage
+    image: SeenFrom
     rows: NDArray[np.intp]
     xy: Array
     warps: Array
@@ -121,7 +121,7 @@ def find_revisit(
     return None
 
 
-def _nearest(mapped: ImagedMap, T_world_cam: Array) -> list[tuple[Keyframe, KeyframeImage]]:
+def _nearest(mapped: ImagedMap, T_world_cam: Array) -> list[tuple[Keyframe, SeenFrom]]:
     """Old keyframes that looked at about the same from about there."""
     camera, world = mapped.camera, mapped.world
     mine = world.keyframes_of(mapped.submap)
@@ -141,7 +141,7 @@ def _nearest(mapped: ImagedMap, T_world_cam: Array) -> list[tuple[Keyframe, Keyf
 def _expected(
     mapped: ImagedMap,
     keyframe: Keyframe,
-    image: KeyframeImage,
+    image: SeenFrom,
     tracked_ids: Ids,
     sight: Sight,
     T_cam_world: Array,

@@ -25,7 +25,7 @@ from semcast.server.geometry.patch_alignment import (
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.geometry.wide_search import WideFeatures, match_wide
-from semcast.server.mapping.keyframe_images import KeyframeImage, KeyframeImages
+from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -69,13 +69,13 @@ class _View:
     """
 
     keyframe: Keyframe
-    image: KeyframeImage
+    image: SeenFrom
     ids: Ids
     xy: Array
     xyz: Array
 
     @staticmethod
-    def of(image: KeyframeImage, keyframe: Keyframe, world: WorldMap) -> "_View":
+    def of(image: SeenFrom, keyframe: Keyframe, world: WorldMap) -> "_View":
         """Gather what a keyframe saw of the map."""
         row = world.landmarks.rows(keyframe.ids)
         known = row >= 0
@@ -112,7 +112,7 @@ class WideRecogniser:
     def __init__(self, camera: Intrinsics, seed: int) -> None:
         self._camera = camera
         self._seed = seed
-        self._known: list[tuple[KeyframeImage, WideFeatures]] = []
+        self._known: list[tuple[SeenFrom, WideFeatures]] = []
         self._looked_for: tuple[int, int] = (-1, 0)
 
     def find(self, sight: Sight, world: WorldMap, images: KeyframeImages, noise: NoiseModel) -> Place | None:
@@ -142,7 +142,7 @@ class WideRecogniser:
                 return self._place(sight, view, views, found, noise)
         return None
 
-    def _features_of(self, image: KeyframeImage) -> WideFeatures:
+    def _features_of(self, image: SeenFrom) -> WideFeatures:
         """Features of a keyframe, kept as long as its image is neither old nor replaced."""
         known = next((features for kept, features in self._known if kept is image), None)
         if known is None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from semcast.server.mapping.keyframe_images import KeyframeImage, KeyframeImages
+from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
 
 GREY = np.zeros((4, 6), np.uint8)
 
@@ -11,7 +11,7 @@ GREY = np.zeros((4, 6), np.uint8)
 def test_of_too_many_images_an_older_one_close_to_others_goes():
     images = KeyframeImages(6)
     for frame_id in (0, 10, 12, 14, 30, 40, 50, 60):
-        images.append(KeyframeImage(frame_id, GREY))
+        images.append(SeenFrom(frame_id, GREY))
     assert [image.frame_id for image in images] == [0, 14, 30, 40, 50, 60]
 
 

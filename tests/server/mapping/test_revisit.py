@@ -12,7 +12,7 @@ from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.features import TrackedPoints, to_grey
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
-from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImage, KeyframeImages
+from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.revisit import NUM_RECENT, find_revisit, place_anew
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -80,7 +80,7 @@ def mapped():
         xyz_of = np.concatenate([xyz_of, xyz])
         count = len(xyz)
         world.add_landmarks(tracks.ids[new], xyz, np.zeros((count, 3), np.uint8), np.ones(count), 0, k)
-        images.append(KeyframeImage(k, sight.grey))
+        images.append(SeenFrom(k, sight.grey))
     return world, images
 
 
@@ -325,7 +325,7 @@ def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped
 def test_images_are_thinned_out_from_the_old_end():
     images = KeyframeImages(10)
     for k in range(30):
-        images.append(KeyframeImage(k, np.zeros((2, 2), np.uint8)))
+        images.append(SeenFrom(k, np.zeros((2, 2), np.uint8)))
     ids = [image.frame_id for image in images]
     assert len(images) == len(ids) <= 10
     assert ids == sorted(ids)

@@ -10,7 +10,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.anchoring import anchor_tracks
-from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImage, KeyframeImages
+from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame
@@ -284,7 +284,7 @@ def mapped():
     xyz = CAMERA.unproject(tracks.xy)
     world.add_landmarks(tracks.ids, xyz, np.zeros((count, 3), np.uint8), np.ones(count), 0, 0)
     images = KeyframeImages(10)
-    images.append(KeyframeImage(0, sight_at(START_X).grey))
+    images.append(SeenFrom(0, sight_at(START_X).grey))
     return world, images, tracks
 
 
@@ -320,7 +320,7 @@ def test_older_keyframes_are_not_looked_at_once_enough_is_found(mapped):
     newer = replace(old, frame_id=1)
     newer.drop_observations(~half)
     world.add_keyframe(newer)
-    images.append(KeyframeImage(1, images.newest(1)[0].grey))
+    images.append(SeenFrom(1, images.newest(1)[0].grey))
     before = world.keyframes[-1].ids
     sight = sight_at(24, frame_id=2)
     for wanted, only_newest in ((5, True), (1000, False)):
@@ -404,7 +404,7 @@ def noisy_keyframes(mapped, places, sd=18.0):
             xy = first.xy - (x - START_X, 0)
             world.add_keyframe(replace(first, frame_id=frame_id, T_world_cam=pose_at(x), xy=xy))
         grey = sight_at(x).grey + rng.normal(0, sd, SHAPE)
-        images.append(KeyframeImage(frame_id, np.clip(grey, 0, 255).astype(np.uint8)))
+        images.append(SeenFrom(frame_id, np.clip(grey, 0, 255).astype(np.uint8)))
     return world, images, tracks
 
 
@@ -466,7 +466,7 @@ def test_a_track_that_fits_nowhere_stays_where_it_is(mapped):
     tracks.follow(sight, tracks.xy - (10, 0))
     followed = tracks.xy.copy()
     other = KeyframeImages(10)
-    other.append(KeyframeImage(0, np.random.default_rng(0).integers(0, 256, SHAPE).astype(np.uint8)))
+    other.append(SeenFrom(0, np.random.default_rng(0).integers(0, 256, SHAPE).astype(np.uint8)))
     assert anchor((world, other, tracks), sight, 30) == 0
     np.testing.assert_array_equal(tracks.xy, followed)
     assert anchor(mapped, sight, 30, submap=1) == 0, "a keyframe of another submap has another world"
