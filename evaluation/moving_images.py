@@ -1,4 +1,4 @@
-"""What images of a moving camera say about the camera itself: they are reconstructed, and asked what is left.
+"""What images of a moving camera say about the camera itself: what their reconstruction leaves unexplained.
 
 All of it is one process, each adjustment done before the next frame, so that the same images give the same
 answer.
