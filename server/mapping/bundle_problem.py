@@ -12,7 +12,7 @@ from semcast.common.camera import Intrinsics
 from semcast.server.geometry.edges import alike, each_of, whitened
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.observations import Observations
-from semcast.server.mapping.pose_graph import Edge
+from semcast.server.mapping.pose_graph import PoseConstraint
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ class BundleProblem:
     motion: ViewMotion | None = None
     edge: Array = field(default_factory=alike)
     solver: Solver = "dense"
-    steps: tuple[Edge, ...] = ()
+    steps: tuple[PoseConstraint, ...] = ()
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""

@@ -332,12 +332,11 @@ class Reconstruction:
     def _try_to_join(self, sight: Sight, T_world_cam: Array) -> float:
         """Look from time to time whether an older submap is in sight again; the factor on lengths, else 1."""
         self._keyframes_since_join += 1
-        others = self._map.other_submaps()
-        if not others or self._keyframes_since_join < _JOIN_INTERVAL:
+        if not self._map.other_submaps() or self._keyframes_since_join < _JOIN_INTERVAL:
             return 1.0
         since = time.perf_counter_ns()
         self._keyframes_since_join = 0
-        place = self._map.relocaliser.find(sight, self._map.world, self._map.noise.model, others)
+        place = self._map.recognise_other_submap(sight)
         scale = None if place is None else self._map.join(place, T_world_cam, self._tracks)
         if scale is not None:
             logger.info("frame %d: submaps are joined", sight.frame.frame_id)
