@@ -11,23 +11,23 @@ Ids = NDArray[np.int64]
 
 
 class View(Protocol):
-    """What a view saw: a keyframe, or a frame that waits for a map."""
+    """A keyframe, or a frame that waits for a map, with the tracks it saw, one a row."""
 
     @property
     def ids(self) -> Ids:
-        """``(M,)`` tracks."""
+        """``(M,)`` tracks, each once."""
 
     @property
     def xy(self) -> Array:
-        """``(M, 2)`` pixels."""
+        """``(M, 2)`` pixels where."""
 
     @property
     def confidence(self) -> Array:
-        """``(M,)``."""
+        """``(M,)`` in [0, 1]."""
 
     @property
     def edge(self) -> Array:
-        """``(M, 2)``."""
+        """``(M, 2)``, see ``geometry.edges``."""
 
 
 class Observations(NamedTuple):
