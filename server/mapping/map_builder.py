@@ -87,7 +87,7 @@ class MapBuilder:
         self.watch.forget_frames()
         self.world = WorldMap()
         self.noise = OnlineNoise(s.confidence, s.sigma0_px, s.beta, s.fit_noise)
-        self._relocaliser = Relocaliser(self._camera, s.seed, s.max_features)
+        self.relocaliser = Relocaliser(self._camera, s.seed, s.max_features)
         self._wide = WideRecogniser(self._camera, s.seed)
         self._adjusted: tuple[int, Array] | None = None
         self.enter(0)
@@ -119,7 +119,7 @@ class MapBuilder:
         """Make a submap the current one."""
         self._adjusted = None  # of a keyframe elsewhere, or in another unit
         self._recognised: int | None = None
-        self.loops = LoopFinder(self._camera, self._relocaliser, self._settings.seed)
+        self.loops = LoopFinder(self._camera, self.relocaliser, self._settings.seed)
         self.submap = submap
 
     def go_on_from(self, place: Place) -> None:
@@ -159,7 +159,7 @@ class MapBuilder:
         newest = start.keyframes[-1]
         _, row, row_k = np.intersect1d(tracks.ids, newest.ids, assume_unique=True, return_indices=True)
         tracks.settle_at(row, newest.xy[row_k], np.full(len(row), np.nan))
-        newest.descriptor_ids, newest.descriptors = self._relocaliser.describe(
+        newest.descriptor_ids, newest.descriptors = self.relocaliser.describe(
             sight.grey, newest.ids, newest.xy
         )
         xyz = transform_points(placed, scale * start.xyz)
@@ -184,12 +184,8 @@ class MapBuilder:
     def recognise(self, sight: Sight) -> Place | None:
         """Look for the place of an image whose camera is lost."""
         noise = self.noise.model
-        place = self._relocaliser.find(sight, self.world, noise)
+        place = self.relocaliser.find(sight, self.world, noise)
         return place or self._wide.find(sight, self.world, self.images, noise)
-
-    def recognise_other_submap(self, sight: Sight) -> Place | None:
-        """Look for the place of an image in the submaps other than the current one."""
-        return self._relocaliser.find(sight, self.world, self.noise.model, self.other_submaps())
 
     def resembles(self, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: Ids) -> bool:
         """Tell whether tracks that agree with a pose show what the newest keyframes saw."""
@@ -293,7 +289,7 @@ class MapBuilder:
         visible = tracks.visible & ~tracks.suspect
         ids, xy = tracks.ids[visible], tracks.xy[visible]
         self.images.append(SeenFrom(frame.frame_id, sight.grey))
-        descriptor_ids, descriptors = self._relocaliser.describe(sight.grey, ids, xy)
+        descriptor_ids, descriptors = self.relocaliser.describe(sight.grey, ids, xy)
         self._tie_to_recognised(frame.frame_id)
         world.add_keyframe(
             Keyframe(
@@ -401,6 +397,10 @@ class MapBuilder:
         self._adjusted = None
         self._on_moved(found[0])
         return found[0]
+
+    def recognise_other_submap(self, sight: Sight) -> Place | None:
+        """Look for the place of an image in the submaps other than the current one."""
+        return self.relocaliser.find(sight, self.world, self.noise.model, self.other_submaps())
 
     def join(self, place: Place, T_world_cam: Array, tracks: TrackTable) -> float | None:
         """Join the current submap and the one a place was recognised in.
