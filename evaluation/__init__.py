@@ -24,7 +24,7 @@ Frames and reconstructions
     runtime_child       one variant of ``runtime``, in its own process
 
 Calibration from images of the camera alone
-    moving_images       what an adjustment leaves over
+    moving_images       what images of a moving camera tell of the camera
     lens                ``semcast lens``: focal length, distortion, principal point
     readout             ``semcast shutter``: readout time of a rolling shutter
 

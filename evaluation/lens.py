@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError
 from semcast.common.sequence import ImageRectifier
-from semcast.evaluation.moving_images import Heard, Images, ImagesSettings, listen, load_images
+from semcast.evaluation.moving_images import (
+    CameraEvidence,
+    Images,
+    ImagesSettings,
+    gather_evidence,
+    load_images,
+)
 from semcast.evaluation.report import provenance, write_result
 from semcast.server.mapping.lens import LensFit, believed_lens
 from semcast.server.mapping.readout import Readout
@@ -95,12 +101,12 @@ class LensTrial:
 
     Attributes:
         lens: The lens.
-        heard: What it left.
+        evidence: What it left.
         change: Of the lens, by which residuals would be less; None where they don't say.
     """
 
     lens: Lens
-    heard: Heard
+    evidence: CameraEvidence
     change: LensFit | None
 
 
@@ -149,26 +155,26 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
 
     best, num_steps = tried(Lens()), 0
     while True:
-        best.heard.check(images)
+        best.evidence.check(images)
         if (change := best.change) is None:
             raise SemcastError(_NOT_TOLD)
-        reaches = _reaches(best.heard, change)
+        reaches = _reaches(best.evidence, change)
         if _is_nothing(change) or num_steps == _MAX_STEPS:
             break
         is_near = np.abs(_values(change)).max() <= _NEAR
-        most_px = (_WORSE if is_near else 1.0) * best.heard.mean_px
+        most_px = (_WORSE if is_near else 1.0) * best.evidence.mean_px
         trial = tried(_changed(best.lens, change))
-        if trial.heard.mean_px > most_px and not is_near:
+        if trial.evidence.mean_px > most_px and not is_near:
             # Adjustments are straight lines only nearby.
             trial = tried(_changed(best.lens, _half(change)))
-        if trial.heard.mean_px > most_px:
+        if trial.evidence.mean_px > most_px:
             # Residuals and the reconstruction contradict each other by so much.
             if num_steps or abs(change.focal) <= reaches[0]:
                 reaches = np.maximum(reaches, np.abs(_values(change)))
                 break
             # From too far away they do altogether.
-            trial = min((tried(Lens(f)) for f in _FAR_FACTORS), key=lambda t: t.heard.mean_px)
-            if trial.heard.mean_px > most_px:
+            trial = min((tried(Lens(f)) for f in _FAR_FACTORS), key=lambda t: t.evidence.mean_px)
+            if trial.evidence.mean_px > most_px:
                 raise SemcastError(_NOT_TOLD)
         best, num_steps = trial, num_steps + 1
     reaches += np.sqrt(_NOT_MODELLED) * np.array(change.unit)
@@ -196,9 +202,9 @@ def _sigmas(change: LensFit) -> Array:
     return np.array([change.sigma_focal, *change.sigma_radial, *change.sigma_centre])
 
 
-def _reaches(heard: Heard, change: LensFit) -> Array:
+def _reaches(evidence: CameraEvidence, change: LensFit) -> Array:
     """Return the bounds of 95 % of scatter, ``(5,)``, to either side."""
-    reaches = np.array([heard.reach_95(sigma) for sigma in _sigmas(change)])
+    reaches = np.array([evidence.reach_95(sigma) for sigma in _sigmas(change)])
     reaches[0] = max(reaches[0], _MIN_REACH)
     return reaches
 
@@ -229,9 +235,9 @@ def _tried(images: Images, lens: Lens, readout: Readout) -> LensTrial:
     camera = lens.put_on(images.camera)
     rectify = ImageRectifier(camera, (camera.width, camera.height))
     frames = [replace(frame, image=rectify(frame.image)) for frame in images.frames]
-    heard = listen(frames, camera, readout)
+    evidence = gather_evidence(frames, camera, readout)
     # What is once believed to be there is asked for to the end.
-    return LensTrial(lens, heard, believed_lens(heard.views, lens.num_radial, any(lens.centre)))
+    return LensTrial(lens, evidence, believed_lens(evidence.views, lens.num_radial, any(lens.centre)))
 
 
 def _report(settings: ImagesSettings, images: Images, found: LensEstimate) -> dict[str, Any]:
@@ -249,8 +255,8 @@ def _report(settings: ImagesSettings, images: Images, found: LensEstimate) -> di
                 "focal": trial.lens.focal,
                 "radial": trial.lens.radial,
                 "centre": trial.lens.centre,
-                "error_px": trial.heard.mean_px,
-                "num_frames": trial.heard.num_frames,
+                "error_px": trial.evidence.mean_px,
+                "num_frames": trial.evidence.num_frames,
                 "more_focal": None if trial.change is None else trial.change.focal,
                 "more_radial": None if trial.change is None else trial.change.radial,
                 "more_centre": None if trial.change is None else trial.change.centre,

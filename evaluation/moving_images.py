@@ -1,4 +1,4 @@
-"""What images of a moving camera say about the camera itself: they are reconstructed, and asked what is left.
+"""What images of a moving camera say about the camera itself: what their reconstruction leaves unexplained.
 
 All of it is one process, each adjustment done before the next frame, so that the same images give the same
 answer.
@@ -23,13 +23,12 @@ from semcast.common.sequence_layouts import Layout
 from semcast.evaluation.statistics import student_quantile
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
-from semcast.server.mapping.left_over import NUM_GROUPS
 from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.reconstruction import Reconstruction
+from semcast.server.mapping.residual_patterns import NUM_GROUPS, PatternEvidence
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
-from semcast.server.mapping.witnesses import Witnesses
 from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
@@ -132,14 +131,14 @@ def _small_frames(source: Source) -> tuple[list[DecodedFrame], Intrinsics]:
 
 
 @dataclass(frozen=True)
-class Heard:
+class CameraEvidence:
     """What a reconstruction left.
 
     Attributes:
-        views: ``(8, 8)`` of each keyframe, see ``left_over.information``, summed over adjustments.
+        views: ``(8, 8)`` of each keyframe, see ``PatternEvidence``.
         mean_px: Mean over frames of their median reprojection error, infinite without any.
         num_frames: Frames that got a pose from a map that was there.
-        sigma_factor: By how much estimates scatter more than residuals do, see ``Witnesses``.
+        sigma_factor: By how much estimates scatter more than residuals do, see ``PatternEvidence``.
     """
 
     views: Sequence[Array]
@@ -148,7 +147,7 @@ class Heard:
     sigma_factor: float = 1.0
 
     def check(self, images: Images) -> None:
-        """Make sure that it is worth listening to.
+        """Make sure that it is worth something.
 
         Args:
             images: What was reconstructed.
@@ -172,14 +171,14 @@ class Heard:
         return student_quantile(NUM_GROUPS) * sigma * self.sigma_factor
 
 
-class _Listening(InlineBundle):
-    """Asks every few adjustments what their residuals say."""
+class _AskingBundle(InlineBundle):
+    """Has every few adjustments say what their residuals tell of shutter and lens."""
 
     def __init__(self, camera: Intrinsics) -> None:
         super().__init__()
         self.watch = ReadoutWatch(camera, is_wanted=True)
         self.world: WorldMap | None = None
-        self.witnesses = Witnesses()
+        self.evidence = PatternEvidence()
 
     def submit(self, problem: BundleProblem) -> bool:
         """Adjust now."""
@@ -190,12 +189,12 @@ class _Listening(InlineBundle):
         """Return the result of the last ``submit``, once."""
         result = super().take(wait)
         if result is not None:
-            self.witnesses.note(result)
+            self.evidence.note(result)
         return result
 
 
-def listen(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout) -> Heard:
-    """Reconstruct images, put right for a readout time, and hear what adjustments leave over.
+def gather_evidence(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout) -> CameraEvidence:
+    """Reconstruct images, put right for a readout time, and collect what adjustments say of their camera.
 
     Args:
         frames: Images without distortion.
@@ -203,7 +202,7 @@ def listen(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout)
         readout: Of the camera.
     """
     settings = ReconstructionSettings(confidence="off", readout_ms=readout.ms, readout_from=readout.side)
-    bundle = _Listening(camera)
+    bundle = _AskingBundle(camera)
     reconstruction = Reconstruction(camera.undistorted(), settings, bundle)
     errors_px = []
     try:
@@ -219,4 +218,4 @@ def listen(frames: Sequence[DecodedFrame], camera: Intrinsics, readout: Readout)
     finally:
         reconstruction.close()
     mean_px = float(np.mean(errors_px)) if errors_px else np.inf
-    return Heard(bundle.witnesses.views, mean_px, len(errors_px), bundle.witnesses.sigma_factor)
+    return CameraEvidence(bundle.evidence.views, mean_px, len(errors_px), bundle.evidence.sigma_factor)

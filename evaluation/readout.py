@@ -13,7 +13,14 @@ import numpy as np
 
 from semcast.common.camera import MAX_READOUT_MS, Intrinsics
 from semcast.common.errors import SemcastError, SourceError
-from semcast.evaluation.moving_images import MIN_FRAMES, Heard, Images, ImagesSettings, listen, load_images
+from semcast.evaluation.moving_images import (
+    MIN_FRAMES,
+    CameraEvidence,
+    Images,
+    ImagesSettings,
+    gather_evidence,
+    load_images,
+)
 from semcast.evaluation.report import provenance, write_result
 from semcast.server.mapping.readout import Readout, ReadoutFit, fit_readout
 
@@ -40,12 +47,12 @@ class Trial:
 
     Attributes:
         readout: The readout time.
-        heard: What it left.
+        evidence: What it left.
         more: By how much more readout residuals would be less, None where they don't say.
     """
 
     readout: Readout
-    heard: Heard
+    evidence: CameraEvidence
     more: ReadoutFit | None
 
 
@@ -95,16 +102,16 @@ def find_readout(
     limit_ms = min(images.period_ms, MAX_READOUT_MS)
     trials = [_seen(_tried(images, Readout("rows", 0.0)), on_trial)]
     more = _checked(trials[0], images)
-    readout, reach_ms = Readout("rows", 0.0), trials[0].heard.reach_95(more.sigma_ms)
+    readout, reach_ms = Readout("rows", 0.0), trials[0].evidence.reach_95(more.sigma_ms)
     while more.readout.ms >= max(_NOTHING_MS, more.sigma_ms) and len(trials) < _MAX_TRIALS:
         longer = readout.with_more(more.readout)
         longer = replace(longer, signed_ms=float(np.clip(longer.signed_ms, -limit_ms, limit_ms)))
         trials.append(trial := _seen(_tried(images, longer), on_trial))
         # Putting images right has errors of its own, which speak for a readout too.
-        is_better = trial.heard.mean_px < _BETTER * trials[-2].heard.mean_px
-        if trial.heard.num_frames < MIN_FRAMES or not is_better:
+        is_better = trial.evidence.mean_px < _BETTER * trials[-2].evidence.mean_px
+        if trial.evidence.num_frames < MIN_FRAMES or not is_better:
             break
-        readout, reach_ms = longer, trials[-2].heard.reach_95(more.sigma_ms)
+        readout, reach_ms = longer, trials[-2].evidence.reach_95(more.sigma_ms)
         more = _checked(trial, images)
     low_ms, high_ms = readout.signed_ms - reach_ms, readout.signed_ms + reach_ms
     if high_ms - low_ms > _MAX_INTERVAL_MS:
@@ -135,8 +142,8 @@ def _report(settings: ImagesSettings, name: str, estimate: ReadoutEstimate) -> d
             {
                 "axis": trial.readout.axis,
                 "signed_ms": trial.readout.signed_ms,
-                "error_px": trial.heard.mean_px,
-                "num_frames": trial.heard.num_frames,
+                "error_px": trial.evidence.mean_px,
+                "num_frames": trial.evidence.num_frames,
                 "more_axis": None if trial.more is None else trial.more.readout.axis,
                 "more_ms": None if trial.more is None else trial.more.readout.signed_ms,
                 "sigma_ms": None if trial.more is None else trial.more.sigma_ms,
@@ -159,7 +166,7 @@ def _checked(trial: Trial, images: Images) -> ReadoutFit:
     Raises:
         SemcastError: Too few frames got a pose, or they say nothing.
     """
-    trial.heard.check(images)
+    trial.evidence.check(images)
     if trial.more is None:
         raise SemcastError(_NOT_TOLD)
     return trial.more
@@ -167,5 +174,5 @@ def _checked(trial: Trial, images: Images) -> ReadoutFit:
 
 def _tried(images: Images, readout: Readout) -> Trial:
     """Reconstruct with one readout time."""
-    heard = listen(images.frames, images.camera, readout)
-    return Trial(readout, heard, fit_readout(heard.views, readout.axis if readout.ms else None))
+    evidence = gather_evidence(images.frames, images.camera, readout)
+    return Trial(readout, evidence, fit_readout(evidence.views, readout.axis if readout.ms else None))

@@ -7,9 +7,11 @@ from semcast.common.messages import SymbolFrame
 
 #: An agent that was silent this long may come back with a clock set to the past.
 SILENCE_NS = 3_000_000_000
+#: Clocks drift: ages are told by the smallest offset of this time and the same before it.
 _OFFSET_WINDOW_NS = 10_000_000_000
 #: A frame that was captured so much later than others, by their arrival, has a wrong time.
 _MAX_LEAD_NS = 1_000_000_000
+#: Numbers of frames that are remembered, to know those that come twice.
 _REMEMBERED = 256
 #: A live agent sends fewer frames a second than this,
 _MAX_RATE_HZ = 1000.0

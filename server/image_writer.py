@@ -24,6 +24,7 @@ logger = logging.getLogger(__name__)
 MAX_PROVISIONAL = 300
 #: How long no image is written after one that could not be.
 RETRY_S = 5.0
+_JPEG_QUALITY = 95
 #: What images leave free of a disk: the path, the map and the dense cloud, up to some 50 MB, come last.
 RESERVED_BYTES = 100_000_000
 
@@ -45,7 +46,6 @@ class ImageWriter:
     Args:
         folder: The run folder.
         lossless: Wait when the queue is full; otherwise the image is dropped and counted.
-        quality: JPEG quality.
         capacity: Images that may wait.
         on_error: Is told in a line, once until one is written again, why the run goes on without images.
         clock_s: Monotonic clock.
@@ -59,14 +59,12 @@ class ImageWriter:
         folder: Path,
         *,
         lossless: bool,
-        quality: int = 95,
         capacity: int = 8,
         on_error: Callable[[str], None] | None = None,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._images = folder / IMAGES_NAME
         self._wait_s = None if lossless else 0.0
-        self._quality = quality
         self._on_error = on_error
         self._clock_s = clock_s
         self._box: Mailbox[_Image] = Mailbox(capacity, "all")
@@ -134,7 +132,7 @@ class ImageWriter:
                 "results"
             )
         bgr = cv2.cvtColor(item.image, cv2.COLOR_RGB2BGR)
-        good, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self._quality])
+        good, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         if not good:
             raise OSError("OpenCV could not encode the image")
         (self._images / image_name(item.frame_id)).write_bytes(data.tobytes())

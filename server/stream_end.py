@@ -16,6 +16,7 @@ AGENT_GONE_S = 2.0
 #: How long another agent of the same name is waited for that is still there: its frames count again after a
 #: silence of the one that has ended.
 ANOTHER_AGENT_S = SILENCE_NS * 1e-9 + 1.0
+#: Starts of an agent that are remembered.
 _REMEMBERED = 16
 
 

@@ -27,7 +27,7 @@ HOMES = {
     "matplotlib": {"evaluation/plots.py"},
     "poselib": {
         *(f"server/geometry/{name}.py" for name in ("lo_ransac", "pnp", "ransac", "two_view", "wide_search")),
-        "server/mapping/planar.py",
+        "server/mapping/planar_ambiguity.py",
     },
     "rosbags": {"agent/ros_bag.py"},
     "safetensors": {"common/nets/checkpoint.py"},

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+#: Nearest matches that are asked.
 _NEIGHBOURS = 10
 #: Moves may differ by this share of the distance, which turns, zooms and slanted surfaces do ...
 _TOLERANCE_SHARE = 0.4

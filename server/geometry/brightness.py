@@ -16,7 +16,9 @@ _PATCH_PX = 7
 #: Patches outside these grey levels may be clipped.
 _DARKEST = 8.0
 _BRIGHTEST = 247.0
+#: Points that tell a change at least.
 _MIN_POINTS = 20
+#: Rounds of reweighting (Huber).
 _ITERATIONS = 5
 #: An exposure is a gain: an offset is taken to be no larger than about this, and matters for tone curves.
 _OFFSET_SIGMA_GREY = 10.0

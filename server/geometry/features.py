@@ -47,6 +47,10 @@ _NOISE_CELL_PX = 16
 _PLAIN_SHARE = 0.2
 _ROUGHNESS = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 _ORB_SCALE = 1.2
+#: Bits by which matched descriptors may differ, and their share of those to the second nearest at most;
+_MAX_DISTANCE, _MAX_RATIO = 64, 0.9
+#: the same where matches are only counted.
+_MAX_DISTANCE_COUNTED, _MAX_RATIO_COUNTED = 60, 0.75
 #: Share of the points that must be found in spite of another exposure for them to tell it surely,
 _MOSTLY_FOUND = 0.6
 #: and pyramid levels of the second search then.
@@ -408,12 +412,7 @@ def hamming(descriptors0: NDArray[np.uint8], descriptors1: NDArray[np.uint8]) ->
     return np.asarray(np.bitwise_count(descriptors0 ^ descriptors1).sum(axis=1, dtype=np.int64))
 
 
-def count_matches(
-    descriptors0: NDArray[np.uint8],
-    descriptors1: NDArray[np.uint8],
-    max_distance: int = 60,
-    max_ratio: float = 0.75,
-) -> int:
+def count_matches(descriptors0: NDArray[np.uint8], descriptors1: NDArray[np.uint8]) -> int:
     """Count the descriptors of one set ``(N, 32)`` that clearly have a nearest one in the other ``(M, 32)``.
 
     A fraction of what ``match_descriptors`` costs: it tells which of many images deserve that.
@@ -422,22 +421,17 @@ def count_matches(
         return 0
     distance, _ = cv2.batchDistance(descriptors0, descriptors1, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2)
     first, second = distance[:, 0], distance[:, 1]
-    return int((first <= np.minimum(max_distance, max_ratio * second)).sum())
+    return int((first <= np.minimum(_MAX_DISTANCE_COUNTED, _MAX_RATIO_COUNTED * second)).sum())
 
 
 def match_descriptors(
-    descriptors0: NDArray[np.uint8],
-    descriptors1: NDArray[np.uint8],
-    max_distance: int = 64,
-    max_ratio: float = 0.9,
+    descriptors0: NDArray[np.uint8], descriptors1: NDArray[np.uint8]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Match descriptors that are each other's nearest, and clearly so; rows into both, best first.
 
     Args:
         descriptors0: ``(N, 32)``; several may describe the same point (other octaves).
         descriptors1: ``(M, 32)``, each of another point.
-        max_distance: Bits that may differ.
-        max_ratio: Distance over that to the second nearest of ``descriptors1``.
     """
     if len(descriptors0) == 0 or len(descriptors1) < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -448,7 +442,7 @@ def match_descriptors(
     found = [
         (first.distance, first.queryIdx, first.trainIdx)
         for first, second in matcher.knnMatch(descriptors0, descriptors1, k=2)
-        if first.distance <= min(max_distance, max_ratio * second.distance)
+        if first.distance <= min(_MAX_DISTANCE, _MAX_RATIO * second.distance)
         and nearest0[first.trainIdx] == first.queryIdx
     ]
     found.sort()

@@ -67,7 +67,9 @@ _TURNING_STEPS = 6
 #: Points near the camera have larger errors and most of the information: the fitted beta overstates what
 #: confidence is worth, half of it does best.
 _BETA_SHARE = 0.5
+#: Standard deviations at which errors are cut off in the refinement,
 _CUT_SIGMAS = 2.5
+#: and the least that is believed of a pair, however well its matches fit.
 _MIN_SIGMA_PX = 0.1
 
 

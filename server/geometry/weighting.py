@@ -28,7 +28,12 @@ HUBER_K = 1.345
 GATE_SIGMAS = 3.035
 #: Range of beta the fit may give.
 BETA_RANGE = (0.0, 8.0)
+#: And of sigma0.
 SIGMA0_RANGE_PX = (0.25, 6.0)
+#: Residuals that a group of like confidence needs for the fit,
+_MIN_PER_BIN = 12
+#: and standard errors from which on its slope counts.
+_SIGNIFICANCE = 2.0
 #: A gate is never narrower than that of this sigma: landmarks have errors of their own, and a gate that
 #: follows the residuals it lets through would close by itself.
 _MIN_GATE_SIGMA_PX = 0.6
@@ -36,7 +41,7 @@ _MIN_GATE_SIGMA_PX = 0.6
 _TRACKING_PX = 0.3
 #: Expected error from which on a position is worth nothing.
 _MOST_PX = 5.0
-#: Median of |x| / sigma under normal noise.
+#: Sigma over the median of |x|, under normal noise.
 MAD_TO_SIGMA = 1.0 / 0.67449
 
 
@@ -89,15 +94,7 @@ class NoiseModel:
         return np.asarray(GATE_SIGMAS * np.maximum(sigma, _MIN_GATE_SIGMA_PX))
 
 
-def fit_noise(
-    confidence: Array,
-    residual_px: Array,
-    *,
-    num_bins: int = 8,
-    min_per_bin: int = 12,
-    max_beta: float = BETA_RANGE[1],
-    significance: float = 2.0,
-) -> NoiseModel | None:
+def fit_noise(confidence: Array, residual_px: Array, *, num_bins: int = 8) -> NoiseModel | None:
     """Fit ``log sigma^2 = log sigma0^2 + beta (1 - c)`` to residuals, robustly.
 
     Residuals are grouped by quantiles of confidence, each group's spread is its median absolute value, and a
@@ -107,19 +104,16 @@ def fit_noise(
         confidence: ``(N,)`` in [0, 1].
         residual_px: ``(N,)`` residuals per coordinate, sign of no matter.
         num_bins: Groups at most.
-        min_per_bin: Residuals a group needs.
-        max_beta: Upper end of beta.
-        significance: Standard errors the slope must exceed to count.
 
     Returns:
         The model, or None with fewer residuals than one group needs.
     """
     count = len(confidence)
-    if count < min_per_bin:
+    if count < _MIN_PER_BIN:
         return None
     size = np.abs(residual_px)
     flat = NoiseModel(_clip_sigma0(float(np.median(size)) * MAD_TO_SIGMA), 0.0)
-    bins = min(num_bins, count // min_per_bin)
+    bins = min(num_bins, count // _MIN_PER_BIN)
     if bins < 3 or float(np.ptp(confidence)) < 1e-3:
         return flat
     order = np.argsort(confidence, kind="stable")
@@ -137,9 +131,9 @@ def fit_noise(
     slope = float((precision * (doubt - mean_doubt) * (log_variance - mean_log)).sum()) / spread_of_doubt
     scatter = log_variance - mean_log - slope * (doubt - mean_doubt)
     misfit = max(1.0, float((precision * scatter**2).sum()) / max(1, bins - 2))
-    if slope < significance * np.sqrt(misfit / spread_of_doubt):
+    if slope < _SIGNIFICANCE * np.sqrt(misfit / spread_of_doubt):
         return flat
-    beta = min(slope, max_beta)
+    beta = min(slope, BETA_RANGE[1])
     return NoiseModel(_clip_sigma0(float(np.exp(0.5 * (mean_log - beta * mean_doubt)))), beta)
 
 

@@ -32,9 +32,9 @@ Start of a map
     scene_motion      whether a relative pose is that of the scene or of a large moving thing
     start_alignment   drift of the tracks a map begins with
     ambiguity         which of several structures that fit the first views is right
-    reversal          the one mirrored in depth (Necker reversal)
-    planar            the second pose and plane of a homography
-    relief            the bas-relief ambiguity
+    depth_reversal    the one mirrored in depth (Necker reversal)
+    planar_ambiguity  the second pose and plane of a homography
+    bas_relief        the bas-relief ambiguity
     hypotheses        structures kept from one attempt to the next
     kept_frames       frames that wait for a map, and their poses once there is one
     look_back         the map grows backwards over those frames
@@ -44,7 +44,10 @@ The map
     landmarks         landmarks as columns
     posed_frames      poses of frames relative to their keyframes, as arrays
     map_builder       owns the map: keyframes, adjustments, joining of submaps
-    mapper            when to take a keyframe, new landmarks, applying adjustments, culling
+    keyframe_rule     when a frame becomes a keyframe
+    new_landmarks     tracks of keyframes, triangulated
+    observations      what keyframes saw of some tracks
+    scene_depth       how far away the scene is
     thinning          what goes when the map reaches its limits
     keyframe_images   images of keyframes, kept to look for landmarks by how they looked there
     map_arrays        checks the arrays of a checkpoint
@@ -56,7 +59,7 @@ Bundle adjustment
     bundle            solves a problem: dense for small ones, GTSAM for the rest
     dense_bundle      Levenberg-Marquardt with the Schur complement in numpy
     bundle_process    the same in a process of its own
-    left_out          landmarks an adjustment had no room for
+    adjustment        brings the result into the map, and lets what it had no room for follow
     whole_map         the adjustment of all keyframes at the end of a stream
     steps             relative poses that tracking found, as constraints between keyframes
 
@@ -64,15 +67,14 @@ Getting lost, and places seen again
     relocalisation    binary descriptors against keyframes, then PnP; joining two submaps
     wide_recognition  the same by SIFT and warped patches, from further off
     visual_gyroscope  how a camera without a pose turns
-    bridging          where a new submap begins, and its unit, by how the camera moved
-    passage           the same anew once the submap has settled
+    bridging          where a new submap begins and its unit, told by how the camera moved
+    submap_placement  puts it there, and again once it has settled
     revisit           old landmarks that are in sight again get their tracks back
     loop_closure      finds loops and shares out the drift
     pose_graph        graph of similarities (Sim(3)) between keyframes, by GTSAM
 
 What residuals say about the camera
-    left_over         how residuals depend on shutter and lens, with poses and points eliminated
-    witnesses         what adjustments have said so far, by keyframe
+    residual_patterns how residuals depend on shutter and lens, with poses and points eliminated
     readout           the readout time of a rolling shutter
     lens              focal length, radial distortion and principal point
     lens_doubt        whether the lens of the calibration is another one, in words

@@ -21,11 +21,11 @@ from semcast.common.geometry import (
     rotation_angle_deg,
 )
 from semcast.server.geometry.edges import whitened
+from semcast.server.mapping.bas_relief import nearer
 from semcast.server.mapping.bundle import optimise, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
-from semcast.server.mapping.planar import twin
-from semcast.server.mapping.relief import nearer
-from semcast.server.mapping.reversal import mirrored
+from semcast.server.mapping.depth_reversal import mirrored
+from semcast.server.mapping.planar_ambiguity import twin
 
 Array = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ _HOPELESS_RATIO = np.e
 
 
 @dataclass(frozen=True)
-class Side:
+class Structure:
     """One of the structures after adjustment.
 
     Attributes:
@@ -68,19 +68,21 @@ class Side:
     doubt: float = 0.0
 
 
-def adjusted(problem: BundleProblem) -> Side:
+def adjusted(problem: BundleProblem) -> Structure:
     """Adjust one of the structures to all observations."""
     result = optimise(problem)
     # All observations anew: those that could not be used at the start count as well.
     residual, _ = residuals_px(problem, result.T_world_cam, result.xyz)
     error = whitened(problem.edge, np.nan_to_num(residual, nan=1e6))
     size = np.linalg.norm(error, axis=1) / problem.sigma_px
-    return Side(result.T_world_cam, result.xyz, float((np.minimum(size, _CUT_SIGMAS) ** 2).sum()), result.ok)
+    return Structure(
+        result.T_world_cam, result.xyz, float((np.minimum(size, _CUT_SIGMAS) ** 2).sum()), result.ok
+    )
 
 
 def decide(
     problem: BundleProblem, carried: Sequence[tuple[BundleProblem, float]] = (), *, at_last: bool = False
-) -> tuple[Side | None, list[Side]]:
+) -> tuple[Structure | None, list[Structure]]:
     """Find the structure the observations speak for.
 
     Args:
@@ -102,44 +104,46 @@ def decide(
     found = [start, *(adjusted(p) for p in others)]
     # What fits worse than the start is on the way to it, and no structure of its own.
     along = [adjusted(nearer(after, factor)) for factor in _NEARER]
-    found += [side for side in along if side.cost < start.cost]
+    found += [structure for structure in along if structure.cost < start.cost]
     found += _mirrored_again(problem, found)
     for begun, doubt in carried:
         found.append(replace(adjusted(begun), doubt=doubt))
-    sides = _weighed(found, len(carried))
-    best, rest = sides[0], sides[1:]
+    structures = _weighed(found, len(carried))
+    best, rest = structures[0], structures[1:]
     if at_last:
-        return best, sides
+        return best, structures
     # An adjustment that failed says nothing against the structure it began with.
-    is_sure = start.ok and best.ok and all(side.ok for side in rest[:1])
-    is_clear = all(side.doubt - best.doubt >= _clear_doubt(best, side) for side in rest)
-    return (best if is_sure and is_clear else None), sides
+    is_sure = start.ok and best.ok and all(structure.ok for structure in rest[:1])
+    is_clear = all(structure.doubt - best.doubt >= _clear_doubt(best, structure) for structure in rest)
+    return (best if is_sure and is_clear else None), structures
 
 
-def _clear_doubt(best: Side, other: Side) -> float:
+def _clear_doubt(best: Structure, other: Structure) -> float:
     """How much more doubt a structure must have than the best one."""
     same_way = _way_between_deg(best, other) < _SAME_WAY_DEG
     return float(np.log(_CLEAR_RATIO_SAME_WAY if same_way else _CLEAR_RATIO))
 
 
-def _mirrored_again(problem: BundleProblem, found: list[Side]) -> list[Side]:
+def _mirrored_again(problem: BundleProblem, found: list[Structure]) -> list[Structure]:
     """Mirror images of the structures that were found beside the start.
 
     A start may be a mixture, too far away and with some of its points on the wrong side: its mirror image
     then leads to that of the true structure, and only the image of that to the true one.
     """
-    lowest = min(side.cost for side in found)
+    lowest = min(structure.cost for structure in found)
     told_apart, again = found[:1], []
-    for side in found[1:]:
-        if any(_is_same(side, other) for other in told_apart):
+    for structure in found[1:]:
+        if any(_is_same(structure, other) for other in told_apart):
             continue
-        told_apart.append(side)
-        if side.cost < _HOPELESS_RATIO * lowest:
-            again.append(adjusted(mirrored(replace(problem, T_world_cam=side.T_world_cam, xyz=side.xyz))))
+        told_apart.append(structure)
+        if structure.cost < _HOPELESS_RATIO * lowest:
+            again.append(
+                adjusted(mirrored(replace(problem, T_world_cam=structure.T_world_cam, xyz=structure.xyz)))
+            )
     return again
 
 
-def _weighed(found: list[Side], num_carried: int) -> list[Side]:
+def _weighed(found: list[Structure], num_carried: int) -> list[Structure]:
     """Structures that differ, each as its cheapest copy, with their doubt after this attempt, least first.
 
     Args:
@@ -148,43 +152,43 @@ def _weighed(found: list[Side], num_carried: int) -> list[Side]:
     """
     by_cost = sorted(range(len(found)), key=lambda k: found[k].cost)
     lowest = max(found[by_cost[0]].cost, 1e-9)
-    sides: list[Side] = []
+    structures: list[Structure] = []
     doubts: list[list[float]] = []
     for k in by_cost:
-        side = found[k]
-        same = next((row for row, other in enumerate(sides) if _is_same(side, other)), None)
+        structure = found[k]
+        same = next((row for row, other in enumerate(structures) if _is_same(structure, other)), None)
         if same is None:
-            sides.append(side)
+            structures.append(structure)
             doubts.append([])
-            same = len(sides) - 1
+            same = len(structures) - 1
         if k >= len(found) - num_carried:
-            doubts[same].append(side.doubt)
+            doubts[same].append(structure.doubt)
     # What is found for the first time is as good as the best one until now, no better.
     new = min((doubt for before in doubts for doubt in before), default=0.0)
     weighed = [
-        replace(side, doubt=min(before, default=new) + float(np.log(max(side.cost, 1e-9) / lowest)))
-        for side, before in zip(sides, doubts, strict=True)
+        replace(structure, doubt=min(before, default=new) + float(np.log(max(structure.cost, 1e-9) / lowest)))
+        for structure, before in zip(structures, doubts, strict=True)
     ]
-    return sorted(weighed, key=lambda side: side.doubt)
+    return sorted(weighed, key=lambda structure: structure.doubt)
 
 
-def _is_same(a: Side, b: Side) -> bool:
+def _is_same(a: Structure, b: Structure) -> bool:
     """Whether both adjustments ended in the same structure: the last cameras went and turned the same way."""
     turn_deg = rotation_angle_deg(_last(a)[:3, :3].T @ _last(b)[:3, :3])
     same_turn = turn_deg < _SAME_TURN_SHARE * max(_parallax_deg(a), _parallax_deg(b))
     return same_turn and _way_between_deg(a, b) < _SAME_WAY_DEG
 
 
-def _way_between_deg(a: Side, b: Side) -> float:
+def _way_between_deg(a: Structure, b: Structure) -> float:
     return angle_between_deg(_last(a)[:3, 3], _last(b)[:3, 3])
 
 
-def _last(side: Side) -> Array:
+def _last(structure: Structure) -> Array:
     """The last camera in the frame of the first."""
-    return np.asarray(invert_transform(side.T_world_cam[0]) @ side.T_world_cam[-1])
+    return np.asarray(invert_transform(structure.T_world_cam[0]) @ structure.T_world_cam[-1])
 
 
-def _parallax_deg(side: Side) -> float:
+def _parallax_deg(structure: Structure) -> float:
     """Median angle between the rays from the first and the last camera to the points."""
-    first, last = (side.xyz - side.T_world_cam[k][:3, 3] for k in (0, -1))
+    first, last = (structure.xyz - structure.T_world_cam[k][:3, 3] for k in (0, -1))
     return float(np.median(angles_between_deg(first, last)))

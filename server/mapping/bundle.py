@@ -17,8 +17,8 @@ from semcast.server.geometry.projection import project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
 from semcast.server.mapping.dense_bundle import Baseline, State, Window, last_covariance, minimise
-from semcast.server.mapping.left_over import information
-from semcast.server.mapping.pose_graph import Edge
+from semcast.server.mapping.pose_graph import PoseConstraint
+from semcast.server.mapping.residual_patterns import pattern_products_of
 
 Array = NDArray[np.float64]
 
@@ -27,6 +27,7 @@ _Solved = tuple[Array, Array, Array | None]
 
 #: Observations share noise models: their sigmas are rounded to this many steps.
 NUM_SIGMAS = 16
+#: in equal ratios within this range.
 SIGMA_RANGE_PX = (0.1, 12.0)
 #: Free views that dense algebra is for: its time grows with their square and the number of points.
 _MAX_DENSE_VIEWS = 60
@@ -86,12 +87,12 @@ def _baseline(problem: BundleProblem) -> Baseline | None:
     return Baseline((0, furthest), length_map, max(1e-4 * length_map, 1e-9))
 
 
-def _step(edge: Edge) -> gtsam.BetweenFactorPose3:
-    T = edge.T_first_second
+def _step(constraint: PoseConstraint) -> gtsam.BetweenFactorPose3:
+    T = constraint.T_first_second
     between = gtsam.Pose3(gtsam.Rot3(project_to_so3(T[:3, :3])), T[:3, 3])
-    noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(edge.sigma[:2], 3))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(constraint.sigma[:2], 3))
     robust = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K), noise)
-    return gtsam.BetweenFactorPose3(X(edge.first), X(edge.second), between, robust)
+    return gtsam.BetweenFactorPose3(X(constraint.first), X(constraint.second), between, robust)
 
 
 def _build(
@@ -108,8 +109,8 @@ def _build(
         noise = gtsam.noiseModel.Isotropic.Sigma(1, held.sigma_map)
         first, furthest = held.views
         graph.add(gtsam.RangeFactorPose3(X(first), X(furthest), held.length_map, noise))
-    for edge in problem.steps:
-        graph.add(_step(edge))
+    for constraint in problem.steps:
+        graph.add(_step(constraint))
     for p in np.unique(problem.point[used]).tolist():
         values.insert(L(p), problem.xyz[p])
     sigmas, step = quantised_sigma(problem.sigma_px)
@@ -154,11 +155,11 @@ def optimise(problem: BundleProblem) -> BundleResult:
     T_world_cam, xyz, covariance = solved or (problem.T_world_cam.copy(), problem.xyz.copy(), None)
     residual, _ = residuals_px(problem, T_world_cam, xyz)
     residual[~used] = np.nan
-    left_over = None
+    pattern_products = None
     if ok and problem.motion is not None:
-        left_over = information(problem, problem.motion, T_world_cam, xyz, residual)
+        pattern_products = pattern_products_of(problem, problem.motion, T_world_cam, xyz, residual)
     elapsed_ms = (time.perf_counter_ns() - started) * 1e-6
-    return BundleResult(problem, ok, T_world_cam, xyz, residual, covariance, elapsed_ms, left_over)
+    return BundleResult(problem, ok, T_world_cam, xyz, residual, covariance, elapsed_ms, pattern_products)
 
 
 def _window_of(problem: BundleProblem, used: NDArray[np.bool_]) -> tuple[Window, State, NDArray[np.intp]]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.edges import alike, each_of, whitened
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.pose_graph import Edge
+from semcast.server.mapping.observations import Observations
+from semcast.server.mapping.pose_graph import PoseConstraint
 
 Array = NDArray[np.float64]
 
@@ -83,7 +84,7 @@ class BundleProblem:
     motion: ViewMotion | None = None
     edge: Array = field(default_factory=alike)
     solver: Solver = "dense"
-    steps: tuple[Edge, ...] = ()
+    steps: tuple[PoseConstraint, ...] = ()
 
     def __post_init__(self) -> None:
         """Have an edge for each observation."""
@@ -96,28 +97,6 @@ class Frame(Protocol):
     @property
     def frame_id(self) -> int:
         """Its number in the stream."""
-
-
-class Observations(NamedTuple):
-    """Observations of tracks in views, one a row.
-
-    Attributes:
-        view: ``(M,)`` which view.
-        point: ``(M,)`` row of the track among those asked for.
-        xy: ``(M, 2)`` pixels.
-        confidence: ``(M,)`` in [0, 1].
-        edge: ``(M, 2)`` see ``edges``.
-    """
-
-    view: NDArray[np.intp]
-    point: NDArray[np.intp]
-    xy: Array
-    confidence: Array
-    edge: Array
-
-    def of_rows(self, kept: NDArray[np.bool_], point: NDArray[np.intp]) -> "Observations":
-        """Return the observations in the mask ``kept (M,)``, with new track rows ``point``."""
-        return Observations(self.view[kept], point, self.xy[kept], self.confidence[kept], self.edge[kept])
 
 
 def assemble_problem(
@@ -180,7 +159,7 @@ class BundleResult:
         covariance: ``(6, 6)`` marginal covariance of the last keyframe's pose in its own frame, rotation
             before translation, or None.
         elapsed_ms: Time it took.
-        left_over: ``(K, 8, 8)``, see ``left_over.information``; None where it was not asked for.
+        pattern_products: ``(K, 8, 8)``, see ``residual_patterns``; None where ``motion`` was not given.
     """
 
     problem: BundleProblem
@@ -190,7 +169,7 @@ class BundleResult:
     residual_px: Array
     covariance: Array | None
     elapsed_ms: float
-    left_over: Array | None = None
+    pattern_products: Array | None = None
 
     @cached_property
     def whitened_px(self) -> Array:

@@ -16,10 +16,10 @@ from semcast.common.geometry import invert_transform
 from semcast.server.geometry.projection import depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.ambiguity import Side
+from semcast.server.mapping.ambiguity import Structure
 from semcast.server.mapping.bundle_problem import BundleProblem, assemble_problem
 from semcast.server.mapping.kept_frames import Observed, pose_of
-from semcast.server.mapping.mapper import gather_observations
+from semcast.server.mapping.observations import gather_observations
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -40,7 +40,7 @@ class Hypothesis:
         poses: Frame id -> ``T_world_cam (4, 4)``, in a frame and unit of its own.
         ids: ``(P,)`` int64 points, ascending.
         xyz: ``(P, 3)``.
-        doubt: What attempts so far say against it, see ``Side``.
+        doubt: What attempts so far say against it, see ``Structure``.
     """
 
     poses: dict[int, Array]
@@ -49,11 +49,13 @@ class Hypothesis:
     doubt: float
 
 
-def hypothesis_of(side: Side, views: Sequence[Observed], camera: Intrinsics, noise: NoiseModel) -> Hypothesis:
+def hypothesis_of(
+    structure: Structure, views: Sequence[Observed], camera: Intrinsics, noise: NoiseModel
+) -> Hypothesis:
     """Return a structure with all points its views have seen, not only those that it was judged by.
 
     Args:
-        side: The structure, with a pose for each view.
+        structure: The structure, with a pose for each view.
         views: In order of time.
         camera: Pinhole.
         noise: Of the observations.
@@ -61,11 +63,11 @@ def hypothesis_of(side: Side, views: Sequence[Observed], camera: Intrinsics, noi
     ids = np.unique(np.concatenate([o.ids for o in views]))
     view, point, xy, confidence, _ = gather_observations(views, ids)
     sigma = noise.sigma_px(confidence)
-    points = triangulate(camera, invert_transform(side.T_world_cam), view, point, xy, sigma, len(ids))
+    points = triangulate(camera, invert_transform(structure.T_world_cam), view, point, xy, sigma, len(ids))
     seen = np.bincount(point, minlength=len(ids))
     good = points.in_front & (seen >= 2) & (points.error_sigma < _MAX_ERROR_SIGMAS)
-    poses = {o.frame_id: T for o, T in zip(views, side.T_world_cam, strict=True)}
-    return Hypothesis(poses, ids[good], points.xyz[good], side.doubt)
+    poses = {o.frame_id: T for o, T in zip(views, structure.T_world_cam, strict=True)}
+    return Hypothesis(poses, ids[good], points.xyz[good], structure.doubt)
 
 
 def poses_in(

@@ -21,10 +21,10 @@ from semcast.server.geometry.epipolar import (
 from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import MIN_MATCHES, TwoViewResult, estimate_two_view
 from semcast.server.geometry.weighting import MAD_TO_SIGMA, ConfidenceMode, NoiseModel, fuse_confidence
-from semcast.server.mapping.ambiguity import Side, decide
+from semcast.server.mapping.ambiguity import Structure, decide
 from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
 from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
-from semcast.server.mapping.mapper import gather_observations
+from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.scene_motion import ITERATIONS, SceneMotion, motion_of_scene
 from semcast.server.mapping.start_alignment import aligned_views
 from semcast.server.mapping.world_map import Keyframe
@@ -86,7 +86,7 @@ _THRESHOLD_RANGE_PX = (1.0, 3.0)
 #: views are near each other.
 _PARALLAX_SHARE = 0.5
 #: RMS error of such a point at most, in standard deviations. It is larger than a landmark's may be
-#: (``mapper.MAX_ERROR_SIGMA``), as a start is adjusted at once.
+#: (``new_landmarks.MAX_ERROR_SIGMA``), as a start is adjusted at once.
 _MAX_ERROR_SIGMA = 2.5
 
 
@@ -372,10 +372,10 @@ class Initialiser:
         chosen = [span[k] for k in sorted(T_world_cam)]
         poses = np.stack([T_world_cam[k] for k in sorted(T_world_cam)])
         chosen = aligned_views(self._camera, chosen, poses)
-        side = self._decide(chosen, poses, noise)
-        if side is None:
+        structure = self._decide(chosen, poses, noise)
+        if structure is None:
             return None
-        T_cam_world = invert_transform(side.T_world_cam) @ side.T_world_cam[0]
+        T_cam_world = invert_transform(structure.T_world_cam) @ structure.T_world_cam[0]
         all_ids = np.unique(np.concatenate([o.ids for o in chosen]))
         points = self._triangulate(chosen, T_cam_world, all_ids, noise)
         good = self._passes(points)
@@ -392,7 +392,7 @@ class Initialiser:
         mean = np.bincount(point, weights=confidence) / np.bincount(point)
         return Start(keyframes, all_ids[good], scale * points.xyz[good], mean)
 
-    def _decide(self, views: list[Observed], T_world_cam: Array, noise: NoiseModel) -> Side | None:
+    def _decide(self, views: list[Observed], T_world_cam: Array, noise: NoiseModel) -> Structure | None:
         """Adjust the start and the structures it may be mistaken for; None while several fit."""
         problem = problem_of(views, T_world_cam, self._camera, noise)
         if problem is None:
@@ -403,15 +403,15 @@ class Initialiser:
             again = None if T is None else problem_of(views, T, self._camera, noise)
             if again is not None:
                 carried.append((again, hypothesis.doubt))
-        side, sides = decide(problem, carried, at_last=self._is_overdue())
-        if side is None:
+        structure, structures = decide(problem, carried, at_last=self._is_overdue())
+        if structure is None:
             self._num_undecided += 1
             self._hypotheses = [
                 hypothesis_of(s, views, self._camera, noise)
-                for s in sides[:_MAX_HYPOTHESES]
-                if s.ok and s.doubt < sides[0].doubt + _HOPELESS
+                for s in structures[:_MAX_HYPOTHESES]
+                if s.ok and s.doubt < structures[0].doubt + _HOPELESS
             ]
-        return side
+        return structure
 
     def _triangulate(
         self, frames: list[Observed], T_cam_world: Array, ids: Ids, noise: NoiseModel

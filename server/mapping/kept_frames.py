@@ -12,7 +12,7 @@ from semcast.server.geometry.edges import alike, each_of
 from semcast.server.geometry.features import Grey
 from semcast.server.geometry.pnp import refine_pose, search_pose
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.mapper import sample_colours
+from semcast.server.mapping.new_landmarks import sample_colours
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -101,8 +101,6 @@ def keyframe_of(observed: Observed, T_world_cam: Array) -> Keyframe:
         xy=observed.xy,
         confidence=observed.confidence,
         edge=observed.edge,
-        descriptor_ids=np.zeros(0, np.int64),
-        descriptors=np.zeros((0, 32), np.uint8),
     )
 
 

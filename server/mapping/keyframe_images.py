@@ -13,7 +13,12 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 @dataclass(frozen=True)
 class SeenFrom:
-    """A keyframe and its image."""
+    """The image of a keyframe.
+
+    Attributes:
+        frame_id: Of the keyframe.
+        grey: ``(H, W)`` uint8, as its tracks were followed in it.
+    """
 
     frame_id: int
     grey: Grey

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.server.mapping.left_over import (
+from semcast.server.mapping.residual_patterns import (
     CENTRE_X,
     CENTRE_Y,
     FOCAL,
@@ -63,7 +63,7 @@ def fit_lens(views: Sequence[Array] | Array, num_radial: int, with_centre: bool 
     """Return the change of the lens that views speak for, None where they say nothing.
 
     Args:
-        views: ``(8, 8)`` of each, as ``left_over.information`` gives them.
+        views: ``(8, 8)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
         num_radial: Radial coefficients that may change, the first ones, 0 to 2.
         with_centre: Whether the principal point may move.
     """
@@ -95,7 +95,7 @@ def believed_lens(
     are asked for together.
 
     Args:
-        views: ``(8, 8)`` of each, as ``left_over.information`` gives them.
+        views: ``(8, 8)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
         num_radial: Coefficients, the first ones, that are believed in anyway.
         with_centre: Whether another principal point is.
 

@@ -1,7 +1,6 @@
 """Where the camera of a frame is in the map: by its tracks, and by landmarks that are looked for again."""
 
 from functools import partial
-from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +10,18 @@ from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Seen, Sight
-from semcast.server.mapping.tracker import MIN_INLIERS, Believing, TrackedPose, expected_positions, track_pose
+from semcast.server.mapping.tracker import (
+    MIN_BELIEVED_SHARE,
+    MIN_INLIERS,
+    TrackedPose,
+    expected_positions,
+    track_pose,
+)
 from semcast.server.mapping.tracks import TrackTable
 
 Array = NDArray[np.float64]
 
+#: Pyramid levels by which tracks are followed where no pose is expected: they may have gone far.
 _START_LEVELS = 5
 #: A pose that rests on fewer landmarks than this share of the tracks asks for more.
 _FEW_INLIERS_SHARE = 0.2
@@ -69,14 +75,26 @@ class Locator:
         return expected_positions(self._camera, world, tracks, T_world_cam, T_world_seen)
 
     def pose(
-        self, T_world_guess: Array | None, seen: Seen | None = None, **how: Unpack[Believing]
+        self,
+        T_world_guess: Array | None,
+        seen: Seen | None = None,
+        *,
+        min_share: float = MIN_BELIEVED_SHARE,
+        may_carry: bool = False,
     ) -> TrackedPose | None:
         """Estimate the pose by the landmarks among what is seen, all tracks by default: ``track_pose``."""
-        seen = self._tracks.seen() if seen is None else seen
-        how["is_after_gap"] = self._is_after_gap
-        known = {"submap": self._map.submap, "seed": self._settings.seed}
-        noise = self._map.noise.model
-        return track_pose(self._camera, self._map.world, noise, seen, T_world_guess, **known, **how)
+        return track_pose(
+            self._camera,
+            self._map.world,
+            self._map.noise.model,
+            self._tracks.seen() if seen is None else seen,
+            T_world_guess,
+            submap=self._map.submap,
+            seed=self._settings.seed,
+            min_share=min_share,
+            may_carry=may_carry,
+            is_after_gap=self._is_after_gap,
+        )
 
     def track(self, sight: Sight, T_world_guess: Array | None) -> TrackedPose | None:
         """Pose of a frame whose tracks were followed; None where it is not sure, and they may be gone."""

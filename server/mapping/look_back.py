@@ -19,11 +19,9 @@ from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.bundle_problem import assemble_problem
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
-from semcast.server.mapping.mapper import (
-    gather_observations,
-    median_depth_of,
-    new_landmarks,
-)
+from semcast.server.mapping.new_landmarks import triangulate_tracks
+from semcast.server.mapping.observations import gather_observations
+from semcast.server.mapping.scene_depth import median_depth_of
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.window import within_limit
 
@@ -111,7 +109,7 @@ def _with_new_points(
     wanted = first.ids[~np.isin(first.ids, start.ids, assume_unique=True)]
     depth = median_depth_of(first, start.ids, start.xyz)
     parallax_deg = settings.min_parallax_deg
-    new = new_landmarks(camera, start.keyframes, first, wanted, noise, parallax_deg, depth)
+    new = triangulate_tracks(camera, start.keyframes, first, wanted, noise, parallax_deg, depth)
     ids = np.concatenate([start.ids, new.ids])
     order = np.argsort(ids, kind="stable")
     return replace(

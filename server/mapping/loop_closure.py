@@ -17,10 +17,10 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, rotation_angle_deg
 from semcast.server.geometry.pnp import reprojection_residual, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
-from semcast.server.mapping.mapper import median_depth
-from semcast.server.mapping.pose_graph import Edge, SolvedGraph, solve_graph
+from semcast.server.mapping.pose_graph import PoseConstraint, SolvedGraph, solve_graph
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, tells_depth
+from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.steps import steps_of, usable_depth
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -255,13 +255,13 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
     """
     mine = world.keyframes_of(submap)
     row = {k.frame_id: i for i, k in enumerate(mine)}
-    edges = [step.edge for step in steps_of(world, mine)]
+    constraints = [step.constraint for step in steps_of(world, mine)]
     for new, old in world.revisits.items():
         if new in row and old in row:
-            edges.append(_tie(world, mine, row[old], row[new], mine[row[new]].T_world_cam, 1.0))
+            constraints.append(_tie(world, mine, row[old], row[new], mine[row[new]].T_world_cam, 1.0))
     old, new = row[loop.place.keyframe_id], row[loop.keyframe_id]
-    edges.append(_tie(world, mine, old, new, loop.moved(mine[new].T_world_cam), loop.scale))
-    solved = solve_graph(np.stack([k.T_world_cam for k in mine]), edges)
+    constraints.append(_tie(world, mine, old, new, loop.moved(mine[new].T_world_cam), loop.scale))
+    solved = solve_graph(np.stack([k.T_world_cam for k in mine]), constraints)
     if solved is None or solved.cost > _MAX_COST:
         return None
     return np.array([k.frame_id for k in mine], dtype=np.int64), solved
@@ -269,8 +269,8 @@ def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGrap
 
 def _tie(
     world: WorldMap, mine: Sequence[Keyframe], old: int, new: int, T_world_new: Array, scale: float
-) -> Edge:
+) -> PoseConstraint:
     """What a place that was recognised says of two keyframes."""
     T = invert_transform(mine[old].T_world_cam) @ T_world_new
     depth = usable_depth(world, mine[old], float(np.linalg.norm(T[:3, 3])))
-    return Edge(old, new, T, scale, (_PLACE_RAD, _PLACE_DEPTH * depth, _PLACE_SCALE))
+    return PoseConstraint(old, new, T, scale, (_PLACE_RAD, _PLACE_DEPTH * depth, _PLACE_SCALE))

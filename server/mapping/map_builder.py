@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, make_transform, skew, transform_points
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
-from semcast.server.mapping import mapper
+from semcast.server.mapping.adjustment import apply_result, place_left_out
 from semcast.server.mapping.anchoring import anchor_tracks, resembles
 from semcast.server.mapping.bridging import may_turn
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed, colours_of
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
+from semcast.server.mapping.keyframe_rule import KeyframeCues, median_flow_px, wants_keyframe
 from semcast.server.mapping.late_readout import put_map_right
-from semcast.server.mapping.left_out import place_left_out
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.map_update import update_of
-from semcast.server.mapping.passage import Passage
+from semcast.server.mapping.new_landmarks import add_landmarks
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
@@ -30,6 +30,7 @@ from semcast.server.mapping.rolling_shutter import ImageFlow
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import MapUpdate
+from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.whole_map import adjust_whole_map
 from semcast.server.mapping.wide_recognition import WideRecogniser
@@ -62,12 +63,20 @@ class MapBuilder:
         camera: Pinhole.
         settings: Of the reconstruction.
         bundle: Runs the adjustments.
+        on_moved: Called after the map has moved under the camera, with the factor on lengths around it.
     """
 
-    def __init__(self, camera: Intrinsics, settings: ReconstructionSettings, bundle: BundleRunner) -> None:
+    def __init__(
+        self,
+        camera: Intrinsics,
+        settings: ReconstructionSettings,
+        bundle: BundleRunner,
+        on_moved: Callable[[float], None],
+    ) -> None:
         self._camera = camera
         self._settings = settings
         self._bundle = bundle
+        self._on_moved = on_moved
         self.watch = ReadoutWatch(camera, is_wanted=settings.watches_readout(camera))
         self.clear()
 
@@ -188,16 +197,13 @@ class MapBuilder:
         """Give lost landmarks of the newest keyframes their tracks back; ids of those found."""
         return recall_landmarks(self._mapped, tracks, sight, T_world_cam, reach_px=reach_px, wanted=wanted)
 
-    def revisit(
-        self, tracks: TrackTable, sight: Sight, T_world_cam: Array, on_moved: Callable[[float], None]
-    ) -> bool:
+    def revisit(self, tracks: TrackTable, sight: Sight, T_world_cam: Array) -> bool:
         """Use what was seen long ago and is in sight again: close a loop, take up landmarks.
 
         Args:
             tracks: Of a frame that becomes a keyframe; found landmarks get their tracks back.
             sight: Its image.
             T_world_cam: Its pose.
-            on_moved: Called with the scale of the newest keyframe after a loop has moved the map.
 
         Returns:
             Whether the map or the tracks have changed.
@@ -206,7 +212,7 @@ class MapBuilder:
         seen = tracks.visible
         view = LoopView(sight, T_world_cam, tracks.ids[seen], tracks.xy[seen])
         loop = self.loops.look(view, self.world, self.noise.model, self.submap, found)
-        closed = loop is not None and self._close(loop, on_moved)
+        closed = loop is not None and self._close(loop)
         if closed:
             T_now = self.world.pose_of_frame(sight.frame.frame_id)
             T_world_cam = T_world_cam if T_now is None else T_now
@@ -219,7 +225,7 @@ class MapBuilder:
         gate_px = GATE_SIGMAS * max(OLD_SIGMA_PX, self.noise.model.sigma0_px)
         return find_revisit(self._mapped, tracks.ids, sight, T_world_cam, gate_px=gate_px)
 
-    def _close(self, loop: Loop, on_moved: Callable[[float], None]) -> bool:
+    def _close(self, loop: Loop) -> bool:
         """Share out what drifted since the camera was at the loop's place; whether that was possible."""
         found = share_out(self.world, self.submap, loop)
         if found is None:
@@ -229,7 +235,7 @@ class MapBuilder:
         self.world.bend(keyframe_ids, solved.T_world_cam, solved.scale)
         self.world.revisits[loop.keyframe_id] = loop.place.keyframe_id
         self._adjusted = None
-        on_moved(float(solved.scale[-1]))
+        self._on_moved(float(solved.scale[-1]))
         logger.info("keyframe %d: a loop is closed, to keyframe %d", loop.keyframe_id, loop.place.keyframe_id)
         return True
 
@@ -247,7 +253,7 @@ class MapBuilder:
             return 0
         frame_id = sight.frame.frame_id
         logger.debug("frame %d: %d landmarks of keyframe %d again", frame_id, len(ids), found.keyframe_id)
-        mapper.note_sight(world, ids, np.ones(len(ids), bool), frame_id)
+        world.note_sight(ids, np.ones(len(ids), bool), frame_id)
         world.revisits[frame_id] = found.keyframe_id
         self.loops.note_tie()
         return len(ids)
@@ -265,17 +271,17 @@ class MapBuilder:
             frames_since: Frames since the newest keyframe.
         """
         ids, xy = tracks.ids[tracks.visible], tracks.xy[tracks.visible]
-        cues = mapper.KeyframeCues(
+        cues = KeyframeCues(
             num_inliers=num_inliers,
             num_inliers_at_keyframe=self.num_inliers_at_keyframe,
             num_visible=len(ids),
             max_features=self._settings.max_features,
-            median_flow_px=mapper.median_flow_px(reference, ids, xy),
+            median_flow_px=median_flow_px(reference, ids, xy),
             width_px=self._camera.width,
             frames_since=frames_since,
             usable_share=float(sight.usable.mean()),
         )
-        return mapper.wants_keyframe(cues)
+        return wants_keyframe(cues)
 
     def make_keyframe(self, sight: Sight, tracks: TrackTable, T_world_cam: Array) -> None:
         """Turn the newest frame into a keyframe, triangulate, and ask for an adjustment."""
@@ -322,7 +328,7 @@ class MapBuilder:
 
     def _add_landmarks(self, image: NDArray[np.uint8]) -> None:
         parallax_deg, noise = self._settings.min_parallax_deg, self.noise.model
-        mapper.add_landmarks(self.world, self._camera, noise, image, parallax_deg, enough=self.enough)
+        add_landmarks(self.world, self._camera, noise, image, parallax_deg, enough=self.enough)
 
     def _bound(self) -> None:
         """Keep the map, and the images of its keyframes, within its size."""
@@ -351,17 +357,17 @@ class MapBuilder:
         result = self._bundle.take(wait=wait)
         if result is None:
             return None
-        mapper.apply_result(self.world, result, self.noise)
+        apply_result(self.world, result, self.noise)
         place_left_out(self.world, self._camera, self.noise.model, result)
         if result.covariance is not None:
             self._adjusted = (int(result.problem.keyframe_ids[-1]), result.covariance)
         self.watch.take(result)
         return result
 
-    def finish(self, on_moved: Callable[[float], None]) -> None:
-        """Wait for an adjustment under way; ``on_moved`` is called after it has moved the map."""
+    def finish(self) -> None:
+        """Wait for an adjustment under way."""
         if self.collect(wait=True) is not None:
-            on_moved(1.0)
+            self._on_moved(1.0)
 
     def put_right(self, camera: Intrinsics, flows: Mapping[int, ImageFlow]) -> None:
         """Make up for a rolling shutter that was not known of, see ``put_map_right``, and adjust the map."""
@@ -372,35 +378,31 @@ class MapBuilder:
 
     def adjust_whole(self) -> int:
         """Adjust all keyframes with all they see, and say how many. Takes seconds where there are many."""
-        self.collect(wait=True)
+        self.finish()
         if not self._settings.final_adjustment:
             return 0
         num_adjusted = adjust_whole_map(self.world, self._camera, self.noise.model)
         if num_adjusted:
             self._adjusted = None
+            self._on_moved(1.0)
         return num_adjusted
 
-    def place_again(self, passage: Passage, on_moved: Callable[[float], None]) -> float:
-        """Move the current submap to where it is by now known to begin; the factor on lengths, else 1.
-
-        ``on_moved`` is called with it after the map has moved.
-        """
-        found = passage.lay_again(self.world, self.submap)
+    def place_again(self, placement: SubmapPlacement) -> float:
+        """Move the current submap to where it is by now known to begin; the factor on lengths, else 1."""
+        found = placement.place_again(self.world, self.submap)
         if found is None:
             return 1.0
         self._abandon_adjustment()
         self.world.transform_submap(self.submap, self.submap, *found)
         self._adjusted = None
-        on_moved(found[0])
+        self._on_moved(found[0])
         return found[0]
 
-    def join(
-        self,
-        place: Place,
-        T_world_cam: Array,
-        tracks: TrackTable,
-        on_moved: Callable[[float], None],
-    ) -> float | None:
+    def recognise_other_submap(self, sight: Sight) -> Place | None:
+        """Look for the place of an image in the submaps other than the current one."""
+        return self.relocaliser.find(sight, self.world, self.noise.model, self.other_submaps())
+
+    def join(self, place: Place, T_world_cam: Array, tracks: TrackTable) -> float | None:
         """Join the current submap and the one a place was recognised in.
 
         The older of the two stays where it is, for its place in the world was not guessed.
@@ -409,7 +411,6 @@ class MapBuilder:
             place: The newest frame's place in the other submap.
             T_world_cam: Its pose in the current one.
             tracks: Its tracks.
-            on_moved: Called with the scale that is returned, after the map has moved.
 
         Returns:
             The scale of the similarity that moved the current submap, 1 if it stayed; None if none was found.
@@ -435,7 +436,7 @@ class MapBuilder:
             scale = 1.0
         self.enter(min(self.submap, place.submap))
         self.world.revisits[self.world.keyframes[-1].frame_id] = place.keyframe_id
-        on_moved(scale)
+        self._on_moved(scale)
         return scale
 
     def take_update(self, map_epoch: int) -> MapUpdate | None:

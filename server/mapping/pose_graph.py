@@ -22,7 +22,7 @@ _FIXED_SIGMA = 1e-6
 
 
 @dataclass(frozen=True)
-class Edge:
+class PoseConstraint:
     """What is known of two keyframes.
 
     Attributes:
@@ -56,12 +56,12 @@ class SolvedGraph:
     cost: float
 
 
-def solve_graph(T_world_cam: Array, edges: Sequence[Edge]) -> SolvedGraph | None:
-    """Find the poses and scales that agree best with the edges; the first keyframe stays.
+def solve_graph(T_world_cam: Array, constraints: Sequence[PoseConstraint]) -> SolvedGraph | None:
+    """Find the poses and scales that agree best with the constraints; the first keyframe stays.
 
     Args:
         T_world_cam: ``(K, 4, 4)`` poses to begin with, all of scale 1.
-        edges: They must join all keyframes.
+        constraints: They must join all keyframes.
 
     Returns:
         The solution, None where there is none.
@@ -71,10 +71,10 @@ def solve_graph(T_world_cam: Array, edges: Sequence[Edge]) -> SolvedGraph | None
         values.insert(X(k), _similarity(T, 1.0))
     fixed = gtsam.noiseModel.Isotropic.Sigma(7, _FIXED_SIGMA)
     graph.add(gtsam.PriorFactorSimilarity3(X(0), values.atSimilarity3(X(0)), fixed))
-    for edge in edges:
-        noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(edge.sigma, (3, 3, 1)))
-        between = _similarity(edge.T_first_second, edge.scale)
-        graph.add(gtsam.BetweenFactorSimilarity3(X(edge.first), X(edge.second), between, noise))
+    for constraint in constraints:
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(constraint.sigma, (3, 3, 1)))
+        between = _similarity(constraint.T_first_second, constraint.scale)
+        graph.add(gtsam.BetweenFactorSimilarity3(X(constraint.first), X(constraint.second), between, noise))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(_MAX_ITERATIONS)
     try:

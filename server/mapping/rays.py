@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.mapper import median_depth
+from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import MAX_READOUT_MS, Intrinsics, ReadoutFrom
 from semcast.common.geometry import log_so3
-from semcast.server.mapping.left_over import (
+from semcast.server.mapping.residual_patterns import (
     COLUMNS,
     RESIDUAL,
     ROWS,
@@ -125,7 +125,7 @@ def fit_readout(views: Sequence[Array] | Array, axis: Axis | None = None) -> Rea
     """Return the readout time that views speak for, None where they say nothing.
 
     Args:
-        views: ``(8, 8)`` of each, as ``left_over.information`` gives them.
+        views: ``(8, 8)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
         axis: What is read one after the other, None for what explains more.
     """
     parts = grouped(views)

@@ -11,7 +11,7 @@ from semcast.common.camera import MAX_READOUT_MS, Intrinsics
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
 from semcast.server.mapping.lens_doubt import lens_doubt
 from semcast.server.mapping.readout import Axis, Readout, body_velocity, fit_readout
-from semcast.server.mapping.witnesses import Witnesses
+from semcast.server.mapping.residual_patterns import PatternEvidence
 from semcast.server.mapping.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ class ReadoutWatch:
         self._camera = camera
         self._is_done = not is_wanted
         self._axis: Axis | None = None
-        self._witnesses = Witnesses()
+        self._evidence = PatternEvidence()
         self._found: Readout | None = None
         self._lens_is_told = False
         self.forget_frames()
@@ -110,14 +110,14 @@ class ReadoutWatch:
 
     def take(self, result: BundleResult) -> None:
         """Take what an adjustment has told."""
-        if result.left_over is None or self._is_done or self._found is not None:
+        if result.pattern_products is None or self._is_done or self._found is not None:
             return
-        self._witnesses.note(result)
+        self._evidence.note(result)
         self._look_at_lens()
-        fit = fit_readout(self._witnesses.views, self._axis)
+        fit = fit_readout(self._evidence.views, self._axis)
         if fit is None:
             return
-        num_views, sigma_ms = len(self._witnesses), fit.sigma_ms * self._witnesses.sigma_factor
+        num_views, sigma_ms = len(self._evidence), fit.sigma_ms * self._evidence.sigma_factor
         logger.debug(
             "readout by %d views: %s, sigma %.2f ms, explains %.4f",
             num_views,
@@ -132,16 +132,16 @@ class ReadoutWatch:
         # An object in the middle of the image is read in no time: what its corners do wrong would take a
         # readout longer than any camera's, and images put right for that would be spoilt.
         if is_sure and least_ms <= fit.readout.ms <= MAX_READOUT_MS:
-            self._found, self._axis, self._witnesses = fit.readout, fit.readout.axis, Witnesses()
+            self._found, self._axis, self._evidence = fit.readout, fit.readout.axis, PatternEvidence()
         else:
             is_known = num_views >= _ENOUGH_VIEWS and sigma_ms <= _SURE_MS
             self._is_done = is_known or num_views >= _MOST_VIEWS
 
     def _look_at_lens(self) -> None:
         """Say once if the lens is clearly another one."""
-        if self._lens_is_told or len(self._witnesses) < _LENS_VIEWS:
+        if self._lens_is_told or len(self._evidence) < _LENS_VIEWS:
             return
-        doubt = lens_doubt(self._witnesses.views, self._witnesses.sigma_factor, self._camera)
+        doubt = lens_doubt(self._evidence.views, self._evidence.sigma_factor, self._camera)
         if doubt is not None:
             self._lens_is_told = True
             logger.warning("%s, by what is seen: semcast lens measures it", doubt)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.server.mapping import mapper
 from semcast.server.mapping.blank import result_of_nothing, shows_nothing
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.camera_motion import CameraMotion
@@ -19,12 +18,12 @@ from semcast.server.mapping.locator import Locator
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
-from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
+from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.tracker import TrackedPose
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import WorldMap
@@ -62,7 +61,7 @@ class Reconstruction:
         self._camera = camera
         self._settings = settings
         self._bundle = bundle
-        self._map = MapBuilder(camera, settings, bundle)
+        self._map = MapBuilder(camera, settings, bundle, self._moved)
         self._map_epoch = 0
         self._begin(settings.with_readout(camera))
 
@@ -72,7 +71,7 @@ class Reconstruction:
         self._initialiser = Initialiser(self._camera, s.confidence, s.min_parallax_deg, s.seed)
         self._motion = CameraMotion(self._camera)
         self._locator = Locator(self._camera, s, self._map, self._tracks, self._motion)
-        self._passage = Passage(self._camera, self._map.enough)
+        self._placement = SubmapPlacement(self._camera, self._map.enough)
         self._shutter = RollingShutter(camera, lambda: self._map.watch.is_on)
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
@@ -138,7 +137,7 @@ class Reconstruction:
             self._initialiser.clear()
         self._lap("track", since)
         result = self._track(sight, T_world_guess) if is_tracked else self._find(sight)
-        self._passage.note(sight, result.T_world_cam, self._motion, self._map.world)
+        self._placement.note(sight, result.T_world_cam, self._motion, self._map.world)
         self._shutter.keep_up()
         return result
 
@@ -201,7 +200,7 @@ class Reconstruction:
             self._on_pose(self._result(frame, pose.T_world_cam, pose, is_keyframe=is_keyframe))
         # The pose is on its way now, and nobody waits.
         self._moves_to(frame.frame_id, frame.t_source_ns, pose.T_world_cam, pose.ids[pose.inliers])
-        mapper.note_sight(self._map.world, pose.ids, pose.inliers, frame.frame_id)
+        self._map.world.note_sight(pose.ids, pose.inliers, frame.frame_id)
         if is_keyframe:
             since = time.perf_counter_ns()
             pose = self._improved(sight, pose)
@@ -210,14 +209,14 @@ class Reconstruction:
             self._frames_since_keyframe = 0
             self._lap("map", since)
             pose = pose.with_unit(self._try_to_join(sight, pose.T_world_cam))
-            pose = pose.with_unit(self._map.place_again(self._passage, self._moved))
+            pose = pose.with_unit(self._map.place_again(self._placement))
         return self._result(frame, self._last_pose(), pose, is_keyframe=is_keyframe)
 
     def _improved(self, sight: Sight, pose: TrackedPose) -> TrackedPose:
         """Take drift out of a keyframe to be: out of its tracks, and where the camera has been before."""
         if self._map.anchor(self._tracks, sight, pose.T_world_cam):
             pose = self._posed_anew(sight, pose.T_world_cam) or pose
-        if self._map.revisit(self._tracks, sight, pose.T_world_cam, self._moved):
+        if self._map.revisit(self._tracks, sight, pose.T_world_cam):
             T_world_guess = self._map.world.pose_of_frame(sight.frame.frame_id)
             assert T_world_guess is not None
             pose = self._posed_anew(sight, T_world_guess) or replace(pose, T_world_cam=T_world_guess)
@@ -236,16 +235,24 @@ class Reconstruction:
         """A frame without a running track: recognise a place, or work towards a new map."""
         if (found := self._recover(sight)) is not None:
             return self._accept(sight, found)
-        frame, tracks = sight.frame, self._tracks
         if self._state is TrackingState.LOST:
-            # An empty image is no sign of another place: only frames that a map could begin with count.
-            self._lost_ns += [frame.t_source_ns] if len(tracks) >= MIN_POINTS else []
-            if self._settings.gives_up(self._lost_ns, rested=self._motion.rests):
-                logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
-                self._state = TrackingState.INITIALIZING
-                self._map.world.forget_frames(self._motion.give_up())
-                self._begin_submap()
-        since = time.perf_counter_ns()
+            self._give_up_in_time(sight.frame)
+        start = self._look_for_start(sight)
+        return self._result(sight.frame, None, None) if start is None else self._begin_map(sight, start)
+
+    def _give_up_in_time(self, frame: DecodedFrame) -> None:
+        """Begin a new submap where the map has not been in sight for long."""
+        # An empty image is no sign of another place: only frames that a map could begin with count.
+        self._lost_ns += [frame.t_source_ns] if len(self._tracks) >= MIN_POINTS else []
+        if self._settings.gives_up(self._lost_ns, rested=self._motion.rests):
+            logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
+            self._state = TrackingState.INITIALIZING
+            self._map.world.forget_frames(self._motion.give_up())
+            self._begin_submap()
+
+    def _look_for_start(self, sight: Sight) -> Start | None:
+        """Keep a frame without a pose for the start of a map, and try to start one with it."""
+        since, tracks = time.perf_counter_ns(), self._tracks
         tracks.refill(sight)
         # Tracks of old landmarks serve to find back, not to start anew: a landmark has one id.
         visible = tracks.visible & (self._map.world.landmarks.rows(tracks.ids) < 0)
@@ -256,7 +263,7 @@ class Reconstruction:
         noise, suspect = self._map.noise.model, tracks.ids[tracks.suspect]
         start = self._initialiser.add(observed, noise, suspect, waits=waits)
         self._lap("two_view", since)
-        return self._result(frame, None, None) if start is None else self._begin_map(sight, start)
+        return start
 
     def _begin_submap(self) -> None:
         """Let the next start be a part of its own that shares no track with what came before.
@@ -298,9 +305,11 @@ class Reconstruction:
         """Bring a start into the map and pose the frames that waited for it."""
         since = time.perf_counter_ns()
         history = self._initialiser.history
-        self._map.finish(self._moved)  # a new part is placed by where the old one ends
+        self._map.finish()  # a new part is placed by where the old one ends
         grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
-        T_world_ref, scale = self._passage.lay(self._motion, start, grown, self._map.world, self._map.submap)
+        T_world_ref, scale = self._placement.place(
+            self._motion, start, grown, self._map.world, self._map.submap
+        )
         self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, history)
         noise, seed = self._map.noise.model, self._settings.seed
         backfilled = backfill(self._camera, self._map.world, grown.keyframes, history[:-1], noise, seed)
@@ -323,13 +332,12 @@ class Reconstruction:
     def _try_to_join(self, sight: Sight, T_world_cam: Array) -> float:
         """Look from time to time whether an older submap is in sight again; the factor on lengths, else 1."""
         self._keyframes_since_join += 1
-        others = self._map.other_submaps()
-        if not others or self._keyframes_since_join < _JOIN_INTERVAL:
+        if not self._map.other_submaps() or self._keyframes_since_join < _JOIN_INTERVAL:
             return 1.0
         since = time.perf_counter_ns()
         self._keyframes_since_join = 0
-        place = self._map.relocaliser.find(sight, self._map.world, self._map.noise.model, others)
-        scale = None if place is None else self._map.join(place, T_world_cam, self._tracks, self._moved)
+        place = self._map.recognise_other_submap(sight)
+        scale = None if place is None else self._map.join(place, T_world_cam, self._tracks)
         if scale is not None:
             logger.info("frame %d: submaps are joined", sight.frame.frame_id)
         self._lap("relocalise", since)
@@ -382,13 +390,11 @@ class Reconstruction:
 
     def conclude(self) -> int:
         """Adjust the whole map of a stream that has ended, if settings want it; the number of keyframes."""
-        if num_adjusted := self._map.adjust_whole():
-            self._moved(1.0)
-        return num_adjusted
+        return self._map.adjust_whole()
 
     def final_trajectory(self) -> dict[int, Array]:
         """Best current ``T_world_cam`` of all posed frames, by frame id; waits for a running adjustment."""
-        self._map.finish(self._moved)
+        self._map.finish()
         return self._map.world.trajectory()
 
     def landmarks(self) -> tuple[Ids, Array, NDArray[np.uint8], NDArray[np.float32]]:

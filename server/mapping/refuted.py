@@ -1,9 +1,9 @@
 """Tracks on something large that moves by itself, such as a lorry ahead, once there is a map.
 
-Keyframes refute tracks that no point at rest explains (``mapper.new_landmarks``). Where they are many, two
-things would go wrong without more care: tracks that have just begun beside them would hold the camera's
-rotation, and become landmarks by chance, as nothing refutes them yet; and a lorry that stays where it is in
-the image would make the camera seem to stand still, and keyframes be left out.
+Keyframes refute tracks that no point at rest explains (``new_landmarks``). Where they are many, two things
+would go wrong without more care: tracks that have just begun beside them would hold the camera's rotation,
+and become landmarks by chance, as nothing refutes them yet; and a lorry that stays where it is in the image
+would make the camera seem to stand still, and keyframes be left out.
 """
 
 import numpy as np

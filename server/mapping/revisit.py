@@ -23,7 +23,9 @@ from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
-from semcast.server.mapping.mapper import gather_observations, median_depth
+from semcast.server.mapping.new_landmarks import MAX_ERROR_SIGMA
+from semcast.server.mapping.observations import gather_observations
+from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -46,19 +48,20 @@ _MIN_EXPECTED = 30
 _MIN_AGREEING = 15
 #: The same as a share of those found.
 _MIN_SHARE = 0.6
+#: How alike the patches of a landmark must be, as their correlation.
 _MIN_CORRELATION = 0.75
 #: How far from its expected place an old landmark is followed: it is not exactly where the map has it.
 _REACH_PX = 40.0
 #: How far aligning its patch may then still move it.
 _MAX_MOVE_PX = 3.0
+#: Pyramid levels that reach so far.
 _KLT_LEVELS = 2
+#: A landmark is looked for no nearer to the border than this.
 _BORDER_PX = 10
 #: Keyframes before and after the old one that help to triangulate.
 _NEIGHBOURS = 6
 #: Rays must be further apart than this to tell a depth.
 _MIN_PARALLAX_DEG = 1.0
-#: RMS error at most, in standard deviations, with which the rays of a landmark must meet.
-_MAX_ERROR_SIGMA = 1.8
 #: A depth that changes by more than this factor (as a logarithm) is that of another point along the line.
 _MAX_LOG_DEPTH = 0.7
 
@@ -241,7 +244,7 @@ def place_anew(
     at_old = world.poses[found.keyframe_id][:3, 3]
     depth, depth_before = (np.linalg.norm(x - at_old, axis=1) for x in (xyz, before))
     change = np.abs(np.log(np.maximum(depth, 1e-9) / np.maximum(depth_before, 1e-9)))
-    sound = placed.in_front & (placed.error_sigma < _MAX_ERROR_SIGMA) & (change < _MAX_LOG_DEPTH)
+    sound = placed.in_front & (placed.error_sigma < MAX_ERROR_SIGMA) & (change < _MAX_LOG_DEPTH)
     good &= ~told | sound
     world.move_landmarks(ids[good & told], xyz[good & told])
     ok = found.points.ok.copy()

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from semcast.common.geometry import invert_transform, rotation_angle_deg
-from semcast.server.mapping.mapper import median_depth
-from semcast.server.mapping.pose_graph import Edge
+from semcast.server.mapping.pose_graph import PoseConstraint
+from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.thinning import is_gap
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -36,12 +36,12 @@ class Step(NamedTuple):
     """A constraint between two keyframes that are next to each other in the map.
 
     Attributes:
-        edge: Relative pose and its standard deviations; keyframes are numbered by their rows.
+        constraint: Relative pose and its standard deviations; keyframes are numbered by their rows.
         is_thinned: Whether keyframes between them were thinned out.
         is_gap: Whether something else than tracking led from one to the other.
     """
 
-    edge: Edge
+    constraint: PoseConstraint
     is_thinned: bool
     is_gap: bool
 
@@ -62,24 +62,26 @@ def steps_of(world: WorldMap, keyframes: Sequence[Keyframe]) -> Iterator[Step]:
             missing = is_gap(before, now)
         else:
             missing = bool(((before.frame_id < gaps) & (gaps <= now.frame_id)).any())
-        yield Step(_edge(world, before, now, row, num, missing), num > 1, missing)
+        yield Step(_constraint(world, before, now, row, num, missing), num > 1, missing)
 
 
-def _edge(world: WorldMap, before: Keyframe, now: Keyframe, row: int, num_steps: int, missing: bool) -> Edge:
+def _constraint(
+    world: WorldMap, before: Keyframe, now: Keyframe, row: int, num_steps: int, missing: bool
+) -> PoseConstraint:
     """Relative pose of the keyframe in ``row`` and the one before, which was ``num_steps`` keyframes ago."""
     T = invert_transform(before.T_world_cam) @ now.T_world_cam
     turn_rad = np.radians(rotation_angle_deg(T[:3, :3]))
     way = float(np.linalg.norm(T[:3, 3]))
     depth = usable_depth(world, now, way)
     if missing:
-        return Edge(row - 1, row, T, 1.0, (_GAP_RAD, way + depth, _GAP_SCALE))
+        return PoseConstraint(row - 1, row, T, 1.0, (_GAP_RAD, way + depth, _GAP_SCALE))
     grown = np.sqrt(num_steps)
     sigma = (
         grown * _STEP_RAD + _STEP_TURN * turn_rad,
         _STEP_WAY * way + grown * _STEP_DEPTH * depth,
         grown * _STEP_SCALE,
     )
-    return Edge(row - 1, row, T, 1.0, sigma)
+    return PoseConstraint(row - 1, row, T, 1.0, sigma)
 
 
 def usable_depth(world: WorldMap, keyframe: Keyframe, otherwise: float) -> float:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,14 +49,6 @@ _CARRY = (60, 0.6)
 _MIN_LEFT = 4
 #: The gate of a ray is widened by at most this factor for the uncertainty of the keyframe's observation.
 _MOST_WIDER = 3.0
-
-
-class Believing(TypedDict, total=False):
-    """When a pose is believed; see the arguments of ``track_pose`` of the same names."""
-
-    min_share: float
-    may_carry: bool
-    is_after_gap: bool
 
 
 @dataclass(frozen=True)
@@ -155,7 +146,6 @@ def track_pose(
     *,
     submap: int,
     seed: int,
-    min_inliers: int = MIN_INLIERS,
     min_share: float = MIN_BELIEVED_SHARE,
     may_carry: bool = False,
     is_after_gap: bool = False,
@@ -170,10 +160,10 @@ def track_pose(
         T_world_guess: Expected pose, or None to search for it.
         submap: Part of the map the camera is in.
         seed: Of the search.
-        min_inliers: Agreeing landmarks needed.
-        min_share: And their share of all that are in sight: fewer are a chance find.
+        min_share: Share of the landmarks in sight that must agree, ``MIN_INLIERS`` at least: fewer are a
+            chance find.
         may_carry: Where landmarks have all but run out, let many other tracks carry the guess on with fewer
-            than ``min_inliers``.
+            than ``MIN_INLIERS``.
         is_after_gap: Frames are missing before this one: what contradicts the guess must have more behind it.
 
     Returns:
@@ -181,8 +171,8 @@ def track_pose(
     """
     known = world.landmarks.rows(seen.ids) >= 0
     marks, others = _SeenLandmarks.of(seen[known], world, noise), seen[~known]
-    best = _pose_from_landmarks(camera, marks, T_world_guess, seed, min_inliers, is_after_gap=is_after_gap)
-    enough = max(min_inliers, min_share * len(marks.xyz))
+    best = _pose_from_landmarks(camera, marks, T_world_guess, seed, is_after_gap=is_after_gap)
+    enough = max(MIN_INLIERS, min_share * len(marks.xyz))
     if best is not None and (best.num_inliers < enough or not np.isfinite(best.T_cam_world).all()):
         best = None
     if best is None and may_carry and T_world_guess is not None and len(marks.xyz) < _RUN_OUT:
@@ -227,7 +217,6 @@ def _pose_from_landmarks(
     marks: _SeenLandmarks,
     T_world_guess: Array | None,
     seed: int,
-    min_inliers: int,
     *,
     is_after_gap: bool,
 ) -> PoseEstimate | None:
@@ -235,11 +224,11 @@ def _pose_from_landmarks(
     observed = (marks.xyz, marks.tracks.xy, marks.sigma_px, marks.gate_px)
     edge, count = marks.tracks.edge, len(marks.xyz)
     best: PoseEstimate | None = None
-    if T_world_guess is not None and count >= min_inliers:
+    if T_world_guess is not None and count >= MIN_INLIERS:
         best = refine_pose(camera, invert_transform(T_world_guess), *observed, edge=edge)
-    if best is None or best.num_inliers < max(min_inliers, _MIN_INLIER_SHARE * count):
+    if best is None or best.num_inliers < max(MIN_INLIERS, _MIN_INLIER_SHARE * count):
         least, share = _BELIEVED_AFTER_GAP if is_after_gap else (0, 0.0)
-        needed = max(min_inliers, least, math.ceil(share * count))
+        needed = max(MIN_INLIERS, least, math.ceil(share * count))
         searched = search_pose(camera, *observed, seed=seed, min_inliers=needed, edge=edge)
         if searched is not None and (best is None or searched.num_inliers > best.num_inliers):
             best = searched

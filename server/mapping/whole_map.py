@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.adjustment import drop_outliers, local_scales
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.bundle_problem import assemble_problem
-from semcast.server.mapping.mapper import drop_outliers, gather_observations, local_scales
-from semcast.server.mapping.pose_graph import Edge
+from semcast.server.mapping.observations import gather_observations
+from semcast.server.mapping.pose_graph import PoseConstraint
 from semcast.server.mapping.steps import steps_of
 from semcast.server.mapping.window import within_limit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -85,9 +86,11 @@ def adjust_whole_map(world: WorldMap, camera: Intrinsics, noise: NoiseModel) -> 
     return num_adjusted
 
 
-def _known_steps(world: WorldMap, keyframes: Sequence[Keyframe]) -> dict[int, Edge]:
+def _known_steps(world: WorldMap, keyframes: Sequence[Keyframe]) -> dict[int, PoseConstraint]:
     """Row of a keyframe -> the step to it, where keyframes were thinned out before it."""
-    return {s.edge.second: s.edge for s in steps_of(world, keyframes) if s.is_thinned and not s.is_gap}
+    return {
+        s.constraint.second: s.constraint for s in steps_of(world, keyframes) if s.is_thinned and not s.is_gap
+    }
 
 
 def _hanging_together(world: WorldMap, keyframes: Sequence[Keyframe]) -> list[list[Keyframe]]:
@@ -107,15 +110,17 @@ def _hanging_together(world: WorldMap, keyframes: Sequence[Keyframe]) -> list[li
 
 
 def _steps_within(
-    steps: dict[int, Edge], keyframes: Sequence[Keyframe], part: Sequence[Keyframe]
-) -> tuple[Edge, ...]:
+    steps: dict[int, PoseConstraint], keyframes: Sequence[Keyframe], part: Sequence[Keyframe]
+) -> tuple[PoseConstraint, ...]:
     """Steps between keyframes of a part, by rows of the part."""
     at = {k.frame_id: row for row, k in enumerate(part)}
     row = [at.get(k.frame_id) for k in keyframes]
-    ends = ((edge, row[edge.first], row[edge.second]) for edge in steps.values())
+    ends = ((constraint, row[constraint.first], row[constraint.second]) for constraint in steps.values())
     return tuple(
-        Edge(first, second, edge.T_first_second, edge.scale, _tightened(edge.sigma))
-        for edge, first, second in ends
+        PoseConstraint(
+            first, second, constraint.T_first_second, constraint.scale, _tightened(constraint.sigma)
+        )
+        for constraint, first, second in ends
         if first is not None and second is not None
     )
 
@@ -128,7 +133,7 @@ def _tightened(sigma: tuple[float, float, float]) -> tuple[float, float, float]:
 def _adjust(
     world: WorldMap,
     part: list[Keyframe],
-    steps: tuple[Edge, ...],
+    steps: tuple[PoseConstraint, ...],
     settled: list[Keyframe],
     camera: Intrinsics,
     noise: NoiseModel,

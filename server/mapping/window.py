@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.bundle_problem import BundleProblem, Observations, assemble_problem
-from semcast.server.mapping.mapper import gather_observations, median_depth
+from semcast.server.mapping.bundle_problem import BundleProblem, assemble_problem
+from semcast.server.mapping.observations import Observations, gather_observations
+from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Ids = NDArray[np.int64]

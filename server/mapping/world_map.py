@@ -18,6 +18,9 @@ from semcast.server.mapping.thinning import evenly_thinned, gaps_among, hung_on_
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
+#: Observations in a row that disagree before a landmark is given up.
+_MAX_MISSED = 4
+
 
 @dataclass
 class Keyframe:
@@ -44,8 +47,8 @@ class Keyframe:
     ids: Ids
     xy: Array
     confidence: Array
-    descriptor_ids: Ids
-    descriptors: NDArray[np.uint8]
+    descriptor_ids: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
+    descriptors: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
     refuted: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
     edge: Array = field(default_factory=alike)
 
@@ -149,6 +152,22 @@ class WorldMap:
         if bad.any():
             self._removed.update(self.landmarks.ids[bad].tolist())
             self.landmarks.keep(~bad)
+
+    def note_sight(self, ids: Ids, agrees: NDArray[np.bool_], frame_id: int) -> None:
+        """Note which landmarks a frame saw and which agreed with its pose; those that keep disagreeing go.
+
+        Args:
+            ids: ``(N,)`` landmarks the frame saw; those that are not there any more are passed over.
+            agrees: ``(N,)`` which agree with its pose.
+            frame_id: The frame.
+        """
+        row = self.landmarks.rows(ids)
+        there = row >= 0
+        row, agrees = row[there], agrees[there]
+        self.landmarks.last_seen[row[agrees]] = frame_id
+        self.landmarks.num_missed[row[agrees]] = 0
+        self.landmarks.num_missed[row[~agrees]] += 1
+        self.remove_landmarks(self.landmarks.num_missed >= _MAX_MISSED)
 
     def move_keyframe(self, frame_id: int, T_world_cam: Array) -> None:
         """Set the pose of a keyframe, thinned out or not."""

@@ -97,7 +97,6 @@ class ViewerFeed:
         recording_id: Names the run; a restarted server that uses the same one continues in the same viewer.
         truth: True path, or None.
         truth_times_ns: See ``Scene``.
-        has_confidence: Whether frames carry confidence maps.
         file: Where the recording goes, or None for no file.
         footer: Whether that ends with an index, see ``RerunStream``.
         process: The viewer to look after, perhaps handed over; None makes one as ``settings.view`` says.
@@ -115,7 +114,6 @@ class ViewerFeed:
         *,
         truth: Trajectory | None = None,
         truth_times_ns: NDArray[np.int64] | None = None,
-        has_confidence: bool = True,
         file: Path | None = None,
         footer: bool = True,
         process: ViewerProcess | None = None,
@@ -125,7 +123,6 @@ class ViewerFeed:
         self._camera = camera
         self._recording_id = recording_id
         self._has_truth = truth is not None
-        self._has_confidence = has_confidence
         self._footer = footer
         self._scene = Scene(truth, truth_times_ns)
         self._scene_lock = threading.Lock()
@@ -224,7 +221,7 @@ class ViewerFeed:
             recording_id=self._recording_id,
             camera=self._camera,
             has_truth=self._has_truth,
-            has_confidence=self._has_confidence,
+            has_confidence=True,
             file=file,
             footer=self._footer,
             port=self._settings.port,

@@ -14,7 +14,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError
 from semcast.evaluation import lens, moving_images
 from semcast.evaluation.lens import Lens, LensTrial
-from semcast.evaluation.moving_images import Heard, ImagesSettings
+from semcast.evaluation.moving_images import CameraEvidence, ImagesSettings
 from semcast.evaluation.scenes.render import RenderSettings, render_scene
 from semcast.server.mapping.lens import LensFit
 
@@ -43,11 +43,11 @@ def world_of(
     def tried(images, at: Lens, readout) -> LensTrial:
         off = focal / at.focal - 1.0
         bent = radial * (at.focal / focal) ** 2 - at.radial[0]  # in the units of the lens believed in
-        heard = Heard([], 0.2 + abs(off) + abs(bent), num_frames)
+        evidence = CameraEvidence([], 0.2 + abs(off) + abs(bent), num_frames)
         is_seen = at.num_radial or abs(bent) > 0.005
         told = (share * bent, 0.001) if is_seen else (0.0, 0.0)
         return LensTrial(
-            at, heard, LensFit(share * off, (told[0], 0.0), sigma_focal=sigma, sigma_radial=(told[1], 0.0))
+            at, evidence, LensFit(share * off, (told[0], 0.0), sigma_focal=sigma, sigma_radial=(told[1], 0.0))
         )
 
     return tried
@@ -76,7 +76,7 @@ def test_from_far_away_it_begins_again_nearer(images, monkeypatch):
             return near(images, at, readout)
         # Lost in a valley of its own.
         return LensTrial(
-            at, Heard([], 0.6 - 0.1 * at.focal, 60), LensFit(-0.05, (0.0, 0.0), sigma_focal=0.001)
+            at, CameraEvidence([], 0.6 - 0.1 * at.focal, 60), LensFit(-0.05, (0.0, 0.0), sigma_focal=0.001)
         )
 
     monkeypatch.setattr(lens, "_tried", tried)
@@ -111,12 +111,14 @@ def test_images_that_do_not_tell_are_refused(images, monkeypatch):
 
     def contradicts(images, at: Lens, readout) -> LensTrial:
         error_px = 0.2 + abs(at.focal - 1.0)
-        return LensTrial(at, Heard([], error_px, 60), LensFit(0.05, (0.0, 0.0), sigma_focal=0.001))
+        return LensTrial(at, CameraEvidence([], error_px, 60), LensFit(0.05, (0.0, 0.0), sigma_focal=0.001))
 
     monkeypatch.setattr(lens, "_tried", contradicts)
     with pytest.raises(SemcastError, match="these images don't tell the focal length"):
         lens.find_lens(settings_of(images))
-    monkeypatch.setattr(lens, "_tried", lambda _, at, readout: LensTrial(at, Heard([], 0.2, 60), None))
+    monkeypatch.setattr(
+        lens, "_tried", lambda _, at, readout: LensTrial(at, CameraEvidence([], 0.2, 60), None)
+    )
     with pytest.raises(SemcastError, match="these images don't tell the focal length"):
         lens.find_lens(settings_of(images))
     monkeypatch.setattr(lens, "_tried", world_of(1.0, num_frames=29))
@@ -129,7 +131,7 @@ def test_images_that_do_not_tell_are_refused(images, monkeypatch):
 def test_a_last_step_that_makes_it_worse_widens_the_bounds(images, monkeypatch):
     def tried(images, at: Lens, readout) -> LensTrial:
         error_px = 0.2 + abs(at.focal - 1.1)
-        return LensTrial(at, Heard([], error_px, 60), LensFit(0.08, (0.0, 0.0), sigma_focal=0.001))
+        return LensTrial(at, CameraEvidence([], error_px, 60), LensFit(0.08, (0.0, 0.0), sigma_focal=0.001))
 
     monkeypatch.setattr(lens, "_tried", tried)
     with pytest.raises(SemcastError, match="these images don't tell the focal length"):
@@ -146,7 +148,7 @@ def test_a_small_change_may_make_it_a_little_worse_by_chance(images, monkeypatch
         def tried(images, at: Lens, readout) -> LensTrial:
             steps = round((at.focal - 1.0) / 0.008)
             change = LensFit(0.008 if steps < 3 else 0.0, (0.0, 0.0), sigma_focal=0.004)
-            return LensTrial(at, Heard([], 0.2 * growth**steps, 60), change)
+            return LensTrial(at, CameraEvidence([], 0.2 * growth**steps, 60), change)
 
         return tried
 
@@ -202,7 +204,7 @@ def test_a_principal_point_that_was_moved_is_told(images, tmp_path, capsys, monk
         left = (0.04 - at.centre[0], -0.02 - at.centre[1])
         error_px = 0.2 + abs(left[0]) + abs(1.1 - at.focal)
         change = LensFit(1.1 / at.focal - 1.0, centre=left, sigma_focal=0.001, sigma_centre=(0.002, 0.001))
-        return LensTrial(at, Heard([], error_px, 60), change)
+        return LensTrial(at, CameraEvidence([], error_px, 60), change)
 
     monkeypatch.setattr(lens, "_tried", tried)
     out, result = tmp_path / "camera.json", tmp_path / "result.json"
@@ -222,7 +224,7 @@ def test_bounds_hold_what_is_not_modelled_besides_chance(images, monkeypatch):
             0.0, sigma_focal=0.005, sigma_radial=(0.002, 0.0), sigma_centre=(0.001, 0.001), unit=unit
         )
         bent = Lens(1.0, (0.05, 0.0), (0.01, 0.0))
-        trial = LensTrial(bent, Heard([], 0.2, 60), change)
+        trial = LensTrial(bent, CameraEvidence([], 0.2, 60), change)
         monkeypatch.setattr(lens, "_tried", lambda *_: trial)
         return lens.find_lens(settings_of(images))
 

@@ -10,13 +10,13 @@ from semcast.cli import main
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError
 from semcast.evaluation import moving_images, readout
-from semcast.evaluation.moving_images import Heard, ImagesSettings
+from semcast.evaluation.moving_images import CameraEvidence, ImagesSettings
 from semcast.evaluation.readout import Trial
 from semcast.evaluation.scenes import render
 from semcast.evaluation.scenes.render import RenderSettings, render_scene
 from semcast.server.mapping.readout import Readout, ReadoutFit
 
-HEARD = Heard([], 0.3, 60)
+EVIDENCE = CameraEvidence([], 0.3, 60)
 
 
 def says(true: Readout, share: float = 0.9, sigma_ms: float = 0.2, num_frames: int = 60):
@@ -25,7 +25,7 @@ def says(true: Readout, share: float = 0.9, sigma_ms: float = 0.2, num_frames: i
     def tried(images, at: Readout) -> Trial:
         missing = true.signed_ms - (at.signed_ms if at.axis == true.axis else 0.0)
         more = ReadoutFit(Readout(true.axis, share * missing), sigma_ms, 0.1)
-        return Trial(at, Heard([], 0.3 + 0.01 * abs(missing), num_frames), more)
+        return Trial(at, CameraEvidence([], 0.3 + 0.01 * abs(missing), num_frames), more)
 
     return tried
 
@@ -47,7 +47,9 @@ def test_what_is_left_of_the_readout_is_added_until_it_is_nothing(rolling, axis,
 
 def test_a_readout_that_makes_nothing_better_is_not_believed(rolling, monkeypatch):
     def tried(images, at: Readout) -> Trial:
-        return Trial(at, Heard([], 0.3 + 0.01 * at.ms, 60), ReadoutFit(Readout("rows", 2.0), 0.3, 0.01))
+        return Trial(
+            at, CameraEvidence([], 0.3 + 0.01 * at.ms, 60), ReadoutFit(Readout("rows", 2.0), 0.3, 0.01)
+        )
 
     monkeypatch.setattr(readout, "_tried", tried)
     found = readout.find_readout(ImagesSettings(source=str(rolling)))
@@ -66,7 +68,7 @@ def test_images_that_do_not_tell_are_refused(rolling, monkeypatch):
     monkeypatch.setattr(readout, "_tried", says(Readout("rows", 10.0), sigma_ms=3.0))
     with pytest.raises(SemcastError, match="these images don't tell the readout time"):
         readout.find_readout(settings)
-    monkeypatch.setattr(readout, "_tried", lambda images, at: Trial(at, HEARD, None))
+    monkeypatch.setattr(readout, "_tried", lambda images, at: Trial(at, EVIDENCE, None))
     with pytest.raises(SemcastError, match="these images don't tell the readout time"):
         readout.find_readout(settings)
     monkeypatch.setattr(readout, "_tried", says(Readout("rows", 10.0), num_frames=29))

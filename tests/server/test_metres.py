@@ -47,12 +47,10 @@ class Run:
         for number, T_map_marker in markers:
             T_cam_marker = invert_transform(T_world_cam) @ T_map_marker
             image = draw_marker(image, CAMERA, T_cam_marker, SIDE_M / UNIT_M, number)
-        none = np.zeros(0, np.int64)
         self.world.add_keyframe(
             Keyframe(
-                frame_id=k, t_source_ns=k, T_world_cam=T_world_cam, submap=part, ids=none,
-                xy=np.zeros((0, 2)), confidence=np.zeros(0), descriptor_ids=none,
-                descriptors=np.zeros((0, 32), np.uint8),
+                frame_id=k, t_source_ns=k, T_world_cam=T_world_cam, submap=part,
+                ids=np.zeros(0, np.int64), xy=np.zeros((0, 2)), confidence=np.zeros(0),
             )
         )  # fmt: skip
         result = result_of(k, part)

@@ -18,8 +18,9 @@ def _show(trial: LensTrial) -> None:
     if any(trial.lens.centre):
         x, y = trial.lens.centre
         bent += f", centre {x:+.4f} {y:+.4f}"
-    error = f", reprojection error {trial.heard.mean_px:.3f} px" if trial.heard.num_frames else ""
-    what = f"focal length x {trial.lens.focal:.4f}{bent}: {trial.heard.num_frames} frames with a pose{error}"
+    num_frames, mean_px = trial.evidence.num_frames, trial.evidence.mean_px
+    error = f", reprojection error {mean_px:.3f} px" if num_frames else ""
+    what = f"focal length x {trial.lens.focal:.4f}{bent}: {num_frames} frames with a pose{error}"
     print(what, file=sys.stderr, flush=True)
 
 

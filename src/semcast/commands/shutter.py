@@ -13,8 +13,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _show(trial: Trial) -> None:
-    error = f", reprojection error {trial.heard.mean_px:.3f} px" if trial.heard.num_frames else ""
-    what = f"{trial.readout!s:>20}: {trial.heard.num_frames} frames with a pose{error}"
+    error = f", reprojection error {trial.evidence.mean_px:.3f} px" if trial.evidence.num_frames else ""
+    what = f"{trial.readout!s:>20}: {trial.evidence.num_frames} frames with a pose{error}"
     print(what, file=sys.stderr, flush=True)
 
 

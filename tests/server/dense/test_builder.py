@@ -63,9 +63,8 @@ def add_keyframe(world, builder, k, *, x_m=None, turn_deg=0.0, submap=0, num_lan
     ids = np.arange(num_landmarks) + 1000 * k
     xy = np.random.default_rng(k).uniform((2, 2), (78, 58), (num_landmarks, 2))
     rays = np.column_stack([(xy - (CAMERA.cx, CAMERA.cy)) / CAMERA.fx, np.ones(num_landmarks)])
-    none, colours = np.zeros(0, np.int64), np.zeros((num_landmarks, 3), np.uint8)
-    ones = np.ones(num_landmarks)
-    world.add_keyframe(Keyframe(k, k, T_world_cam, submap, ids, xy, ones, none, np.zeros((0, 32), np.uint8)))
+    ones, colours = np.ones(num_landmarks), np.zeros((num_landmarks, 3), np.uint8)
+    world.add_keyframe(Keyframe(k, k, T_world_cam, submap, ids, xy, ones))
     world.add_landmarks(ids, transform_points(T_world_cam, WALL * rays), colours, ones, submap, k)
     image = np.full((60, 80, 3), 10 + k, np.uint8)
     builder.add_keyframe(k, image, np.full((60, 80), 0.25, np.float32))

@@ -24,9 +24,9 @@ def make_world(frame_ids=(0, 10), submap=0, world=None):
     for k in frame_ids:
         ids = np.arange(NUM_LANDMARKS) + 1000 * k
         T_world_cam = exp_se3(0.1 * np.random.default_rng(k).normal(size=6))
-        xy, ones, none = np.zeros((NUM_LANDMARKS, 2)), np.ones(NUM_LANDMARKS), np.zeros(0, np.int64)
-        descriptors, black = np.zeros((0, 32), np.uint8), np.zeros((NUM_LANDMARKS, 3), np.uint8)
-        world.add_keyframe(Keyframe(k, k, T_world_cam, submap, ids, xy, ones, none, descriptors))
+        xy, ones = np.zeros((NUM_LANDMARKS, 2)), np.ones(NUM_LANDMARKS)
+        black = np.zeros((NUM_LANDMARKS, 3), np.uint8)
+        world.add_keyframe(Keyframe(k, k, T_world_cam, submap, ids, xy, ones))
         xyz = np.random.default_rng(k).uniform((-1, -1, 2), (1, 1, 6), (NUM_LANDMARKS, 3))
         world.add_landmarks(ids, transform_points(T_world_cam, xyz), black, ones, submap, k)
     return world

@@ -29,8 +29,6 @@ def world_of_two_parts():
                 ids=ids,
                 xy=np.zeros((2, 2)),
                 confidence=np.ones(2),
-                descriptor_ids=np.zeros(0, np.int64),
-                descriptors=np.zeros((0, 32), np.uint8),
             )
         )
         world.add_landmarks(ids, np.ones((2, 3)), np.zeros((2, 3), np.uint8), np.ones(2), submap, frame_id)

@@ -30,7 +30,7 @@ def start_at(first, num=3, turn_deg=0.0, step=0.05):
     keyframes = [
         Keyframe(
             *(first + k, (first + k) * FRAME_NS, np.linalg.matrix_power(step, k), 1),
-            *(none, np.zeros((0, 2)), np.zeros(0), none, np.zeros((0, 32), np.uint8)),
+            *(none, np.zeros((0, 2)), np.zeros(0)),
         )
         for k in range(num)
     ]

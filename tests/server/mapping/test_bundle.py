@@ -14,7 +14,7 @@ from semcast.server.mapping import bundle, dense_bundle
 from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.bundle_process import ProcessBundle
-from semcast.server.mapping.pose_graph import Edge
+from semcast.server.mapping.pose_graph import PoseConstraint
 
 CAMERA = Intrinsics(fx=500.0, fy=480.0, cx=320.0, cy=240.0, width=640, height=480)
 
@@ -329,7 +329,7 @@ def test_sigmas_share_sixteen_models():
 
 def step_between(T_world_cam, first, second, sigma=(0.001, 0.001, 1.0)):
     T = invert_transform(T_world_cam[first]) @ T_world_cam[second]
-    return Edge(first, second, T, 1.0, sigma)
+    return PoseConstraint(first, second, T, 1.0, sigma)
 
 
 def test_a_view_that_saw_nothing_goes_where_a_step_leads():

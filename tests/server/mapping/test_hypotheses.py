@@ -3,10 +3,10 @@
 import numpy as np
 
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.ambiguity import Side
+from semcast.server.mapping.ambiguity import Structure
+from semcast.server.mapping.depth_reversal import mirrored
 from semcast.server.mapping.hypotheses import hypothesis_of, poses_in, problem_of
 from semcast.server.mapping.kept_frames import Observed
-from semcast.server.mapping.reversal import mirrored
 
 NOISE = NoiseModel(0.5, 0.0)
 
@@ -22,7 +22,9 @@ def views_of(problem):
 def test_later_frames_are_posed_in_the_structure_of_earlier_ones(arc):
     truth = arc(focal_px=600.0, depth=4.0, noise_px=0.3, num_views=8, turn_deg=16.0)
     camera, views = truth.camera, views_of(truth)
-    first = hypothesis_of(Side(truth.T_world_cam[:5], truth.xyz, 0.0, True, 0.7), views[:5], camera, NOISE)
+    first = hypothesis_of(
+        Structure(truth.T_world_cam[:5], truth.xyz, 0.0, True, 0.7), views[:5], camera, NOISE
+    )
     assert first.doubt == 0.7
     assert len(first.ids) > 100
     T = poses_in(first, views[2:], camera, NOISE, seed=0)
@@ -34,7 +36,7 @@ def test_a_mirror_image_stays_one_in_later_frames(arc, direction_error_deg):
     truth = arc(focal_px=2000.0, depth=12.0, noise_px=0.2, num_views=6, turn_deg=6.0)
     camera, views = truth.camera, views_of(truth)
     other = mirrored(truth)
-    carried = hypothesis_of(Side(other.T_world_cam[:4], other.xyz, 0.0, True), views[:4], camera, NOISE)
+    carried = hypothesis_of(Structure(other.T_world_cam[:4], other.xyz, 0.0, True), views[:4], camera, NOISE)
     T = poses_in(carried, [views[0], views[4], views[5]], camera, NOISE, seed=0)
     assert direction_error_deg(T, truth.T_world_cam) > 90.0
 
@@ -42,7 +44,7 @@ def test_a_mirror_image_stays_one_in_later_frames(arc, direction_error_deg):
 def test_a_structure_ends_with_the_frames_that_share_nothing_with_it(arc):
     truth = arc(focal_px=600.0, depth=4.0)
     camera, views = truth.camera, views_of(truth)
-    first = hypothesis_of(Side(truth.T_world_cam, truth.xyz, 0.0, True), views, camera, NOISE)
+    first = hypothesis_of(Structure(truth.T_world_cam, truth.xyz, 0.0, True), views, camera, NOISE)
     elsewhere = Observed(9, 9 * 10**8, views[0].ids + 1000, views[0].xy, views[0].confidence)
     assert poses_in(first, [views[0], elsewhere], camera, NOISE, seed=0) is None
 

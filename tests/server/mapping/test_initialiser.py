@@ -202,8 +202,8 @@ def test_structures_go_on_to_the_next_attempt_with_their_doubt(monkeypatch, hope
 
     def undecided(problem, carried, *, at_last):
         asked.append((problem, carried))
-        side = adjusted(problem)
-        return None, [side, replace(side, doubt=0.4), replace(side, **hopeless)]
+        structure = adjusted(problem)
+        return None, [structure, replace(structure, doubt=0.4), replace(structure, **hopeless)]
 
     monkeypatch.setattr("semcast.server.mapping.initialiser.decide", undecided)
     assert begin(frames) is None

@@ -11,8 +11,8 @@ import shaken_views
 from drawn_boards import CAMERA, ate_percent, make, render
 
 from semcast.common.geometry import exp_so3, make_transform
-from semcast.server.mapping.left_over import COLUMNS, ROWS
 from semcast.server.mapping.readout_watch import ReadoutWatch
+from semcast.server.mapping.residual_patterns import COLUMNS, ROWS
 from semcast.server.mapping.rolling_shutter import RollingShutter
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable
@@ -98,10 +98,10 @@ def test_a_readout_longer_than_any_camera_has_is_not_believed():
 
     def found(slower):
         """What is found where rows and columns are so many times closer in time than they seem."""
-        unit = np.ones(result.left_over.shape[-1])
+        unit = np.ones(result.pattern_products.shape[-1])
         unit[[ROWS, COLUMNS]] = 1.0 / slower
         watch = ReadoutWatch(shaken_views.CAMERA, is_wanted=True)
-        watch.take(replace(result, left_over=unit[:, None] * result.left_over * unit))
+        watch.take(replace(result, pattern_products=unit[:, None] * result.pattern_products * unit))
         assert watch.is_on, "views to come may tell"
         return watch.take_found()
 

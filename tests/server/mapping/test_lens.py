@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from shaken_views import CAMERA, adjusted
 
-from semcast.server.mapping.left_over import FOCAL, RADIAL, RESIDUAL, _lens_patterns, grouped, spread
 from semcast.server.mapping.lens import believed_lens, fit_lens
+from semcast.server.mapping.residual_patterns import FOCAL, RADIAL, RESIDUAL, _lens_patterns, grouped, spread
 
 
 @pytest.mark.parametrize("factor", [0.97, 1.02])
 def test_a_focal_length_that_is_wrong_is_found_in_what_an_adjustment_leaves(factor):
     camera = replace(CAMERA, fx=factor * CAMERA.fx, fy=factor * CAMERA.fy)
-    fit = fit_lens(adjusted(camera).left_over, num_radial=0)
+    fit = fit_lens(adjusted(camera).pattern_products, num_radial=0)
     assert fit.focal == pytest.approx(factor - 1.0, abs=0.004)  # one step of what is no straight line
     assert fit.radial == fit.sigma_radial == (0.0, 0.0)
     assert fit.sigma_focal < 0.003
@@ -23,33 +23,33 @@ def test_a_focal_length_that_is_wrong_is_found_in_what_an_adjustment_leaves(fact
 
 def test_distortion_is_told_from_focal_length():
     camera = replace(CAMERA, fx=1.01 * CAMERA.fx, fy=1.01 * CAMERA.fy)
-    fit = fit_lens(adjusted(camera, radial=-0.05).left_over, num_radial=1)
+    fit = fit_lens(adjusted(camera, radial=-0.05).pattern_products, num_radial=1)
     assert fit.radial[0] == pytest.approx(-0.05, abs=0.01)
     assert fit.focal == pytest.approx(0.01, abs=0.003)
     assert fit.sigma_radial[0] < 0.01
 
 
 def test_the_second_coefficient_is_told_from_the_first():
-    views = adjusted(CAMERA, radial=-0.1, radial_2=0.2).left_over
+    views = adjusted(CAMERA, radial=-0.1, radial_2=0.2).pattern_products
     fit = believed_lens(views)
     assert fit == fit_lens(views, num_radial=2)
     assert fit.radial == pytest.approx((-0.1, 0.2), abs=0.03)
     assert max(fit.sigma_radial) < 0.03
     assert abs(fit.focal) < 0.005
     # Once both are believed in they are asked for to the end, whatever they explain.
-    right = adjusted(CAMERA).left_over
+    right = adjusted(CAMERA).pattern_products
     assert believed_lens(right).sigma_radial == (0.0, 0.0)
     assert believed_lens(right, 2) == fit_lens(right, num_radial=2)
 
 
 def test_the_principal_point_is_found_once_the_rest_is_near():
     moved = replace(CAMERA, cx=CAMERA.cx + 8.0, cy=CAMERA.cy - 4.0)
-    views = adjusted(moved).left_over
+    views = adjusted(moved).pattern_products
     fit = believed_lens(views)
     assert fit == fit_lens(views, num_radial=0, with_centre=True)
     assert fit.centre == pytest.approx((8.0 / CAMERA.fx, -4.0 / CAMERA.fy), abs=0.004)
     assert max(fit.sigma_centre) < 0.004
-    far = adjusted(replace(moved, fx=1.12 * CAMERA.fx, fy=1.12 * CAMERA.fy)).left_over
+    far = adjusted(replace(moved, fx=1.12 * CAMERA.fx, fy=1.12 * CAMERA.fy)).pattern_products
     assert believed_lens(far).centre == (0.0, 0.0)
     assert believed_lens(far, with_centre=True).centre != (0.0, 0.0)
 
@@ -86,7 +86,7 @@ def test_patterns_are_how_pixels_change_with_the_lens(distortion):
 
 
 def test_a_lens_that_is_right_is_left_alone():
-    fit = fit_lens(adjusted(CAMERA).left_over, num_radial=1)
+    fit = fit_lens(adjusted(CAMERA).pattern_products, num_radial=1)
     assert abs(fit.focal) < 4 * fit.sigma_focal < 0.012
     assert abs(fit.radial[0]) < 4 * fit.sigma_radial[0] < 0.02
     assert fit.explained < 0.01
@@ -94,7 +94,7 @@ def test_a_lens_that_is_right_is_left_alone():
 
 def test_distortion_is_believed_where_it_explains_more():
     far = replace(CAMERA, fx=1.06 * CAMERA.fx, fy=1.06 * CAMERA.fy)
-    straight, bent = adjusted(far).left_over, adjusted(far, radial=-0.1).left_over
+    straight, bent = adjusted(far).pattern_products, adjusted(far, radial=-0.1).pattern_products
     assert believed_lens(straight) == fit_lens(straight, num_radial=0)
     fit = believed_lens(bent)
     assert fit == fit_lens(bent, num_radial=1)
@@ -124,7 +124,7 @@ def test_by_hand_the_change_is_the_slope_and_its_spread_that_of_what_is_left():
 
 
 def test_a_unit_of_change_doubles_the_squared_residuals_the_others_following():
-    views = adjusted(CAMERA, radial=-0.05).left_over
+    views = adjusted(CAMERA, radial=-0.05).pattern_products
     fit, total = fit_lens(views, num_radial=1), grouped(views).sum(axis=0)
     at = [FOCAL, RADIAL]
     for k, other in ((0, 1), (1, 0)):

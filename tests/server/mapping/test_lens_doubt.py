@@ -13,7 +13,7 @@ from semcast.server.mapping.lens_doubt import lens_doubt
 def doubt(focal=1.0, radial=0.0, centre_px=0.0, noise_px=0.2):
     """What is said of ``CAMERA`` by 24 views of another one."""
     camera = replace(CAMERA, fx=focal * CAMERA.fx, fy=focal * CAMERA.fy, cx=CAMERA.cx + centre_px)
-    views = [adjusted(camera, noise_px, seed, radial=radial).left_over for seed in range(2)]
+    views = [adjusted(camera, noise_px, seed, radial=radial).pattern_products for seed in range(2)]
     return lens_doubt(np.concatenate(views), 1.1, CAMERA)
 
 

@@ -59,7 +59,6 @@ def room(rng):
     angle, height = rng.uniform(0, 2 * np.pi, 3000), rng.uniform(-2, 2, 3000)
     xyz = np.column_stack((5 * np.sin(angle), height, 5 * np.cos(angle)))
     world = WorldMap()
-    none = np.zeros(0, np.int64), np.zeros((0, 32), np.uint8)
     known = np.zeros(0, np.int64)
     for k in range(NUM):
         T = around(k)
@@ -68,7 +67,7 @@ def room(rng):
         order = np.argsort(ids)
         ids, point, xy = ids[order], point[order], xy[order]
         believed = drifted(T, k)
-        world.add_keyframe(Keyframe(k, k * 10**8, believed, 0, ids, xy, np.ones(len(ids)), *none))
+        world.add_keyframe(Keyframe(k, k * 10**8, believed, 0, ids, xy, np.ones(len(ids))))
         new = ~np.isin(ids, known)
         known = np.union1d(known, ids)
         T_drift, scale = share_of_drift(k)

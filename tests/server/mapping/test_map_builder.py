@@ -59,7 +59,7 @@ class NewestFrame:
 
 @pytest.fixture
 def builder():
-    return MapBuilder(CAMERA, ReconstructionSettings(), Asked())
+    return MapBuilder(CAMERA, ReconstructionSettings(), Asked(), on_moved=print)
 
 
 def add_part(builder, submap, num_keyframes, first_id, seed=0):
@@ -90,8 +90,6 @@ def keyframe(frame_id, submap, ids, T_world_cam, xyz):
         ids=ids,
         xy=seen(xyz, T_world_cam),
         confidence=np.full(len(ids), 0.8),
-        descriptor_ids=np.zeros(0, np.int64),
-        descriptors=np.zeros((0, 32), np.uint8),
     )
 
 
@@ -163,7 +161,9 @@ def test_covariance_of_another_part_is_not_carried_over(builder):
 
 
 def test_parts_that_begin_and_are_lost_again_keep_the_map_within_its_size():
-    builder = MapBuilder(CAMERA, ReconstructionSettings(max_landmarks=500, max_keyframes=20), Asked())
+    builder = MapBuilder(
+        CAMERA, ReconstructionSettings(max_landmarks=500, max_keyframes=20), Asked(), on_moved=print
+    )
     rng = np.random.default_rng(0)
     xyz = rng.uniform((-0.5, -0.4, 0.8), (0.5, 0.4, 1.4), (150, 3))
     for part in range(10):

@@ -10,7 +10,8 @@ from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import ate
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
-from semcast.server.mapping.mapper import add_landmarks, median_flow_px
+from semcast.server.mapping.keyframe_rule import median_flow_px
+from semcast.server.mapping.new_landmarks import add_landmarks
 from semcast.server.mapping.rays import rays_of
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
 from semcast.server.mapping.refuted import on_something_large, with_neighbours
@@ -88,8 +89,6 @@ def keyframe(frame_id, T_world_cam, ids, xy):
         ids=ids,
         xy=xy,
         confidence=np.ones(len(ids)),
-        descriptor_ids=np.zeros(0, np.int64),
-        descriptors=np.zeros((0, 32), np.uint8),
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from semcast.common.geometry import exp_se3, invert_transform, make_transform, rotation_angle_deg
-from semcast.server.mapping.pose_graph import Edge, solve_graph
+from semcast.server.mapping.pose_graph import PoseConstraint, solve_graph
 
 SIGMA = (0.003, 0.02, 0.01)
 
@@ -33,13 +33,14 @@ def drifted(truth, rng, scale_step):
 
 def steps(poses):
     return [
-        Edge(k, k + 1, invert_transform(poses[k]) @ poses[k + 1], 1.0, SIGMA) for k in range(len(poses) - 1)
+        PoseConstraint(k, k + 1, invert_transform(poses[k]) @ poses[k + 1], 1.0, SIGMA)
+        for k in range(len(poses) - 1)
     ]
 
 
 def test_an_edge_says_where_and_how_large():
     first, apart = exp_se3([0.2, -0.1, 0.3, 1, 2, 3]), exp_se3([0.1, 0.4, -0.2, 0.5, -1, 2])
-    solved = solve_graph(np.stack([first, np.eye(4)]), [Edge(0, 1, apart, 1.7, (1.0, 1.0, 1.0))])
+    solved = solve_graph(np.stack([first, np.eye(4)]), [PoseConstraint(0, 1, apart, 1.7, (1.0, 1.0, 1.0))])
     np.testing.assert_allclose(solved.T_world_cam[0], first, atol=1e-6)
     np.testing.assert_allclose(solved.T_world_cam[1], first @ apart, atol=1e-5)
     np.testing.assert_allclose(solved.scale, [1.0, 1.7], atol=1e-5)
@@ -51,7 +52,7 @@ def test_a_loop_takes_out_what_drifted(rng, scale_step):
     truth = circle(60)
     path, scale = drifted(truth, rng, scale_step)
     where_first_is_again = invert_transform(truth[0]) @ truth[-1]
-    loop = Edge(0, 59, where_first_is_again, 1.0 / scale[-1], (0.001, 0.005, 0.01))
+    loop = PoseConstraint(0, 59, where_first_is_again, 1.0 / scale[-1], (0.001, 0.005, 0.01))
     solved = solve_graph(path, [*steps(path), loop])
 
     def error(poses):
@@ -65,9 +66,9 @@ def test_a_loop_takes_out_what_drifted(rng, scale_step):
 
 def test_edges_are_weighed_by_what_they_are_worth():
     poses = np.stack([make_transform(np.eye(3), [k, 0, 0]) for k in range(3)])
-    loop = Edge(0, 2, make_transform(np.eye(3), [3.0, 0, 0]), 1.0, (1.0, 1e-4, 1.0))
-    sure = Edge(0, 1, make_transform(np.eye(3), [1.0, 0, 0]), 1.0, (0.01, 0.01, 0.001))
-    doubtful = Edge(1, 2, make_transform(np.eye(3), [1.0, 0, 0]), 1.0, (0.01, 0.1, 0.001))
+    loop = PoseConstraint(0, 2, make_transform(np.eye(3), [3.0, 0, 0]), 1.0, (1.0, 1e-4, 1.0))
+    sure = PoseConstraint(0, 1, make_transform(np.eye(3), [1.0, 0, 0]), 1.0, (0.01, 0.01, 0.001))
+    doubtful = PoseConstraint(1, 2, make_transform(np.eye(3), [1.0, 0, 0]), 1.0, (0.01, 0.1, 0.001))
     x = solve_graph(poses, [sure, doubtful, loop]).T_world_cam[:, 0, 3]
     assert x[2] == pytest.approx(3.0, abs=0.01)
     # The error is shared out by variance: 1 to 100.

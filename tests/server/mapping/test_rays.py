@@ -41,8 +41,6 @@ def scene(num_landmarks, seed=0, noise_px=0.5):
             ids=ids,
             xy=xy + noise_px * rng.standard_normal(xy.shape),
             confidence=np.ones(NUM),
-            descriptor_ids=np.zeros(0, np.int64),
-            descriptors=np.zeros((0, 32), np.uint8),
         )
     )
     some = slice(0, num_landmarks)

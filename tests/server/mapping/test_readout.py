@@ -8,15 +8,15 @@ from shaken_views import CAMERA, NUM_VIEWS, SIZE_WH, adjusted, pose_at, rolling_
 
 from semcast.common.geometry import exp_se3, invert_transform, transform_points
 from semcast.server.mapping.bundle_problem import ViewMotion
-from semcast.server.mapping.left_over import information
 from semcast.server.mapping.readout import Readout, body_velocity, fit_readout, lean
+from semcast.server.mapping.residual_patterns import pattern_products_of
 
 
 @pytest.mark.parametrize("readout_from", ["top", "bottom", "left", "right"])
 def test_the_readout_and_its_side_are_found_in_what_an_adjustment_leaves(readout_from):
     result = adjusted(replace(CAMERA, readout_ms=20.0, readout_from=readout_from))
-    assert result.left_over.shape == (NUM_VIEWS, 8, 8)
-    fit = fit_readout(result.left_over)
+    assert result.pattern_products.shape == (NUM_VIEWS, 8, 8)
+    fit = fit_readout(result.pattern_products)
     assert fit.readout.side == readout_from
     assert fit.readout.ms == pytest.approx(20.0, abs=1.5)
     assert fit.sigma_ms < 1.5
@@ -24,14 +24,14 @@ def test_the_readout_and_its_side_are_found_in_what_an_adjustment_leaves(readout
 
 
 def test_noise_alone_looks_like_no_rolling_shutter():
-    fit = fit_readout(adjusted(CAMERA).left_over)
+    fit = fit_readout(adjusted(CAMERA).pattern_products)
     assert fit.readout.ms < 4 * max(fit.sigma_ms, 0.05)
     assert fit.readout.ms < 1.0
     assert fit.explained < 0.01
 
 
 def test_an_axis_that_is_known_is_kept():
-    views = adjusted(replace(CAMERA, readout_ms=20.0, readout_from="bottom")).left_over
+    views = adjusted(replace(CAMERA, readout_ms=20.0, readout_from="bottom")).pattern_products
     assert fit_readout(views, "rows") == fit_readout(views)
     across = fit_readout(views, "columns")
     assert across.readout.axis == "columns"
@@ -39,15 +39,15 @@ def test_an_axis_that_is_known_is_kept():
 
 
 def test_without_movement_nothing_is_said():
-    assert adjusted(CAMERA, velocities=False).left_over is None
+    assert adjusted(CAMERA, velocities=False).pattern_products is None
     result = adjusted(CAMERA)
     motion = ViewMotion(SIZE_WH, np.full((NUM_VIEWS, 6), np.nan))
-    told = information(result.problem, motion, result.T_world_cam, result.xyz, result.residual_px)
+    told = pattern_products_of(result.problem, motion, result.T_world_cam, result.xyz, result.residual_px)
     assert not told.any()
     assert fit_readout(told) is None
     assert fit_readout(np.zeros((0, 8, 8))) is None
     still = replace(motion, velocity=np.zeros((NUM_VIEWS, 6)))
-    told = information(result.problem, still, result.T_world_cam, result.xyz, result.residual_px)
+    told = pattern_products_of(result.problem, still, result.T_world_cam, result.xyz, result.residual_px)
     assert fit_readout(told) is None
 
 

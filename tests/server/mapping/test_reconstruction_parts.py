@@ -20,9 +20,9 @@ from semcast.server.mapping.initialiser import MIN_POINTS
 from semcast.server.mapping.locator import Locator
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_builder import MapBuilder
-from semcast.server.mapping.passage import Passage
 from semcast.server.mapping.relocalisation import Place, Relocaliser
 from semcast.server.mapping.state import TrackingState
+from semcast.server.mapping.submap_placement import SubmapPlacement
 
 
 def test_another_place_becomes_a_map_of_its_own(room):
@@ -282,13 +282,13 @@ def made_bad(image, rng):
 
 def test_a_part_after_a_turn_in_bad_images_begins_as_they_say_and_gets_its_unit_after_a_second(monkeypatch):
     """No point can be followed while the camera turns; a start makes the part too large."""
-    lay, rng = Passage.lay, np.random.default_rng(0)
+    lay, rng = SubmapPlacement.place, np.random.default_rng(0)
 
-    def laid_too_large(passage, *how):
-        T_world_ref, scale = lay(passage, *how)
-        return T_world_ref, scale if passage._before is None else 1.5 * scale
+    def laid_too_large(placement, *how):
+        T_world_ref, scale = lay(placement, *how)
+        return T_world_ref, scale if placement._before is None else 1.5 * scale
 
-    monkeypatch.setattr(Passage, "lay", laid_too_large)
+    monkeypatch.setattr(SubmapPlacement, "place", laid_too_large)
     truth, images = turn_in_bad_images(42)
     core, results = make(lost_after_s=0.05), []
     for k, image in enumerate(images):

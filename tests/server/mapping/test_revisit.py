@@ -73,8 +73,7 @@ def mapped():
         tracks.adopt(again, xy[again], 1.0)
         tracks.next_id = next_id
         tracks.refill(sight)
-        none = np.zeros(0, np.int64), np.zeros((0, 32), np.uint8)
-        world.add_keyframe(Keyframe(k, k * 10**8, T, 0, tracks.ids, tracks.xy, tracks.confidence, *none))
+        world.add_keyframe(Keyframe(k, k * 10**8, T, 0, tracks.ids, tracks.xy, tracks.confidence))
         new = tracks.ids >= next_id
         next_id = tracks.next_id
         xyz = on_wall(T, tracks.xy[new])
@@ -183,7 +182,7 @@ def reused(mapped, T_world_cam, T_believed=None, max_landmarks=20_000, young=40)
     """A map builder after a frame that came back, its tracks, and the landmarks taken up."""
     world, images = mapped
     settings = ReconstructionSettings(confidence="off", max_features=120, max_landmarks=max_landmarks)
-    builder = MapBuilder(CAMERA, settings, InlineBundle())
+    builder = MapBuilder(CAMERA, settings, InlineBundle(), on_moved=print)
     builder.world, builder.images = world, images
     sight = sight_from(T_world_cam, 100)
     tracks = TrackTable("off", young, 0)
@@ -191,7 +190,7 @@ def reused(mapped, T_world_cam, T_believed=None, max_landmarks=20_000, young=40)
     tracks.remember(sight)
     tracks.refill(sight)
     T_believed = T_world_cam if T_believed is None else T_believed
-    changed = builder.revisit(tracks, sight, T_believed, lambda scale: None)
+    changed = builder.revisit(tracks, sight, T_believed)
     again = tracks.ids[world.landmarks.rows(tracks.ids) >= 0]
     assert changed == (len(again) > 0)
     assert np.all(np.diff(tracks.ids) > 0)
@@ -293,7 +292,8 @@ def test_an_adjustment_with_them_takes_the_drift_out_of_the_newest_pose(mapped):
 
 def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped):
     world, images = mapped
-    builder = MapBuilder(CAMERA, ReconstructionSettings(confidence="off", max_features=120), InlineBundle())
+    settings, moved = ReconstructionSettings(confidence="off", max_features=120), []
+    builder = MapBuilder(CAMERA, settings, InlineBundle(), on_moved=moved.append)
     builder.world, builder.images = world, images
     true, scale = pose(0.1, 0.05), 1.1
     drift = pose(0.02, 0.03, 0.02, (0.3, 0.4, 0.0))
@@ -306,15 +306,13 @@ def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped
     # The young tracks have landmarks already, in the drifted part's place and unit.
     young = scale * on_wall(true, tracks.xy) @ drift[:3, :3].T + drift[:3, 3]
     newest, young_ids = 90, tracks.ids
-    none = np.zeros(0, np.int64), np.zeros((0, 32), np.uint8)
     seen = tracks.ids, tracks.xy, tracks.confidence
-    world.add_keyframe(Keyframe(newest, newest * 10**8, drift @ pose(0.2 * scale), 0, *seen, *none))
+    world.add_keyframe(Keyframe(newest, newest * 10**8, drift @ pose(0.2 * scale), 0, *seen))
     colour = np.zeros((len(young), 3), np.uint8)
     world.add_landmarks(young_ids, young, colour, np.ones(len(young)), 0, newest)
     world.add_frame(100, newest, believed)
     before = world.landmarks.xyz[world.landmarks.born == 0].copy()
-    moved = []
-    assert builder.revisit(tracks, sight, believed, moved.append)
+    assert builder.revisit(tracks, sight, believed)
     assert moved == [pytest.approx(1 / scale, rel=0.04)]
     np.testing.assert_allclose(world.pose_of_frame(100)[:3, 3], true[:3, 3], atol=0.03)
     xyz_young = world.landmarks.xyz[world.landmarks.rows(young_ids)]

@@ -9,8 +9,7 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 
 def make_keyframe(frame_id, T_world_cam, ids):
-    none = np.zeros(0, np.int64), np.zeros((0, 32), np.uint8)
-    return Keyframe(frame_id, frame_id, T_world_cam, 0, ids, np.zeros((10, 2)), np.ones(10), *none)
+    return Keyframe(frame_id, frame_id, T_world_cam, 0, ids, np.zeros((10, 2)), np.ones(10))
 
 
 @pytest.mark.parametrize(
@@ -38,9 +37,9 @@ def test_how_well_a_step_is_known_by_hand(num_shared, num_steps, gaps, sigma, is
     world.add_landmarks(ids, xyz, np.zeros((10, 3), np.uint8), np.ones(10), 0, 1)
     (step,) = steps_of(world, world.keyframes)
     assert (step.is_thinned, step.is_gap) == (num_steps > 1, is_gap)
-    assert (step.edge.first, step.edge.second, step.edge.scale) == (0, 1, 1.0)
-    np.testing.assert_allclose(step.edge.T_first_second, invert_transform(before) @ now, atol=1e-12)
-    assert step.edge.sigma == pytest.approx(sigma)
+    assert (step.constraint.first, step.constraint.second, step.constraint.scale) == (0, 1, 1.0)
+    np.testing.assert_allclose(step.constraint.T_first_second, invert_transform(before) @ now, atol=1e-12)
+    assert step.constraint.sigma == pytest.approx(sigma)
 
 
 @pytest.mark.parametrize("behind", [1, 17, 33])
@@ -65,5 +64,7 @@ def test_a_submap_that_was_joined_to_another_begins_with_a_gap():
         world.bound(max_landmarks=100, max_keyframes=20, recent=5)
     assert world.keyframe(13) is None
     world.transform_submap(1, 0, 1.0, np.eye(4))
-    gaps = [world.keyframes[s.edge.second].frame_id for s in steps_of(world, world.keyframes) if s.is_gap]
+    gaps = [
+        world.keyframes[s.constraint.second].frame_id for s in steps_of(world, world.keyframes) if s.is_gap
+    ]
     assert gaps == [min(k.frame_id for k in world.keyframes if k.frame_id > 13)]

@@ -279,8 +279,6 @@ def mapped():
             ids=tracks.ids.copy(),
             xy=tracks.xy.copy(),
             confidence=tracks.confidence.copy(),
-            descriptor_ids=np.zeros(0, np.int64),
-            descriptors=np.zeros((0, 32), np.uint8),
         )
     )
     xyz = CAMERA.unproject(tracks.xy)

@@ -76,8 +76,6 @@ def keyframe(k, T_world_cam, ids, xy):
         ids=ids,
         xy=xy,
         confidence=np.ones(len(ids)),
-        descriptor_ids=np.zeros(0, np.int64),
-        descriptors=np.zeros((0, 32), np.uint8),
     )
 
 

@@ -1,18 +1,18 @@
 """What an adjustment takes of what keyframes saw."""
 
 import numpy as np
+import pytest
+from cloud_of_points import CAMERA, IMAGE, NOISE, make_world, put_landmarks
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
-from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping import window
+from semcast.server.mapping.bundle import optimise
+from semcast.server.mapping.new_landmarks import add_landmarks
 from semcast.server.mapping.window import build_problem, within_limit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Ids = NDArray[np.int64]
-
-CAMERA = Intrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 
 #: Of eight landmarks so many observations each, in any order.
 COUNT = np.array([2, 5, 1, 3, 5, 2, 4, 3])
@@ -51,7 +51,7 @@ def test_the_newest_keyframe_keeps_its_part_where_long_tracks_would_take_all(mon
     for k in range(20):
         ids = long_seen if k < 18 else np.concatenate([long_seen[:4], new])
         world.add_keyframe(_keyframe(k, ids))
-    problem = build_problem(world, CAMERA, NoiseModel(0.5, 0.0), 10)
+    problem = build_problem(world, CAMERA, NOISE, 10)
     assert problem is not None
     assert len(problem.xy) <= 400
     newest = problem.landmark_ids[problem.point[problem.view == len(problem.fixed) - 1]]
@@ -69,6 +69,74 @@ def _keyframe(number: int, ids: Ids) -> Keyframe:
         ids=ids,
         xy=np.full((len(ids), 2), 100.0),
         confidence=np.ones(len(ids)),
-        descriptor_ids=np.zeros(0, np.int64),
-        descriptors=np.zeros((0, 32), np.uint8),
     )
+
+
+def test_a_large_window_is_cut_to_what_several_keyframes_see():
+    world, _, _ = make_world(10, 600)
+    add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)
+    for keyframe in world.keyframes[:8]:
+        keyframe.drop_observations(keyframe.ids % 2 == 1)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    assert problem is not None
+    assert len(problem.xy) <= window.MAX_OBSERVATIONS
+    assert (problem.landmark_ids % 2 == 0).sum() >= (world.landmarks.ids % 2 == 0).sum() - 1
+
+
+def test_there_is_nothing_to_adjust_at_first():
+    world, _, _ = make_world(2)
+    assert build_problem(world, CAMERA, NOISE, 10) is None
+    add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)
+    assert build_problem(world, CAMERA, NOISE, 10) is None
+    assert build_problem(world, CAMERA, NOISE, 10, start=True) is not None
+
+
+def test_the_first_adjustment_of_a_map_is_held_by_a_pose_and_a_distance():
+    world, points, _ = make_world(num_keyframes=4)
+    put_landmarks(world, points)
+    for start in (True, False):
+        problem = build_problem(world, CAMERA, NOISE, 10, start=start)
+        assert problem.fixed.tolist() == [True, not start, False, False]
+        assert problem.keep_baseline == start
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_keyframes_before_the_window_keep_its_scale_where_keyframes_are_dense(monkeypatch, seed):
+    """Ten keyframes within 1/70 of the depth hardly know a scale; those before saw the same landmarks."""
+    way = np.concatenate([0.3 * np.arange(6), 1.5 + 0.01 * np.arange(1, 11)])
+    error = {}
+    for num_before in (0, window._MAX_BEFORE):
+        monkeypatch.setattr(window, "_MAX_BEFORE", num_before)
+        world, points, _ = make_world(noise_px=0.5, step=0.0, seed=seed, way=way)
+        put_landmarks(world, points * np.random.default_rng(seed).uniform(0.95, 1.05, (len(points), 1)))
+        problem = build_problem(world, CAMERA, NOISE, 10)
+        assert problem.num_anchors == num_before
+        assert problem.fixed.sum() == (2 if num_before == 0 else num_before + 1)
+        xyz = optimise(problem).xyz
+        error[num_before > 0] = abs(np.log(np.median(xyz[:, 2] / points[problem.landmark_ids, 2])))
+    assert error[True] < 0.01
+    assert error[False] > 3 * error[True]
+
+
+@pytest.mark.parametrize(("step", "first_held"), [(0.05, 0), (0.3, 5)])
+def test_a_window_of_some_extent_is_not_held_by_the_start_of_the_map(step, first_held):
+    world, points, _ = make_world(num_keyframes=14, step=step)
+    put_landmarks(world, points)
+    assert (build_problem(world, CAMERA, NOISE, 10).num_anchors > 0) == (first_held == 0)
+    world, points, _ = make_world(num_keyframes=34, step=step)
+    put_landmarks(world, points)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    assert problem.num_anchors > 1
+    assert problem.keyframe_ids[0] // 10 == first_held
+    assert problem.fixed.sum() == problem.num_anchors + 1
+
+
+def test_of_many_keyframes_before_the_window_some_hold_it_evenly():
+    world, points, _ = make_world(num_keyframes=40, step=0.02)
+    put_landmarks(world, points)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    before = problem.keyframe_ids[: problem.num_anchors] // 10
+    assert before.tolist() == [0, 5, 11, 17, 23, 29]
+    for keyframe in world.keyframes[:30]:
+        keyframe.drop_observations(keyframe.ids >= 5)
+    assert build_problem(world, CAMERA, NOISE, 10).num_anchors == 0, "five landmarks in common say little"

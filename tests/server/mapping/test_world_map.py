@@ -264,3 +264,15 @@ def test_an_empty_map_travels_too():
     world.restore(WorldMap().arrays())
     assert world.trajectory() == {}
     assert len(world.observations()[0]) == 0
+
+
+def test_a_landmark_that_keeps_disagreeing_is_given_up():
+    world = make_world()
+    bad = world.landmarks.ids[[2]]
+    for frame_id in range(3):
+        world.note_sight(bad, np.array([False]), frame_id)
+    world.note_sight(bad, np.array([True]), 3)
+    for frame_id in range(4, 8):
+        assert world.landmarks.rows(bad)[0] >= 0
+        world.note_sight(bad, np.array([False]), frame_id)
+    assert world.landmarks.rows(bad)[0] == -1

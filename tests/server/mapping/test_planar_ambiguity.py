@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from semcast.common.geometry import invert_transform
-from semcast.server.mapping.planar import twin
+from semcast.server.mapping.planar_ambiguity import twin
 
 
 def test_the_twin_shows_the_same_images_from_elsewhere(wall, projected, relative, direction_error_deg):

@@ -8,35 +8,34 @@ from shaken_views import CAMERA, SIZE_WH, STEP_S, pose_at
 
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.mapping.bundle_problem import BundleProblem, ViewMotion
-from semcast.server.mapping.left_over import information
 from semcast.server.mapping.readout import body_velocity, fit_readout
 from semcast.server.mapping.readout_watch import ReadoutWatch
-from semcast.server.mapping.witnesses import Witnesses
+from semcast.server.mapping.residual_patterns import PatternEvidence, pattern_products_of
 
 NUM_VIEWS = 28
 #: Of ten groups, by which nine differences tell a standard deviation.
 STUDENT_95 = 2.262
 
 
-def result_of(keyframe_ids, left_over):
+def result_of(keyframe_ids, pattern_products):
     """Of 40 points in three views each, of which one observation is not used."""
     residual_px = np.zeros((120, 2))
     residual_px[7, 1] = np.nan
     problem = SimpleNamespace(
         keyframe_ids=np.array(keyframe_ids), view=np.repeat(np.arange(3), 40), point=np.tile(np.arange(40), 3)
     )
-    return SimpleNamespace(problem=problem, residual_px=residual_px, left_over=left_over)
+    return SimpleNamespace(problem=problem, residual_px=residual_px, pattern_products=pattern_products)
 
 
 def test_what_a_keyframe_says_in_two_windows_counts_as_of_one_witness():
-    witnesses = Witnesses()
-    assert (len(witnesses), witnesses.views, witnesses.sigma_factor) == (0, [], 1.0)
+    evidence = PatternEvidence()
+    assert (len(evidence), evidence.views, evidence.sigma_factor) == (0, [], 1.0)
     for keyframe_ids in ([3, 1, 2], [2, 3, 4]):
-        witnesses.note(result_of(keyframe_ids, np.stack([np.full((8, 8), float(k)) for k in keyframe_ids])))
-    witnesses.note(result_of([4, 5, 6], None))
-    assert len(witnesses) == 4
-    assert [view[0, 0] for view in witnesses.views] == [1.0, 4.0, 6.0, 4.0]
-    assert witnesses.sigma_factor == pytest.approx((1.0 - (6 * 3 + 3 * 40) / (2 * 119)) ** -0.5)
+        evidence.note(result_of(keyframe_ids, np.stack([np.full((8, 8), float(k)) for k in keyframe_ids])))
+    evidence.note(result_of([4, 5, 6], None))
+    assert len(evidence) == 4
+    assert [view[0, 0] for view in evidence.views] == [1.0, 4.0, 6.0, 4.0]
+    assert evidence.sigma_factor == pytest.approx((1.0 - (6 * 3 + 3 * 40) / (2 * 119)) ** -0.5)
 
 
 def test_as_many_unknowns_as_observations_leave_nothing_to_be_sure_of():
@@ -44,11 +43,13 @@ def test_as_many_unknowns_as_observations_leave_nothing_to_be_sure_of():
     view = np.arange(32) // 2
     problem = SimpleNamespace(keyframe_ids=np.arange(16), view=view, point=(view + np.arange(32) % 2) % 16)
     rows = np.random.default_rng(0).normal(0.0, 1.0, (16, 8, 60))
-    left_over = rows @ np.swapaxes(rows, 1, 2)
+    pattern_products = rows @ np.swapaxes(rows, 1, 2)
     watch = ReadoutWatch(CAMERA, is_wanted=True)
-    watch.take(SimpleNamespace(problem=problem, residual_px=np.zeros((32, 2)), left_over=left_over))
-    assert fit_readout(watch._witnesses.views, None) is not None, "else this tests nothing"
-    assert watch._witnesses.sigma_factor == np.inf
+    watch.take(
+        SimpleNamespace(problem=problem, residual_px=np.zeros((32, 2)), pattern_products=pattern_products)
+    )
+    assert fit_readout(watch._evidence.views, None) is not None, "else this tests nothing"
+    assert watch._evidence.sigma_factor == np.inf
     assert watch.take_found() is None
 
 
@@ -83,8 +84,10 @@ def windows(seed, size, interval, num_points):
             sigma_px=np.full(len(view), 0.3),
             confidence=np.ones(len(view)),
         )
-        left_over = information(problem, ViewMotion(SIZE_WH, velocity[ids]), poses[ids], xyz, residual_px)
-        yield SimpleNamespace(problem=problem, left_over=left_over, residual_px=residual_px)
+        pattern_products = pattern_products_of(
+            problem, ViewMotion(SIZE_WH, velocity[ids]), poses[ids], xyz, residual_px
+        )
+        yield SimpleNamespace(problem=problem, pattern_products=pattern_products, residual_px=residual_px)
 
 
 @pytest.mark.parametrize(
@@ -101,6 +104,6 @@ def test_a_readout_is_as_sure_as_the_watch_says(size, interval, num_points):
         for result in windows(seed, size, interval, num_points):
             watch.take(result)
         assert watch.take_found() is None, "noise is no shutter"
-        fit = fit_readout(watch._witnesses.views, "rows")
-        is_covered.append(fit.readout.ms <= STUDENT_95 * fit.sigma_ms * watch._witnesses.sigma_factor)
+        fit = fit_readout(watch._evidence.views, "rows")
+        is_covered.append(fit.readout.ms <= STUDENT_95 * fit.sigma_ms * watch._evidence.sigma_factor)
     assert np.mean(is_covered) == pytest.approx(0.95, abs=0.055 if size == 12 else 0.025)

@@ -17,7 +17,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.edges import whiteners
 from semcast.server.geometry.projection import MIN_DEPTH_MAP
-from semcast.server.mapping.bundle_problem import BundleProblem, ViewMotion
+from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
 
 Array = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ _STEP = 1e-5
 NUM_GROUPS = 10
 
 
-def information(
+def pattern_products_of(
     problem: BundleProblem, motion: ViewMotion, T_world_cam: Array, xyz: Array, residual_px: Array
 ) -> Array:
     """Return what each view's residuals say: inner products of all patterns, residuals included.
@@ -198,11 +198,52 @@ def _unexplained(
     return np.asarray(left - by_pose @ moved.reshape(num_views, 6, -1)[view])
 
 
+class PatternEvidence:
+    """Collects the pattern products of keyframes over all adjustments so far.
+
+    Windows overlap: what a keyframe says in several adjustments is added up, and it stays one independent
+    witness. Also counts observations and unknowns, since unknowns that were fitted to the observations have
+    made residuals smaller than the errors they stand for.
+    """
+
+    def __init__(self) -> None:
+        self._told: dict[int, Array] = {}
+        self._num_observed = self._num_fitted = 0
+
+    def __len__(self) -> int:
+        return len(self._told)
+
+    @property
+    def views(self) -> list[Array]:
+        """What each keyframe's residuals say, see ``pattern_products_of``, in order of time."""
+        return [self._told[frame_id] for frame_id in sorted(self._told)]
+
+    @property
+    def sigma_factor(self) -> float:
+        """Factor on standard deviations for the degrees of freedom that fitted unknowns have taken.
+
+        Infinite where there are as many unknowns as observations: such residuals say nothing.
+        """
+        share_left = 1.0 - self._num_fitted / self._num_observed if self._num_observed else 1.0
+        return share_left**-0.5 if share_left > 0.0 else np.inf
+
+    def note(self, result: BundleResult) -> None:
+        """Add the residuals of an adjustment, if it was asked for them."""
+        if result.pattern_products is None:
+            return
+        for frame_id, told in zip(result.problem.keyframe_ids.tolist(), result.pattern_products, strict=True):
+            self._told[frame_id] = self._told.get(frame_id, 0.0) + told
+        used = np.isfinite(result.residual_px).all(axis=1)
+        num_views, num_points = (len(np.unique(k[used])) for k in (result.problem.view, result.problem.point))
+        self._num_observed += 2 * int(used.sum())
+        self._num_fitted += 6 * num_views + 3 * num_points
+
+
 def grouped(views: Sequence[Array] | Array) -> Array | None:
     """Return sums over groups of consecutive views, ``(G, 8, 8)``; None where fewer than three say something.
 
     Args:
-        views: ``(8, 8)`` of each, as ``information`` gives them.
+        views: ``(8, 8)`` of each, as ``pattern_products_of`` gives them.
     """
     each = np.asarray(views, dtype=np.float64).reshape(-1, NUM_PATTERNS, NUM_PATTERNS)
     each = each[each[:, RESIDUAL, RESIDUAL] > 0.0]

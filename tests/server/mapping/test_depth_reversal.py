@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from semcast.server.mapping.reversal import mirrored
+from semcast.server.mapping.depth_reversal import mirrored
 
 
 def test_from_far_away_the_mirror_image_looks_the_same(arc, projected):

@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 _MIN_SHARE = 0.5
 #: Standard deviations within which a point is explained.
 _CUT_SIGMAS = 4.0
+#: Points by which a plane, or a view of it, is told at least.
 _MIN_POINTS = 12
 #: Share of the points that must lie in front of both cameras: noise tilts a plane seen at a low angle.
 _MIN_IN_FRONT = 0.75

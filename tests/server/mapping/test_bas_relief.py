@@ -5,7 +5,7 @@ import pytest
 
 from semcast.common.geometry import rotation_angle_deg
 from semcast.server.mapping.ambiguity import adjusted, decide
-from semcast.server.mapping.relief import nearer
+from semcast.server.mapping.bas_relief import nearer
 
 
 @pytest.mark.parametrize("factor", [2.0, 0.5])
@@ -31,11 +31,11 @@ def test_nearer_and_further_again_is_as_it_was(arc):
 def test_the_true_distance_is_found_where_an_adjustment_stops_on_the_way(arc, relative, seed):
     truth = arc(focal_px=700.0, depth=7.0, noise_px=0.4, num_views=3, turn_deg=7.0, seed=seed)
 
-    def turn_error_deg(side):
+    def turn_error_deg(structure):
         R_true = relative(truth.T_world_cam)[:3, :3]
-        return rotation_angle_deg(R_true.T @ relative(side.T_world_cam)[:3, :3])
+        return rotation_angle_deg(R_true.T @ relative(structure.T_world_cam)[:3, :3])
 
     too_far = nearer(truth, 0.25)
     assert turn_error_deg(adjusted(too_far)) > 2.0
-    _, sides = decide(too_far)
-    assert turn_error_deg(sides[0]) < turn_error_deg(adjusted(truth)) + 0.5
+    _, structures = decide(too_far)
+    assert turn_error_deg(structures[0]) < turn_error_deg(adjusted(truth)) + 0.5

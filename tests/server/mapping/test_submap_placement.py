@@ -7,7 +7,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, invert_transform, make_transform
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Start
-from semcast.server.mapping.passage import Passage
+from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
@@ -22,9 +22,8 @@ def path(frame):
 
 
 def keyframe(frame, T_world_cam, submap):
-    xy, no_descriptors = np.zeros((len(IDS), 2)), (np.zeros(0, np.int64), np.zeros((0, 32), np.uint8))
-    ids = IDS + 100 * submap
-    return Keyframe(frame, frame * FRAME_NS, T_world_cam, submap, ids, xy, np.ones(len(ids)), *no_descriptors)
+    xy, ids = np.zeros((len(IDS), 2)), IDS + 100 * submap
+    return Keyframe(frame, frame * FRAME_NS, T_world_cam, submap, ids, xy, np.ones(len(ids)))
 
 
 def add(world, frames, T_of, submap, xyz):
@@ -42,23 +41,23 @@ def world():
 
 
 def laid(world, submap=1):
-    """A passage to a part that began at frame 15, in a unit of a fifth of the world's."""
+    """The placement of a part that began at frame 15, in a unit of a fifth of the world's."""
     motion = CameraMotion(CAMERA)
     for k in range(10):
         motion.observe(k, k * FRAME_NS, path(k), world.landmarks.xyz)
     begun = Start([keyframe(15 + k, make_transform(np.eye(3), (0, 0, 0.04 * k)), 0) for k in range(3)], *NONE)
-    passage = Passage(CAMERA, 20)
-    T, scale = passage.lay(motion, begun, begun, world, submap)
+    placement = SubmapPlacement(CAMERA, 20)
+    T, scale = placement.place(motion, begun, begun, world, submap)
     motion.reset()
     np.testing.assert_allclose(T, path(15), atol=0.02)
     assert scale == pytest.approx(5.0, rel=0.03)
-    return passage
+    return placement
 
 
 @pytest.mark.parametrize("drift", [0.7, 1.3])
 def test_a_part_whose_unit_changed_after_its_start_is_placed_again(world, drift):
     """The first adjustments have shrunk it, or stretched it, and turned it about its first view."""
-    passage = laid(world)
+    placement = laid(world)
     T_off = path(15) @ exp_se3([0.0, 0.1, 0.0, 0.0, 0.0, 0.0])
 
     def T_drifted(frame):
@@ -69,50 +68,50 @@ def test_a_part_whose_unit_changed_after_its_start_is_placed_again(world, drift)
     in_front = np.random.default_rng(1).uniform((-2, -2, 7), (2, 2, 9), (len(IDS), 3))
     xyz = (drift * in_front) @ T_off[:3, :3].T + T_off[:3, 3]
     add(world, [15, 18, 21, 24], T_drifted, 1, xyz)
-    assert passage.lay_again(world, 1) is None, "it is too young"
+    assert placement.place_again(world, 1) is None, "it is too young"
     world.add_keyframe(keyframe(26, T_drifted(26), 1))
-    assert passage.lay_again(world, 2) is None, "that is another part"
-    scale, T = passage.lay_again(world, 1)
+    assert placement.place_again(world, 2) is None, "that is another part"
+    scale, T = placement.place_again(world, 1)
     assert scale == pytest.approx(1.0 / drift, rel=0.03)
     world.transform_submap(1, 1, scale, T)
     for frame in (15, 18, 21, 24, 26):
         np.testing.assert_allclose(world.poses[frame], path(frame), atol=0.07)
-    assert passage.lay_again(world, 1) is None, "once is enough"
+    assert placement.place_again(world, 1) is None, "once is enough"
 
 
 @pytest.mark.parametrize(("frame", "stays"), [(26, False), (36, True)])
 def test_a_camera_that_stood_for_a_while_has_not_gone_on_as_before(world, frame, stays):
-    passage = laid(world)
+    placement = laid(world)
     add(world, [15, 18, frame], path, 1, np.random.default_rng(1).uniform((-2, -2, 9), (2, 2, 11), (60, 3)))
-    assert (passage.lay_again(world, 1) is None) == stays
+    assert (placement.place_again(world, 1) is None) == stays
     world.add_keyframe(keyframe(frame + 1, path(frame + 1), 1))
-    assert passage.lay_again(world, 1) is None
+    assert placement.place_again(world, 1) is None
 
 
 def test_a_part_that_nothing_is_known_of_stays(world):
-    passage = laid(world)
+    placement = laid(world)
     for frame in (15, 18, 26):
         world.add_keyframe(keyframe(frame, path(frame), 1))
-    assert passage.lay_again(world, 1) is None, "how far away is what it sees?"
+    assert placement.place_again(world, 1) is None, "how far away is what it sees?"
 
 
 def test_a_part_that_nothing_led_to_is_not_placed_again(world):
     """The server was started again, and its camera sees nothing of the map so far."""
     begun = Start([keyframe(15 + k, make_transform(np.eye(3), (0, 0, 0.04 * k)), 0) for k in range(3)], *NONE)
-    passage = Passage(CAMERA, 20)
-    T, scale = passage.lay(CameraMotion(CAMERA), begun, begun, world, 1)
+    placement = SubmapPlacement(CAMERA, 20)
+    T, scale = placement.place(CameraMotion(CAMERA), begun, begun, world, 1)
     np.testing.assert_array_equal(T, np.eye(4))
     assert scale == 1.0
     in_front = np.random.default_rng(1).uniform((-2, -2, 7), (2, 2, 9), (len(IDS), 3))
     add(world, [15, 18, 26], path, 1, in_front)
-    assert passage.lay_again(world, 1) is None
+    assert placement.place_again(world, 1) is None
 
 
 def test_a_first_map_is_where_it_is():
-    passage, empty = Passage(CAMERA, 20), WorldMap()
+    placement, empty = SubmapPlacement(CAMERA, 20), WorldMap()
     begun = Start([keyframe(k, path(k), 0) for k in range(3)], *NONE)
-    T, scale = passage.lay(CameraMotion(CAMERA), begun, begun, empty, 0)
+    T, scale = placement.place(CameraMotion(CAMERA), begun, begun, empty, 0)
     np.testing.assert_array_equal(T, np.eye(4))
     assert scale == 1.0
     add(empty, range(30), path, 0, np.full((len(IDS), 3), 9.0))
-    assert passage.lay_again(empty, 0) is None
+    assert placement.place_again(empty, 0) is None

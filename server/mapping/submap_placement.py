@@ -16,7 +16,7 @@ from semcast.common.geometry import invert_transform
 from semcast.server.mapping.bridging import bridge
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Start
-from semcast.server.mapping.mapper import median_depth, usual_depth
+from semcast.server.mapping.scene_depth import median_depth, usual_depth
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.visual_gyroscope import VisualGyroscope
 from semcast.server.mapping.world_map import WorldMap
@@ -50,8 +50,8 @@ class _Before:
     start_ns: int
 
 
-class Passage:
-    """Follows a camera from one submap to the next.
+class SubmapPlacement:
+    """Tells where a submap is by how the camera moved since the one before.
 
     Args:
         camera: Pinhole.
@@ -70,7 +70,7 @@ class Passage:
         elif world.keyframes:
             self._gyroscope.go_on(sight, motion, usual_depth(world, self._enough))
 
-    def lay(
+    def place(
         self, motion: CameraMotion, start: Start, grown: Start, world: WorldMap, submap: int
     ) -> tuple[Array, float]:
         """Pose and scale of a new submap, see ``bridging.bridge``."""
@@ -84,7 +84,7 @@ class Passage:
         self._before = _Before(deepcopy(motion), last_ns, depth, turned, submap, start_ns)
         return bridge(motion, start, grown, last_ns, depth, turned)
 
-    def lay_again(self, world: WorldMap, submap: int) -> tuple[float, Array] | None:
+    def place_again(self, world: WorldMap, submap: int) -> tuple[float, Array] | None:
         """Similarity that moves a submap to where its first second says it is.
 
         Args:
