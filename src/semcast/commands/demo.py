@@ -15,8 +15,8 @@ from semcast.channel.emulator import warn_of_settings
 from semcast.commands.console import plain_console
 from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings, run_until_stopped
 from semcast.common.run_folder import RUN_FILES, VIEWER_NAME
-from semcast.common.sequence import open_sequence
 from semcast.demo import DemoSettings, default_sequence, run_demo
+from semcast.demo_recording import look_at
 from semcast.evaluation.report import STDOUT, provenance, write_result
 from semcast.server.export.parts import parts_line
 
@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
     if json_to_stdout:
         settings = replace(settings, json=None)
     talk = plain_console(stderr=True)
-    frames = len(open_sequence(settings.sequence or default_sequence(), settings.camera))
+    frames = look_at(settings.sequence or default_sequence(), settings.camera).num_frames
     result: dict[str, Any] = {}
     failures: list[str] = []
 
