@@ -170,6 +170,12 @@ class _Captured:
             self._capture = None
 
 
+def calibration_beside(path: Path) -> Path | None:
+    """Return the file beside a video that holds its intrinsics, if there is one."""
+    files = (path.with_suffix(".json"), path.parent / "intrinsics.json")
+    return next((file for file in files if file.is_file()), None)
+
+
 class VideoSource(_Captured):
     """A video file, played in time; intrinsics may lie beside it as ``<name>.json`` or ``intrinsics.json``.
 
@@ -181,10 +187,7 @@ class VideoSource(_Captured):
         path = Path(settings.source)
         if settings.repeat == "swing":
             raise SourceError("a video can't be played backwards: use repeat 'once' or 'loop'")
-        beside = next(
-            (p for p in (path.with_suffix(".json"), path.parent / "intrinsics.json") if p.is_file()), None
-        )
-        super().__init__(settings, live=False, beside=beside)
+        super().__init__(settings, live=False, beside=calibration_beside(path))
         assert self._capture is not None
         self._fps = _stated_hz(self._capture, settings.rate_hz or 30.0)
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))

@@ -39,7 +39,10 @@ VERBS: dict[str, tuple[str, str]] = {
     "recover": ("recover", "make a recording that was cut off whole again"),
     "export": ("export", "write a run in the format of COLMAP, nerfstudio, evo, Rerun or as points"),
     "plot": ("plot", "draw a run: its path against the truth, and what happened over time"),
-    "info": ("info", "say what a recording, run, sequence, ROS bag or weights file is, in a screenful"),
+    "info": (
+        "info",
+        "say what a recording, run, sequence, video, bag or weights file is, in a screenful",
+    ),
     "unpack": ("unpack", "turn a ROS bag into a sequence: images, times, camera, true path"),
     "calibrate": ("calibrate", "find a camera's intrinsics from pictures of a chessboard or live"),
     "lens": ("lens", "find a camera's intrinsics from a video or live, without a chessboard"),
