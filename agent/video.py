@@ -49,7 +49,9 @@ def public_name(source: str) -> str:
 def _why_not(source: str, live: bool) -> str:
     """Return what can be told about why a source can't be opened, to end the sentence that says so."""
     if not live:
-        return ": 'semcast replay' takes recordings of a stream" if source.endswith(".mcap") else ""
+        if source.endswith(".mcap"):
+            return ": 'semcast replay' takes recordings of a stream"
+        return ": it is in no format of videos that OpenCV reads, or it is damaged or was cut off"
     if "://" in source:
         return f": no stream came within {_OPEN_TIMEOUT_MS // 1000} s; are address and password right?"
     device = Path(f"/dev/video{int(source)}" if is_camera_number(source) else source)

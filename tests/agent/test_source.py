@@ -312,7 +312,7 @@ def test_a_video_needs_a_camera_that_fits(video, tmp_path):
 
 def test_what_can_not_be_opened_is_said(tmp_path):
     (tmp_path / "notes.txt").write_text("no video")
-    with pytest.raises(SourceError, match=r"video .*notes.txt can't be opened$"):
+    with pytest.raises(SourceError, match=r"video .*notes.txt can't be opened: it is in no format"):
         open_source(fast(tmp_path / "notes.txt", camera=PINHOLE))
     (tmp_path / "run.mcap").write_bytes(b"recording")
     with pytest.raises(SourceError, match="run.mcap can't be opened: 'semcast replay' takes recordings"):
