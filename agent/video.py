@@ -22,6 +22,7 @@ from semcast.common.camera_settings import HOW_TO_GIVE, check_size
 from semcast.common.errors import SourceError
 from semcast.common.image_file import as_rgb
 from semcast.common.sequence import ImageRectifier, resized_wh
+from semcast.common.sequence_layouts import IMAGE_SUFFIXES
 from semcast.common.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
@@ -72,9 +73,11 @@ def open_capture(source: str, *, live: bool) -> cv2.VideoCapture:
         live: It is a camera.
 
     Raises:
-        SourceError: It can't be opened; one at an address is waited for for five seconds.
+        SourceError: It is a picture, or can't be opened; one at an address is waited for for five seconds.
     """
     if not live:
+        if Path(source).suffix.lower() in IMAGE_SUFFIXES:  # OpenCV would take it for a video
+            raise SourceError(f"{source} is a single picture: give the folder of pictures that it is in")
         capture = cv2.VideoCapture(source)
     elif is_camera_number(source):
         capture = cv2.VideoCapture(int(source))
