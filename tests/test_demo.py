@@ -421,3 +421,15 @@ def test_few_poses_are_said_not_to_be_those_of_a_stream():
 def test_a_demo_without_a_pose_says_why():
     assert "no image could be decoded" in why_no_pose({"frames": {"source": 51}, "completeness": 0.0})
     assert "move sideways" in why_no_pose({"frames": {"tracked": 51}, "completeness": 0.0})
+
+
+def test_frames_that_a_busy_machine_skipped_are_not_blamed_on_the_images():
+    skipped = {
+        "frames": {"sent": 34, "tracked": 5},
+        "drops": {"superseded": 23, "too_old": 6, "duplicate": 9},
+    }
+    told = "the server had no time for 29 of 34; a smaller --resize or --rate-hz"
+    assert f"only 6% of the frames have a pose: {told}" in few_poses({"completeness": 0.059, **skipped})
+    assert f"no frame has a pose: {told}" in why_no_pose({"completeness": 0.0, **skipped})
+    few = {**skipped, "drops": {"superseded": 10}}
+    assert "are the images" in few_poses({"completeness": 0.059, **few})
