@@ -22,6 +22,7 @@ from semcast.common.camera_settings import HOW_TO_GIVE, check_size
 from semcast.common.errors import SourceError
 from semcast.common.image_file import as_rgb
 from semcast.common.sequence import ImageRectifier, resized_wh
+from semcast.common.sequence_layouts import IMAGE_SUFFIXES
 from semcast.common.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
@@ -49,7 +50,9 @@ def public_name(source: str) -> str:
 def _why_not(source: str, live: bool) -> str:
     """Return what can be told about why a source can't be opened, to end the sentence that says so."""
     if not live:
-        return ": 'semcast replay' takes recordings of a stream" if source.endswith(".mcap") else ""
+        if source.endswith(".mcap"):
+            return ": 'semcast replay' takes recordings of a stream"
+        return ": it is in no format of videos that OpenCV reads, or it is damaged or was cut off"
     if "://" in source:
         return f": no stream came within {_OPEN_TIMEOUT_MS // 1000} s; are address and password right?"
     device = Path(f"/dev/video{int(source)}" if is_camera_number(source) else source)
@@ -70,9 +73,11 @@ def open_capture(source: str, *, live: bool) -> cv2.VideoCapture:
         live: It is a camera.
 
     Raises:
-        SourceError: It can't be opened; one at an address is waited for for five seconds.
+        SourceError: It is a picture, or can't be opened; one at an address is waited for for five seconds.
     """
     if not live:
+        if Path(source).suffix.lower() in IMAGE_SUFFIXES:  # OpenCV would take it for a video
+            raise SourceError(f"{source} is a single picture: give the folder of pictures that it is in")
         capture = cv2.VideoCapture(source)
     elif is_camera_number(source):
         capture = cv2.VideoCapture(int(source))
@@ -170,6 +175,12 @@ class _Captured:
             self._capture = None
 
 
+def calibration_beside(path: Path) -> Path | None:
+    """Return the file beside a video that holds its intrinsics, if there is one."""
+    files = (path.with_suffix(".json"), path.parent / "intrinsics.json")
+    return next((file for file in files if file.is_file()), None)
+
+
 class VideoSource(_Captured):
     """A video file, played in time; intrinsics may lie beside it as ``<name>.json`` or ``intrinsics.json``.
 
@@ -181,10 +192,7 @@ class VideoSource(_Captured):
         path = Path(settings.source)
         if settings.repeat == "swing":
             raise SourceError("a video can't be played backwards: use repeat 'once' or 'loop'")
-        beside = next(
-            (p for p in (path.with_suffix(".json"), path.parent / "intrinsics.json") if p.is_file()), None
-        )
-        super().__init__(settings, live=False, beside=beside)
+        super().__init__(settings, live=False, beside=calibration_beside(path))
         assert self._capture is not None
         self._fps = _stated_hz(self._capture, settings.rate_hz or 30.0)
         count = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))

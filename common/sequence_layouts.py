@@ -192,7 +192,8 @@ def _check_there(path: Path) -> None:
     check_no_ros_bag(path)
     if path.is_file():
         if path.suffix.lower() != ".json":
-            way = f"videos go through: {shlex.join(('semcast', 'agent', '--source', str(path)))}"
+            name = shlex.quote(str(path))
+            way = f"videos go through: semcast demo --sequence {name}, or semcast agent --source {name}"
             if path.suffix.lower() == ".mcap":
                 way = f"recordings of a stream go through: {shlex.join(('semcast', 'replay', str(path)))}"
             raise SourceError(

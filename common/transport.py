@@ -40,6 +40,8 @@ _CONNECT_TRY_MS = 300
 #: Where something answers, the next try may take twice as long: meeting takes several round trips, and over
 #: a slow network these take longer than the first. After one of this length it is none of ours that answers.
 _LONGEST_TRY_MS = 8 * _CONNECT_TRY_MS
+#: Roles that are started together are there within a second, and a demo asks for one: neither need be told.
+_TELL_AFTER_S = 1.0
 #: How long a sender that drops under congestion waits for room first: half a frame's time at 30 a second.
 #: A process on a busy machine waits for its turn for longer than the 1 ms that Zenoh gives it.
 _WAIT_FOR_ROOM_US = 15_000
@@ -382,13 +384,14 @@ def open_session(
             answering = knocks.answering()
             # What has just begun to listen may be ours.
             why = _why_not_met(answering) if answering is not None and try_ms > _CONNECT_TRY_MS else ""
-            if deadline_s is not None and time.monotonic() - started_s >= deadline_s:
+            waited_s = time.monotonic() - started_s
+            if deadline_s is not None and waited_s >= deadline_s:
                 nothing = (
                     f"nothing answers at {', '.join(network.connect)} within {deadline_s:g} s: is "
                     f"'semcast server' running there? ({_in_a_line(err)})"
                 )
                 raise TransportError(why or nothing) from err
-            if not told:
+            if not told and waited_s >= _TELL_AFTER_S:
                 logger.info("waiting for the server at %s", ", ".join(network.connect))
                 told = True
             if why and try_ms == _LONGEST_TRY_MS and not told_why:

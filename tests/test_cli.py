@@ -101,6 +101,16 @@ def test_a_shortened_option_is_refused_with_the_whole_one_as_a_hint(verb, capsys
     )
 
 
+@pytest.mark.parametrize("option", ["--chanel", "--chanel=rayleigh"])
+def test_the_value_of_an_option_that_is_none_is_not_taken_for_an_argument_of_the_verb(option, capsys):
+    with pytest.raises(SystemExit):
+        main(["channel", "--seed", "1", option, "rayleigh"])
+    assert capsys.readouterr().err == (
+        f"semcast channel: unrecognized arguments: {option} rayleigh, did you mean '--channel'? "
+        "('semcast channel --help' lists the options)\n"
+    )
+
+
 def test_an_option_of_another_sub_verb_is_no_hint(capsys):
     with pytest.raises(SystemExit):
         main(["eval", "latency", "--images=x"])

@@ -5,6 +5,7 @@ import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from semcast.commands.demo import few_poses, summary_table, why_no_pose
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.config import build_settings, read_toml
-from semcast.common.errors import ConfigError, SemcastError
+from semcast.common.errors import ConfigError, SemcastError, SourceError
 from semcast.common.loopback import free_endpoint
 from semcast.common.metrics import Metrics
 from semcast.common.recording_reader import RecordingReader
@@ -32,6 +33,7 @@ from semcast.demo import (
     role_commands,
     run_demo,
 )
+from semcast.demo_recording import look_at
 from semcast.demo_watch import Alive, watch
 from semcast.real_time import Plan
 from semcast.role import Role
@@ -45,8 +47,8 @@ SEQUENCE = Path(__file__).resolve().parents[1] / "deploy" / "demo" / "kitti_06"
 @pytest.mark.parametrize("stride", [1, 3, 7])
 def test_a_machine_that_keeps_up_plays_at_the_recorded_times(tmp_path, monkeypatch, stride):
     monkeypatch.setattr(demo, "plan_for", lambda *given: Plan(0.5, given[3]))
-    recorded = open_sequence(SEQUENCE)
-    recorded.times_ns = recorded.times_ns * 1.0371
+    recorded = look_at(SEQUENCE, CameraSettings())
+    recorded = replace(recorded, rate_hz=recorded.rate_hz / 1.0371)
     settings = DemoSettings(stride=stride, out=tmp_path)
     playback = choose_playback(settings, recorded)
     assert (playback.resize, playback.stride, playback.speed) == (0.5, stride, 1.0)
@@ -63,9 +65,29 @@ def test_a_damaged_first_image_is_no_reason_not_to_play_a_recording(tmp_path, mo
     folder = shutil.copytree(SEQUENCE, tmp_path / "damaged")
     for name in ("000000.jpg", "000001.jpg"):
         (folder / "images" / name).write_bytes(b"no picture")
-    recorded = open_sequence(folder)
-    assert choose_playback(DemoSettings(out=tmp_path), recorded).resize == 0.5
-    assert np.array_equal(seen[0], recorded.image(2))
+    assert choose_playback(DemoSettings(out=tmp_path), look_at(folder, CameraSettings())).resize == 0.5
+    assert np.array_equal(seen[0], open_sequence(folder).image(2))
+
+
+def write_video(path, count):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, (64, 48))
+    for k in range(count):
+        writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
+    writer.release()
+
+
+def test_a_video_is_played_like_a_sequence_but_compared_with_nothing(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(demo, "plan_for", lambda *given: seen.append(given[2]) or Plan(1.0, given[3]))
+    video = tmp_path / "walk.avi"
+    write_video(video, 4)
+    with pytest.raises(SourceError, match="walk.avi is unknown"):
+        look_at(video, CameraSettings())
+    recorded = look_at(video, CameraSettings(focal_35mm=26.0))
+    assert (recorded.num_frames, recorded.is_video) == (4, True)
+    playback = choose_playback(DemoSettings(out=tmp_path, stride=1), recorded)
+    assert (playback.rate_hz, playback.speed, seen[0].shape) == (20.0, 1.0, (48, 64, 3))
+    assert "--reference" not in role_commands(DemoSettings(), None, "tcp/127.0.0.1:1")["server"]
 
 
 def write_images(folder, count):
@@ -399,3 +421,15 @@ def test_few_poses_are_said_not_to_be_those_of_a_stream():
 def test_a_demo_without_a_pose_says_why():
     assert "no image could be decoded" in why_no_pose({"frames": {"source": 51}, "completeness": 0.0})
     assert "move sideways" in why_no_pose({"frames": {"tracked": 51}, "completeness": 0.0})
+
+
+def test_frames_that_a_busy_machine_skipped_are_not_blamed_on_the_images():
+    skipped = {
+        "frames": {"sent": 34, "tracked": 5},
+        "drops": {"superseded": 23, "too_old": 6, "duplicate": 9},
+    }
+    told = "the server had no time for 29 of 34; a smaller --resize or --rate-hz"
+    assert f"only 6% of the frames have a pose: {told}" in few_poses({"completeness": 0.059, **skipped})
+    assert f"no frame has a pose: {told}" in why_no_pose({"completeness": 0.0, **skipped})
+    few = {**skipped, "drops": {"superseded": 10}}
+    assert "are the images" in few_poses({"completeness": 0.059, **few})

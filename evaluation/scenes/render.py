@@ -1,5 +1,6 @@
 """Write a drawn scene as a recorded sequence with its exact path."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -152,10 +153,14 @@ class RenderSettings:
             raise ValueError(f"distortion must be 4, 5 or 8 numbers, got {len(self.distortion)}")
 
 
-def render_scene(settings: RenderSettings) -> int:
+def render_scene(settings: RenderSettings, progress: Callable[[int, int], None] | None = None) -> int:
     """Write a scene as a sequence of the native layout: images, times, intrinsics and the exact path.
 
     The same settings give the same files.
+
+    Args:
+        settings: What to draw.
+        progress: Takes how many frames are drawn, and of how many.
 
     Returns:
         Number of frames.
@@ -168,10 +173,12 @@ def render_scene(settings: RenderSettings) -> int:
         scene.camera = replace(scene.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
         Optics.of(scene.camera)
         (folder / "images").mkdir()
-        return _draw_into(folder, settings, scene)
+        return _draw_into(folder, settings, scene, progress or (lambda _done, _total: None))
 
 
-def _draw_into(folder: Path, settings: RenderSettings, scene: Scene) -> int:
+def _draw_into(
+    folder: Path, settings: RenderSettings, scene: Scene, progress: Callable[[int, int], None]
+) -> int:
     times_s = np.arange(max(1, round(settings.seconds * scene.rate_hz))) / scene.rate_hz
     T_world_cams = np.stack([scene.T_world_cam(float(t_s)) for t_s in times_s])
     for index, t_s in enumerate(times_s):
@@ -180,6 +187,7 @@ def _draw_into(folder: Path, settings: RenderSettings, scene: Scene) -> int:
         image = frame_of(scene, float(t_s), settings.noise_sd, rng, readout_s, settings.brightness)
         _, png = cv2.imencode(".png", image[..., ::-1])
         write_whole(folder / "images" / f"{index:06d}.png", png.tobytes())
+        progress(index + 1, len(times_s))
     write_whole(folder / "times.txt", "".join(f"{t_s:.6f}\n" for t_s in times_s))
     scene.camera.save(folder / "intrinsics.json")
     write_tum(folder / "groundtruth.txt", Trajectory(times_s, T_world_cams))

@@ -15,7 +15,7 @@ import shutil
 import sys
 import textwrap
 import traceback
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from semcast import SemcastError, __version__
@@ -39,7 +39,10 @@ VERBS: dict[str, tuple[str, str]] = {
     "recover": ("recover", "make a recording that was cut off whole again"),
     "export": ("export", "write a run in the format of COLMAP, nerfstudio, evo, Rerun or as points"),
     "plot": ("plot", "draw a run: its path against the truth, and what happened over time"),
-    "info": ("info", "say what a recording, run, sequence, ROS bag or weights file is, in a screenful"),
+    "info": (
+        "info",
+        "say what a recording, run, sequence, video, bag or weights file is, in a screenful",
+    ),
     "unpack": ("unpack", "turn a ROS bag into a sequence: images, times, camera, true path"),
     "calibrate": ("calibrate", "find a camera's intrinsics from pictures of a chessboard or live"),
     "lens": ("lens", "find a camera's intrinsics from a video or live, without a chessboard"),
@@ -64,6 +67,22 @@ EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 _WRONG_CHOICE = re.compile(r"argument (\S+): invalid choice: (.*) \(choose from (.*)\)")
 
 
+def _unknown_options(words: list[str], known: Container[str]) -> list[str]:
+    """Return options that are none, each with the words behind it.
+
+    Argparse would take such a word for an argument of the verb, and say that this is wrong.
+    """
+    end = words.index("--") if "--" in words else len(words)
+    unknown: list[str] = []
+    is_unknown = False
+    for word in words[:end]:
+        if word.startswith("--"):
+            is_unknown = word.split("=")[0] not in known
+        if is_unknown:
+            unknown.append(word)
+    return unknown
+
+
 class _Parser(argparse.ArgumentParser):
     """A parser that says what is wrong in a line, without the usage of dozens of options before it.
 
@@ -76,12 +95,18 @@ class _Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuse what is not known here, where a sub-verb's options are, and not in the verb above it."""
-        found, unknown = super().parse_known_args(args, namespace)
+        words = list(sys.argv[1:] if args is None else args)
+        if self._subparsers is None:
+            self._refuse(_unknown_options(words, self._option_string_actions))
+        found, unknown = super().parse_known_args(words, namespace)
+        self._refuse(unknown)
+        return found, unknown
+
+    def _refuse(self, unknown: list[str]) -> None:
         if unknown:
             option = next((word.split("=")[0] for word in unknown if word.startswith("--")), "")
             hint = near_match(option, [name for name in self._option_string_actions if name.startswith("--")])
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
-        return found, unknown
 
     def error(self, message: str) -> NoReturn:
         if found := _WRONG_CHOICE.fullmatch(message):

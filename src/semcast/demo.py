@@ -1,6 +1,5 @@
 """The demo: server, channel and agent as three real processes on loopback, until the sequence ends."""
 
-import contextlib
 import json
 import shlex
 import sys
@@ -11,9 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from semcast.agent.pace_control import start_stride
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
@@ -22,16 +18,16 @@ from semcast.common.codec import DEFAULT_CODEC, Modulation
 from semcast.common.codecs import check_codec, named_weights
 from semcast.common.config import to_toml
 from semcast.common.config_flags import flag_words
-from semcast.common.errors import ConfigError, SemcastError, SourceError, TransportError
+from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import status_key
 from semcast.common.loopback import free_endpoint
 from semcast.common.network_settings import NetworkSettings
-from semcast.common.playback import check_playback, usual_period_ns
+from semcast.common.playback import check_playback
 from semcast.common.rate import NATIVE_RATE, RateChoice
 from semcast.common.run_folder import DEMO_SETTINGS_NAME, SUMMARY_NAME
-from semcast.common.sequence import Sequence, open_sequence
 from semcast.common.transport import Session, open_session
 from semcast.common.whole_file import check_writable, write_whole
+from semcast.demo_recording import DemoRecording, look_at
 from semcast.demo_watch import ERROR_CODE, START_DEADLINE_S, Alive, watch
 from semcast.real_time import plan_for
 from semcast.role import Role
@@ -54,7 +50,8 @@ class DemoSettings:
     """
 
     sequence: Path | None = field(
-        default=None, metadata={"help": "recorded sequence; without it the one shipped with semcast"}
+        default=None,
+        metadata={"help": "recorded sequence or video; without it the sequence shipped with semcast"},
     )
     camera: CameraSettings = field(
         default=CameraSettings(), metadata={"help": "camera of a sequence that does not say it"}
@@ -154,10 +151,11 @@ class Playback:
     speed: float
 
 
-def role_commands(settings: DemoSettings, sequence: Path, endpoint: str) -> dict[str, list[str]]:
+def role_commands(settings: DemoSettings, reference: Path | None, endpoint: str) -> dict[str, list[str]]:
     """Return the command lines of server and channel, in the order they are started."""
     server = [*_PROGRAM, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
-    server += ["--reference", str(sequence), *flag_words(settings.camera)]
+    if reference is not None:
+        server += ["--reference", str(reference), *flag_words(settings.camera)]
     server += ["--confidence", settings.confidence, "--view", settings.view]
     server += ["--viewer-port", str(settings.viewer_port), "--web-port", str(settings.web_port)]
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
@@ -204,13 +202,12 @@ def run_demo(
     Raises:
         SemcastError: The sequence or the codec can't be used, or a process could not be started.
     """
-    sequence = settings.sequence or default_sequence()
-    recorded, logs = _prepare(settings, sequence)
+    recorded, logs = _prepare(settings)
     if doubt := recorded.doubt:
         tell(f"{recorded.name} is {doubt}")
     summary_file = settings.out / SUMMARY_NAME
     endpoint = free_endpoint()
-    commands = role_commands(settings, sequence, endpoint)
+    commands = role_commands(settings, None if recorded.is_video else recorded.path, endpoint)
     children = {name: Role(name, command, logs / f"{name}.log") for name, command in commands.items()}
     alive = Alive(set(), threading.Condition())
     try:
@@ -228,11 +225,11 @@ def run_demo(
                 return None, None
             for text in _reductions(settings, playback):
                 tell(text)
-            command = agent_command(settings, sequence, endpoint, playback)
+            command = agent_command(settings, recorded.path, endpoint, playback)
             children["agent"] = Role("agent", command, logs / "agent.log")
             _bring_up(children, alive, stop, tell)
             error = watch(settings.out, children, alive, stop, tell, progress)
-            _keep_settings(settings, sequence, playback, tell)
+            _keep_settings(settings, recorded.path, playback, tell)
             children["agent"].stop()  # what it says last counts
             if left_out := alive.num_unreadable:
                 where = children["agent"].log
@@ -246,14 +243,13 @@ def run_demo(
     return summary, error
 
 
-def _prepare(settings: DemoSettings, sequence: Path) -> tuple[Sequence, Path]:
+def _prepare(settings: DemoSettings) -> tuple[DemoRecording, Path]:
     """Look at all that can be wrong before anything of a former run goes; the recording, a folder for logs.
 
     Raises:
         SemcastError: Something is wrong.
     """
-    recorded = open_sequence(sequence, settings.camera)
-    _ = recorded.intrinsics
+    recorded = look_at(settings.sequence or default_sequence(), settings.camera)
     check_codec(settings.codec)
     named_weights(settings.codec)
     check_viewer(ServerSettings(out=settings.out, view=settings.view_settings))
@@ -320,7 +316,7 @@ def _join(endpoint: str, server: Role, stop: threading.Event) -> Session | None:
 
 
 def choose_playback(
-    settings: DemoSettings, recorded: Sequence, stop: threading.Event | None = None
+    settings: DemoSettings, recorded: DemoRecording, stop: threading.Event | None = None
 ) -> Playback | None:
     """Return how the recording is played: as asked for, and the rest as this machine can serve it.
 
@@ -330,30 +326,18 @@ def choose_playback(
         ConfigError: The codec is unknown.
         CheckpointError: Its weights are missing or damaged.
     """
-    recorded_hz = 1.0 / (usual_period_ns(recorded.times_ns) * 1e-9)
-    stride = settings.stride or start_stride(recorded_hz)
-    full_hz = recorded_hz / stride
+    stride = settings.stride or start_stride(recorded.rate_hz)
+    full_hz = recorded.rate_hz / stride
     rate_hz = settings.rate_hz or full_hz
     if settings.resize is not None and settings.rate_hz is not None:
         return Playback(settings.resize, stride, rate_hz, rate_hz / full_hz)
-    image = _first_image(recorded)
-    plan = plan_for(settings.codec, settings.modulation, image, rate_hz, settings.rate, settings.resize, stop)
+    plan = plan_for(
+        *(settings.codec, settings.modulation, recorded.image, rate_hz, settings.rate, settings.resize, stop)
+    )
     if plan is None:
         return None
     rate_hz = settings.rate_hz or plan.rate_hz
     return Playback(plan.resize, stride, rate_hz, rate_hz / full_hz)
-
-
-def _first_image(recorded: Sequence) -> NDArray[np.uint8]:
-    """Return the first image that can be read: agents leave out those before it.
-
-    Raises:
-        SourceError: None can be read.
-    """
-    for index in range(len(recorded) - 1):
-        with contextlib.suppress(SourceError):
-            return recorded.image(index)
-    return recorded.image(len(recorded) - 1)
 
 
 def _reductions(settings: DemoSettings, playback: Playback) -> Iterator[str]:

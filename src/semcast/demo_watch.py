@@ -17,7 +17,7 @@ from semcast.common.wire import WireError, unpack
 from semcast.role import Role
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
-START_DEADLINE_S = 60.0
+START_DEADLINE_S = 180.0
 #: What a role that gave up ends with; others are of signals or of wrong usage.
 ERROR_CODE = 1
 _LOOK_INTERVAL_S = 0.1

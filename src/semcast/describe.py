@@ -1,4 +1,4 @@
-"""What a file or folder is, in a screenful: recordings, runs, recorded sequences and weights."""
+"""What a file or folder is, in a screenful: recordings, runs, sequences, videos, cameras and weights."""
 
 import datetime
 import json
@@ -22,6 +22,7 @@ from semcast.common.run_folder import (
 )
 from semcast.common.run_summary import read_summary
 from semcast.common.trajectory import Trajectory
+from semcast.describe_video import calibration_facts, camera_facts, is_calibration, video_facts
 from semcast.server.export.parts import count_parts, parts_line
 from semcast.server.export.placement import TWO_SIDED_95
 from semcast.server.recorded_streams import RecordedStream, recorded_streams
@@ -34,9 +35,9 @@ def describe(path: Path) -> list[Section]:
     """Say what a path holds.
 
     Args:
-        path: A recording (``.mcap``), a run folder, a sequence folder, a transforms ``.json`` file, a ROS
-            bag, or weights (``.safetensors``, an exported encoder ``.onnx`` or a shipped name such as
-            ``3dcsc-lite``).
+        path: A recording (``.mcap``), a run folder, a sequence folder, a transforms ``.json`` file, a
+            video, a calibration file, a ROS bag, or weights (``.safetensors``, an exported encoder ``.onnx``
+            or a shipped name such as ``3dcsc-lite``).
 
     Raises:
         SemcastError: It is none of these, or damaged.
@@ -54,19 +55,21 @@ def describe(path: Path) -> list[Section]:
     if path.suffix == ".safetensors" or _is_bare_name(path):
         return describe_weights(path)
     if path.is_file():
+        if is_calibration(path):
+            return [(f"camera {path}", calibration_facts(path))]
         if path.suffix.lower() == ".json":
             return describe_sequence(path)
         with path.open("rb") as file:
             if file.read(5) == b"\x89MCAP":
                 return describe_recording(path)
+        if (facts := video_facts(path)) is not None:
+            return [(f"video {path}", facts)]
     known = (
         "it must be a recording (.mcap), a folder that --out wrote, a sequence folder or transforms.json, "
-        "a ROS bag, or weights (.safetensors, .onnx or a shipped name)"
+        "a video, a calibration, a ROS bag, or weights (.safetensors, .onnx or a shipped name)"
     )
     if path.exists():
-        way = f"a video is read by: {shlex.join(('semcast', 'agent', '--source', str(path)))}, with its "
-        way += "camera as --intrinsics FILE, --focal-35mm 26 (a phone's), or a .json of its name beside it"
-        raise SourceError(f"{path} is another kind of file: {known}; {way}")
+        raise SourceError(f"{path} is another kind of file, or damaged: {known}")
     raise SourceError(f"there is no file or folder {path}: {known}")
 
 
@@ -229,16 +232,7 @@ def describe_sequence(path: Path) -> list[Section]:
         facts.append(("time", f"{times_s[-1] - times_s[0]:.1f} s, {rate_hz:.1f} images a second{note}"))
     try:
         camera = sequence.intrinsics
-        coefficients = " ".join(f"{k:.4g}" for k in sequence.stored_camera.distortion)
-        distortion = f", with distortion {coefficients}" if coefficients else ""
-        facts.append(
-            (
-                "camera",
-                f"fx {camera.fx:.1f} fy {camera.fy:.1f} cx {camera.cx:.1f} cy {camera.cy:.1f} px{distortion}",
-            )
-        )
-        if camera.readout_ms:
-            facts.append(("shutter", f"rolling, {camera.readout_ms:g} ms from {camera.readout_from}"))
+        facts += camera_facts(camera, sequence.stored_camera.distortion)
     except SourceError:
         facts.append(("camera", f"unknown: {HOW_TO_GIVE}"))
     truth = sequence.groundtruth()

@@ -312,8 +312,11 @@ def test_a_video_needs_a_camera_that_fits(video, tmp_path):
 
 def test_what_can_not_be_opened_is_said(tmp_path):
     (tmp_path / "notes.txt").write_text("no video")
-    with pytest.raises(SourceError, match=r"video .*notes.txt can't be opened$"):
+    with pytest.raises(SourceError, match=r"video .*notes.txt can't be opened: it is in no format"):
         open_source(fast(tmp_path / "notes.txt", camera=PINHOLE))
+    cv2.imwrite(str(tmp_path / "one.JPG"), np.zeros((48, 64, 3), np.uint8))
+    with pytest.raises(SourceError, match="one.JPG is a single picture: give the folder"):
+        open_source(fast(tmp_path / "one.JPG", camera=PINHOLE))
     (tmp_path / "run.mcap").write_bytes(b"recording")
     with pytest.raises(SourceError, match="run.mcap can't be opened: 'semcast replay' takes recordings"):
         open_source(fast(tmp_path / "run.mcap", camera=PINHOLE))

@@ -151,7 +151,7 @@ def test_a_video_is_sent_to_where_videos_go(tmp_path, layout):
     path = tmp_path / "my film.mp4"
     path.write_bytes(b"video")
     # As a shell takes it, also where a name has spaces.
-    with pytest.raises(SourceError, match=f"film.mp4: videos go through: semcast agent --source '{path}'"):
+    with pytest.raises(SourceError, match=f"videos go through: semcast demo --sequence '{path}', or"):
         open_sequence(path, layout=layout)
     (tmp_path / "run.mcap").write_bytes(b"recording")
     with pytest.raises(SourceError, match="run.mcap: recordings of a stream go through: semcast replay"):

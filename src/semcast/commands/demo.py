@@ -15,8 +15,8 @@ from semcast.channel.emulator import warn_of_settings
 from semcast.commands.console import plain_console
 from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings, run_until_stopped
 from semcast.common.run_folder import RUN_FILES, VIEWER_NAME
-from semcast.common.sequence import open_sequence
 from semcast.demo import DemoSettings, default_sequence, run_demo
+from semcast.demo_recording import look_at
 from semcast.evaluation.report import STDOUT, provenance, write_result
 from semcast.server.export.parts import parts_line
 
@@ -67,8 +67,23 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
     return table
 
 
+def too_much(summary: Mapping[str, Any]) -> str | None:
+    """Say in words that most frames were skipped as there was no time for them; None where they were not."""
+    num_sent = (summary.get("frames") or {}).get("sent") or 0
+    drops = summary.get("drops") or {}
+    num_skipped = sum(drops.get(reason, 0) for reason in ("superseded", "too_old"))
+    if num_skipped <= _FEW * num_sent:
+        return None
+    return (
+        f"the server had no time for {num_skipped} of {num_sent}; a smaller --resize or --rate-hz, or a "
+        "machine with less other work, leaves it more"
+    )
+
+
 def why_no_pose(summary: Mapping[str, Any]) -> str:
     """Say in a line what is likely of a run that gave no frame a pose."""
+    if busy := too_much(summary):
+        return f"no frame has a pose: {busy}"
     if not (summary.get("frames") or {}).get("tracked"):
         return "no frame has a pose, as no image could be decoded"
     return (
@@ -82,6 +97,8 @@ def few_poses(summary: Mapping[str, Any]) -> str | None:
     share = summary.get("completeness") or 0.0
     if not 0.0 < share < _FEW:
         return None
+    if busy := too_much(summary):
+        return f"only {share:.0%} of the frames have a pose: {busy}"
     return (
         f"only {share:.0%} of the frames have a pose: are the images those of one moving camera, in the "
         "order in which they were taken? Consecutive ones must show much the same"
@@ -99,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
     if json_to_stdout:
         settings = replace(settings, json=None)
     talk = plain_console(stderr=True)
-    frames = len(open_sequence(settings.sequence or default_sequence(), settings.camera))
+    frames = look_at(settings.sequence or default_sequence(), settings.camera).num_frames
     result: dict[str, Any] = {}
     failures: list[str] = []
 

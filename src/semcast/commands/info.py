@@ -1,4 +1,4 @@
-"""``semcast info``: what a recording, run, sequence or weights file is."""
+"""``semcast info``: what a recording, run, sequence, video, camera or weights file is."""
 
 import argparse
 
@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=named_path,
         metavar="PATH",
         help="recording (.mcap), folder that --out wrote, sequence folder or transforms.json, "
-        "ROS bag, weights (.safetensors, .onnx) or the name of shipped weights",
+        "video, calibration, ROS bag, weights (.safetensors, .onnx) or the name of shipped weights",
     )
 
 
