@@ -335,6 +335,7 @@ def test_the_first_adjustment_of_a_map_is_held_by_a_pose_and_a_distance():
 def test_keyframes_before_the_window_keep_its_scale_where_keyframes_are_dense(monkeypatch, seed):
     """Ten keyframes within 1/70 of the depth hardly know a scale; those before saw the same landmarks."""
     way = np.concatenate([0.3 * np.arange(6), 1.5 + 0.01 * np.arange(1, 11)])
+    monkeypatch.setattr(window, "_LEAST_WAY", 0.0)  # for two of the window to hold it without those before
     error = {}
     for num_before in (0, window._MAX_BEFORE):
         monkeypatch.setattr(window, "_MAX_BEFORE", num_before)

@@ -1,12 +1,16 @@
 """What an adjustment takes of what keyframes saw."""
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import make_transform
-from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping import window
+from semcast.common.geometry import invert_transform, make_transform, transform_points
+from semcast.server.geometry.weighting import NoiseModel, OnlineNoise
+from semcast.server.mapping import mapper, window
+from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.window import build_problem, within_limit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -58,6 +62,30 @@ def test_the_newest_keyframe_keeps_its_part_where_long_tracks_would_take_all(mon
     assert np.isin(newest, new).sum() >= 50
     # And what ties the window to the keyframes before it keeps its own.
     assert np.isin(problem.landmark_ids, long_seen).sum() >= 5
+
+
+@pytest.mark.parametrize(("num_stood", "window_size"), [(2, 20), (4, 12)])
+def test_views_from_where_the_camera_stood_do_not_change_the_scale(num_stood, window_size):
+    """How far apart they are is an error of their poses; all lengths would grow as if it were not."""
+    rng = np.random.default_rng(0)
+    ids, xyz = np.arange(80), rng.uniform((-2, -2, 4), (3, 2, 8), (80, 3))
+    true_x = np.array([0.0, *np.full(num_stood - 1, 0.005), *np.arange(1, 12) * 0.1])
+    world = WorldMap()
+    world.add_landmarks(ids, xyz, np.zeros((80, 3), np.uint8), np.ones(80), 0, 0)
+    for k, x in enumerate(true_x):
+        T_world_cam = make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
+        xy = CAMERA.project(transform_points(invert_transform(T_world_cam), xyz))
+        T_world_cam[0, 3] += 0.015 if 0 < k < num_stood else 0.0
+        world.add_keyframe(replace(_keyframe(k, ids), T_world_cam=T_world_cam, xy=xy))
+    if window_size < len(true_x):
+        world.revisits[len(true_x) - 1] = 0  # where it stood holds the window from before it
+    noise = OnlineNoise("robust", 0.5, 0.0, fit=False)
+    for _ in range(3):
+        problem = build_problem(world, CAMERA, noise.model, window_size)
+        assert problem is not None
+        mapper.apply_result(world, optimise(problem), noise)
+    x = np.array([k.T_world_cam[0, 3] for k in world.keyframes])
+    np.testing.assert_allclose(x - x[0], true_x, atol=0.02)
 
 
 def _keyframe(number: int, ids: Ids) -> Keyframe:
