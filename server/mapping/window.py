@@ -63,8 +63,8 @@ def build_problem(
     """Collect the newest keyframes of the current submap and what they see.
 
     Older keyframes that see it too are fixed. Two of them know the scale, and then only the first of the
-    newest is fixed with them; otherwise the first two are. Where all that are fixed are in one place, as those
-    of a camera that stood at first, a baseline is held too.
+    newest is fixed with them; otherwise the first two are. Where all that are fixed are in one place, as
+    those of a camera that stood at first, a baseline is held too.
 
     Args:
         world: The map.
