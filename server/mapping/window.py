@@ -44,6 +44,9 @@ _REACH_BACK = 60
 _MIN_SHARED = 6
 #: Extent of a window, in median depths, from which on it knows its own scale.
 _MIN_EXTENT = 0.2
+#: Way between the keyframes that hold a window, in median depths, from which on they tell its scale. Where
+#: the camera stood it is less, and as much an error of their poses: all lengths would follow that.
+_LEAST_WAY = 0.01
 #: The first keyframes of a submap that do not hold such a window: those of the start, or the furthest before
 #: it, which were placed with the least to go by.
 _NUM_UNSURE = 5
@@ -61,7 +64,8 @@ def build_problem(
     """Collect the newest keyframes of the current submap and what they see.
 
     Older keyframes that see it too are fixed. Two of them know the scale, and then only the first of the
-    newest is fixed with them; otherwise the first two are.
+    newest is fixed with them; otherwise the first two are. Where all that are fixed are in one place, as
+    those of a camera that stood at first, a baseline is held too.
 
     Args:
         world: The map.
@@ -89,8 +93,11 @@ def build_problem(
     if len(used_points) < _MIN_LANDMARKS:
         return None
     held = np.bincount(seen.view[kept], minlength=len(views))[: len(anchors)] >= _MIN_SHARED
+    num_new = 1 if start or held.sum() >= 2 else 2
+    holding = [*(k for k, holds in zip(anchors, held, strict=True) if holds), *recent[:num_new]]
+    keep_baseline = start or not _tell_scale(world, holding)
     fixed = np.zeros(len(views), bool)
-    fixed[: len(anchors) + (1 if start or held.sum() >= 2 else 2)] = True
+    fixed[: len(anchors) + (1 if keep_baseline else num_new)] = True
     landmark_ids = ids[used_points]
     problem = assemble_problem(
         camera,
@@ -101,10 +108,17 @@ def build_problem(
         seen.of_rows(kept, point),
         noise,
         fixed=fixed,
-        keep_baseline=start,
+        keep_baseline=keep_baseline,
         iterations=iterations,
     )
     return replace(problem, num_anchors=len(anchors), with_covariance=True)
+
+
+def _tell_scale(world: WorldMap, holding: list[Keyframe]) -> bool:
+    """Whether keyframes that hold a window are so far apart that they tell its scale."""
+    places = np.stack([k.T_world_cam[:3, 3] for k in holding])
+    extent = float(np.linalg.norm(places - places[0], axis=1).max())
+    return extent >= _LEAST_WAY * median_depth(world, holding[-1])
 
 
 def _order_of_choice(

@@ -1,12 +1,16 @@
 """What an adjustment takes of what keyframes saw."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from cloud_of_points import CAMERA, IMAGE, NOISE, make_world, put_landmarks
 from numpy.typing import NDArray
 
-from semcast.common.geometry import make_transform
+from semcast.common.geometry import invert_transform, make_transform, transform_points
+from semcast.server.geometry.weighting import OnlineNoise
 from semcast.server.mapping import window
+from semcast.server.mapping.adjustment import apply_result
 from semcast.server.mapping.bundle import optimise
 from semcast.server.mapping.new_landmarks import add_landmarks
 from semcast.server.mapping.window import build_problem, within_limit
@@ -60,6 +64,30 @@ def test_the_newest_keyframe_keeps_its_part_where_long_tracks_would_take_all(mon
     assert np.isin(problem.landmark_ids, long_seen).sum() >= 5
 
 
+@pytest.mark.parametrize(("num_stood", "window_size"), [(2, 20), (4, 12)])
+def test_views_from_where_the_camera_stood_do_not_change_the_scale(num_stood, window_size):
+    """How far apart they are is an error of their poses; all lengths would grow as if it were not."""
+    rng = np.random.default_rng(0)
+    ids, xyz = np.arange(80), rng.uniform((-2, -2, 4), (3, 2, 8), (80, 3))
+    true_x = np.array([0.0, *np.full(num_stood - 1, 0.005), *np.arange(1, 12) * 0.1])
+    world = WorldMap()
+    world.add_landmarks(ids, xyz, np.zeros((80, 3), np.uint8), np.ones(80), 0, 0)
+    for k, x in enumerate(true_x):
+        T_world_cam = make_transform(np.eye(3), np.array([x, 0.0, 0.0]))
+        xy = CAMERA.project(transform_points(invert_transform(T_world_cam), xyz))
+        T_world_cam[0, 3] += 0.015 if 0 < k < num_stood else 0.0
+        world.add_keyframe(replace(_keyframe(k, ids), T_world_cam=T_world_cam, xy=xy))
+    if window_size < len(true_x):
+        world.revisits[len(true_x) - 1] = 0  # where it stood holds the window from before it
+    noise = OnlineNoise("robust", 0.5, 0.0, fit=False)
+    for _ in range(3):
+        problem = build_problem(world, CAMERA, noise.model, window_size)
+        assert problem is not None
+        apply_result(world, optimise(problem), noise)
+    x = np.array([k.T_world_cam[0, 3] for k in world.keyframes])
+    np.testing.assert_allclose(x - x[0], true_x, atol=0.02)
+
+
 def _keyframe(number: int, ids: Ids) -> Keyframe:
     return Keyframe(
         frame_id=number,
@@ -104,6 +132,7 @@ def test_the_first_adjustment_of_a_map_is_held_by_a_pose_and_a_distance():
 def test_keyframes_before_the_window_keep_its_scale_where_keyframes_are_dense(monkeypatch, seed):
     """Ten keyframes within 1/70 of the depth hardly know a scale; those before saw the same landmarks."""
     way = np.concatenate([0.3 * np.arange(6), 1.5 + 0.01 * np.arange(1, 11)])
+    monkeypatch.setattr(window, "_LEAST_WAY", 0.0)  # for two of the window to hold it without those before
     error = {}
     for num_before in (0, window._MAX_BEFORE):
         monkeypatch.setattr(window, "_MAX_BEFORE", num_before)
