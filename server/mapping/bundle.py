@@ -78,13 +78,18 @@ def _noise_model(
 
 
 def _baseline(problem: BundleProblem) -> Baseline | None:
-    """Return what holds the scale: the longest way from the first view, for a camera may come back to it."""
-    if not problem.keep_baseline or len(problem.T_world_cam) < 2:
+    """Return what holds the scale: the longest way from the newest fixed view, as a camera may come back.
+
+    Fixed views of long ago are no end of it: a way between two of them holds nothing, and one from far aside
+    hardly changes with the scale.
+    """
+    if not problem.keep_baseline or problem.fixed.all():
         return None
-    away = np.linalg.norm(problem.T_world_cam[:, :3, 3] - problem.T_world_cam[0, :3, 3], axis=1)
-    furthest = int(away.argmax())
+    newest = int(np.flatnonzero(problem.fixed)[-1])
+    away = np.linalg.norm(problem.T_world_cam[:, :3, 3] - problem.T_world_cam[newest, :3, 3], axis=1)
+    furthest = int(np.where(problem.fixed, -1.0, away).argmax())
     length_map = float(away[furthest])
-    return Baseline((0, furthest), length_map, max(1e-4 * length_map, 1e-9))
+    return Baseline((newest, furthest), length_map, max(1e-4 * length_map, 1e-9))
 
 
 def _step(constraint: PoseConstraint) -> gtsam.BetweenFactorPose3:

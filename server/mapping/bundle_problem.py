@@ -45,8 +45,8 @@ class BundleProblem:
         keyframe_ids: ``(K,)`` int64 frame ids, in order of time.
         T_world_cam: ``(K, 4, 4)``.
         fixed: ``(K,)`` bool, poses that hold the gauge; at least one.
-        keep_baseline: The distance between the first keyframe and the one furthest from it is held too, for
-            a window with a single fixed pose.
+        keep_baseline: The distance between the newest fixed keyframe and the free one furthest from it is
+            held too, for a window whose fixed poses don't tell its scale.
         landmark_ids: ``(P,)`` int64.
         xyz: ``(P, 3)`` world frame.
         view: ``(M,)`` keyframe of each observation.
