@@ -6,11 +6,11 @@ Images are not opened here. Poses are brought to ``T_world_cam`` of the camera w
 import logging
 import re
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,8 @@ from semcast.common.trajectory import Trajectory, read_tum, seconds_of
 from semcast.common.transforms_file import read_transforms_json
 
 logger = logging.getLogger(__name__)
+
+Row = TypeVar("Row")
 
 Layout = Literal["auto", "native", "tum", "kitti", "euroc", "transforms", "colmap", "folder"]
 
@@ -222,38 +224,47 @@ def _nominal_times_ns(count: int, rate_hz: float) -> NDArray[np.int64]:
     return np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 
 
-def _fields(path: Path, at_least: int) -> Iterable[list[str]]:
-    """Yield the blank- or comma-separated fields of each line that is no comment."""
+def _rows(path: Path, at_least: int, read: Callable[[list[str]], Row]) -> list[Row]:
+    """Return what ``read`` makes of the blank- or comma-separated fields of each line that is no comment.
+
+    Raises:
+        SourceError: The file can't be read, or ``read`` raises ``ValueError`` for a line.
+    """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as err:
         raise SourceError(f"{path} can't be read: {err}") from err
+    rows: list[Row] = []
     for number, line in enumerate(lines, start=1):
         fields = line.split("#", 1)[0].replace(",", " ").split()
         if not fields:
             continue
         if len(fields) < at_least:
             raise SourceError(f"{path}:{number} must have {at_least} fields, got {line!r}")
-        yield fields
+        try:
+            rows.append(read(fields))
+        except ValueError as err:
+            raise SourceError(f"{path}:{number}: {err}") from err
+    return rows
 
 
-def _finite(numbers: Iterable[str]) -> list[float]:
+def _finite(numbers: list[str], count: int) -> NDArray[np.float64]:
     """Return numbers that a pose can have.
 
     Raises:
-        ValueError: One is none, or is not finite.
+        ValueError: One is none or is not finite, or they are not ``count``.
     """
-    values = [float(number) for number in numbers]
-    if not np.isfinite(values).all():
-        raise ValueError(f"poses must be finite, got {values}")
+    try:
+        values = np.array([float(number) for number in numbers])
+    except ValueError:
+        values = np.array([np.nan])
+    if len(values) != count or not np.isfinite(values).all():
+        raise ValueError(f"must be {count} finite numbers, got {' '.join(numbers)}")
     return values
 
 
 def _read_times_ns(path: Path) -> NDArray[np.int64]:
-    try:
-        return np.array([seconds_to_ns(fields[0]) for fields in _fields(path, 1)], dtype=np.int64)
-    except ValueError as err:
-        raise SourceError(f"{path}: {err}") from err
+    return np.array(_rows(path, 1, lambda fields: seconds_to_ns(fields[0])), dtype=np.int64)
 
 
 def _calibration_beside(folder: Path) -> Callable[[int, int], Intrinsics | None]:
@@ -292,10 +303,7 @@ def _with_what_lies_beside(path: Path, images: tuple[Path, ...], rate_hz: float)
 
 def _read_tum_folder(path: Path, rate_hz: float) -> SequenceFiles:
     del rate_hz
-    try:
-        rows = [(seconds_to_ns(t), path / name) for t, name, *_ in _fields(path / "rgb.txt", 2)]
-    except ValueError as err:
-        raise SourceError(f"{path / 'rgb.txt'}: {err}") from err
+    rows = _rows(path / "rgb.txt", 2, lambda fields: (seconds_to_ns(fields[0]), path / fields[1]))
     beside = _calibration_beside(path)
     name = path.resolve().name
 
@@ -378,14 +386,12 @@ def kitti_pose_places(path: Path) -> tuple[Path, Path, Path]:
 def _kitti_projection(path: Path, camera_idx: int) -> NDArray[np.float64] | None:
     if not path.is_file():
         return None
-    for label, *numbers in _fields(path, 2):
+    for label, *numbers in _rows(path, 1, list):
         if label.rstrip(":") == f"P{camera_idx}":
             try:
-                projection = np.array(_finite(numbers)).reshape(3, 4)
+                projection = _finite(numbers, 12).reshape(3, 4)
             except ValueError as err:
-                raise SourceError(
-                    f"{path}: P{camera_idx} must have 12 finite numbers, got {' '.join(numbers)}"
-                ) from err
+                raise SourceError(f"{path}: P{camera_idx} {err}") from err
             if not (projection[0, 0] > 0 and projection[1, 1] > 0 and projection[2, 2] > 0):
                 raise SourceError(
                     f"{path}: P{camera_idx} must have positive focal lengths, got {' '.join(numbers)}"
@@ -395,10 +401,7 @@ def _kitti_projection(path: Path, camera_idx: int) -> NDArray[np.float64] | None
 
 
 def _kitti_poses(path: Path) -> NDArray[np.float64]:
-    try:
-        rows = np.array([_finite(fields) for fields in _fields(path, 12)]).reshape(-1, 3, 4)
-    except ValueError as err:
-        raise SourceError(f"{path}: every line must have 12 numbers: {err}") from err
+    rows = _rows(path, 12, lambda fields: _finite(fields, 12).reshape(3, 4))
     return np.array([make_transform(project_to_so3(row[:, :3]), row[:, 3]) for row in rows]).reshape(-1, 4, 4)
 
 
@@ -412,13 +415,7 @@ def _read_euroc(path: Path, rate_hz: float) -> SequenceFiles:
     folder = _euroc_camera_folder(path)
     if folder is None:
         raise SourceError(f"{path} must have mav0/cam0/data.csv and mav0/cam0/data to be a EuRoC sequence")
-    try:
-        rows = [(int(t), folder / "data" / name) for t, name, *_ in _fields(folder / "data.csv", 2)]
-        too_large = [t_ns for t_ns, _ in rows if abs(t_ns) > _MAX_TIME_NS]
-        if too_large:
-            raise ValueError(f"must be within {_MAX_TIME_NS}, got {too_large[0]}")
-    except ValueError as err:
-        raise SourceError(f"{folder / 'data.csv'}: times must be whole nanoseconds: {err}") from err
+    rows = _rows(folder / "data.csv", 2, lambda fields: (_whole_ns(fields[0]), folder / "data" / fields[1]))
     sensor = folder / "sensor.yaml"
     name = path.resolve().name
     return SequenceFiles(
@@ -430,24 +427,38 @@ def _read_euroc(path: Path, rate_hz: float) -> SequenceFiles:
     )
 
 
+def _whole_ns(text: str) -> int:
+    try:
+        time_ns = int(text)
+    except ValueError as err:
+        raise ValueError(f"time must be whole nanoseconds, got {text!r}") from err
+    if abs(time_ns) > _MAX_TIME_NS:
+        raise ValueError(f"time must be within {_MAX_TIME_NS} ns, got {text}")
+    return time_ns
+
+
 def _euroc_truth(path: Path, sensor: Path) -> Trajectory | None:
     """Return camera poses: body poses of the estimate times the camera's ``T_BS``."""
     if not path.is_file() or not sensor.is_file():
         return None
     try:
         T_body_cam = transform_from_yaml(read_flat_yaml(sensor), "T_BS")
-        if T_body_cam is None:
-            raise ValueError(f"{sensor} has no T_BS")
-        times_s: list[float] = []
-        poses: list[NDArray[np.float64]] = []
-        for t_ns, *numbers in _fields(path, 8):
-            px, py, pz, qw, qx, qy, qz = _finite(numbers[:7])
-            T_world_body = make_transform(rotation_from_quat_wxyz((qw, qx, qy, qz)), (px, py, pz))
-            times_s.append(int(t_ns) * 1e-9)
-            poses.append(T_world_body @ T_body_cam)
-        return Trajectory(np.array(times_s), np.array(poses).reshape(-1, 4, 4))
-    except (ValueError, OverflowError) as err:
-        raise SourceError(f"{path} can't be used as ground truth: {err}") from err
+    except ValueError as err:
+        raise SourceError(f"{sensor} has no usable T_BS: {err}") from err
+    if T_body_cam is None:
+        raise SourceError(f"{sensor} has no T_BS")
+
+    def pose(fields: list[str]) -> tuple[int, NDArray[np.float64]]:
+        px, py, pz, *quat_wxyz = _finite(fields[1:8], 7).tolist()
+        T_world_body = make_transform(rotation_from_quat_wxyz(quat_wxyz), (px, py, pz))
+        return _whole_ns(fields[0]), T_world_body @ T_body_cam
+
+    rows = _rows(path, 8, pose)
+    times_ns = np.array([t_ns for t_ns, _ in rows], np.int64)
+    try:
+        return Trajectory(ns_to_seconds(times_ns), np.array([T for _, T in rows]).reshape(-1, 4, 4))
+    except ValueError as err:
+        raise SourceError(f"{path}: {err}") from err
 
 
 def _read_transforms(path: Path, rate_hz: float) -> SequenceFiles:

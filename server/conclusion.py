@@ -22,6 +22,7 @@ def conclude(
     tell: Callable[[str], None],
     depth_budget_s: float | None = None,
     gives_way: Callable[[], bool] = lambda: False,
+    is_stopped: Callable[[], bool] = lambda: False,
 ) -> None:
     """Adjust the whole map of a stream that has ended, and complete its dense cloud.
 
@@ -31,6 +32,7 @@ def conclude(
         tell: Takes what is going on in a few words, before each step.
         depth_budget_s: Depth that is still missing by then is left out; None waits for all.
         gives_way: Tells, after each depth, that the rest is left for later.
+        is_stopped: Tells, after each depth, that the rest is left out.
     """
     if num_keyframes := session.num_to_adjust:
         tell(f"last adjustment of {num_keyframes} keyframes")
@@ -44,6 +46,7 @@ def conclude(
     if num_waiting > _MANY:
         logger.info("the depth of %d keyframes is estimated now", num_waiting)
     logged_s = time.monotonic()
+    comes_later = False
     for patches in session.complete_cloud(depth_budget_s):
         if patches:
             show(None, patches)
@@ -52,9 +55,9 @@ def conclude(
         if time.monotonic() - logged_s > _LOG_INTERVAL_S:
             logged_s = time.monotonic()
             logger.info("%s", how_far)
-        if gives_way():
+        comes_later = gives_way()
+        if comes_later or is_stopped():
             break
-    else:
-        if num_left := session.num_without_depth:
-            logger.info("no time was left for the depth of %d keyframes: dense.ply is without them", num_left)
+    if not comes_later and (num_left := session.num_without_depth):
+        logger.info("no time was left for the depth of %d keyframes: dense.ply is without them", num_left)
     tell("writing results")

@@ -224,7 +224,7 @@ def _replayed(
                     on_frame(arrival.message.frame_id)
         if not processed and not stop.is_set():
             raise SourceError(f"{settings.file} holds no {settings.source} frames that can be decoded")
-        return _concluded(settings, session, viewer, drops, on_activity, stopped=stop.is_set())
+        return _concluded(settings, session, viewer, drops, on_activity, stop)
 
 
 def _concluded(
@@ -233,10 +233,10 @@ def _concluded(
     viewer: "ViewerFeed | None",
     drops: dict[str, int],
     on_activity: Callable[[str], None] | None,
-    *,
-    stopped: bool,
+    stop: threading.Event,
 ) -> dict[str, Any]:
     """Adjust the whole map, write what the replay leaves behind and return the summary."""
+    stopped = stop.is_set()  # later on only what is left of the depth is missing
     with contextlib.suppress(OSError):  # said at the end
         session.write_results(settings.out)  # who stops the replay may not wait for the adjustment
     conclude(
@@ -244,6 +244,7 @@ def _concluded(
         lambda update, patches: viewer.submit(None, update, patches) if viewer is not None else None,
         on_activity or (lambda text: None),
         0.0 if stopped else None,
+        is_stopped=stop.is_set,
     )
     try:
         whole = settings.start_s == 0.0 and settings.end_s is None and not stopped

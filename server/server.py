@@ -152,7 +152,7 @@ class Server:
                     break
         finally:
             self._control.close()
-            summary = self._sessions.finish(is_stopped=stop.is_set())
+            summary = self._sessions.finish(stop)
         return summary
 
     def _next_decoded(self) -> DecodedArrival | None:

@@ -2,6 +2,7 @@
 
 import functools
 import logging
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -169,8 +170,10 @@ class SuccessiveSessions:
                 logger.info("outputs are in %s, waiting for the next stream", out)
         self._tell("")
 
-    def finish(self, *, is_stopped: bool) -> dict[str, Any]:
+    def finish(self, stop: threading.Event) -> dict[str, Any]:
         """End the present stream and return its summary; that of a server that heard of none is empty.
+
+        A stop leaves missing depth a little time, one that comes meanwhile none: who asks waits already.
 
         Raises:
             SemcastError: The outputs can't be written.
@@ -180,7 +183,9 @@ class SuccessiveSessions:
             return {}
         out = self._settings.out
         try:
-            self._conclude(session, _STOPPED_S if is_stopped or not self._end_of.complete else None)
+            was_stopped = stop.is_set()
+            budget_s = _STOPPED_S if was_stopped or not self._end_of.complete else None
+            self._conclude(session, budget_s, is_stopped=lambda: stop.is_set() and not was_stopped)
             summary = self._end(session, out)
         except OSError as err:
             raise SemcastError(_not_written(out, err)) from err
@@ -191,7 +196,11 @@ class SuccessiveSessions:
         return summary
 
     def _conclude(
-        self, session: Session, depth_budget_s: float | None, gives_way: Callable[[], bool] = lambda: False
+        self,
+        session: Session,
+        depth_budget_s: float | None,
+        gives_way: Callable[[], bool] = lambda: False,
+        is_stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         """Adjust the whole map of a stream that has ended, and tell who follows it."""
         self._save(session)  # the adjustment takes seconds, and the server may be stopped or killed meanwhile
@@ -203,7 +212,7 @@ class SuccessiveSessions:
                     self._outbox.put_metric_pose(session.identity.agent_epoch, last, session.metres.of(last))
             self.views.submit(None, update, patches)
 
-        conclude(session, show, self._tell, depth_budget_s, gives_way)
+        conclude(session, show, self._tell, depth_budget_s, gives_way, is_stopped)
 
     def _end_former(self, former: Session) -> None:
         """Write what the agent's start before leaves behind; that it can't be written ends no stream."""

@@ -194,6 +194,19 @@ def test_a_full_disk_behind_standard_output_is_told_in_a_line(words, buffered):
     assert (done.returncode, done.stderr) == (1, ""), "who reads no further knows"
 
 
+@pytest.mark.parametrize(
+    "words",
+    ["channel --help --typo", "channel --typo x -h", "channel wrong --help", "eval codec --typo --help"],
+)
+def test_who_asks_for_help_gets_it_beside_a_mistake(words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(words.split())
+    assert stopped.value.code == 0
+    said = capsys.readouterr()
+    assert said.out.startswith("usage: semcast ")
+    assert not said.err
+
+
 def test_help_is_a_verb_too(capsys):
     for words, first in ((["help"], "usage: semcast VERB"), (["help", "replay"], "usage: semcast replay")):
         with pytest.raises(SystemExit) as ended:

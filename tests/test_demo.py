@@ -44,6 +44,17 @@ pytestmark = pytest.mark.xdist_group("real-time")
 SEQUENCE = Path(__file__).resolve().parents[1] / "deploy" / "demo" / "kitti_06"
 
 
+def test_what_a_role_warns_of_is_told_once_and_nothing_else(tmp_path):
+    child = Role("server", [], tmp_path / "log")
+    child.log.write_text(
+        "11:58:03 INFO    semcast.server.session: frame 4: a map has begun\n"
+        "11:58:04 WARNING semcast.server.mapping.readout_watch: the focal length seems too short\n"
+        "11:58:05 WARNING semcast.server.session: 1 frames tracked, 0 with a pose\n"
+        "11:58:06 WARNING semcast.server.mapping.readout_watch: the focal length seems too short\n"
+    )
+    assert child.warnings() == ["the focal length seems too short", "1 frames tracked, 0 with a pose"]
+
+
 @pytest.mark.parametrize("stride", [1, 3, 7])
 def test_a_machine_that_keeps_up_plays_at_the_recorded_times(tmp_path, monkeypatch, stride):
     monkeypatch.setattr(demo, "plan_for", lambda *given: Plan(0.5, given[3]))

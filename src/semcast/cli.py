@@ -94,9 +94,14 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **settings)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse what is not known here, where a sub-verb's options are, and not in the verb above it."""
+        """Refuse what is not known here, where a sub-verb's options are, and not in the verb above it.
+
+        Who asks for help gets it, whatever else is wrong.
+        """
         words = list(sys.argv[1:] if args is None else args)
         if self._subparsers is None:
+            if not {"-h", "--help"}.isdisjoint(words):
+                words = ["--help"]
             self._refuse(_unknown_options(words, self._option_string_actions))
         found, unknown = super().parse_known_args(words, namespace)
         self._refuse(unknown)

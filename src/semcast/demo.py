@@ -237,6 +237,10 @@ def run_demo(
     finally:
         for child in reversed(children.values()):
             child.stop()
+    for name in ("agent", "server"):
+        if name in children:
+            for warning in children[name].warnings():
+                tell(f"the {name} warns: {warning}")
     if error is None and children["server"].returncode == ERROR_CODE:
         error = f"the server: {children['server'].last_words()}"  # its outputs are there, not its recording
     summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None

@@ -44,6 +44,11 @@ class Role:
         lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return lines[-1] if lines else "no output"
 
+    def warnings(self) -> list[str]:
+        """Return what the log warns of, each once, in the order in which it came."""
+        log = self.log.read_text(encoding="utf-8", errors="replace")
+        return list(dict.fromkeys(re.findall(r"^\S+ WARNING \S+: (.+)$", log, re.MULTILINE)))
+
     def viewer_address(self) -> str | None:
         """Return the address of the viewer's page, once the log names it."""
         log = self.log.read_text(encoding="utf-8", errors="replace")

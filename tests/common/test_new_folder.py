@@ -1,3 +1,8 @@
+import os
+import shutil
+import signal
+import threading
+
 import pytest
 
 from semcast.common.errors import SourceError
@@ -44,3 +49,26 @@ def test_why_a_folder_can_not_be_written_is_said(tmp_path):
 
     with pytest.raises(SourceError, match="can't write to .*out: No space left on device"):
         fill()
+
+
+def test_a_run_that_is_asked_to_end_leaves_nothing_behind(tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+
+    def fill():
+        with new_folder(tmp_path / "out") as folder:
+            (folder / "times.txt").write_text("0")
+            os.kill(os.getpid(), signal.SIGTERM)
+            threading.Event().wait(10)
+
+    with pytest.raises(SystemExit) as ended:
+        fill()
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert not (tmp_path / "out").exists()
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+def test_what_a_killed_run_left_is_told_from_what_is_the_users(tmp_path):
+    with new_folder(tmp_path / "out") as folder:
+        shutil.copytree(folder, tmp_path / "killed")
+    with pytest.raises(SourceError, match="killed has an unfinished sequence in it: delete it"):
+        new_folder(tmp_path / "killed").__enter__()

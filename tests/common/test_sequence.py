@@ -96,8 +96,9 @@ def test_an_image_is_brought_to_the_camera_of_a_resized_stream(native):
 )
 @pytest.mark.parametrize("name", ["times.txt", "rgb.txt"])
 def test_times_that_are_no_seconds_are_refused(native, name, time, message):
-    (native / name).write_text("".join(f"{time} images/{k:06d}.png\n" for k in range(6)))
-    with pytest.raises(SourceError, match=f"{name}: {message}"):
+    times = ["# seconds", "0.0", "0.1", time, "0.3", "0.4", "0.5"]
+    (native / name).write_text("".join(f"{t} images/{k:06d}.png\n" for k, t in enumerate(times)))
+    with pytest.raises(SourceError, match=f"{name}:4: {message}"):
         open_sequence(native)
 
 

@@ -17,7 +17,7 @@ CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
 def test_whole_nanoseconds_beyond_64_bits_are_refused(tmp_path, write_images):
     write_images(tmp_path / "mav0/cam0/data", 2)
     (tmp_path / "mav0/cam0/data.csv").write_text(f"{10**18},000000.png\n{10**20},000001.png\n")
-    with pytest.raises(SourceError, match=f"data.csv: times must be whole nanoseconds: .* got {10**20}"):
+    with pytest.raises(SourceError, match=f"data.csv:2: time must be within .* ns, got {10**20}"):
         open_sequence(tmp_path)
 
 
@@ -77,7 +77,7 @@ def test_kitti_layout_moves_poses_to_the_camera_that_is_used(tmp_path, write_ima
     [
         ("0\n2\n1\n", "1 0 0 0 0 1 0 0 0 0 1 0", "must strictly increase, image 3 has 1 s after 2 s"),
         ("0\n1\n", "1 0 0 0 0 1 0 0 0 0 1 0", "one time per image, got 2 times and 3 images"),
-        ("0\n1\n2\n", "nan 0 0 0 0 1 0 0 0 0 1 0", "poses.txt: every line must have 12 numbers: .*finite"),
+        ("0\n1\n2\n", "nan 0 0 0 0 1 0 0 0 0 1 0", "poses.txt:1: must be 12 finite numbers, got nan 0"),
     ],
 )
 def test_what_is_wrong_with_a_kitti_recording_is_said(tmp_path, write_images, times, pose, message):
@@ -93,8 +93,8 @@ def test_what_is_wrong_with_a_kitti_recording_is_said(tmp_path, write_images, ti
     [
         ("0 0 15.5 0 0 31 11.5 0 0 0 1 0", "P0 must have positive focal lengths, got 0 0 15.5"),
         ("-30 0 15.5 0 0 31 11.5 0 0 0 1 0", "P0 must have positive focal lengths, got -30 0"),
-        ("inf 0 15.5 0 0 31 11.5 0 0 0 1 0", "P0 must have 12 finite numbers, got inf 0"),
-        ("30 0 15.5", "P0 must have 12 finite numbers, got 30 0 15.5"),
+        ("inf 0 15.5 0 0 31 11.5 0 0 0 1 0", "P0 must be 12 finite numbers, got inf 0"),
+        ("30 0 15.5", "P0 must be 12 finite numbers, got 30 0 15.5"),
     ],
 )
 def test_a_damaged_kitti_calibration_is_said(tmp_path, write_images, projection, message):
@@ -193,7 +193,7 @@ def test_euroc_layout_gives_poses_of_the_camera_not_of_the_body(tmp_path, write_
     assert sequence.times_ns[0] == 1403636579763555584
     np.testing.assert_allclose(sequence.groundtruth().T_world_cam, poses(2) @ T_body_cam, atol=1e-9)
     (truth / "data.csv").write_text(f"{'9' * 400},0,0,0,1,0,0,0\n")
-    with pytest.raises(SourceError, match="can't be used as ground truth: int too large"):
+    with pytest.raises(SourceError, match="data.csv:1: time must be within 9000000000000000000 ns"):
         open_sequence(folder)
 
 

@@ -33,6 +33,13 @@ def test_depth_is_left_for_later_where_it_must_give_way():
     assert shown_of(session) == ["patch 3"]
 
 
+def test_a_stop_on_the_way_leaves_the_rest_of_the_depth_out_and_it_is_told(caplog):
+    caplog.set_level("INFO", logger="semcast.server.conclusion")
+    session = Ended()
+    assert shown_of(session, is_stopped=lambda: session.num_without_depth < 3) == ["patch 1"]
+    assert "no time was left for the depth of 2 keyframes: dense.ply is without them" in caplog.text
+
+
 class Adjusted(Ended):
     """One whose last adjustment changed the map; of its depths the second confirms none."""
 
