@@ -362,9 +362,13 @@ def test_an_agent_that_gives_up_ends_the_demo_with_what_came_out_so_far(tmp_path
     summary, error = run_demo(settings, threading.Event(), told.append, lambda done, text: None)
     assert error is not None
     assert "images" in error
-    assert [line.partition(", see")[0] for line in told if "left out" in line] == [
+    assert [line.partition(", see")[0] for line in told if line.startswith("images left out")] == [
         "images left out, unreadable or of another size: 9"
     ]
+    warnings = [line for line in told if line.startswith("the agent warns: ")]
+    assert len(warnings) == 4, "the first three, and how many more"
+    assert "000025.jpg is not a readable image" in warnings[0]
+    assert "times more, see" in warnings[3]
     assert summary is not None
     assert summary["frames"]["tracked"] > 0
 

@@ -39,6 +39,8 @@ from semcast.server.viewing import check_viewer
 
 AGENT_ID = "demo"
 _PROGRAM = (sys.executable, "-m", "semcast")
+#: Warnings of one role that are told at the end.
+_MAX_WARNINGS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,12 +241,19 @@ def run_demo(
             child.stop()
     for name in ("agent", "server"):
         if name in children:
-            for warning in children[name].warnings():
-                tell(f"the {name} warns: {warning}")
+            for text in _warnings(children[name]):
+                tell(f"the {name} warns: {text}")
     if error is None and children["server"].returncode == ERROR_CODE:
         error = f"the server: {children['server'].last_words()}"  # its outputs are there, not its recording
     summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
     return summary, error
+
+
+def _warnings(role: Role) -> list[str]:
+    """Return the first few warnings of a role, and how many more there are: one image each may be damaged."""
+    told = role.warnings()
+    more = len(told) - _MAX_WARNINGS
+    return told if more <= 0 else [*told[:_MAX_WARNINGS], f"{more} times more, see {role.log}"]
 
 
 def _prepare(settings: DemoSettings) -> tuple[DemoRecording, Path]:
