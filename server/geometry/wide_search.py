@@ -103,27 +103,25 @@ class WideMatches:
 
 
 def clear_matches(
-    features0: WideFeatures, features1: WideFeatures, max_ratio: float = _MAX_RATIO
+    features0: WideFeatures, features1: WideFeatures, max_ratio: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows ``(M,)`` into two images' features whose descriptors clearly have a nearest one; some are wrong.
+    """Rows ``(M,)`` into two images' features that match one to one; some are wrong.
+
+    Many features of the first image that are taken for one of the second would agree with a camera so far
+    away that it sees them in one place.
 
     Args:
         features0: Of the first image.
         features1: Of the second.
-        max_ratio: The nearest one must be nearer than this share of the distance to the second nearest.
+        max_ratio: The nearest descriptor must be nearer than this share of the distance to the second nearest.
     """
-    clear: list[tuple[int, int]] = []
-    if len(features0.xy) and len(features1.xy) > 1:
-        pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(features0.descriptors, features1.descriptors, k=2)
-        clear = [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < max_ratio * b.distance]
-    row0, row1 = np.array(clear, dtype=np.intp).reshape(-1, 2).T
-    return row0, row1
+    return _one_to_one(*_clearly_nearest(features0, features1, max_ratio))
 
 
 def expected_matches(
     features0: WideFeatures, features1: WideFeatures, expected_xy: Array, reach_px: float, max_ratio: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """As ``clear_matches``, among those that are about where they are expected.
+    """As ``clear_matches``, among features that are about where they are expected.
 
     Args:
         features0: Of the first image.
@@ -142,12 +140,35 @@ def expected_matches(
     distance[~(square_distances(expected_xy, features1.xy) < reach_px**2)] = _UNLIKE
     nearest, second = np.partition(distance, 1, axis=1)[:, :2].T
     row0 = np.flatnonzero(nearest < max_ratio * second)
-    return row0, distance[row0].argmin(axis=1)
+    return _one_to_one(row0, distance[row0].argmin(axis=1), nearest[row0])
+
+
+def _clearly_nearest(
+    features0: WideFeatures, features1: WideFeatures, max_ratio: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Rows ``(M,)`` into both and distances ``(M,)`` of descriptors that clearly have a nearest one."""
+    clear: list[tuple[int, int, float]] = []
+    if len(features0.xy) and len(features1.xy) > 1:
+        pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(features0.descriptors, features1.descriptors, k=2)
+        clear = [
+            (a.queryIdx, a.trainIdx, a.distance) for a, b in pairs if a.distance < max_ratio * b.distance
+        ]
+    row0, row1, distance = np.array(clear, dtype=np.float64).reshape(-1, 3).T
+    return row0.astype(np.intp), row1.astype(np.intp), distance
+
+
+def _one_to_one(
+    row0: NDArray[np.intp], row1: NDArray[np.intp], distance: Array
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Of matches with the same feature of the second image the one with the nearest descriptor."""
+    order = np.argsort(distance, kind="stable")
+    first = np.sort(order[np.unique(row1[order], return_index=True)[1]])
+    return row0[first], row1[first]
 
 
 def match_wide(features0: WideFeatures, features1: WideFeatures) -> WideMatches:
-    """Match two images, see ``clear_matches``."""
-    row0, row1 = clear_matches(features0, features1)
+    """Match two images by descriptors that clearly have a nearest one; some matches are wrong."""
+    row0, row1, _ = _clearly_nearest(features0, features1, _MAX_RATIO)
     scale = features1.size_px[row1] / features0.size_px[row0]
     angle = features1.angle_rad[row1] - features0.angle_rad[row0]
     cos, sin = scale * np.cos(angle), scale * np.sin(angle)
