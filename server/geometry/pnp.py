@@ -107,7 +107,7 @@ def refine_pose(
         iterations: Steps at most.
         spread_px: ``(N, 2)`` the vectors ``s``, None where all points are certain.
         edge: ``(N, 2)`` of the observations, see ``edges``; None where errors have no direction.
-        is_rough: The start is. Points three gates off have a say in the first two steps then, and else in none.
+        is_rough: The start is: in the first two steps, points three gates off have a say too.
 
     Returns:
         The refined pose; the start with no inlier where nothing could be solved.

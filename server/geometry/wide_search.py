@@ -113,7 +113,7 @@ def clear_matches(
     Args:
         features0: Of the first image.
         features1: Of the second.
-        max_ratio: The nearest descriptor must be nearer than this share of the distance to the second nearest.
+        max_ratio: The nearest descriptor must be nearer than this share of the distance to the second.
     """
     return _one_to_one(*_clearly_nearest(features0, features1, max_ratio))
 
@@ -126,7 +126,7 @@ def expected_matches(
     Args:
         features0: Of the first image.
         features1: Of the second.
-        expected_xy: ``(N, 2)`` pixels of the first image's features in the second; NaN is nowhere.
+        expected_xy: ``(N, 2)`` pixels of the first one's features in the second image; NaN is nowhere.
         reach_px: How far from there they are looked for.
         max_ratio: See ``clear_matches``; of the features within reach.
     """

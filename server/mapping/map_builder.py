@@ -173,7 +173,7 @@ class MapBuilder:
         return anchor_tracks(self._mapped, tracks, sight, T_world_cam)
 
     def recognise(self, sight: Sight, T_world_expected: Array | None) -> Place | None:
-        """Look for the place of an image whose camera is lost; it may have gone on to ``T_world_expected``."""
+        """Look for the place of an image whose camera is lost, or went on to ``T_world_expected``."""
         noise = self.noise.model
         place = self.relocaliser.find(sight, self.world, noise)
         return place or self._wide.find(sight, self.world, self.images, noise, T_world_expected)

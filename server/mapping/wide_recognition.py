@@ -60,6 +60,8 @@ _LEAST_SHARES = (0.0, 0.0, 0.2)
 #: Share of those that must agree with the pose of the next round.
 _MIN_AGREEING_SHARE = 0.5
 _ALIGNED_SIGMA_PX = 1.0
+#: Standard deviation of a recognised rotation at most: errors were up to five times as large.
+_MAX_SIGMA_RAD = np.radians(0.5)
 _BORDER_PX = 8
 _SEARCH_ITERATIONS = 400
 
@@ -176,8 +178,10 @@ class WideRecogniser:
         T_cam_expected = None if T_world_expected is None else invert_transform(T_world_expected)
         for view, fine in [*((view, False) for view in views), (views[0], True)]:
             for start in self._starts(sight, view, T_cam_expected, noise, fine=fine):
-                if (found := self._proved(sight, view, start, noise)) is not None:
-                    return self._place(sight, view, views, found, noise)
+                found = self._proved(sight, view, start, noise)
+                place = None if found is None else self._place(sight, view, views, found, noise)
+                if place is not None:
+                    return place
         return None
 
     def _features_of(self, image: SeenFrom, *, fine: bool) -> WideFeatures:
@@ -236,8 +240,10 @@ class WideRecogniser:
 
     def _place(
         self, sight: Sight, proved: _View, views: list[_View], found: PoseEstimate, noise: NoiseModel
-    ) -> Place:
+    ) -> Place | None:
         """Look for the landmarks of all views: a pose from far off rests on few of any single one.
+
+        None where they hold the rotation loosely: a few that lie close together agree with many poses.
 
         Args:
             sight: The image.
@@ -253,6 +259,8 @@ class WideRecogniser:
         ids, first = np.unique(np.concatenate([a.ids for a in each]), return_index=True)
         xyz, xy = (np.concatenate([getattr(a, name) for a in each])[first] for name in ("xyz", "xy"))
         pose = self._refined(found, xyz, xy, noise)
+        if pose.covariance is None or np.sqrt(np.trace(pose.covariance[:3, :3])) > _MAX_SIGMA_RAD:
+            return None
         good, keyframe = pose.inliers, proved.keyframe
         T_world_cam = invert_transform(pose.T_cam_world)
         return Place(T_world_cam, keyframe.frame_id, ids[good], xy[good], keyframe.submap)
