@@ -98,7 +98,7 @@ class _View:
     def points(self, camera: Intrinsics, features: WideFeatures) -> tuple[WideFeatures, Array]:
         """Features that have a landmark next to them, and where they are if they are as far, ``(M, 3)``."""
         if len(self.ids) == 0:
-            return features[:0], np.zeros((0, 3))
+            return features[np.zeros(0, np.intp)], np.zeros((0, 3))
         square = square_distances(features.xy, self.xy)
         next_to = square.argmin(axis=1)
         near = square[np.arange(len(next_to)), next_to] < _MAX_OFFSET_PX**2
