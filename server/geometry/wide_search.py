@@ -25,8 +25,6 @@ _NUM_FEATURES = 2000
 _MIN_CONTRAST = 0.015
 #: By this ratio of distances a nearest descriptor is clearly the nearest (Lowe 2004).
 _MAX_RATIO = 0.8
-#: Distance of descriptors that have nothing to do with each other; their length is 512.
-_UNLIKE = 420.0
 _EPIPOLAR_PX = 3.0
 _NEIGHBOURS = 7
 #: Matches next to a point that the warp around it is fitted to.
@@ -57,9 +55,6 @@ class WideFeatures:
     size_px: Array
     angle_rad: Array
     descriptors: NDArray[np.float32]
-
-    def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> "WideFeatures":
-        return WideFeatures(self.xy[rows], self.size_px[rows], self.angle_rad[rows], self.descriptors[rows])
 
     @staticmethod
     def of(grey: Grey, usable: NDArray[np.bool_] | None = None, *, fine: bool = False) -> "WideFeatures":
@@ -101,74 +96,42 @@ class WideMatches:
     to_xy: Array
     turns: Array
 
+    def carry(self, xy: Array, max_offset_px: float) -> tuple[NDArray[np.intp], Array]:
+        """Take pixels ``(N, 2)`` of the first image to the second: for each match the one next to it.
 
-def clear_matches(
-    features0: WideFeatures, features1: WideFeatures, max_ratio: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows ``(M,)`` into two images' features that match one to one; some are wrong.
+        Args:
+            xy: Pixels.
+            max_offset_px: One further from its match is left out.
 
-    Many features of the first image that are taken for one of the second would agree with a camera so far
-    away that it sees them in one place.
+        Returns:
+            Rows of those that were taken ``(K,)``, and where they come to lie ``(K, 2)``.
+        """
+        if len(xy) == 0 or len(self.from_xy) == 0:
+            return np.zeros(0, np.intp), np.zeros((0, 2))
+        square = square_distances(xy, self.from_xy)
+        next_to = square.argmin(axis=0)
+        near = np.flatnonzero(square[next_to, np.arange(len(next_to))] < max_offset_px**2)
+        rows, first = np.unique(next_to[near], return_index=True)
+        match = near[first]
+        offset = np.einsum("nij,nj->ni", self.turns[match], xy[rows] - self.from_xy[match])
+        return rows, self.to_xy[match] + offset
+
+
+def match_wide(
+    features0: WideFeatures, features1: WideFeatures, max_ratio: float = _MAX_RATIO
+) -> WideMatches:
+    """Match two images by descriptors that clearly have a nearest one; some matches are wrong.
 
     Args:
         features0: Of the first image.
         features1: Of the second.
-        max_ratio: The nearest descriptor must be nearer than this share of the distance to the second.
+        max_ratio: The nearest one must be nearer than this share of the distance to the second nearest.
     """
-    return _one_to_one(*_clearly_nearest(features0, features1, max_ratio))
-
-
-def expected_matches(
-    features0: WideFeatures, features1: WideFeatures, expected_xy: Array, reach_px: float, max_ratio: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """As ``clear_matches``, among features that are about where they are expected.
-
-    Args:
-        features0: Of the first image.
-        features1: Of the second.
-        expected_xy: ``(N, 2)`` pixels of the first one's features in the second image; NaN is nowhere.
-        reach_px: How far from there they are looked for.
-        max_ratio: See ``clear_matches``; of the features within reach.
-    """
-    if len(features0.xy) == 0 or len(features1.xy) < 2:
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    descriptors0, descriptors1 = features0.descriptors, features1.descriptors
-    square = (descriptors0**2).sum(axis=1)[:, None] + (descriptors1**2).sum(axis=1)
-    square -= 2.0 * descriptors0 @ descriptors1.T
-    distance = np.sqrt(np.maximum(square, 0.0))
-    # What is out of reach is as unlike as what shows nothing of the other.
-    distance[~(square_distances(expected_xy, features1.xy) < reach_px**2)] = _UNLIKE
-    nearest, second = np.partition(distance, 1, axis=1)[:, :2].T
-    row0 = np.flatnonzero(nearest < max_ratio * second)
-    return _one_to_one(row0, distance[row0].argmin(axis=1), nearest[row0])
-
-
-def _clearly_nearest(
-    features0: WideFeatures, features1: WideFeatures, max_ratio: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Rows ``(M,)`` into both and distances ``(M,)`` of descriptors that clearly have a nearest one."""
-    clear: list[tuple[int, int, float]] = []
+    clear: list[tuple[int, int]] = []
     if len(features0.xy) and len(features1.xy) > 1:
         pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(features0.descriptors, features1.descriptors, k=2)
-        clear = [
-            (a.queryIdx, a.trainIdx, a.distance) for a, b in pairs if a.distance < max_ratio * b.distance
-        ]
-    row0, row1, distance = np.array(clear, dtype=np.float64).reshape(-1, 3).T
-    return row0.astype(np.intp), row1.astype(np.intp), distance
-
-
-def _one_to_one(
-    row0: NDArray[np.intp], row1: NDArray[np.intp], distance: Array
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Of matches with the same feature of the second image the one with the nearest descriptor."""
-    order = np.argsort(distance, kind="stable")
-    first = np.sort(order[np.unique(row1[order], return_index=True)[1]])
-    return row0[first], row1[first]
-
-
-def match_wide(features0: WideFeatures, features1: WideFeatures) -> WideMatches:
-    """Match two images by descriptors that clearly have a nearest one; some matches are wrong."""
-    row0, row1, _ = _clearly_nearest(features0, features1, _MAX_RATIO)
+        clear = [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < max_ratio * b.distance]
+    row0, row1 = np.array(clear, dtype=np.intp).reshape(-1, 2).T
     scale = features1.size_px[row1] / features0.size_px[row0]
     angle = features1.angle_rad[row1] - features0.angle_rad[row0]
     cos, sin = scale * np.cos(angle), scale * np.sin(angle)

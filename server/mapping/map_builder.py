@@ -181,11 +181,11 @@ class MapBuilder:
         """Align tracks with how earlier keyframes of this submap saw them; the number aligned."""
         return anchor_tracks(self._mapped, tracks, sight, T_world_cam)
 
-    def recognise(self, sight: Sight, T_world_expected: Array | None) -> Place | None:
-        """Look for the place of an image whose camera is lost, or went on to ``T_world_expected``."""
+    def recognise(self, sight: Sight) -> Place | None:
+        """Look for the place of an image whose camera is lost."""
         noise = self.noise.model
         place = self.relocaliser.find(sight, self.world, noise)
-        return place or self._wide.find(sight, self.world, self.images, noise, T_world_expected)
+        return place or self._wide.find(sight, self.world, self.images, noise)
 
     def resembles(self, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: Ids) -> bool:
         """Tell whether tracks that agree with a pose show what the newest keyframes saw."""

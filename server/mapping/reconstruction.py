@@ -289,8 +289,7 @@ class Reconstruction:
         return pose
 
     def _recognise(self, sight: Sight) -> TrackedPose | None:
-        T_world_expected = self._motion.predict(sight.frame.t_source_ns)
-        if (place := self._map.recognise(sight, T_world_expected)) is None:
+        if (place := self._map.recognise(sight)) is None:
             return None
         # Nothing is given up for a place before there is a pose in it.
         seen = Seen(place.ids, place.xy, np.full(len(place.ids), _RECOGNISED_CONFIDENCE))

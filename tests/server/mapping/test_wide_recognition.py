@@ -79,11 +79,8 @@ class _Moved(Orbit):
         return T_world_cam
 
 
-# From nearer the same errors of the map are more pixels.
-@pytest.mark.parametrize(("further_m", "error_px"), [(-0.75, 2.0), (-0.6, 1.5), (2.4, 1.5)])
-def test_the_place_is_found_from_where_things_are_twice_as_large_or_half_as_large(
-    mapped, further_m, error_px
-):
+@pytest.mark.parametrize("further_m", [-0.6, 2.4])
+def test_the_place_is_found_from_where_things_are_twice_as_large_or_half_as_large(mapped, further_m):
     k = NUM_MAPPED + 1
     sequence, reconstruction = mapped
     image = frame_of(_Moved(further_m), 0.1 * k, 1.5, np.random.default_rng(0))
@@ -101,7 +98,7 @@ def test_the_place_is_found_from_where_things_are_twice_as_large_or_half_as_larg
     )
     times = np.median(points[:, 2]) / np.median(before[:, 2])
     assert times < 0.65 if further_m < 0.0 else times > 2.0
-    assert np.median(np.linalg.norm(camera.project(points) - place.xy, axis=1)) < error_px
+    assert np.median(np.linalg.norm(camera.project(points) - place.xy, axis=1)) < 1.5
 
 
 def test_landmarks_that_only_other_keyframes_saw_are_found_too(mapped):
@@ -121,6 +118,14 @@ def test_another_place_is_not_taken_for_it(mapped):
     image = mapped[0].image(NUM_MAPPED)
     for other in (image[:, ::-1].copy(), np.random.default_rng(0).permutation(image), image // 255 + 90):
         assert find(mapped, sight_of(other, NUM_MAPPED)) is None
+
+
+@pytest.mark.parametrize(("num_columns", "is_place"), [(320, True), (105, False)])
+def test_a_place_shows_a_good_part_of_what_should_be_in_view(mapped, num_columns, is_place):
+    # As a wrong one of equal houses: what is like there is the same, but not what stands around it.
+    image = mapped[0].image(NUM_MAPPED).copy()
+    image[:, num_columns:] = 255 - image[::-1, num_columns:]
+    assert (find(mapped, sight_of(image, NUM_MAPPED)) is not None) == is_place
 
 
 def test_what_is_not_found_in_eight_frames_is_not_looked_for_any_more(mapped):
