@@ -212,7 +212,7 @@ class Relocaliser:
         if refined.num_inliers < max(self._min_inliers, _MIN_GUIDED_SHARE * len(point)):
             return None
         good = refined.inliers
-        if spread_alike(self._camera, expected, xy[row][good]) < _LEAST_ALIKE:
+        if self._alike(expected, xy[row][good]) < _LEAST_ALIKE:
             return None
         return Place(
             invert_transform(refined.T_cam_world),
@@ -222,12 +222,11 @@ class Relocaliser:
             keyframe.submap,
         )
 
-
-def spread_alike(camera: Intrinsics, in_view_xy: Array, found_xy: Array) -> float:
-    """Bhattacharyya coefficient of how two sets of pixels ``(N, 2)`` and ``(M, 2)`` lie in an image."""
-    size = ((0, camera.width), (0, camera.height))
-    p, q = (np.histogramdd(xy, _FIELDS_XY, size)[0] / len(xy) for xy in (in_view_xy, found_xy))
-    return float(np.sqrt(p * q).sum())
+    def _alike(self, in_view_xy: Array, found_xy: Array) -> float:
+        """Bhattacharyya coefficient of how two sets of pixels ``(N, 2)`` and ``(M, 2)`` lie in the image."""
+        size = ((0, self._camera.width), (0, self._camera.height))
+        p, q = (np.histogramdd(xy, _FIELDS_XY, size)[0] / len(xy) for xy in (in_view_xy, found_xy))
+        return float(np.sqrt(p * q).sum())
 
 
 def _likeliest(candidates: Sequence[Keyframe], descriptors: NDArray[np.uint8]) -> list[Keyframe]:

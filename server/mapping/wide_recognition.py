@@ -26,7 +26,7 @@ from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.geometry.wide_search import WideFeatures, match_wide
 from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
-from semcast.server.mapping.relocalisation import Place, spread_alike
+from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -52,11 +52,6 @@ _LEAST_SHARES = (0.0, 0.0, 0.2)
 #: Share of those that must agree with the pose of the next round.
 _MIN_AGREEING_SHARE = 0.5
 _ALIGNED_SIGMA_PX = 1.0
-#: Where houses or doors are alike, a wrong one has not what stands around it. Landmarks that agree must lie
-#: in the image like those that should be in view (``spread_alike``), or be this share of them. At 27 wrong
-#: places that was at most 0.79 and 0.39; at 88 of 99 right ones, one of the two was more.
-_LEAST_ALIKE = 0.8
-_LEAST_FOUND = 0.4
 _BORDER_PX = 8
 _SEARCH_ITERATIONS = 400
 
@@ -188,10 +183,8 @@ class WideRecogniser:
 
     def _place(
         self, sight: Sight, proved: _View, views: list[_View], found: PoseEstimate, noise: NoiseModel
-    ) -> Place | None:
+    ) -> Place:
         """Look for the landmarks of all views: a pose from far off rests on few of any single one.
-
-        None where much of what should be in view is not there.
 
         Args:
             sight: The image.
@@ -208,21 +201,8 @@ class WideRecogniser:
         xyz, xy = (np.concatenate([getattr(a, name) for a in each])[first] for name in ("xyz", "xy"))
         pose = self._refined(found, xyz, xy, noise)
         good, keyframe = pose.inliers, proved.keyframe
-        if good.sum() < _MIN_FIRST:
-            return None
-        in_view_xy = self._in_view(sight, mine, pose.T_cam_world)
-        is_like = spread_alike(self._camera, in_view_xy, xy[good]) >= _LEAST_ALIKE
-        if not is_like and good.sum() < _LEAST_FOUND * len(in_view_xy):
-            return None
         T_world_cam = invert_transform(pose.T_cam_world)
         return Place(T_world_cam, keyframe.frame_id, ids[good], xy[good], keyframe.submap)
-
-    def _in_view(self, sight: Sight, views: list[_View], T_cam_world: Array) -> Array:
-        """Where an image should show the landmarks of several views, ``(N, 2)``, each of them once."""
-        first = np.unique(np.concatenate([view.ids for view in views]), return_index=True)[1]
-        xyz = np.concatenate([view.xyz for view in views])[first]
-        xy = self._camera.project(transform_points(T_cam_world, xyz))
-        return xy[sight.shows(xy, 0)]
 
     def _aligned(self, sight: Sight, view: _View, T_cam_world: Array) -> _Aligned:
         """Look for all landmarks of a keyframe where a pose has them."""

@@ -120,14 +120,6 @@ def test_another_place_is_not_taken_for_it(mapped):
         assert find(mapped, sight_of(other, NUM_MAPPED)) is None
 
 
-@pytest.mark.parametrize(("num_columns", "is_place"), [(320, True), (105, False)])
-def test_a_place_shows_a_good_part_of_what_should_be_in_view(mapped, num_columns, is_place):
-    # As a wrong one of equal houses: what is like there is the same, but not what stands around it.
-    image = mapped[0].image(NUM_MAPPED).copy()
-    image[:, num_columns:] = 255 - image[::-1, num_columns:]
-    assert (find(mapped, sight_of(image, NUM_MAPPED)) is not None) == is_place
-
-
 def test_what_is_not_found_in_eight_frames_is_not_looked_for_any_more(mapped):
     sequence, _ = mapped
     recogniser = WideRecogniser(sequence.intrinsics, seed=0)
