@@ -90,6 +90,7 @@ def refine_pose(
     iterations: int = 10,
     spread_px: Array | None = None,
     edge: Array | None = None,
+    is_rough: bool = True,
 ) -> PoseEstimate:
     """Minimise weighted reprojection errors under Huber's loss by Gauss-Newton over the pose alone.
 
@@ -103,9 +104,10 @@ def refine_pose(
         keypoints_xy: ``(N, 2)`` their observations.
         sigma_px: ``(N,)`` standard deviation of each observation per coordinate.
         gate_px: ``(N,)`` reprojection error up to which an observation is an inlier.
-        iterations: Steps at most; from the third on without points three gates off.
+        iterations: Steps at most.
         spread_px: ``(N, 2)`` the vectors ``s``, None where all points are certain.
         edge: ``(N, 2)`` of the observations, see ``edges``; None where errors have no direction.
+        is_rough: The start is: in the first two steps, points three gates off have a say too.
 
     Returns:
         The refined pose; the start with no inlier where nothing could be solved.
@@ -116,7 +118,7 @@ def refine_pose(
     hessian = np.zeros((6, 6))
     for iteration in range(iterations):
         # Early steps are more tolerant, so that a poor start does not lose the points that would mend it.
-        is_early = iteration < 2
+        is_early = is_rough and iteration < 2
         equations = seen.normal_equations(T, 4.0 if is_early else 1.0, None if is_early else far_px)
         step = None
         if equations is not None:
@@ -299,5 +301,7 @@ def search_pose(
     if info["num_inliers"] < min_inliers or not (np.isfinite(R).all() and np.isfinite(t).all()):
         return None
     start = make_transform(project_to_so3(R), t)
-    estimate = refine_pose(camera, start, points_world, keypoints_xy, sigma_px, gate_px, edge=edge)
+    # Most observations may be wrong: all together they would pull the pose away from where it was found.
+    observed = (points_world, keypoints_xy, sigma_px, gate_px)
+    estimate = refine_pose(camera, start, *observed, edge=edge, is_rough=False)
     return estimate if estimate.num_inliers >= min_inliers else None
