@@ -345,7 +345,7 @@ def choose_playback(
     if settings.resize is not None and settings.rate_hz is not None:
         return Playback(settings.resize, stride, rate_hz, rate_hz / full_hz)
     plan = plan_for(
-        *(settings.codec, settings.modulation, recorded.image, rate_hz, settings.rate, settings.resize, stop)
+        settings.codec, settings.modulation, recorded.image, rate_hz, settings.rate, settings.resize, stop
     )
     if plan is None:
         return None
