@@ -30,6 +30,7 @@ from semcast.demo import (
     Playback,
     agent_command,
     choose_playback,
+    open_recording,
     role_commands,
     run_demo,
 )
@@ -42,6 +43,10 @@ from semcast.server.replay import ReplaySettings, replay
 pytestmark = pytest.mark.xdist_group("real-time")
 
 SEQUENCE = Path(__file__).resolve().parents[1] / "deploy" / "demo" / "kitti_06"
+
+
+def run(settings, tell=lambda line: None, progress=lambda done, text: None, stop=None):
+    return run_demo(settings, open_recording(settings), stop or threading.Event(), tell, progress)
 
 
 def test_what_a_role_warns_of_is_told_once_and_nothing_else(tmp_path):
@@ -185,7 +190,7 @@ def test_what_can_not_run_is_refused_before_a_former_run_goes(tmp_path, wrong, m
         "view": "no display: use --view web",
     }[wrong]
     with pytest.raises((SemcastError, ValueError), match=message):
-        run_demo(DemoSettings(**values), threading.Event(), lambda line: None, lambda done, text: None)
+        run(DemoSettings(**values))
     assert [p.name for p in former.iterdir()] == ["summary.json"]
 
 
@@ -193,7 +198,7 @@ def test_a_role_that_can_not_start_ends_the_demo_with_its_own_words(tmp_path, mo
     monkeypatch.setattr("semcast.demo.check_codec", lambda name: None)
     settings = DemoSettings(codec="no-such-codec", view="none", resize=0.25, rate_hz=10.0, out=tmp_path)
     with pytest.raises(SemcastError, match="did not start: .*no-such-codec"):
-        run_demo(settings, threading.Event(), lambda line: None, lambda done, text: None)
+        run(settings)
 
 
 def test_a_server_that_ends_before_it_listens_is_not_waited_for(tmp_path, monkeypatch):
@@ -201,12 +206,7 @@ def test_a_server_that_ends_before_it_listens_is_not_waited_for(tmp_path, monkey
     monkeypatch.setattr("semcast.demo._PROGRAM", program)
     started_s = time.monotonic()
     with pytest.raises(SemcastError, match="server did not start: .*the disk is on fire"):
-        run_demo(
-            DemoSettings(view="none", out=tmp_path),
-            threading.Event(),
-            lambda line: None,
-            lambda done, text: None,
-        )
+        run(DemoSettings(view="none", out=tmp_path))
     assert time.monotonic() - started_s < 20.0
 
 
@@ -265,7 +265,7 @@ def test_a_folder_with_images_no_run_wrote_is_no_place_for_outputs(tmp_path):
     before = sorted(p.name for p in sequence.rglob("*"))
     settings = DemoSettings(sequence=sequence, codec="jpeg-ldpc", view="none", out=sequence)
     with pytest.raises(ConfigError, match="out must not hold images that no run wrote"):
-        run_demo(settings, threading.Event(), lambda line: None, lambda done, text: None)
+        run(settings)
     assert sorted(p.name for p in sequence.rglob("*")) == before
 
 
@@ -274,7 +274,7 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
     told, rows = [], []
     recording = tmp_path / "run.mcap"
     settings = DemoSettings(codec="jpeg-ldpc", view="none", resize=0.4, out=tmp_path, record=recording)
-    summary, error = run_demo(settings, threading.Event(), told.append, lambda *row: rows.append(row))
+    summary, error = run(settings, told.append, lambda *row: rows.append(row))
     assert error is None
     assert summary is not None
     assert {line.split()[0] for line in told} >= {"server", "channel", "agent"}
@@ -303,7 +303,7 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
 
 @pytest.mark.slow
 def test_a_link_that_nothing_can_be_decoded_on_is_said(tmp_path):
-    told = []
+    lines, told = [], []
     settings = DemoSettings(
         codec="jpeg-ldpc",
         link=ChannelSettings(snr_db=0.0),
@@ -313,9 +313,7 @@ def test_a_link_that_nothing_can_be_decoded_on_is_said(tmp_path):
         stride=2,
         out=tmp_path,
     )
-    summary, error = run_demo(
-        settings, threading.Event(), lambda line: None, lambda done, text: told.append((done, text))
-    )
+    summary, error = run(settings, lines.append, lambda *row: told.append(row))
     assert error is None
     assert summary["frames"]["tracked"] == 0
     # On a busy machine it is still told that results are being written.
@@ -323,6 +321,7 @@ def test_a_link_that_nothing_can_be_decoded_on_is_said(tmp_path):
     assert text == f"no image could be decoded, {num_done} outages"
     assert num_done > 5
     assert "0 frames tracked, 0 with a pose; dropped: " in (tmp_path / "logs" / "server.log").read_text()
+    assert not [line for line in lines if "with a pose" in line], "the table that follows says it"
     assert (tmp_path / "run.rrd").stat().st_size > 20_000  # grey images
 
 
@@ -340,7 +339,7 @@ def test_a_link_that_loses_all_ends_the_demo_and_is_said(tmp_path):
     stop = threading.Event()
     patience = threading.Timer(90.0, stop.set)
     patience.start()
-    summary, error = run_demo(settings, stop, lambda line: None, lambda done, text: None)
+    summary, error = run(settings, stop=stop)
     patience.cancel()
     assert not stop.is_set(), "it ends by itself"
     assert error is None
@@ -359,7 +358,7 @@ def test_an_agent_that_gives_up_ends_the_demo_with_what_came_out_so_far(tmp_path
         sequence=sequence, codec="jpeg-ldpc", view="none", resize=0.4, rate_hz=10.0, out=tmp_path / "out"
     )
     told = []
-    summary, error = run_demo(settings, threading.Event(), told.append, lambda done, text: None)
+    summary, error = run(settings, told.append)
     assert error is not None
     assert "images" in error
     assert [line.partition(", see")[0] for line in told if line.startswith("images left out")] == [

@@ -32,6 +32,8 @@ BETA_RANGE = (0.0, 8.0)
 SIGMA0_RANGE_PX = (0.25, 6.0)
 #: Residuals that a group of like confidence needs for the fit,
 _MIN_PER_BIN = 12
+#: such groups at most,
+_MAX_BINS = 8
 #: and standard errors from which on its slope counts.
 _SIGNIFICANCE = 2.0
 #: A gate is never narrower than that of this sigma: landmarks have errors of their own, and a gate that
@@ -94,7 +96,7 @@ class NoiseModel:
         return np.asarray(GATE_SIGMAS * np.maximum(sigma, _MIN_GATE_SIGMA_PX))
 
 
-def fit_noise(confidence: Array, residual_px: Array, *, num_bins: int = 8) -> NoiseModel | None:
+def fit_noise(confidence: Array, residual_px: Array) -> NoiseModel | None:
     """Fit ``log sigma^2 = log sigma0^2 + beta (1 - c)`` to residuals, robustly.
 
     Residuals are grouped by quantiles of confidence, each group's spread is its median absolute value, and a
@@ -103,7 +105,6 @@ def fit_noise(confidence: Array, residual_px: Array, *, num_bins: int = 8) -> No
     Args:
         confidence: ``(N,)`` in [0, 1].
         residual_px: ``(N,)`` residuals per coordinate, sign of no matter.
-        num_bins: Groups at most.
 
     Returns:
         The model, or None with fewer residuals than one group needs.
@@ -113,7 +114,7 @@ def fit_noise(confidence: Array, residual_px: Array, *, num_bins: int = 8) -> No
         return None
     size = np.abs(residual_px)
     flat = NoiseModel(_clip_sigma0(float(np.median(size)) * MAD_TO_SIGMA), 0.0)
-    bins = min(num_bins, count // _MIN_PER_BIN)
+    bins = min(_MAX_BINS, count // _MIN_PER_BIN)
     if bins < 3 or float(np.ptp(confidence)) < 1e-3:
         return flat
     order = np.argsort(confidence, kind="stable")

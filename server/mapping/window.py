@@ -115,10 +115,14 @@ def build_problem(
 
 
 def _tell_scale(world: WorldMap, holding: list[Keyframe]) -> bool:
-    """Whether keyframes that hold a window are so far apart that they tell its scale."""
+    """Whether keyframes that hold a window are so far apart that they tell its scale.
+
+    The depth is that of the newest of them that sees landmarks.
+    """
     places = np.stack([k.T_world_cam[:3, 3] for k in holding])
     extent = float(np.linalg.norm(places - places[0], axis=1).max())
-    return extent >= _LEAST_WAY * median_depth(world, holding[-1])
+    depths = (median_depth(world, k) for k in reversed(holding))
+    return extent >= _LEAST_WAY * next((d for d in depths if np.isfinite(d)), 0.0)
 
 
 def _order_of_choice(

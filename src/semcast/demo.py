@@ -32,6 +32,7 @@ from semcast.demo_watch import ERROR_CODE, START_DEADLINE_S, Alive, watch
 from semcast.real_time import plan_for
 from semcast.role import Role
 from semcast.server.former_run import check_not_foreign, discard, output_folder
+from semcast.server.frame_rows import run_line
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.settings import DenseWhen, ServerSettings
 from semcast.server.view.settings import ViewChoice, ViewSettings
@@ -181,8 +182,18 @@ def agent_command(settings: DemoSettings, sequence: Path, endpoint: str, playbac
     return agent
 
 
+def open_recording(settings: DemoSettings) -> DemoRecording:
+    """Open what the demo plays.
+
+    Raises:
+        SemcastError: It can't be read, or its camera is unknown.
+    """
+    return look_at(settings.sequence or default_sequence(), settings.camera)
+
+
 def run_demo(
     settings: DemoSettings,
+    recorded: DemoRecording,
     stop: threading.Event,
     tell: Callable[[str], None],
     progress: Callable[[int, str], None],
@@ -194,6 +205,7 @@ def run_demo(
 
     Args:
         settings: What to run.
+        recorded: What they play.
         stop: Ends the run early; outputs are still written.
         tell: Takes one line of text for the user.
         progress: Takes the number of images that are done with, and how it stands in words.
@@ -202,9 +214,9 @@ def run_demo(
         The server's summary, or None when it never wrote one, and what ended the run early, or None.
 
     Raises:
-        SemcastError: The sequence or the codec can't be used, or a process could not be started.
+        SemcastError: The codec can't be used, or a process could not be started.
     """
-    recorded, logs = _prepare(settings)
+    logs = _prepare(settings)
     if doubt := recorded.doubt:
         tell(f"{recorded.name} is {doubt}")
     summary_file = settings.out / SUMMARY_NAME
@@ -239,30 +251,30 @@ def run_demo(
     finally:
         for child in reversed(children.values()):
             child.stop()
+    summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
+    known = run_line(summary) if summary else None  # a warning where no frame has a pose: the table says so
     for name in ("agent", "server"):
         if name in children:
-            for text in _warnings(children[name]):
+            for text in _warnings(children[name], known):
                 tell(f"the {name} warns: {text}")
     if error is None and children["server"].returncode == ERROR_CODE:
         error = f"the server: {children['server'].last_words()}"  # its outputs are there, not its recording
-    summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
     return summary, error
 
 
-def _warnings(role: Role) -> list[str]:
-    """Return the first few warnings of a role, and how many more there are: one image each may be damaged."""
-    told = role.warnings()
+def _warnings(role: Role, known: str | None) -> list[str]:
+    """Return the first few unknown warnings of a role, and how many more: one image each may be damaged."""
+    told = [text for text in role.warnings() if text != known]
     more = len(told) - _MAX_WARNINGS
     return told if more <= 0 else [*told[:_MAX_WARNINGS], f"{more} times more, see {role.log}"]
 
 
-def _prepare(settings: DemoSettings) -> tuple[DemoRecording, Path]:
-    """Look at all that can be wrong before anything of a former run goes; the recording, a folder for logs.
+def _prepare(settings: DemoSettings) -> Path:
+    """Look at all that can be wrong before anything of a former run goes, and return a folder for logs.
 
     Raises:
         SemcastError: Something is wrong.
     """
-    recorded = look_at(settings.sequence or default_sequence(), settings.camera)
     check_codec(settings.codec)
     named_weights(settings.codec)
     check_viewer(ServerSettings(out=settings.out, view=settings.view_settings))
@@ -279,7 +291,7 @@ def _prepare(settings: DemoSettings) -> tuple[DemoRecording, Path]:
         except OSError as err:
             raise ConfigError(f"{logs} can't be made a folder for logs: {err}") from err
         discard(settings.out)
-    return recorded, logs
+    return logs
 
 
 def _bring_up(

@@ -86,6 +86,12 @@ def test_without_a_file_the_table_is_printed_and_it_is_said_that_nothing_else_is
     assert "{" not in said.out
 
 
+def test_of_an_input_that_is_missing_nothing_else_is_said(tmp_path, capsys):
+    assert main(["eval", "trajectory", "--sequence", str(tmp_path / "none")]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "none" in line
+
+
 @pytest.mark.parametrize(
     ("words", "idle"),
     [

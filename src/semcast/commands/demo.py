@@ -15,8 +15,7 @@ from semcast.channel.emulator import warn_of_settings
 from semcast.commands.console import plain_console
 from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings, run_until_stopped
 from semcast.common.run_folder import RUN_FILES, VIEWER_NAME
-from semcast.demo import DemoSettings, default_sequence, run_demo
-from semcast.demo_recording import look_at
+from semcast.demo import DemoSettings, open_recording, run_demo
 from semcast.evaluation.report import STDOUT, provenance, write_result
 from semcast.server.export.parts import parts_line
 
@@ -116,19 +115,21 @@ def run(arguments: argparse.Namespace) -> int:
     if json_to_stdout:
         settings = replace(settings, json=None)
     talk = plain_console(stderr=True)
-    frames = look_at(settings.sequence or default_sequence(), settings.camera).num_frames
+    recorded = open_recording(settings)
     result: dict[str, Any] = {}
     failures: list[str] = []
 
     def work(stop: threading.Event) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         with Progress(*columns, console=talk) as bar:
-            task = bar.add_task("starting server, channel and agent", total=frames)
+            task = bar.add_task("starting server, channel and agent", total=recorded.num_frames)
 
             def show(num_done: int, text: str) -> None:
                 bar.update(task, completed=num_done, description=text)
 
-            summary, error = run_demo(settings, stop, lambda line: talk.print(line, soft_wrap=True), show)
+            summary, error = run_demo(
+                settings, recorded, stop, lambda line: talk.print(line, soft_wrap=True), show
+            )
             result.update(summary or {})
             if error is not None:
                 failures.append(error)

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -136,7 +137,7 @@ def run(arguments: argparse.Namespace) -> int:
         settings = replace(settings, json=None)
     elif settings.json is None and out is not None:
         settings = replace(settings, json=out / RESULT_NAME)
-    elif settings.json is None:
+    elif settings.json is None and _input_exists(settings):
         _tell("only the table will be left of this run: --json FILE keeps all figures")
     check_outputs(settings.json, out)
     _warn_of_link(settings, read_given(cls, arguments))
@@ -155,6 +156,12 @@ def run(arguments: argparse.Namespace) -> int:
     for path in written:
         _tell(f"written: {path}")
     return 0
+
+
+def _input_exists(settings: Any) -> bool:
+    """Whether what is to be measured is there; if it is not, that is all there is to say."""
+    inputs = (getattr(settings, name, None) for name in ("sequence", "images", "file"))
+    return all(path is None or os.path.exists(path) for path in inputs)
 
 
 def _warn_of_link(settings: Any, given: Mapping[str, Any]) -> None:

@@ -105,7 +105,7 @@ def test_fit_withstands_outliers():
 def test_a_slope_counts_from_two_of_its_standard_errors_on(slope, beta):
     # Three groups of 12 at c = 1, 0.5, 0, each without spread: se = 2.33 / sqrt(12 * (0.25 + 0.25)) = 0.951.
     c = np.repeat([1.0, 0.5, 0.0], 12)
-    fitted = fit_noise(c, 0.6 * np.exp(0.5 * slope * (1.0 - c)), num_bins=3)
+    fitted = fit_noise(c, 0.6 * np.exp(0.5 * slope * (1.0 - c)))
     assert fitted is not None
     assert fitted.beta == pytest.approx(beta)
     if beta == slope:
@@ -118,7 +118,7 @@ def test_groups_beside_the_line_make_its_slope_less_certain(middle, beta):
     # k/6, k/3, k/6. One degree of freedom is left, so the misfit is 12 / 2.33^2 * k^2 / 6 = 0.368 k^2. By its
     # root two standard errors of 0.951 grow: to 2.31 for k = 2 and to 3.46 for k = 3.
     c = np.repeat([1.0, 0.5, 0.0], 12)
-    fitted = fit_noise(c, 0.6 * np.exp(0.5 * np.repeat([0.0, middle, 3.0], 12)), num_bins=3)
+    fitted = fit_noise(c, 0.6 * np.exp(0.5 * np.repeat([0.0, middle, 3.0], 12)))
     assert fitted is not None
     assert fitted.beta == pytest.approx(beta)
 

@@ -128,6 +128,16 @@ def test_the_first_adjustment_of_a_map_is_held_by_a_pose_and_a_distance():
         assert problem.keep_baseline == start
 
 
+def test_a_window_whose_newest_held_keyframe_sees_no_landmark_is_held_as_others_are():
+    world, points, _ = make_world(num_keyframes=4)
+    put_landmarks(world, points)
+    lost = world.keyframes[1]
+    lost.drop_observations(np.ones(len(lost.ids), bool))
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    assert problem.fixed.tolist() == [True, True, False, False]
+    assert not problem.keep_baseline
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_keyframes_before_the_window_keep_its_scale_where_keyframes_are_dense(monkeypatch, seed):
     """Ten keyframes within 1/70 of the depth hardly know a scale; those before saw the same landmarks."""
