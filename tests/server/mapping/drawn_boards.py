@@ -35,20 +35,22 @@ def board_texture(seed, size=512):
 
 @functools.cache
 def textures():
-    """Made when the first picture is drawn: every process of the tests imports this."""
-    return [board_texture(k, 1536 if k == 0 else 256) for k in range(len(BOARDS))]
+    """Texture and mask of each board, made when the first picture is drawn: every process imports this."""
+    drawn = [board_texture(k, 1536 if k == 0 else 256) for k in range(len(BOARDS))]
+    return [(texture, np.full_like(texture, 255)) for texture in drawn]
 
 
-def render(T_world_cam):
-    """Draw the boards from far to near by the homography of each."""
+def render(T_world_cam, corner_xy=(0, 0), size_wh=(CAMERA.width, CAMERA.height)):
+    """Draw the boards, or a part of the image, from far to near by the homography of each."""
     T = invert_transform(T_world_cam)
-    image = np.zeros(CAMERA.shape_hw, np.uint8)
-    for texture, (x, y, z, size) in zip(textures(), BOARDS, strict=True):
+    image = np.zeros(size_wh[::-1], np.uint8)
+    K = CAMERA.K - np.outer((*corner_xy, 0), (0, 0, 1))
+    for (texture, whole), (x, y, z, size) in zip(textures(), BOARDS, strict=True):
         scale = size / texture.shape[0]
         board = np.array([[scale, 0, x - size / 2], [0, scale, y - size / 2], [0, 0, z], [0, 0, 1]])
-        H = CAMERA.K @ (T[:3] @ board)
-        mask = cv2.warpPerspective(np.full_like(texture, 255), H, (CAMERA.width, CAMERA.height))
-        drawn = cv2.warpPerspective(texture, H, (CAMERA.width, CAMERA.height), flags=cv2.INTER_AREA)
+        H = K @ (T[:3] @ board)
+        mask = cv2.warpPerspective(whole, H, size_wh)
+        drawn = cv2.warpPerspective(texture, H, size_wh, flags=cv2.INTER_AREA)
         image = np.where(mask == 255, drawn, image)
     return np.repeat(image[..., None], 3, axis=2)
 

@@ -35,7 +35,9 @@ def rolled(t_s, readout_s, axis):
     for low, high in pairwise(edges):
         late_s = readout_s * (0.5 * (low + high) / size - 0.5)
         band = (slice(None),) * axis + (slice(low, high),)
-        image[band] = render(pose_at(t_s + late_s))[band]
+        corner_xy, size_wh = [0, 0], [CAMERA.width, CAMERA.height]
+        corner_xy[1 - axis], size_wh[1 - axis] = low, high - low
+        image[band] = render(pose_at(t_s + late_s), corner_xy, tuple(size_wh))
     return image
 
 
