@@ -45,6 +45,12 @@ def photos(tmp_path):
     return folder
 
 
+@pytest.fixture(autouse=True)
+def few_crops_to_fold(monkeypatch):
+    """Passing as many as a real run does takes longer than the few steps of these."""
+    monkeypatch.setattr(loop, "_FOLD_BATCHES", 2)
+
+
 @pytest.fixture
 def tiny_network(monkeypatch):
     """Register the smallest real network under the name of the main one."""
