@@ -39,6 +39,7 @@ def test_variants_switch_terms_and_are_graded(photos, monkeypatch):
         "architecture",
         lambda name: dataclasses.replace(known(name), sizes=TINY),
     )
+    monkeypatch.setattr("semcast.training.loop._FOLD_BATCHES", 2)  # the many of a real run take longest here
     settings = TrainSettings(
         data=folder, steps=4, batch=2, head_every=1, crop=CropSettings(size_px=64), threads=1
     )

@@ -350,10 +350,11 @@ from pathlib import Path
 import torch
 import semcast.common.nets.registry as registry
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.training import loop
 from semcast.training.data import CropSettings
-from semcast.training.loop import train
 from semcast.training.settings import TrainSettings
 torch.set_num_threads(1)
+loop._FOLD_BATCHES = 2
 sizes = Sizes((8, 8, 8), (1, 1, 1), (1, 1, 1), 8)
 registry._entries = lambda: (registry.Architecture("3dcsc", sizes, build_3dcsc),)
 runs = (("whole", 2, None), ("first", 1000, "0"), ("second", 1000, "1"))
@@ -361,7 +362,7 @@ for (name, steps, stopped_rank), port in zip(runs, sys.argv[3:], strict=True):
     os.environ["MASTER_PORT"] = port  # one may still be leaving the last run when the other joins the next
     settings = TrainSettings(architecture="3dcsc", data=Path(sys.argv[1]), out=Path(sys.argv[2]) / name,
                              batch=2, steps=steps, bf16=False, device="cpu", crop=CropSettings(size_px=32))
-    train(settings, should_stop=lambda: os.environ["RANK"] == stopped_rank)
+    loop.train(settings, should_stop=lambda: os.environ["RANK"] == stopped_rank)
 """
 
 
