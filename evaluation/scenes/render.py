@@ -168,10 +168,12 @@ def render_scene(settings: RenderSettings, progress: Callable[[int, int], None] 
     Raises:
         SourceError: The folder has files in it or can't be written, or no lens has such a distortion.
     """
-    with new_folder(settings.out) as folder:  # refuses before the scene is painted
-        scene = SCENES[settings.scene](settings.seed, settings.pace)
-        scene.camera = replace(scene.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
-        Optics.of(scene.camera)
+    scene_type = SCENES[settings.scene]
+    with new_folder(settings.out) as folder:  # this and the lens are refused before the scene is painted
+        camera = replace(scene_type.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
+        Optics.of(camera)
+        scene = scene_type(settings.seed, settings.pace)
+        scene.camera = camera
         (folder / "images").mkdir()
         return _draw_into(folder, settings, scene, progress or (lambda _done, _total: None))
 
