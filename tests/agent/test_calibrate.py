@@ -198,6 +198,17 @@ def test_too_few_views_are_an_error():
         calibrate(exact_views(3), BOARD, (480, 360))
 
 
+def test_boards_that_were_never_tilted_are_refused_as_they_fit_any_focal_length():
+    rng = np.random.default_rng(0)
+    views = []
+    for k in range(12):
+        straight_on = make_transform(np.eye(3), np.array([k % 4 - 5.5, k // 4 - 3.5, 9.0 + k % 5]))
+        noise = rng.normal(0, 0.1, (54, 2))
+        views.append(BoardView(f"{k}", (true_corners(straight_on) + noise).astype(np.float32)))
+    with pytest.raises(SourceError, match=r"tilted by 20-45 degrees .*parallel to within \d\.\d degrees"):
+        calibrate(views, BOARD, (480, 360))
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
