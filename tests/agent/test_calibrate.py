@@ -273,7 +273,7 @@ def test_a_camera_that_says_nothing_is_given_up(monkeypatch):
     assert time.monotonic() - began_s < 10.0  # by itself OpenCV waits for half a minute
 
 
-def test_a_video_of_the_board_stands_for_a_live_camera(tmp_path, pictures, capsys):
+def test_of_a_video_of_the_board_views_are_taken_as_of_a_live_camera(tmp_path, pictures, capsys):
     path = str(tmp_path / "board.avi")
     video = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 30, (480, 360))
     assert video.isOpened()
@@ -283,6 +283,6 @@ def test_a_video_of_the_board_stands_for_a_live_camera(tmp_path, pictures, capsy
     video.release()
     out = tmp_path / "live.json"
     words = ["--views", "9", "--distortion", "radtan4", "--out", str(out)]
-    assert main(["calibrate", "--camera", path, *words]) == 0
+    assert main(["calibrate", path, *words]) == 0
     assert "9 views" in capsys.readouterr().out
     assert Intrinsics.load(out).fx == pytest.approx(TRUE.fx, rel=0.02)
