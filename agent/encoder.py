@@ -13,8 +13,8 @@ from semcast.common.symbol_payload import pack_data_symbols
 class LinkFeedback:
     """The SNR to encode for: the receiver's newest estimate, before the first one a fixed one.
 
-    An estimate counts until the next: a server that is busy, or a long delay, makes reports late, and the link
-    is then still more like the last report than like any fixed number.
+    An estimate counts until the next: a server that is busy, or a long delay, makes reports late, and the
+    link is then still more like the last report than like any fixed number.
 
     Args:
         agent_epoch: Reports of another epoch are ignored.

@@ -113,6 +113,12 @@ def test_rendered_pictures_give_the_camera_they_were_rendered_with(tmp_path, pic
     assert cv2.imread(str(out.with_suffix(".png"))).shape == (360, 960, 3)
 
 
+def test_who_counts_squares_is_told_the_inner_corners(tmp_path, pictures, capsys):
+    cv2.imwrite(str(tmp_path / "0.png"), pictures[0])
+    assert main(["calibrate", str(tmp_path), "--board", "10x7", "--out", str(tmp_path / "out.json")]) == 1
+    assert "these are its squares, give --board 9x6" in capsys.readouterr().err
+
+
 def turned_by_note(jpeg, orientation):
     """Put an EXIF note before a JPEG's content that says how to turn it for people."""
     entry = b"II*\0\x08\0\0\0\x01\0" + b"\x12\x01\x03\0\x01\0\0\0" + bytes([orientation, 0, 0, 0]) + bytes(4)

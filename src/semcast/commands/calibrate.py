@@ -1,6 +1,7 @@
-"""``semcast calibrate``: a camera's intrinsics from a chessboard, in pictures, a video or before the camera."""
+"""``semcast calibrate``: a camera's intrinsics from a chessboard in pictures, a video or before the camera."""
 
 import argparse
+import itertools
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -157,6 +158,15 @@ def camera_pictures(camera: str) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
         capture.release()
 
 
+def are_squares(board: tuple[int, int], files: list[Path]) -> bool:
+    """Tell whether squares were counted instead of inner corners, by the first few pictures."""
+    from semcast.agent.calibrate import find_board
+
+    corners = (board[0] - 1, board[1] - 1)
+    first = itertools.islice(read_pictures(files), 3)
+    return min(corners) >= 3 and any(find_board(image, corners) is not None for _, image in first)
+
+
 def _collect(
     arguments: argparse.Namespace, board: tuple[int, int]
 ) -> tuple[list["BoardView"], "NDArray[np.uint8]"]:
@@ -193,9 +203,11 @@ def _collect(
             if arguments.camera is None:
                 raise
     if sample is None:
+        why = "show all of it with a white border, and count inner corners: 10x7 squares are --board 9x6"
+        if arguments.camera is None and are_squares(board, files):
+            why = f"these are its squares, give --board {board[0] - 1}x{board[1] - 1}"
         raise SourceError(
-            f"no board with {board[0]}x{board[1]} inner corners was found in {num_seen} pictures: count inner"
-            " corners (a board of 10x7 squares is --board 9x6), show all of it with a white border"
+            f"no board with {board[0]}x{board[1]} inner corners was found in {num_seen} pictures: {why}"
         )
     return views, sample
 
