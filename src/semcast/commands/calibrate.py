@@ -1,4 +1,4 @@
-"""``semcast calibrate``: a camera's intrinsics from a chessboard in pictures, a video or before the camera."""
+"""``semcast calibrate``: a camera's intrinsics from a chessboard, in pictures, a video or live."""
 
 import argparse
 import itertools
