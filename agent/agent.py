@@ -81,7 +81,7 @@ class _Sending:
         self.metrics = metrics
         self.complaints = Complaints(metrics)
         self.lossless = settings.mode == "replay"
-        self.feedback = LinkFeedback(self.agent_epoch, settings.snr_db, settings.feedback_max_age_s)
+        self.feedback = LinkFeedback(self.agent_epoch, settings.snr_db)
         follows = settings.follow_server and not self.lossless
         self._pace = PaceControl(self.agent_epoch, source.rate_hz) if follows else None
         self._settings = settings

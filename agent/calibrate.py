@@ -20,6 +20,13 @@ GOOD_VIEWS = 10
 GOOD_COVERAGE = 0.5
 GOOD_RMS_PX = 1.0
 GOOD_FOCAL_DEVIATION = 0.01
+#: Boards that are parallel to within this fit any focal length, and the deviations that OpenCV gives are then
+#: of rounding: tenths of a pixel for one that is wrong by half.
+_MIN_TILT_DEG = 2.0
+_UNDETERMINED = (
+    "the views don't determine the camera: show the board from several directions, "
+    "tilted by 20-45 degrees and not only moved"
+)
 _COVERAGE_GRID = 6
 #: A view this many times worse than the median one is left out.
 _OUTLIER_FACTOR = 4.0
@@ -174,10 +181,10 @@ def _fit(
             distortion=tuple(float(c) for c in coefficients.ravel()[: _NUM_COEFFICIENTS[distortion]]),
         )
     except (cv2.error, ValueError) as err:
-        raise SourceError(
-            "the views don't determine the camera: show the board from several directions, "
-            f"tilted and not only moved ({err})"
-        ) from err
+        raise SourceError(f"{_UNDETERMINED} ({err})") from err
+    tilt_deg = _largest_angle_deg(rotations)
+    if tilt_deg < _MIN_TILT_DEG:
+        raise SourceError(f"{_UNDETERMINED} (all are parallel to within {tilt_deg:.1f} degrees)")
     fx_fy_cx_cy = tuple(float(v) for v in deviations.ravel()[:4])
     return CalibrationResult(
         intrinsics=intrinsics,
@@ -189,6 +196,12 @@ def _fit(
         deviations=(fx_fy_cx_cy[0], fx_fy_cx_cy[1], fx_fy_cx_cy[2], fx_fy_cx_cy[3]),
         coverage=coverage(views, size_wh),
     )
+
+
+def _largest_angle_deg(rotations: Sequence[Array]) -> float:
+    """Return the largest angle between the normals of two boards, given as rotation vectors."""
+    normals = np.array([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
+    return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
 
 
 def coverage(views: Sequence[BoardView], size_wh: tuple[int, int]) -> float:

@@ -1,8 +1,6 @@
 """From an image to the message with its channel symbols, encoded for the link as the receiver last saw it."""
 
 import threading
-import time
-from collections.abc import Callable
 
 from semcast.agent.source import SourceFrame
 from semcast.common.codec import Codec
@@ -13,26 +11,19 @@ from semcast.common.symbol_payload import pack_data_symbols
 
 
 class LinkFeedback:
-    """The SNR to encode for: the receiver's estimate while it is fresh, else a fixed one.
+    """The SNR to encode for: the receiver's newest estimate, before the first one a fixed one.
+
+    An estimate counts until the next: a server that is busy, or a long delay, makes reports late, and the
+    link is then still more like the last report than like any fixed number.
 
     Args:
         agent_epoch: Reports of another epoch are ignored.
-        fallback_db: Without a fresh report.
-        max_age_s: Age up to which a report counts, from the capture of the frame it is about.
-        clock_ns: The clock ``t_capture_ns`` is of.
+        initial_db: Before the first report.
     """
 
-    def __init__(
-        self,
-        agent_epoch: int,
-        fallback_db: float,
-        max_age_s: float,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
+    def __init__(self, agent_epoch: int, initial_db: float) -> None:
         self._agent_epoch = agent_epoch
-        self._fallback_db = fallback_db
-        self._max_age_s = max_age_s
-        self._clock_ns = clock_ns
+        self._initial_db = initial_db
         self._lock = threading.Lock()
         self._newest: LinkReport | None = None
 
@@ -50,20 +41,10 @@ class LinkFeedback:
         with self._lock:
             return self._newest.frame_id if self._newest is not None else -1
 
-    @property
-    def age_s(self) -> float | None:
-        """Time since the capture of the frame the newest report is about; None without one."""
-        with self._lock:
-            newest = self._newest
-        return (self._clock_ns() - newest.t_capture_ns) * 1e-9 if newest is not None else None
-
     def snr_db(self) -> float:
         """Return the SNR to encode for."""
-        age_s = self.age_s
         with self._lock:
-            if self._newest is None or age_s is None or not 0.0 <= age_s <= self._max_age_s:
-                return self._fallback_db
-            return self._newest.snr_db_estimate
+            return self._newest.snr_db_estimate if self._newest is not None else self._initial_db
 
 
 class FrameEncoder:

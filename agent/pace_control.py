@@ -119,4 +119,6 @@ class PaceControl:
         self._valid_from_ns = None
         self._passed_over.clear()
         self._quiet = self._since_change = 0
-        logger.info("sending %s", "every frame" if stride == 1 else f"one frame in {stride}")
+        pace = "every frame" if stride == 1 else f"one frame in {stride}"
+        why = "" if is_trial else ", as many as the server can follow; smaller ones (--resize) would be more"
+        logger.info("sending %s%s", pace, why)

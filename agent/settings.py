@@ -51,9 +51,6 @@ class AgentSettings:
             "server reports it"
         },
     )
-    feedback_max_age_s: float = field(
-        default=2.0, metadata={"help": "seconds for which a report about the link counts"}
-    )
     share_source: Literal["off", "jpeg", "png"] = field(
         default="off",
         metadata={
@@ -89,5 +86,3 @@ class AgentSettings:
         low, high = SNR_RANGE_DB
         if not low <= self.snr_db <= high:
             raise ValueError(f"snr_db must be in [{low:g}, {high:g}], got {self.snr_db:g}")
-        if not 0.0 < self.feedback_max_age_s <= 3600.0:
-            raise ValueError(f"feedback_max_age_s must be in (0, 3600], got {self.feedback_max_age_s:g}")

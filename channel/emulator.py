@@ -286,8 +286,11 @@ def set_channel(
         answer = session.request(
             control_key(agent_id, ROLE), pack(ControlRequest(op=op, settings=plain)), timeout_s
         )
+        others = [] if answer is not None else session.alive_agents()
     if answer is None:
-        raise TransportError(f"no channel of {agent_id} answers: is 'semcast channel' running?")
+        names = ", ".join(name for name in others if name != agent_id)
+        meant = f" --agent-id says which is meant; there are agents {names}" if names else ""
+        raise TransportError(f"no channel of {agent_id} answers: is 'semcast channel' running?{meant}")
     reply = unpack(answer, ControlReply)
     if not reply.ok:
         raise ConfigError(reply.error)

@@ -173,7 +173,9 @@ def read_images(
     """
     paths = images_in(folder)
     if not paths:
-        raise SourceError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)})")
+        inside = next((p for p in sorted(folder.iterdir()) if p.is_dir() and images_in(p)), None)
+        hint = f"; {inside} does" if inside else ""
+        raise SourceError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)}){hint}")
     images: dict[str, NDArray[np.uint8]] = {}
     left_out: list[str] = []
     for path in (paths := paths[:max_images]):

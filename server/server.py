@@ -11,7 +11,7 @@ from typing import Any
 from semcast.common.codec import Codec, Modulation
 from semcast.common.codecs import named_weights
 from semcast.common.config import to_toml
-from semcast.common.errors import SemcastError
+from semcast.common.errors import SemcastError, TransportError
 from semcast.common.metrics import Metrics
 from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
@@ -302,4 +302,19 @@ def run_server(settings: ServerSettings, stop_event: threading.Event) -> dict[st
         return {}
     with network, contextlib.closing(Server(settings, network)) as server:
         logger.info("%s, waiting for agent '%s'", settings.network.where, settings.agent_id)
-        return server.run(stop_event)
+        summary = server.run(stop_event)
+        if settings.network.listens_on:
+            _warn_of_others(network, settings.agent_id)
+        return summary
+
+
+def _warn_of_others(hub: NetworkSession, agent_id: str) -> None:
+    """Tell whose processes met at the hub that is about to close."""
+    with contextlib.suppress(TransportError):  # results are written, and nothing else is asked for
+        others = [name for name in hub.alive_agents() if name != agent_id]
+        if others:
+            logger.warning(
+                "%s met at this server and can't go on without it: start it again, with --keep-running it "
+                "stays; or let the server of each agent listen on a port of its own",
+                ", ".join(others),
+            )

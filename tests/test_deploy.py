@@ -36,6 +36,9 @@ def test_a_service_is_tried_again_for_ever_and_has_time_to_write_its_results():
     assert float(unit["Service"]["TimeoutStopSec"]) >= STOP_DEADLINE_S
     # A signal to every process of the service would end those that adjust and write.
     assert unit["Service"]["KillMode"] == "mixed"
+    # A copy of the file under another name is of another camera.
+    assert unit["Service"]["ExecStart"].endswith("--config /etc/%p/%i.toml")
+    assert unit["Service"]["StateDirectory"] == "%p-%i"
 
 
 @pytest.mark.skipif(shutil.which("setsid") is None, reason="the viewer runs in a group of its own")

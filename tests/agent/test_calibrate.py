@@ -113,6 +113,12 @@ def test_rendered_pictures_give_the_camera_they_were_rendered_with(tmp_path, pic
     assert cv2.imread(str(out.with_suffix(".png"))).shape == (360, 960, 3)
 
 
+def test_who_counts_squares_is_told_the_inner_corners(tmp_path, pictures, capsys):
+    cv2.imwrite(str(tmp_path / "0.png"), pictures[0])
+    assert main(["calibrate", str(tmp_path), "--board", "10x7", "--out", str(tmp_path / "out.json")]) == 1
+    assert "these are its squares, give --board 9x6" in capsys.readouterr().err
+
+
 def turned_by_note(jpeg, orientation):
     """Put an EXIF note before a JPEG's content that says how to turn it for people."""
     entry = b"II*\0\x08\0\0\0\x01\0" + b"\x12\x01\x03\0\x01\0\0\0" + bytes([orientation, 0, 0, 0]) + bytes(4)
@@ -198,6 +204,17 @@ def test_too_few_views_are_an_error():
         calibrate(exact_views(3), BOARD, (480, 360))
 
 
+def test_boards_that_were_never_tilted_are_refused_as_they_fit_any_focal_length():
+    rng = np.random.default_rng(0)
+    views = []
+    for k in range(12):
+        straight_on = make_transform(np.eye(3), np.array([k % 4 - 5.5, k // 4 - 3.5, 9.0 + k % 5]))
+        noise = rng.normal(0, 0.1, (54, 2))
+        views.append(BoardView(f"{k}", (true_corners(straight_on) + noise).astype(np.float32)))
+    with pytest.raises(SourceError, match=r"tilted by 20-45 degrees .*parallel to within \d\.\d degrees"):
+        calibrate(views, BOARD, (480, 360))
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -262,7 +279,7 @@ def test_a_camera_that_says_nothing_is_given_up(monkeypatch):
     assert time.monotonic() - began_s < 10.0  # by itself OpenCV waits for half a minute
 
 
-def test_a_video_of_the_board_stands_for_a_live_camera(tmp_path, pictures, capsys):
+def test_of_a_video_of_the_board_views_are_taken_as_of_a_live_camera(tmp_path, pictures, capsys):
     path = str(tmp_path / "board.avi")
     video = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 30, (480, 360))
     assert video.isOpened()
@@ -272,6 +289,6 @@ def test_a_video_of_the_board_stands_for_a_live_camera(tmp_path, pictures, capsy
     video.release()
     out = tmp_path / "live.json"
     words = ["--views", "9", "--distortion", "radtan4", "--out", str(out)]
-    assert main(["calibrate", "--camera", path, *words]) == 0
+    assert main(["calibrate", path, *words]) == 0
     assert "9 views" in capsys.readouterr().out
     assert Intrinsics.load(out).fx == pytest.approx(TRUE.fx, rel=0.02)

@@ -79,10 +79,13 @@ def test_trials_of_more_become_rare_when_they_fail():
     assert 1 <= late <= 3
 
 
-def test_the_stride_comes_back_when_the_server_has_time_again():
+def test_the_stride_comes_back_when_the_server_has_time_again(caplog):
+    caplog.set_level("INFO")
     _, _, strides = run(lambda now_s: 0.160 if now_s < 10 else 0.015, 60)
     assert strides[: 10 * 30].max() == 4
     assert strides[-1] == 1
+    assert "sending one frame in 4, as many as the server can follow" in caplog.text
+    assert caplog.messages[-1] == "sending every frame"
 
 
 def test_one_busy_moment_and_frames_lost_on_the_air_change_nothing():

@@ -23,6 +23,7 @@ from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.phy.qam import constellation
 from semcast.common.symbol_payload import lost_slots_of, pack_data_symbols, slots_of
+from semcast.common.transport import open_client
 from semcast.common.wire import pack, unpack
 
 pytestmark = pytest.mark.xdist_group("real-time")
@@ -172,8 +173,13 @@ def test_a_trace_file_whose_name_is_no_text_does_not_silence_the_channel(ends, t
 
 def test_nobody_to_set_is_said(ends):
     e = ends()
-    with pytest.raises(TransportError, match="no channel of other answers"):
+    with pytest.raises(TransportError, match=r"no channel of other answers.*running\?$"):
         set_channel(e.network, "other", {"snr_db": 4.0}, timeout_s=0.5)
+    with open_client(e.network, 5.0) as agents:
+        agents.declare_alive("other", "agent")
+        agents.declare_alive("left", "agent")
+        with pytest.raises(TransportError, match="--agent-id says which is meant; there are agents left$"):
+            set_channel(e.network, "other", {"snr_db": 4.0}, timeout_s=0.5)
 
 
 def test_lost_frames_never_arrive_live_but_are_announced_in_replay(ends, make):

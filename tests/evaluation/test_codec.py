@@ -212,7 +212,12 @@ def test_image_folders_are_checked(folder, tmp_path):
     assert left_out == []
     with pytest.raises(SourceError, match="missing can't be read"):
         read_images(tmp_path / "missing")
-    with pytest.raises(SourceError, match="holds no images"):
+    with pytest.raises(SourceError, match=r"holds no images \(\.png.*webp\)$"):
+        read_images(tmp_path)
+    inside = tmp_path / "images"
+    inside.mkdir()
+    cv2.imwrite(str(inside / "0.png"), images["image0.png"])
+    with pytest.raises(SourceError, match=f"holds no images .*; {inside} does$"):
         read_images(tmp_path)
     (tmp_path / "broken.png").write_bytes(b"nothing")
     with pytest.raises(SourceError, match=r"broken\.png"):

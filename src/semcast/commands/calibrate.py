@@ -1,6 +1,7 @@
-"""``semcast calibrate``: a camera's intrinsics from pictures of a chessboard or from the live camera."""
+"""``semcast calibrate``: a camera's intrinsics from a chessboard, in pictures, a video or live."""
 
 import argparse
+import itertools
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +26,11 @@ LIVE_STRIDE = 5
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "images", type=named_path, nargs="*", metavar="PATH", help="pictures of the board, or folders of them"
+        "images",
+        type=named_path,
+        nargs="*",
+        metavar="PATH",
+        help="pictures of the board, folders of them, or a video",
     )
     parser.add_argument("--camera", metavar="N|DEVICE|URL", help="take views from this live camera instead")
     parser.add_argument(
@@ -41,7 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="lens model: k1 k2 p1 p2 k3, without k3, or none (default radtan5)",
     )
     parser.add_argument(
-        "--views", type=int, default=20, metavar="N", help="views to take from a live camera (default 20)"
+        "--views",
+        type=int,
+        default=20,
+        metavar="N",
+        help="views to take from a video or a live camera (default 20)",
     )
     parser.add_argument(
         "--out",
@@ -115,8 +124,15 @@ def read_pictures(files: list[Path]) -> Iterator[tuple[str, "NDArray[np.uint8]"]
         yield file.name, image
 
 
+def is_video(path: Path) -> bool:
+    """Tell whether a file is to be read as a video: one that is not named as a picture."""
+    from semcast.common.sequence_layouts import IMAGE_SUFFIXES
+
+    return path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES
+
+
 def camera_pictures(camera: str) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
-    """Yield every few frames of a live camera until it ends.
+    """Yield every few frames of a live camera, or of a video, until it ends.
 
     Raises:
         SourceError: The camera can't be opened or stops.
@@ -140,6 +156,15 @@ def camera_pictures(camera: str) -> Iterator[tuple[str, "NDArray[np.uint8]"]]:
                     yield f"frame {number}", np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
     finally:
         capture.release()
+
+
+def are_squares(board: tuple[int, int], files: list[Path]) -> bool:
+    """Tell whether squares were counted instead of inner corners, by the first few pictures."""
+    from semcast.agent.calibrate import find_board
+
+    corners = (board[0] - 1, board[1] - 1)
+    first = itertools.islice(read_pictures(files), 3)
+    return min(corners) >= 3 and any(find_board(image, corners) is not None for _, image in first)
 
 
 def _collect(
@@ -178,9 +203,11 @@ def _collect(
             if arguments.camera is None:
                 raise
     if sample is None:
+        why = "show all of it with a white border, and count inner corners: 10x7 squares are --board 9x6"
+        if arguments.camera is None and are_squares(board, files):
+            why = f"these are its squares, give --board {board[0] - 1}x{board[1] - 1}"
         raise SourceError(
-            f"no board with {board[0]}x{board[1]} inner corners was found in {num_seen} pictures: count inner"
-            " corners (a board of 10x7 squares is --board 9x6), show all of it with a white border"
+            f"no board with {board[0]}x{board[1]} inner corners was found in {num_seen} pictures: {why}"
         )
     return views, sample
 
@@ -202,6 +229,8 @@ def run(arguments: argparse.Namespace) -> int:
     board = parse_board(arguments.board)
     if (arguments.camera is None) == (not arguments.images):
         raise ConfigError("give either pictures of a chessboard or --camera")
+    if len(arguments.images) == 1 and is_video(arguments.images[0]):
+        arguments.camera = str(arguments.images[0])
     if arguments.views < 4:
         raise ConfigError(f"views must be at least 4, got {arguments.views}")
     picture = arguments.picture or arguments.out.with_suffix(".png")

@@ -15,10 +15,10 @@ from waiting import until
 from semcast.common.codecs import load_codec
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.keys import status_key
-from semcast.common.loopback import open_hub
+from semcast.common.loopback import free_endpoint, open_hub
 from semcast.common.messages import StatusMessage
 from semcast.common.metrics import Metrics
-from semcast.common.network_settings import NetworkSettings
+from semcast.common.network_settings import HubSettings, NetworkSettings
 from semcast.common.phy.slots import layout_for
 from semcast.common.run_folder import read_run
 from semcast.common.symbol_payload import pack_lost
@@ -26,7 +26,7 @@ from semcast.common.trajectory import read_tum
 from semcast.common.transport import open_client
 from semcast.common.wire import pack, unpack
 from semcast.server.mapping.bundle_process import GIVEN_UP
-from semcast.server.server import Server
+from semcast.server.server import Server, run_server
 from semcast.server.session import Session
 from semcast.server.settings import ServerSettings
 from semcast.server.view.settings import ViewSettings
@@ -185,6 +185,20 @@ def test_a_bundle_adjustment_that_gave_up_is_in_the_status(air):
 def test_a_server_that_hears_nothing_ends_with_its_time_limit(air):
     running = air.serve(duration_s=0.2)
     assert running.finish() == {}
+
+
+def test_a_server_that_ends_says_whose_processes_met_at_it(caplog):
+    stop, endpoint = threading.Event(), free_endpoint()
+    settings = ServerSettings(network=HubSettings(listen=(endpoint,)), view=ViewSettings(view="none"))
+    serving = threading.Thread(target=run_server, args=(settings, stop))
+    serving.start()
+    with open_client(NetworkSettings(connect=(endpoint,)), DEADLINE_S) as other:
+        other.declare_alive("right", "agent")
+        until(lambda: other.alive_roles(settings.agent_id))
+        stop.set()
+        serving.join(DEADLINE_S)
+    assert "right met at this server and can't go on without it" in caplog.text
+    assert settings.agent_id not in caplog.messages[-1]
 
 
 def test_a_silent_stream_ends_with_the_idle_limit_and_its_outputs(tmp_path, air):
