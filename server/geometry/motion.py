@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform
+from semcast.server.geometry.whereabouts import Whereabouts
 
 Array = NDArray[np.float64]
 
@@ -19,6 +20,8 @@ _BRIDGE_STEPS = 10
 #: The way from one pose to the next is mostly noise where poses are poor, as they are before a loss: a speed
 #: is that of so long a time.
 _SPEED_S = 1.0
+#: Time for which steps are remembered, to tell how far the camera strays from where its speed leads.
+_MEMORY_S = 8.0
 
 
 class ConstantVelocity:
@@ -29,6 +32,7 @@ class ConstantVelocity:
         self._rotation_rad_per_s: Array = np.zeros(3)
         self._translation_per_s: Array = np.zeros(3)
         self._ways: list[tuple[float, Array]] = []
+        self._steps: list[tuple[float, Array]] = []
 
     def reset(self) -> None:
         """Forget the motion."""
@@ -56,6 +60,9 @@ class ConstantVelocity:
                 T_before_now = invert_transform(T_world_before) @ T_world_cam
                 self._rotation_rad_per_s = log_so3(T_before_now[:3, :3]) / elapsed_s
                 self._translation_per_s = T_before_now[:3, 3] / elapsed_s
+                self._steps.append((elapsed_s, T_before_now))
+                while sum(interval_s for interval_s, _ in self._steps[1:]) >= _MEMORY_S:
+                    del self._steps[0]
                 # A way is that of a whole interval in the frame in which that began: the camera turned on it.
                 half_back = exp_so3(-0.5 * elapsed_s * self._rotation_rad_per_s)
                 self._ways.append((elapsed_s, half_back @ T_before_now[:3, 3]))
@@ -63,7 +70,7 @@ class ConstantVelocity:
                     del self._ways[0]
             else:
                 self._rotation_rad_per_s, self._translation_per_s = np.zeros(3), np.zeros(3)
-                self._ways = []
+                self._ways, self._steps = [], []
         self._last = (t_source_ns, T_world_cam.copy())
 
     def correct(self, T_world_cam: Array, scale: float = 1.0) -> None:
@@ -72,6 +79,8 @@ class ConstantVelocity:
             self._last = (self._last[0], T_world_cam.copy())
             self._translation_per_s = self._translation_per_s * scale
             self._ways = [(interval_s, scale * way) for interval_s, way in self._ways]
+            if scale != 1.0:
+                self._steps = [(s, make_transform(T[:3, :3], scale * T[:3, 3])) for s, T in self._steps]
 
     def predict(self, t_source_ns: int) -> Array | None:
         """``T_world_cam`` expected at a time, None without any pose.
@@ -88,6 +97,20 @@ class ConstantVelocity:
     def way_in(self, elapsed_s: float) -> Array:
         """Translation ``(3,)`` in the camera's own frame that goes on for so long."""
         return elapsed_s * self._way_per_s()
+
+    def whereabouts(self, t_source_ns: int, depth: float) -> Whereabouts | None:
+        """Where the camera can be at a time, with the scene at a depth in map units.
+
+        Returns:
+            None without any pose, or with the last one more than ``MAX_GAP_S`` ago: it may be anywhere.
+        """
+        if self._last is None:
+            return None
+        t_ns, T_world_last = self._last
+        elapsed_s = (t_source_ns - t_ns) * 1e-9
+        if not 0.0 < elapsed_s <= MAX_GAP_S:
+            return None
+        return Whereabouts.after(T_world_last, self.way_in(elapsed_s), elapsed_s, self._steps, depth)
 
     def bridge(
         self, t_source_ns: int, T_after_later: Array, later_s: float, turned: Sequence[tuple[int, Array]] = ()

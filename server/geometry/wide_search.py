@@ -132,6 +132,13 @@ def match_wide(
         pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(features0.descriptors, features1.descriptors, k=2)
         clear = [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < max_ratio * b.distance]
     row0, row1 = np.array(clear, dtype=np.intp).reshape(-1, 2).T
+    return _turned(features0, features1, row0, row1)
+
+
+def _turned(
+    features0: WideFeatures, features1: WideFeatures, row0: NDArray[np.intp], row1: NDArray[np.intp]
+) -> WideMatches:
+    """Matches of features, row by row, with how each was turned and scaled."""
     scale = features1.size_px[row1] / features0.size_px[row0]
     angle = features1.angle_rad[row1] - features0.angle_rad[row0]
     cos, sin = scale * np.cos(angle), scale * np.sin(angle)
@@ -152,6 +159,32 @@ class Carried:
     xy: Array
     warps: Array
     num_matches: int
+
+
+def match_near(
+    features0: WideFeatures, features1: WideFeatures, expected_xy: Array, reach_px: float, max_ratio: float
+) -> WideMatches:
+    """Match as ``match_wide``, but only what is near where a feature is expected.
+
+    What looks alike elsewhere, as in a row of equal doors, is no rival then.
+
+    Args:
+        features0: Of the first image.
+        features1: Of the second image.
+        expected_xy: ``(N, 2)`` where those of the first are expected in the second, NaN for unknown.
+        reach_px: How far from there they may be.
+        max_ratio: As for ``match_wide``.
+    """
+    square = square_distances(expected_xy, features1.xy)
+    apart = features1.descriptors @ features0.descriptors.T
+    norm0, norm1 = ((f.descriptors**2).sum(axis=1) for f in (features0, features1))
+    apart = np.maximum(norm0[:, None] + norm1 - 2.0 * apart.T, 0.0)
+    apart[~(square < reach_px**2)] = np.inf
+    best = apart.argmin(axis=1)
+    nearest = apart[np.arange(len(best)), best]
+    apart[np.arange(len(best)), best] = np.inf
+    row0 = np.flatnonzero(nearest < max_ratio**2 * apart.min(axis=1))
+    return _turned(features0, features1, row0, best[row0])
 
 
 def search_wide(features0: WideFeatures, features1: WideFeatures, xy0: Array) -> Carried | None:

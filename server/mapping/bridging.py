@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.geometry import rotation_angle_deg
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Start
 
@@ -25,11 +24,6 @@ _SPEED_SIGMA = 0.03
 _SPEED_CHANGE_DEPTHS_S = 0.03
 #: Time after a gap from which it is told how the camera moves then: the shorter, the noisier.
 _LATER_NS = 500_000_000
-#: A submap turned from where it was put by more than this was not recognised: the camera is in another
-#: corridor that looks the same.
-_MOST_TURNED_DEG = 30.0
-#: How much more it may be for each second of the gap before it.
-_MOST_TURNED_DEG_S = 60.0
 
 
 def bridge(
@@ -85,21 +79,3 @@ def bridge(
     T_later[:3, 3] *= scale
     T_world_first = motion.bridge(at_ns, T_later, (soon.t_source_ns - at_ns) * 1e-9, turned)
     return T_world_guess if T_world_first is None else T_world_first, scale
-
-
-def may_turn(R_join: Array, older_ns: NDArray[np.int64], newer_ns: NDArray[np.int64]) -> bool:
-    """Whether a recognised place may turn a submap by ``R_join`` from where ``bridge`` put it.
-
-    The angular velocity is known well before and after a gap, so after a short one the rotation can't be far
-    off.
-
-    Args:
-        R_join: ``(3, 3)`` rotation that a recognised place asks for.
-        older_ns: ``(N,)`` source times in ns of the keyframes of the submap that began first.
-        newer_ns: ``(M,)`` those of the other; both submaps have keyframes.
-    """
-    before = older_ns[older_ns < newer_ns.min()]
-    if len(before) == 0:
-        return True
-    gap_s = float(newer_ns.min() - before.max()) * 1e-9
-    return rotation_angle_deg(R_join) <= _MOST_TURNED_DEG + _MOST_TURNED_DEG_S * gap_s

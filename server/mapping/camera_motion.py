@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.motion import MAX_EXTRAPOLATION_S, ConstantVelocity
+from semcast.server.geometry.whereabouts import Whereabouts
 
 Array = NDArray[np.float64]
 
@@ -94,6 +95,10 @@ class CameraMotion:
     def predict_on(self, t_source_ns: int) -> Array | None:
         """Where a camera that seems to have stopped would be if it went on, None where it did not stop."""
         return self._motion.predict(t_source_ns) if self._still else None
+
+    def whereabouts(self, t_source_ns: int, depth: float) -> Whereabouts | None:
+        """As ``ConstantVelocity.whereabouts``; None while the camera stands, or seems to."""
+        return None if self._still else self._motion.whereabouts(t_source_ns, depth)
 
     def way_in(self, elapsed_s: float) -> Array:
         """Translation ``(3,)`` in the camera's frame that goes on for so long; none while it stands."""

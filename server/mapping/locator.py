@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
+from semcast.server.geometry.whereabouts import Whereabouts
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -40,6 +41,9 @@ class Locator:
         builder: Owns the map.
         tracks: Followed into each frame.
         motion: Tells where the camera is expected.
+
+    Attributes:
+        whereabouts: Where the camera can be in the newest image if it comes after a gap, None for anywhere.
     """
 
     def __init__(
@@ -56,11 +60,17 @@ class Locator:
         self._tracks = tracks
         self._motion = motion
         self._is_after_gap = False
+        self.whereabouts: Whereabouts | None = None
+        self._has_gone_astray = False
 
     def follow(self, sight: Sight, T_world_guess: Array | None) -> None:
         """Follow the tracks into an image: to where a pose expects them, or on as they went so far."""
         tracks = self._tracks
         self._is_after_gap = self._motion.comes_after_gap(sight.frame.t_source_ns)
+        self.whereabouts = None
+        if self._is_after_gap:
+            self.whereabouts = self._motion.whereabouts(sight.frame.t_source_ns, self._map.depth())
+        self._has_gone_astray = False
         if len(tracks) == 0:
             tracks.remember(sight)
         elif T_world_guess is not None:
@@ -98,7 +108,7 @@ class Locator:
 
     def track(self, sight: Sight, T_world_guess: Array | None) -> TrackedPose | None:
         """Pose of a frame whose tracks were followed; None where it is not sure, and they may be gone."""
-        pose = self.pose(T_world_guess, may_carry=True)
+        pose = self._possible(self.pose(T_world_guess, may_carry=True))
         if (
             pose is None
             and (T_world_on := self._motion.predict_on(sight.frame.t_source_ns)) is not None
@@ -106,13 +116,22 @@ class Locator:
         ):
             pose = self.pose(T_world_on)
         if pose is None and self._tracks.follow_jump(sight):
-            pose = self.pose(T_world_guess)
+            pose = self._possible(self.pose(T_world_guess))
+        if pose is None and self._has_gone_astray:
+            self._tracks.clear()  # they are on another one of a row of equal things
         is_vague = pose is None or self._is_after_gap or pose.num_inliers < 2 * MIN_INLIERS
         pose = self._with_more(sight, pose, T_world_guess)
         if pose is not None and is_vague and not self._resembles(sight, pose):
             self._tracks.clear()  # nothing that was found is kept
             return None
         return pose
+
+    def _possible(self, pose: TrackedPose | None) -> TrackedPose | None:
+        """Give up a pose that the camera can't have got to in a gap."""
+        if pose is None or self.whereabouts is None or self.whereabouts.holds(pose.T_world_cam):
+            return pose
+        self._has_gone_astray = True
+        return None
 
     def _with_more(
         self, sight: Sight, pose: TrackedPose | None, T_world_guess: Array | None
@@ -125,7 +144,7 @@ class Locator:
         wanted = round(few) - (0 if pose is None else pose.num_inliers)
         reach_px = _REACH_PX if pose is not None and pose.num_inliers >= MIN_INLIERS else _REACH_BLIND_PX
         recalled = self._map.recall(self._tracks, sight, T_world_cam, wanted=wanted, reach_px=reach_px)
-        again = self.pose(T_world_cam) if len(recalled) else None
+        again = self._possible(self.pose(T_world_cam)) if len(recalled) else None
         if again is not None and (pose is None or again.num_inliers > pose.num_inliers):
             return again
         # What was recalled has proved nothing.

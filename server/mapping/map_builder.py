@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, make_transform, skew, transform_points
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
+from semcast.server.geometry.whereabouts import Whereabouts
 from semcast.server.mapping.adjustment import apply_result, place_left_out
 from semcast.server.mapping.anchoring import anchor_tracks, resembles
-from semcast.server.mapping.bridging import may_turn
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
 from semcast.server.mapping.initialiser import Start
+from semcast.server.mapping.joining import may_join
 from semcast.server.mapping.kept_frames import Observed, colours_of
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
 from semcast.server.mapping.keyframe_rule import KeyframeCues, median_flow_px, wants_keyframe
@@ -27,6 +28,7 @@ from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, find_revisit, place_anew
 from semcast.server.mapping.rolling_shutter import ImageFlow
+from semcast.server.mapping.scene_depth import usual_depth
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import MapUpdate
@@ -181,11 +183,30 @@ class MapBuilder:
         """Align tracks with how earlier keyframes of this submap saw them; the number aligned."""
         return anchor_tracks(self._mapped, tracks, sight, T_world_cam)
 
-    def recognise(self, sight: Sight) -> Place | None:
-        """Look for the place of an image whose camera is lost."""
+    def depth(self) -> float:
+        """How far away the scene is, map units."""
+        return usual_depth(self.world, self.enough)
+
+    def recognise(
+        self, sight: Sight, T_world_guess: Array | None, whereabouts: Whereabouts | None
+    ) -> Place | None:
+        """Look for the place of an image whose camera is lost.
+
+        Args:
+            sight: The image.
+            T_world_guess: Where its motion leads the camera, None where that is not known.
+            whereabouts: Where it can be in the submap of the newest keyframe, None for anywhere.
+        """
+        last = self.world.keyframes[-1].submap
+
+        def is_possible(place: Place) -> bool:
+            return whereabouts is None or place.submap != last or whereabouts.holds(place.T_world_cam)
+
         noise = self.noise.model
-        place = self.relocaliser.find(sight, self.world, noise)
-        return place or self._wide.find(sight, self.world, self.images, noise)
+        place = self.relocaliser.find(sight, self.world, noise, is_possible=is_possible)
+        if place is None:
+            place = self._wide.find(sight, self.world, self.images, noise, T_world_guess)
+        return place if place is None or is_possible(place) else None
 
     def resembles(self, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: Ids) -> bool:
         """Tell whether tracks that agree with a pose show what the newest keyframes saw."""
@@ -420,20 +441,18 @@ class MapBuilder:
         if found is None:
             return None
         scale, T_place_mine = found
-        older, newer = (
-            np.array([k.t_source_ns for k in self.world.keyframes_of(submap)], dtype=np.int64)
-            for submap in sorted((self.submap, place.submap))
-        )
-        if not may_turn(T_place_mine[:3, :3], older, newer):
+        T_mine_place = invert_transform(T_place_mine)
+        T_mine_place[:3, 3] /= scale
+        is_newer = self.submap > place.submap
+        join = (scale, T_place_mine) if is_newer else (1.0 / scale, T_mine_place)
+        older, newer = map(self.world.keyframes_of, sorted((self.submap, place.submap)))
+        posed_ids = self.world.frames.keyframes()[0]
+        if not may_join(older, newer, *join, posed_ids=posed_ids, depth=self.depth()):
             return None
         self._abandon_adjustment()
-        if self.submap > place.submap:
-            self.world.transform_submap(self.submap, place.submap, scale, T_place_mine)
-        else:
-            T_mine_place = invert_transform(T_place_mine)
-            T_mine_place[:3, 3] /= scale
-            self.world.transform_submap(place.submap, self.submap, 1.0 / scale, T_mine_place)
-            scale = 1.0
+        moving, staying = (self.submap, place.submap) if is_newer else (place.submap, self.submap)
+        self.world.transform_submap(moving, staying, *join)
+        scale = scale if is_newer else 1.0
         self.enter(min(self.submap, place.submap))
         self.world.revisits[self.world.keyframes[-1].frame_id] = place.keyframe_id
         self._on_moved(scale)

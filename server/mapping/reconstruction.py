@@ -289,16 +289,19 @@ class Reconstruction:
         return pose
 
     def _recognise(self, sight: Sight) -> TrackedPose | None:
-        if (place := self._map.recognise(sight)) is None:
+        whereabouts = self._locator.whereabouts
+        T_world_guess = None if whereabouts is None else self._motion.predict(sight.frame.t_source_ns)
+        if (place := self._map.recognise(sight, T_world_guess, whereabouts)) is None:
             return None
         # Nothing is given up for a place before there is a pose in it.
         seen = Seen(place.ids, place.xy, np.full(len(place.ids), _RECOGNISED_CONFIDENCE))
         pose = self._locator.pose(place.T_world_cam, seen)
         if pose is not None:
+            if whereabouts is None or place.submap != self._map.world.keyframes[-1].submap:
+                self._motion.reset()
             self._map.go_on_from(place)
             self._tracks.adopt(place.ids, place.xy, _RECOGNISED_CONFIDENCE)
             self._initialiser.clear()
-            self._motion.reset()
         return pose
 
     def _begin_map(self, sight: Sight, start: Start) -> FrameResult:

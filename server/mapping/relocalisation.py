@@ -1,6 +1,6 @@
 """Where am I? Descriptors of the current image against keyframes, then PnP; and joining two submaps."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,6 +88,10 @@ class Place:
     submap: int
 
 
+def _anywhere(_: Place) -> bool:
+    return True
+
+
 class Relocaliser:
     """Recognises keyframes.
 
@@ -110,7 +114,12 @@ class Relocaliser:
         return ids[rows], descriptors
 
     def find(
-        self, sight: Sight, world: WorldMap, noise: NoiseModel, submaps: set[int] | None = None
+        self,
+        sight: Sight,
+        world: WorldMap,
+        noise: NoiseModel,
+        submaps: set[int] | None = None,
+        is_possible: Callable[[Place], bool] = _anywhere,
     ) -> Place | None:
         """Look for the place of an image among keyframes: the newest ones and, in turn, all others.
 
@@ -119,13 +128,14 @@ class Relocaliser:
             world: The map.
             noise: Of observations.
             submaps: Only keyframes of these, None for all.
+            is_possible: Whether the camera can be at a place.
         """
         known = [k for k in world.keyframes if submaps is None or k.submap in submaps]
         newest, older = known[-_NUM_NEWEST:], known[:-_NUM_NEWEST]
         count = min(len(older), _MAX_CONSIDERED)
         turn = [older[-1 - (self._turn + k) % len(older)] for k in range(count)]
         self._turn = (self._turn + count) % max(1, len(older))
-        return self.recognise(sight, world, noise, turn, tried_anyway=newest[::-1])
+        return self.recognise(sight, world, noise, turn, tried_anyway=newest[::-1], is_possible=is_possible)
 
     def recognise(
         self,
@@ -134,6 +144,7 @@ class Relocaliser:
         noise: NoiseModel,
         candidates: Sequence[Keyframe],
         tried_anyway: Sequence[Keyframe] = (),
+        is_possible: Callable[[Place], bool] = _anywhere,
     ) -> Place | None:
         """Look for the place of an image among some keyframes.
 
@@ -143,6 +154,7 @@ class Relocaliser:
             noise: Of observations.
             candidates: Keyframes of which the two with the most similar descriptors are tried.
             tried_anyway: Keyframes that are tried before these.
+            is_possible: Whether the camera can be at a place.
         """
         if not candidates and not tried_anyway:
             return None
@@ -158,7 +170,7 @@ class Relocaliser:
             if found is None:
                 continue
             place = self._confirm(world, keyframe, found, corners[rows], descriptors, sigma_px)
-            if place is not None:
+            if place is not None and is_possible(place):
                 return place
         return None
 

@@ -23,8 +23,9 @@ from semcast.server.geometry.patch_alignment import (
     seen_alike,
 )
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
+from semcast.server.geometry.square_distance import square_distances
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
-from semcast.server.geometry.wide_search import WideFeatures, match_wide
+from semcast.server.geometry.wide_search import WideFeatures, match_near, match_wide
 from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
 from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.sight import Sight
@@ -53,6 +54,8 @@ _LEAST_SHARES = (0.0, 0.0, 0.2)
 _MIN_AGREEING_SHARE = 0.5
 _ALIGNED_SIGMA_PX = 1.0
 _BORDER_PX = 8
+#: How far what a guess expects may be from there in the image.
+_REACH_PX = 60.0
 _SEARCH_ITERATIONS = 400
 
 
@@ -115,7 +118,14 @@ class WideRecogniser:
         self._known: list[tuple[SeenFrom, WideFeatures]] = []
         self._looked_for: tuple[int, int] = (-1, 0)
 
-    def find(self, sight: Sight, world: WorldMap, images: KeyframeImages, noise: NoiseModel) -> Place | None:
+    def find(
+        self,
+        sight: Sight,
+        world: WorldMap,
+        images: KeyframeImages,
+        noise: NoiseModel,
+        T_world_guess: Array | None = None,
+    ) -> Place | None:
         """Look for the place of an image among the newest keyframes, in the first frames after the newest.
 
         Args:
@@ -123,6 +133,7 @@ class WideRecogniser:
             world: The map.
             images: Of keyframes.
             noise: Of observations.
+            T_world_guess: Where the camera's motion leads, where that is known.
         """
         there = [(image, world.keyframe(image.frame_id)) for image in images.newest(_NUM_KEYFRAMES)]
         newest = [(image, keyframe) for image, keyframe in reversed(there) if keyframe is not None]
@@ -136,10 +147,12 @@ class WideRecogniser:
         self._looked_for = newest_id, num_looked + 1
         self._known = [(image, known) for image, known in self._known if any(image is i for i, _ in newest)]
         views = [_View.of(image, keyframe, world) for image, keyframe in newest]
-        for view in views:
-            found = self._proved(sight, view, self._search(sight, view, noise), noise)
-            if found is not None:
-                return self._place(sight, view, views, found, noise)
+        guesses = [None] if T_world_guess is None else [invert_transform(T_world_guess), None]
+        for T_cam_world in guesses:
+            for view in views:
+                found = self._proved(sight, view, self._search(sight, view, noise, T_cam_world), noise)
+                if found is not None:
+                    return self._place(sight, view, views, found, noise)
         return None
 
     def _features_of(self, image: SeenFrom) -> WideFeatures:
@@ -150,9 +163,16 @@ class WideRecogniser:
             self._known.append((image, known))
         return known
 
-    def _search(self, sight: Sight, view: _View, noise: NoiseModel) -> PoseEstimate | None:
-        """Rough pose, by landmarks next to matches."""
-        matches = match_wide(self._features_of(view.image), sight.wide_features, _MAX_RATIO)
+    def _search(
+        self, sight: Sight, view: _View, noise: NoiseModel, T_cam_world: Array | None
+    ) -> PoseEstimate | None:
+        """Rough pose, by landmarks next to matches: those near where a guess has them, or any."""
+        features, here = self._features_of(view.image), sight.wide_features
+        if T_cam_world is None:
+            matches = match_wide(features, here, _MAX_RATIO)
+        else:
+            expected = self._expected(view, features.xy, T_cam_world)
+            matches = match_near(features, here, expected, _REACH_PX, _MAX_RATIO)
         rows, carried = matches.carry(view.xy, _MAX_OFFSET_PX)
         sigma = np.full(len(rows), max(_CARRIED_SIGMA_PX, noise.sigma0_px))
         return search_pose(
@@ -165,6 +185,13 @@ class WideRecogniser:
             min_inliers=_MIN_FIRST,
             max_iterations=_SEARCH_ITERATIONS,
         )
+
+    def _expected(self, view: _View, xy: Array, T_cam_world: Array) -> Array:
+        """Return where a pose has pixels ``(N, 2)`` of a keyframe, as deep as the landmarks next to them."""
+        xyz = transform_points(invert_transform(view.keyframe.T_world_cam), view.xyz)
+        depth = xyz[square_distances(xy, view.xy).argmin(axis=1), 2]
+        points = transform_points(view.keyframe.T_world_cam, depth[:, None] * self._camera.unproject(xy))
+        return self._camera.project(transform_points(T_cam_world, points))
 
     def _proved(
         self, sight: Sight, view: _View, found: PoseEstimate | None, noise: NoiseModel

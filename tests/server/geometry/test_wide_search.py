@@ -2,7 +2,13 @@
 
 import numpy as np
 
-from semcast.server.geometry.wide_search import WideFeatures, epipolar_inliers, search_wide
+from semcast.server.geometry.wide_search import (
+    WideFeatures,
+    epipolar_inliers,
+    match_near,
+    match_wide,
+    search_wide,
+)
 
 
 def drifted(seed, count=30, num_wrong=2):
@@ -27,3 +33,31 @@ def test_images_without_anything_give_no_places():
     blank = WideFeatures.of(np.full((240, 320), 90, np.uint8))
     assert search_wide(blank, blank, np.zeros((0, 2))) is None
     assert search_wide(blank, blank, np.full((30, 2), 100.0)) is None
+
+
+def features_at(xy, descriptors):
+    count = len(xy)
+    return WideFeatures(np.array(xy, float), np.full(count, 4.0), np.zeros(count), np.float32(descriptors))
+
+
+def test_of_equal_doors_the_one_next_to_where_it_is_expected_is_matched():
+    doors = 100.0 * np.eye(128)[:2]
+    here = features_at([(50.0, 100.0), (60.0, 120.0)], doors)
+    there = features_at(
+        [(150.0, 100.0), (160.0, 120.0), (450.0, 100.0), (460.0, 120.0)], np.tile(doors, (2, 1))
+    )
+    assert len(match_wide(here, there).to_xy) == 0, "each has two that are as near"
+    for offset in np.array([(100.0, 0.0), (400.0, 0.0)]):
+        matches = match_near(here, there, here.xy + offset + 5.0, 60.0, 0.8)
+        assert np.array_equal(matches.from_xy, here.xy)
+        assert np.array_equal(matches.to_xy, here.xy + offset)
+    assert len(match_near(here, there, here.xy + np.array([250.0, 0.0]), 60.0, 0.8).to_xy) == 0
+    assert len(match_near(here, there, np.full((2, 2), np.nan), 60.0, 0.8).to_xy) == 0
+
+
+def test_near_where_it_is_expected_too_a_match_must_be_clear():
+    here = features_at([(50.0, 100.0)], 100.0 * np.eye(128)[:1])
+    alike = 100.0 * np.eye(128)[[0, 0]] + 10.0 * np.eye(128)[[1, 2]]
+    there = features_at([(60.0, 100.0), (70.0, 100.0)], alike)
+    assert len(match_near(here, there, here.xy, 60.0, 0.8).to_xy) == 0
+    assert len(match_near(here, there, here.xy, 15.0, 0.8).to_xy) == 1

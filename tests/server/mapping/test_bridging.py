@@ -5,7 +5,7 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform
-from semcast.server.mapping.bridging import bridge, may_turn
+from semcast.server.mapping.bridging import bridge
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.world_map import Keyframe
@@ -105,16 +105,3 @@ def test_a_first_map_begins_at_the_origin():
     T, scale = bridge(CameraMotion(CAMERA), start, start, None, 1.0)
     np.testing.assert_array_equal(T, np.eye(4))
     assert scale == 1.0
-
-
-@pytest.mark.parametrize(
-    ("angle_deg", "gap_s", "may"),
-    [(20.0, 0.1, True), (90.0, 0.2, False), (90.0, 1.2, True), (179.0, 3.0, True)],
-)
-def test_a_submap_after_a_short_gap_is_not_turned_into_another_corridor(angle_deg, gap_s, may):
-    turn = np.radians(angle_deg)
-    R_join = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
-    older = (1e9 * np.array([0.0, 1.0, 2.0, 9.0])).astype(np.int64)
-    newer = (1e9 * (2.0 + gap_s + np.array([0.0, 0.5]))).astype(np.int64)
-    assert may_turn(R_join, older, newer) == may
-    assert may_turn(R_join, newer, older), "what did not come before tells nothing"

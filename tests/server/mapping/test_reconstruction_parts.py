@@ -165,9 +165,9 @@ def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch
     assert ate_percent(trajectory, truth) < 1.0
 
 
-def test_a_place_that_turns_a_new_map_too_far_joins_nothing(caplog, monkeypatch):
+def test_a_place_where_the_camera_cannot_be_joins_nothing(caplog, monkeypatch):
     asked = []
-    monkeypatch.setattr(map_builder, "may_turn", lambda *a: asked.append(a) or False)
+    monkeypatch.setattr(map_builder, "may_join", lambda *a, **k: asked.append((*a, k)) or False)
     x = [0.12 * k for k in range(8)] + [13.0 - 0.3 * k for k in range(42)]
     reconstruction = make(lost_after_s=0.05)
     with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
@@ -175,9 +175,12 @@ def test_a_place_that_turns_a_new_map_too_far_joins_nothing(caplog, monkeypatch)
             reconstruction.process(frame_of(k, render(make_transform(np.eye(3), (v, 0.05 * np.sin(v), 0.0)))))
     assert asked
     assert "submaps are joined" not in caplog.text
-    for R_join, older_ns, newer_ns in asked:
-        assert np.allclose(R_join, np.eye(3), atol=0.1), "where the new map was put it need not turn"
-        assert older_ns.max() < newer_ns.min()
+    for older, newer, scale, T_join, more in asked:
+        assert older[-1].frame_id < newer[0].frame_id
+        first = T_join[:3, :3] @ (scale * newer[0].T_world_cam[:3, 3]) + T_join[:3, 3]
+        assert abs(first[0] / older[1].T_world_cam[0, 3] - 13.0 / x[older[1].frame_id]) < 5.0
+        assert np.array_equal(more["posed_ids"], np.sort(more["posed_ids"]))
+        assert more["depth"] > 0.0
 
 
 def test_a_join_leaves_the_older_part_where_it_is(caplog):
@@ -186,7 +189,8 @@ def test_a_join_leaves_the_older_part_where_it_is(caplog):
         turn = exp_so3((0.0, 0.004 * np.sin(k / 5), 0.0))
         return make_transform(turn, (x, 0.05 * np.sin(k / 4), 0.02 * np.sin(k / 7)))
 
-    path = [at(0.08 * k, k) for k in range(25)] + [None] * 3 + [at(13.0 + 0.1 * k, k) for k in range(40)]
+    # It was away for longer than it could be told where it went.
+    path = [at(0.08 * k, k) for k in range(25)] + [None] * 35 + [at(13.0 + 0.1 * k, k) for k in range(40)]
     path += [None] * 2 + [at(1.0 + 0.12 * k, k) for k in range(130)]
     blank = np.full((*CAMERA.shape_hw, 3), 90, np.uint8)
     reconstruction = make(lost_after_s=0.15)
