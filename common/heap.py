@@ -15,8 +15,9 @@ def keep_freed_memory() -> bool:
     """Keep what is freed for the next frame, instead of giving it back to the system.
 
     Arrays of one frame are freed when it is done, and glibc gives their memory back at once. The system then
-    has to clear the same pages for the next frame: thousands of page faults each, a tenth of the time that
-    decoding takes. All threads share one heap, so that no two keep memory of the same use.
+    has to clear pages for the next frame: thousands of page faults for each one that is decoded, and for each
+    adjustment, where they are a quarter of its time. All threads share one heap, so that not each of them
+    keeps memory of its own.
 
     Returns:
         False where another C library than glibc manages memory, and nothing is changed.

@@ -261,6 +261,7 @@ def _run(words: list[str]) -> int:
         _quieten_libraries()
     if verb in _ONE_THREAD:
         _compute_in_one_thread()
+    if verb in _ONE_THREAD - {"agent"}:  # which may have little memory, and knows how it encodes
         keep_freed_memory()
     try:
         parser = verb_parser(verb)
