@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import sys
 import threading
 import time
 from typing import Any
@@ -17,6 +18,7 @@ from semcast.common.codec import Codec
 from semcast.common.codecs import load_codec
 from semcast.common.complaints import Complaints
 from semcast.common.errors import SourceError, TransportError
+from semcast.common.heap import keep_freed_memory
 from semcast.common.keys import camera_key, flow_key, link_key, tx_key
 from semcast.common.message_fields import sendable
 from semcast.common.messages import CameraInfo, FlowMessage, LinkReport, SymbolFrame
@@ -317,7 +319,7 @@ def run_agent(settings: AgentSettings, stop: threading.Event, codec: Codec | Non
 
 
 def _codec_of(settings: AgentSettings) -> Codec:
-    return load_codec(
+    codec = load_codec(
         settings.codec,
         modulation=settings.modulation,
         num_threads=settings.threads,
@@ -325,6 +327,9 @@ def _codec_of(settings: AgentSettings) -> Codec:
         weights=settings.weights,
         runtime=settings.runtime,
     )
+    if "torch" in sys.modules:  # onnxruntime keeps its memory by itself
+        keep_freed_memory()
+    return codec
 
 
 def _send(

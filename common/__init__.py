@@ -67,6 +67,7 @@ Settings, files, processes
     whole_file              files that are never half written
     npz_file                arrays with a header
     cores                   processor cores and threads
+    heap                    memory that frames take again and again
     interrupts              Ctrl-C
     worker_guard            unexpected exceptions in worker threads
 """

@@ -15,6 +15,7 @@ from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 from typing import Generic, TypeVar
 
+from semcast.common.heap import keep_freed_memory
 from semcast.common.interrupts import deaf_children
 
 logger = logging.getLogger(__name__)
@@ -56,6 +57,7 @@ def serve(connection: Connection, work: Callable[[Problem], Result], stands_back
     Work that raises, or whose result can't be sent, is answered with why; the next one is another matter.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Windows nothing else keeps Ctrl-C away
+    keep_freed_memory()
     if stands_back:
         _stand_back()
     while True:

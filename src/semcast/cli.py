@@ -21,12 +21,13 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from semcast import SemcastError, __version__
 from semcast.common.argument_order import arguments_last
 from semcast.common.config import MissingSettingError, near_match
+from semcast.common.heap import keep_freed_memory
 from semcast.common.interrupts import ctrl_c_held
 
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-#: Verbs whose matrices are small: those of frames, and of windows of keyframes.
+#: Verbs that go through frames: their matrices, and those of windows of keyframes, are small.
 _ONE_THREAD = frozenset({"agent", "server", "replay", "eval", "lens", "shutter"})
 #: verb -> (module in semcast.commands, one line of help)
 VERBS: dict[str, tuple[str, str]] = {
@@ -260,6 +261,8 @@ def _run(words: list[str]) -> int:
         _quieten_libraries()
     if verb in _ONE_THREAD:
         _compute_in_one_thread()
+    if verb in _ONE_THREAD - {"agent"}:  # which may have little memory, and knows how it encodes
+        keep_freed_memory()
     try:
         parser = verb_parser(verb)
         arguments = parser.parse_args(arguments_last(parser, words[1:]))
