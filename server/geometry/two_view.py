@@ -164,6 +164,44 @@ def estimate_two_view(
     return _result(camera, T, xy0, xy1, threshold_px, choose_model)
 
 
+def search_closely(
+    camera: Intrinsics,
+    xy0: Array,
+    xy1: Array,
+    *,
+    threshold_px: float,
+    seed: int,
+    min_iterations: int,
+    max_iterations: int,
+) -> TwoViewResult | None:
+    """Return the motion that explains the most matches to within a small threshold, however the others move.
+
+    ``estimate_two_view`` weighs several thresholds, since the noise is not known beforehand: of two motions
+    it prefers one that explains all matches badly to one that explains most of them well.
+
+    Args:
+        camera: Of both images, without distortion.
+        xy0: ``(N, 2)`` pixels, finite.
+        xy1: ``(N, 2)`` pixels, matched row by row.
+        threshold_px: Inlier threshold on the Sampson distance.
+        seed: Of the search.
+        min_iterations: Hypotheses at least.
+        max_iterations: Hypotheses at most.
+    """
+    T = _search(
+        camera,
+        xy0,
+        xy1,
+        threshold_px,
+        in_order=False,
+        seed=seed,
+        max_iterations=max_iterations,
+        min_iterations=min_iterations,
+    )
+    T = _likeliest(camera, [T], xy0, xy1, np.ones(len(xy0)), threshold_px)
+    return None if T is None else _result(camera, T, xy0, xy1, threshold_px, choose_model=True)
+
+
 def _checked_matches(
     camera: Intrinsics,
     keypoints0_xy: Array,

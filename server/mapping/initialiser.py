@@ -19,13 +19,13 @@ from semcast.server.geometry.epipolar import (
     turn_in_doubt_deg,
 )
 from semcast.server.geometry.triangulation import Triangulation, triangulate
-from semcast.server.geometry.two_view import MIN_MATCHES, TwoViewResult, estimate_two_view
+from semcast.server.geometry.two_view import MIN_MATCHES, TwoViewResult
 from semcast.server.geometry.weighting import MAD_TO_SIGMA, ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.ambiguity import Structure, decide
 from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
 from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
 from semcast.server.mapping.observations import gather_observations
-from semcast.server.mapping.scene_motion import ITERATIONS, SceneMotion, motion_of_scene
+from semcast.server.mapping.scene_motion import SceneMotion, motion_of_scene
 from semcast.server.mapping.start_alignment import aligned_views
 from semcast.server.mapping.world_map import Keyframe
 
@@ -78,10 +78,6 @@ _MIN_PARALLAX_DOUBTS = 2.0
 #: Where the camera only turned and tracks err alike in all directions, that is 1.7, and was up to 3.3 after a
 #: search for lines along which they err; at starts it has been 5.4 and more, over poor links too.
 _MIN_RELIEF_SIGMAS = 4.0
-#: Inlier threshold of the search, in standard deviations of the noise,
-_THRESHOLD_SIGMAS = 2.0
-#: and its limits.
-_THRESHOLD_RANGE_PX = (1.0, 3.0)
 #: Least angle between the rays of a point of a start, as a share of the one that is asked for later: its
 #: views are near each other.
 _PARALLAX_SHARE = 0.5
@@ -215,7 +211,9 @@ class Initialiser:
             return None
         if self._reference + 1 == len(self.history) - 1 and self._is_too_short():
             return None
-        scene = self._scene_of(pair, noise)
+        scene = motion_of_scene(
+            self._camera, pair.xy0, pair.xy1, pair.confidence, noise, mode=self._mode, seed=self._seed
+        )
         agreeing = 0.0 if scene is None else float(scene.motion.inliers.mean())
         self._agreeing = max(_LEAST_AGREEING, agreeing)
         if scene is None or not self._is_good(scene) or not self._has_gone(pair, scene):
@@ -224,7 +222,7 @@ class Initialiser:
             return None
         history = [o.without(pair.left_out) for o in self.history]
         span = [o.without(pair.ids[scene.alone]) for o in history[self._reference :]]
-        start = self._build(span, scene.motion, pair.ids[scene.motion.inliers], noise)
+        start = self._build(span, scene.motion, pair.ids[scene.motion.inliers], scene.noise)
         if start is not None:
             self.history = history
         elif self._num_undecided:
@@ -239,34 +237,6 @@ class Initialiser:
             self._reference = max(0, self._reference - 1)
         self._move_reference(suspect)
         self._forget_images()
-
-    def _scene_of(self, pair: _Pair, noise: NoiseModel) -> SceneMotion | None:
-        """How the scene moved between two frames; None where nothing tells it."""
-        threshold_px = float(np.clip(_THRESHOLD_SIGMAS * noise.sigma0_px, *_THRESHOLD_RANGE_PX))
-        found = estimate_two_view(
-            self._camera,
-            pair.xy0,
-            pair.xy1,
-            pair.confidence,
-            mode=self._mode,
-            threshold_px=threshold_px,
-            seed=self._seed,
-            min_iterations=ITERATIONS[0],
-            max_iterations=ITERATIONS[1],
-            choose_model=True,
-        )
-        if found is None:
-            return None
-        return motion_of_scene(
-            self._camera,
-            found,
-            pair.xy0,
-            pair.xy1,
-            pair.confidence,
-            mode=self._mode,
-            threshold_px=threshold_px,
-            seed=self._seed,
-        )
 
     def _relief_px(self, xy0: Array, xy1: Array) -> float:
         """Median way of tracks that turning alone does not explain: a hand turns more than it goes."""

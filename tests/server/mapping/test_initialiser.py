@@ -8,11 +8,11 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.edges import alike
-from semcast.server.geometry.two_view import estimate_two_view
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.ambiguity import adjusted
 from semcast.server.mapping.initialiser import Initialiser
 from semcast.server.mapping.kept_frames import Observed
+from semcast.server.mapping.scene_motion import motion_of_scene
 
 CAMERA = Intrinsics(fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640, height=480)
 NOISE = NoiseModel(1.0, 0.0)
@@ -71,9 +71,9 @@ def test_no_relative_pose_is_looked_for_before_there_is_a_third_view(monkeypatch
 
     def counted(camera, xy0, xy1, *args, **options):
         sizes.append(len(xy0))
-        return estimate_two_view(camera, xy0, xy1, *args, **options)
+        return motion_of_scene(camera, xy0, xy1, *args, **options)
 
-    monkeypatch.setattr("semcast.server.mapping.initialiser.estimate_two_view", counted)
+    monkeypatch.setattr("semcast.server.mapping.initialiser.motion_of_scene", counted)
     k, _ = begin(ride(6)[0])
     assert k == 2
     assert len(sizes) == 1
