@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.evaluation.scenes.textures import Pyramid
+from semcast.evaluation.scenes.textures import Texture
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ class Surface:
     corner_m: Array
     edge_u_m: Array
     edge_v_m: Array
-    texture: Pyramid
+    texture: Texture
     repeats: tuple[float, float] = (1.0, 1.0)
     light: float = 1.0
 
@@ -43,7 +43,7 @@ def box(
     centre_m: Sequence[float],
     size_m: Sequence[float],
     yaw_rad: float,
-    textures: Sequence[Pyramid],
+    textures: Sequence[Texture],
     lights: Sequence[float] = (0.75, 0.9, 1.0, 0.82, 1.1, 0.5),
 ) -> list[Surface]:
     """Return the six sides of a box that stands upright.
@@ -199,16 +199,16 @@ def _paint(
     u, v, inverse_depth, visible = hit.u, hit.v, hit.inverse_depth, hit.visible
     if not visible.any():
         return
-    tall, wide = surface.texture[0].shape[:2]
+    tall, wide = surface.texture.levels[0].shape[:2]
     wide, tall = wide * surface.repeats[0], tall * surface.repeats[1]
     # Texture pixels under an image pixel decide the level, half a level sharper: pixels have several samples.
     area = abs(np.linalg.det(G)) * wide * tall / np.where(visible, inverse_depth, 1.0) ** 3
-    level = np.clip(0.5 * np.log2(area) - 0.5, 0, len(surface.texture) - 1)
+    level = np.clip(0.5 * np.log2(area) - 0.5, 0, len(surface.texture.levels) - 1)
     shown = np.zeros((*visible.shape, 3), np.float32)
     low, high = int(level[visible].min()), int(np.ceil(level[visible].max()))
     for k in range(low, high + 1):
         weight = np.maximum(0, 1 - np.abs(level - k))
-        texture = surface.texture[k]
+        texture = surface.texture.levels[k]
         wide_k, tall_k = texture.shape[1] * surface.repeats[0], texture.shape[0] * surface.repeats[1]
         map_x = np.where(visible, u * wide_k - 0.5, 0).astype(np.float32)
         map_y = np.where(visible, v * tall_k - 0.5, 0).astype(np.float32)
