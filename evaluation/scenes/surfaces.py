@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -16,6 +17,8 @@ Array = NDArray[np.float64]
 NEAR_M = 0.05
 #: Nothing farther than one over this is drawn, per metre.
 _LEAST_INVERSE_DEPTH = np.float32(1e-4)
+#: Places of a texture that are looked up in one row.
+_ROW = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,11 @@ class Surface:
     texture: Texture
     repeats: tuple[float, float] = (1.0, 1.0)
     light: float = 1.0
+
+    @cached_property
+    def spans_m(self) -> Array:
+        """``(3, 3)`` with edges and corner as columns: times ``(u, v, 1)``, a point of the rectangle."""
+        return np.column_stack([self.edge_u_m, self.edge_v_m, self.corner_m])
 
 
 def box(
@@ -108,8 +116,8 @@ def exact_depth(surfaces: Sequence[Surface], camera: Intrinsics, T_world_cam: Ar
     """
     nearest = np.full((camera.height, camera.width), _LEAST_INVERSE_DEPTH, np.float32)
     for _, G, window in _seen(surfaces, camera, T_world_cam):
-        hit = _hit(nearest, G, window)
-        nearest[window][hit.visible] = hit.inverse_depth[hit.visible]
+        if (hit := _hit(nearest, G, window)) is not None:
+            nearest[window][hit.visible] = hit.inverse_depth
     with np.errstate(divide="ignore"):
         return np.asarray(1.0 / np.where(nearest > _LEAST_INVERSE_DEPTH, nearest, 0.0), np.float32)
 
@@ -123,8 +131,9 @@ def _seen(
     """
     R_cam_world, centre = T_world_cam[:3, :3].T, T_world_cam[:3, 3]
     # Columns span each plane in the camera's frame, so that A (u, v, 1) is a point of it.
-    spans = [np.column_stack([s.edge_u_m, s.edge_v_m, s.corner_m - centre]) for s in surfaces]
-    As = R_cam_world @ np.stack(spans)
+    spans_m = np.array([surface.spans_m for surface in surfaces])
+    spans_m[:, :, 2] -= centre
+    As = R_cam_world @ spans_m
     for index in _in_view(As, camera):
         window = _window(As[index], camera)
         if window is not None and abs(np.linalg.det(As[index])) > 1e-9:
@@ -165,26 +174,29 @@ def _window(A: Array, camera: Intrinsics) -> tuple[slice, slice] | None:
 
 @dataclass(frozen=True, eq=False)
 class _Hit:
-    """Where rays through pixels of a window meet a rectangle's plane; all ``(H, W)``."""
+    """Where a rectangle is the nearest: the pixels ``(H, W)`` of a window, and for these N, in turn, the rest."""
 
+    visible: NDArray[np.bool_]
     u: NDArray[np.float32]
     v: NDArray[np.float32]
     inverse_depth: NDArray[np.float32]
-    visible: NDArray[np.bool_]
 
 
-def _hit(nearest: NDArray[np.float32], G: Array, window: tuple[slice, slice]) -> _Hit:
+def _hit(nearest: NDArray[np.float32], G: Array, window: tuple[slice, slice]) -> _Hit | None:
     """Tell where a rectangle is nearer than what is there; ``G`` maps pixels to ``(u, v, 1)`` over depth."""
     rows, columns = window
-    ys, xs = np.mgrid[rows, columns].astype(np.float32)
+    ys = np.arange(rows.start, rows.stop, dtype=np.float32)[:, None]
+    xs = np.arange(columns.start, columns.stop, dtype=np.float32)
     G32 = G.astype(np.float32)
     inverse_depth = G32[2, 0] * xs + G32[2, 1] * ys + G32[2, 2]
+    visible = (inverse_depth > nearest[window]) & (inverse_depth < 1 / NEAR_M)
+    if not visible.any():
+        return None
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         u = (G32[0, 0] * xs + G32[0, 1] * ys + G32[0, 2]) / inverse_depth
         v = (G32[1, 0] * xs + G32[1, 1] * ys + G32[1, 2]) / inverse_depth
-        inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
-        visible = inside & (inverse_depth > nearest[window]) & (inverse_depth < 1 / NEAR_M)
-    return _Hit(u, v, inverse_depth, visible)
+        visible &= (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+    return _Hit(visible, u[visible], v[visible], inverse_depth[visible]) if visible.any() else None
 
 
 def _paint(
@@ -196,23 +208,34 @@ def _paint(
 ) -> None:
     """Draw one rectangle where it is the nearest; ``G`` maps pixels to ``(u, v, 1)`` over depth."""
     hit = _hit(nearest, G, window)
-    u, v, inverse_depth, visible = hit.u, hit.v, hit.inverse_depth, hit.visible
-    if not visible.any():
+    if hit is None:
         return
-    tall, wide = surface.texture.levels[0].shape[:2]
+    levels = surface.texture.levels
+    tall, wide = levels[0].shape[:2]
     wide, tall = wide * surface.repeats[0], tall * surface.repeats[1]
     # Texture pixels under an image pixel decide the level, half a level sharper: pixels have several samples.
-    area = abs(np.linalg.det(G)) * wide * tall / np.where(visible, inverse_depth, 1.0) ** 3
-    level = np.clip(0.5 * np.log2(area) - 0.5, 0, len(surface.texture.levels) - 1)
-    shown = np.zeros((*visible.shape, 3), np.float32)
-    low, high = int(level[visible].min()), int(np.ceil(level[visible].max()))
-    for k in range(low, high + 1):
-        weight = np.maximum(0, 1 - np.abs(level - k))
-        texture = surface.texture.levels[k]
-        wide_k, tall_k = texture.shape[1] * surface.repeats[0], texture.shape[0] * surface.repeats[1]
-        map_x = np.where(visible, u * wide_k - 0.5, 0).astype(np.float32)
-        map_y = np.where(visible, v * tall_k - 0.5, 0).astype(np.float32)
-        layer = cv2.remap(texture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-        shown += weight[..., None].astype(np.float32) * layer
-    image[window][visible] = shown[visible] * surface.light
-    nearest[window][visible] = inverse_depth[visible]
+    area = abs(np.linalg.det(G)) * wide * tall / hit.inverse_depth**3
+    level = np.clip(0.5 * np.log2(area) - 0.5, 0, len(levels) - 1)
+    shown = np.zeros((len(level), 3), np.float32)
+    for k in range(int(level.min()), int(np.ceil(level.max())) + 1):
+        weight = 1 - np.abs(level - k)
+        mixed = np.flatnonzero(weight > 0)
+        layer = _looked_up(levels[k], surface.repeats, hit.u[mixed], hit.v[mixed])
+        shown[mixed] += weight[mixed, None].astype(np.float32) * layer
+    image[window][hit.visible] = shown * surface.light
+    nearest[window][hit.visible] = hit.inverse_depth
+
+
+def _looked_up(
+    texture: NDArray[np.float32],
+    repeats: tuple[float, float],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Return ``(N, 3)`` colours of a texture that fits so often, at places ``(N,)`` in [0, 1]."""
+    # OpenCV takes images of less than 2^15 rows and columns, so places fill rows.
+    maps = np.zeros((2, -(-len(u) // _ROW), _ROW), np.float32)
+    maps[0].ravel()[: len(u)] = u * (texture.shape[1] * repeats[0]) - 0.5
+    maps[1].ravel()[: len(v)] = v * (texture.shape[0] * repeats[1]) - 0.5
+    layer = cv2.remap(texture, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.asarray(layer.reshape(-1, 3)[: len(u)], np.float32)

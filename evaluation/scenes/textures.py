@@ -52,7 +52,7 @@ def dead_leaves(rng: np.random.Generator, contrast: float = 1.0, max_radius_shar
     least, most = 2.0, max_radius_share * _SIDE_PX
     shares = rng.uniform(0, 1, _NUM_LEAVES)
     radii = ((1 - shares) * least**-1.5 + shares * most**-1.5) ** (-1 / 1.5)
-    # A call of numpy costs more than a leaf: drawn numbers are scaled here, colours and corners found for all.
+    # A call of numpy costs more than a leaf: numbers are scaled here, colours and corners found for all.
     colour_idx, offsets, ellipses, polygons = [], [], [], []
     for radius in radii.tolist():
         colour_idx.append(rng.integers(12))
@@ -75,7 +75,7 @@ def dead_leaves(rng: np.random.Generator, contrast: float = 1.0, max_radius_shar
 
 
 def _corners(polygons: list[tuple[float, float, float, list[float]]]) -> list[NDArray[np.int32]]:
-    """Return corners ``(N, 2)`` of each polygon, given as its circle's x, y and radius and shares of a turn."""
+    """Return corners ``(N, 2)`` of polygons given by x, y and radius of a circle and shares of a turn."""
     nums = [len(shares) for *_, shares in polygons]
     circles = np.repeat([circle for *circle, _ in polygons], nums, axis=0)
     angles = 2 * np.pi * np.concatenate([shares for *_, shares in polygons])
