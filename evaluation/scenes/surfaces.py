@@ -134,42 +134,49 @@ def _seen(
     spans_m = np.array([surface.spans_m for surface in surfaces])
     spans_m[:, :, 2] -= centre
     As = R_cam_world @ spans_m
-    for index in _in_view(As, camera):
-        window = _window(As[index], camera)
-        if window is not None and abs(np.linalg.det(As[index])) > 1e-9:
-            yield surfaces[index], np.linalg.inv(As[index]) @ np.linalg.inv(camera.K), window
-
-
-def _in_view(As: Array, camera: Intrinsics) -> list[int]:
-    """Return which rectangles may be seen, the nearest first: what they hide need not be painted."""
     corners = As @ np.array([[0, 1, 1, 0], [0, 0, 1, 1], [1, 1, 1, 1]])  # (N, 3, 4)
+    order = _in_view(corners, camera)
+    low, high = _windows(corners[order], camera)
+    seen = (low < high).all(1) & (np.abs(np.linalg.det(As[order])) > 1e-9)
+    order, low, high = order[seen], low[seen], high[seen]
+    Gs = np.linalg.inv(As[order]) @ np.linalg.inv(camera.K)
+    for index, G, (left, top), (right, bottom) in zip(
+        order.tolist(), Gs, low.tolist(), high.tolist(), strict=True
+    ):
+        yield surfaces[index], G, (slice(top, bottom), slice(left, right))
+
+
+def _in_view(corners: Array, camera: Intrinsics) -> NDArray[np.intp]:
+    """Return which rectangles ``(N, 3, 4)`` may be seen, the nearest first: what they hide is not painted."""
     x, y, z = corners[:, 0], corners[:, 1], corners[:, 2]
     left, right = (0 - camera.cx) / camera.fx, (camera.width - camera.cx) / camera.fx
     top, bottom = (0 - camera.cy) / camera.fy, (camera.height - camera.cy) / camera.fy
     beside = (x < left * z).all(1) | (x > right * z).all(1) | (y < top * z).all(1) | (y > bottom * z).all(1)
     seen = np.flatnonzero(~beside & (z >= NEAR_M).any(1))
     order = np.argsort(np.linalg.norm(corners[seen], axis=1).min(1))
-    return [int(i) for i in seen[order]]
+    return np.asarray(seen[order])
 
 
-def _window(A: Array, camera: Intrinsics) -> tuple[slice, slice] | None:
-    """Return rows and columns a rectangle may cover, None when it is out of view."""
-    corners = [A @ np.array([u, v, 1.0]) for u, v in ((0, 0), (1, 0), (1, 1), (0, 1))]
-    kept = []
-    for this, following in zip(corners, corners[1:] + corners[:1], strict=True):
-        if this[2] >= NEAR_M:
-            kept.append(this)
-        if (this[2] >= NEAR_M) != (following[2] >= NEAR_M):
-            share = (NEAR_M - this[2]) / (following[2] - this[2])
-            kept.append(this + share * (following - this))
-    if not kept:
-        return None
-    pixels = np.array([camera.K @ (point / point[2]) for point in kept])[:, :2]
-    low = np.maximum(np.floor(pixels.min(0)), 0).astype(int)
-    high = np.minimum(np.ceil(pixels.max(0)) + 1, (camera.width, camera.height)).astype(int)
-    if (low >= high).any():
-        return None
-    return slice(low[1], high[1]), slice(low[0], high[0])
+def _windows(corners: Array, camera: Intrinsics) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first pixel and the one past the last, both ``(N, 2)``, that rectangles may cover.
+
+    Args:
+        corners: ``(N, 3, 4)`` in the camera's frame, one at least of each in front of it.
+        camera: Pinhole, distortion ignored.
+    """
+    following = np.roll(corners, -1, axis=2)
+    in_front = corners[:, 2] >= NEAR_M
+    crosses = in_front != (following[:, 2] >= NEAR_M)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        shares = (NEAR_M - corners[:, 2]) / (following[:, 2] - corners[:, 2])
+        cuts = corners + shares[:, None] * (following - corners)
+        points = np.concatenate([corners, cuts], axis=2)
+        pixels = points[:, :2] / points[:, 2:] * np.array([[camera.fx], [camera.fy]])
+        pixels += np.array([[camera.cx], [camera.cy]])
+    kept = np.concatenate([in_front, crosses], axis=1)[:, None]
+    low = np.maximum(np.floor(np.where(kept, pixels, np.inf).min(2)), 0)
+    high = np.ceil(np.where(kept, pixels, -np.inf).max(2)) + 1
+    return low.astype(np.intp), np.minimum(high, (camera.width, camera.height)).astype(np.intp)
 
 
 @dataclass(frozen=True, eq=False)
