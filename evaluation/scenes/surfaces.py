@@ -223,13 +223,18 @@ def _paint(
     # Texture pixels under an image pixel decide the level, half a level sharper: pixels have several samples.
     area = abs(np.linalg.det(G)) * wide * tall / hit.inverse_depth**3
     level = np.clip(0.5 * np.log2(area) - 0.5, 0, len(levels) - 1)
-    shown = np.zeros((len(level), 3), np.float32)
+    # Colour by colour: numpy takes ten times as long to pick or set pixels of three values.
+    shown = np.zeros((3, len(level)), np.float32)
     for k in range(int(level.min()), int(np.ceil(level.max())) + 1):
-        weight = 1 - np.abs(level - k)
-        mixed = np.flatnonzero(weight > 0)
+        weights = 1 - np.abs(level - k)
+        mixed = np.flatnonzero(weights > 0)
+        weights = weights[mixed].astype(np.float32)
         layer = _looked_up(levels[k], surface.repeats, hit.u[mixed], hit.v[mixed])
-        shown[mixed] += weight[mixed, None].astype(np.float32) * layer
-    image[window][hit.visible] = shown * surface.light
+        for colour in range(3):
+            shown[colour, mixed] += weights * layer[:, colour]
+    picture = image[window]
+    for colour in range(3):
+        picture[..., colour][hit.visible] = shown[colour] * surface.light
     nearest[window][hit.visible] = hit.inverse_depth
 
 
