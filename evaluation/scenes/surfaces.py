@@ -181,7 +181,7 @@ def _windows(corners: Array, camera: Intrinsics) -> tuple[NDArray[np.intp], NDAr
 
 @dataclass(frozen=True, eq=False)
 class _Hit:
-    """Where a rectangle is the nearest: the pixels ``(H, W)`` of a window, and for these N, in turn, the rest."""
+    """Where a rectangle is the nearest: pixels ``(H, W)`` of a window, and values ``(N,)`` at those."""
 
     visible: NDArray[np.bool_]
     u: NDArray[np.float32]
