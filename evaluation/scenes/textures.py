@@ -11,6 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+#: Centre, axes and angle in degrees, as OpenCV has them.
+_Ellipse = tuple[tuple[float, float], tuple[float, float], float]
+
 _SIDE_PX = 512
 _NUM_LEAVES = 1500
 
@@ -53,7 +56,8 @@ def dead_leaves(rng: np.random.Generator, contrast: float = 1.0, max_radius_shar
     shares = rng.uniform(0, 1, _NUM_LEAVES)
     radii = ((1 - shares) * least**-1.5 + shares * most**-1.5) ** (-1 / 1.5)
     # A call of numpy costs more than a leaf: numbers are scaled here, colours and corners found for all.
-    colour_idx, offsets, ellipses, polygons = [], [], [], []
+    colour_idx, offsets, polygons = [], [], []
+    ellipses: list[_Ellipse | None] = []
     for radius in radii.tolist():
         colour_idx.append(rng.integers(12))
         offsets.append(rng.standard_normal())
