@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from semcast.common.codec import DEFAULT_CODEC
-from semcast.common.codecs import LEARNED_CODECS, available_codecs
+from semcast.common.codecs import LEARNED_CODECS, available_codecs, check_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.evaluation.report import json_ready, provenance, write_result
@@ -129,11 +129,15 @@ def evaluate_runtime(settings: RuntimeSettings) -> dict[str, Any]:
         codec has no weights or no exported encoder; and provenance.
 
     Raises:
-        ConfigError: A codec is not a learned one: neither runtime nor instruction set makes it another.
+        ConfigError: A codec is none there is, or not a learned one: neither runtime nor instruction set
+            makes it another.
         SemcastError: No variant ran.
     """
     for name in settings.codecs:
-        if name in available_codecs() and name not in LEARNED_CODECS:
+        if name in LEARNED_CODECS:
+            continue
+        check_codec(name)
+        if name in available_codecs():
             raise ConfigError(f"codec must be a learned one, got {name!r}, which has no runtime to choose")
     children: list[_Child] = []
     try:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.evaluation.scenes.motion import PACE_FACTOR, Pace, Wobble, look
 from semcast.evaluation.scenes.surfaces import Surface, box
-from semcast.evaluation.scenes.textures import Pyramid, asphalt, dead_leaves, paint
+from semcast.evaluation.scenes.textures import Texture, asphalt, dead_leaves, paint
 
 Array = NDArray[np.float64]
 
@@ -103,9 +103,9 @@ def _wall(
     length_m: float,
     along: Array,
     inward: Array,
-    walls: list[Pyramid],
-    doors: list[Pyramid],
-    posters: list[Pyramid],
+    walls: list[Texture],
+    doors: list[Texture],
+    posters: list[Texture],
 ) -> list[Surface]:
     up = np.array([0.0, 0.0, 1.0])
     light = rng.uniform(0.8, 1.0)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.evaluation.scenes.motion import PACE_FACTOR, Pace, Wobble, look
 from semcast.evaluation.scenes.surfaces import Surface, box
-from semcast.evaluation.scenes.textures import Pyramid, asphalt, dead_leaves, facade, paint
+from semcast.evaluation.scenes.textures import Texture, asphalt, dead_leaves, facade, paint
 
 Array = NDArray[np.float64]
 
@@ -171,7 +171,7 @@ def _town(rng: np.random.Generator, line: Array, yaw: Array) -> list[Surface]:
 
 
 def _house(
-    rng: np.random.Generator, near: Array, far: Array, fronts: list[Pyramid], line: Array
+    rng: np.random.Generator, near: Array, far: Array, fronts: list[Texture], line: Array
 ) -> list[Surface]:
     along = far - near
     length = float(np.linalg.norm(along))
@@ -198,11 +198,11 @@ def _distance_m(position: Array, line: Array) -> float:
     return float(np.linalg.norm(line - position, axis=1).min())
 
 
-def _car_textures(rng: np.random.Generator) -> list[Pyramid]:
+def _car_textures(rng: np.random.Generator) -> list[Texture]:
     return [paint(rng, 1.0), paint(rng, 1.0)]
 
 
-def _car(x: float, y: float, yaw: float, painted: list[Pyramid]) -> list[Surface]:
+def _car(x: float, y: float, yaw: float, painted: list[Texture]) -> list[Surface]:
     body = box((x, y, 0.6), (4.2, 1.75, 0.8), yaw, painted[:1])
     cabin = box((x, y, 1.25), (2.1, 1.6, 0.55), yaw, painted[1:])
     return body + cabin

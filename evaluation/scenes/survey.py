@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.evaluation.scenes.motion import PACE_FACTOR, Pace, Wobble, look
 from semcast.evaluation.scenes.surfaces import Surface, box
-from semcast.evaluation.scenes.textures import Pyramid, asphalt, dead_leaves, paint
+from semcast.evaluation.scenes.textures import Texture, asphalt, dead_leaves, paint
 
 Array = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def _land(rng: np.random.Generator) -> list[Surface]:
     return found
 
 
-def _fields(rng: np.random.Generator, crops: list[Pyramid]) -> list[Surface]:
+def _fields(rng: np.random.Generator, crops: list[Texture]) -> list[Surface]:
     found = []
     for x in np.arange(-_SIDE_M / 2, _SIDE_M / 2, _FIELD_M):
         for y in np.arange(-_SIDE_M / 2, _SIDE_M / 2, _FIELD_M):
@@ -110,7 +110,7 @@ def _fields(rng: np.random.Generator, crops: list[Pyramid]) -> list[Surface]:
     return found
 
 
-def _strip(start_m: Array, way_m: Array, texture: Pyramid) -> Surface:
+def _strip(start_m: Array, way_m: Array, texture: Texture) -> Surface:
     length = float(np.linalg.norm(way_m))
     across = np.array([-way_m[1], way_m[0]]) * _TRACK_M / length
     corner, along = np.array([*start_m, 0.02]), np.array([*way_m, 0.0])

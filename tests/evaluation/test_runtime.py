@@ -3,6 +3,7 @@ import json
 import pytest
 
 from semcast.common.errors import ConfigError, SemcastError
+from semcast.evaluation import runtime
 from semcast.evaluation.runtime import RuntimeSettings, evaluate_runtime, variants
 
 pytestmark = pytest.mark.xdist_group("real-time")
@@ -36,8 +37,31 @@ def test_a_codec_without_a_runtime_is_not_timed_under_the_name_of_one():
         )
 
 
-def test_an_unknown_codec_is_one_clear_error():
-    with pytest.raises(SemcastError, match="no variant ran: .*codec must be one of .*got '3dcsc-huge'"):
+def test_an_unknown_codec_is_one_clear_error(monkeypatch):
+    monkeypatch.setattr(runtime, "_Child", lambda *_: pytest.fail("seconds of imports for nothing"))
+    with pytest.raises(ConfigError, match="^codec must be one of .*got '3dcsc-huge'"):
         evaluate_runtime(RuntimeSettings(codecs=("3dcsc-huge",), threads=(1,), rounds=1))
     with pytest.raises(ValueError, match="threads must be in"):
         RuntimeSettings(threads=(0,))
+
+
+def test_without_a_variant_that_ran_the_first_one_says_why(monkeypatch):
+    children = []
+
+    class Child:
+        times_ms: tuple[float, ...] = ()
+
+        def __init__(self, variant, shape_hw):
+            self.error, self.closed = f"no {variant.work}", False
+            children.append(self)
+
+        def turn(self, calls):
+            pass
+
+        def close(self):
+            self.closed = True
+
+    monkeypatch.setattr(runtime, "_Child", Child)
+    with pytest.raises(SemcastError, match="^no variant ran: no encode$"):
+        evaluate_runtime(RuntimeSettings(threads=(1,), rounds=1))
+    assert [child.closed for child in children] == [True] * 5

@@ -22,6 +22,13 @@ def painted(name):
     return SCENES[name](3, "fast")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def forgotten():
+    """Let scenes go when they were all looked at: each holds a hundred megabytes."""
+    yield
+    painted.cache_clear()
+
+
 def seen(distortion, readout_s=0.0, name="room"):
     scene = copy.copy(painted(name))
     scene.camera = replace(scene.camera, distortion=distortion)

@@ -6,7 +6,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.evaluation.scenes.motion import look
 from semcast.evaluation.scenes.surfaces import Surface, box, draw, exact_depth
-from semcast.evaluation.scenes.textures import Pyramid, pyramid
+from semcast.evaluation.scenes.textures import Texture
 
 CAMERA = Intrinsics(fx=100.0, fy=100.0, cx=49.5, cy=39.5, width=100, height=80)
 BLACK = np.zeros((80, 100, 3), np.float32)
@@ -14,11 +14,11 @@ BLACK = np.zeros((80, 100, 3), np.float32)
 AHEAD = look(np.zeros(3), 0.0, 0.0)
 
 
-def plain(grey: float, side: int = 64) -> Pyramid:
-    return pyramid(np.full((side, side, 3), grey, np.uint8))
+def plain(grey: float, side: int = 64) -> Texture:
+    return Texture(np.full((side, side, 3), grey, np.uint8))
 
 
-def wall(distance_m: float, half_m: float, texture: Pyramid) -> Surface:
+def wall(distance_m: float, half_m: float, texture: Texture) -> Surface:
     """A square wall across the view, texture upright."""
     return Surface(
         np.array([distance_m, half_m, half_m]),
@@ -39,7 +39,7 @@ def test_wall_covers_the_pixels_its_corners_project_to() -> None:
 def test_texture_is_upright_and_not_mirrored() -> None:
     quarters = np.zeros((64, 64, 3), np.uint8)
     quarters[:32, :32], quarters[:32, 32:], quarters[32:, :32] = 50, 100, 150
-    image = draw([wall(2.0, 0.5, pyramid(quarters))], CAMERA, AHEAD, BLACK)
+    image = draw([wall(2.0, 0.5, Texture(quarters))], CAMERA, AHEAD, BLACK)
     seen = [round(float(image[y, x, 0])) for y, x in ((25, 35), (25, 65), (55, 35), (55, 65))]
     assert seen == [50, 100, 150, 0]
 
@@ -68,7 +68,7 @@ def test_what_is_behind_the_camera_is_not_seen() -> None:
 def test_texture_far_away_is_averaged_and_not_sampled() -> None:
     stripes = np.zeros((512, 512, 3), np.uint8)
     stripes[:, ::2] = 200
-    image = draw([wall(2.0, 0.25, pyramid(stripes))], CAMERA, AHEAD, BLACK)
+    image = draw([wall(2.0, 0.25, Texture(stripes))], CAMERA, AHEAD, BLACK)
     # 512 columns on 25 pixels: every pixel has the mean.
     assert np.abs(image[30:50, 40:60, 0] - 100).max() < 3
 
