@@ -28,4 +28,5 @@ Pose and structure
     triangulation    points from rays
     projection       world points in a camera
     motion           constant-velocity prior
+    whereabouts      where the camera can have got to in a gap
 """

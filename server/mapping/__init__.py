@@ -69,6 +69,7 @@ Getting lost, and places seen again
     visual_gyroscope  how a camera without a pose turns
     bridging          where a new submap begins and its unit, told by how the camera moved
     submap_placement  puts it there, and again once it has settled
+    joining           whether the camera can have got to where a place joins two submaps
     revisit           old landmarks that are in sight again get their tracks back
     loop_closure      finds loops and shares out the drift
     pose_graph        graph of similarities (Sim(3)) between keyframes, by GTSAM
