@@ -28,4 +28,7 @@ Pose and structure
     triangulation    points from rays
     projection       world points in a camera
     motion           constant-velocity prior
+
+Numbers
+    finite_differences  the derivative of what is known at a few moments
 """
