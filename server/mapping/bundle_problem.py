@@ -29,7 +29,7 @@ class ViewMotion:
         velocity: ``(K, 6)`` of each view in its own frame, rotation (rad/s) before translation (map units/s);
             NaN where unknown.
         distortion: OpenCV coefficients of the lens that the images were put right for.
-        put_right_px: ``(M, 2)`` how much further each observation is in its image as received, before the image
+        put_right_px: ``(M, 2)`` how much further each observation is in its image as received, before that
             was put right for its readout; None where only what is left of a readout is asked for.
     """
 
