@@ -20,4 +20,4 @@ def slope_weights(times_s: Array) -> Array:
     """
     unit_s = np.abs(times_s).max()
     powers = np.vander(times_s / unit_s, increasing=True).T
-    return np.linalg.solve(powers, np.eye(len(times_s))[1]) / unit_s
+    return np.asarray(np.linalg.solve(powers, np.eye(len(times_s))[1]) / unit_s)
