@@ -30,7 +30,7 @@ _MAX_TRIALS, _BETTER = 4, 0.995
 #: What is left of the readout then counts as nothing.
 _NOTHING_MS = 0.3
 #: Residuals are not noise alone: blur and all else that is not modelled speak for a readout too. Of ten drawn
-#: recordings the true readout was within bounds of scatter in eight, and in all ten with the change added that
+#: recordings the true readout was within bounds of scatter in eight, and in all with the change added that
 #: explains this share of the squared residuals, as for a lens.
 _NOT_MODELLED = 0.002
 #: An interval wider than this is no answer.
