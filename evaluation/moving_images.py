@@ -5,7 +5,7 @@ answer.
 """
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -27,9 +27,9 @@ from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.residual_patterns import NUM_GROUPS, PatternEvidence
+from semcast.server.mapping.rolling_shutter import ImageFlow, RowTimes
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
-from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
 
@@ -135,7 +135,7 @@ class CameraEvidence:
     """What a reconstruction left.
 
     Attributes:
-        views: ``(8, 8)`` of each keyframe, see ``PatternEvidence``.
+        views: ``(9, 9)`` of each keyframe, see ``PatternEvidence``.
         mean_px: Mean over frames of their median reprojection error, infinite without any.
         num_frames: Frames that got a pose from a map that was there.
         sigma_factor: By how much estimates scatter more than residuals do, see ``PatternEvidence``.
@@ -172,18 +172,37 @@ class CameraEvidence:
 
 
 class _AskingBundle(InlineBundle):
-    """Has every few adjustments say what their residuals tell of shutter and lens."""
+    """Has every few adjustments say what their residuals tell of shutter and lens.
 
-    def __init__(self, camera: Intrinsics) -> None:
+    Args:
+        camera: With the distortion that images were freed of.
+        readout: That images are put right for.
+    """
+
+    def __init__(self, camera: Intrinsics, readout: Readout) -> None:
         super().__init__()
         self.watch = ReadoutWatch(camera, is_wanted=True)
-        self.world: WorldMap | None = None
+        self.reconstruction: Reconstruction | None = None
         self.evidence = PatternEvidence()
+        self._rows = RowTimes(readout.put_on(camera))
 
     def submit(self, problem: BundleProblem) -> bool:
         """Adjust now."""
-        assert self.world is not None
-        return super().submit(replace(problem, motion=self.watch.motion(self.world, problem)))
+        assert self.reconstruction is not None
+        motion = self.watch.motion(self.reconstruction.world, problem)
+        if motion is not None:
+            put_right_px = self._put_right_px(problem, self.reconstruction.flows)
+            motion = replace(motion, put_right_px=put_right_px)
+        return super().submit(replace(problem, motion=motion))
+
+    def _put_right_px(self, problem: BundleProblem, flows: Mapping[int, ImageFlow]) -> Array:
+        """Return how far observations are in images as received from where they are, ``(M, 2)``."""
+        moved_px = np.zeros_like(problem.xy)
+        for k, frame_id in enumerate(problem.keyframe_ids.tolist()):
+            if (flow := flows.get(frame_id)) is not None:
+                xy = problem.xy[problem.view == k]
+                moved_px[problem.view == k] = self._rows.as_received(flow, xy) - xy
+        return moved_px
 
     def take(self, wait: bool = False) -> BundleResult | None:
         """Return the result of the last ``submit``, once."""
@@ -202,12 +221,11 @@ def gather_evidence(frames: Sequence[DecodedFrame], camera: Intrinsics, readout:
         readout: Of the camera.
     """
     settings = ReconstructionSettings(confidence="off", readout_ms=readout.ms, readout_from=readout.side)
-    bundle = _AskingBundle(camera)
-    reconstruction = Reconstruction(camera.undistorted(), settings, bundle)
+    bundle = _AskingBundle(camera, readout)
+    reconstruction = bundle.reconstruction = Reconstruction(camera.undistorted(), settings, bundle)
     errors_px = []
     try:
         for frame in frames:
-            bundle.world = reconstruction.world
             result = reconstruction.process(frame)
             for frame_id, t_source_ns, _ in result.backfilled:
                 bundle.watch.note(frame_id, t_source_ns)

@@ -29,4 +29,7 @@ Pose and structure
     projection       world points in a camera
     motion           constant-velocity prior
     whereabouts      where the camera can have got to in a gap
+
+Numbers
+    finite_differences  the derivative of what is known at a few moments
 """

@@ -29,11 +29,14 @@ class ViewMotion:
         velocity: ``(K, 6)`` of each view in its own frame, rotation (rad/s) before translation (map units/s);
             NaN where unknown.
         distortion: OpenCV coefficients of the lens that the images were put right for.
+        put_right_px: ``(M, 2)`` how much further each observation is in its image as received, before that
+            was put right for its readout; None where only what is left of a readout is asked for.
     """
 
     size_wh: tuple[int, int]
     velocity: Array
     distortion: tuple[float, ...] = ()
+    put_right_px: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -159,7 +162,7 @@ class BundleResult:
         covariance: ``(6, 6)`` marginal covariance of the last keyframe's pose in its own frame, rotation
             before translation, or None.
         elapsed_ms: Time it took.
-        pattern_products: ``(K, 8, 8)``, see ``residual_patterns``; None where ``motion`` was not given.
+        pattern_products: ``(K, 9, 9)``, see ``residual_patterns``; None where ``motion`` was not given.
     """
 
     problem: BundleProblem

@@ -63,7 +63,7 @@ def fit_lens(views: Sequence[Array] | Array, num_radial: int, with_centre: bool 
     """Return the change of the lens that views speak for, None where they say nothing.
 
     Args:
-        views: ``(8, 8)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
+        views: ``(9, 9)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
         num_radial: Radial coefficients that may change, the first ones, 0 to 2.
         with_centre: Whether the principal point may move.
     """
@@ -95,7 +95,7 @@ def believed_lens(
     are asked for together.
 
     Args:
-        views: ``(8, 8)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
+        views: ``(9, 9)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
         num_radial: Coefficients, the first ones, that are believed in anyway.
         with_centre: Whether another principal point is.
 

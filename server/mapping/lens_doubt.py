@@ -36,7 +36,7 @@ def lens_doubt(views: Sequence[Array], sigma_factor: float, camera: Intrinsics) 
     only of a focal length that is wrong alone.
 
     Args:
-        views: ``(8, 8)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
+        views: ``(9, 9)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
         sigma_factor: On standard deviations, see ``PatternEvidence``.
         camera: As it is believed to be, of the images that were tracked.
     """

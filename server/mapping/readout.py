@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import MAX_READOUT_MS, Intrinsics, ReadoutFrom
 from semcast.common.geometry import log_so3
+from semcast.server.geometry.finite_differences import slope_weights
 from semcast.server.mapping.residual_patterns import (
     COLUMNS,
+    PUT_RIGHT,
     RESIDUAL,
     ROWS,
     by_points,
@@ -82,26 +84,29 @@ class ReadoutFit:
     Attributes:
         readout: Along the axis that explains more.
         sigma_ms: Standard deviation, by leaving out a part of the keyframes at a time.
-        explained: Share of the squared residuals that it explains.
+        explained: Share of the squared residuals that it explains, without what images were put right for.
+        unit_ms: The readout that would double the squared residuals.
     """
 
     readout: Readout
     sigma_ms: float
     explained: float
+    unit_ms: float
 
 
-def body_velocity(T_world_before: Array, T_world_cam: Array, T_world_after: Array, step_s: float) -> Array:
-    """Return the velocity of a camera between two poses, see ``ViewMotion``: ``(6,)``.
+def body_velocity(T_world_cam: Array, T_world_around: Array, since_s: Array) -> Array:
+    """Return the velocity of a camera, see ``ViewMotion``, by its poses around a moment: ``(6,)``.
 
     Args:
-        T_world_before: ``(4, 4)`` a moment before.
-        T_world_cam: ``(4, 4)`` in whose frame the velocity is given.
-        T_world_after: ``(4, 4)`` a moment after.
-        step_s: From before to after.
+        T_world_cam: ``(4, 4)`` at that moment; in its frame the velocity is given.
+        T_world_around: ``(N, 4, 4)`` before and after.
+        since_s: ``(N,)`` from that moment to these, all different and none 0.
     """
-    turned_rad = log_so3(T_world_before[:3, :3].T @ T_world_after[:3, :3])
-    moved_map = T_world_cam[:3, :3].T @ (T_world_after[:3, 3] - T_world_before[:3, 3])
-    return np.concatenate([turned_rad, moved_map]) / step_s
+    R_cam_world = T_world_cam[:3, :3].T
+    turned_rad = np.array([log_so3(R_cam_world @ T[:3, :3]) for T in T_world_around])
+    moved_map = (T_world_around[:, :3, 3] - T_world_cam[:3, 3]) @ R_cam_world.T
+    weights = slope_weights(np.append(since_s, 0.0))[:-1]
+    return np.asarray(weights @ np.column_stack([turned_rad, moved_map]))
 
 
 def lean(camera: Intrinsics, points_cam: Array, flow_px_s: Array) -> Array:
@@ -124,8 +129,11 @@ def lean(camera: Intrinsics, points_cam: Array, flow_px_s: Array) -> Array:
 def fit_readout(views: Sequence[Array] | Array, axis: Axis | None = None) -> ReadoutFit | None:
     """Return the readout time that views speak for, None where they say nothing.
 
+    It is all of it where ``ViewMotion`` tells how far points moved as images were put right: flows by which
+    that was done may be wrong, as far as poses tell better. Else it is what is left of it.
+
     Args:
-        views: ``(8, 8)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
+        views: ``(9, 9)`` of each, as ``residual_patterns.pattern_products_of`` gives them.
         axis: What is read one after the other, None for what explains more.
     """
     parts = grouped(views)
@@ -136,8 +144,14 @@ def fit_readout(views: Sequence[Array] | Array, axis: Axis | None = None) -> Rea
     for name, k in zip(AXES, (ROWS, COLUMNS), strict=True):
         if axis in (None, name) and total[k, k] > 0.0:
             without = total - parts
-            slopes = without[:, RESIDUAL, k] / np.maximum(without[:, k, k], 1e-12)
-            readout = Readout(name, float(1e3 * total[RESIDUAL, k] / total[k, k]))
+            slopes = _speaks_for(without, k) / np.maximum(without[:, k, k], 1e-12)
+            readout = Readout(name, float(1e3 * _speaks_for(total, k) / total[k, k]))
             explained = total[RESIDUAL, k] ** 2 / (total[k, k] * total[RESIDUAL, RESIDUAL])
-            fits.append(ReadoutFit(readout, float(1e3 * spread(slopes)), float(explained)))
+            unit_ms = 1e3 * np.sqrt(total[RESIDUAL, RESIDUAL] / total[k, k])
+            fits.append(ReadoutFit(readout, float(1e3 * spread(slopes)), float(explained), float(unit_ms)))
     return max(fits, key=lambda fit: fit.explained, default=None)
+
+
+def _speaks_for(products: Array, pattern: int) -> Array:
+    """Return the inner products ``(...)`` of a pattern and what a readout has done to points."""
+    return np.asarray(products[..., RESIDUAL, pattern] + products[..., PUT_RIGHT, pattern])

@@ -19,7 +19,7 @@ from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.readout import Readout
-from semcast.server.mapping.rolling_shutter import RollingShutter
+from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
@@ -91,6 +91,11 @@ class Reconstruction:
     def camera(self) -> Intrinsics:
         """Pinhole, with the readout that images are put right for: given, or found."""
         return self._shutter.camera
+
+    @property
+    def flows(self) -> Mapping[int, ImageFlow]:
+        """How the newest images moved, by frame id, as far as known: by that they are put right."""
+        return self._shutter.flows
 
     def close(self) -> None:
         """End the bundle runner. Idempotent."""

@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 
 #: The patterns in their order: the residuals themselves; a second of readout along rows, along columns; a
 #: focal length twice as long; a first and a second radial coefficient of 1; a principal point further to the
-#: right and down, by a focal length.
-RESIDUAL, ROWS, COLUMNS, FOCAL, RADIAL, RADIAL_2, CENTRE_X, CENTRE_Y = range(8)
-NUM_PATTERNS = 8
+#: right and down, by a focal length; what was put right for a readout, as it was before.
+RESIDUAL, ROWS, COLUMNS, FOCAL, RADIAL, RADIAL_2, CENTRE_X, CENTRE_Y, PUT_RIGHT = range(9)
+NUM_PATTERNS = 9
 #: Residuals beyond this many medians count less (Huber).
 _HUBER_MEDIANS = 1.5
 #: Damping that holds the gauge, as a share of the mean of the diagonal.
@@ -51,7 +51,7 @@ def pattern_products_of(
         residual_px: ``(M, 2)``, NaN where not used.
 
     Returns:
-        ``(K, 8, 8)``, in the order of ``RESIDUAL``, ``ROWS`` ...; zero for views of unknown velocity.
+        ``(K, 9, 9)``, in the order of ``RESIDUAL``, ``ROWS`` ...; zero for views of unknown velocity.
     """
     num_views, num_points = len(T_world_cam), len(xyz)
     T_cam_world = invert_transform(T_world_cam)[problem.view]
@@ -68,21 +68,27 @@ def pattern_products_of(
     by_pose = by_poses(by_point, points)
     by_xyz = by_point @ T_cam_world[used, :3, :3]
     flow = np.einsum("mij,mj->mi", by_pose, motion.velocity[view])
-    share = shares_of_readout(motion.size_wh, problem.xy[used])
+    put_right_px = np.zeros_like(residual_px) if motion.put_right_px is None else motion.put_right_px
+    share = shares_of_readout(motion.size_wh, (problem.xy + put_right_px)[used])
     patterns = np.stack(
         [
             residual_px[used],
             share[:, 1:] * flow,
             share[:, :1] * flow,
             *_lens_patterns((camera.fx, camera.fy), motion.distortion, points[:, :2] / points[:, 2:]),
+            put_right_px[used],
         ],
         axis=2,
     )
-    error = (whitener @ residual_px[used, :, None])[..., 0]
-    weight = _weights(error, problem.sigma_px[used])[:, None, None] * whitener
-    left = _unexplained(
-        weight @ by_pose, weight @ by_xyz, weight @ patterns, view, point, (num_views, num_points)
-    )
+    error, sigma_px = (whitener @ residual_px[used, :, None])[..., 0], problem.sigma_px[used]
+    # What a readout does to points is no outlier: if it counted as one, a shorter one would be found.
+    for _ in range(2):
+        trust = _weights(error, sigma_px)
+        weight = trust[:, None, None] * whitener
+        left = _unexplained(
+            weight @ by_pose, weight @ by_xyz, weight @ patterns, view, point, (num_views, num_points)
+        )
+        error = _without_readout(left) / trust[:, None]
     np.add.at(told, view, np.einsum("mkg,mkh->mgh", left, left))
     return told
 
@@ -150,6 +156,17 @@ def _skews(points: Array) -> Array:
     x, y, z = points.T
     none = np.zeros_like(x)
     return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
+
+
+def _without_readout(left: Array) -> Array:
+    """Return residuals ``(M, 2)`` without the readout that explains most of them.
+
+    Args:
+        left: ``(M, 2, G)`` weighted, what poses and points leave of residuals and patterns.
+    """
+    readouts = left[..., [ROWS, COLUMNS]].reshape(-1, 2)
+    explains = np.linalg.lstsq(readouts, left[..., RESIDUAL].ravel(), rcond=None)[0]
+    return np.asarray(left[..., RESIDUAL] - left[..., [ROWS, COLUMNS]] @ explains)
 
 
 def _weights(residual_px: Array, sigma_px: Array) -> Array:
@@ -240,10 +257,10 @@ class PatternEvidence:
 
 
 def grouped(views: Sequence[Array] | Array) -> Array | None:
-    """Return sums over groups of consecutive views, ``(G, 8, 8)``; None where fewer than three say something.
+    """Return sums over groups of consecutive views, ``(G, 9, 9)``; None where fewer than three say something.
 
     Args:
-        views: ``(8, 8)`` of each, as ``pattern_products_of`` gives them.
+        views: ``(9, 9)`` of each, as ``pattern_products_of`` gives them.
     """
     each = np.asarray(views, dtype=np.float64).reshape(-1, NUM_PATTERNS, NUM_PATTERNS)
     each = each[each[:, RESIDUAL, RESIDUAL] > 0.0]

@@ -24,8 +24,8 @@ def says(true: Readout, share: float = 0.9, sigma_ms: float = 0.2, num_frames: i
 
     def tried(images, at: Readout) -> Trial:
         missing = true.signed_ms - (at.signed_ms if at.axis == true.axis else 0.0)
-        more = ReadoutFit(Readout(true.axis, share * missing), sigma_ms, 0.1)
-        return Trial(at, CameraEvidence([], 0.3 + 0.01 * abs(missing), num_frames), more)
+        fit = ReadoutFit(Readout(true.axis, true.signed_ms - (1.0 - share) * missing), sigma_ms, 0.1, 8.0)
+        return Trial(at, CameraEvidence([], 0.3 + 0.01 * abs(missing), num_frames), fit)
 
     return tried
 
@@ -47,14 +47,15 @@ def test_what_is_left_of_the_readout_is_added_until_it_is_nothing(rolling, axis,
 
 def test_a_readout_that_makes_nothing_better_is_not_believed(rolling, monkeypatch):
     def tried(images, at: Readout) -> Trial:
-        return Trial(
-            at, CameraEvidence([], 0.3 + 0.01 * at.ms, 60), ReadoutFit(Readout("rows", 2.0), 0.3, 0.01)
-        )
+        fit = ReadoutFit(Readout("rows", 2.0), 0.3, 0.01, 8.0)
+        return Trial(at, CameraEvidence([], 0.3 + 0.01 * at.ms, 60), fit)
 
     monkeypatch.setattr(readout, "_tried", tried)
     found = readout.find_readout(ImagesSettings(source=str(rolling)))
     assert [trial.readout.signed_ms for trial in found.trials] == [0.0, 2.0]
     assert found.is_global
+    assert found.low_ms <= -2.0
+    assert found.high_ms >= 2.0, "what residuals speak for may be true all the same"
 
 
 def test_no_readout_is_longer_than_a_frame(rolling, monkeypatch):

@@ -34,8 +34,11 @@ def rolling_xy(xyz, t_s, camera):
     return xy
 
 
-def adjusted(camera, noise_px=0.2, seed=0, velocities=True, radial=0.0, radial_2=0.0):
-    """An adjustment that takes every image for one of a moment and of ``CAMERA``, and what it says."""
+def adjusted(camera, noise_px=0.2, seed=0, velocities=True, radial=0.0, radial_2=0.0, put_right=0.0):
+    """An adjustment that takes every image for one of a moment and of ``CAMERA``, and what it says.
+
+    Images may have been put right by a multiple of what the readout did to them.
+    """
     rng = np.random.default_rng(seed)
     xyz = np.column_stack(
         [rng.uniform(-2.0, 2.5, 150), rng.uniform(-1.5, 1.5, 150), rng.uniform(3.0, 6.0, 150)]
@@ -46,10 +49,15 @@ def adjusted(camera, noise_px=0.2, seed=0, velocities=True, radial=0.0, radial_2
     ray = (xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     r2 = (ray**2).sum(axis=1, keepdims=True)
     xy += (radial * r2 + radial_2 * r2**2) * (xy - (camera.cx, camera.cy))
+    at_once_xy = np.concatenate([rolling_xy(xyz, t, CAMERA) for t in times_s])
+    put_right_px = put_right * (xy - at_once_xy)
     view, point = np.divmod(np.arange(len(xy)), len(xyz))
     ms = 1e-3
     velocity = np.stack(
-        [body_velocity(pose_at(t - ms), pose_at(t), pose_at(t + ms), 2 * ms) for t in times_s]
+        [
+            body_velocity(pose_at(t), np.array([pose_at(t - ms), pose_at(t + ms)]), np.array([-ms, ms]))
+            for t in times_s
+        ]
     )
     problem = BundleProblem(
         camera=CAMERA,
@@ -61,10 +69,10 @@ def adjusted(camera, noise_px=0.2, seed=0, velocities=True, radial=0.0, radial_2
         xyz=xyz,
         view=view,
         point=point,
-        xy=xy + noise_px * rng.standard_normal(xy.shape),
+        xy=xy - put_right_px + noise_px * rng.standard_normal(xy.shape),
         sigma_px=np.full(len(xy), 0.5),
         confidence=np.ones(len(xy)),
         iterations=20,
-        motion=ViewMotion(SIZE_WH, velocity) if velocities else None,
+        motion=ViewMotion(SIZE_WH, velocity, put_right_px=put_right_px) if velocities else None,
     )
     return optimise(problem)

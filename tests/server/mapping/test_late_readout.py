@@ -4,13 +4,14 @@ import functools
 import logging
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import shaken_views
 from drawn_boards import CAMERA, ate_percent, make, render
 
-from semcast.common.geometry import exp_so3, make_transform
+from semcast.common.geometry import exp_se3, exp_so3, make_transform
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.residual_patterns import COLUMNS, ROWS
 from semcast.server.mapping.rolling_shutter import RollingShutter
@@ -140,3 +141,22 @@ def test_movements_are_measured_only_while_they_are_wanted():
     middle = np.array([[160.0, 120.0]])
     speeds = [shutter.flows[k].at(middle)[0, 0] for k in range(3)]
     assert speeds[0] == pytest.approx(2 * speeds[1] - speeds[2])
+
+
+def test_the_velocity_of_a_shaking_hand_is_found_by_frames_to_either_side():
+    w_rad_s, rate_hz = 2 * np.pi * 3.0, 30.0
+
+    def turned(frame_id):
+        return exp_se3(np.array([0.02 * np.sin(w_rad_s * frame_id / rate_hz), 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+    watch = ReadoutWatch(CAMERA, is_wanted=True)
+    for frame_id in range(40):
+        watch.note(frame_id, round(frame_id / rate_hz * 1e9))
+    keyframe_ids = np.arange(0, 40, 3)
+    world = SimpleNamespace(pose_of_frame=lambda frame_id: None if frame_id == 30 else turned(frame_id))
+    motion = watch.motion(world, SimpleNamespace(keyframe_ids=keyframe_ids))
+    found_rad_s, known = motion.velocity[:, 0], np.isfinite(motion.velocity).all(axis=1)
+    assert keyframe_ids[~known].tolist() == [0, 30, 39], "ends, and where a frame has no pose"
+    truth_rad_s = 0.02 * w_rad_s * np.cos(w_rad_s * keyframe_ids / rate_hz)
+    error_rad_s = np.abs(found_rad_s - truth_rad_s)[known]
+    assert np.median(error_rad_s) < 0.01 * 0.02 * w_rad_s

@@ -101,13 +101,13 @@ def test_distortion_is_believed_where_it_explains_more():
     # In the units of the focal length that was believed in.
     assert fit.radial[0] == pytest.approx(-0.1 / 1.06**2, abs=0.02)
     assert fit.focal == pytest.approx(0.06, abs=0.01)
-    assert believed_lens(np.zeros((9, 8, 8))) is None
+    assert believed_lens(np.zeros((9, 9, 9))) is None
 
 
 def test_by_hand_the_change_is_the_slope_and_its_spread_that_of_what_is_left():
     # A doubled focal length would move the points of a view by 10 in all; they are off by .012 of that.
     def view(slope):
-        told = np.zeros((8, 8))
+        told = np.zeros((9, 9))
         told[RESIDUAL, RESIDUAL], told[FOCAL, FOCAL] = 4.0, 100.0
         told[RESIDUAL, FOCAL] = told[FOCAL, RESIDUAL] = 100.0 * slope
         return told
@@ -137,9 +137,9 @@ def test_a_unit_of_change_doubles_the_squared_residuals_the_others_following():
 
 
 def test_views_that_say_nothing_are_no_lens():
-    assert fit_lens(np.zeros((0, 8, 8)), num_radial=1) is None
-    assert fit_lens(np.zeros((9, 8, 8)), num_radial=1) is None
-    flat = np.zeros((4, 8, 8))
+    assert fit_lens(np.zeros((0, 9, 9)), num_radial=1) is None
+    assert fit_lens(np.zeros((9, 9, 9)), num_radial=1) is None
+    flat = np.zeros((4, 9, 9))
     flat[:, RESIDUAL, RESIDUAL] = 1.0
     assert fit_lens(flat, num_radial=0) is None
-    assert grouped(flat).shape == (4, 8, 8)
+    assert grouped(flat).shape == (4, 9, 9)

@@ -52,5 +52,5 @@ def test_a_principal_point_is_told_from_distortion():
 
 
 def test_views_that_say_nothing_give_no_doubt():
-    assert lens_doubt(np.zeros((20, 8, 8)), 1.0, CAMERA) is None
+    assert lens_doubt(np.zeros((20, 9, 9)), 1.0, CAMERA) is None
     assert lens_doubt([], 1.0, CAMERA) is None

@@ -15,7 +15,7 @@ from semcast.server.mapping.residual_patterns import pattern_products_of
 @pytest.mark.parametrize("readout_from", ["top", "bottom", "left", "right"])
 def test_the_readout_and_its_side_are_found_in_what_an_adjustment_leaves(readout_from):
     result = adjusted(replace(CAMERA, readout_ms=20.0, readout_from=readout_from))
-    assert result.pattern_products.shape == (NUM_VIEWS, 8, 8)
+    assert result.pattern_products.shape == (NUM_VIEWS, 9, 9)
     fit = fit_readout(result.pattern_products)
     assert fit.readout.side == readout_from
     assert fit.readout.ms == pytest.approx(20.0, abs=1.5)
@@ -28,6 +28,16 @@ def test_noise_alone_looks_like_no_rolling_shutter():
     assert fit.readout.ms < 4 * max(fit.sigma_ms, 0.05)
     assert fit.readout.ms < 1.0
     assert fit.explained < 0.01
+
+
+@pytest.mark.parametrize("put_right", [0.0, 0.8, 1.1])
+def test_all_of_the_readout_is_found_however_much_images_were_put_right_for(put_right):
+    result = adjusted(replace(CAMERA, readout_ms=20.0), put_right=put_right)
+    fit = fit_readout(result.pattern_products)
+    assert fit.readout.signed_ms == pytest.approx(20.0, abs=0.25)
+    untold = replace(result.problem.motion, put_right_px=None)
+    told = pattern_products_of(result.problem, untold, result.T_world_cam, result.xyz, result.residual_px)
+    assert fit_readout(told).readout.signed_ms == pytest.approx(20.0 * (1.0 - put_right), abs=0.25)
 
 
 def test_an_axis_that_is_known_is_kept():
@@ -45,7 +55,7 @@ def test_without_movement_nothing_is_said():
     told = pattern_products_of(result.problem, motion, result.T_world_cam, result.xyz, result.residual_px)
     assert not told.any()
     assert fit_readout(told) is None
-    assert fit_readout(np.zeros((0, 8, 8))) is None
+    assert fit_readout(np.zeros((0, 9, 9))) is None
     still = replace(motion, velocity=np.zeros((NUM_VIEWS, 6)))
     told = pattern_products_of(result.problem, still, result.T_world_cam, result.xyz, result.residual_px)
     assert fit_readout(told) is None
@@ -53,8 +63,10 @@ def test_without_movement_nothing_is_said():
 
 def test_a_velocity_is_the_twist_between_two_poses():
     T_world_cam, twist = pose_at(0.3), np.array([0.2, -0.1, 0.3, 1.0, -2.0, 0.5])
-    after, before = (T_world_cam @ exp_se3(s * 0.005 * twist) for s in (1.0, -1.0))
-    np.testing.assert_allclose(body_velocity(before, T_world_cam, after, 0.01), twist, atol=1e-4)
+    around = np.array([T_world_cam @ exp_se3(s * twist) for s in (-0.005, 0.005)])
+    np.testing.assert_allclose(
+        body_velocity(T_world_cam, around, np.array([-0.005, 0.005])), twist, atol=1e-4
+    )
 
 
 def test_by_hand_a_camera_that_nods_stretches_its_image():

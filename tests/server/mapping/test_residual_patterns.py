@@ -10,7 +10,7 @@ from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.mapping.bundle_problem import BundleProblem, ViewMotion
 from semcast.server.mapping.readout import body_velocity, fit_readout
 from semcast.server.mapping.readout_watch import ReadoutWatch
-from semcast.server.mapping.residual_patterns import PatternEvidence, pattern_products_of
+from semcast.server.mapping.residual_patterns import NUM_PATTERNS, PatternEvidence, pattern_products_of
 
 NUM_VIEWS = 28
 #: Of ten groups, by which nine differences tell a standard deviation.
@@ -31,7 +31,7 @@ def test_what_a_keyframe_says_in_two_windows_counts_as_of_one_witness():
     evidence = PatternEvidence()
     assert (len(evidence), evidence.views, evidence.sigma_factor) == (0, [], 1.0)
     for keyframe_ids in ([3, 1, 2], [2, 3, 4]):
-        evidence.note(result_of(keyframe_ids, np.stack([np.full((8, 8), float(k)) for k in keyframe_ids])))
+        evidence.note(result_of(keyframe_ids, np.stack([np.full((9, 9), float(k)) for k in keyframe_ids])))
     evidence.note(result_of([4, 5, 6], None))
     assert len(evidence) == 4
     assert [view[0, 0] for view in evidence.views] == [1.0, 4.0, 6.0, 4.0]
@@ -42,7 +42,7 @@ def test_as_many_unknowns_as_observations_leave_nothing_to_be_sure_of():
     # Sixteen landmarks in two of sixteen views each: 64 coordinates, and 6 * 16 + 3 * 16 unknowns.
     view = np.arange(32) // 2
     problem = SimpleNamespace(keyframe_ids=np.arange(16), view=view, point=(view + np.arange(32) % 2) % 16)
-    rows = np.random.default_rng(0).normal(0.0, 1.0, (16, 8, 60))
+    rows = np.random.default_rng(0).normal(0.0, 1.0, (16, NUM_PATTERNS, 60))
     pattern_products = rows @ np.swapaxes(rows, 1, 2)
     watch = ReadoutWatch(CAMERA, is_wanted=True)
     watch.take(
@@ -60,7 +60,10 @@ def windows(seed, size, interval, num_points):
     times_s = STEP_S * np.arange(NUM_VIEWS)
     poses = np.stack([pose_at(t) for t in times_s])
     velocity = np.stack(
-        [body_velocity(pose_at(t - ms), pose_at(t), pose_at(t + ms), 2 * ms) for t in times_s]
+        [
+            body_velocity(pose_at(t), np.array([pose_at(t - ms), pose_at(t + ms)]), np.array([-ms, ms]))
+            for t in times_s
+        ]
     )
     low, high = (-2.0, -1.5, 3.0), (3.5, 1.5, 6.0)
     xyz = rng.uniform(low, high, (num_points, 3))

@@ -1,6 +1,7 @@
 """Images of a rolling shutter are put right by the movement of their points."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
-from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter, RowTimes
+from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter, RowTimes, _at_the_end
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable
@@ -214,3 +215,11 @@ def test_the_reconstruction_follows_points_in_images_put_right_and_shows_them_as
         np.testing.assert_allclose(found[readout_ms][:, 0] - tracked[:, 0], 300.0 * late_s, atol=0.2)
         reconstruction.close()
     assert all(len(xy) > 100 for xy in found.values())
+
+
+def test_the_movement_at_an_image_is_where_the_trend_of_the_means_before_it_leads():
+    since_s, rate = np.cumsum([0.0, 0.03, 0.04, 0.03]), np.polynomial.Polynomial([3.0, -20.0, 400.0])
+    way = rate.integ()
+    steps = [(b - a, np.array([(way(-a) - way(-b)) / (b - a), 1.0])) for a, b in pairwise(since_s)]
+    np.testing.assert_allclose(_at_the_end(steps), [3.0, 1.0])
+    np.testing.assert_allclose(_at_the_end(steps[:1]), steps[0][1])
