@@ -222,7 +222,7 @@ class Initialiser:
             return None
         history = [o.without(pair.left_out) for o in self.history]
         span = [o.without(pair.ids[scene.alone]) for o in history[self._reference :]]
-        start = self._build(span, scene.motion, pair.ids[scene.motion.inliers], scene.noise)
+        start = self._build(span, scene, pair.ids[scene.motion.inliers], noise)
         if start is not None:
             self.history = history
         elif self._num_undecided:
@@ -322,9 +322,12 @@ class Initialiser:
             if self.history[k].grey is not None:
                 self.history[k] = replace(self.history[k], grey=None)
 
-    def _build(self, span: list[Observed], found: TwoViewResult, ids: Ids, noise: NoiseModel) -> Start | None:
+    def _build(
+        self, span: list[Observed], scene: SceneMotion, ids: Ids, expected: NoiseModel
+    ) -> Start | None:
         """Triangulate, place the frames between, and triangulate again from all."""
         first, last = span[0], span[-1]
+        found, noise = scene.motion, scene.noise
         T_world_cam = {0: np.eye(4), len(span) - 1: invert_transform(found.T_cam1_cam0)}
         points = self._triangulate([first, last], np.stack([np.eye(4), found.T_cam1_cam0]), ids, noise)
         good = self._passes(points)
@@ -347,7 +350,8 @@ class Initialiser:
             return None
         T_cam_world = invert_transform(structure.T_world_cam) @ structure.T_world_cam[0]
         all_ids = np.unique(np.concatenate([o.ids for o in chosen]))
-        points = self._triangulate(chosen, T_cam_world, all_ids, noise)
+        # Where nothing moves by itself, points may err as they are expected to: the more there are the better.
+        points = self._triangulate(chosen, T_cam_world, all_ids, noise if scene.alone.any() else expected)
         good = self._passes(points)
         if int(good.sum()) < MIN_POINTS:
             return None
