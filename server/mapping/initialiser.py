@@ -19,7 +19,7 @@ from semcast.server.geometry.epipolar import (
     turn_in_doubt_deg,
 )
 from semcast.server.geometry.triangulation import Triangulation, triangulate
-from semcast.server.geometry.two_view import MIN_MATCHES, TwoViewResult
+from semcast.server.geometry.two_view import MIN_MATCHES
 from semcast.server.geometry.weighting import MAD_TO_SIGMA, ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.ambiguity import Structure, decide
 from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
@@ -272,7 +272,7 @@ class Initialiser:
     def _is_good(self, scene: SceneMotion) -> bool:
         """Whether a map could begin with a motion: of half of the tracks, but for what moves by itself."""
         found = scene.motion
-        enough = max(self._min_points(), _LEAST_AGREEING * int((~scene.alone).sum()))
+        enough = max(self._min_points(), _LEAST_AGREEING * int(scene.judged_by.sum()))
         return (
             int(found.inliers.sum()) >= enough
             and not found.is_rotation
@@ -281,8 +281,8 @@ class Initialiser:
 
     def _has_gone(self, pair: _Pair, scene: SceneMotion) -> bool:
         """Whether it takes a translation of the camera to explain two views, and not a turn and errors."""
-        found, of_scene = scene.motion, ~scene.alone
-        xy0, xy1 = pair.xy0[of_scene], pair.xy1[of_scene]
+        found, tracks = scene.motion, scene.judged_by
+        xy0, xy1 = pair.xy0[tracks], pair.xy1[tracks]
         F = fundamental_matrix(self._camera, found.T_cam1_cam0)
         sigma_px = MAD_TO_SIGMA * float(np.median(np.abs(sampson_px(F, xy0, xy1))))
         if self._relief_px(xy0, xy1) < _MIN_RELIEF_SIGMAS * sigma_px:
@@ -350,7 +350,7 @@ class Initialiser:
             return None
         T_cam_world = invert_transform(structure.T_world_cam) @ structure.T_world_cam[0]
         all_ids = np.unique(np.concatenate([o.ids for o in chosen]))
-        # Where nothing moves by itself, points may err as they are expected to: the more there are the better.
+        # Where nothing moves by itself, points may err as they are expected to: the more the better.
         points = self._triangulate(chosen, T_cam_world, all_ids, noise if scene.alone.any() else expected)
         good = self._passes(points)
         if int(good.sum()) < MIN_POINTS:

@@ -69,6 +69,14 @@ class SceneMotion:
     alone: Mask
     is_contested: bool
 
+    @property
+    def judged_by(self) -> Mask:
+        """Tracks that tell whether the motion is one, ``(N,)``: all, unless most of them move by themselves.
+
+        Those that follow it best do so where there is but noise, too.
+        """
+        return ~self.alone if self.alone.mean() > 1.0 - _MOST else np.ones(len(self.alone), bool)
+
 
 def motion_of_scene(
     camera: Intrinsics,
