@@ -11,6 +11,9 @@ Array = NDArray[np.float64]
 #: OpenGL's camera axes (x right, y up, z backward) in ours (x right, y down, z forward); its own inverse.
 T_opencv_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
 
+#: Square of an angle (rad) of whose powers the first two are enough.
+_SMALL_ANGLE2 = 1e-8
+
 
 def make_transform(R_a_b: ArrayLike, t_a_b: ArrayLike) -> Array:
     """Assemble a 4x4 rigid transform from a 3x3 rotation and a translation of length 3."""
@@ -38,25 +41,31 @@ def transform_points(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
 
 
 def skew(v: ArrayLike) -> Array:
-    """Return the 3x3 matrix with ``skew(v) @ w == cross(v, w)``."""
-    x, y, z = np.asarray(v, dtype=np.float64)
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    """Return the matrices ``(..., 3, 3)`` with ``skew(v) @ w == cross(v, w)`` of vectors ``(..., 3)``."""
+    v = np.asarray(v, dtype=np.float64)
+    W = np.zeros((*v.shape, 3))
+    W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    return np.asarray(W - W.swapaxes(-1, -2))
 
 
 def exp_so3(rotation_vector_rad: ArrayLike) -> Array:
-    """Rodrigues' formula: rotation vector of length 3 (radians) to a 3x3 rotation."""
+    """Rodrigues' formula: rotation vectors ``(..., 3)`` in radians to rotations ``(..., 3, 3)``."""
     w = np.asarray(rotation_vector_rad, dtype=np.float64)
     W = skew(w)
-    return _rodrigues(float(np.linalg.norm(w)), W, W @ W)
+    first, second, _ = _series(w)
+    return np.asarray(np.eye(3) + first * W + second * (W @ W))
 
 
-def _rodrigues(angle_rad: float, W: Array, W2: Array) -> Array:
-    """Rotation of an angle and of the skew matrix of the rotation vector, with its square."""
-    if angle_rad < 1e-8:
-        return np.asarray(np.eye(3) + W + 0.5 * W2)
-    a = np.sin(angle_rad) / angle_rad
-    b = (1.0 - np.cos(angle_rad)) / angle_rad**2
-    return np.asarray(np.eye(3) + a * W + b * W2)
+def _series(rotation_vector_rad: Array) -> tuple[Array, Array, Array]:
+    """``sin(a) / a``, ``(1 - cos(a)) / a^2`` and ``(a - sin(a)) / a^3`` of angles (rad), ``(..., 1, 1)`` each."""
+    square = (rotation_vector_rad**2).sum(axis=-1)[..., None, None]
+    is_small = square < _SMALL_ANGLE2
+    square_or_1 = np.where(is_small, 1.0, square)
+    angle_rad = np.sqrt(square_or_1)
+    first = np.where(is_small, 1.0 - square / 6.0, np.sin(angle_rad) / angle_rad)
+    second = np.where(is_small, 0.5 - square / 24.0, (1.0 - np.cos(angle_rad)) / square_or_1)
+    third = np.where(is_small, 1.0 / 6.0, (1.0 - first) / square_or_1)
+    return first, second, third
 
 
 def log_so3(R: ArrayLike) -> Array:
@@ -69,19 +78,21 @@ def log_so3(R: ArrayLike) -> Array:
 
 
 def exp_se3(xi: ArrayLike) -> Array:
-    """Rigid transform of a twist ``[rotation (rad), translation]`` (gtsam's order), by the closed form."""
+    """Rigid transforms ``(..., 4, 4)`` of twists ``(..., 6)``, by the closed form.
+
+    Args:
+        xi: ``[rotation (rad), translation]``, gtsam's order.
+    """
     xi = np.asarray(xi, dtype=np.float64)
-    w, v = xi[:3], xi[3:]
-    angle_rad = float(np.linalg.norm(w))
+    w = xi[..., :3]
     W = skew(w)
     W2 = W @ W
-    if angle_rad < 1e-8:
-        V = np.eye(3) + 0.5 * W
-    else:
-        b = (1.0 - np.cos(angle_rad)) / angle_rad**2
-        c = (angle_rad - np.sin(angle_rad)) / angle_rad**3
-        V = np.eye(3) + b * W + c * W2
-    return make_transform(_rodrigues(angle_rad, W, W2), V @ v)
+    first, second, third = _series(w)
+    T = np.zeros((*xi.shape[:-1], 4, 4))
+    T[..., :3, :3] = np.eye(3) + first * W + second * W2
+    T[..., :3, 3:] = (np.eye(3) + second * W + third * W2) @ xi[..., 3:, None]
+    T[..., 3, 3] = 1.0
+    return T
 
 
 def project_to_so3(M: ArrayLike) -> Array:

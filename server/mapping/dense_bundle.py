@@ -178,15 +178,14 @@ class Normal:
 
         Returns:
             The poses' system ``(C, C)``; the inverse Cholesky factors ``(P, 3, 3)`` of the points' own ones;
-            and ``both`` multiplied by these, ``(P, 3, C)``.
+            and ``both`` multiplied by these, ``(3 P, C)``.
 
         Raises:
             LinAlgError: A point is not determined.
         """
-        factor = np.asarray(np.linalg.inv(np.linalg.cholesky(self.points + damping * np.eye(3))), np.float64)
-        scaled = factor @ self.both
-        flat = scaled.reshape(3 * len(scaled), len(self.poses))
-        return self.poses + damping * np.eye(len(self.poses)) - flat.T @ flat, factor, scaled
+        factor = _inverse_of_lower(np.linalg.cholesky(self.points + damping * np.eye(3)))
+        scaled = (factor @ self.both).reshape(3 * len(factor), len(self.poses))
+        return self.poses + damping * np.eye(len(self.poses)) - scaled.T @ scaled, factor, scaled
 
     def step(self, damping: float) -> tuple[Array, Array, float]:
         """Solve: twists of poses ``(C,)``, moves of points ``(P, 3)``, and by how much the cost should fall.
@@ -196,12 +195,23 @@ class Normal:
         """
         system, factor, scaled = self.reduced(damping)
         right = np.einsum("pij,pj->pi", factor, self.right_points)
-        right_poses = self.right_poses - np.tensordot(right, scaled, 2)
+        right_poses = self.right_poses - right.ravel() @ scaled
         twists = np.asarray(np.linalg.solve(system, right_poses), np.float64)
-        moves: Array = np.einsum("pji,pj->pi", factor, right - scaled @ twists)
+        moves: Array = np.einsum("pji,pj->pi", factor, right - (scaled @ twists).reshape(-1, 3))
         promised = twists @ self.right_poses + (moves * self.right_points).sum()
         promised += damping * (twists @ twists + (moves**2).sum())
         return twists, moves, 0.5 * float(promised)
+
+
+def _inverse_of_lower(factor: Array) -> Array:
+    """Inverses of lower triangular matrices ``(P, 3, 3)``, an element at a time for all of them."""
+    inverse = np.zeros_like(factor)
+    a, c, f = (1.0 / factor[:, k, k] for k in range(3))
+    inverse[:, 0, 0], inverse[:, 1, 1], inverse[:, 2, 2] = a, c, f
+    inverse[:, 1, 0] = -a * c * factor[:, 1, 0]
+    inverse[:, 2, 1] = -c * f * factor[:, 2, 1]
+    inverse[:, 2, 0] = -f * (a * factor[:, 2, 0] + inverse[:, 1, 0] * factor[:, 2, 1])
+    return inverse
 
 
 def linearise(window: Window, seen: Seen) -> Normal:
@@ -220,15 +230,23 @@ def linearise(window: Window, seen: Seen) -> Normal:
     sums = [_summed(window.point, row, window.num_points) for row in own.reshape(12, -1)]
     points = np.stack(sums, axis=1).reshape(window.num_points, 3, 4)
     rows, count = window.of_free, window.num_unknowns
-    by_point, by_xyz = by_point[..., rows], by_xyz[..., rows]
-    # What moves is the camera, in its own frame.
-    turn = np.cross(by_point, seen.points_cam[:, rows], axisa=1, axisb=0, axisc=1)
-    by_pose = np.concatenate([turn, -by_point], axis=1)
-    poses, right_poses = _poses_own(window, by_pose, residual[:, rows])
+    # Not by an index in brackets: that puts observations first in memory, and the products below take thrice
+    # as long.
+    by_point, by_xyz, residual = (values.take(rows, axis=-1) for values in (by_point, by_xyz, residual))
+    by_pose = _by_pose(by_point, seen.points_cam.take(rows, axis=-1))
+    poses, right_poses = _poses_own(window, by_pose, residual)
     _hold_baseline(window, seen.state, poses, right_poses)
     both = _summed(window.place, _products(by_xyz, by_pose).ravel(), 3 * window.num_points * count)
     both = both.reshape(window.num_points, 3, count)
     return Normal(poses, points[..., :3], both, right_poses, points[..., 3])
+
+
+def _by_pose(by_point: Array, points_cam: Array) -> Array:
+    """Slopes ``(2, 6, F)`` by a twist of the camera in its own frame, of those ``(2, 3, F)`` by points."""
+    x, y, z = points_cam
+    by_x, by_y, by_z = by_point.transpose(1, 0, 2)
+    turn = [by_y * z - by_z * y, by_z * x - by_x * z, by_x * y - by_y * x]
+    return np.stack([*turn, -by_x, -by_y, -by_z], axis=1)
 
 
 def _summed(group: NDArray[np.intp], values: Array, num_groups: int) -> Array:
@@ -271,8 +289,7 @@ def _hold_baseline(window: Window, state: State, poses: Array, right_poses: Arra
 
 def _moved(window: Window, state: State, twists: Array, moves: Array) -> State:
     T_world_cam = state.T_world_cam.copy()
-    for k, twist in zip(np.flatnonzero(window.free).tolist(), twists.reshape(-1, 6), strict=True):
-        T_world_cam[k] = T_world_cam[k] @ exp_se3(twist)
+    T_world_cam[window.free] = T_world_cam[window.free] @ exp_se3(twists.reshape(-1, 6))
     return State(T_world_cam, state.xyz + moves)
 
 

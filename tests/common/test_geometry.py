@@ -49,6 +49,21 @@ def test_exp_se3_is_the_flow_of_its_twist(rng):
     np.testing.assert_allclose(g.exp_se3([0, 0, 0, 1, 2, 3])[:3, 3], [1, 2, 3])
 
 
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-9, 1e-7, 0.99e-4, 1.01e-4, 1e-2, 1.0, np.pi, 6.0])
+def test_exponentials_are_those_of_matrices_at_any_angle_and_of_many_at_once(angle_rad):
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    twists = np.stack([np.concatenate([s * angle_rad * axis, [1.0, -2.0, s]]) for s in (1.0, -1.0, 0.5)])
+    generators = np.zeros((3, 4, 4))
+    generators[:, :3, :3], generators[:, :3, 3] = g.skew(twists[:, :3]), twists[:, 3:]
+    term = total = np.broadcast_to(np.eye(4), (3, 4, 4))
+    for k in range(1, 50):
+        term = term @ generators / k
+        total = total + term
+    np.testing.assert_allclose(g.exp_se3(twists), total, rtol=0.0, atol=2e-11)
+    np.testing.assert_allclose(g.exp_so3(twists[:, :3]), total[:, :3, :3], rtol=0.0, atol=2e-11)
+    np.testing.assert_array_equal(g.exp_se3(twists)[1], g.exp_se3(twists[1]))
+
+
 def test_skew_is_the_cross_product(rng):
     a, b = rng.normal(size=(2, 3))
     np.testing.assert_allclose(g.skew(a) @ b, np.cross(a, b))
