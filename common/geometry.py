@@ -57,7 +57,7 @@ def exp_so3(rotation_vector_rad: ArrayLike) -> Array:
 
 
 def _series(rotation_vector_rad: Array) -> tuple[Array, Array, Array]:
-    """``sin(a) / a``, ``(1 - cos(a)) / a^2`` and ``(a - sin(a)) / a^3`` of angles (rad), ``(..., 1, 1)`` each."""
+    """``sin(a) / a``, ``(1 - cos(a)) / a^2``, ``(a - sin(a)) / a^3``, each ``(..., 1, 1)``, of angles a."""
     square = (rotation_vector_rad**2).sum(axis=-1)[..., None, None]
     is_small = square < _SMALL_ANGLE2
     square_or_1 = np.where(is_small, 1.0, square)

@@ -27,7 +27,6 @@ from semcast.server.frame_views import frame_view
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
 from semcast.server.view.picture import compress_picture
-from semcast.server.view.rerun_viewer import RerunStream
 from semcast.server.view.scene import Cursor, Scene
 from semcast.server.view.settings import ViewSettings
 
@@ -71,6 +70,8 @@ class ViewStage:
     """
 
     def __init__(self, file: Path, camera: Intrinsics, truth: Trajectory | None) -> None:
+        from semcast.server.view.rerun_viewer import RerunStream  # loads rerun
+
         self._quality = ViewSettings().jpeg_quality
         self._scene, self._cursor = Scene(truth), Cursor()
         self._stream = RerunStream(

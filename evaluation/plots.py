@@ -1,23 +1,23 @@
 """Plots of results: pose error against SNR (Fig. 9 and 10 of the paper), trajectories, reliability.
 
-Matplotlib lives here alone and is used through its object interface, without a window or global state.
+Matplotlib lives here alone and is used through its object interface, without a window or global state. It
+is loaded with the first figure: half a second that an evaluation without plots, or ``--help``, need not wait.
 """
 
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.text import Text
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from semcast.common.errors import SemcastError
 from semcast.common.whole_file import whole_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _MARKERS = "os^Dv<>P*Xhp"
 #: Matplotlib's own ten and two more: as many as Kodak has codecs. Further curves are dashed.
@@ -27,9 +27,17 @@ _COLOURS = (*(f"C{k}" for k in range(10)), "black", "goldenrod")
 _LEAST_SHARE = 0.001
 
 
-def _new_figure(width_in: float, height_in: float) -> tuple[Figure, Axes]:
+def _empty_figure(width_in: float, height_in: float) -> "Figure":
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
+    return figure
+
+
+def _new_figure(width_in: float, height_in: float) -> "tuple[Figure, Axes]":
+    figure = _empty_figure(width_in, height_in)
     axes = figure.add_subplot()
     axes.grid(alpha=0.3)
     return figure, axes
@@ -37,17 +45,16 @@ def _new_figure(width_in: float, height_in: float) -> tuple[Figure, Axes]:
 
 def new_grid(
     num_rows: int, num_columns: int, width_in: float, height_in: float, *, share_x: bool = False
-) -> tuple[Figure, list[list[Axes]]]:
+) -> "tuple[Figure, list[list[Axes]]]":
     """Return a figure with a grid of axes, as lists of rows."""
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = _empty_figure(width_in, height_in)
     grid = figure.subplots(num_rows, num_columns, squeeze=False, sharex=share_x)
     for axes in grid.flat:
         axes.grid(alpha=0.3)
     return figure, [list(row) for row in grid]
 
 
-def save_figure(figure: Figure, path: Path) -> None:
+def save_figure(figure: "Figure", path: Path) -> None:
     """Write a figure in the format its name asks for, making the folder; the file is whole or as it was.
 
     Its texts are names of files and curves, never formulas: a ``$`` is a ``$``.
@@ -55,6 +62,8 @@ def save_figure(figure: Figure, path: Path) -> None:
     Raises:
         SemcastError: The file can't be written.
     """
+    from matplotlib.text import Text
+
     for text in figure.findobj(Text):
         text.set_parse_math(False)
     try:
@@ -149,9 +158,11 @@ def plot_pair_errors(folder: Path, result: Mapping[str, Any]) -> list[Path]:
 
 
 def _draw_pair_errors(
-    axes: Axes, cells: Sequence[Mapping[str, Any]], modes: Sequence[str], figure: str
+    axes: "Axes", cells: Sequence[Mapping[str, Any]], modes: Sequence[str], figure: str
 ) -> None:
     """Draw a figure of all modes over the SNR, the first one boldest."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
     snr_db = [cell["snr_db"] for cell in cells]
     for k, mode in enumerate(modes):
         values = [cell["results"][mode][figure] for cell in cells]
@@ -175,7 +186,7 @@ def _draw_pair_errors(
 
 
 def _draw_intervals(
-    axes: Axes, cells: Sequence[Mapping[str, Any]], mode: str, figure: str, colour: str
+    axes: "Axes", cells: Sequence[Mapping[str, Any]], mode: str, figure: str, colour: str
 ) -> None:
     """Draw how far a mode is from the one that all are compared with; nothing for that one itself.
 
