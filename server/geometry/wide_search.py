@@ -166,7 +166,7 @@ def match_near(
 ) -> WideMatches:
     """Match as ``match_wide``, but only what is near where a feature is expected.
 
-    What looks alike elsewhere, as in a row of equal doors, is no rival then.
+    What looks alike elsewhere, as in a row of equal doors, is no rival then; a lone one has none.
 
     Args:
         features0: Of the first image.
@@ -176,9 +176,9 @@ def match_near(
         max_ratio: As for ``match_wide``.
     """
     square = square_distances(expected_xy, features1.xy)
-    apart = features1.descriptors @ features0.descriptors.T
     norm0, norm1 = ((f.descriptors**2).sum(axis=1) for f in (features0, features1))
-    apart = np.maximum(norm0[:, None] + norm1 - 2.0 * apart.T, 0.0)
+    alike = features0.descriptors @ features1.descriptors.T
+    apart = np.maximum(norm0[:, None] + norm1 - 2.0 * alike, 0.0)
     apart[~(square < reach_px**2)] = np.inf
     best = apart.argmin(axis=1)
     nearest = apart[np.arange(len(best)), best]
