@@ -1,6 +1,7 @@
 """How the tests run side by side, and shared fixtures."""
 
 import functools
+import gc
 import os
 import re
 import signal
@@ -25,6 +26,16 @@ def pytest_configure() -> None:
     """Hear Ctrl-C, which a shell lets everything ignore that it starts in the background, tests included."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, Any, Any]:
+    """Search for no garbage among tests and modules, which all stay: a tenth of the time to collect them."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)

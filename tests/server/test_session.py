@@ -270,11 +270,18 @@ def test_frames_that_the_agent_left_out_don_t_count_as_unposed(demo, tmp_path):
     assert [row.seq for row in read_rows(tmp_path / FRAMES_NAME)] == [k for k in range(17) if k != 11]
 
 
-def test_every_keyframe_has_its_image_also_those_the_map_began_with(demo, tmp_path):
-    run_session(demo, tmp_path, range(12), save_images="keyframes")
-    keyframes = read_run(tmp_path).keyframe_ids.tolist()
+@pytest.fixture(scope="module")
+def twelve_frames(demo, tmp_path_factory):
+    """What a session leaves of them."""
+    folder = tmp_path_factory.mktemp("twelve") / "run"
+    run_session(demo, folder, range(12), save_images="keyframes")
+    return folder
+
+
+def test_every_keyframe_has_its_image_also_those_the_map_began_with(twelve_frames):
+    keyframes = read_run(twelve_frames).keyframe_ids.tolist()
     assert keyframes[0] == 0
-    assert list(read_image_paths(tmp_path)) == keyframes
+    assert list(read_image_paths(twelve_frames)) == keyframes
 
 
 def test_all_images_are_kept_where_all_are_wanted(demo, tmp_path):
@@ -299,25 +306,23 @@ def mirrored_later(demo, k):
     return image if k < 8 else np.ascontiguousarray(image[:, ::-1])
 
 
-def test_every_keyframe_of_a_later_part_has_its_image_too(demo, tmp_path):
-    reconstruction = ReconstructionSettings(lost_after_s=0.25)
-    run_session(
-        demo,
-        tmp_path,
-        range(20),
-        picture=mirrored_later,
-        save_images="keyframes",
-        reconstruction=reconstruction,
-    )
-    keyframes = read_run(tmp_path).keyframe_ids.tolist()
+@pytest.fixture(scope="module")
+def two_parts(demo, tmp_path_factory):
+    """What a session leaves of two places that never met."""
+    folder = tmp_path_factory.mktemp("parts") / "run"
+    how = ReconstructionSettings(lost_after_s=0.25)
+    run_session(demo, folder, range(20), picture=mirrored_later, save_images="keyframes", reconstruction=how)
+    return folder
+
+
+def test_every_keyframe_of_a_later_part_has_its_image_too(two_parts):
+    keyframes = read_run(two_parts).keyframe_ids.tolist()
     assert min(k for k in keyframes if k >= 8) < 12, "the part began with frames that were lost"
-    assert list(read_image_paths(tmp_path)) == keyframes
+    assert list(read_image_paths(two_parts)) == keyframes
 
 
-def test_parts_that_never_met_are_told_apart_in_all_that_is_left(demo, tmp_path):
-    reconstruction = ReconstructionSettings(lost_after_s=0.25)
-    run_session(demo, tmp_path, range(20), picture=mirrored_later, reconstruction=reconstruction)
-    data = read_run(tmp_path)
+def test_parts_that_never_met_are_told_apart_in_all_that_is_left(two_parts):
+    data = read_run(two_parts)
     first = data.frame_ids < 8
     assert data.frame_submap.tolist() == [0 if early else 1 for early in first]
     for part in (0, 1):
@@ -325,24 +330,23 @@ def test_parts_that_never_met_are_told_apart_in_all_that_is_left(demo, tmp_path)
         marks = np.isin(data.landmark_ids, data.observed_landmark_ids[seen])
         assert marks.any()
         assert set(data.landmark_submap[marks].tolist()) == {part}
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary = json.loads((two_parts / "summary.json").read_text())
     num_first, num_later = int(first.sum()), int((~first).sum())
     assert min(num_first, num_later) > 3
     assert summary["parts"] == [
         {"submap": 0, "num_posed": num_first},
         {"submap": 1, "num_posed": num_later},
     ]
-    rows = read_rows(tmp_path / FRAMES_NAME)
+    rows = read_rows(two_parts / FRAMES_NAME)
     assert (rows[0].submap, rows[-1].submap) == (0, 1)
     early = [row.frame_id for row in rows if row.submap == 0 and row.frame_id >= 8]
     assert set(early) & set(data.frame_ids.tolist()), "a start gave frames a pose that had been lost"
 
 
-def test_the_summary_counts_the_keyframes_of_the_map_also_those_it_began_with(demo, tmp_path):
-    run_session(demo, tmp_path, range(12))
-    num_keyframes = len(read_run(tmp_path).keyframe_ids)
-    assert num_keyframes > sum(row.is_keyframe for row in read_rows(tmp_path / FRAMES_NAME))
-    assert json.loads((tmp_path / "summary.json").read_text())["frames"]["keyframes"] == num_keyframes
+def test_the_summary_counts_the_keyframes_of_the_map_also_those_it_began_with(twelve_frames):
+    num_keyframes = len(read_run(twelve_frames).keyframe_ids)
+    assert num_keyframes > sum(row.is_keyframe for row in read_rows(twelve_frames / FRAMES_NAME))
+    assert json.loads((twelve_frames / "summary.json").read_text())["frames"]["keyframes"] == num_keyframes
 
 
 def test_the_dense_cloud_lies_around_the_landmarks_where_it_is_wanted(demo, tmp_path, read_ply):
@@ -446,7 +450,7 @@ def test_results_have_the_map_as_it_was_adjusted_at_the_end_where_that_is_wanted
     runs = {}
     for wanted in (True, False):
         how = ReconstructionSettings(final_adjustment=wanted)
-        run_session(demo, tmp_path / str(wanted), range(24), reconstruction=how)
+        run_session(demo, tmp_path / str(wanted), range(14), reconstruction=how)
         runs[wanted] = read_run(tmp_path / str(wanted))
     assert np.array_equal(runs[True].frame_ids, runs[False].frame_ids)
     moved_m = np.linalg.norm((runs[True].T_world_cam - runs[False].T_world_cam)[:, :3, 3], axis=1)

@@ -1,5 +1,7 @@
 """An adjustment of views of a shaking hand, by a camera that is not quite as believed."""
 
+import functools
+
 import numpy as np
 
 from semcast.common.camera import Intrinsics
@@ -26,14 +28,13 @@ def rolling_xy(xyz, t_s, camera):
     xy = camera.project(transform_points(invert_transform(pose_at(t_s)), xyz))
     for _ in range(4 if readout_s else 0):
         late_s = readout_s * (xy[:, axis] / (SIZE_WH[axis] - 1) - 0.5)
-        in_cam = [
-            transform_points(invert_transform(pose_at(t_s + s)), p[None])[0]
-            for s, p in zip(late_s, xyz, strict=True)
-        ]
-        xy = camera.project(np.array(in_cam))
+        T_world_cam = np.stack([pose_at(t_s + s) for s in late_s])
+        in_cam = np.einsum("nji,nj->ni", T_world_cam[:, :3, :3], xyz - T_world_cam[:, :3, 3])
+        xy = camera.project(in_cam)
     return xy
 
 
+@functools.cache  # many tests look at the same few adjustments
 def adjusted(camera, noise_px=0.2, seed=0, velocities=True, radial=0.0, radial_2=0.0, put_right=0.0):
     """An adjustment that takes every image for one of a moment and of ``CAMERA``, and what it says.
 

@@ -1,5 +1,6 @@
 """What keyframes have said in several windows, and how sure an estimate from it is."""
 
+import functools
 from types import SimpleNamespace
 
 import numpy as np
@@ -53,18 +54,23 @@ def test_as_many_unknowns_as_observations_leave_nothing_to_be_sure_of():
     assert watch.take_found() is None
 
 
-def windows(seed, size, interval, num_points):
-    """What a global shutter's noise alone leaves in windows that overlap; linear, so nothing is adjusted."""
-    rng = np.random.default_rng(seed)
+@functools.cache
+def shaken_path():
+    """Poses and velocities of all views."""
     ms = 1e-3
     times_s = STEP_S * np.arange(NUM_VIEWS)
     poses = np.stack([pose_at(t) for t in times_s])
-    velocity = np.stack(
-        [
-            body_velocity(pose_at(t), np.array([pose_at(t - ms), pose_at(t + ms)]), np.array([-ms, ms]))
-            for t in times_s
-        ]
-    )
+    velocity = [
+        body_velocity(pose_at(t), np.array([pose_at(t - ms), pose_at(t + ms)]), np.array([-ms, ms]))
+        for t in times_s
+    ]
+    return poses, np.stack(velocity)
+
+
+def windows(seed, size, interval, num_points):
+    """What a global shutter's noise alone leaves in windows that overlap; linear, so nothing is adjusted."""
+    rng = np.random.default_rng(seed)
+    poses, velocity = shaken_path()
     low, high = (-2.0, -1.5, 3.0), (3.5, 1.5, 6.0)
     xyz = rng.uniform(low, high, (num_points, 3))
     seen = np.stack([CAMERA.project(transform_points(invert_transform(T), xyz)) for T in poses])
