@@ -238,11 +238,11 @@ def _wait_for_peers(session: Session, agent_id: str, stop: threading.Event) -> N
     missing = set(_PEERS)
     both = threading.Event()
 
-    def on_change(role: str, alive: bool) -> None:
-        if role not in _PEERS or alive == (role not in missing):
+    def on_change(role: str, alive: bool | None) -> None:
+        if role not in _PEERS or bool(alive) == (role not in missing):
             return
         (missing.discard if alive else missing.add)(role)
-        if both.is_set():  # live frames are lost, or not even encoded
+        if both.is_set() and alive is not None:  # live frames are lost, or not even encoded
             logger.info("%s %s", role, "is there" if alive else "is gone")
         elif not missing:
             both.set()

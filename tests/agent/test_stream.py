@@ -306,6 +306,25 @@ def test_an_agent_says_when_the_channel_is_gone_and_when_it_is_back(bench, caplo
     until(lambda: told() == ["channel is gone", "channel is there"])
 
 
+def test_an_agent_that_loses_its_hub_does_not_say_that_the_others_are_gone(bench, caplog):
+    caplog.set_level("INFO", "semcast.agent.agent")
+
+    def told():
+        return sorted(r.message for r in caplog.records if r.message.endswith(("is gone", "is there")))
+
+    bench.channel()
+    first = bench.receiver()
+    bench.agent(source={"repeat": "loop"})
+    take(first, count=1)
+    bench.hub.close()
+    until(lambda: "lost touch with" in caplog.text)
+    assert told() == []
+    bench.hub = open_session(NetworkSettings(listen=(bench.endpoint,), connect=()))
+    until(lambda: "channel is there" in caplog.text)
+    take(bench.receiver(), count=1)
+    until(lambda: told() == ["channel is there", "server is there"])
+
+
 def test_an_agent_encodes_nothing_while_nobody_takes_frames(bench):
     channel = bench.channel()
     receiver = bench.receiver()
