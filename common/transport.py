@@ -175,11 +175,11 @@ class Session:
             self._add(_Pump(listener, self._on_transport, "touch"))
 
     def _hubs(self) -> list[str]:
-        """Name the hub that a client is in touch with, by the name that each start of it has; of a hub none."""
+        """Name the hub a client is in touch with, by the name that each start of it has; of a hub none."""
         return [str(zid) for zid in self._session.info.routers_zid()] if self._hub else []
 
     def _on_transport(self, event: Any) -> None:
-        """Say that touch with the hub was lost, or is there again, as it is now: events may come in a burst."""
+        """Say that touch with the hub was lost, or is back, as it is now: events may come in a burst."""
         if event.kind == zenoh.SampleKind.DELETE:
             time.sleep(_LOST_AFTER_S)
         in_touch = bool(self._hubs())
