@@ -115,6 +115,12 @@ class _Sending:
             text = f"a report must be of a frame that was sent, got {report.frame_id}"
             self.complaints.refuse(WireError("range", text))
             return
+        if report.agent_epoch > self.agent_epoch and self._last_frame_id >= 0:
+            self.complaints.tell(
+                "another",
+                f"the server takes the frames of another agent {self._settings.agent_id!r}, started after "
+                "this one: stop one of the two or give it another --agent-id",
+            )
         self.feedback.update(report)
         if self._pace is not None:
             self._pace.on_report(report)
