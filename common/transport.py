@@ -166,7 +166,7 @@ class Session:
         self._pumps: list[_Pump] = []
         self._tokens: list[Any] = []
         self._lock = threading.Lock()
-        self._closed = False
+        self._closing = threading.Event()
         # A thread still inside zenoh while the interpreter ends would abort the process.
         atexit.register(self.close)
         if hub:
@@ -181,9 +181,9 @@ class Session:
     def _on_transport(self, event: Any) -> None:
         """Say that touch with the hub was lost, or is back, as it is now: events may come in a burst."""
         if event.kind == zenoh.SampleKind.DELETE:
-            time.sleep(_LOST_AFTER_S)
+            self._closing.wait(_LOST_AFTER_S)
         in_touch = bool(self._hubs())
-        if in_touch == self._was_in_touch or self._closed:
+        if in_touch == self._was_in_touch or self._closing.is_set():
             return
         self._was_in_touch = in_touch
         if in_touch:
@@ -336,7 +336,7 @@ class Session:
             if alive:
                 hubs = self._hubs()
             elif self._hub:
-                time.sleep(_LOST_AFTER_S)
+                self._closing.wait(_LOST_AFTER_S)
                 now = self._hubs()
                 alive = False if now and now == hubs else None
             on_change(role_of(str(sample.key_expr)), alive)
@@ -368,7 +368,7 @@ class Session:
 
     def _add(self, pump: _Pump) -> None:
         with self._lock:
-            if not self._closed:
+            if not self._closing.is_set():
                 self._pumps.append(pump)
                 return
         pump.close()
@@ -376,9 +376,9 @@ class Session:
     def close(self) -> None:
         """End threads, declarations and connections; ports are free again. Idempotent."""
         with self._lock:
-            if self._closed:
+            if self._closing.is_set():
                 return
-            self._closed = True
+            self._closing.set()
             pumps, self._pumps = self._pumps, []
         atexit.unregister(self.close)
         for pump in pumps:
