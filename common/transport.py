@@ -189,7 +189,7 @@ class Session:
         if in_touch:
             logger.info("in touch with %s again", self._hub)
         else:
-            logger.warning("lost touch with %s: nothing is sent or heard until it is back", self._hub)
+            logger.info("lost touch with %s: nothing is sent or heard until it is back", self._hub)
 
     def __enter__(self) -> Self:
         return self
