@@ -170,7 +170,7 @@ class Session:
         # A thread still inside zenoh while the interpreter ends would abort the process.
         atexit.register(self.close)
         if hub:
-            events = zenoh.handlers.FifoChannel(_FIFO_CAPACITY)
+            events: Any = zenoh.handlers.FifoChannel(_FIFO_CAPACITY)
             listener = session.info.declare_transport_events_listener(events)
             self._add(_Pump(listener, self._on_transport, "touch"))
 
