@@ -115,6 +115,12 @@ class _Sending:
             text = f"a report must be of a frame that was sent, got {report.frame_id}"
             self.complaints.refuse(WireError("range", text))
             return
+        if report.agent_epoch > self.agent_epoch and self._last_frame_id >= 0:
+            self.complaints.tell(
+                "another",
+                f"the server takes the frames of another agent {self._settings.agent_id!r}, started after "
+                "this one: stop one of the two or give it another --agent-id",
+            )
         self.feedback.update(report)
         if self._pace is not None:
             self._pace.on_report(report)
@@ -238,11 +244,11 @@ def _wait_for_peers(session: Session, agent_id: str, stop: threading.Event) -> N
     missing = set(_PEERS)
     both = threading.Event()
 
-    def on_change(role: str, alive: bool) -> None:
-        if role not in _PEERS or alive == (role not in missing):
+    def on_change(role: str, alive: bool | None) -> None:
+        if role not in _PEERS or bool(alive) == (role not in missing):
             return
         (missing.discard if alive else missing.add)(role)
-        if both.is_set():  # live frames are lost, or not even encoded
+        if both.is_set() and alive is not None:  # live frames are lost, or not even encoded
             logger.info("%s %s", role, "is there" if alive else "is gone")
         elif not missing:
             both.set()

@@ -250,9 +250,14 @@ class RecordedSource:
                 image = self._sequence.image(index)
             except SourceError as err:
                 bad += 1
-                if bad >= MAX_BAD_IN_A_ROW or (final and once):
+                if bad >= MAX_BAD_IN_A_ROW:
+                    raise SourceError(f"{bad} images in a row can't be used, the last one: {err}") from err
+                if final and once:
                     raise
                 self._leave_out(frame_id, err)
+                # In their time, too: a drive or a share that is back in a moment ends nothing.
+                if not pacer.until_due(t_source_ns):
+                    return
                 continue
             bad = 0
             sent += 1

@@ -159,7 +159,7 @@ class MapMirror:
                 for message in changes:
                     self._map = self._map.updated(message)
 
-    def _on_role(self, role: str, alive: bool) -> None:
+    def _on_role(self, role: str, alive: bool | None) -> None:
         """A server that was away may be another one, with another map."""
         if role != "server":
             return

@@ -42,6 +42,9 @@ _CONNECT_TRY_MS = 300
 _LONGEST_TRY_MS = 8 * _CONNECT_TRY_MS
 #: Roles that are started together are there within a second, and a demo asks for one: neither need be told.
 _TELL_AFTER_S = 1.0
+#: How long it takes to tell who is gone: a hub that was frozen is met, lost and met again within milliseconds
+#: when it goes on, and of one that ends clients hear first that the others are gone.
+_LOST_AFTER_S = 0.2
 #: How long a sender that drops under congestion waits for room first: half a frame's time at 30 a second.
 #: A process on a busy machine waits for its turn for longer than the 1 ms that Zenoh gives it.
 _WAIT_FOR_ROOM_US = 15_000
@@ -149,17 +152,44 @@ class _Pump:
 
 
 class Session:
-    """A connection to the hub, or the hub itself. Closing ends all that was declared on it."""
+    """A connection to the hub, or the hub itself. Closing ends all that was declared on it.
 
-    def __init__(self, session: Any) -> None:
-        """Take an open Zenoh session; use ``open_session``."""
+    A client that loses touch with its hub says so, and again when it is back, by itself and with all that was
+    declared on it.
+    """
+
+    def __init__(self, session: Any, hub: str = "") -> None:
+        """Take an open Zenoh session, a client's with the endpoints of its hub; use ``open_session``."""
         self._session = session
+        self._hub = hub
+        self._was_in_touch = True
         self._pumps: list[_Pump] = []
         self._tokens: list[Any] = []
         self._lock = threading.Lock()
-        self._closed = False
+        self._closing = threading.Event()
         # A thread still inside zenoh while the interpreter ends would abort the process.
         atexit.register(self.close)
+        if hub:
+            events: Any = zenoh.handlers.FifoChannel(_FIFO_CAPACITY)
+            listener = session.info.declare_transport_events_listener(events)
+            self._add(_Pump(listener, self._on_transport, "touch"))
+
+    def _hubs(self) -> list[str]:
+        """Name the hub a client is in touch with, by the name that each start of it has; of a hub none."""
+        return [str(zid) for zid in self._session.info.routers_zid()] if self._hub else []
+
+    def _on_transport(self, event: Any) -> None:
+        """Say that touch with the hub was lost, or is back, as it is now: events may come in a burst."""
+        if event.kind == zenoh.SampleKind.DELETE:
+            self._closing.wait(_LOST_AFTER_S)
+        in_touch = bool(self._hubs())
+        if in_touch == self._was_in_touch or self._closing.is_set():
+            return
+        self._was_in_touch = in_touch
+        if in_touch:
+            logger.info("in touch with %s again", self._hub)
+        else:
+            logger.info("lost touch with %s: nothing is sent or heard until it is back", self._hub)
 
     def __enter__(self) -> Self:
         return self
@@ -284,8 +314,10 @@ class Session:
         key = alive_key(agent_id, role)
         self._tokens.append(self._declare(lambda: self._session.liveliness().declare_token(key), key))
 
-    def watch_alive(self, agent_id: str, on_change: Callable[[str, bool], None]) -> None:
+    def watch_alive(self, agent_id: str, on_change: Callable[[str, bool | None], None]) -> None:
         """Call ``on_change(role, alive)`` for every role alive now and for each that comes or goes.
+
+        For a client that loses touch with its hub all others go: ``alive`` is None then, as nobody knows.
 
         Raises:
             TransportError: The session is closed.
@@ -296,9 +328,18 @@ class Session:
             ),
             f"watching {agent_id}",
         )
+        hubs = self._hubs()
 
         def deliver(sample: Any) -> None:
-            on_change(role_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
+            nonlocal hubs
+            alive: bool | None = sample.kind == zenoh.SampleKind.PUT
+            if alive:
+                hubs = self._hubs()
+            elif self._hub:
+                self._closing.wait(_LOST_AFTER_S)
+                now = self._hubs()
+                alive = False if now and now == hubs else None
+            on_change(role_of(str(sample.key_expr)), alive)
 
         self._add(_Pump(declared, deliver, "alive"))
 
@@ -327,7 +368,7 @@ class Session:
 
     def _add(self, pump: _Pump) -> None:
         with self._lock:
-            if not self._closed:
+            if not self._closing.is_set():
                 self._pumps.append(pump)
                 return
         pump.close()
@@ -335,9 +376,9 @@ class Session:
     def close(self) -> None:
         """End threads, declarations and connections; ports are free again. Idempotent."""
         with self._lock:
-            if self._closed:
+            if self._closing.is_set():
                 return
-            self._closed = True
+            self._closing.set()
             pumps, self._pumps = self._pumps, []
         atexit.unregister(self.close)
         for pump in pumps:
@@ -379,7 +420,7 @@ def open_session(
     while stop is None or not stop.is_set():
         config.insert_json5("connect/timeout_ms", json.dumps(try_ms))
         try:
-            return Session(zenoh.open(config))
+            return Session(zenoh.open(config), ", ".join(network.connect))
         except zenoh.ZError as err:
             answering = knocks.answering()
             # What has just begun to listen may be ours.

@@ -172,11 +172,11 @@ class Receiver:
         self._metrics.drop("missing", behind - counted)
         self._end = agent_epoch, num_sent, behind
 
-    def _on_alive(self, role: str, alive: bool) -> None:
+    def _on_alive(self, role: str, alive: bool | None) -> None:
         with self._lock:
             known = role in self._roles
             (self._roles.add if alive else self._roles.discard)(role)
-        if known != alive and role != "server":
+        if alive is not None and known != alive and role != "server":
             logger.info("%s %s", role, "is there" if alive else "is gone")
 
     def _on_camera(self, payload: bytes) -> None:

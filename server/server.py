@@ -4,7 +4,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -300,12 +300,26 @@ def run_server(settings: ServerSettings, stop_event: threading.Event) -> dict[st
     network = open_session(settings.network, stop_event)
     if network is None:
         return {}
-    with network, contextlib.closing(Server(settings, network)) as server:
+    with network, _closing(Server(settings, network)) as server:
         logger.info("%s, waiting for agent '%s'", settings.network.where, settings.agent_id)
         summary = server.run(stop_event)
         if settings.network.listens_on:
             _warn_of_others(network, settings.agent_id)
         return summary
+
+
+@contextlib.contextmanager
+def _closing(server: Server) -> Iterator[Server]:
+    """Close a server in the end; what goes wrong then does not hide what went wrong before."""
+    with contextlib.closing(server):
+        try:
+            yield server
+        except SemcastError as err:
+            try:
+                server.close()
+            except SemcastError as another:
+                raise SemcastError(f"{err}; {another}") from err
+            raise
 
 
 def _warn_of_others(hub: NetworkSession, agent_id: str) -> None:

@@ -386,6 +386,19 @@ def test_a_demo_that_is_stopped_before_its_first_frame_blames_no_process(tmp_pat
     assert "logs" not in said
 
 
+def test_a_demo_that_is_stopped_when_its_server_was_killed_says_where_to_look(tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        (tmp_path / "frames.jsonl").write_text("{}\n")
+        os.kill(os.getpid(), signal.SIGINT)
+        return None, None
+
+    monkeypatch.setattr("semcast.commands.demo.run_demo", interrupted)
+    assert main(["demo", "--out", str(tmp_path)]) == 130
+    said = capsys.readouterr().err
+    assert "no summary was written; the logs of the three processes say why" in said
+    assert "stopped before the first frame" not in said
+
+
 @pytest.mark.parametrize(
     ("value", "told"), [(0.003312, "0.00331 m"), (12.345, "12.3 m"), (1234.5, "1230 m"), (0.0, "0 m")]
 )

@@ -179,8 +179,8 @@ def _quieten_libraries() -> None:
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
-    # Rerun warns of every file without a footer.
-    os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=error")
+    # Rerun warns of every file without a footer, and of full disks, which the server says by itself.
+    os.environ.setdefault("RUST_LOG", "warn,re_log_encoding::rrd::file_sink=off,re_sdk::recording_stream=off")
 
 
 def _compute_in_one_thread() -> None:

@@ -33,7 +33,7 @@ class Alive:
     num_unreadable: int = 0
     activity: str = ""
 
-    def on_change(self, role: str, alive: bool) -> None:
+    def on_change(self, role: str, alive: bool | None) -> None:
         """Take one change."""
         with self.changed:
             (self.roles.add if alive else self.roles.discard)(role)

@@ -177,8 +177,18 @@ def test_a_damaged_image_is_left_out_and_many_end_the_source(recording, tmp_path
     assert "frame 4 is left out" in caplog.text
     for k in range(1, 1 + MAX_BAD_IN_A_ROW):
         (folder / "images" / f"{k:06d}.png").write_bytes(b"broken")
-    with pytest.raises(SourceError, match="000010.png is not a readable image"):
+    with pytest.raises(SourceError, match=r"^10 images in a row .*000010.png is not a readable image"):
         play(fast(folder))
+
+
+def test_images_that_can_not_be_read_take_their_time(recording, tmp_path):
+    folder = tmp_path / "away"
+    shutil.copytree(recording, folder)
+    for k in range(1, MAX_BAD_IN_A_ROW):
+        (folder / "images" / f"{k:06d}.png").write_bytes(b"broken")
+    _, frames = play(SourceSettings(source=str(folder), pace="rate", rate_hz=50.0))
+    assert [f.frame_id for f in frames] == [0, MAX_BAD_IN_A_ROW, MAX_BAD_IN_A_ROW + 1]
+    assert frames[1].t_capture_ns - frames[0].t_capture_ns > 0.9e9 * MAX_BAD_IN_A_ROW / 50.0
 
 
 @pytest.mark.parametrize("damaged", [1, MAX_BAD_IN_A_ROW - 1])

@@ -271,6 +271,25 @@ def test_a_restarted_agent_is_followed_at_once(bench):
     assert second.result["agent_epoch"] == after[0].message.agent_epoch
 
 
+def test_of_two_agents_of_one_name_the_one_that_is_left_out_says_so_once(bench, caplog):
+    bench.channel()
+    receiver = bench.receiver()
+    first = bench.agent(source={"repeat": "loop"})
+    take(receiver, count=2)
+    second = bench.agent(source={"repeat": "loop"})
+    text = "the server takes the frames of another agent 'agent0', started after this one"
+
+    def told():
+        take(receiver, count=1)
+        return [r.message for r in caplog.records if r.message.startswith(text)]
+
+    until(told)
+    take(receiver, count=10)
+    second.end()
+    assert len(told()) == 1
+    first.end()
+
+
 def test_an_agent_waits_for_the_others_unless_told_not_to(bench, caplog):
     caplog.set_level("INFO")
     waiting = bench.agent(source={"repeat": "loop"})
@@ -304,6 +323,25 @@ def test_an_agent_says_when_the_channel_is_gone_and_when_it_is_back(bench, caplo
     until(lambda: told() == ["channel is gone"])
     bench.channel()
     until(lambda: told() == ["channel is gone", "channel is there"])
+
+
+def test_an_agent_that_loses_its_hub_does_not_say_that_the_others_are_gone(bench, caplog):
+    caplog.set_level("INFO", "semcast.agent.agent")
+
+    def told():
+        return sorted(r.message for r in caplog.records if r.message.endswith(("is gone", "is there")))
+
+    bench.channel()
+    first = bench.receiver()
+    bench.agent(source={"repeat": "loop"})
+    take(first, count=1)
+    bench.hub.close()
+    until(lambda: "lost touch with" in caplog.text)
+    assert told() == []
+    bench.hub = open_session(NetworkSettings(listen=(bench.endpoint,), connect=()))
+    until(lambda: "channel is there" in caplog.text)
+    take(bench.receiver(), count=1)
+    until(lambda: told() == ["channel is there", "server is there"])
 
 
 def test_an_agent_encodes_nothing_while_nobody_takes_frames(bench):

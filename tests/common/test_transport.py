@@ -138,7 +138,12 @@ def test_a_second_agent_of_the_same_name_is_warned_of(pair, caplog):
     assert "agent of 'a' is there already" in caplog.text
 
 
-def test_clients_survive_a_hub_that_is_killed():
+def test_clients_survive_a_hub_that_is_killed_and_say_so_once(caplog):
+    caplog.set_level("INFO")
+
+    def told():
+        return [r.message for r in caplog.records if "touch" in r.message]
+
     endpoint = free_endpoint()
     network = NetworkSettings(connect=(endpoint,))
 
@@ -155,6 +160,8 @@ def test_clients_survive_a_hub_that_is_killed():
         with open_client(network, 60) as sender, open_client(network, 60) as receiver:
             received = []
             receiver.subscribe("semcast/a/rx/symbols", "newest", received.append)
+            seen = []
+            receiver.watch_alive("a", lambda role, alive: seen.append((role, alive)))
             sender.declare_alive("a", "agent")
             publisher = sender.publisher("semcast/a/rx/symbols", "newest")
 
@@ -166,6 +173,9 @@ def test_clients_survive_a_hub_that_is_killed():
             process.kill()
             process.wait(10)
             until(lambda: not publisher.has_receiver)
+            lost = f"lost touch with {endpoint}: nothing is sent or heard until it is back"
+            until(lambda: told() == [lost] * 2)  # one of each client
+            until(lambda: seen == [("agent", True), ("agent", None)])
             received.clear()
             publisher.put(b"into the void")
             process = start()
@@ -173,6 +183,8 @@ def test_clients_survive_a_hub_that_is_killed():
             until(passes)
             assert time.monotonic() - started_s < 15.0
             assert alive_roles(endpoint, "a") == {"agent"}
+            until(lambda: told() == [lost] * 2 + [f"in touch with {endpoint} again"] * 2)
+        assert len(told()) == 4, "who closes has not lost touch"
     finally:
         process.kill()
         process.wait(10)

@@ -417,6 +417,19 @@ def test_presence_of_the_others_is_known(ends):
     until(lambda: not e.receiver.roles_alive)
 
 
+def test_who_is_gone_is_not_told_where_only_the_hub_was_lost(ends, caplog):
+    caplog.set_level("INFO", "semcast.server.receiver")
+    e = ends()
+    with open_client(NetworkSettings(connect=(e.endpoint,)), 60) as elsewhere:
+        receiver = Receiver(elsewhere, "b", "live", Metrics("server"))
+        e.client.declare_alive("b", "agent")
+        until(lambda: receiver.roles_alive == {"agent"})
+        e.hub.close()
+        until(lambda: not receiver.roles_alive)
+        receiver.close()
+    assert [r.message for r in caplog.records if r.levelname == "INFO"] == ["agent is there"]
+
+
 def test_bad_arguments_are_refused(ends):
     e = ends()
     with pytest.raises(ValueError, match="mode must be live or replay, got 'fast'"):

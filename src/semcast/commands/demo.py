@@ -14,7 +14,7 @@ from rich.table import Table
 from semcast.channel.emulator import warn_of_settings
 from semcast.commands.console import plain_console
 from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings, run_until_stopped
-from semcast.common.run_folder import RUN_FILES, VIEWER_NAME
+from semcast.common.run_folder import FRAMES_NAME, RUN_FILES, VIEWER_NAME
 from semcast.demo import DemoSettings, open_recording, run_demo
 from semcast.evaluation.report import STDOUT, provenance, write_result
 from semcast.server.export.parts import parts_line
@@ -139,7 +139,8 @@ def run(arguments: argparse.Namespace) -> int:
         talk.print(failures[0], soft_wrap=True)
         code = code or 1
     if not result:
-        if code == INTERRUPTED and not failures:
+        # A server that had frames writes a summary, unless it was killed.
+        if code == INTERRUPTED and not failures and not (settings.out / FRAMES_NAME).exists():
             talk.print("stopped before the first frame was tracked: there are no results")
         else:
             logs = settings.out / "logs"

@@ -25,6 +25,7 @@ from semcast.common.symbol_payload import pack_lost
 from semcast.common.trajectory import read_tum
 from semcast.common.transport import open_client
 from semcast.common.wire import pack, unpack
+from semcast.server import server
 from semcast.server.mapping.bundle_process import GIVEN_UP
 from semcast.server.server import Server, run_server
 from semcast.server.session import Session
@@ -249,6 +250,25 @@ def test_a_recording_that_breaks_off_leaves_the_results_and_is_an_error_at_the_e
     assert status.last_error.endswith("run.mcap ended: [Errno 28] No space left on device")
     assert running.summary["frames"]["tracked"] == 3
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"]["tracked"] == 3
+
+
+def test_a_recording_that_is_not_whole_hides_no_output_that_could_not_be_written(monkeypatch):
+    class Full:
+        def __init__(self, settings, session):
+            self.is_open = True
+
+        def run(self, stop):
+            raise SemcastError("outputs can't be written")
+
+        def close(self):
+            was_open, self.is_open = self.is_open, False
+            if was_open:
+                raise SourceError("run.mcap is not complete")
+
+    monkeypatch.setattr(server, "Server", Full)
+    settings = ServerSettings(network=HubSettings(listen=(free_endpoint(),)))
+    with pytest.raises(SemcastError, match=r"^outputs can't be written; run.mcap is not complete$"):
+        run_server(settings, threading.Event())
 
 
 @pytest.mark.parametrize("num_seen", [0, 5])
