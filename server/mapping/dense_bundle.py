@@ -183,7 +183,8 @@ class Normal:
         Raises:
             LinAlgError: A point is not determined.
         """
-        factor = _inverse_of_lower(np.linalg.cholesky(self.points + damping * np.eye(3)))
+        lower = np.asarray(np.linalg.cholesky(self.points + damping * np.eye(3)), np.float64)
+        factor = _inverse_of_lower(lower)
         scaled = (factor @ self.both).reshape(3 * len(factor), len(self.poses))
         return self.poses + damping * np.eye(len(self.poses)) - scaled.T @ scaled, factor, scaled
 
@@ -203,14 +204,14 @@ class Normal:
         return twists, moves, 0.5 * float(promised)
 
 
-def _inverse_of_lower(factor: Array) -> Array:
+def _inverse_of_lower(lower: Array) -> Array:
     """Inverses of lower triangular matrices ``(P, 3, 3)``, an element at a time for all of them."""
-    inverse = np.zeros_like(factor)
-    a, c, f = (1.0 / factor[:, k, k] for k in range(3))
+    inverse = np.zeros_like(lower)
+    a, c, f = (1.0 / lower[:, k, k] for k in range(3))
     inverse[:, 0, 0], inverse[:, 1, 1], inverse[:, 2, 2] = a, c, f
-    inverse[:, 1, 0] = -a * c * factor[:, 1, 0]
-    inverse[:, 2, 1] = -c * f * factor[:, 2, 1]
-    inverse[:, 2, 0] = -f * (a * factor[:, 2, 0] + inverse[:, 1, 0] * factor[:, 2, 1])
+    inverse[:, 1, 0] = -a * c * lower[:, 1, 0]
+    inverse[:, 2, 1] = -c * f * lower[:, 2, 1]
+    inverse[:, 2, 0] = -f * (a * lower[:, 2, 0] + inverse[:, 1, 0] * lower[:, 2, 1])
     return inverse
 
 
