@@ -326,10 +326,12 @@ def test_an_agent_says_when_the_channel_is_gone_and_when_it_is_back(bench, caplo
 
 
 def test_an_agent_that_loses_its_hub_does_not_say_that_the_others_are_gone(bench, caplog):
+    caplog.set_level("INFO", "semcast.common.transport")
     caplog.set_level("INFO", "semcast.agent.agent")
 
     def told():
-        return sorted(r.message for r in caplog.records if r.message.endswith(("is gone", "is there")))
+        own = [r.message for r in caplog.records if r.name == "semcast.agent.agent"]
+        return sorted(text for text in own if text.endswith(("is gone", "is there")))
 
     bench.channel()
     first = bench.receiver()
