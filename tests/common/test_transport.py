@@ -2,6 +2,7 @@ import asyncio
 import contextlib
 import json
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -9,8 +10,9 @@ import threading
 import time
 
 import pytest
-from waiting import until
+from waiting import came_true, until
 
+from semcast.common import transport
 from semcast.common.errors import ConfigError, TransportError
 from semcast.common.loopback import free_endpoint, loopback_round_trip_ms, open_hub
 from semcast.common.network_settings import HubSettings, NetworkSettings, is_loopback
@@ -26,6 +28,15 @@ session = open_session(NetworkSettings(listen=(sys.argv[1],), connect=()))
 print("up", flush=True)
 threading.Event().wait()
 """
+
+
+def start_hub(endpoint):
+    process = subprocess.Popen(
+        [sys.executable, "-c", HUB_PROGRAM, endpoint], stdout=subprocess.PIPE, text=True
+    )
+    with process.stdout:
+        assert process.stdout.readline() == "up\n"
+    return process
 
 
 def alive_roles(endpoint, agent_id, zenoh_config=None):
@@ -140,22 +151,13 @@ def test_a_second_agent_of_the_same_name_is_warned_of(pair, caplog):
 
 def test_clients_survive_a_hub_that_is_killed_and_say_so_once(caplog):
     caplog.set_level("INFO")
+    endpoint = free_endpoint()
+    network = NetworkSettings(connect=(endpoint,))
 
     def told():
         return [r.message for r in caplog.records if "touch" in r.message]
 
-    endpoint = free_endpoint()
-    network = NetworkSettings(connect=(endpoint,))
-
-    def start():
-        process = subprocess.Popen(
-            [sys.executable, "-c", HUB_PROGRAM, endpoint], stdout=subprocess.PIPE, text=True
-        )
-        with process.stdout:
-            assert process.stdout.readline() == "up\n"
-        return process
-
-    process = start()
+    process = start_hub(endpoint)
     try:
         with open_client(network, 60) as sender, open_client(network, 60) as receiver:
             received = []
@@ -178,7 +180,7 @@ def test_clients_survive_a_hub_that_is_killed_and_say_so_once(caplog):
             until(lambda: seen == [("agent", True), ("agent", None)])
             received.clear()
             publisher.put(b"into the void")
-            process = start()
+            process = start_hub(endpoint)
             started_s = time.monotonic()
             until(passes)
             assert time.monotonic() - started_s < 15.0
@@ -188,6 +190,29 @@ def test_clients_survive_a_hub_that_is_killed_and_say_so_once(caplog):
     finally:
         process.kill()
         process.wait(10)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="Windows can't freeze a process so")
+def test_a_hub_that_was_frozen_is_lost_once_and_back_once(caplog):
+    caplog.set_level("INFO")
+    endpoint = free_endpoint()
+    process = start_hub(endpoint)
+
+    def told():
+        return [r.message.split(" tcp/")[0] for r in caplog.records if "touch" in r.message]
+
+    try:
+        with open_client(NetworkSettings(connect=(endpoint,)), 60):
+            process.send_signal(signal.SIGSTOP)
+            until(lambda: told() == ["lost touch with"])
+            process.send_signal(signal.SIGCONT)
+            until(lambda: told() == ["lost touch with", "in touch with"])
+            # It is met, lost and met again. What is told too often is told within this time.
+            assert not came_true(lambda: len(told()) > 2, 2 * transport._LOST_AFTER_S)
+    finally:
+        process.kill()
+        process.wait(10)
+    assert told() == ["lost touch with", "in touch with"]
 
 
 def test_a_client_waits_for_its_hub_until_it_is_stopped():
