@@ -427,7 +427,7 @@ def test_who_is_gone_is_not_told_where_only_the_hub_was_lost(ends, caplog):
         e.hub.close()
         until(lambda: not receiver.roles_alive)
         receiver.close()
-    assert [r.message for r in caplog.records if r.levelname == "INFO"] == ["agent is there"]
+    assert [r.message for r in caplog.records if r.name == "semcast.server.receiver"] == ["agent is there"]
 
 
 def test_bad_arguments_are_refused(ends):
