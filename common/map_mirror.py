@@ -143,12 +143,11 @@ class MapMirror:
         with self._asking:
             with self._lock:
                 self._early, asked = [*early], self._server
-            try:
-                answer = self._session.request(map_key(self._agent_id), b"", self._timeout_s)
-                whole = unpack(answer, MapMessage) if answer is not None else None
-            except (TransportError, WireError) as err:
-                logger.warning("the map can't be taken from the server: %s", err)
-                whole = None
+            whole = self._ask()
+            with self._lock:
+                has_begun = len(self._early) > len(early)
+            if whole is None and has_begun:  # it had no map when it was asked, and has one now
+                whole = self._ask()
             with self._lock:
                 changes, self._early = self._early or [], None
                 if whole is not None:
@@ -158,6 +157,15 @@ class MapMirror:
                     self._map_of = asked
                 for message in changes:
                     self._map = self._map.updated(message)
+
+    def _ask(self) -> MapMessage | None:
+        """Whole map of the server, None where it has none or does not answer."""
+        try:
+            answer = self._session.request(map_key(self._agent_id), b"", self._timeout_s)
+            return unpack(answer, MapMessage) if answer is not None else None
+        except (TransportError, WireError) as err:
+            logger.warning("the map can't be taken from the server: %s", err)
+            return None
 
     def _on_role(self, role: str, alive: bool | None) -> None:
         """A server that was away may be another one, with another map."""

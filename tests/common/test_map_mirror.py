@@ -175,6 +175,23 @@ def test_a_server_that_goes_while_its_answer_is_on_its_way_is_not_taken_for_the_
     assert mirror.map.xyz[:, 0].tolist() == [1.5, 5.5, 7.0]
 
 
+def test_a_server_that_begins_its_map_while_it_is_asked_is_asked_again():
+    session = ScriptedSession()
+    session.whole = message([1, 8])
+    mirror = MapMirror(session, AGENT)
+    session.on_role("server", False)
+
+    def begins():
+        session.on_the_way, session.whole = lambda: None, message([1, 2])
+        session.deliver(pack(session.whole))
+
+    session.on_the_way, session.whole = begins, None
+    session.on_role("server", True)
+    assert mirror.map.ids.tolist() == [1, 2], "8 was of the one before"
+    session.deliver(pack(message([3])))
+    assert mirror.map.ids.tolist() == [1, 2, 3]
+
+
 def test_a_map_is_brought_to_metres_as_a_pose_tells():
     ids = np.arange(5)
     change = message(ids, keyframes=(2, 4))
