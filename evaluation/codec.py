@@ -246,7 +246,7 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         write_result(settings.json, report)
     if settings.out is not None:
         if settings.link.channel != "trace":
-            _draw(settings.out, settings.snr_db, results)
+            _draw(settings, settings.out, results)
         label = snr_file_label(strip_snr_db, settings.link)
         write_picture_strip(settings.out / f"pictures_{label}.png", strip)
     return dict(report)
@@ -371,14 +371,19 @@ def _strip_row(
     row = {f"original ({name})": image}
     for codec, sample in samples.items():
         psnr, similarity = sample.figures["psnr_db"], sample.figures["ssim"]
-        label = f"{codec}: {psnr:.2f} dB" + ("" if similarity is None else f" / {similarity:.3f}")
+        label = f"{codec}: {psnr:.2f} dB" + ("" if similarity is None else f", SSIM {similarity:.3f}")
         row[label] = sample.decoded.image
     return row
 
 
-def _draw(folder: Path, snr_db: Sequence[float], results: list[dict[str, Any]]) -> None:
-    """Draw PSNR and SSIM over SNR (Fig. 7 and 8 of the paper)."""
-    order = sorted(snr_db)
+def _draw(settings: CodecSettings, folder: Path, results: list[dict[str, Any]]) -> None:
+    """Draw PSNR and SSIM over SNR (Fig. 7 and 8 of the paper), with the link they were measured over."""
+    order = sorted(settings.snr_db)
+    num_images = len(results[0]["images"])
+    title = (
+        f"{settings.link.channel}, {settings.modulation}, CBR {settings.rate}, "
+        f"mean of {num_images} image{'s' if num_images > 1 else ''}"
+    )
     names = list(dict.fromkeys(row["codec"] for row in results))
     for key, file_name, label in (
         ("psnr_db", "fig7_psnr.png", "PSNR (dB)"),
@@ -388,4 +393,4 @@ def _draw(folder: Path, snr_db: Sequence[float], results: list[dict[str, Any]]) 
         values = {(row["codec"], row["snr_db"]): row[key] for row in results}
         curves = {name: [values[name, s] for s in order] for name in names}
         if any(v is not None for curve in curves.values() for v in curve):
-            plot_against_snr(folder / file_name, order, curves, label)
+            plot_against_snr(folder / file_name, order, curves, label, title)

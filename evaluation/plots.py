@@ -73,6 +73,9 @@ def save_figure(figure: "Figure", path: Path) -> None:
         with warnings.catch_warnings():
             # Of letters that the font lacks; what stands for them is seen in the picture.
             warnings.filterwarnings("ignore", message="Glyph .* missing from")
+            # Axes of equal scale are numbered anew once they have a size; the layout must see those numbers.
+            if any(axes.get_aspect() != "auto" for axes in figure.axes):
+                figure.draw_without_rendering()
             with whole_file(path) as file:
                 figure.savefig(file, format=path.suffix[1:], dpi=150, metadata=metadata)
     except (OSError, ValueError) as err:
@@ -80,7 +83,11 @@ def save_figure(figure: "Figure", path: Path) -> None:
 
 
 def plot_against_snr(
-    path: Path, snr_db: Sequence[float], curves: Mapping[str, Sequence[float | None]], y_label: str
+    path: Path,
+    snr_db: Sequence[float],
+    curves: Mapping[str, Sequence[float | None]],
+    y_label: str,
+    title: str = "",
 ) -> None:
     """Draw one curve per name over the SNR and save it.
 
@@ -89,6 +96,7 @@ def plot_against_snr(
         snr_db: ``(N,)`` abscissae.
         curves: Name to N values; None leaves a gap.
         y_label: Quantity and unit.
+        title: Above the axes.
 
     Raises:
         ValueError: A curve has another length than ``snr_db``.
@@ -103,6 +111,7 @@ def plot_against_snr(
         style = "-" if k < len(_COLOURS) else "--"
         axes.plot(snr_db, y, style, color=colour, marker=marker, markersize=4, label=name)
     axes.set(xlabel="SNR (dB)", ylabel=y_label)
+    axes.set_title(title, fontsize="medium")
     # Inside the axes the names would hide points of the curves.
     figure.legend(fontsize="small", loc="outside right upper")
     save_figure(figure, path)

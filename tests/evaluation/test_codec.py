@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codecs import load_codec
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.link_report import LinkReporter
+from semcast.evaluation import codec as codec_evaluation
 from semcast.evaluation.codec import CodecSettings, evaluate_codec, read_images
 from semcast.evaluation.picture_strip import picture_strip, write_picture_strip
 from semcast.evaluation.result_table import result_table
@@ -159,6 +161,24 @@ def test_result_curves_and_pictures_are_written(report):
         assert cv2.imread(str(settings.out / name)) is not None
     strip = cv2.imread(str(settings.out / "pictures_10db.png"))
     assert strip.shape[1] == 3 * 384 + 2 * 4
+
+
+def test_curves_and_pictures_say_what_they_are_of(folder, tmp_path, monkeypatch):
+    titles, labels = [], []
+    monkeypatch.setattr(
+        codec_evaluation,
+        "plot_against_snr",
+        lambda path, snr_db, curves, y_label, title: titles.append(title),
+    )
+    monkeypatch.setattr(codec_evaluation, "write_picture_strip", lambda path, strip: labels.extend(strip[0]))
+    link = ChannelSettings(channel="erasure", slot_loss=0.01)
+    evaluate_codec(
+        CodecSettings(
+            images=folder, codec=("jpeg-ldpc",), snr_db=(10.0,), link=link, max_images=1, out=tmp_path
+        )
+    )
+    assert set(titles) == {"erasure, 16qam, CBR 1/16, mean of 1 image"}
+    assert re.fullmatch(r"jpeg-ldpc: \d+\.\d\d dB, SSIM \d\.\d{3}", labels[1])
 
 
 def test_the_same_seed_gives_the_same_figures(folder, report):

@@ -220,6 +220,23 @@ def test_the_spread_of_a_few_errors_counts_no_half_frames(tmp_path, monkeypatch)
     assert all(count == int(count) for count in drawn[-1].axes[3].get_yticks())
 
 
+def test_a_panels_label_stays_clear_of_the_panel_beside_it(tmp_path, monkeypatch):
+    drawn, save = [], run_plots.save_figure
+
+    def watched(figure, path):
+        save(figure, path)
+        drawn.append(figure)
+
+    monkeypatch.setattr(run_plots, "save_figure", watched)
+    trajectory = line(range(10))
+    trajectory.T_world_cam[:, :3, 3] = np.outer(np.linspace(0.0, 1.0, 10), (0.8, -0.09, 0.53))
+    plot_run(RunToPlot(name="run", trajectory=trajectory, rows=[], truth=None), tmp_path)
+    drawn[0].set_layout_engine("none")  # as it was saved, at another resolution
+    drawn[0].canvas.draw()
+    left, right = drawn[0].axes
+    assert left.get_window_extent().x1 < right.yaxis.label.get_window_extent().x0
+
+
 def test_a_run_without_a_decoded_frame_has_nothing_to_plot(tmp_path):
     folder = write_run(tmp_path / "run", [])
     for _ in range(2):
