@@ -18,11 +18,17 @@ class Knocks:
         places = {endpoint: _OVER_TCP.fullmatch(endpoint) for endpoint in endpoints}
         self._places = {e: (found["host"], int(found["port"])) for e, found in places.items() if found}
         self._num_endpoints = len(places)
+        self._unknown_hosts: list[str] = []
 
     @property
     def all_can_be_asked(self) -> bool:
         """Whether nothing is there where nothing answers."""
         return len(self._places) == self._num_endpoints
+
+    @property
+    def unknown_hosts(self) -> tuple[str, ...]:
+        """Names for which no address was found when they were asked."""
+        return tuple(self._unknown_hosts)
 
     def answering(self) -> str | None:
         """Return the first endpoint where something takes a connection now."""
@@ -32,6 +38,7 @@ class Knocks:
                     return endpoint
             except (socket.gaierror, UnicodeError):
                 del self._places[endpoint]  # asking for a name again can take long each time
+                self._unknown_hosts.append(place[0])
             except OSError:
                 pass
         return None

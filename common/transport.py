@@ -425,15 +425,16 @@ def open_session(
             answering = knocks.answering()
             # What has just begun to listen may be ours.
             why = _why_not_met(answering) if answering is not None and try_ms > _CONNECT_TRY_MS else ""
+            unknown = "".join(f"; no address is known for {host!r}" for host in knocks.unknown_hosts)
             waited_s = time.monotonic() - started_s
             if deadline_s is not None and waited_s >= deadline_s:
                 nothing = (
-                    f"nothing answers at {', '.join(network.connect)} within {deadline_s:g} s: is "
+                    f"nothing answers at {', '.join(network.connect)} within {deadline_s:g} s{unknown}: is "
                     f"'semcast server' running there? ({_in_a_line(err)})"
                 )
                 raise TransportError(why or nothing) from err
             if not told and waited_s >= _TELL_AFTER_S:
-                logger.info("waiting for the server at %s", ", ".join(network.connect))
+                logger.info("waiting for the server at %s%s", ", ".join(network.connect), unknown)
                 told = True
             if why and try_ms == _LONGEST_TRY_MS and not told_why:
                 logger.warning("%s", why)

@@ -17,6 +17,8 @@ def test_other_protocols_and_names_nobody_knows_are_not_asked():
     knocks = Knocks(("udp/127.0.0.1:7447", "unixsock-stream//tmp/hub"))
     assert not knocks.all_can_be_asked
     assert knocks.answering() is None
+    assert knocks.unknown_hosts == ()
     knocks = Knocks((f"tcp/{'a' * 70}:7447",))
     assert knocks.answering() is None
     assert not knocks.all_can_be_asked
+    assert knocks.unknown_hosts == ("a" * 70,)

@@ -243,6 +243,8 @@ def test_a_client_started_first_finds_a_hub_started_later():
 def test_nobody_there_and_a_port_in_use_are_said(hub):
     with pytest.raises(TransportError, match=r"nothing answers at tcp/127.0.0.1:\d+ within 0.2 s"):
         open_client(NetworkSettings(connect=(free_endpoint(),)), 0.2)
+    with pytest.raises(TransportError, match="within 0.2 s; no address is known for 'a{70}': is 'semcast"):
+        open_client(NetworkSettings(connect=(f"tcp/{'a' * 70}:7447",)), 0.2)
     with pytest.raises(TransportError, match=r"can't listen on tcp/.*perhaps something already") as taken:
         open_session(NetworkSettings(listen=(hub[1],), connect=()))
     assert str(taken.value).count("[") == str(taken.value).count("]")
