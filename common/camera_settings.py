@@ -9,7 +9,7 @@ from semcast.common.camera_file import read_intrinsics
 from semcast.common.errors import SourceError
 
 HOW_TO_GIVE = (
-    "put intrinsics.json (fx fy cx cy width height) beside the images, or give --intrinsics FILE "
+    "put intrinsics.json (fx fy cx cy width height) into its folder, or give --intrinsics FILE "
     "(.json, or .yaml of OpenCV, ROS or EuRoC), or --fx --fy --cx --cy in pixels. 'semcast calibrate' finds "
     "them from pictures of a chessboard; --focal-35mm 26 (a phone's main camera) is a rough start without, "
     "and 'semcast lens' makes it better from images alone"

@@ -197,10 +197,12 @@ def test_a_video_is_described_with_the_camera_beside_it_or_without(tmp_path):
     writer.release()
     text = text_of(video)
     assert "images: 4, 64x48 px\ntime: 0.2 s, 20.0 images a second\ncamera: unknown: put" in text
-    assert f"is reconstructed by: semcast demo --sequence '{video}'" in text
+    assert f"is reconstructed by: semcast demo --sequence '{video}' --focal-35mm 26" in text
     camera = Intrinsics(fx=50, fy=50, cx=31.5, cy=23.5, width=64, height=48, distortion=(-0.25, 0.08, 0, 0))
     camera.save(video.with_suffix(".json"))
-    assert "camera: fx 50.0 fy 50.0 cx 31.5 cy 23.5 px, with distortion -0.25 0.08 0 0\n" in text_of(video)
+    text = text_of(video)
+    assert "camera: fx 50.0 fy 50.0 cx 31.5 cy 23.5 px, with distortion -0.25 0.08 0 0\n" in text
+    assert text.endswith(f"is reconstructed by: semcast demo --sequence '{video}'")
     Intrinsics(fx=50, fy=50, cx=23.5, cy=31.5, width=48, height=64).save(video.with_suffix(".json"))
     assert "are for 48x64 images, its images are 64x48: are they turned by 90 degrees" in text_of(video)
 

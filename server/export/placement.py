@@ -95,6 +95,10 @@ def place_by_run(data: RunData) -> Placement:
     )
 
 
+def _span(t_s: Array) -> str:
+    return f"{t_s.min():.1f} to {t_s.max():.1f} s" if len(t_s) else "no time"
+
+
 def place_by_path(data: RunData, known: Trajectory) -> Placement:
     """Return the similarity that brings a run's camera path onto a known one.
 
@@ -121,7 +125,8 @@ def place_by_path(data: RunData, known: Trajectory) -> Placement:
     if at_frames is None or matched.shape[1] < MIN_MATCHES:
         raise SourceError(
             f"the known path must have a pose at the time of {MIN_MATCHES} posed frames or more, "
-            f"got {matched.shape[1]} of {len(data.frame_ids)}"
+            f"got {matched.shape[1]} of {len(data.frame_ids)}: it has {_span(known.t_s)}, the frames "
+            f"{_span(ns_to_seconds(times_ns))}"
         )
     T_map_cam, T_known_cam = T_world_cam[matched[0]], at_frames.T_world_cam[matched[1]]
     p_map, p_known = T_map_cam[:, :3, 3], T_known_cam[:, :3, 3]

@@ -36,8 +36,10 @@ def video_facts(path: Path) -> Facts | None:
     if rate_hz > 0.0 and count > 0:
         facts.append(("time", f"{count / rate_hz:.1f} s, {rate_hz:.1f} images a second"))
     beside = calibration_beside(path)
+    command = f"semcast demo --sequence {shlex.quote(str(path))}"
     if beside is None:
         facts.append(("camera", f"unknown: {HOW_TO_GIVE}"))
+        command += " --focal-35mm 26"
     else:
         try:
             camera = Intrinsics.load(beside)
@@ -45,7 +47,7 @@ def video_facts(path: Path) -> Facts | None:
             facts += [*camera_facts(camera, camera.distortion), ("", f"as {beside} says")]
         except SourceError as err:
             facts.append(("camera", str(err)))
-    facts.append(("is reconstructed by", f"semcast demo --sequence {shlex.quote(str(path))}"))
+    facts.append(("is reconstructed by", command))
     return facts
 
 

@@ -125,8 +125,12 @@ def test_directions_of_something_else_than_the_camera_do_not_tip_a_straight_path
 def test_a_path_of_another_time_or_of_one_place_is_refused(arc_run):
     data = arc_run()
     late = Trajectory(data.t_source_ns * 1e-9 + 100, data.T_world_cam)
-    with pytest.raises(SourceError, match="time of 3 posed frames or more, got 0 of 9"):
+    first_s, last_s = data.t_source_ns[[0, -1]] * 1e-9
+    with pytest.raises(SourceError, match="time of 3 posed frames or more, got 0 of 9") as refused:
         place_by_path(data, late)
+    assert f"it has {100 + first_s:.1f} to {100 + last_s:.1f} s, the frames {first_s:.1f} to" in str(
+        refused.value
+    )
     two = Trajectory(data.t_source_ns[:2] * 1e-9, data.T_world_cam[:2])
     with pytest.raises(SourceError, match="got 2 of 9"):
         place_by_path(data, two)
