@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from semcast.cli import VERBS, verb_parser
+from semcast.common import keys
 from semcast.evaluation.markdown import with_part
 from semcast.evaluation.path_tables import readme_table
 from semcast.evaluation.results_page import (
@@ -75,6 +76,22 @@ def test_the_table_of_messages_is_up_to_date():
     assert "`payload_format`" in page
     with pytest.raises(ValueError, match="must hold <!-- messages -->"):
         with_messages("a page without the marks")
+
+
+def test_the_keys_that_the_page_on_messages_tells_are_those_in_use():
+    page = (ROOT / "docs/file-formats.md").read_text(encoding="utf-8")
+    by_kind = ("camera", "source", "link", "flow", "channel", "pose", "metric_pose", "map")
+    for kind in by_kind:
+        assert f"| `{kind}` |" in page
+        assert getattr(keys, f"{kind}_key")("agent0") == f"semcast/agent0/{kind}"
+    for key in (
+        keys.tx_key("agent0"),
+        keys.status_key("agent0", "server").replace("server", "<role>"),
+        keys.control_key("agent0", "server").replace("server", "<role>"),
+    ):
+        assert f"`{key.replace('agent0', '<agent>')}`" in page
+    assert keys.rx_key("agent0").endswith("/rx/symbols")
+    assert "`.../rx/symbols`" in page
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
