@@ -86,7 +86,10 @@ def unpack(data: bytes, expected: type[M]) -> M:
         raise WireError(err.reason, f"{wanted}: {err}") from err
     version = values.get("version")
     if type(version) is not int or version != PROTOCOL_VERSION:
-        text = f"{wanted}: protocol version must be {PROTOCOL_VERSION}, got {str(version)[:20]}"
+        text = (
+            f"{wanted}: protocol version must be {PROTOCOL_VERSION}, got {str(version)[:20]}: install the same "
+            "version of semcast on both ends"
+        )
         raise WireError("version", text)
     kind = values.get("kind")
     if type(kind) is not str or kind != wanted:
