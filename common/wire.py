@@ -87,8 +87,8 @@ def unpack(data: bytes, expected: type[M]) -> M:
     version = values.get("version")
     if type(version) is not int or version != PROTOCOL_VERSION:
         text = (
-            f"{wanted}: protocol version must be {PROTOCOL_VERSION}, got {str(version)[:20]}: install the same "
-            "version of semcast on both ends"
+            f"{wanted}: protocol version must be {PROTOCOL_VERSION}, got {str(version)[:20]}: install the "
+            "same version of semcast on both ends"
         )
         raise WireError("version", text)
     kind = values.get("kind")

@@ -308,7 +308,10 @@ def test_a_flood_of_nonsense_does_not_hide_what_is_wrong(ends, make, caplog):
     values = {**msgpack.unpackb(pack(make(0))), "version": 2}
     e.rx.put(msgpack.packb(values))
     until(lambda: e.metrics.drops.get("protocol") == 121)
-    refused = "a message was refused: symbols: protocol version must be 1, got 2"
+    refused = (
+        "a message was refused: symbols: protocol version must be 1, got 2: install the same version of "
+        "semcast on both ends"
+    )
     assert refused in caplog.text
     assert e.metrics.status(0).last_error == refused
 
