@@ -79,7 +79,7 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
         write_result(settings.json, report)
     if settings.out is not None:
         tables = {
-            snr_label(snr_db, settings.link): result["pixel"]["reliability"]
+            f"SNR {snr_label(snr_db, settings.link)}": result["pixel"]["reliability"]
             for snr_db, result in zip(settings.snr_db, report["results"], strict=True)
         }
         label = f"1 - tanh({settings.pixel_alpha:g} |error|)"

@@ -5,10 +5,19 @@ import pytest
 
 from semcast.channel.settings import ChannelSettings
 from semcast.common.errors import ConfigError
+from semcast.evaluation import confidence
 from semcast.evaluation.confidence import ConfidenceSettings, evaluate_confidence
+from semcast.evaluation.plots import plot_reliability
 
 
-def test_confidence_is_graded_per_snr_and_written(room, phase_codec, tmp_path):
+def test_confidence_is_graded_per_snr_and_written(room, phase_codec, tmp_path, monkeypatch):
+    curves = []
+
+    def watched(path, tables, observed, title):
+        curves.extend(tables)
+        plot_reliability(path, tables, observed, title)
+
+    monkeypatch.setattr(confidence, "plot_reliability", watched)
     settings = ConfidenceSettings(
         sequence=room,
         codec="phase",
@@ -21,6 +30,7 @@ def test_confidence_is_graded_per_snr_and_written(room, phase_codec, tmp_path):
     report = evaluate_confidence(settings, phase_codec)
     assert json.loads(settings.json.read_text()) == report
     assert cv2.imread(str(tmp_path / "reliability.png")) is not None
+    assert curves == ["SNR 4 dB", "SNR 20 dB"]
     low, high = report["results"]
     assert (low["snr_db"], high["snr_db"]) == (4.0, 20.0)
     assert low["psnr_db"] < high["psnr_db"]
