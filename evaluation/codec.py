@@ -26,7 +26,7 @@ from semcast.common.codec import (
     Modulation,
     ReceivedImage,
 )
-from semcast.common.codecs import LEARNED_CODECS, load_codec
+from semcast.common.codecs import LEARNED_CODECS, is_conventional, load_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.image import psnr_db
@@ -246,7 +246,8 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         write_result(settings.json, report)
     if settings.out is not None:
         if settings.link.channel != "trace":
-            _draw(settings, settings.out, results)
+            learned = {codec.modulation for codec in under_name.values() if not is_conventional(codec.name)}
+            _draw(settings, sorted(learned), results)
         label = snr_file_label(strip_snr_db, settings.link)
         write_picture_strip(settings.out / f"pictures_{label}.png", strip)
     return dict(report)
@@ -376,13 +377,25 @@ def _strip_row(
     return row
 
 
-def _draw(settings: CodecSettings, folder: Path, results: list[dict[str, Any]]) -> None:
-    """Draw PSNR and SSIM over SNR (Fig. 7 and 8 of the paper), with the link they were measured over."""
+def _draw(settings: CodecSettings, modulations: list[str], results: list[dict[str, Any]]) -> None:
+    """Draw PSNR and SSIM over SNR (Fig. 7 and 8 of the paper), with the link they were measured over.
+
+    Args:
+        settings: With ``out``.
+        modulations: Those of learned codecs; conventional ones have their own.
+        results: Rows of the report.
+    """
+    assert settings.out is not None
     order = sorted(settings.snr_db)
     num_images = len(results[0]["images"])
-    title = (
-        f"{settings.link.channel}, {settings.modulation}, CBR {settings.rate}, "
-        f"mean of {num_images} image{'s' if num_images > 1 else ''}"
+    sent = [f"{modulation} (learned codecs)" for modulation in modulations]
+    title = ", ".join(
+        [
+            settings.link.channel,
+            *sent,
+            f"CBR {settings.rate}",
+            f"mean of {num_images} image{'s' if num_images > 1 else ''}",
+        ]
     )
     names = list(dict.fromkeys(row["codec"] for row in results))
     for key, file_name, label in (
@@ -393,4 +406,4 @@ def _draw(settings: CodecSettings, folder: Path, results: list[dict[str, Any]]) 
         values = {(row["codec"], row["snr_db"]): row[key] for row in results}
         curves = {name: [values[name, s] for s in order] for name in names}
         if any(v is not None for curve in curves.values() for v in curve):
-            plot_against_snr(folder / file_name, order, curves, label, title)
+            plot_against_snr(settings.out / file_name, order, curves, label, title)

@@ -163,7 +163,7 @@ def test_result_curves_and_pictures_are_written(report):
     assert strip.shape[1] == 3 * 384 + 2 * 4
 
 
-def test_curves_and_pictures_say_what_they_are_of(folder, tmp_path, monkeypatch):
+def test_curves_and_pictures_say_what_they_are_of(folder, phase_codec, tmp_path, monkeypatch):
     titles, labels = [], []
     monkeypatch.setattr(
         codec_evaluation,
@@ -177,8 +177,12 @@ def test_curves_and_pictures_say_what_they_are_of(folder, tmp_path, monkeypatch)
             images=folder, codec=("jpeg-ldpc",), snr_db=(10.0,), link=link, max_images=1, out=tmp_path
         )
     )
-    assert set(titles) == {"erasure, 16qam, CBR 1/16, mean of 1 image"}
+    assert set(titles) == {"erasure, CBR 1/16, mean of 1 image"}
     assert re.fullmatch(r"jpeg-ldpc: \d+\.\d\d dB, SSIM \d\.\d{3}", labels[1])
+    titles.clear()
+    settings = CodecSettings(images=folder, codec=("phase",), snr_db=(10.0,), max_images=2, out=tmp_path)
+    evaluate_codec(settings, [phase_codec])
+    assert set(titles) == {f"awgn, {phase_codec.modulation} (learned codecs), CBR 1/16, mean of 2 images"}
 
 
 def test_the_same_seed_gives_the_same_figures(folder, report):
