@@ -266,7 +266,7 @@ def test_a_ros_bag_is_described_by_what_a_sequence_can_be_made_of(tmp_path):
 
 def test_a_ros_bag_is_told_where_nothing_can_read_it(tmp_path, monkeypatch):
     monkeypatch.setattr("semcast.describe.find_spec", lambda name: None)
-    assert "semcast[ros]" in text_of(ros_bag(tmp_path))
+    assert "pip install '.[ros]'" in text_of(ros_bag(tmp_path))
 
 
 def test_a_bag_unpacked_is_a_sequence(tmp_path, capsys):

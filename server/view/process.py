@@ -36,7 +36,9 @@ def rerun_binary() -> Path:
     for name in ("rerun", "rerun.exe", "Rerun.app/Contents/MacOS/Rerun"):
         if spec is not None and (folder / name).exists():
             return folder / name
-    raise ConfigError("no Rerun viewer is installed: pip install 'semcast[server]', or use --view none")
+    raise ConfigError(
+        "no Rerun viewer is installed: pip install '.[server]' in a checkout of semcast, or use --view none"
+    )
 
 
 def window_display() -> str | None:

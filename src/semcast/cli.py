@@ -284,9 +284,10 @@ def _run(words: list[str]) -> int:
     except ModuleNotFoundError as err:
         if debug or (err.name or "").startswith("semcast"):
             raise
+        # Nothing is released yet, so a package index has no semcast, or another.
         print(
-            f"semcast {verb}: the package {err.name!r} is not installed; "
-            f"install semcast with the extra this verb needs: 'semcast[{_EXTRAS.get(verb, 'server')}]'",
+            f"semcast {verb}: the package {err.name!r} is not installed; install semcast with the extra this "
+            f"verb needs, in its checkout: pip install '.[{_EXTRAS.get(verb, 'server')}]'",
             file=sys.stderr,
         )
         return EXIT_ERROR

@@ -77,7 +77,7 @@ def describe_bag(path: Path) -> list[Section]:
     """Say what of a ROS bag can be made a sequence."""
     if find_spec("rosbags") is None:
         return [
-            (f"ROS bag {path}", [("topics", "can't be read: install semcast with the extra 'semcast[ros]'")])
+            (f"ROS bag {path}", [("topics", "can't be read: pip install '.[ros]' in a checkout of semcast")])
         ]
     from semcast.agent.ros_bag import RosBag
 
