@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform
-from semcast.server.geometry.whereabouts import Whereabouts
+from semcast.server.geometry.whereabouts import Step, Whereabouts, mean_way
 
 Array = NDArray[np.float64]
 
@@ -31,8 +31,7 @@ class ConstantVelocity:
         self._last: tuple[int, Array] | None = None
         self._rotation_rad_per_s: Array = np.zeros(3)
         self._translation_per_s: Array = np.zeros(3)
-        self._ways: list[tuple[float, Array]] = []
-        self._steps: list[tuple[float, Array]] = []
+        self._steps: list[Step] = []
 
     def reset(self) -> None:
         """Forget the motion."""
@@ -45,8 +44,7 @@ class ConstantVelocity:
 
     def _way_per_s(self) -> Array:
         """Mean translation per second in the camera's own frame: turning does not shorten it, noise does."""
-        elapsed_s = sum(interval_s for interval_s, _ in self._ways)
-        return sum((way for _, way in self._ways), np.zeros(3)) / elapsed_s if self._ways else np.zeros(3)
+        return mean_way(self._steps, _SPEED_S)
 
     def observe(self, t_source_ns: int, T_world_cam: Array) -> None:
         """Take the pose of a frame, in the map's unit.
@@ -58,19 +56,16 @@ class ConstantVelocity:
             elapsed_s = (t_source_ns - t_ns) * 1e-9
             if 0.0 < elapsed_s <= MAX_EXTRAPOLATION_S:
                 T_before_now = invert_transform(T_world_before) @ T_world_cam
-                self._rotation_rad_per_s = log_so3(T_before_now[:3, :3]) / elapsed_s
+                turn = log_so3(T_before_now[:3, :3])
+                self._rotation_rad_per_s = turn / elapsed_s
                 self._translation_per_s = T_before_now[:3, 3] / elapsed_s
-                self._steps.append((elapsed_s, T_before_now))
-                while sum(interval_s for interval_s, _ in self._steps[1:]) >= _MEMORY_S:
+                # The way of a whole interval is in the frame in which that began: the camera turned on it.
+                self._steps.append((elapsed_s, T_before_now, exp_so3(-0.5 * turn) @ T_before_now[:3, 3]))
+                while sum(step_s for step_s, _, _ in self._steps[1:]) >= _MEMORY_S:
                     del self._steps[0]
-                # A way is that of a whole interval in the frame in which that began: the camera turned on it.
-                half_back = exp_so3(-0.5 * elapsed_s * self._rotation_rad_per_s)
-                self._ways.append((elapsed_s, half_back @ T_before_now[:3, 3]))
-                while sum(interval_s for interval_s, _ in self._ways[1:]) >= _SPEED_S:
-                    del self._ways[0]
             else:
                 self._rotation_rad_per_s, self._translation_per_s = np.zeros(3), np.zeros(3)
-                self._ways, self._steps = [], []
+                self._steps = []
         self._last = (t_source_ns, T_world_cam.copy())
 
     def correct(self, T_world_cam: Array, scale: float = 1.0) -> None:
@@ -78,9 +73,11 @@ class ConstantVelocity:
         if self._last is not None:
             self._last = (self._last[0], T_world_cam.copy())
             self._translation_per_s = self._translation_per_s * scale
-            self._ways = [(interval_s, scale * way) for interval_s, way in self._ways]
             if scale != 1.0:
-                self._steps = [(s, make_transform(T[:3, :3], scale * T[:3, 3])) for s, T in self._steps]
+                self._steps = [
+                    (step_s, make_transform(T[:3, :3], scale * T[:3, 3]), scale * way)
+                    for step_s, T, way in self._steps
+                ]
 
     def predict(self, t_source_ns: int) -> Array | None:
         """``T_world_cam`` expected at a time, None without any pose.
@@ -110,7 +107,7 @@ class ConstantVelocity:
         elapsed_s = (t_source_ns - t_ns) * 1e-9
         if not 0.0 < elapsed_s <= MAX_GAP_S:
             return None
-        return Whereabouts.after(T_world_last, self.way_in(elapsed_s), elapsed_s, self._steps, depth)
+        return Whereabouts.after(T_world_last, elapsed_s, self._steps, depth)
 
     def bridge(
         self, t_source_ns: int, T_after_later: Array, later_s: float, turned: Sequence[tuple[int, Array]] = ()

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.geometry import rotation_angle_deg
+from semcast.common.geometry import make_transform, rotation_angle_deg
 from semcast.server.geometry.motion import ConstantVelocity
 from semcast.server.mapping.world_map import Keyframe
 
@@ -62,9 +62,12 @@ def may_join(
     there = motion.whereabouts(first.t_source_ns, depth)
     if there is None:
         return True
-    began, ended = (T_join[:3, :3] @ (scale * k.T_world_cam[:3, 3]) + T_join[:3, 3] for k in (first, newest))
-    slack = _WAY_SHARE * float(np.linalg.norm(ended - began))
-    return float(np.linalg.norm(began - there.centre)) <= there.radius + slack
+    T_began, T_ended = (
+        make_transform(T_join[:3, :3] @ T[:3, :3], T_join[:3, :3] @ (scale * T[:3, 3]) + T_join[:3, 3])
+        for T in (first.T_world_cam, newest.T_world_cam)
+    )
+    slack = _WAY_SHARE * float(np.linalg.norm(T_ended[:3, 3] - T_began[:3, 3]))
+    return there.astray(T_began) <= there.radius + slack
 
 
 def _is_gap(before_ids: Ids, first_id: int) -> bool:

@@ -197,15 +197,25 @@ class MapBuilder:
             T_world_guess: Where its motion leads the camera, None where that is not known.
             whereabouts: Where it can be in the submap of the newest keyframe, None for anywhere.
         """
-        last = self.world.keyframes[-1].submap
+        last, noise = self.world.keyframes[-1].submap, self.noise.model
+        astray: list[Place] = []
 
         def is_possible(place: Place) -> bool:
-            return whereabouts is None or place.submap != last or whereabouts.holds(place.T_world_cam)
+            if whereabouts is None or place.submap != last or whereabouts.holds(place.T_world_cam):
+                return True
+            astray.append(place)
+            return False
 
-        noise = self.noise.model
         place = self.relocaliser.find(sight, self.world, noise, is_possible=is_possible)
         if place is None:
             place = self._wide.find(sight, self.world, self.images, noise, T_world_guess)
+        if place is not None and is_possible(place):
+            return place
+        if whereabouts is None or not astray:
+            return None
+        # The next one of a row of equal things is turned alike: that and the motion tell where the camera is.
+        T_world_cam = whereabouts.turned_alike(astray[0].T_world_cam)
+        place = self._wide.look(sight, self.world, self.images, noise, T_world_cam)
         return place if place is None or is_possible(place) else None
 
     def resembles(self, tracks: TrackTable, sight: Sight, T_world_cam: Array, ids: Ids) -> bool:

@@ -5,6 +5,7 @@ for a second sees it turned and from elsewhere. What looks as it did there, once
 it, proves the place, and says to a fraction of a pixel where each landmark is.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,8 @@ _MIN_FIRST = 8
 #: Share of a keyframe's landmarks that must look as they did where the pose has them, one for each round of
 #: looking: the first pose is a rough one.
 _LEAST_SHARES = (0.0, 0.0, 0.2)
+#: Where a pose is expected and nothing was matched, the images are so many times smaller in those rounds.
+_COARSE = (4, 2, 1)
 #: Share of those that must agree with the pose of the next round.
 _MIN_AGREEING_SHARE = 0.5
 _ALIGNED_SIGMA_PX = 1.0
@@ -135,24 +138,42 @@ class WideRecogniser:
             noise: Of observations.
             T_world_guess: Where the camera's motion leads, where that is known.
         """
-        there = [(image, world.keyframe(image.frame_id)) for image in images.newest(_NUM_KEYFRAMES)]
-        newest = [(image, keyframe) for image, keyframe in reversed(there) if keyframe is not None]
-        if not newest:
+        views = _newest_views(world, images)
+        if not views:
             return None
         last_id, num_looked = self._looked_for
-        newest_id = newest[0][1].frame_id
+        newest_id = views[0].keyframe.frame_id
         num_looked = num_looked if newest_id == last_id else 0
         if num_looked == _MAX_FRAMES:
             return None
         self._looked_for = newest_id, num_looked + 1
-        self._known = [(image, known) for image, known in self._known if any(image is i for i, _ in newest)]
-        views = [_View.of(image, keyframe, world) for image, keyframe in newest]
+        self._known = [(image, known) for image, known in self._known if any(image is v.image for v in views)]
         guesses = [None] if T_world_guess is None else [invert_transform(T_world_guess), None]
         for T_cam_world in guesses:
             for view in views:
-                found = self._proved(sight, view, self._search(sight, view, noise, T_cam_world), noise)
+                searched = self._search(sight, view, noise, T_cam_world)
+                found = None if searched is None else self._proved(sight, view, searched.T_cam_world, noise)
                 if found is not None:
                     return self._place(sight, view, views, found, noise)
+        return None
+
+    def look(
+        self, sight: Sight, world: WorldMap, images: KeyframeImages, noise: NoiseModel, T_world_cam: Array
+    ) -> Place | None:
+        """Look for the place of an image at an expected pose only, by patches that need no match.
+
+        Args:
+            sight: The image.
+            world: The map.
+            images: Of keyframes.
+            noise: Of observations.
+            T_world_cam: The pose, turned to a degree and as near as things move by some ten pixels.
+        """
+        views = _newest_views(world, images)
+        for view in views:
+            found = self._proved(sight, view, invert_transform(T_world_cam), noise, _COARSE)
+            if found is not None:
+                return self._place(sight, view, views, found, noise)
         return None
 
     def _features_of(self, image: SeenFrom) -> WideFeatures:
@@ -194,18 +215,23 @@ class WideRecogniser:
         return self._camera.project(transform_points(T_cam_world, points))
 
     def _proved(
-        self, sight: Sight, view: _View, found: PoseEstimate | None, noise: NoiseModel
+        self,
+        sight: Sight,
+        view: _View,
+        T_cam_world: Array,
+        noise: NoiseModel,
+        coarse: Sequence[int] = (1, 1, 1),
     ) -> PoseEstimate | None:
         """Pose of landmarks that look as a keyframe saw them, None where those are too few."""
-        for least_share in _LEAST_SHARES:
-            if found is None:
-                return None
-            aligned = self._aligned(sight, view, found.T_cam_world)
+        found = None
+        for least_share, by in zip(_LEAST_SHARES, coarse, strict=True):
+            aligned = self._aligned(sight, view, T_cam_world, by)
             if len(aligned.ids) < max(_MIN_FIRST, least_share * aligned.num_looked_for):
                 return None
-            found = self._refined(found, aligned.xyz, aligned.xy, noise)
+            found = self._refined(T_cam_world, aligned.xyz, aligned.xy, noise, by)
             if found.num_inliers < max(_MIN_FIRST, _MIN_AGREEING_SHARE * len(aligned.ids)):
                 return None
+            T_cam_world = found.T_cam_world
         return found
 
     def _place(
@@ -226,19 +252,19 @@ class WideRecogniser:
         # Where several saw a landmark, the place is that of the first: the view that was recognised.
         ids, first = np.unique(np.concatenate([a.ids for a in each]), return_index=True)
         xyz, xy = (np.concatenate([getattr(a, name) for a in each])[first] for name in ("xyz", "xy"))
-        pose = self._refined(found, xyz, xy, noise)
+        pose = self._refined(found.T_cam_world, xyz, xy, noise)
         good, keyframe = pose.inliers, proved.keyframe
         T_world_cam = invert_transform(pose.T_cam_world)
         return Place(T_world_cam, keyframe.frame_id, ids[good], xy[good], keyframe.submap)
 
-    def _aligned(self, sight: Sight, view: _View, T_cam_world: Array) -> _Aligned:
-        """Look for all landmarks of a keyframe where a pose has them."""
+    def _aligned(self, sight: Sight, view: _View, T_cam_world: Array, by: int = 1) -> _Aligned:
+        """Look for all landmarks of a keyframe where a pose has them, in images reduced by a factor."""
         depth0 = transform_points(invert_transform(view.keyframe.T_world_cam), view.xyz)[:, 2]
         expected = self._camera.project(transform_points(T_cam_world, view.xyz))
         rows = np.flatnonzero(sight.shows(expected, _BORDER_PX) & (depth0 > 0.0))
         T_cam_keyframe = T_cam_world @ view.keyframe.T_world_cam
         warps, depth1 = affine_warps(self._camera, T_cam_keyframe, view.xy[rows], depth0[rows])
-        there, here = _reductions(warps)
+        there, here = (by * reduction for reduction in _reductions(warps))
         warps = warps * (there / here)
         alike = seen_alike(warps, depth1)
         rows, warps = rows[alike], warps[alike]
@@ -252,10 +278,18 @@ class WideRecogniser:
         xy = _in_reduced(patches.xy[fits], 1.0 / here)
         return _Aligned(view.ids[kept], view.xyz[kept], xy, len(rows))
 
-    def _refined(self, found: PoseEstimate, xyz: Array, xy: Array, noise: NoiseModel) -> PoseEstimate:
-        """Pose of landmarks that were found."""
-        sigma = np.full(len(xyz), max(_ALIGNED_SIGMA_PX, noise.sigma0_px))
-        return refine_pose(self._camera, found.T_cam_world, xyz, xy, sigma, GATE_SIGMAS * sigma)
+    def _refined(
+        self, T_cam_world: Array, xyz: Array, xy: Array, noise: NoiseModel, by: int = 1
+    ) -> PoseEstimate:
+        """Pose of landmarks that were found, in images reduced by a factor."""
+        sigma = np.full(len(xyz), by * max(_ALIGNED_SIGMA_PX, noise.sigma0_px))
+        return refine_pose(self._camera, T_cam_world, xyz, xy, sigma, GATE_SIGMAS * sigma)
+
+
+def _newest_views(world: WorldMap, images: KeyframeImages) -> list[_View]:
+    """What the newest keyframes with an image saw, newest first."""
+    there = [(image, world.keyframe(image.frame_id)) for image in images.newest(_NUM_KEYFRAMES)]
+    return [_View.of(image, keyframe, world) for image, keyframe in reversed(there) if keyframe is not None]
 
 
 def _reductions(warps: Array) -> tuple[int, int]:

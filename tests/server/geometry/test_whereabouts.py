@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from semcast.common.geometry import exp_so3, make_transform
+from semcast.common.geometry import exp_se3, exp_so3, make_transform
 from semcast.server.geometry.motion import MAX_GAP_S, ConstantVelocity
 from semcast.server.geometry.whereabouts import Whereabouts
 
@@ -25,7 +25,7 @@ def at_x(x, turn_deg=0.0):
 def test_a_camera_that_went_straight_on_is_neither_back_nor_twice_as_far():
     motion, last_ns = went(0.2 * np.arange(30))
     there = motion.whereabouts(last_ns + 1_000_000_000, depth=1.0)
-    assert np.allclose(there.centre, (5.8 + 2.0, 0.0, 0.0))
+    assert np.isclose(there.astray(at_x(5.8 + 2.0 + 0.7)), 0.7)
     assert np.isclose(there.radius, 0.6 * 2.0)
     assert there.holds(at_x(7.8))
     assert there.holds(at_x(6.8, turn_deg=40.0)), "it stopped half-way"
@@ -55,7 +55,7 @@ def test_the_unit_of_the_map_changes_all_of_it():
     motion.correct(at_x(3.0 * x[-1]), 3.0)
     after = motion.whereabouts(last_ns + 700_000_000, depth=0.3)
     assert np.isclose(after.radius, 3.0 * before.radius)
-    assert np.allclose(after.centre, 3.0 * before.centre)
+    assert np.isclose(after.astray(at_x(3.0 * x[-1] + 3.0)), 3.0 * before.astray(at_x(x[-1] + 1.0)))
 
 
 def test_what_is_long_ago_or_unknown_tells_nothing():
@@ -65,11 +65,34 @@ def test_what_is_long_ago_or_unknown_tells_nothing():
     assert ConstantVelocity().whereabouts(1, depth=1.0) is None
 
 
-@pytest.mark.parametrize("num", [0, 1, 3])
-def test_few_steps_tell_nothing_of_how_far_it_strays(num):
-    steps = [(FRAME_S, at_x(0.2))] * num
-    there = Whereabouts.after(np.eye(4), np.array([2.0, 0.0, 0.0]), 1.0, steps, depth=0.5)
-    assert np.isclose(there.radius, 1.2)
+@pytest.mark.parametrize(("num", "radius"), [(0, 0.3 * 0.5), (1, 0.6 * 2.0), (3, 0.6 * 2.0)])
+def test_few_steps_tell_nothing_of_how_far_it_strays(num, radius):
+    steps = [(FRAME_S, at_x(0.2), np.array([0.2, 0.0, 0.0]))] * num
+    assert np.isclose(Whereabouts.after(np.eye(4), 1.0, steps, depth=0.5).radius, radius)
+
+
+def test_bends_are_no_straying():
+    """A robot goes straight on and turns by 90 degrees in turn, a second each; the next door is 2 m on."""
+    turns = np.repeat(np.tile((0.0, np.pi / 2), 6), 10) * FRAME_S
+    T_world_cam = [np.eye(4)]
+    for turn in turns:
+        T_world_cam.append(T_world_cam[-1] @ exp_se3((0.0, turn, 0.0, 0.0, 0.0, 1.5 * FRAME_S)))
+    next_door = make_transform(np.eye(3), (0.0, 0.0, 2.0))
+    motion = ConstantVelocity()
+    for k, T_world_now in enumerate(T_world_cam[:-10]):
+        motion.observe(round(k * FRAME_S * 1e9), T_world_now)
+        if k >= 80:
+            there = motion.whereabouts(round((k + 10) * FRAME_S * 1e9), depth=2.0)
+            after = T_world_cam[k + 10]
+            assert there.holds(after)
+            assert not there.holds(after @ next_door)
+            assert not there.holds(after @ np.linalg.inv(next_door))
+
+
+def test_a_camera_that_looks_aside_may_have_gone_straight_on():
+    motion, last_ns = went(0.2 * np.arange(30))
+    there = motion.whereabouts(last_ns + 1_000_000_000, depth=1.0)
+    assert np.isclose(there.astray(at_x(7.8, turn_deg=90.0)), 0.0)
 
 
 def test_a_hand_that_has_just_begun_to_turn_back_may_be_far_off():

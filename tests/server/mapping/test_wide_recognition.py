@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from semcast.common.geometry import invert_transform, rotation_angle_deg, transform_points
+from semcast.common.geometry import (
+    exp_so3,
+    invert_transform,
+    make_transform,
+    rotation_angle_deg,
+    transform_points,
+)
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.scenes.orbit import Orbit
 from semcast.evaluation.scenes.render import frame_of
@@ -129,3 +135,23 @@ def test_what_is_not_found_in_eight_frames_is_not_looked_for_any_more(mapped):
         assert find(mapped, nothing, recogniser) is None
     assert find(mapped, seen, recogniser) is not None
     assert find(mapped, seen, recogniser) is None
+
+
+def look(mapped, sight, T_world_cam):
+    sequence, reconstruction = mapped
+    recogniser = WideRecogniser(sequence.intrinsics, seed=0)
+    return recogniser.look(sight, reconstruction.world, reconstruction._map.images, NOISE, T_world_cam)
+
+
+def test_a_pose_that_is_nearly_right_is_proved_by_how_things_look_there_and_another_is_not(mapped):
+    """A degree off it is put right; one that looks at something else is refused."""
+    sequence, _ = mapped
+    k = NUM_MAPPED + 3
+    sight = sight_of(sequence.image(k), k)
+    true = find(mapped, sight).T_world_cam
+    for turn_rad in ((0.0, 0.02, 0.0), (0.01, 0.01, 0.01)):
+        place = look(mapped, sight, true @ make_transform(exp_so3(turn_rad), np.zeros(3)))
+        assert place is not None
+        assert len(place.ids) > 100
+        assert rotation_angle_deg(place.T_world_cam[:3, :3].T @ true[:3, :3]) < 0.2
+    assert look(mapped, sight, true @ make_transform(exp_so3((0.0, 0.2, 0.0)), np.zeros(3))) is None
