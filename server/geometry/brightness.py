@@ -30,7 +30,9 @@ _MIN_CHANGE_GREY = 1.5
 _CHANCE_SIGMAS = 4.0
 
 
-def brightness_change(grey0: Grey, grey1: Grey, xy0: Array, xy1: Array) -> tuple[float, float] | None:
+def brightness_change(
+    grey0: Grey, grey1: Grey, xy0: Array, xy1: Array, patch_px: int = _PATCH_PX
+) -> tuple[float, float] | None:
     """Fit ``grey1 = gain * grey0 + offset`` to patches around the same points, robustly.
 
     Args:
@@ -38,12 +40,13 @@ def brightness_change(grey0: Grey, grey1: Grey, xy0: Array, xy1: Array) -> tuple
         grey1: Second image.
         xy0: ``(N, 2)`` points in the first image.
         xy1: ``(N, 2)`` the same in the second image; some may be wrong.
+        patch_px: Side of the patches, odd: the larger, the less it matters that all are wrong by a little.
 
     Returns:
         Gain and offset in grey levels; None where points are too few, or where the change is too small to
         matter or no larger than chance would have it.
     """
-    before, after = _patch_means(grey0, xy0), _patch_means(grey1, xy1)
+    before, after = _patch_means(grey0, xy0, patch_px), _patch_means(grey1, xy1, patch_px)
     inside = (np.minimum(before, after) > _DARKEST) & (np.maximum(before, after) < _BRIGHTEST)
     before, after = before[inside], after[inside]
     if len(before) < _MIN_POINTS or abs(np.median(after - before)) < 0.5 * _MIN_CHANGE_GREY:
@@ -71,9 +74,9 @@ def with_brightness(grey: Grey, gain: float, offset: float) -> Grey:
     return np.asarray(cv2.LUT(grey, levels), dtype=np.uint8)
 
 
-def _patch_means(grey: Grey, xy: Array) -> Array:
+def _patch_means(grey: Grey, xy: Array, patch_px: int) -> Array:
     height, width = grey.shape
-    mean = cv2.blur(grey, (_PATCH_PX, _PATCH_PX))
+    mean = cv2.blur(grey, (patch_px, patch_px))
     nearest = np.rint(np.nan_to_num(xy))
     x = np.clip(nearest[:, 0], 0, width - 1).astype(np.intp)
     y = np.clip(nearest[:, 1], 0, height - 1).astype(np.intp)

@@ -55,6 +55,13 @@ _MAX_DISTANCE_COUNTED, _MAX_RATIO_COUNTED = 60, 0.75
 _MOSTLY_FOUND = 0.6
 #: and pyramid levels of the second search then.
 _LEVELS_ANEW = 1
+#: Points that tell whether guesses are near, though the exposure may be another one: of at least this factor
+#: as many, or all are as soon found;
+_NUM_SCOUTS, _LEAST_STEP = 40, 3
+#: the share of them that must be found, and how far from where they are guessed they typically may be.
+_SCOUTS_FOUND, _NEAR_PX = 0.4, 2.0
+#: Two changes of brightness are one where they make as much of these grey levels, but for so much.
+_LEVELS_GREY, _SAME_LIGHT_GREY = np.array([64.0, 192.0]), 2.0
 #: With fewer, what they tell is right if it finds this factor as many.
 _CLEARLY_MORE = 1.2
 
@@ -252,18 +259,21 @@ def track_through_light(
     count = len(xy0)
     if count == 0 or grey0.shape != grey1.shape:
         return TrackedPoints.none(count), None
-    found = _search(grey0, grey1, xy0, guess1_xy, max_forward_backward_px, max_level)
-    like_second, told = grey0, None
+    told = _light_at_guesses(grey0, grey1, xy0, guess1_xy, max_level)
+    like_second = _in_light(grey0, told)
+    found = _search(like_second, grey1, xy0, guess1_xy, max_forward_backward_px, max_level)
     for _ in range(2):
         # Where hardly any was found, the guesses are near enough for a first idea of the change.
         is_sure = bool(found.ok.mean() >= _MOSTLY_FOUND)
         rows = found.ok if is_sure else np.ones(count, bool)
         xy1 = np.where(found.ok[:, None], found.xy, guess1_xy)
         change = brightness_change(grey0, grey1, xy0[rows], xy1[rows])
-        if change is None:
+        alike = _in_light(grey0, change)
+        if _is_same_light(told, change):
+            if is_sure:
+                like_second, told = alike, change
             break
         levels = min(_LEVELS_ANEW, max_level) if is_sure else max_level
-        alike = with_brightness(grey0, *change)
         anew = _search(alike, grey1, xy0, xy1, max_forward_backward_px, levels)
         if anew.ok.sum() < (1.0 if is_sure else _CLEARLY_MORE) * found.ok.sum():
             break
@@ -271,6 +281,35 @@ def track_through_light(
         if is_sure:
             break
     return _placed(like_second, grey1, xy0, found), told
+
+
+def _light_at_guesses(
+    grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, max_level: int
+) -> tuple[float, float] | None:
+    """Change of brightness where points are guessed to be, so that they need not be looked for twice.
+
+    It is believed where a few of them are found about there. If all guesses are off to one side, light that
+    falls off along a wall looks like a change, and points would be found where it says.
+    """
+    change = brightness_change(grey0, grey1, xy0, guess1_xy, KLT_WINDOW_PX)
+    step = len(xy0) // _NUM_SCOUTS
+    if change is None or step < _LEAST_STEP:
+        return None
+    guess = guess1_xy[::step]
+    found = _search(grey0, grey1, xy0[::step], guess, _MAX_FORWARD_BACKWARD_PX, max_level)
+    if found.ok.mean() < _SCOUTS_FOUND:
+        return None
+    off_px = np.abs(np.median((found.xy - guess)[found.ok], axis=0)).max()
+    return change if off_px < _NEAR_PX else None
+
+
+def _is_same_light(one: tuple[float, float] | None, other: tuple[float, float] | None) -> bool:
+    (gain0, offset0), (gain1, offset1) = one or (1.0, 0.0), other or (1.0, 0.0)
+    return bool(np.abs((gain0 - gain1) * _LEVELS_GREY + offset0 - offset1).max() < _SAME_LIGHT_GREY)
+
+
+def _in_light(grey: Grey, change: tuple[float, float] | None) -> Grey:
+    return grey if change is None else with_brightness(grey, *change)
 
 
 def track_alike(

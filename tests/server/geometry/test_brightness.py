@@ -2,8 +2,9 @@ import cv2
 import numpy as np
 import pytest
 
+from semcast.server.geometry import features
 from semcast.server.geometry.brightness import brightness_change, with_brightness
-from semcast.server.geometry.features import detect_corners, track_points
+from semcast.server.geometry.features import detect_corners, track_points, track_through_light
 
 
 @pytest.fixture
@@ -61,3 +62,38 @@ def test_points_are_followed_to_where_they_are_through_a_change_of_exposure(grey
     monkeypatch.setattr("semcast.server.geometry.features.brightness_change", lambda *_: None)
     without = track_points(grey, moved, corners, corners)
     assert without.ok.mean() < 0.5 * found.ok.mean()
+
+
+@pytest.fixture
+def searches(monkeypatch):
+    """Number of points of each Lucas-Kanade search, there and back being one."""
+    search, counts = features._search, []
+
+    def counted(grey0, grey1, xy0, *how):
+        counts.append(len(xy0))
+        return search(grey0, grey1, xy0, *how)
+
+    monkeypatch.setattr(features, "_search", counted)
+    return counts
+
+
+def test_one_search_is_enough_where_guesses_are_near(grey, searches):
+    corners = detect_corners(grey, 200).astype(np.float64)
+    corners = corners[((corners > 25) & (corners < (294, 214))).all(axis=1)]
+    moved = with_brightness(shifted(grey, 3, 2), 0.95, 0.0)
+    found, (gain, offset) = track_through_light(grey, moved, corners, corners + np.array([2.0, 3.0]))
+    assert searches == [pytest.approx(len(corners) / 3, abs=1), len(corners)], "some, then all, once"
+    assert found.ok.mean() > 0.95
+    assert gain * 100 + offset == pytest.approx(95, abs=1.0)
+
+
+def test_light_that_far_guesses_make_up_is_none(grey, searches):
+    # A wall is brighter the further to the right: where points are guessed to be, but not where they are.
+    scene = np.rint(20 + 0.35 * np.arange(320) + 0.3 * grey).astype(np.uint8)
+    corners = detect_corners(scene, 200).astype(np.float64)
+    corners = corners[((corners > 25) & (corners < (280, 214))).all(axis=1)]
+    guess = corners + np.array([14.0, 0.0])
+    assert brightness_change(scene, scene, corners, guess) is not None
+    found, change = track_through_light(scene, scene, corners, guess)
+    assert change is None
+    assert np.median(np.linalg.norm(found.xy[found.ok] - corners[found.ok], axis=1)) < 0.05
