@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
-from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
 from semcast.common.codecs import load_codec
@@ -72,9 +71,6 @@ class StreamSettings:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        low, high = SNR_RANGE_DB
-        if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
-            raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
         check_snrs(self.snr_db, self.link)
         for name, least in (("seed", 0), ("seeds", 1), ("start", 0)):
             if getattr(self, name) < least:
