@@ -277,6 +277,30 @@ def test_without_one_a_rerun_recording_is_made_of_poses_images_and_points(tmp_pa
     assert {"/world/camera", "/world/camera/image", "/world/map_colour/0000"} <= set(entities)
 
 
+def test_a_rerun_recording_that_is_made_is_looked_at_from_a_distance_of_the_maps_size(
+    tmp_path, arc_run, write_arc_run
+):
+    import rerun as rr
+
+    data, sizes = arc_run(), []
+    for factor in (1.0, 100.0):
+        T_world_cam = data.T_world_cam.copy()
+        T_world_cam[:, :3, 3] *= factor
+        write_arc_run(tmp_path / "run", replace(data, T_world_cam=T_world_cam, xyz=factor * data.xyz))
+        export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
+        at = {}
+        for chunk in rr.chunk.RrdReader(tmp_path / "made.rrd").stream().to_chunks():
+            rows = chunk.to_record_batch()
+            for name in rows.schema.names:
+                at.setdefault((str(chunk.entity_path), name), []).extend(rows.column(name).to_pylist())
+        (frustum,) = at["/world/camera/image", "Pinhole:image_plane_distance"][-1]
+        eye, camera = (
+            np.ravel(at[path, "Transform3D:translation"][0]) for path in ("/world/spectator", "/world/camera")
+        )
+        sizes.append((frustum, np.linalg.norm(eye - camera)))
+    np.testing.assert_allclose(sizes[1], 100.0 * np.array(sizes[0]), rtol=1e-5)
+
+
 @pytest.mark.parametrize("room", [0, 3000])
 def test_a_rerun_recording_that_finds_no_room_is_an_error(tmp_path, arc_run, write_arc_run, room):
     write_arc_run(tmp_path / "run", arc_run())
