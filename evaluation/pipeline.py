@@ -27,6 +27,7 @@ from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.sounding import told_at_first
 from semcast.evaluation.trace_snr import check_snrs
+from semcast.server.mapping.settings import MAX_SEED
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +76,8 @@ class StreamSettings:
         for name, least in (("seed", 0), ("seeds", 1), ("start", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if self.all_seeds[-1] > MAX_SEED:
+            raise ValueError(f"last of the seeds must be at most {MAX_SEED}, got {self.all_seeds[-1]}")
         check_threads(self.threads)
         check_playback(resize=self.resize, stride=self.stride, max_frames=self.max_frames)
 
