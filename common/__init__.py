@@ -66,6 +66,7 @@ Settings, files, processes
     former_file             keeps a file that would be written over
     whole_file              files that are never half written
     npz_file                arrays with a header
+    source_commit           the commit that the code is of
     cores                   processor cores and threads
     heap                    memory that frames take again and again
     interrupts              Ctrl-C

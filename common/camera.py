@@ -133,6 +133,11 @@ class Intrinsics:
         """Image height and width in pixels."""
         return self.height, self.width
 
+    @property
+    def half_diagonal_rad(self) -> float:
+        """Angle from the middle of the view to a corner, taken as if the principal point were the middle."""
+        return float(np.arctan(0.5 * np.hypot(self.width / self.fx, self.height / self.fy)))
+
     def has_shape_of(self, width: int, height: int) -> bool:
         """Whether images of this size have the shape of the camera's, up to a pixel of rounding."""
         return abs(width * self.height - height * self.width) <= max(self.width, width)

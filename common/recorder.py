@@ -63,11 +63,21 @@ class Recorder:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._former = keep_former(path)
             self._stream = path.open("wb")
-            self._writer = RecordingWriter(self._stream, header)
+            self._writer = self._begun(header)
         except OSError as err:
             raise SourceError(f"{path} can't be written: {err}") from err
         self._thread = threading.Thread(target=self._run, name="semcast-recorder", daemon=True)
         self._thread.start()
+
+    def _begun(self, header: Mapping[str, str]) -> RecordingWriter:
+        """Write the first record; where the disk does not take it, all is left as it was."""
+        try:
+            return RecordingWriter(self._stream, header)
+        except OSError:
+            with contextlib.suppress(OSError):  # it has no room for what is left to write, either
+                self._stream.close()
+            self._leave_as_it_was()
+            raise
 
     @property
     def num_written(self) -> int:
@@ -159,20 +169,20 @@ class Recorder:
         if not already and not self._thread.is_alive():
             try:
                 self._stream.close()
-                self._drop_empty()
+                if self.num_written == 0 and self.error is None:
+                    self._leave_as_it_was()
             except OSError as err:
                 logger.error("closing %s failed: %s", self._path, err)
 
-    def _drop_empty(self) -> None:
-        """Leave things as they were where nothing came: a start that fails must not move a good recording."""
-        if self.num_written == 0 and self.error is None:
-            if self._path.is_file():  # not a device, such as /dev/null
-                self._path.unlink()
-            if self._former is not None:
-                self._former.rename(self._path)
-            for folder in self._new_folders:  # the innermost first
-                with contextlib.suppress(OSError):  # somebody else put something in
-                    folder.rmdir()
+    def _leave_as_it_was(self) -> None:
+        """Take the file away again: a start that fails must not move a good recording."""
+        if self._path.is_file():  # not a device, such as /dev/null
+            self._path.unlink()
+        if self._former is not None:
+            self._former.rename(self._path)
+        for folder in self._new_folders:  # the innermost first
+            with contextlib.suppress(OSError):  # somebody else put something in
+                folder.rmdir()
 
     def __enter__(self) -> "Recorder":
         return self

@@ -247,6 +247,11 @@ def read_run(folder: Path) -> RunData:
         raise SourceError(f"{path} is damaged: {err}") from err
 
 
+def files_of_run(folder: Path) -> list[Path]:
+    """Return the files that a run left in its folder, those of results first, without images."""
+    return [folder / name for name in RUN_FILES if (folder / name).is_file()]
+
+
 def image_name(frame_id: int) -> str:
     """Return the file name of a frame's decoded image."""
     return f"{frame_id:06d}.jpg"

@@ -239,11 +239,11 @@ class Session:
         """
         self._subscribe(key, service, lambda sample: deliver(sample.payload.to_bytes()), capacity)
 
-    def subscribe_keyed(self, key: str, service: Service, deliver: Callable[[str, bytes], None]) -> None:
-        """Do as ``subscribe``, with the key of each message: for expressions that match several."""
+    def subscribe_keyed(self, key: str, deliver: Callable[[str, bytes], None]) -> None:
+        """Call ``deliver(key, payload)`` as ``subscribe`` does for every one: a key may match several."""
         self._subscribe(
             key,
-            service,
+            "every",
             lambda sample: deliver(str(sample.key_expr), sample.payload.to_bytes()),
             _FIFO_CAPACITY,
         )

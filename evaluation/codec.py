@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
-from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.codec import (
     DEFAULT_CODEC,
     LABEL_SHARPNESS,
@@ -99,17 +98,13 @@ class CodecSettings:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        low, high = SNR_RANGE_DB
-        if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
-            raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
+        check_snrs(self.snr_db, self.link, _SNRS_DB)
         if not self.codec or len(set(self.codec)) != len(self.codec):
             raise ValueError(f"codec must be one or more different names, got {self.codec}")
         for name, least in (("seed", 0), ("max_images", 1)):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
-        if self.snr_db != _SNRS_DB:
-            check_snrs(self.snr_db, self.link)
         check_threads(self.threads)
 
     @property

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
-from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Codec, Modulation
 from semcast.common.codecs import load_codec
@@ -99,11 +98,7 @@ class DepthSettings:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        low, high = SNR_RANGE_DB
-        if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
-            raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
-        if self.snr_db != _SNRS_DB:
-            check_snrs(self.snr_db, self.link)
+        check_snrs(self.snr_db, self.link, _SNRS_DB)
         for name in ("codec", "confidence"):
             values = getattr(self, name)
             if not values or len(set(values)) != len(values):

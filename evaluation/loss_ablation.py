@@ -20,8 +20,9 @@ from semcast.common.image import psnr_of_mse
 from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
+from semcast.common.source_commit import source_commit
 from semcast.evaluation.calibration import reliability
-from semcast.evaluation.report import check_outputs, json_ready, machine_kind, source_commit, write_result
+from semcast.evaluation.report import check_outputs, json_ready, machine_kind, write_result
 from semcast.evaluation.statistics import spearman
 from semcast.training.channel import LinkDrawSettings, draw_links, through_link
 from semcast.training.data import read_images

@@ -68,6 +68,18 @@ class ImagesSettings:
     def __post_init__(self) -> None:
         if not MIN_FRAMES < self.frames <= 1000:
             raise ValueError(f"frames must be in [{MIN_FRAMES + 1}, 1000], got {self.frames}")
+        self.as_source()  # for its own checks
+
+    def as_source(self) -> SourceSettings:
+        """Return where the frames come from, one after the other as fast as they are taken."""
+        return SourceSettings(
+            source=self.source,
+            layout=self.layout,
+            camera=self.camera,
+            rate_hz=self.rate_hz,
+            max_frames=self.frames,
+            pace="receiver",
+        )
 
 
 @dataclass(frozen=True)
@@ -97,16 +109,7 @@ def load_images(settings: ImagesSettings) -> Images:
     Raises:
         SourceError: Images or intrinsics can't be read, or the images are too few.
     """
-    source = open_source(
-        SourceSettings(
-            source=settings.source,
-            layout=settings.layout,
-            camera=settings.camera,
-            rate_hz=settings.rate_hz,
-            max_frames=settings.frames,
-            pace="receiver",
-        )
-    )
+    source = open_source(settings.as_source())
     try:
         frames, camera = _small_frames(source)
         stored = source.stored_camera

@@ -20,7 +20,7 @@ from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import number, table
 from semcast.evaluation.pair_suite import RECORDINGS
 from semcast.evaluation.pipeline import CLEAN
-from semcast.evaluation.statistics import MIN_SAMPLES, small_sample_factor
+from semcast.evaluation.statistics import MIN_SAMPLES, finite_mean, small_sample_factor
 
 Array = NDArray[np.float64]
 
@@ -183,7 +183,7 @@ def _against_rival(cells: Sequence[Cell]) -> Iterator[str]:
     yield f"`{RIVAL}` excludes zero; by chance alone one in forty does on either side.\n"
     rows = []
     for title, group in _groups(cells):
-        figures = [number(_mean(c.mean(m) for c in group), 1) for m in _METHODS]
+        figures = [number(finite_mean(c.mean(m) for c in group), 1) for m in _METHODS]
         paired = [p for c in group if (p := c.interval("robust", RIVAL)) is not None]
         paired = [p for p in paired if p["low"] is not None]
         better = sum(p["high"] < 0 for p in paired)
@@ -202,7 +202,7 @@ def _against_rival(cells: Sequence[Cell]) -> Iterator[str]:
     )
     hard = [c for c in cells if _is_hard(c)]
     if hard and all(c.mean("oracle") is not None for c in hard):
-        ours, theirs, best = (_mean(c.mean(m) for c in hard) for m in ("robust", RIVAL, "oracle"))
+        ours, theirs, best = (finite_mean(c.mean(m) for c in hard) for m in ("robust", RIVAL, "oracle"))
         yield _paragraph(
             f"In the {len(hard)} hard cells ({BAD_LINK_DB:g} dB and below, both {_HARD_DEG:g} degrees and "
             f"more off) `robust` has {_ratio(hard, 'robust', RIVAL):.2f} times the error of `{RIVAL}`, and "
@@ -215,7 +215,7 @@ def _against_rival(cells: Sequence[Cell]) -> Iterator[str]:
 def _is_hard(cell: Cell) -> bool:
     # By the mean of both: chosen by one of them, its own luck would speak for the other.
     both = [cell.mean("robust"), cell.mean(RIVAL)]
-    mean = _mean(both)
+    mean = finite_mean(both)
     return _is_bad_link(cell) and mean is not None and mean >= _HARD_DEG
 
 
@@ -227,7 +227,7 @@ def _originals(cells: Sequence[Cell]) -> Iterator[str]:
     rows = []
     for title, group in _groups(cells):
         if ";" in title:
-            figures = [number(_mean(c.mean(m) for c in group), 1) for m in _METHODS]
+            figures = [number(finite_mean(c.mean(m) for c in group), 1) for m in _METHODS]
             rows.append([title, str(len(group)), *figures])
     yield from table(["cells of", "number", *_METHODS], rows)
 
@@ -297,10 +297,10 @@ def _with_and_without(cells: Sequence[Cell]) -> Iterator[str]:
 
 def _error_and_gains(cells: Sequence[Cell], rival: str, methods: Sequence[str], figure: str) -> list[str]:
     """Return a rival's mean error and by how much those of others are less, as text."""
-    plain = _mean(c.mean(rival, figure) for c in cells)
+    plain = finite_mean(c.mean(rival, figure) for c in cells)
     texts = [number(plain, 1)]
     for method in methods:
-        ours = _mean(c.mean(method, figure) for c in cells)
+        ours = finite_mean(c.mean(method, figure) for c in cells)
         texts.append("-" if plain is None or ours is None else f"{plain - ours:+.1f}")
     return texts
 
@@ -366,7 +366,7 @@ def _cues(cells: Sequence[Cell]) -> Iterator[str]:
                     found[kind, c.values["features"], cue].append(float(value))
     kinds = sorted({(kind, features) for kind, features, _ in found})
     rows = [
-        [cue, *(number(_mean(found.get((*kind, cue), ()))) for kind in kinds)]
+        [cue, *(number(finite_mean(found.get((*kind, cue), ()))) for kind in kinds)]
         for cue in sorted({cue for _, _, cue in found})
     ]
     yield from table(["cue", *(f"{kind}, {features}" for kind, features in kinds)], rows)
@@ -400,11 +400,6 @@ def _groups(cells: Sequence[Cell]) -> Iterator[tuple[str, list[Cell]]]:
         for cell in cells:
             groups[key(cell)].append(cell)
         yield from groups.items()
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = [v for v in values if v is not None]
-    return float(np.mean(known)) if known else None
 
 
 def _log_ratios(cells: Iterable[Cell], ours: str, theirs: str) -> Array:

@@ -112,7 +112,7 @@ class PairSettings(StreamSettings):
         for name in ("threshold_px", "inlier_px"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name):g}")
-        if self.min_baseline_m < 0 or not 0 <= self.min_baseline_share < 1:
+        if not self.min_baseline_m >= 0 or not 0 <= self.min_baseline_share < 1:
             raise ValueError(
                 "min_baseline_m must be at least 0 and min_baseline_share in [0, 1), "
                 f"got {self.min_baseline_m:g} and {self.min_baseline_share:g}"

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
-from semcast.channel.trace import SNR_RANGE_DB
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
 from semcast.common.codecs import load_codec
@@ -28,6 +27,7 @@ from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.sounding import told_at_first
 from semcast.evaluation.trace_snr import check_snrs
+from semcast.server.mapping.settings import MAX_SEED
 
 logger = logging.getLogger(__name__)
 
@@ -72,13 +72,12 @@ class StreamSettings:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        low, high = SNR_RANGE_DB
-        if not self.snr_db or any(not low <= snr_db <= high for snr_db in self.snr_db):
-            raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {self.snr_db}")
         check_snrs(self.snr_db, self.link)
         for name, least in (("seed", 0), ("seeds", 1), ("start", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        if self.all_seeds[-1] > MAX_SEED:
+            raise ValueError(f"last of the seeds must be at most {MAX_SEED}, got {self.all_seeds[-1]}")
         check_threads(self.threads)
         check_playback(resize=self.resize, stride=self.stride, max_frames=self.max_frames)
 

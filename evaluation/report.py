@@ -2,16 +2,15 @@
 
 import platform
 import shlex
-import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import semcast
 from semcast.common.config_flags import flag_words
 from semcast.common.cores import usable_cores
 from semcast.common.errors import ConfigError, SemcastError
+from semcast.common.source_commit import source_commit
 from semcast.common.whole_file import check_writable
 from semcast.server.export.outputs import plain, versions_of, write_json
 
@@ -78,29 +77,6 @@ def machine_kind() -> str:
         flags = set()
     sets = "/".join(name for flag, name in _CPU_FLAGS if flag in flags)
     return f"{cores}-core {architecture}" + (f", {sets}" if sets else "")
-
-
-def source_commit() -> str:
-    """Return the git commit the running code comes from, with ``+changes`` when files differ from it.
-
-    An installed copy outside a git checkout gives ``semcast <version>``.
-    """
-    version = f"semcast {semcast.__version__}"
-    folder = Path(__file__).resolve().parent
-
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", "-C", str(folder), *words], capture_output=True, text=True, timeout=10, check=True
-        )
-        return done.stdout.strip()
-
-    try:
-        if git("ls-files", "--", Path(__file__).name) == "":
-            return version
-        changed = git("status", "--porcelain", "--untracked-files=no")
-        return git("rev-parse", "HEAD") + ("+changes" if changed else "")
-    except (OSError, subprocess.SubprocessError):
-        return version
 
 
 def command_line(verb: str, settings: Any) -> str:

@@ -4,7 +4,7 @@ Everything is numpy; a statistic that is not defined for its input (an empty cla
 ``None``, never NaN, so results can be written as JSON.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -100,7 +100,7 @@ def pose_auc_percent(errors_deg: ArrayLike, threshold_deg: float) -> float | Non
     return float(100.0 * np.sum(np.diff(e) * (r[1:] + r[:-1]) / 2) / threshold_deg)
 
 
-def finite_mean(values: Sequence[float | None]) -> float | None:
+def finite_mean(values: Iterable[float | None]) -> float | None:
     """Return the mean of the values that are there and finite, or None when there are none."""
     known = [v for v in values if v is not None and np.isfinite(v)]
     return float(np.mean(known)) if known else None

@@ -5,15 +5,24 @@ from dataclasses import replace
 from typing import Any
 
 from semcast.channel.settings import ChannelSettings
+from semcast.channel.trace import SNR_RANGE_DB
 
 
-def check_snrs(snr_db: Sequence[float], link: ChannelSettings) -> None:
-    """Check that no link would be measured twice under two SNRs.
+def check_snrs(snr_db: Sequence[float], link: ChannelSettings, by_default: Sequence[float] = ()) -> None:
+    """Check that SNRs are in range, and that no link would be measured twice under two of them.
+
+    Args:
+        snr_db: At which a link is measured.
+        link: Which.
+        by_default: What nobody asked for: of these a link that has its own takes none.
 
     Raises:
-        ValueError: There are several SNRs, and a file has its own.
+        ValueError: There is none, one is out of range, or there are several and a file has its own.
     """
-    if len(snr_db) > 1 and link.has_own_snr:
+    low, high = SNR_RANGE_DB
+    if not snr_db or any(not low <= value <= high for value in snr_db):
+        raise ValueError(f"snr_db must be one or more values in [{low:g}, {high:g}], got {snr_db}")
+    if len(snr_db) > 1 and link.has_own_snr and tuple(snr_db) != tuple(by_default):
         values = " ".join(f"{value:g}" for value in snr_db)
         raise ValueError(f"snr_db must be a single value with --trace file, which sets the SNR, got {values}")
 

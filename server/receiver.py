@@ -160,6 +160,8 @@ class Receiver:
         if num_sent is None or self._mode != "live":
             return
         with self._lock:
+            if self._arrivals.epoch not in (0, agent_epoch):
+                return  # the agent was started again: what arrived before that is not known any more
             counted = self._end[2] if self._end[0] == agent_epoch else 0
             self._end = agent_epoch, num_sent, counted
             self._count_behind()

@@ -139,7 +139,7 @@ def recording(
             return None
 
         notes = StreamNotes(recorder, ask)
-        session.subscribe_keyed(all_keys(agent_id), "every", notes.put)
+        session.subscribe_keyed(all_keys(agent_id), notes.put)
         notes.put_camera(agent_id)
         yield recorder
     if recorder.error is not None:

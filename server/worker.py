@@ -1,4 +1,4 @@
-"""Work in a child process, one problem at a time, that is started again when it dies."""
+"""Work one problem at a time: in a child process, started again when it dies, or in the caller's thread."""
 
 import contextlib
 import logging
@@ -49,6 +49,39 @@ class Answer(Generic[Result]):
         """Return the answer of work that raised."""
         said = f"{type(err).__name__}: {' '.join(str(err).split())}".removesuffix(": ")
         return cls(failure=said, trace=traceback.format_exc())
+
+
+class Inline(Generic[Problem, Result]):
+    """Works in the caller's thread, with the interface of ``Worker``: the same input gives the same result.
+
+    Args:
+        work: What is done with a problem.
+    """
+
+    def __init__(self, work: Callable[[Problem], Result]) -> None:
+        self._work = work
+        self._result: Result | None = None
+
+    @property
+    def busy(self) -> bool:
+        """A result waits to be taken."""
+        return self._result is not None
+
+    def submit(self, problem: Problem) -> bool:
+        """Work on a problem now; False (and nothing happens) while a result waits to be taken."""
+        if self._result is not None:
+            return False
+        self._result = self._work(problem)
+        return True
+
+    def take(self, wait: bool = False) -> Result | None:
+        """Return the result of the last ``submit``, once."""
+        result, self._result = self._result, None
+        return result
+
+    def close(self) -> None:
+        """Forget a result that was not taken."""
+        self._result = None
 
 
 def serve(connection: Connection, work: Callable[[Problem], Result], stands_back: bool) -> None:

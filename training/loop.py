@@ -5,7 +5,6 @@ import json
 import logging
 import os
 import pickle
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -23,6 +22,7 @@ from semcast.common.nets.codec import check_device
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, channel_bandwidth_ratio
+from semcast.common.source_commit import source_commit
 from semcast.common.whole_file import check_writable, whole_file
 from semcast.training.centring import centre_hidden, folded, unfolded
 from semcast.training.channel import to_device
@@ -266,7 +266,7 @@ class Run:
                 "processes": self.world,
                 "device": self.device.type,
                 "seed": settings.seed,
-                "commit": _commit(),
+                "commit": source_commit(),
                 "torch": torch.__version__,
             },
             measured={"validation": valid} if valid else {},
@@ -347,17 +347,6 @@ class Run:
     def _update_average(self) -> None:
         keep = min(self.settings.ema, (1.0 + self.step) / (10.0 + self.step))
         torch._foreach_lerp_(self.averages, self.weights, 1.0 - keep)
-
-
-def _commit() -> str:
-    here = Path(__file__).resolve().parent
-    try:
-        done = subprocess.run(
-            ["git", "rev-parse", "--short=12", "HEAD"], cwd=here, capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return done.stdout.strip()
 
 
 def train(

@@ -149,8 +149,8 @@ class RenderSettings:
             raise ValueError(f"brightness must be in (0, 1], got {self.brightness:g}")
         if not 0 <= self.readout_ms <= 100:
             raise ValueError(f"readout_ms must be in [0, 100], got {self.readout_ms:g}")
-        if len(self.distortion) not in DISTORTION_COUNTS:
-            raise ValueError(f"distortion must be 4, 5 or 8 numbers, got {len(self.distortion)}")
+        if len(self.distortion) not in DISTORTION_COUNTS or not np.all(np.isfinite(self.distortion)):
+            raise ValueError(f"distortion must be 4, 5 or 8 finite values, got {self.distortion}")
 
 
 def render_scene(settings: RenderSettings, progress: Callable[[int, int], None] | None = None) -> int:

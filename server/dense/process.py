@@ -5,7 +5,7 @@ from collections.abc import Callable
 import cv2
 
 from semcast.server.dense.depth_map import DepthMap, DepthProblem, estimate_depth
-from semcast.server.worker import MAX_FAILURES, Worker
+from semcast.server.worker import MAX_FAILURES, Inline, Worker
 
 #: A busy machine leaves a hundredth of its time.
 _DEADLINE_S = 120.0
@@ -18,32 +18,11 @@ def _estimate(problem: DepthProblem) -> DepthMap:
     return estimate_depth(problem)
 
 
-class InlineDepth:
+class InlineDepth(Inline[DepthProblem, DepthMap]):
     """Estimates depth maps in the caller's thread."""
 
     def __init__(self) -> None:
-        self._result: DepthMap | None = None
-
-    @property
-    def busy(self) -> bool:
-        """A result waits to be taken."""
-        return self._result is not None
-
-    def submit(self, problem: DepthProblem) -> bool:
-        """Estimate now; the result waits for ``take``."""
-        if self._result is not None:
-            return False
-        self._result = estimate_depth(problem)
-        return True
-
-    def take(self, wait: bool = False) -> DepthMap | None:
-        """Return the result of the last ``submit``, once."""
-        result, self._result = self._result, None
-        return result
-
-    def close(self) -> None:
-        """Forget a result that was not taken."""
-        self._result = None
+        super().__init__(estimate_depth)
 
 
 class ProcessDepth(Worker[DepthProblem, DepthMap]):

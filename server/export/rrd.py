@@ -70,6 +70,8 @@ def write_rrd(
 def _show(stream: RerunStream, data: RunData, images: Mapping[int, Path]) -> None:
     """Send points, poses and images, frame by frame."""
     scene, cursor = Scene(), Cursor()
+    # By how far landmarks are from where the camera begins, a scene knows how large it is.
+    scene.set_keyframes(data.frame_ids[:1], data.T_world_cam[:1])
     scene.add_landmarks(data.landmark_ids, data.xyz, data.rgb, data.confidence, np.zeros(0, dtype=np.int64))
     for frame_id, t_ns, T_world_cam in zip(
         data.frame_ids.tolist(), data.t_source_ns.tolist(), data.T_world_cam, strict=True

@@ -9,6 +9,8 @@ more than its error across the line, whichever way that lies. *Shapes* are the c
 ``(N, 2, 2)`` each and of determinant 1; distances are then those of matches known alike in all directions.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -174,6 +176,22 @@ def depths(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> tu
     determinant = np.maximum(a * c - b * b, 1e-15)
     ray0_t, ray1_t = ray0 @ t, ray1 @ t
     return (b * ray1_t - c * ray0_t) / determinant, (a * ray1_t - b * ray0_t) / determinant
+
+
+def most_in_front(camera: Intrinsics, candidates: Sequence[Array], xy0: Array, xy1: Array) -> Array:
+    """Of relative poses ``(4, 4)`` the one with most points in front of both cameras; of equals the first.
+
+    Args:
+        camera: Of both images.
+        candidates: ``T_cam1_cam0`` each, with a translation.
+        xy0: ``(N, 2)`` pixels.
+        xy1: ``(N, 2)`` pixels, matched row by row.
+    """
+    counts = []
+    for T in candidates:
+        depth0, depth1 = depths(camera, T, xy0, xy1)
+        counts.append(int(((depth0 > 0) & (depth1 > 0)).sum()))
+    return candidates[int(np.argmax(counts))]
 
 
 def rays_angle_deg(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:

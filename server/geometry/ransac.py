@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
-from semcast.server.geometry.epipolar import depths, essential_matrix
+from semcast.server.geometry.epipolar import essential_matrix, most_in_front
 from semcast.server.geometry.weighting import adaptive_threshold, sampling_probability
 
 Array = NDArray[np.float64]
@@ -130,8 +130,4 @@ def in_front(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> 
     R, t = T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3]
     twisted = (2.0 * np.outer(t, t) / float(t @ t) - np.eye(3)) @ R
     candidates = [make_transform(r, sign * t) for r in (R, twisted) for sign in (1.0, -1.0)]
-    counts = []
-    for T in candidates:
-        depth0, depth1 = depths(camera, T, xy0, xy1)
-        counts.append(int(((depth0 > 0) & (depth1 > 0)).sum()))
-    return candidates[int(np.argmax(counts))]
+    return most_in_front(camera, candidates, xy0, xy1)

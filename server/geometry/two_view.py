@@ -28,6 +28,7 @@ from semcast.server.geometry.epipolar import (
     fit_rotation,
     fundamental_matrix,
     half_line_px,
+    most_in_front,
     msac_score,
     rays_angle_deg,
     refine_relative_pose,
@@ -237,7 +238,8 @@ def _as_in_the_paper(
     if found is None:
         return None
     near = np.abs(sampson_px(fundamental_matrix(camera, found.T_cam1_cam0), xy0, xy1)) < 2.0 * threshold_px
-    return _in_front_sign(camera, found.T_cam1_cam0, xy0[near], xy1[near])
+    T = found.T_cam1_cam0
+    return most_in_front(camera, (T, make_transform(T[:3, :3], -T[:3, 3])), xy0[near], xy1[near])
 
 
 def _searched(
@@ -469,20 +471,3 @@ def _result(
         is_rotation = bool(turned.mean() > 0.8)
     parallax = float(np.median(angle[inliers])) if inliers.any() else 0.0
     return TwoViewResult(T, inliers, is_rotation, parallax)
-
-
-def _in_front_sign(camera: Intrinsics, T: Array, xy0: Array, xy1: Array) -> Array:
-    """Turn the translation of ``T_cam1_cam0`` round when that puts more points in front of both cameras.
-
-    Args:
-        camera: Of both images.
-        T: ``(4, 4)`` relative pose.
-        xy0: ``(N, 2)`` pixels.
-        xy1: ``(N, 2)`` pixels, matched row by row.
-    """
-    turned = make_transform(T[:3, :3], -T[:3, 3])
-    counts = []
-    for candidate in (T, turned):
-        depth0, depth1 = depths(camera, candidate, xy0, xy1)
-        counts.append(int(((depth0 > 0) & (depth1 > 0)).sum()))
-    return turned if counts[1] > counts[0] else T

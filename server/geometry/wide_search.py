@@ -180,6 +180,8 @@ def match_near(
     alike = features0.descriptors @ features1.descriptors.T
     apart = np.maximum(norm0[:, None] + norm1 - 2.0 * alike, 0.0)
     apart[~(square < reach_px**2)] = np.inf
+    if apart.size == 0:
+        return _turned(features0, features1, np.zeros(0, np.intp), np.zeros(0, np.intp))
     best = apart.argmin(axis=1)
     nearest = apart[np.arange(len(best)), best]
     apart[np.arange(len(best)), best] = np.inf

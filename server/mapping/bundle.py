@@ -19,6 +19,7 @@ from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
 from semcast.server.mapping.dense_bundle import Baseline, State, Window, last_covariance, minimise
 from semcast.server.mapping.pose_graph import PoseConstraint
 from semcast.server.mapping.residual_patterns import pattern_products_of
+from semcast.server.worker import Inline
 
 Array = NDArray[np.float64]
 
@@ -231,29 +232,8 @@ def _covariance(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, k: int)
     return covariance if np.isfinite(covariance).all() else None
 
 
-class InlineBundle:
+class InlineBundle(Inline[BundleProblem, BundleResult]):
     """Adjusts in the caller's thread: the same input gives the same result, bit for bit."""
 
     def __init__(self) -> None:
-        self._result: BundleResult | None = None
-
-    @property
-    def busy(self) -> bool:
-        """A result waits to be taken."""
-        return self._result is not None
-
-    def submit(self, problem: BundleProblem) -> bool:
-        """Adjust now; the result waits for ``take``."""
-        if self._result is not None:
-            return False
-        self._result = optimise(problem)
-        return True
-
-    def take(self, wait: bool = False) -> BundleResult | None:
-        """Return the result of the last ``submit``, once."""
-        result, self._result = self._result, None
-        return result
-
-    def close(self) -> None:
-        """Forget a result that was not taken."""
-        self._result = None
+        super().__init__(optimise)

@@ -233,10 +233,9 @@ class LoopFinder:
         apart = np.linalg.norm(position[: len(older)] - T_world_cam[:3, 3], axis=1)
         axis = np.stack([k.T_world_cam[:3, 2] for k in older])
         turn = np.arccos(np.clip(axis @ T_world_cam[:3, 2], -1.0, 1.0))
-        camera = self._camera
-        reach = 2 * np.arctan(0.5 * np.hypot(camera.width / camera.fx, camera.height / camera.fy))
         depth = median_depth(world, newest)
-        near = (apart < _MAX_DRIFT * way + depth) & (apart < _MAX_APART * way) & (turn < 0.5 * reach)
+        near = (apart < _MAX_DRIFT * way + depth) & (apart < _MAX_APART * way)
+        near &= turn < self._camera.half_diagonal_rad
         rows = np.flatnonzero(near)
         return [older[row] for row in rows[:: 1 + len(rows) // _MAX_CONSIDERED].tolist()]
 

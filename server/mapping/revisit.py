@@ -123,7 +123,7 @@ def find_revisit(
 
 def _nearest(mapped: ImagedMap, T_world_cam: Array) -> list[tuple[Keyframe, SeenFrom]]:
     """Old keyframes that looked at about the same from about there."""
-    camera, world = mapped.camera, mapped.world
+    world = mapped.world
     mine = world.keyframes_of(mapped.submap)
     by_id = {k.frame_id: k for k in mine[:-NUM_RECENT]}
     known = [(by_id[image.frame_id], image) for image in mapped.images if image.frame_id in by_id]
@@ -132,8 +132,7 @@ def _nearest(mapped: ImagedMap, T_world_cam: Array) -> list[tuple[Keyframe, Seen
     T_world_old = np.stack([keyframe.T_world_cam for keyframe, _ in known])
     way = np.linalg.norm(T_world_old[:, :3, 3] - T_world_cam[:3, 3], axis=1) / median_depth(world, mine[-1])
     turn = np.arccos(np.clip(T_world_old[:, :3, 2] @ T_world_cam[:3, 2], -1.0, 1.0))
-    reach = np.arctan(0.5 * np.hypot(camera.width / camera.fx, camera.height / camera.fy))
-    apart = turn / reach + way
+    apart = turn / mapped.camera.half_diagonal_rad + way
     nearest = np.argsort(apart, kind="stable")[:_NUM_NEAREST]
     return [known[k] for k in nearest.tolist() if apart[k] < _MAX_APART]
 

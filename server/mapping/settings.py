@@ -8,6 +8,8 @@ from semcast.common.camera import Intrinsics, ReadoutFrom, check_readout
 from semcast.server.geometry.weighting import ConfidenceMode
 from semcast.server.mapping.bundle_problem import Solver
 
+#: The largest seed of a search, which evaluations keep to as well.
+MAX_SEED = 2**31 - 1
 #: A place gets as many chances to be recognised, however far apart frames are.
 _LEAST_LOST_FRAMES = 3
 #: What hides everything from a camera at rest, as a bus before a car that waits, may take so long to pass.
@@ -95,7 +97,7 @@ class ReconstructionSettings:
             allowed = ", ".join(get_args(ConfidenceMode))
             raise ValueError(f"confidence must be one of {allowed}, got {self.confidence!r}")
         for name, low, high in (
-            ("seed", 0, 2**31 - 1),
+            ("seed", 0, MAX_SEED),
             ("max_features", 50, 5000),
             ("window_size", 3, 30),
             ("max_landmarks", 500, 300_000),

@@ -64,11 +64,16 @@ class Sight:
         inside = (xy >= margin_px) & (xy < np.array([width, height]) - margin_px)
         return np.asarray(inside.all(axis=1)) & ~self.near_lost(xy, margin_px)
 
+    def rows_near_lost(self, margin_px: int) -> NDArray[np.bool_]:
+        """Which rows have a lost one within the margin, ``(H,)``."""
+        around = np.convolve(~self.usable, np.ones(2 * margin_px + 1, int))
+        return np.asarray(around[margin_px : margin_px + len(self.usable)] > 0)
+
     def near_lost(self, xy: Array, margin_px: int) -> NDArray[np.bool_]:
-        """Which points have a lost row within the margin."""
+        """Which points have a lost row within the margin, ``(N,)``."""
         if self.usable.all():
             return np.zeros(len(xy), bool)
-        reach = np.convolve(~self.usable, np.ones(2 * margin_px + 1, int), mode="same") > 0
+        reach = self.rows_near_lost(margin_px)
         y = np.clip(np.rint(np.nan_to_num(xy[:, 1])), 0, len(self.usable) - 1).astype(np.intp)
         return np.asarray(reach[y])
 

@@ -470,7 +470,7 @@ class TrackTable:
             return 0
         usable = None
         if not sight.usable.all():
-            rows = np.convolve(~sight.usable, np.ones(KLT_WINDOW_PX, int), mode="same") == 0
+            rows = ~sight.rows_near_lost(KLT_WINDOW_PX // 2)
             usable = np.repeat(rows[:, None], sight.grey.shape[1], axis=1)
         height, width = sight.grey.shape
         cell_px = int(np.clip(np.sqrt(height * width / max(1.0, self._max_features / 2.5)), 16, 96))

@@ -339,7 +339,7 @@ class WorldMap:
         return MapChanges(self.landmarks.ids.copy(), none, keyframes, frames=none, withdrawn=none)
 
     def arrays(self) -> dict[str, NDArray]:
-        """Everything as plain arrays, for a checkpoint."""
+        """All as plain arrays, for a checkpoint, but the refuted tracks, which end with the process."""
         lengths = [[len(getattr(k, part)) for part in _KEYFRAME_PARTS] for k in self.keyframes]
         frame_ids, keyframe_ids, T_keyframe_cam = self.frames.columns()
         posed = sorted(self.poses)

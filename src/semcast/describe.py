@@ -15,8 +15,8 @@ from semcast.common.ros_bag_files import is_ros_bag
 from semcast.common.run_folder import (
     FRAMES_NAME,
     RECONSTRUCTION_NAME,
-    RUN_FILES,
     SUMMARY_NAME,
+    files_of_run,
     read_image_paths,
     read_run,
 )
@@ -178,7 +178,7 @@ def describe_run(path: Path) -> list[Section]:
         )
     if line := parts_line(parts):
         facts.append(("parts", line))
-    files = [(name, _bytes((path / name).stat().st_size)) for name in RUN_FILES if (path / name).is_file()]
+    files = [(file.name, _bytes(file.stat().st_size)) for file in files_of_run(path)]
     images = read_image_paths(path)
     if images:
         files.append(("images/", f"{len(images)} decoded images"))

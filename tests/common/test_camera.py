@@ -45,6 +45,12 @@ def test_resizing_each_side_by_its_own_factor():
     assert (small.width, small.height) == (320, 120)
 
 
+def test_the_half_diagonal_is_the_angle_from_the_axis_to_a_corner():
+    camera = Intrinsics(fx=100.0, fy=200.0, cx=149.5, cy=399.5, width=300, height=800)
+    # A corner is 1.5 focal lengths to the side and 2 down.
+    assert camera.half_diagonal_rad == pytest.approx(np.arctan(2.5))
+
+
 def test_json_round_trip(tmp_path):
     camera = replace(CAMERA, distortion=(0.1, -0.2, 0.0, 0.001))
     camera.save(tmp_path / "intrinsics.json")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from full_disk import room_for
 from mcap.reader import make_reader
 
 from semcast import SourceError
@@ -388,6 +389,15 @@ def test_a_path_that_can_not_be_written_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(SourceError, match="can't be written"):
         Recorder(tmp_path / "file" / "a.mcap", HEADER)
+
+
+def test_a_disk_that_is_full_at_the_start_leaves_the_former_recording_where_it_was(tmp_path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"a recording of hours")
+    with room_for(1), pytest.raises(SourceError, match=r"run\.mcap can't be written"):
+        Recorder(path, HEADER)
+    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+    assert path.read_bytes() == b"a recording of hours"
 
 
 def test_a_recording_that_is_not_there_is_named_alone(tmp_path):

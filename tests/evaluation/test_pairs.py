@@ -161,6 +161,8 @@ def test_short_baselines_are_left_out(room):
         ({"max_matches": (4,)}, "max_matches"),
         ({"threshold_px": 0.0}, "threshold_px"),
         ({"min_baseline_share": 1.0}, "min_baseline_share"),
+        ({"min_baseline_m": -0.1}, "min_baseline_m"),
+        ({"min_baseline_m": float("nan")}, "min_baseline_m"),
         ({"confidence": ()}, "confidence"),
     ],
 )

@@ -166,6 +166,8 @@ def test_opening_gives_the_named_codec_or_none(room, phase_codec):
         ({"snr_db": ()}, "snr_db"),
         ({"snr_db": (99.0,)}, "snr_db"),
         ({"seed": -1}, "seed must be at least 0"),
+        ({"seed": 2**31}, "last of the seeds must be at most 2147483647, got 2147483648"),
+        ({"seed": 2**31 - 2, "seeds": 3}, "last of the seeds must be at most 2147483647, got 2147483648"),
         ({"seeds": 0}, "seeds"),
         ({"stride": 0}, "stride"),
         ({"max_frames": 0}, "max_frames"),

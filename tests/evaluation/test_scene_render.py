@@ -125,6 +125,8 @@ def test_seeds_and_paces_differ() -> None:
         ({"noise_sd": 60}, r"noise_sd must be in \[0, 50\], got 60"),
         ({"brightness": 0}, r"brightness must be in \(0, 1\], got 0"),
         ({"brightness": 1.5}, r"brightness must be in \(0, 1\], got 1.5"),
+        ({"distortion": (0.1, float("nan"), 0, 0)}, "4, 5 or 8 finite values, got .*nan"),
+        ({"distortion": (0.1, float("inf"), 0, 0)}, "4, 5 or 8 finite values, got .*inf"),
     ],
 )
 def test_settings_out_of_range_are_refused(values: dict[str, float], message: str, tmp_path: Path) -> None:

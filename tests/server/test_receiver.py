@@ -412,6 +412,14 @@ def test_frames_that_come_after_they_were_counted_as_missing_are_missing_no_long
     assert e.metrics.drops == {"missing": 4}
 
 
+def test_none_of_an_ended_stream_is_missing_once_frames_of_the_agents_next_start_are_there(ends, make):
+    e = ends()
+    e.put(*(make(k) for k in range(5)), make(0, epoch=EPOCH + 1))
+    until(lambda: e.metrics.counts.get("received") == 6)
+    e.receiver.count_missing(EPOCH, 5)
+    assert "missing" not in e.metrics.drops
+
+
 def test_presence_of_the_others_is_known(ends):
     e = ends()
     e.client.declare_alive("a", "agent")

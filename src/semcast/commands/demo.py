@@ -14,7 +14,7 @@ from rich.table import Table
 from semcast.channel.emulator import warn_of_settings
 from semcast.commands.console import plain_console
 from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings, run_until_stopped
-from semcast.common.run_folder import FRAMES_NAME, RUN_FILES, VIEWER_NAME
+from semcast.common.run_folder import FRAMES_NAME, VIEWER_NAME, files_of_run
 from semcast.demo import DemoSettings, open_recording, run_demo
 from semcast.evaluation.report import STDOUT, provenance, write_result
 from semcast.server.export.parts import parts_line
@@ -148,7 +148,7 @@ def run(arguments: argparse.Namespace) -> int:
         return code or 1
     shown = talk if json_to_stdout else plain_console()
     shown.print(summary_table(result))
-    there = ", ".join(name for name in RUN_FILES if (settings.out / name).is_file())
+    there = ", ".join(file.name for file in files_of_run(settings.out))
     shown_file = settings.out / VIEWER_NAME
     show_again = shlex.join(("rerun", str(shown_file)))
     again = f"; look again with: {show_again}" if shown_file.exists() else ""

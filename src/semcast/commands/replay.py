@@ -10,7 +10,7 @@ from rich.text import Text
 from semcast.commands.console import plain_console
 from semcast.commands.demo import summary_table, why_no_pose
 from semcast.commands.running import add_settings, read_given, read_settings, run_until_stopped
-from semcast.common.run_folder import RUN_FILES
+from semcast.common.run_folder import files_of_run
 from semcast.server.replay import ReplaySettings, replay
 
 #: A recording is replayed in order and at once; the seed is that of channel and estimation alike.
@@ -41,8 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     code = run_until_stopped(work)
     plain_console().print(summary_table(summary))
     if settings.out is not None:
-        there = ", ".join(name for name in RUN_FILES if (settings.out / name).is_file())
-        print(f"in {settings.out}: {there}")
+        print(f"in {settings.out}: {', '.join(file.name for file in files_of_run(settings.out))}")
     if not code and not summary.get("completeness"):
         talk.print(f"semcast replay: {why_no_pose(summary)}", soft_wrap=True)
         return 1

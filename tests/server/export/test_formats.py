@@ -9,6 +9,7 @@ import pycolmap
 import pytest
 import trimesh
 from evo.tools import file_interface
+from full_disk import room_for
 
 from semcast import SemcastError, SourceError
 from semcast.cli import main
@@ -276,17 +277,35 @@ def test_without_one_a_rerun_recording_is_made_of_poses_images_and_points(tmp_pa
     assert {"/world/camera", "/world/camera/image", "/world/map_colour/0000"} <= set(entities)
 
 
+def test_a_rerun_recording_that_is_made_is_looked_at_from_a_distance_of_the_maps_size(
+    tmp_path, arc_run, write_arc_run
+):
+    import rerun as rr
+
+    data, sizes = arc_run(), []
+    for factor in (1.0, 100.0):
+        T_world_cam = data.T_world_cam.copy()
+        T_world_cam[:, :3, 3] *= factor
+        write_arc_run(tmp_path / "run", replace(data, T_world_cam=T_world_cam, xyz=factor * data.xyz))
+        export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
+        at = {}
+        for chunk in rr.chunk.RrdReader(tmp_path / "made.rrd").stream().to_chunks():
+            rows = chunk.to_record_batch()
+            for name in rows.schema.names:
+                at.setdefault((str(chunk.entity_path), name), []).extend(rows.column(name).to_pylist())
+        (frustum,) = at["/world/camera/image", "Pinhole:image_plane_distance"][-1]
+        eye, camera = (
+            np.ravel(at[path, "Transform3D:translation"][0]) for path in ("/world/spectator", "/world/camera")
+        )
+        sizes.append((frustum, np.linalg.norm(eye - camera)))
+    np.testing.assert_allclose(sizes[1], 100.0 * np.array(sizes[0]), rtol=1e-5)
+
+
 @pytest.mark.parametrize("room", [0, 3000])
 def test_a_rerun_recording_that_finds_no_room_is_an_error(tmp_path, arc_run, write_arc_run, room):
-    resource = pytest.importorskip("resource")
     write_arc_run(tmp_path / "run", arc_run())
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
-    try:
-        with pytest.raises(SemcastError, match=r"made.rrd can't be written"):
-            export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with room_for(room), pytest.raises(SemcastError, match=r"made.rrd can't be written"):
+        export_run(tmp_path / "run", "rrd", tmp_path / "made.rrd")
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
@@ -392,16 +411,10 @@ def test_trimesh_reads_the_points_with_their_colours(tmp_path, arc_run, write_ar
 
 @pytest.mark.parametrize("format_name", ["colmap", "nerfstudio", "kitti"])
 def test_an_export_that_finds_no_room_leaves_no_truncated_file(tmp_path, arc_run, write_arc_run, format_name):
-    resource = pytest.importorskip("resource")
     write_arc_run(tmp_path / "run", arc_run())
     folder = tmp_path / "out"
     folder.mkdir()
     out = folder / "poses.txt" if format_name == "kitti" else folder
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200, before[1]))
-    try:
-        with pytest.raises(SemcastError, match=r"can't be written: .*File too large"):
-            export_run(tmp_path / "run", format_name, out)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with room_for(200), pytest.raises(SemcastError, match=r"can't be written: .*File too large"):
+        export_run(tmp_path / "run", format_name, out)
     assert not [p for p in folder.rglob("*") if p.is_file()]

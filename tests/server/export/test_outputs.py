@@ -1,11 +1,10 @@
 """What a run leaves behind can be read by others."""
 
-import contextlib
 import json
-import resource
 
 import numpy as np
 import pytest
+from full_disk import room_for
 
 from semcast.common.trajectory import Trajectory, read_tum, write_tum
 from semcast.server.export.outputs import (
@@ -18,22 +17,6 @@ from semcast.server.export.outputs import (
     write_json,
     write_ply,
 )
-
-
-@pytest.fixture
-def full_disk():
-    """Return a context in which no file grows beyond 512 bytes: writes fail as on a full disk."""
-
-    @contextlib.contextmanager
-    def limited():
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (512, before[1]))
-        try:
-            yield
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-    return limited
 
 
 def test_ply_is_what_the_format_says_byte_for_byte(tmp_path):
@@ -88,11 +71,11 @@ def test_ply_opens_in_colmap(tmp_path):
     assert [p.color.tolist() for p in points] == rgb.tolist()
 
 
-def test_a_full_disk_leaves_the_results_of_before(tmp_path, full_disk, read_ply):
+def test_a_full_disk_leaves_the_results_of_before(tmp_path, read_ply):
     xyz, rgb, confidence = np.ones((100, 3)), np.zeros((100, 3), np.uint8), np.ones(100, np.float32)
     write_ply(tmp_path / "map.ply", xyz[:1], rgb[:1], confidence[:1])
     write_tum(tmp_path / "t.tum", Trajectory(np.zeros(1), np.eye(4)[None]))
-    with full_disk():
+    with room_for(512):
         with pytest.raises(OSError, match="File too large"):
             write_ply(tmp_path / "map.ply", xyz, rgb, confidence)
         with pytest.raises(OSError, match="File too large"):

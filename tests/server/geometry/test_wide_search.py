@@ -55,6 +55,13 @@ def test_of_equal_doors_the_one_next_to_where_it_is_expected_is_matched():
     assert len(match_near(here, there, np.full((2, 2), np.nan), 60.0, 0.8).to_xy) == 0
 
 
+def test_an_image_without_features_has_no_match_near_where_one_is_expected():
+    here = features_at([(50.0, 100.0)], 100.0 * np.eye(128)[:1])
+    blank = WideFeatures.of(np.full((240, 320), 90, np.uint8))
+    for pair in ((here, blank), (blank, here), (blank, blank)):
+        assert len(match_near(*pair, pair[0].xy, 60.0, 0.8).to_xy) == 0
+
+
 def test_near_where_it_is_expected_too_a_match_must_be_clear():
     here = features_at([(50.0, 100.0)], 100.0 * np.eye(128)[:1])
     alike = 100.0 * np.eye(128)[[0, 0]] + 10.0 * np.eye(128)[[1, 2]]

@@ -18,3 +18,11 @@ def test_an_image_does_not_show_what_is_next_to_lost_rows():
     usable[10] = False
     xy = np.array([[15.0, y] for y in (7.0, 8.0, 12.0, 13.0)])
     assert sight_of(usable).shows(xy, 2).tolist() == [True, False, False, True]
+
+
+def test_in_an_image_of_fewer_rows_than_the_margins_all_are_near_a_lost_one():
+    usable = np.ones(5, bool)
+    usable[4] = False
+    sight = sight_of(usable)
+    assert sight.rows_near_lost(3).tolist() == [False, True, True, True, True]
+    assert sight.rows_near_lost(10).tolist() == [True] * 5

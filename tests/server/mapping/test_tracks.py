@@ -88,6 +88,15 @@ def test_no_corner_is_taken_near_a_lost_slot():
     assert not np.any((tracks.xy[:, 1] > 80 - 6) & (tracks.xy[:, 1] < 96 + 6))
 
 
+def test_an_image_of_fewer_rows_than_a_window_may_lose_some():
+    noise = np.random.default_rng(0).integers(0, 256, (20, 200, 3), dtype=np.uint8)
+    usable = np.arange(20) < 16
+    sight = Sight(DecodedFrame(0, 0, noise), to_grey(noise), usable)
+    tracks = TrackTable("robust", 50, 0)
+    tracks.remember(sight)
+    assert tracks.refill(sight) == 0  # each row is next to a lost one
+
+
 def test_a_damaged_frame_makes_all_tracks_coast():
     tracks = begin()
     count = len(tracks)
