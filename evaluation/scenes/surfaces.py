@@ -228,6 +228,8 @@ def _paint(
     for k in range(int(level.min()), int(np.ceil(level.max())) + 1):
         weights = 1 - np.abs(level - k)
         mixed = np.flatnonzero(weights > 0)
+        if len(mixed) == 0:
+            continue  # of a few pixels, some are near and the others far
         weights = weights[mixed].astype(np.float32)
         layer = _looked_up(levels[k], surface.repeats, hit.u[mixed], hit.v[mixed])
         for colour in range(3):

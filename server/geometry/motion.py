@@ -22,6 +22,16 @@ _BRIDGE_STEPS = 10
 _SPEED_S = 1.0
 #: Time for which steps are remembered, to tell how far the camera strays from where its speed leads.
 _MEMORY_S = 8.0
+#: A camera at rest is infinitely slower than one that moves: for a ratio of speeds, none is less than this
+#: share of the highest.
+_LEAST_SHARE_OF_SPEED = 0.02
+#: Sums of intervals that differ by less are the same time.
+_SAME_S = 1e-6
+
+
+def _last_by(ascending_s: Array, at_s: Array) -> NDArray[np.int64]:
+    """Index of the last time that is not after another one, for each of these; -1 where there is none."""
+    return np.searchsorted(ascending_s, at_s + _SAME_S, side="right") - 1
 
 
 class ConstantVelocity:
@@ -41,6 +51,41 @@ class ConstantVelocity:
     def speed_map_per_s(self) -> float:
         """Length of the translation per second, over the last second."""
         return float(np.linalg.norm(self._way_per_s()))
+
+    def speed_at(self, t_source_ns: int) -> tuple[float, float]:
+        """Speed to expect at a time after the last pose, by the speeds of the last ``_MEMORY_S``.
+
+        A robot keeps its speed, and its last one is the best guess. A hand that slowed down to turn goes on
+        faster: between the last speed and the usual one is nearer the truth than either.
+
+        Args:
+            t_source_ns: Start of the second the speed is asked for.
+
+        Returns:
+            Map units per second, and the standard deviation of its logarithm: by what factor speeds so far
+            apart differed so far; 0 where the motion is not known for so long.
+        """
+        ends_s, speeds = self._speeds()
+        if self._last is None or len(speeds) == 0 or speeds.max() <= 0.0:
+            return self.speed_map_per_s, 0.0
+        ahead_s = max(0.0, (t_source_ns - self._last[0]) * 1e-9) + _SPEED_S
+        logs = np.log(np.maximum(speeds, _LEAST_SHARE_OF_SPEED * speeds.max()))
+        earlier = _last_by(ends_s, ends_s - ahead_s)
+        known = earlier >= 0
+        if not known.any():
+            return self.speed_map_per_s, 0.0
+        changes = logs[known] - logs[earlier[known]]
+        return float(np.exp(0.5 * (logs[-1] + logs.mean()))), float(np.sqrt(np.mean(changes**2)))
+
+    def _speeds(self) -> tuple[Array, Array]:
+        """Mean speeds ``(N,)`` over a second each, and the times ``(N,)`` in seconds at which these end."""
+        t_s = np.cumsum([0.0, *(step_s for step_s, _, _ in self._steps)])
+        ways = np.cumsum([np.zeros(3), *(way for _, _, way in self._steps)], axis=0)
+        begin = _last_by(t_s, t_s - _SPEED_S)
+        known = begin >= 0
+        begin = begin[known]
+        lengths = np.linalg.norm(ways[known] - ways[begin], axis=1)
+        return t_s[known], lengths / (t_s[known] - t_s[begin])
 
     def _way_per_s(self) -> Array:
         """Mean translation per second in the camera's own frame: turning does not shorten it, noise does."""

@@ -18,10 +18,10 @@ _LEAST_WAY = 0.02
 _MOST_FARTHER = 5.0
 #: Standard deviation of the logarithm of a new map's unit, guessed from things being as far away as before,
 _DEPTH_SIGMA = 0.5
-#: or from the camera going on at its old speed,
+#: or from the camera going on at a speed that is as sure as this at best. To it come how much the speed
+#: changed before, and the error of a speed in depths per second: of a slow camera, that is most of it.
 _SPEED_SIGMA = 0.03
-#: to which the speed's own standard deviation is added, in depths per second: a hand changes its speed.
-_SPEED_CHANGE_DEPTHS_S = 0.03
+_SPEED_ERROR_DEPTHS_S = 0.03
 #: Time after a gap from which it is told how the camera moves then: the shorter, the noisier.
 _LATER_NS = 500_000_000
 
@@ -36,9 +36,9 @@ def bridge(
 ) -> tuple[Array, float]:
     """Estimate pose and scale of a new submap from how the camera moved before and after the gap.
 
-    The scale is a weighted mean of two guesses: that the camera goes on at its old speed, and that the scene
-    is as far away as it was. The slower the camera was, the more the second one counts; it alone counts where
-    the camera stood or the gap is long.
+    The scale is a weighted mean of two guesses: that the camera goes on at the speed expected of it, and that
+    the scene is as far away as it was. The slower the camera was, and the more its speed changed before, the
+    more the second one counts; it alone counts where the camera stood or the gap is long.
 
     The pose is where the camera must have got to. Its rotation is the one that images of the gap showed,
     where there are any. Otherwise velocities change evenly from those before the gap to those of the submap
@@ -63,13 +63,14 @@ def bridge(
     way = float(np.linalg.norm(last.T_world_cam[:3, 3] - first.T_world_cam[:3, 3]))
     elapsed_s = (last.t_source_ns - first.t_source_ns) * 1e-9
     since_s = (first.t_source_ns - last_ns) * 1e-9
-    gone = motion.speed_map_per_s * elapsed_s
+    speed, speed_sigma = motion.speed_at(first.t_source_ns)
+    gone = speed * elapsed_s
     if since_s >= _MAX_BRIDGE_S or way <= 0.0 or gone <= _LEAST_WAY * depth:
         return T_world_guess, depth
     if not depth / _MOST_FARTHER < gone / way < _MOST_FARTHER * depth:
         return T_world_guess, depth
-    changed = _SPEED_CHANGE_DEPTHS_S * depth / motion.speed_map_per_s
-    weights = _DEPTH_SIGMA**-2, 1.0 / (_SPEED_SIGMA**2 + changed**2)
+    error = _SPEED_ERROR_DEPTHS_S * depth / speed
+    weights = _DEPTH_SIGMA**-2, 1.0 / (_SPEED_SIGMA**2 + error**2 + speed_sigma**2)
     scale = float(np.exp(np.average(np.log((depth, gone / way)), weights=weights)))
     turned = [then for then in turned if then[0] <= at_ns]
     # Of a source that gives two images one time, the second tells no speed.

@@ -73,10 +73,9 @@ class CameraMotion:
         """
         return self._rests and not self._still and not self._has_gap
 
-    @property
-    def speed_map_per_s(self) -> float:
-        """Length of the translation per second, the one before a stop while it lasts."""
-        return self._motion.speed_map_per_s
+    def speed_at(self, t_source_ns: int) -> tuple[float, float]:
+        """As ``ConstantVelocity.speed_at``; while the camera stands, as before it stopped."""
+        return self._motion.speed_at(t_source_ns)
 
     def correct(self, T_world_cam: Array, scale: float = 1.0) -> None:
         """Replace the last pose after the map has moved; the motion in the camera's frame stays."""

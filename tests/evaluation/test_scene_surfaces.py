@@ -73,6 +73,16 @@ def test_texture_far_away_is_averaged_and_not_sampled() -> None:
     assert np.abs(image[30:50, 40:60, 0] - 100).max() < 3
 
 
+def test_of_two_pixels_one_may_be_near_and_the_other_far() -> None:
+    """Of a floor 1 m below, at 1 m and at 10 m: no pixel needs the sizes of its texture in between."""
+    camera = Intrinsics(fx=10.0, fy=1.0, cx=0.0, cy=-0.1, width=1, height=2)
+    floor = Surface(
+        np.array([0.0, -5.0, -1.0]), np.array([60.0, 0, 0]), np.array([0, 10.0, 0]), plain(120, side=128)
+    )
+    image = draw([floor], camera, AHEAD, np.zeros((2, 1, 3), np.float32))
+    np.testing.assert_allclose(image, 120, atol=0.5)
+
+
 def test_box_shows_the_light_of_the_side_that_faces_the_camera() -> None:
     sides = box((3.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.0, [plain(100)], lights=(0.1, 0.2, 0.3, 0.9, 0.5, 0.6))
     image = draw(sides, CAMERA, AHEAD, BLACK)

@@ -6,6 +6,7 @@ from semcast.server.geometry.motion import ConstantVelocity
 
 STEP = make_transform(exp_so3((0.0, 0.02, 0.01)), (0.1, 0.0, 0.3))
 FRAME_NS = 100_000_000
+SECOND_NS = 1_000_000_000
 
 
 def test_steady_motion_goes_on():
@@ -63,6 +64,48 @@ def test_a_speed_is_that_of_a_second_not_of_one_noisy_step():
     motion.correct(np.eye(4), scale=2.0)
     np.testing.assert_allclose(motion.way_in(0.5), (0, 0, 5.1), atol=0.02)
     assert np.isclose(motion.predict(30 * FRAME_NS)[2, 3], 1.2), "the next step is like the last"
+
+
+def walked(speeds, interval_s=0.1):
+    """A camera that goes straight on at a speed for each interval."""
+    motion, z = ConstantVelocity(), 0.0
+    motion.observe(0, np.eye(4))
+    for k, speed in enumerate(speeds, start=1):
+        z += speed * interval_s
+        motion.observe(round(k * interval_s * 1e9), make_transform(np.eye(3), (0, 0, z)))
+    return motion
+
+
+def test_the_speed_of_a_robot_is_its_last_one_and_sure():
+    speed, sigma = walked([2.0] * 60).speed_at(8 * SECOND_NS)
+    assert speed == pytest.approx(2.0)
+    assert sigma == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_hand_that_has_slowed_down_goes_on_faster_and_nobody_knows_how_fast():
+    """Seconds at 1, 4, 1, 4 ... and at last 1: a second apart they differ by a factor of 4, two by none."""
+    motion = walked(np.repeat([1.0, 4.0, 1.0, 4.0, 1.0], 10))
+    end_ns = 5 * SECOND_NS
+    next_speed, sigma_next = motion.speed_at(end_ns)
+    assert 1.3 < next_speed < 1.6, "between 1 and the mean of all, about 2"
+    speed, sigma_later = motion.speed_at(end_ns + SECOND_NS)
+    assert speed == next_speed
+    assert sigma_next > 0.75 > 0.5 > sigma_later
+    motion.correct(np.eye(4), scale=3.0)
+    assert motion.speed_at(end_ns) == pytest.approx((3.0 * next_speed, sigma_next)), "in another unit"
+
+
+def test_a_camera_that_once_stood_may_go_at_any_speed_but_not_at_none():
+    speed, sigma = walked([0.0] * 20 + [2.0] * 20).speed_at(4 * SECOND_NS)
+    assert 0.2 < speed < 2.0
+    assert 1.0 < sigma < 4.0
+
+
+@pytest.mark.parametrize("num_steps", [0, 1, 9, 25])
+def test_a_motion_that_is_not_known_for_long_enough_tells_its_last_speed(num_steps):
+    motion = walked([2.0] * num_steps)
+    after_ns = num_steps * FRAME_NS + 2 * SECOND_NS
+    assert motion.speed_at(after_ns) == pytest.approx((2.0 if num_steps else 0.0, 0.0))
 
 
 def test_how_the_camera_turned_in_a_gap_is_better_known_than_guessed():

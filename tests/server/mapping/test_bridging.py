@@ -57,6 +57,17 @@ def test_the_slower_a_camera_was_the_more_its_surroundings_tell_the_unit(speed, 
     assert np.log2(scale / 4.0) == pytest.approx(by_depth), "4 by the speed, twice that by the depth"
 
 
+def test_of_a_camera_that_was_fast_and_slow_by_turns_the_surroundings_tell_the_unit():
+    motion, z = CameraMotion(CAMERA), 0.0
+    for k in range(80):
+        z += 0.1 * (16.0 if k // 10 % 2 else 4.0)
+        motion.observe(k, k * FRAME_NS, make_transform(np.eye(3), (0, 0, z)), POINTS)
+    start = start_at(99, step=0.4)
+    steady, unsteady = (bridge(m, start, start, 79 * FRAME_NS, 8.0)[1] for m in (moved(16.0, 80), motion))
+    assert steady == pytest.approx(4.0, rel=0.01), "by a speed that was always 16"
+    assert unsteady > 6.0, "by depth it is 8"
+
+
 def test_half_of_a_bend_was_driven_out_of_sight():
     start = start_at(12, turn_deg=4.0)
     T, _ = bridge(moved(), start, start, 2 * FRAME_NS, 4.0)

@@ -86,7 +86,7 @@ def test_the_unit_of_a_new_part_is_told_by_its_start_alone(monkeypatch):
     for k, T in enumerate(truth):
         result = core.process(frame_of(k, render(T)))
         if k == 7:
-            speed_map_per_s = core._motion.speed_map_per_s
+            speed_map_per_s, _ = core._motion.speed_at(k * FRAME_NS)
         if len(starts) == 2:
             break
     start, grown = ([keyframe.frame_id for keyframe in s.keyframes] for s in starts[1])
