@@ -110,7 +110,9 @@ class WideMatches:
             return np.zeros(0, np.intp), np.zeros((0, 2))
         square = square_distances(xy, self.from_xy)
         next_to = square.argmin(axis=0)
-        near = np.flatnonzero(square[next_to, np.arange(len(next_to))] < max_offset_px**2)
+        away = square[next_to, np.arange(len(next_to))]
+        near = np.flatnonzero(away < max_offset_px**2)
+        near = near[np.argsort(away[near], kind="stable")]  # of several beside one pixel the nearest counts
         rows, first = np.unique(next_to[near], return_index=True)
         match = near[first]
         offset = np.einsum("nij,nj->ni", self.turns[match], xy[rows] - self.from_xy[match])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import exp_so3, rotation_angle_deg
+from semcast.common.geometry import exp_so3, log_so3, rotation_angle_deg
 from semcast.server.geometry.turning import turn_between
 
 CAMERA = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5, width=320, height=240)
@@ -38,6 +38,15 @@ def test_a_turn_is_told_by_images_without_corners(turn_deg):
     R = exp_so3(np.radians(turn_deg))
     found = turn_between(CAMERA, noisy(wall(np.eye(3), STAYED), 1), noisy(wall(R, STAYED), 2), STAYED)
     assert rotation_angle_deg(found.T @ R) < 0.15
+
+
+def test_a_strip_whose_height_is_rounded_tells_as_much():
+    rows = slice(85, 155)  # a width of 80 would make it 17.5 pixels high
+    strip = Intrinsics(fx=260, fy=260, cx=159.5, cy=119.5 - rows.start, width=320, height=70)
+    R = exp_so3(np.radians((2, 0, 0)))
+    before, now = (np.rint(wall(turn, STAYED)[rows]).astype(np.uint8) for turn in (np.eye(3), R))
+    up_deg = np.degrees(log_so3(turn_between(strip, before, now, STAYED)))[0]
+    assert up_deg == pytest.approx(2.0, abs=0.06)
 
 
 def test_brightness_may_change():

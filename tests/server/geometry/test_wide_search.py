@@ -4,6 +4,7 @@ import numpy as np
 
 from semcast.server.geometry.wide_search import (
     WideFeatures,
+    WideMatches,
     epipolar_inliers,
     match_near,
     match_wide,
@@ -68,3 +69,12 @@ def test_near_where_it_is_expected_too_a_match_must_be_clear():
     there = features_at([(60.0, 100.0), (70.0, 100.0)], alike)
     assert len(match_near(here, there, here.xy, 60.0, 0.8).to_xy) == 0
     assert len(match_near(here, there, here.xy, 15.0, 0.8).to_xy) == 1
+
+
+def test_of_several_matches_beside_a_pixel_the_nearest_carries_it():
+    from_xy = np.array([[53.0, 50.0], [50.5, 50.0], [90.0, 90.0]])
+    to_xy = from_xy + np.array([[30.0, 0.0], [10.0, 0.0], [10.0, 0.0]])
+    matches = WideMatches(from_xy, to_xy, np.tile(np.eye(2), (3, 1, 1)))
+    rows, carried = matches.carry(np.array([[50.0, 50.0], [70.0, 70.0]]), max_offset_px=4.0)
+    assert rows.tolist() == [0]
+    np.testing.assert_allclose(carried, [[60.0, 50.0]])
