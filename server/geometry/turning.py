@@ -67,8 +67,8 @@ def _aligned(
     slopes = [_slope(small1, dx) for dx in (1, 0)]
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
     seen_from_there = camera.unproject((pixels + 0.5) / scale - 0.5) - way_depths
-    focal_px = scale * (camera.fx, camera.fy)
-    centre_px = scale * (camera.cx + 0.5, camera.cy + 0.5) - 0.5
+    focal_px = scale * np.array([camera.fx, camera.fy])
+    centre_px = scale * np.array([camera.cx + 0.5, camera.cy + 0.5]) - 0.5
     correlation = 0.0
     for _ in range(_ITERATIONS):
         rays = seen_from_there @ R_cam1_cam0.T
