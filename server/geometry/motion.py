@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform
-from semcast.server.geometry.whereabouts import Step, Whereabouts, mean_way
+from semcast.server.geometry.whereabouts import Step, Whereabouts, last_by, mean_way
 
 Array = NDArray[np.float64]
 
@@ -25,13 +25,6 @@ _MEMORY_S = 8.0
 #: A camera at rest is infinitely slower than one that moves: for a ratio of speeds, none is less than this
 #: share of the highest.
 _LEAST_SHARE_OF_SPEED = 0.02
-#: Sums of intervals that differ by less are the same time.
-_SAME_S = 1e-6
-
-
-def _last_by(ascending_s: Array, at_s: Array) -> NDArray[np.int64]:
-    """Index of the last time that is not after another one, for each of these; -1 where there is none."""
-    return np.searchsorted(ascending_s, at_s + _SAME_S, side="right") - 1
 
 
 class ConstantVelocity:
@@ -70,7 +63,7 @@ class ConstantVelocity:
             return self.speed_map_per_s, 0.0
         ahead_s = max(0.0, (t_source_ns - self._last[0]) * 1e-9) + _SPEED_S
         logs = np.log(np.maximum(speeds, _LEAST_SHARE_OF_SPEED * speeds.max()))
-        earlier = _last_by(ends_s, ends_s - ahead_s)
+        earlier = last_by(ends_s, ends_s - ahead_s)
         known = earlier >= 0
         if not known.any():
             return self.speed_map_per_s, 0.0
@@ -81,7 +74,7 @@ class ConstantVelocity:
         """Mean speeds ``(N,)`` over a second each, and the times ``(N,)`` in seconds at which these end."""
         t_s = np.cumsum([0.0, *(step_s for step_s, _, _ in self._steps)])
         ways = np.cumsum([np.zeros(3), *(way for _, _, way in self._steps)], axis=0)
-        begin = _last_by(t_s, t_s - _SPEED_S)
+        begin = last_by(t_s, t_s - _SPEED_S)
         known = begin >= 0
         begin = begin[known]
         lengths = np.linalg.norm(ways[known] - ways[begin], axis=1)

@@ -29,6 +29,8 @@ _DEPTH_SHARE = 0.3
 #: that is a random walk.
 _SPANS_S = (0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0)
 _GROWTH = 1.5
+#: Sums of intervals that differ by less are the same time.
+_SAME_S = 1e-6
 
 
 @dataclass(frozen=True)
@@ -84,10 +86,15 @@ def mean_way(steps: Sequence[Step], span_s: float) -> Array:
     """Mean way ``(3,)`` per second of the newest steps that make up so long a time; of none it is zero."""
     total_s, total = 0.0, np.zeros(3)
     for step_s, _, way in reversed(steps):
-        if total_s >= span_s - 1e-6:
+        if total_s >= span_s - _SAME_S:
             break
         total_s, total = total_s + step_s, total + way
     return total / total_s if total_s > 0.0 else total
+
+
+def last_by(ascending_s: Array, at_s: Array) -> NDArray[np.int64]:
+    """Index of the last time that is not after another one, for each of these; -1 where there is none."""
+    return np.searchsorted(ascending_s, at_s + _SAME_S, side="right") - 1
 
 
 def _led(T_world_before: Array, T_world_after: Array, way: Array) -> Array:
@@ -126,14 +133,14 @@ def _strayed(steps: Sequence[Step], elapsed_s: float) -> float:
     T_first_cam = np.array(list(accumulate((T for _, T, _ in steps), np.matmul, initial=np.eye(4))))
     gone = np.concatenate([np.zeros((1, 3)), np.cumsum([way for _, _, way in steps], axis=0)])
     t_s = np.concatenate([[0.0], np.cumsum([step_s for step_s, _, _ in steps])])
-    before = np.searchsorted(t_s, t_s - _SPEED_S + 1e-6, side="right") - 1
+    before = last_by(t_s, t_s - _SPEED_S)
     known = np.flatnonzero(before >= 0)
     before = before[known]
     speed = np.zeros_like(gone)
     speed[known] = (gone[known] - gone[before]) / (t_s[known] - t_s[before])[:, None]
     furthest = 0.0
     for span_s in [*(s for s in _SPANS_S if s < elapsed_s), elapsed_s]:
-        after = np.searchsorted(t_s, t_s + span_s - 1e-6)
+        after = np.searchsorted(t_s, t_s + span_s - _SAME_S)
         now = known[after[known] < len(t_s)]
         after = after[now]
         way = speed[now] * (t_s[after] - t_s[now])[:, None]

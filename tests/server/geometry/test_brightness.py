@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semcast.common.codec import KLT_WINDOW_PX
 from semcast.server.geometry import features
 from semcast.server.geometry.brightness import brightness_change, with_brightness
 from semcast.server.geometry.features import detect_corners, track_points, track_through_light
@@ -87,13 +88,13 @@ def test_one_search_is_enough_where_guesses_are_near(grey, searches):
     assert gain * 100 + offset == pytest.approx(95, abs=1.0)
 
 
-def test_light_that_far_guesses_make_up_is_none(grey, searches):
+def test_light_that_far_guesses_make_up_is_none(grey):
     # A wall is brighter the further to the right: where points are guessed to be, but not where they are.
     scene = np.rint(20 + 0.35 * np.arange(320) + 0.3 * grey).astype(np.uint8)
     corners = detect_corners(scene, 200).astype(np.float64)
     corners = corners[((corners > 25) & (corners < (280, 214))).all(axis=1)]
     guess = corners + np.array([14.0, 0.0])
-    assert brightness_change(scene, scene, corners, guess) is not None
+    assert brightness_change(scene, scene, corners, guess, KLT_WINDOW_PX) is not None
     found, change = track_through_light(scene, scene, corners, guess)
     assert change is None
     assert np.median(np.linalg.norm(found.xy[found.ok] - corners[found.ok], axis=1)) < 0.05
