@@ -47,12 +47,13 @@ class FileStream:
             return
         self._stream.write(self._changes_since(self._cursor))
         if time.monotonic() - self._flushed_s > _FLUSH_INTERVAL_S:
-            self._flush(_FLUSH_TIMEOUT_S)
+            # Rerun writes on a thread of its own, which ends at the first write that fails.
+            if self._stream.flush(_FLUSH_TIMEOUT_S) is Delivery.SEVERED:
+                self._fail()
             self._flushed_s = time.monotonic()
 
-    def _flush(self, timeout_s: float) -> None:
-        # Rerun writes on a thread of its own, which ends at the first write that fails.
-        if self._stream.flush(timeout_s) is not Delivery.SEVERED or self._has_failed:
+    def _fail(self) -> None:
+        if self._has_failed:
             return
         self._has_failed = True
         text = f"{self._path} can't be written to its end (is there room on the disk?)"
@@ -62,5 +63,7 @@ class FileStream:
 
     def close(self) -> None:
         """Finish the file."""
-        self._flush(_CLOSE_DEADLINE_S)
+        # A thread that ends while it is asked never answers, however often: that looks like a stalled disk.
+        if self._stream.flush(_CLOSE_DEADLINE_S) is not Delivery.DONE:
+            self._fail()
         self._stream.close(_CLOSE_DEADLINE_S)

@@ -13,6 +13,8 @@ from semcast.server.view.settings import ViewSettings
 pytest.importorskip("rerun")
 
 from semcast.server.view.feed import ViewerFeed
+from semcast.server.view.file_stream import FileStream
+from semcast.server.view.rerun_viewer import Delivery
 
 CAMERA = Intrinsics(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
 ROOM_BYTES = 50_000
@@ -61,6 +63,25 @@ def test_a_disk_that_is_full_in_the_last_second_is_told_too(full_disk):
         feed.submit(None, patches=[DensePatch(k, xyz, grey, np.ones(1000, np.float32))])
     feed.close()
     assert len(told) == 1
+
+
+@pytest.mark.parametrize("delivery", Delivery)
+def test_a_file_whose_end_did_not_go_out_is_told(tmp_path, delivery):
+    class Ended:
+        """Rerun's stream, or one whose thread ended or took the question with it."""
+
+        closed = False
+
+        def flush(self, timeout_s):
+            return delivery
+
+        def close(self, deadline_s):
+            self.closed = True
+
+    stream, told = Ended(), []
+    FileStream(stream, tmp_path / "run.rrd", lambda cursor: None, told.append).close()
+    assert len(told) == (delivery is not Delivery.DONE)
+    assert stream.closed
 
 
 def test_a_file_that_is_whole_is_no_error(tmp_path):
