@@ -63,6 +63,8 @@ class FileStream:
 
     def close(self) -> None:
         """Finish the file."""
+        if not self._has_failed:
+            self._stream.write_held()
         # A thread that ends while it is asked never answers, however often: that looks like a stalled disk.
         if self._stream.flush(_CLOSE_DEADLINE_S) is not Delivery.DONE:
             self._fail()

@@ -244,13 +244,17 @@ class RerunStream:
             columns = rr.Transform3D.columns(translation=T[:, :3, 3], mat3x3=T[:, :3, :3])
             self._open().send_columns(path, indexes=times, columns=columns)
 
+    def write_held(self) -> None:
+        """Log the plot values that wait."""
+        self._send_held(self._open())
+
     def _plot(self, rows: list[Row]) -> None:
         """Send plot values when there are some: a dozen curves cost as much for one frame as for ten."""
         if rows and not self._held:
             self._held_since_s = time.monotonic()
         self._held += rows
         if len(self._held) >= _HELD_ROWS or time.monotonic() - self._held_since_s >= _HELD_S:
-            self._send_held(self._open())
+            self.write_held()
 
     def _send_held(self, stream: rr.RecordingStream) -> None:
         rows, self._held = self._held, []

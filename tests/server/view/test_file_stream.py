@@ -70,9 +70,13 @@ def test_a_file_whose_end_did_not_go_out_is_told(tmp_path, delivery):
     class Ended:
         """Rerun's stream, or one whose thread ended or took the question with it."""
 
-        closed = False
+        closed = held_went_out = False
+
+        def write_held(self):
+            self.held_went_out = True
 
         def flush(self, timeout_s):
+            assert self.held_went_out, "asked before all was written"
             return delivery
 
         def close(self, deadline_s):
