@@ -127,6 +127,11 @@ class _Sending:
         self.metrics.count("link_reports")
 
     @property
+    def channel_uses(self) -> str:
+        """How many a frame takes, for people."""
+        return " to ".join(map(str, sorted(set(self._rate.num_uses))))
+
+    @property
     def is_heard(self) -> bool:
         """Whether anybody takes frames now, a channel or a recorder; told not to wait, it is not asked."""
         return not self._settings.wait or self._symbols.has_receiver
@@ -315,7 +320,8 @@ def run_agent(settings: AgentSettings, stop: threading.Event, codec: Codec | Non
             if not sending.lossless:
                 _wait_until_ready(session, settings.agent_id, agent_epoch, stop)
         if not stop.is_set():
-            logger.info("sending %s with %s, %s", source.name, codec.name, settings.mode)
+            what = f"sending {source.name} with {codec.name}, {settings.mode}"
+            logger.info("%s, %s channel uses a frame", what, sending.channel_uses)
         capture = Capture(source, "all" if sending.lossless else "newest", metrics, sending.wants)
         stack.callback(capture.close)
         unread.pop_all()  # from now on it is the capture's, which frees it when nobody reads from it

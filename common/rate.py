@@ -128,7 +128,15 @@ class RateControl:
             allowed = ", ".join(self._rates) or "none"
             raise ConfigError(f"rate must be one of {allowed} for frames of {shape_hw}, got {rate!r}")
         self._fixed = None if rate == "auto" else rate
+        self._shape_hw = shape_hw
         self._rate: Rate = min(self._rates, key=lambda known: abs(_log_uses(known) - _log_uses(NATIVE_RATE)))
+
+    @property
+    def num_uses(self) -> tuple[int, int]:
+        """Fewest and most channel uses of a frame, pilots included."""
+        rates = self._rates if self._fixed is None else [self._fixed]
+        uses = [layout_for(coded_shape(self._shape_hw, rate)).num_uses for rate in rates]
+        return min(uses), max(uses)
 
     def choose(self, snr_db: float) -> Rate:
         """Return the rate for a link of this SNR."""

@@ -88,6 +88,15 @@ def test_an_agent_that_is_stopped_while_it_waits_does_not_say_that_it_sends(
     assert "sending" not in caplog.text
 
 
+@pytest.mark.parametrize(("rate", "told"), [("1/16", "576"), ("auto", "192 to 1152")])
+def test_an_agent_says_what_it_takes_of_the_channel(recording, codec, monkeypatch, caplog, rate, told):
+    caplog.set_level("INFO", "semcast")
+    monkeypatch.setattr(agent, "open_session", lambda network, stop: FailingSession(None))
+    settings = AgentSettings(source=SourceSettings(source=str(recording)), wait=False, rate=rate)
+    run_agent(settings, threading.Event(), codec)
+    assert f"sending steps with tiny, live, {told} channel uses a frame" in caplog.messages
+
+
 def test_an_agent_without_weights_closes_its_source(recording, tmp_path, opened):
     settings = AgentSettings(
         source=SourceSettings(source=str(recording)), weights=tmp_path / "missing.safetensors"

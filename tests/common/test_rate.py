@@ -114,6 +114,11 @@ def test_auto_spends_more_on_a_bad_link_and_does_not_flutter():
         RateControl("1/7", (480, 640))
 
 
+def test_channel_uses_by_hand():
+    assert RateControl("1/16", (480, 640)).num_uses == (30 * 40 * 48,) * 2
+    assert RateControl("auto", (480, 640)).num_uses == (17 * 23 * 48, 42 * 57 * 48)
+
+
 def test_rates_whose_frames_are_too_large_are_not_taken():
     huge = (4000, 6000)
     with pytest.raises(
