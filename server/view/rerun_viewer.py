@@ -147,6 +147,7 @@ class RerunStream:
         self._named: set[str] = set()
         self._held: list[Row] = []
         self._held_since_s = 0.0
+        self._newest: Row | None = None
         self._stream: rr.RecordingStream | None = rr.RecordingStream(
             APPLICATION_ID, recording_id=recording_id
         )
@@ -195,6 +196,8 @@ class RerunStream:
     def write(self, changes: Changes) -> None:
         """Log what changed, plot values a little later; returns before it has arrived."""
         stream = self._open()
+        if self._newest is not None:  # not the time of the picture that was sent last, which may be older
+            _set_time(stream, self._newest)
         if changes.cleared:
             for path in (
                 "world/trajectory",
@@ -208,9 +211,8 @@ class RerunStream:
         if changes.frustum_size is not None and changes.frustum_size > 0:
             self._log_pinhole(changes.frustum_size)
         if changes.rows:
-            last = changes.rows[-1]
-            stream.set_time("frame", sequence=last.frame_id)
-            stream.set_time("source_time", duration=last.t_source_ns * 1e-9)
+            self._newest = changes.rows[-1]
+            _set_time(stream, self._newest)
             self._write_poses(changes.rows)
         self._plot(changes.rows)
         for idx, strips in changes.segments.items():
@@ -311,8 +313,7 @@ class RerunStream:
 
     def _write_picture(self, picture: Picture) -> None:
         stream = self._open()
-        stream.set_time("frame", sequence=picture.frame_id)
-        stream.set_time("source_time", duration=picture.t_source_ns * 1e-9)
+        _set_time(stream, picture)
         stream.log(
             "world/camera/image", rr.EncodedImage(contents=picture.image_jpeg, media_type="image/jpeg")
         )
@@ -363,6 +364,12 @@ class RerunStream:
             rr.unregister_shutdown()
             return False
         return True
+
+
+def _set_time(stream: rr.RecordingStream, of: Row | Picture) -> None:
+    """Let what is logged next be of a frame."""
+    stream.set_time("frame", sequence=of.frame_id)
+    stream.set_time("source_time", duration=of.t_source_ns * 1e-9)
 
 
 def _time_columns(rows: list[Row]) -> list[rr.TimeColumn]:

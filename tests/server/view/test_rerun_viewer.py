@@ -32,6 +32,7 @@ import rerun as rr
 
 from semcast.server.view.feed import ViewerFeed, check_view, resolve_view
 from semcast.server.view.live_stream import MAX_REFUSALS
+from semcast.server.view.picture import compress_picture
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
 from semcast.server.view.rerun_viewer import SERIES, RerunStream, blueprint
 from semcast.server.view.scene import Cursor, Scene
@@ -150,6 +151,23 @@ def test_plot_values_go_out_together_and_none_is_lost(tmp_path):
     text = rerun_output("rrd", "print", "-vvv", "--entity", "/plots/link/psnr_db", str(file))
     assert re.findall(r"\[(2\d\.0)\]", text) == [f"{20 + k}.0" for k in range(10)]
     assert re.findall(r"with (\d+) rows? .*- \[?/?plots/link/psnr_db", text).count("4") == 2
+
+
+def test_what_comes_behind_an_older_picture_is_of_the_newest_frame(tmp_path):
+    file = tmp_path / "run.rrd"
+    stream = RerunStream(recording_id="late", camera=CAMERA, has_truth=False, has_confidence=True, file=file)
+    scene, cursor = Scene(None), Cursor()
+    scene.set_picture(compress_picture(frame(3), 80))
+    for k in (4, 5):
+        scene.add_frame(frame(k).without_image())
+    stream.write(scene.changes_since(cursor))
+    # The last adjustment comes without a frame: a viewer that stands at frame 5 must show it.
+    scene.set_marker(Marker(np.eye(4)[:, :3], "1 unit of the map is 0.4 m"))
+    stream.write(scene.changes_since(cursor))
+    assert stream.close()
+    for entity, frame_id in (("/world/camera/image/keypoints", 3), ("/world/marker", 5)):
+        text = rerun_output("rrd", "print", "-vvv", "--entity", entity, str(file))
+        assert re.findall(r"row_\w+ +\S (\d+) ", text) == [str(frame_id)], entity
 
 
 def test_plot_values_of_a_stream_that_rests_go_out_all_the_same(tmp_path):
