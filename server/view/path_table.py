@@ -154,8 +154,10 @@ class PathTable:
             self.keyframes[keyframe_id] = T
             self._newest_keyframe = max(self._newest_keyframe, keyframe_id)
         if moved:
-            places = (place for place, frame in enumerate(self._frames) if frame.reference in moved)
-            self._touch({place // SEGMENT_POSES for place in places})
+            places = [place for place, frame in enumerate(self._frames) if frame.reference in moved]
+            last = len(self._frames) - 1
+            # The segment after a pose begins with it where it is the last one of its own.
+            self._touch({min(k, last) // SEGMENT_POSES for place in places for k in (place, place + 1)})
 
     def _touch_from(self, place: int) -> None:
         self._touch(range(place // SEGMENT_POSES, (len(self._frames) - 1) // SEGMENT_POSES + 1))

@@ -86,6 +86,13 @@ def test_only_segments_that_changed_have_another_version():
     assert changed == [False, True]
     assert lines(table, 1)[0][:2] == [SEGMENT_POSES - 1.0, SEGMENT_POSES], "it joins the one before"
     before = list(table.segment_versions)
+    table.set_keyframes({0: at(0, 3)})
+    changed = [now != then for now, then in zip(table.segment_versions, before, strict=True)]
+    assert changed == [True, True], "the second begins with the last pose of the first, which has moved"
+    before = list(table.segment_versions)
+    table.set_keyframes({SEGMENT_POSES: at(SEGMENT_POSES, 2)})
+    assert len(table.segment_versions) == len(before), "there is no segment after the last pose"
+    before = list(table.segment_versions)
     table.move({})
     table.withdraw([99 * SEGMENT_POSES])
     assert table.segment_versions == before
