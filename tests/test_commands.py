@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import importlib.metadata
+import importlib.util
 import json
 import os
 import re
@@ -23,7 +24,7 @@ from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
 from semcast.cli import main, verb_parser
 from semcast.commands.agent import settings_of
-from semcast.commands.doctor import check_packages, check_processor, check_system
+from semcast.commands.doctor import check_packages, check_processor, check_system, check_viewer
 from semcast.commands.evaluate import EVALUATIONS
 from semcast.commands.running import read_given, read_settings, run_until_stopped
 from semcast.common.argument_order import arguments_last
@@ -258,6 +259,18 @@ def test_doctor_says_what_runs_an_agent_without_torch(monkeypatch):
     texts = {finding.what: finding.text for finding in check_packages()}
     assert "extra 'edge'" in texts["onnxruntime"]
     assert "without onnxruntime" in texts["torch"]
+
+
+def test_doctor_looks_for_the_viewer_that_a_server_starts(monkeypatch, tmp_path):
+    (tmp_path / "rerun").touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))  # another program of that name, which no server starts
+    found = next(check_viewer())
+    assert (found.verdict, Path(found.text).parent.name) == ("good", "rerun_cli")
+    known = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if "_cli" in name else known(name))
+    found = next(check_viewer())
+    assert found.verdict == "note"
+    assert found.text.startswith("--view native and web can't start: no Rerun viewer is installed")
 
 
 @pytest.mark.weights

@@ -7,7 +7,6 @@ import argparse
 import importlib.metadata
 import importlib.util
 import platform
-import shutil
 import socket
 import sys
 from collections.abc import Collection, Iterable, Iterator
@@ -26,7 +25,7 @@ from semcast.common.keys import DEFAULT_AGENT_ID
 from semcast.common.messages import ROLES, StatusMessage
 from semcast.common.metrics import frames_in_words
 from semcast.common.network_settings import NetworkSettings
-from semcast.server.view.process import window_display
+from semcast.server.view.process import rerun_binary, window_display
 
 if TYPE_CHECKING:
     from semcast.common.transport import Session
@@ -126,15 +125,13 @@ def check_weights() -> Iterator[Finding]:
 
 
 def check_viewer() -> Iterator[Finding]:
-    """Check whether a window can be opened and the viewer program is there."""
+    """Check whether a window can be opened and the viewer program that a server starts is there."""
     if importlib.util.find_spec("rerun") is None:
         return
-    program = shutil.which("rerun") or shutil.which("rerun", path=str(Path(sys.executable).parent))
-    yield Finding(
-        "rerun program",
-        "good" if program else "note",
-        program or "not on PATH: --view native and web can't start",
-    )
+    try:
+        yield Finding("rerun program", "good", str(rerun_binary()))
+    except ConfigError as err:
+        yield Finding("rerun program", "note", f"--view native and web can't start: {err}")
     display = window_display()
     if display is None:
         yield Finding("display", "note", "none: use --view web, or --view file and open run.rrd elsewhere")
