@@ -291,12 +291,14 @@ def read_known_path(path: Path) -> Trajectory:
     """Return the path in a TUM file, or the true path of a sequence.
 
     Raises:
-        SourceError: It can't be read, or the sequence has none.
+        SourceError: It can't be read, the sequence has none, or the file holds no pose.
     """
     is_tum = path.is_file() and path.suffix.lower() != ".json"
     truth = read_tum(path) if is_tum else open_truth(path)[0]
     if truth is None:
         raise SourceError(f"{path} is a sequence without a true path")
+    if len(truth) == 0:
+        raise SourceError(f"{path} must hold poses, got none")
     return truth
 
 

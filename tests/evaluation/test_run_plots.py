@@ -267,6 +267,13 @@ def test_a_summary_that_no_run_wrote_is_named_in_one_line(tmp_path, capsys, summ
     assert f"{tmp_path / SUMMARY_NAME} is none that a run wrote: " in capsys.readouterr().err
 
 
+def test_a_true_path_without_a_pose_is_refused_in_one_line(tmp_path, capsys):
+    write_tum(tmp_path / TRAJECTORY_NAME, line([1, 2, 3]))
+    write_tum(tmp_path / "empty.tum", line([]))
+    assert main(["plot", str(tmp_path), "--truth", str(tmp_path / "empty.tum")]) == 1
+    assert f"{tmp_path / 'empty.tum'} must hold poses, got none" in capsys.readouterr().err
+
+
 def test_from_above_is_from_above_also_where_the_true_world_has_z_up(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(run_plots, "save_figure", lambda figure, path: drawn.append(figure))
