@@ -115,7 +115,7 @@ def _seen(true: Mapping[int, TrueView]) -> tuple[Array, Array]:
 
 def _distance_between(places: Array, xyz: Array) -> Array:
     """Return how far each place ``(N, 3)`` is from the nearest ``(M, 3)``; infinite without any."""
-    if not len(xyz):
+    if not len(xyz) or not len(places):
         return np.full(len(places), np.inf)
     tree = cv2.flann_Index(xyz.astype(np.float32), _EXACT_TREE)  # type: ignore[attr-defined]
     _, squared = tree.knnSearch(places.astype(np.float32), 1, params=_ALL_LEAVES)

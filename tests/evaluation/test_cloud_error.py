@@ -81,8 +81,10 @@ def test_a_cloud_without_points_covers_nothing():
 
 
 def test_of_an_empty_world_there_is_nothing_to_cover():
-    figures = cloud_error([{}], {1: seen(wall(z_m=-4.0))})
-    assert (figures["points"], figures["completeness"]) == (0.0, None)
+    nothing = {1: seen(wall(z_m=-4.0))}
+    for points in (np.zeros((0, 3), np.float32), np.ones((5, 3), np.float32)):
+        figures = cloud_error([{1: points}], nothing)
+        assert (figures["points"], figures["completeness"]) == (len(points), None)
 
 
 def test_the_nearest_points_are_exact(rng):
