@@ -289,8 +289,8 @@ def _readout(report: Report) -> Iterator[str]:
                 row["axis"],
                 number(row["error_px"], 3),
                 str(row["num_frames"]),
-                f"{row['more_ms']:.1f} +- {row['sigma_ms']:.1f}",
-                row["more_axis"],
+                "-" if row["more_ms"] is None else f"{row['more_ms']:.1f} +- {row['sigma_ms']:.1f}",
+                row["more_axis"] or "-",
             ]
             for row in report["trials"]
         ],
@@ -327,7 +327,7 @@ def _lens(report: Report) -> Iterator[str]:
                 *(f"{value:.4f}" for value in (*row["radial"], *row["centre"])),
                 number(row["error_px"], 3),
                 str(row["num_frames"]),
-                f"{100 * row['more_focal']:+.2f}",
+                "-" if row["more_focal"] is None else f"{100 * row['more_focal']:+.2f}",
             ]
             for row in report["trials"]
         ],

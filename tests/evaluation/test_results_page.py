@@ -22,3 +22,18 @@ def test_a_table_names_its_codec_be_it_the_default(tmp_path, file, codec):
     report["settings"]["codec"] = codec
     (tmp_path / f"{file}.json").write_text(json.dumps(report), encoding="utf-8")
     assert f"\nCodec `{codec}`.\n" in results_page(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "unknown"),
+    [
+        ("readout_room_rolling", ("more_ms", "more_axis", "sigma_ms")),
+        ("lens_room_bent", ("more_focal", "more_radial", "more_centre")),
+    ],
+)
+def test_a_trial_whose_residuals_say_nothing_has_dashes(tmp_path, file, unknown):
+    report = json.loads((RESULTS / f"{file}.json").read_text(encoding="utf-8"))
+    report["trials"][-1] |= dict.fromkeys(unknown)
+    (tmp_path / f"{file}.json").write_text(json.dumps(report), encoding="utf-8")
+    rows = [line for line in results_page(tmp_path).splitlines() if line.startswith("|")]
+    assert [row.endswith("| - |") for row in rows[-2:]] == [False, True]
