@@ -44,6 +44,15 @@ class RecordingSettings:
             raise ValueError(f"round_s must be in [0.1, 3600], got {self.round_s:g}")
         if self.rounds < 1:
             raise ValueError(f"rounds must be at least 1, got {self.rounds}")
+        if self.num_frames < 1:
+            raise ValueError(
+                f"round_s must be long enough for a frame at {self.rate_hz:g} Hz, got {self.round_s:g}"
+            )
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of a round."""
+        return round(self.rate_hz * self.round_s)
 
 
 def by_frame(messages: Iterable[RecordedMessage]) -> list[list[RecordedMessage]]:
@@ -101,7 +110,7 @@ def _round(
 ) -> float:
     """Return the CPU seconds of one round."""
     began_s, cpu_s = time.monotonic(), time.process_time()
-    for k in range(round(settings.rate_hz * settings.round_s)):
+    for k in range(settings.num_frames):
         for message in groups[k % len(groups)]:
             since_ns = time.perf_counter_ns()
             if recorder is not None:

@@ -45,8 +45,9 @@ class RuntimeSettings:
         for name in ("width", "height", "rounds", "calls"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not self.threads:
-            raise ValueError("threads must be one or more numbers, got none")
+        for name, values in (("codec", self.codecs), ("threads", self.threads)):
+            if not values or len(set(values)) != len(values):
+                raise ValueError(f"{name} must be one or more different values, got {values}")
         for num_threads in self.threads:
             check_threads(num_threads)
 

@@ -45,3 +45,5 @@ def test_a_recording_without_frames_is_one_clear_error(tmp_path):
         evaluate_recording(RecordingSettings(file=tmp_path / "e.mcap"))
     with pytest.raises(ValueError, match="rounds must be at least 1, got 0"):
         RecordingSettings(file=tmp_path / "e.mcap", rounds=0)
+    with pytest.raises(ValueError, match="round_s must be long enough for a frame at 0.5 Hz, got 0.2"):
+        RecordingSettings(file=tmp_path / "e.mcap", rate_hz=0.5, round_s=0.2)

@@ -45,6 +45,12 @@ def test_an_unknown_codec_is_one_clear_error(monkeypatch):
         RuntimeSettings(threads=(0,))
 
 
+@pytest.mark.parametrize("values", [{"codecs": ()}, {"codecs": ("3dcsc", "3dcsc")}, {"threads": (2, 2)}])
+def test_no_variant_is_timed_twice_and_there_is_one(values):
+    with pytest.raises(ValueError, match="(codec|threads) must be one or more different values, got"):
+        RuntimeSettings(**values)
+
+
 def test_without_a_variant_that_ran_the_first_one_says_why(monkeypatch):
     children = []
 
