@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -22,6 +22,16 @@ def frames_in_words(event: str, count: int, drops: Mapping[str, int]) -> str:
     """Say to how many frames something happened, and how many were dropped for which reason."""
     dropped = ", ".join(f"{number} {reason}" for reason, number in sorted(drops.items()) if number)
     return f"{count} frames {event}; dropped: {dropped or 'none'}"
+
+
+def duration_percentiles(values_ms: Iterable[float]) -> dict[str, float] | None:
+    """Return ``p50``, ``p95`` and ``max``, without values that are not finite; None where there are none."""
+    values = np.fromiter(values_ms, dtype=np.float64)
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return None
+    p50, p95, most = np.percentile(values, (50, 95, 100)).tolist()
+    return {"p50": p50, "p95": p95, "max": most}
 
 
 class Metrics:
@@ -120,15 +130,12 @@ class Metrics:
                 self._forget(times_ns, now_ns)
             return {event: len(times_ns) / over_s for event, times_ns in self._events_ns.items()}
 
-    def stages_ms(self) -> dict[str, tuple[float, float, float]]:
-        """Stage to (p50, p95, max) over its last runs."""
+    def stages_ms(self) -> dict[str, dict[str, float]]:
+        """Stage to ``duration_percentiles`` of its last runs."""
         with self._lock:
-            kept = {stage: np.array(values) for stage, values in self._stages_ms.items()}
-        result: dict[str, tuple[float, float, float]] = {}
-        for stage, values in kept.items():
-            p50, p95, most = np.percentile(values, (50, 95, 100))
-            result[stage] = (float(p50), float(p95), float(most))
-        return result
+            kept = {stage: list(values) for stage, values in self._stages_ms.items()}
+        found = {stage: duration_percentiles(values) for stage, values in kept.items()}
+        return {stage: figures for stage, figures in found.items() if figures is not None}
 
     def status(self, agent_epoch: int) -> StatusMessage:
         """Return the message that is sent once a second."""
@@ -141,7 +148,7 @@ class Metrics:
             rates_hz=self.rates_hz(),
             counts=self.counts,
             drops=self.drops,
-            stages_ms={stage: tuple(values) for stage, values in self.stages_ms().items()},
+            stages_ms={stage: (f["p50"], f["p95"], f["max"]) for stage, f in self.stages_ms().items()},
             last_error=last_error,
             activity=activity,
             ended=ended,
@@ -152,8 +159,5 @@ class Metrics:
         return {
             "counts": self.counts,
             "drops": self.drops,
-            "stage_ms": {
-                stage: {"p50": p50, "p95": p95, "max": most}
-                for stage, (p50, p95, most) in self.stages_ms().items()
-            },
+            "stage_ms": self.stages_ms(),
         }

@@ -11,6 +11,7 @@ import numpy as np
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import Codec
 from semcast.common.errors import ConfigError
+from semcast.common.metrics import duration_percentiles
 from semcast.common.trajectory import Trajectory
 from semcast.evaluation.pipeline import (
     UNUSED_LINK_FIELDS,
@@ -116,9 +117,7 @@ def stage_profile(rows: list[dict[str, Any]]) -> dict[str, Any]:
     total_ms = sum(float(t.sum()) for t in times.values())
     profile = {
         stage: {
-            "p50": float(np.percentile(t, 50)),
-            "p95": float(np.percentile(t, 95)),
-            "max": float(t.max()),
+            **(duration_percentiles(t) or {}),
             "ran_share": len(t) / len(rows),
             "mean_per_frame_ms": float(t.sum()) / len(rows),
             "time_share": float(t.sum()) / total_ms if total_ms > 0 else 0.0,

@@ -20,7 +20,7 @@ from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import number, table
 from semcast.evaluation.pair_suite import RECORDINGS
 from semcast.evaluation.pipeline import CLEAN
-from semcast.evaluation.statistics import MIN_SAMPLES, finite_mean, small_sample_factor
+from semcast.evaluation.statistics import MIN_SAMPLES, finite_mean, scatter_of_mean
 
 Array = NDArray[np.float64]
 
@@ -50,7 +50,6 @@ _RATIOS = (
     ("inverted", "off"),
     ("robust", "shuffled"),
 )
-_NUM_RESAMPLES = 4000
 _SEED = 0
 
 
@@ -424,8 +423,6 @@ def ratio_text(cells: Iterable[Cell], ours: str, theirs: str) -> str:
     ratio = f"{np.exp(logs.mean()):.2f}"
     if len(logs) < MIN_SAMPLES:
         return ratio
-    rng = np.random.default_rng(_SEED)
-    off = logs[rng.integers(len(logs), size=(_NUM_RESAMPLES, len(logs)))].mean(axis=1) - logs.mean()
-    bounds = logs.mean() + small_sample_factor(len(logs)) * np.percentile(off, [2.5, 97.5])
-    low, high = np.exp(bounds)
+    off = scatter_of_mean(logs, np.random.default_rng(_SEED))
+    low, high = np.exp(logs.mean() + np.percentile(off, [2.5, 97.5]))
     return f"{ratio} ({low:.2f} .. {high:.2f})"

@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 #: Resamples of a bootstrap: the 95 % bounds are then steady to a few percent of their width.
 NUM_RESAMPLES = 2000
+#: Resamples behind an interval in a table of a page, of which there are few: the second digit is then steady.
+_NUM_PAGE_RESAMPLES = 4000
 #: Samples from which an interval is given.
 MIN_SAMPLES = 5
 
@@ -162,6 +164,24 @@ def student_quantile(count: int, level: float = 0.95) -> float:
     # In powers of 1 / nu (Abramowitz and Stegun 26.7.5).
     quantile = z + (z**3 + z) / (4 * nu) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * nu**2)
     return quantile + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * nu**3)
+
+
+def scatter_of_mean(values: Array, rng: np.random.Generator) -> Array:
+    """Return by how much means of resampled values are off, widened as ``small_sample_factor`` says.
+
+    Args:
+        values: ``(N,)``, at least 5.
+        rng: Source of the resamples.
+
+    Returns:
+        ``(R,)``: with the mean of the values added, its percentiles are the bounds of an interval.
+
+    Raises:
+        ValueError: As ``small_sample_factor``.
+    """
+    factor, size = small_sample_factor(len(values)), (_NUM_PAGE_RESAMPLES, len(values))
+    off = values[rng.integers(len(values), size=size)].mean(axis=1) - values.mean()
+    return np.asarray(factor * off)
 
 
 def _checked_pair(

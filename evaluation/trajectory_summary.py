@@ -12,13 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.evaluation.markdown import number, table
-from semcast.evaluation.statistics import small_sample_factor
+from semcast.evaluation.statistics import MIN_SAMPLES, scatter_of_mean
 
 Array = NDArray[np.float64]
 
-#: A cell with fewer seeds says nothing about bad runs.
-MIN_SEEDS = 5
-_NUM_RESAMPLES = 4000
 _SEED = 0
 
 
@@ -62,7 +59,7 @@ def pairings_of(reports: Iterable[Mapping[str, Any]]) -> list[Pairing]:
             shared = sorted(a.keys() & b.keys())
             both = [(a[s]["ate_percent"], b[s]["ate_percent"]) for s in shared]
             known = [pair for pair in both if None not in pair]
-            if len(known) < MIN_SEEDS:
+            if len(known) < MIN_SAMPLES:  # fewer seeds say nothing about bad runs
                 continue
             # An error of exactly 0 has no logarithm.
             values = np.maximum(np.array(known, dtype=np.float64), 1e-6)
@@ -79,12 +76,9 @@ def ratio_interval(pairings: Sequence[Pairing]) -> tuple[float, float, float]:
     """Return the geometric mean ratio of errors, all cells alike, and its 95 % bootstrap interval."""
     rng = np.random.default_rng(_SEED)
     logs = [np.log(p.ours_percent / p.theirs_percent) for p in pairings]
-    drawn = np.zeros(_NUM_RESAMPLES)
-    for log in logs:
-        off = log[rng.integers(len(log), size=(_NUM_RESAMPLES, len(log)))].mean(axis=1) - log.mean()
-        drawn += small_sample_factor(len(log)) * off / len(logs)
+    off = np.mean([scatter_of_mean(log, rng) for log in logs], axis=0)
     mean = np.mean([log.mean() for log in logs])
-    low, high = np.exp(mean + np.percentile(drawn, [2.5, 97.5]))
+    low, high = np.exp(mean + np.percentile(off, [2.5, 97.5]))
     return float(np.exp(mean)), float(low), float(high)
 
 

@@ -14,11 +14,12 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from semcast.common.errors import SemcastError
+from semcast.common.metrics import duration_percentiles
 from semcast.common.run_folder import FRAMES_NAME
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
 from semcast.common.whole_file import whole_file
-from semcast.server.export.outputs import percentiles, plain
+from semcast.server.export.outputs import plain
 from semcast.server.export.parts import count_parts
 from semcast.server.mapping.state import DecodedFrame, FrameResult
 from semcast.server.sent_frames import Stretch, unposed_ranges
@@ -295,8 +296,8 @@ def summarise(
     num_sent = max(sum(stretch.num for stretch in sent), len(posed_ids))
     psnr_db = np.array([row.psnr_db for row in rows if row.psnr_db is not None and np.isfinite(row.psnr_db)])
     stages = sorted({stage for row in rows for stage in row.stage_ms})
-    stage_ms = {s: percentiles(row.stage_ms[s] for row in rows if s in row.stage_ms) for s in stages}
-    stage_ms["arrival_to_pose"] = percentiles(row.age_ms for row in rows)
+    stage_ms = {s: duration_percentiles(row.stage_ms[s] for row in rows if s in row.stage_ms) for s in stages}
+    stage_ms["arrival_to_pose"] = duration_percentiles(row.age_ms for row in rows)
     span_s = 0.0
     if len(rows) > 1:
         ids = rows[-1].frame_id - rows[0].frame_id

@@ -204,15 +204,6 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
     write_whole(path, json.dumps(plain(value), indent=1, allow_nan=False) + "\n")
 
 
-def percentiles(values_ms: Iterable[float]) -> dict[str, float] | None:
-    """Return p50, p95 and max, None without values."""
-    values = np.fromiter((v for v in values_ms if math.isfinite(v)), dtype=np.float64)
-    if len(values) == 0:
-        return None
-    p50, p95 = np.percentile(values, [50, 95])
-    return {"p50": float(p50), "p95": float(p95), "max": float(values.max())}
-
-
 def versions_of(packages: Iterable[str]) -> dict[str, str]:
     """Return the versions of semcast, of Python and of those of some packages that are installed."""
     found = {"semcast": __version__, "python": platform.python_version()}

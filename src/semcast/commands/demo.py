@@ -49,10 +49,7 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
     """Return the figures of a run as a table; what is not known, as errors without a truth, has no row."""
     table = Table(title="what came out", show_header=False, title_justify="left")
     for key, name, written in _FIGURES:
-        value = summary.get(key)
-        if isinstance(value, Mapping):
-            value = value.get("p50", value.get("mean"))
-        if value is not None:
+        if (value := summary.get(key)) is not None:
             table.add_row(name, written(value))
     if summary.get("readout_ms"):
         table.add_row("rolling shutter", f"{summary['readout_ms']:.1f} ms from {summary['readout_from']}")
@@ -61,8 +58,7 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
     for reason, count in (summary.get("drops") or {}).items():
         table.add_row(f"frames dropped: {reason}", str(count))
     for stage, figures in (summary.get("stage_ms") or {}).items():
-        if figures.get("p50") is not None:
-            table.add_row(f"{stage}, p50 / p95", f"{figures['p50']:.1f} / {figures['p95']:.1f} ms")
+        table.add_row(f"{stage}, p50 / p95", f"{figures['p50']:.1f} / {figures['p95']:.1f} ms")
     return table
 
 

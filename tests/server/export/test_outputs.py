@@ -9,7 +9,6 @@ from full_disk import room_for
 from semcast.common.trajectory import Trajectory, read_tum, write_tum
 from semcast.server.export.outputs import (
     EachFile,
-    percentiles,
     plain,
     read_ply,
     trajectory_of,
@@ -107,11 +106,6 @@ def test_json_has_no_nan(tmp_path):
     assert read == {"a": None, "b": [1.5, None], "c": [0, 1], "3": [str(tmp_path)], "d": None}
     assert list(tmp_path.iterdir()) == [tmp_path / "summary.json"]
     assert plain(True) is True
-
-
-def test_percentiles_by_hand():
-    assert percentiles([1.0, 2.0, 3.0, float("nan")]) == {"p50": 2.0, "p95": pytest.approx(2.9), "max": 3.0}
-    assert percentiles([]) is None
 
 
 def test_versions_name_what_figures_depend_on():
