@@ -90,8 +90,13 @@ def test_the_servers_folders_are_layers(folder, may_import):
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.parametrize("folder", ["common", "evaluation", "server", "server/geometry", "server/mapping"])
-def test_the_guide_to_a_large_folder_names_each_of_its_modules_once(folder):
+@pytest.mark.parametrize(
+    "folder",
+    sorted(
+        str(path.parent.relative_to(ROOT)) for top in FOLDERS for path in (ROOT / top).rglob("__init__.py")
+    ),
+)
+def test_the_guide_to_a_folder_names_each_of_its_modules_once(folder):
     docstring = ast.get_docstring(ast.parse((ROOT / folder / "__init__.py").read_text(encoding="utf-8")))
     named = re.findall(r"^ {4}(\w+) +\S", docstring, re.MULTILINE)
     modules = [path.stem for path in (ROOT / folder).glob("*.py") if path.stem != "__init__"]
