@@ -22,7 +22,7 @@ from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
 from semcast.common.source_commit import source_commit
 from semcast.evaluation.calibration import reliability
-from semcast.evaluation.report import check_outputs, json_ready, machine_kind, write_result
+from semcast.evaluation.report import RESULTS, check_outputs, json_ready, machine_kind, write_result
 from semcast.evaluation.statistics import spearman
 from semcast.training.channel import LinkDrawSettings, draw_links, through_link
 from semcast.training.data import read_images
@@ -32,7 +32,6 @@ from semcast.training.loop import train
 from semcast.training.losses import LossSettings, confidence_label
 from semcast.training.settings import TrainSettings
 
-RESULT = Path("evaluation/results/ablation_loss.json")
 #: Weight at which the descriptor term's gradient is about half of that of the reconstruction.
 _DESCRIPTOR = 0.005
 VARIANTS = {
@@ -121,7 +120,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path, help="folder with train/ and valid/")
     parser.add_argument("--steps", type=int, default=1000, help="steps of each training")
-    parser.add_argument("--json", type=Path, default=RESULT, help="file for the result")
+    parser.add_argument(
+        "--json", type=Path, default=RESULTS / "ablation_loss.json", help="file for the result"
+    )
     arguments = parser.parse_args()
     check_outputs(arguments.json, None)
     settings = TrainSettings(

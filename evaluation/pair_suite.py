@@ -13,10 +13,9 @@ from typing import Any
 from semcast.channel.settings import ChannelName, ChannelSettings
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.pairs import PairSettings, evaluate_pairs
-from semcast.evaluation.report import check_outputs
+from semcast.evaluation.report import RESULTS, check_outputs
 from semcast.server.geometry.weighting import ConfidenceMode
 
-RESULTS = Path("evaluation/results")
 _ALL_MODES: tuple[ConfidenceMode, ...] = ("robust", "paper", "off", "constant", "shuffled", "inverted")
 
 

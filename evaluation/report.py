@@ -16,6 +16,8 @@ from semcast.server.export.outputs import plain, versions_of, write_json
 
 #: File of a result in the folder its pictures go to.
 RESULT_NAME = "result.json"
+#: Folder of the results that pages are made of, where the source is.
+RESULTS = Path("evaluation/results")
 #: What ``--json`` is to have the result on stdout.
 STDOUT = Path("-")
 #: Libraries whose version can change a result.

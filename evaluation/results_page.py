@@ -15,10 +15,10 @@ from semcast.evaluation.markdown import number, table, with_part
 from semcast.evaluation.pair_summary import RIVAL, pair_headline, pair_summary
 from semcast.evaluation.path_tables import WORST_RATIO, readme_table, trajectory_table
 from semcast.evaluation.plots import variant_name
+from semcast.evaluation.report import RESULTS
 from semcast.evaluation.trace_snr import level_name
 from semcast.evaluation.trajectory_summary import trajectory_summary
 
-RESULTS = Path("evaluation/results")
 PAGE = Path("docs/results.md")
 README = Path("README.md")
 CONFIDENCE_PAGE = Path("docs/confidence.md")

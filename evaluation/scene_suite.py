@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from semcast.channel.settings import ChannelSettings
-from semcast.evaluation.report import check_outputs
+from semcast.evaluation.report import RESULTS, check_outputs
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.render import RenderSettings, SceneName, render_scene
 from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory
 
-RESULTS = Path("evaluation/results")
 SCENES_FOLDER = Path("runs/scenes")
 #: Seeds of the scenes; those below 100 were looked at while the renderer was written.
 _SEEDS = {
