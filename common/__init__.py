@@ -9,7 +9,7 @@ Images and cameras
     camera                  pinhole, lens distortion, readout of the shutter
     camera_file             calibration files of many tools
     camera_settings         the camera on the command line
-    lens                    names of distortion coefficients
+    lens                    names of distortion coefficients, one camera for all images
 
 Geometry and trajectories
     geometry                rotations, rigid and similarity transforms
@@ -47,6 +47,7 @@ Recorded sequences and recordings
     colmap_file             cameras and poses of a COLMAP model
     sequence_sizes          sizes of its image files
     numbered_images         lines of a file, matched with images
+    text_rows               lines of fields, without comments
     transforms_file         transforms.json
     ros_bag_files           tells ROS bags by how they look
     playback                which frames are played, and how fast

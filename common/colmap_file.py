@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import invert_transform, make_transform, rotation_from_quat_wxyz
+from semcast.common.lens import check_one_camera
 
 T = TypeVar("T")
 
@@ -36,8 +37,6 @@ _MODELS = {
 }
 _ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _TWO_FOCAL_LENGTHS = ("PINHOLE", "OPENCV", "FULL_OPENCV")
-#: Cameras that COLMAP fits to each image differ by less where it is one that does not zoom.
-_SAME_CAMERA = 0.01
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,8 @@ def read_colmap(folder: Path) -> ColmapModel:
         raise SourceError(f"{folder} has no image with a pose")
     try:
         used = [_intrinsics(cameras[k]) for k in sorted({image.camera_id for image in images})]
-        _check_one_camera(used)
+        for name in ("width", "height", "fx", "fy"):
+            check_one_camera(name, [float(getattr(camera, name)) for camera in used])
     except KeyError as err:
         raise SourceError(f"{folder} has no camera {err}, which took one of its images") from err
     except (ValueError, OverflowError) as err:
@@ -218,18 +218,3 @@ def _intrinsics(camera: _Camera) -> Intrinsics:
         height=camera.height,
         distortion=distortion,
     )
-
-
-def _check_one_camera(cameras: list[Intrinsics]) -> None:
-    """Check that images were taken by one camera that does not zoom.
-
-    Raises:
-        ValueError: They were not.
-    """
-    for name in ("width", "height", "fx", "fy"):
-        values = [float(getattr(camera, name)) for camera in cameras]
-        if max(values) - min(values) > _SAME_CAMERA * max(values):
-            raise ValueError(
-                f"{name} must be the same for all images (one camera, no zoom), "
-                f"got {min(values):g} to {max(values):g}"
-            )

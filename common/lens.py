@@ -1,10 +1,10 @@
-"""Lens distortion as calibration files of many tools name it, under OpenCV's coefficients.
+"""Lens distortion as calibration files of many tools name it, under OpenCV's coefficients; checks of cameras.
 
 A lens is read whole or refused: points of an image whose distortion was left out would be quietly wrong.
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 #: Coefficients of OpenCV's models that are known here: none, radial-tangential, with k3, rational.
@@ -38,6 +38,9 @@ _NO_PINHOLE = (
     "spheri",
 )
 _NO_PINHOLE_WORDS = ("mei", "ds", "eucm", "fov", "kb4", "kb8")
+#: By how much of itself an intrinsic may differ between images: programs that fit a camera to each one differ
+#: by less where it is the same, and a zoom moves the focal length by more.
+_SAME_CAMERA = 0.01
 #: Part of the words for models that map the other way, as RealSense's ``inverse_brown_conrady`` does.
 _INVERSE = "inverse"
 #: Parts of the words for models whose coefficients are known here.
@@ -67,6 +70,23 @@ def check_pinhole(values: dict[str, Any]) -> None:
             raise ValueError(f"{key} must be a pinhole camera's (pinhole, radtan, none), got {value!r}")
         if key.lower() in _FISHEYE_KEYS and value:
             raise ValueError(f"{key} must be false for a pinhole camera, got {value!r}")
+
+
+def check_one_camera(name: str, values: Sequence[float]) -> None:
+    """Check that images were taken by one camera that does not zoom.
+
+    Args:
+        name: Of an intrinsic, such as ``fx``.
+        values: What it is for each image, at least one.
+
+    Raises:
+        ValueError: They differ by more than a hundredth of the largest.
+    """
+    low, high = min(values), max(values)
+    if not high - low <= _SAME_CAMERA * abs(high):
+        raise ValueError(
+            f"{name} must be the same for all images (one camera, no zoom), got {low:g} to {high:g}"
+        )
 
 
 def distortion_in(values: dict[str, Any]) -> tuple[float, ...]:

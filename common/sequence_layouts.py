@@ -22,6 +22,7 @@ from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, project_to_so3, rotation_from_quat_wxyz
 from semcast.common.numbered_images import lines_of_images, numbers_in_names
 from semcast.common.ros_bag_files import check_no_ros_bag
+from semcast.common.text_rows import text_rows
 from semcast.common.trajectory import Trajectory, read_tum, seconds_of
 from semcast.common.transforms_file import read_transforms_json
 
@@ -230,15 +231,8 @@ def _rows(path: Path, at_least: int, read: Callable[[list[str]], Row]) -> list[R
     Raises:
         SourceError: The file can't be read, or ``read`` raises ``ValueError`` for a line.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as err:
-        raise SourceError(f"{path} can't be read: {err}") from err
     rows: list[Row] = []
-    for number, line in enumerate(lines, start=1):
-        fields = line.split("#", 1)[0].replace(",", " ").split()
-        if not fields:
-            continue
+    for number, line, fields in text_rows(path):
         if len(fields) < at_least:
             raise SourceError(f"{path}:{number} must have {at_least} fields, got {line!r}")
         try:

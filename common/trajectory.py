@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from semcast.common.errors import SourceError
 from semcast.common.geometry import make_transform, quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from semcast.common.text_rows import text_rows
 from semcast.common.whole_file import write_whole
 
 
@@ -76,17 +77,10 @@ def read_tum(path: Path) -> Trajectory:
     Raises:
         SourceError: The file can't be read, a line has not eight finite numbers, or times do not increase.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as err:
-        raise SourceError(f"{path} can't be read: {err}") from err
     times: list[float] = []
     poses: list[NDArray[np.float64]] = []
     before = ""
-    for number, line in enumerate(lines, start=1):
-        fields = line.split("#", 1)[0].replace(",", " ").split()
-        if not fields:
-            continue
+    for number, line, fields in text_rows(path):
         try:
             t, tx, ty, tz, qx, qy, qz, qw = numbers = [float(f) for f in fields]
             if not np.isfinite(numbers).all():

@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import T_opencv_opengl, project_to_so3
-from semcast.common.lens import check_pinhole, distortion_in
+from semcast.common.lens import check_one_camera, check_pinhole, distortion_in
 
 #: Models that undistortion turns into a pinhole; nerfstudio's others are fisheyes and panoramas.
 _PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
-#: What frames may say each for themselves, and by how much of itself it may differ between them: programs
-#: that fit a camera per image differ by less where it is one, and a zoom moves the focal length by more.
+#: What frames may say each for themselves.
 _CAMERA_OF_FRAME = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x")
-_SAME_CAMERA = 0.01
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ def read_transforms_json(
         frames = sorted(document["frames"], key=lambda f: order(str(f["file_path"])))
         images = tuple(_image(path.parent, str(frame["file_path"]), suffixes) for frame in frames)
         T_world_gl = _matrices(frames)
-        _check_one_camera(document, frames)
+        _check_frames(document, frames)
     except (OSError, ValueError, KeyError, TypeError, OverflowError) as err:
         what = f"{err} is missing" if isinstance(err, KeyError) else str(err)
         raise SourceError(f"{path} can't be used as transforms.json: {what}") from err
@@ -97,22 +95,17 @@ def _matrices(frames: list[dict[str, Any]]) -> NDArray[np.float64]:
     return T_world_gl
 
 
-def _check_one_camera(document: dict[str, Any], frames: list[dict[str, Any]]) -> None:
+def _check_frames(document: dict[str, Any], frames: list[dict[str, Any]]) -> None:
     """Check that frames which bring intrinsics of their own were taken by one camera that does not zoom.
 
     Raises:
-        ValueError: A value differs between frames by more than ``_SAME_CAMERA`` of itself.
+        ValueError: See ``check_one_camera``.
         KeyError: Only some frames have it.
     """
     for key in _CAMERA_OF_FRAME:
         if key in document or not any(key in frame for frame in frames):
             continue
-        values = [float(frame[key]) for frame in frames]
-        low, high = min(values), max(values)
-        if not high - low <= _SAME_CAMERA * abs(high):
-            raise ValueError(
-                f"{key} must be the same for all frames (one camera, no zoom), got {low:g} to {high:g}"
-            )
+        check_one_camera(key, [float(frame[key]) for frame in frames])
 
 
 def _camera(values: dict[str, Any], width: int, height: int) -> Intrinsics | None:

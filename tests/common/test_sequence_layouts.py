@@ -259,7 +259,7 @@ def test_a_transforms_file_without_frames_has_no_images(tmp_path):
 
 @pytest.mark.parametrize(
     ("focal_px", "message"),
-    [((30.0, 30.1), None), ((30.0, 45.0), "fl_x must be the same for all frames .*, got 30 to 45")],
+    [((30.0, 30.1), None), ((30.0, 45.0), "fl_x must be the same for all images .*, got 30 to 45")],
 )
 def test_a_transforms_file_of_several_cameras_is_refused(tmp_path, write_images, focal_px, message):
     write_images(tmp_path / "images", 2)
