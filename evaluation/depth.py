@@ -6,7 +6,7 @@ keyframes are sent.
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -110,6 +110,19 @@ class DepthSettings:
         if not 0 < self.seconds <= 120:
             raise ValueError(f"seconds must be in (0, 120], got {self.seconds:g}")
         check_threads(self.threads)
+        self._check_of_use()
+
+    def _check_of_use(self) -> None:
+        """Check that nothing is set that is of a scene where a recording is measured, or the other way."""
+        if self.sequence is None and self.camera != CameraSettings():
+            raise ValueError("camera values are of a recording, and there is none (--sequence)")
+        for entry in fields(self):
+            of_scene = entry.name in ("scene", "pace", "scene_seed", "seconds")
+            if self.sequence is not None and of_scene and getattr(self, entry.name) != entry.default:
+                raise ValueError(
+                    f"{entry.name} is of a scene to draw, and none is drawn with --sequence, "
+                    f"got {getattr(self, entry.name)}"
+                )
 
 
 @dataclass(frozen=True)

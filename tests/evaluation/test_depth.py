@@ -1,12 +1,14 @@
 """Depth from decoded images is held against the truth of a drawn scene, or against that of the originals."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from semcast.common.camera import Intrinsics
+from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.sequence import open_sequence
 from semcast.evaluation import depth
@@ -169,6 +171,9 @@ def test_images_without_movement_are_refused(tmp_path, phase_codec):
         ({"seconds": 0.0}, "seconds must be"),
         ({"snr_db": (99.0,)}, "snr_db must be"),
         ({"max_frames": 0}, "max_frames must be"),
+        ({"camera": CameraSettings(focal_35mm=26.0)}, "camera values are of a recording"),
+        ({"sequence": Path("room"), "scene": "street"}, "scene is of a scene to draw, .* got street"),
+        ({"sequence": Path("room"), "seconds": 9.0}, "seconds is of a scene to draw, .* got 9"),
     ],
 )
 def test_settings_out_of_range_are_refused(given, words):
