@@ -88,17 +88,10 @@ class Link:
         """SNR in dB that is set for the first frame, also where a trace sets it."""
         return self._model.snr_db(0.0)
 
-    def update(self, settings: ChannelSettings) -> None:
-        """Change the settings, also to another kind of channel, from the next frame on.
-
-        Raises:
-            ConfigError: A trace can't be read; the old settings stay in force.
-        """
-        self.switch(settings, build_channel(settings, self._seed))
-
     def switch(self, settings: ChannelSettings, model: ChannelModel) -> None:
-        """Change to settings and the channel that was built of them: reading a trace may take long.
+        """Change to settings, from the next frame on, and the channel that was built of them.
 
+        That is built before, as reading a trace may take long, or fail.
         A trace that is another one than before begins with the next frame.
         """
         if settings.trace_in_force() != self._settings.trace_in_force():

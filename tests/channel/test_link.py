@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from semcast.channel.link import Link
+from semcast.channel.registry import build_channel
 from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import LOST_SLOT_SNR_DB, EncodedImage
 from semcast.common.errors import ConfigError
@@ -156,17 +157,21 @@ def test_lost_slots_reach_the_decoder_as_lost(encoded):
     assert not received.symbols[lost].any()
 
 
+def change(link, settings):
+    link.switch(settings, build_channel(settings, 0))
+
+
 def test_settings_change_between_frames(slots, tmp_path):
     link = Link(ChannelSettings(snr_db=10.0), 0)
     assert link.transmit(slots, 0.0).snr_db_set == 10.0
-    link.update(ChannelSettings(snr_db=4.0))
+    change(link, ChannelSettings(snr_db=4.0))
     assert link.transmit(slots, 0.1).snr_db_set == 4.0
-    link.update(ChannelSettings(channel="trace", snr_db=9.0, trace_end_db=1.0, trace_s=4.0))
+    change(link, ChannelSettings(channel="trace", snr_db=9.0, trace_end_db=1.0, trace_s=4.0))
     assert link.transmit(slots, 30.0).snr_db_set == 9.0
     assert link.transmit(slots, 32.0).snr_db_set == pytest.approx(5.0)
     missing = ChannelSettings(channel="trace", trace="file", trace_file=tmp_path / "no.csv")
     with pytest.raises(ConfigError, match="can't be read"):
-        link.update(missing)
+        change(link, missing)
     assert link.settings.trace == "ramp"
     assert link.transmit(slots, 33.0).snr_db_set == pytest.approx(3.0)
 
@@ -175,19 +180,19 @@ def test_a_trace_begins_when_it_is_set_and_fading_goes_on(slots):
     ramp = ChannelSettings(channel="trace", snr_db=9.0, trace_end_db=1.0, trace_s=4.0, delay_ms=5.0)
     link = Link(ramp, 0)
     link.transmit(slots, 10.0)
-    link.update(replace(ramp, delay_ms=9.0, trace_step_db=3.0))  # neither belongs to a ramp
+    change(link, replace(ramp, delay_ms=9.0, trace_step_db=3.0))  # neither belongs to a ramp
     assert link.transmit(slots, 12.0).snr_db_set == pytest.approx(5.0)
     for changed in ({"snr_db": 7.0}, {"trace_end_db": 3.0}, {"trace_s": 2.0}, {"trace": "walk"}):
-        link.update(replace(ramp, **changed))
+        change(link, replace(ramp, **changed))
         assert link.transmit(slots, 12.5).snr_db_set == changed.get("snr_db", 9.0)
         link.transmit(slots, 13.5)
     fading = ChannelSettings(channel="rayleigh", doppler_hz=2.0)
     one, two = Link(fading, 0), Link(fading, 0)
     for link in (one, two):
         link.transmit(slots, 0.0, 0)
-    two.update(ramp)
+    change(two, ramp)
     two.transmit(slots, 0.1, 1)
-    two.update(replace(fading, snr_db=4.0))
+    change(two, replace(fading, snr_db=4.0))
     np.testing.assert_array_equal(two.transmit(slots, 0.2, 2).truth.h, one.transmit(slots, 0.2, 2).truth.h)
 
 
