@@ -235,19 +235,16 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"views must be at least 4, got {arguments.views}")
     picture = arguments.picture or arguments.out.with_suffix(".png")
     _check_outputs(arguments.out, picture)
-    import cv2
-
     from semcast.agent.calibrate import calibrate, calibration_picture
+    from semcast.evaluation.picture_strip import write_picture
 
     views, sample = _collect(arguments, board)
     result = calibrate(views, board, (sample.shape[1], sample.shape[0]), arguments.distortion)
     try:
         result.intrinsics.save(arguments.out)
-        good = cv2.imwrite(str(picture), cv2.cvtColor(calibration_picture(result, sample), cv2.COLOR_RGB2BGR))
-    except (OSError, cv2.error) as err:
-        raise SemcastError(f"the result can't be written: {err}") from err
-    if not good:
-        raise SemcastError(f"{picture} can't be written")
+    except OSError as err:
+        raise SemcastError(f"{arguments.out} can't be written: {err}") from err
+    write_picture(picture, calibration_picture(result, sample))
     c, deviation = result.intrinsics, result.deviations
     print(f"{c.width}x{c.height}, {len(result.views)} views, reprojection error {result.rms_px:.3f} px rms")
     print(f"fx {c.fx:.2f} +- {deviation[0]:.2f} px, fy {c.fy:.2f} +- {deviation[1]:.2f} px")
