@@ -27,6 +27,9 @@ KLT_WINDOW_PX = 21
 #: images in [0, 1].
 LABEL_SHARPNESS = 30.0
 
+#: Grey level of an image of which nothing usable arrived.
+OUTAGE_GREY = 128
+
 #: Effective SNR given to the decoder for a slot of which nothing arrived.
 LOST_SLOT_SNR_DB = -20.0
 

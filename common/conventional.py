@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from semcast.common.codec import (
     LABEL_SHARPNESS,
     LOST_SLOT_SNR_DB,
+    OUTAGE_GREY,
     DecodedImage,
     EncodedImage,
     Modulation,
@@ -42,7 +43,6 @@ from semcast.common.phy.qam import indices_to_symbols
 from semcast.common.phy.slots import SlotLayout, layout_for
 from semcast.common.shapes import check_shape
 
-_GREY = 128
 #: No link is better; what is said to be is finite this way.
 _MAX_SNR_DB = 100.0
 #: Standard deviation of grey levels in an 8x8 window that separates the classes of activity.
@@ -212,7 +212,7 @@ class ConventionalCodec:
             image = decompress(payload[_NUM_CLASSES:], received.shape_hw)
         if payload is None or image is None:
             return DecodedImage(
-                image=np.full((*received.shape_hw, 3), _GREY, dtype=np.uint8),
+                image=np.full((*received.shape_hw, 3), OUTAGE_GREY, dtype=np.uint8),
                 confidence=np.zeros(received.shape_hw, dtype=np.float32),
                 outage=True,
             )

@@ -19,6 +19,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import (
     DEFAULT_CODEC,
     LABEL_SHARPNESS,
+    OUTAGE_GREY,
     Codec,
     DecodedImage,
     EncodedImage,
@@ -43,20 +44,16 @@ from semcast.evaluation.report import json_ready, provenance, write_result
 from semcast.evaluation.sounding import told_at_first
 from semcast.evaluation.statistics import finite_mean, percentiles, spearman
 from semcast.evaluation.trace_snr import check_snrs, snr_file_label, stated_snr_db
-from semcast.evaluation.uncertainty_maps import block_means, pixel_label
+from semcast.evaluation.uncertainty_maps import GRADED, block_means, pixel_label
 
 logger = logging.getLogger(__name__)
 
 VERB = "eval codec"
 UNUSED_FIELDS = UNUSED_LINK_FIELDS
-#: What a receiver shows when a whole frame is lost.
-_LOST_GREY = 128
 _SNRS_DB = (2.0, 4.0, 6.0, 8.0, 10.0, 12.0)
 _STRIP_SNR_DB = 10.0
 _STRIP_IMAGES = 2
 _FRAME_INTERVAL_S = 0.1
-#: Every third pixel of a map is graded.
-_PIXEL_STEP = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,12 +195,11 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
 
     Returns:
         Provenance and ``results``: one row per codec and SNR (``snr_db``, of a trace its start, None for that
-        of a file) with means over the images of ``psnr_db``,
-        ``ssim``, ``ms_ssim`` (None for images below 176 pixels) and ``cbr``, pilots included; the share
-        of ``outage``; ``snr_db_estimate`` of the receiver; ``encode_ms`` and ``decode_ms`` (p50, p95);
-        ``confidence`` with ``mean``, ``ece`` against the pixel label and ``spearman_blocks``; and
-        ``images``, one row per image. Written to ``settings.json`` and drawn into ``settings.out`` where
-        given.
+        of a file) with means over the images of ``psnr_db``, ``ssim`` (None for images below 11 pixels),
+        ``ms_ssim`` (below 176) and ``cbr``, pilots included; the share of ``outage``; ``snr_db_estimate`` of
+        the receiver; ``encode_ms`` and ``decode_ms`` (p50, p95); ``confidence`` with ``mean``, ``ece``
+        against the pixel label and ``spearman_blocks``; and ``images``, one row per image. Written to
+        ``settings.json`` and drawn into ``settings.out`` where given.
 
     Raises:
         SourceError: The images can't be read.
@@ -313,7 +309,7 @@ def _run(
     times_ms = {"encode": encode_ms}
     if equalised is None:
         decoded = DecodedImage(
-            image=np.full_like(image, _LOST_GREY),
+            image=np.full_like(image, OUTAGE_GREY),
             confidence=np.zeros(image.shape[:2], dtype=np.float32),
             outage=True,
         )
@@ -321,11 +317,10 @@ def _run(
         start_ns = time.perf_counter_ns()
         decoded = from_coded(codec.decode(equalised.received), (image.shape[0], image.shape[1]))
         times_ms["decode"] = (time.perf_counter_ns() - start_ns) * 1e-6
-    big_enough = min(image.shape[:2]) >= 11
     figures = {
         "psnr_db": psnr_db(decoded.image, image),
-        "ssim": ssim(decoded.image, image) if big_enough else None,
-        "ms_ssim": ms_ssim(decoded.image, image) if big_enough else None,
+        "ssim": ssim(decoded.image, image),
+        "ms_ssim": ms_ssim(decoded.image, image),
         "cbr": layout_for(encoded.shape_hw).num_uses / image.size,
         "outage": float(decoded.outage),
         "snr_db_estimate": None if equalised is None else equalised.snr_db,
@@ -336,10 +331,10 @@ def _run(
 
 def _grade_confidence(decoded: DecodedImage, image: NDArray[np.uint8]) -> dict[str, float | None]:
     label = pixel_label(decoded.image, image, LABEL_SHARPNESS)
-    step = np.s_[1::_PIXEL_STEP, 1::_PIXEL_STEP]
+    graded = label[GRADED]
     return {
         "mean": float(decoded.confidence.mean()),
-        "ece": reliability(decoded.confidence[step], label[step]).ece if label[step].size else None,
+        "ece": reliability(decoded.confidence[GRADED], graded).ece if graded.size else None,
         "spearman_blocks": spearman(block_means(decoded.confidence), block_means(label)),
     }
 

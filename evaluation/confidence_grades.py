@@ -16,6 +16,7 @@ from semcast.evaluation.calibration import normalised_ause, reliability
 from semcast.evaluation.match_truth import displacement_from_original_px
 from semcast.evaluation.statistics import finite_mean, spearman
 from semcast.evaluation.uncertainty_maps import (
+    GRADED,
     absolute_error,
     block_means,
     gradient_energy,
@@ -24,8 +25,6 @@ from semcast.evaluation.uncertainty_maps import (
     sample_at,
 )
 
-#: Pixels graded: every third row and column, so no phase of a 2x or 4x upsampling is preferred.
-_PIXEL_STEP = 3
 #: Corners per frame for the keypoint grades.
 _MAX_CORNERS = 500
 _CORNER_QUALITY = 0.01
@@ -50,10 +49,9 @@ class PixelGrader:
 
     def add(self, decoded: DecodedImage, original: NDArray[np.uint8]) -> None:
         """Take one frame: its decoded image with confidence and its original, same shape."""
-        step = np.s_[1::_PIXEL_STEP, 1::_PIXEL_STEP]
         error = absolute_error(decoded.image, original)
-        self._predicted.append(decoded.confidence[step].ravel().copy())
-        self._observed.append(pixel_label(decoded.image, original, self._alpha)[step].ravel())
+        self._predicted.append(decoded.confidence[GRADED].ravel().copy())
+        self._observed.append(pixel_label(decoded.image, original, self._alpha)[GRADED].ravel())
         maps = {
             "confidence": 1.0 - decoded.confidence,
             "constant": np.zeros_like(error),
@@ -61,8 +59,8 @@ class PixelGrader:
         }
         for name, uncertainty in maps.items():
             grades = self._grades.setdefault(name, {"nause": [], "spearman_pixel": [], "spearman_block": []})
-            grades["nause"].append(normalised_ause(uncertainty[step], error[step]))
-            grades["spearman_pixel"].append(spearman(uncertainty[step], error[step]))
+            grades["nause"].append(normalised_ause(uncertainty[GRADED], error[GRADED]))
+            grades["spearman_pixel"].append(spearman(uncertainty[GRADED], error[GRADED]))
             grades["spearman_block"].append(spearman(block_means(uncertainty), block_means(error)))
 
     def result(self) -> dict[str, Any]:

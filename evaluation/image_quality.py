@@ -24,8 +24,6 @@ def _check_pair(a: _Image, b: _Image) -> None:
         raise ValueError(f"images must be uint8, got {a.dtype} and {b.dtype}")
     if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
         raise ValueError(f"images must have the same shape (H, W, 3), got {a.shape} and {b.shape}")
-    if min(a.shape[:2]) < _WINDOW_PX:
-        raise ValueError(f"images must be at least {_WINDOW_PX} pixels high and wide, got {a.shape[:2]}")
 
 
 def _window_mean(x: _Plane) -> _Plane:
@@ -45,13 +43,17 @@ def _similarity(x: _Plane, y: _Plane) -> tuple[NDArray[np.float64], NDArray[np.f
     return (luminance * structure).mean(axis=(0, 1)), structure.mean(axis=(0, 1))
 
 
-def ssim(a: _Image, b: _Image) -> float:
+def ssim(a: _Image, b: _Image) -> float | None:
     """Return the structural similarity of two ``(H, W, 3)`` uint8 images, 1 for equal ones.
 
+    None when the smaller side is below 11 pixels, where the window doesn't fit.
+
     Raises:
-        ValueError: Shapes differ, or an image is smaller than the 11x11 window.
+        ValueError: Shapes differ, or an image is not uint8.
     """
     _check_pair(a, b)
+    if min(a.shape[:2]) < _WINDOW_PX:
+        return None
     return float(_similarity(a / 255.0, b / 255.0)[0].mean())
 
 

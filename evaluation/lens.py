@@ -16,6 +16,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError
 from semcast.common.sequence import ImageRectifier
 from semcast.evaluation.moving_images import (
+    NOT_MODELLED,
     CameraEvidence,
     Images,
     ImagesSettings,
@@ -37,11 +38,6 @@ _FAR_FACTORS = (0.83, 1.2)
 _NOTHING = 0.001
 #: So does one of fewer standard deviations.
 _NOTHING_SIGMAS = 0.5
-#: Residuals are not noise alone: blur, patches with a depth of their own and all else that is not modelled
-#: speak for a lens too. In 41 reconstructions of eight recordings with the right lens it was within bounds of
-#: scatter in 61 to 93 % (by value), and in 98 to 100 % with the change added that explains this share of the
-#: squared residuals.
-_NOT_MODELLED = 0.002
 #: No bounds are closer than this share: reconstructions with nearly the same lens speak for changes that
 #: differ by as much.
 _MIN_REACH = 0.004
@@ -177,7 +173,7 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
             if trial.evidence.mean_px > most_px:
                 raise SemcastError(_NOT_TOLD)
         best, num_steps = trial, num_steps + 1
-    reaches += np.sqrt(_NOT_MODELLED) * np.array(change.unit)
+    reaches += np.sqrt(NOT_MODELLED) * np.array(change.unit)
     if reaches[0] > _MAX_REACH:
         raise SemcastError(_NOT_TOLD)
     camera = best.lens.put_on(images.stored)

@@ -15,6 +15,7 @@ from semcast.common.camera import MAX_READOUT_MS, Intrinsics
 from semcast.common.errors import SemcastError, SourceError
 from semcast.evaluation.moving_images import (
     MIN_FRAMES,
+    NOT_MODELLED,
     CameraEvidence,
     Images,
     ImagesSettings,
@@ -29,10 +30,6 @@ from semcast.server.mapping.readout import Readout, ReadoutFit, fit_readout
 _MAX_TRIALS, _BETTER = 4, 0.995
 #: What is left of the readout then counts as nothing.
 _NOTHING_MS = 0.3
-#: Residuals are not noise alone: blur and all else that is not modelled speak for a readout too. Of ten drawn
-#: recordings the true readout was within bounds of scatter in eight, and in all with the change added that
-#: explains this share of the squared residuals, as for a lens.
-_NOT_MODELLED = 0.002
 #: An interval wider than this is no answer.
 _MAX_INTERVAL_MS = 10.0
 #: Below it a shutter is as good as global: turning by 100 degrees a second leans an image by .1 degree.
@@ -132,7 +129,7 @@ def find_readout(
             break
         best, fit = trial, _checked(trial, images)
     readout, reach_ms = _within(fit.readout, limit_ms), best.evidence.reach_95(fit.sigma_ms)
-    reach_ms += np.sqrt(_NOT_MODELLED) * fit.unit_ms
+    reach_ms += np.sqrt(NOT_MODELLED) * fit.unit_ms
     if is_wrong:
         readout, reach_ms = best.readout, max(reach_ms, fit.readout.ms)
     low_ms, high_ms = readout.signed_ms - reach_ms, readout.signed_ms + reach_ms

@@ -12,6 +12,8 @@ import numpy as np
 
 from semcast.common.codecs import load_codec
 
+_SNR_DB = 10.0
+
 
 def main() -> None:
     """Serve until the input ends."""
@@ -23,13 +25,14 @@ def main() -> None:
     rng = np.random.default_rng(0)
     coarse = rng.integers(0, 256, (height // 16 + 1, width // 16 + 1, 3), dtype=np.uint8)
     image = np.ascontiguousarray(coarse.repeat(16, axis=0).repeat(16, axis=1)[:height, :width])
-    encoded = codec.encode(image, 10.0)
-    snr_db = np.full(encoded.symbols.shape[0], 10.0, dtype=np.float32)
-    received = encoded.arrived(encoded.symbols * np.float32(10 / 11), snr_db)
+    encoded = codec.encode(image, _SNR_DB)
+    snr, snr_db = 10.0 ** (_SNR_DB / 10.0), np.full(encoded.symbols.shape[0], _SNR_DB, dtype=np.float32)
+    # The MMSE equaliser shrinks what it estimates.
+    received = encoded.arrived(encoded.symbols * np.float32(snr / (1.0 + snr)), snr_db)
 
     def call() -> None:
         if task["work"] == "encode":
-            codec.encode(image, 10.0)
+            codec.encode(image, _SNR_DB)
         else:
             codec.decode(received)
 

@@ -8,6 +8,8 @@ Map = NDArray[np.float32]
 
 #: Side of the window over which gradients are summed.
 WINDOW_PX = 7
+#: Pixels that are graded: every third row and column, so no phase of a 2x or 4x upsampling is preferred.
+GRADED = np.s_[1::3, 1::3]
 #: Side of the blocks of block-wise rank correlations.
 BLOCK_PX = 8
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from semcast.common.codec import OUTAGE_GREY
 from semcast.server.decoder import DecodedArrival
 from semcast.server.frame_rows import FrameRow
 from semcast.server.mapping.state import DecodedFrame, FrameResult
@@ -11,8 +12,6 @@ from semcast.server.view.frame_view import MISSING, FrameView
 
 #: Stages in the viewer's plot; all of them are in ``frames.jsonl`` and the summary.
 PLOTTED_STAGES = ("decode", "track", "map", "bundle")
-#: Brightness where nothing could be decoded, as conventional codecs show it.
-_GREY = 128
 
 
 def frame_view(
@@ -75,7 +74,7 @@ def missing_view(decoded: DecodedArrival, drops: Mapping[str, int]) -> FrameView
         T_world_cam=None,
         state=MISSING,
         scalars=_known(scalars),
-        image=np.full((height, width, 3), _GREY, np.uint8) if arrived else None,
+        image=np.full((height, width, 3), OUTAGE_GREY, np.uint8) if arrived else None,
         confidence=np.zeros((height, width), np.float32) if arrived else None,
         keypoints_xy=np.zeros((0, 2), np.float32),
         keypoint_inlier=np.zeros(0, bool),

@@ -84,7 +84,6 @@ def _furnished(rng: np.random.Generator) -> list[Surface]:
             foot = wall.corner_m * (1, 1, 0) + along * place + inward * (size[1] / 2 + 0.05)
             yaw = np.arctan2(along[1], along[0]) + rng.normal(0, 0.1)
             contrast = rng.uniform(0.3, 0.9)
-            found += box(
-                (foot[0], foot[1], size[2] / 2), size, yaw, [dead_leaves(rng, contrast) for _ in "ab"]
-            )
+            painted = [dead_leaves(rng, contrast) for _ in range(2)]
+            found += box((foot[0], foot[1], size[2] / 2), size, yaw, painted)
     return found

@@ -21,15 +21,13 @@ from semcast.common.run_folder import RunData
 from semcast.common.sequence import truth_at_frames
 from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.common.trajectory import Trajectory
-from semcast.common.trajectory_error import match_times
+from semcast.common.trajectory_error import MIN_MATCHES, match_times
 from semcast.server.export.poses import rising_times
 
 Array = NDArray[np.float64]
 
 #: Standard deviations to either side that hold 95 % of a normal distribution.
 TWO_SIDED_95 = 1.96
-#: Two camera centres can always be fitted; the third says whether they should be.
-MIN_MATCHES = 3
 #: A path that is this much longer than wide says nothing about the rotation about itself.
 STRAIGHT = 50.0
 #: Directions of cameras that differ by more than this from those the positions give are not of the cameras.

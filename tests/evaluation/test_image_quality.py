@@ -76,16 +76,14 @@ def test_an_image_and_its_negative_stay_finite(pair):
     assert math.isfinite(ms_ssim(a, 255 - a))
 
 
-def test_small_images_have_no_ms_ssim(pair):
+def test_images_that_the_window_does_not_fit_have_no_similarity(pair):
     a, b = pair
-    assert ms_ssim(a[:175], b[:175]) is None
-    assert ms_ssim(a[:176], b[:176]) is not None
+    for similarity, least in ((ssim, 11), (ms_ssim, 176)):
+        assert similarity(a[: least - 1], b[: least - 1]) is None
+        assert similarity(a[:least], b[:least]) is not None
 
 
 def test_bad_images_are_named():
-    small = np.zeros((10, 20, 3), np.uint8)
-    with pytest.raises(ValueError, match=r"at least 11 pixels high and wide, got \(10, 20\)"):
-        ssim(small, small)
     with pytest.raises(ValueError, match="images must be uint8, got float64"):
         ssim(np.zeros((20, 20, 3)), np.zeros((20, 20, 3)))
     with pytest.raises(ValueError, match="same shape"):
