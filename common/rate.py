@@ -123,9 +123,11 @@ class RateControl:
     def __init__(self, rate: RateChoice, shape_hw: tuple[int, int]) -> None:
         if rate != "auto" and rate not in RATES:
             raise ValueError(f"rate must be auto or one of {', '.join(RATES)}, got {rate!r}")
-        self._rates = [known for known in RATES if _can_be_sent(coded_shape(shape_hw, known))]
-        if not self._rates or rate not in ("auto", *self._rates):
-            allowed = ", ".join(self._rates) or "none"
+        self._rates = [known for known in RATES if _can_be_sent(shape_hw, known)]
+        if not self._rates:
+            raise ConfigError(f"resize must make frames smaller: those of {shape_hw} can be sent at no rate")
+        if rate not in ("auto", *self._rates):
+            allowed = ", ".join(self._rates)
             raise ConfigError(f"rate must be one of {allowed} for frames of {shape_hw}, got {rate!r}")
         self._fixed = None if rate == "auto" else rate
         self._shape_hw = shape_hw
@@ -156,9 +158,12 @@ def _log_uses(rate: Rate) -> float:
     return math.log(uses_per_value(rate))
 
 
-def _can_be_sent(coded_hw: tuple[int, int]) -> bool:
-    """Whether sides and received samples are within the protocol's limits."""
-    return max(coded_hw) <= MAX_SIDE_PX and received_bytes(layout_for(coded_hw)) <= MAX_PAYLOAD_BYTES
+def _can_be_sent(shape_hw: tuple[int, int], rate: Rate) -> bool:
+    """Whether sides, of the camera too, and received samples are within the protocol's limits."""
+    coded_hw = coded_shape(shape_hw, rate)
+    if max(*shape_hw, *coded_hw) > MAX_SIDE_PX:
+        return False
+    return received_bytes(layout_for(coded_hw)) <= MAX_PAYLOAD_BYTES
 
 
 def _capacity_bits(snr_db: float) -> float:
