@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.errors import SourceError
+from semcast.common.image_file import decoded
 
 #: Encoding of ``sensor_msgs/Image`` -> values a pixel, their type, OpenCV's way to BGR where one is needed.
 _ENCODINGS: dict[str, tuple[int, type, int | None]] = {
@@ -109,7 +110,7 @@ def compressed_image_file(message: CompressedImage) -> tuple[str, bytes]:
     mosaic = re.search(r"compressed (bayer_\w+8)$", message.format.strip())
     if mosaic is None:
         return suffix, data
-    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    pixels = decoded(np.frombuffer(data, dtype=np.uint8))
     if pixels is None or pixels.ndim != 2 or mosaic[1] not in _ENCODINGS:
         raise SourceError(f"an image of format {message.format!r} must be grey, and is not")
     return _png(_coloured(pixels, _ENCODINGS[mosaic[1]][2]))

@@ -73,11 +73,22 @@ def _read_raw(path: Path) -> tuple[NDArray, bool]:
         data = np.fromfile(path, dtype=np.uint8)
     except (OSError, ValueError) as err:  # a path with a NUL in it is a ValueError
         raise SourceError(f"{path} can't be read: {getattr(err, 'strerror', None) or err}") from err
-    raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    raw = decoded(data)
     if raw is None:
         raise SourceError(f"{path} is not a readable image (damaged, or of an unknown format)")
     is_on_black = raw.ndim == 3 and raw.shape[2] == 4 and is_laid_on_black(data.tobytes(), 8 * raw.itemsize)
-    return np.asarray(raw), is_on_black
+    return raw, is_on_black
+
+
+def decoded(data: NDArray[np.uint8]) -> NDArray | None:
+    """Return the values in the bytes of an image file, as they are stored; None where it is none."""
+    if not data.size:
+        return None
+    try:
+        raw = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    except cv2.error:  # sides beyond its limits, which a damaged header may state
+        return None
+    return None if raw is None else np.asarray(raw)
 
 
 def as_rgb(raw: NDArray, *, is_on_black: bool = False) -> NDArray[np.uint8]:

@@ -1,3 +1,4 @@
+import zlib
 from types import SimpleNamespace
 
 import cv2
@@ -150,6 +151,16 @@ def test_a_compressed_mosaic_gets_its_colours():
     mosaic[::2, ::2] = 200
     sent = packed(mosaic, ".png", "bayer_rggb8; png compressed bayer_rggb8")
     np.testing.assert_array_equal(pixels_of(compressed_image_file(sent))[4, 4], (0, 0, 200))
+
+
+def test_a_compressed_mosaic_of_sides_beyond_all_limits_is_refused():
+    sent = packed(np.zeros((8, 8), np.uint8), ".png", "bayer_rggb8; png compressed bayer_rggb8")
+    content = bytearray(sent.data.tobytes())
+    content[16:24] = (60_000).to_bytes(4, "big") * 2
+    content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
+    sent.data = np.frombuffer(bytes(content), np.uint8)
+    with pytest.raises(SourceError, match="must be grey, and is not"):
+        compressed_image_file(sent)
 
 
 @pytest.mark.parametrize(

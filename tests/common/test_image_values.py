@@ -1,3 +1,5 @@
+import zlib
+
 import cv2
 import numpy as np
 import pytest
@@ -85,3 +87,20 @@ def test_depth_images_among_those_of_a_colour_camera_are_refused(tmp_path, suffi
         str(tmp_path / f"{k}.depth{suffix}") for k in range(3)
     ]
     assert num_skipped == 0
+
+
+@pytest.mark.parametrize(("suffix", "width_at", "order"), [(".bmp", 18, "little"), (".png", 16, "big")])
+def test_sides_beyond_all_limits_are_damage_of_that_image_alone(tmp_path, suffix, width_at, order):
+    (tmp_path / "images").mkdir()
+    files = [tmp_path / "images" / f"{k}{suffix}" for k in range(3)]
+    for file in files:
+        cv2.imwrite(str(file), np.full((24, 32), 90, np.uint8))
+    damaged = bytearray(files[1].read_bytes())
+    damaged[width_at : width_at + 8] = (60_000).to_bytes(4, order) * 2
+    if suffix == ".png":  # whose checksum is over the kind and the content of a chunk
+        damaged[29:33] = zlib.crc32(damaged[12:29]).to_bytes(4, "big")
+    files[1].write_bytes(damaged)
+    sequence = open_sequence(tmp_path)
+    assert [sequence.image(k).max() for k in (0, 2)] == [90, 90]
+    with pytest.raises(SourceError, match=f"1{suffix} is not a readable image"):
+        sequence.image(1)
