@@ -121,6 +121,11 @@ class _Pair:
     confidence: Array
     left_out: Ids
 
+    @property
+    def flow_px(self) -> float:
+        """Median way of the tracks; there must be one."""
+        return float(np.median(np.linalg.norm(self.xy1 - self.xy0, axis=1)))
+
 
 def _pair(first: Observed, second: Observed, suspect: Ids) -> _Pair:
     """Match two frames by the ids of their tracks."""
@@ -152,6 +157,7 @@ class Initialiser:
         """Forget all frames."""
         self.history: list[Observed] = []
         self._reference = 0
+        self._is_tried = False
         self._num_too_short = 0
         self._num_contested = 0
         self._num_undecided = 0
@@ -201,12 +207,12 @@ class Initialiser:
         if waits or self._reference == len(self.history) - 1:
             return None
         pair = _pair(self.history[self._reference], observed, suspect)
-        if len(pair.ids) < self._min_points():
+        if not self._has_moved(pair):
             return None
-        flow_px = float(np.median(np.linalg.norm(pair.xy1 - pair.xy0, axis=1)))
-        if flow_px < _MIN_FLOW_SHARE * self._camera.width:
-            return None
-        evidence_px = np.array([flow_px, self._relief_px(pair.xy0, pair.xy1)])
+        if len(pair.left_out) and not self._is_tried:
+            pair = self._from_nearest(pair, suspect)
+        self._is_tried = True
+        evidence_px = np.array([pair.flow_px, self._relief_px(pair.xy0, pair.xy1)])
         if not self._is_new_evidence(evidence_px):
             return None
         if self._reference + 1 == len(self.history) - 1 and self._is_too_short():
@@ -237,6 +243,27 @@ class Initialiser:
             self._reference = max(0, self._reference - 1)
         self._move_reference(suspect)
         self._forget_images()
+
+    def _has_moved(self, pair: _Pair) -> bool:
+        """Whether enough tracks have moved by enough for a start to be tried."""
+        return len(pair.ids) >= self._min_points() and pair.flow_px >= _MIN_FLOW_SHARE * self._camera.width
+
+    def _from_nearest(self, pair: _Pair, suspect: Ids) -> _Pair:
+        """Let the reference be the newest frame that the scene has moved enough since.
+
+        As long as a bonnet was taken for a part of it, the scene seemed to rest, however far it went. Few
+        tracks last for such a way, and of those that do many slid along an outline.
+
+        Args:
+            pair: Of the reference as it was, which is kept if no newer frame will do.
+            suspect: Tracks that may be of no scene.
+        """
+        for k in range(len(self.history) - 2, self._reference, -1):
+            nearer = _pair(self.history[k], self.history[-1], suspect)
+            if self._has_moved(nearer):
+                self._reference = k
+                return nearer
+        return pair
 
     def _relief_px(self, xy0: Array, xy1: Array) -> float:
         """Median way of tracks that turning alone does not explain: a hand turns more than it goes."""
@@ -310,6 +337,7 @@ class Initialiser:
             if shared >= max(MIN_POINTS / self._agreeing, _MIN_SHARED * len(reference.ids)):
                 return
             self._reference += 1
+            self._is_tried = False
             # Its tracks begin anew. Attempts are counted on: a fast camera would never use them up.
             self._undecided_px = np.zeros(2)
 

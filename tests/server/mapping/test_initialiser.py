@@ -293,17 +293,17 @@ def test_a_start_is_looked_at_anew_without_tracks_that_were_left_out(monkeypatch
     assert len(asked) == so_far + 1
 
 
-def before_what_stands(frames):
-    """Frames that see a hundred points more, which never move, and their ids."""
+def before_what_stands(frames, num_standing=100):
+    """Frames that see a number of points more, which never move, and their ids."""
     rng = np.random.default_rng(7)
-    ids = 100_000 + np.arange(100)
-    standing = np.column_stack((rng.uniform(0, 640, 100), rng.uniform(400, 480, 100)))
+    ids = 100_000 + np.arange(num_standing)
+    standing = np.column_stack((rng.uniform(0, 640, num_standing), rng.uniform(400, 480, num_standing)))
     both = [
         replace(
             f,
             ids=np.concatenate([f.ids, ids]),
             xy=np.concatenate([f.xy, standing]),
-            confidence=np.ones(len(f.ids) + 100),
+            confidence=np.ones(len(f.ids) + num_standing),
             edge=alike(),
         )
         for f in frames
@@ -333,3 +333,14 @@ def test_what_stands_ties_no_start_to_frames_whose_scene_is_out_of_sight():
     start = next(start for start in found if start is not None)
     assert not np.isin(start.ids, ids).any()
     assert min(k.frame_id for k in start.keyframes) >= 3
+
+
+def test_a_start_is_made_from_near_frames_when_what_stands_hid_for_long_that_the_scene_moves():
+    """Most tracks are a bonnet's, and that shows late: by then the first frames share few of the scene's."""
+    frames, ids = before_what_stands(ride(20)[0], 300)
+    initialiser = Initialiser(CAMERA, "off", 1.0, 0)
+    for frame in frames[:14]:
+        assert initialiser.add(frame, NOISE) is None
+    start = initialiser.add(frames[14], NOISE, ids) or initialiser.add(frames[15], NOISE, ids)
+    assert start is not None
+    assert min(keyframe.frame_id for keyframe in start.keyframes) >= 12
