@@ -61,6 +61,7 @@ class Reconstruction:
         self._camera = camera
         self._settings = settings
         self._bundle = bundle
+        self._has_told_old_images = False
         self._map = MapBuilder(camera, settings, bundle, self._moved)
         self._map_epoch = 0
         self._begin(settings.with_readout(camera))
@@ -170,8 +171,18 @@ class Reconstruction:
         """Let the motion go on; frames that now turn out to have shown an older image have no pose."""
         xyz, stands = self._map.world.landmarks.xyz_of(ids), self._tracks.passing.camera_stands
         self._map.watch.note(frame_id, t_source_ns)
-        gone = self._motion.observe(frame_id, t_source_ns, T_world_cam, xyz, stands=stands)
-        self._map.world.forget_frames(gone)
+        self._take_back(self._motion.observe(frame_id, t_source_ns, T_world_cam, xyz, stands=stands))
+
+    def _take_back(self, frame_ids: list[int]) -> None:
+        """Leave frames whose image was an older one without a pose, and tell of the first of them."""
+        self._map.world.forget_frames(frame_ids)
+        if frame_ids and not self._has_told_old_images:
+            self._has_told_old_images = True
+            logger.warning(
+                "frame %d shows what an earlier one showed, though the camera went on (a video that repeats "
+                "frames, or a camera that hangs): such frames get no pose in the results; told once",
+                frame_ids[0],
+            )
 
     def _last_pose(self) -> Array | None:
         return None if self._last_posed_id is None else self._map.world.pose_of_frame(self._last_posed_id)
@@ -252,7 +263,7 @@ class Reconstruction:
         if self._settings.gives_up(self._lost_ns, rested=self._motion.rests):
             logger.info("frame %d: a new map is begun, the old one is not in sight", frame.frame_id)
             self._state = TrackingState.INITIALIZING
-            self._map.world.forget_frames(self._motion.give_up())
+            self._take_back(self._motion.give_up())
             self._begin_submap()
 
     def _look_for_start(self, sight: Sight) -> Start | None:

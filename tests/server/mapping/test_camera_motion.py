@@ -124,7 +124,7 @@ def test_less_than_the_error_of_poses_is_no_stop():
 
 
 @pytest.mark.parametrize(("num_hung", "parts"), [(4, 1), (10, 2)])
-def test_a_road_is_driven_past_a_grabber_that_hangs(num_hung, parts):
+def test_a_road_is_driven_past_a_grabber_that_hangs(num_hung, parts, caplog):
     """After a second nothing is left in sight, and a new part of the map begins."""
     sequence = open_sequence(STREET)
     times_ns = {}
@@ -142,6 +142,8 @@ def test_a_road_is_driven_past_a_grabber_that_hangs(num_hung, parts):
     reconstruction.close()
     assert len(submaps) == parts
     assert sorted(set(range(num)) - set(poses)) == list(hung)
+    told = [r.getMessage() for r in caplog.records if r.name.endswith("reconstruction")]
+    assert [text[:9] for text in told if "shows what an earlier one showed" in text] == ["frame 16 "]
     error = ate(trajectory_of(poses, times_ns), sequence.groundtruth())
     assert error.rmse < 0.2
 
