@@ -221,6 +221,10 @@ def test_a_missing_file_is_named_once(tmp_path, capsys):
     file = tmp_path / "nope.mcap"
     assert main(["replay", str(file)]) == 1
     assert capsys.readouterr().err == f"semcast replay: {file} can't be read: No such file or directory\n"
+    folder = tmp_path / "photos"
+    assert main(["train", "--data", str(folder), "--out", str(tmp_path)]) == 1
+    why = f"--data must be a folder of images: {folder} can't be read: No such file or directory\n"
+    assert capsys.readouterr().err == f"semcast train: {why}"
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from semcast.common.errors import CheckpointError, SourceError
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
-from semcast.common.nets.codec import check_device
+from semcast.common.nets.codec import check_device, has_fast_bfloat16
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, channel_bandwidth_ratio
@@ -92,6 +92,7 @@ class Run:
         use_cuda = settings.device == "cuda" or (settings.device == "auto" and torch.cuda.is_available())
         local = int(os.environ.get("LOCAL_RANK", "0"))
         self.device = torch.device("cuda", local) if use_cuda else torch.device("cpu")
+        self.bf16 = settings.bf16 and (use_cuda or has_fast_bfloat16())
         torch.backends.cudnn.benchmark = True  # crops keep their size
         entry = architecture(settings.architecture)
         torch.manual_seed(settings.seed)  # layers draw their first weights from the global generator
@@ -235,23 +236,24 @@ class Run:
             draw = drawn.links.to(device)
             noise = torch.randn((len(x), model.channels, blocks, blocks), generator=generator).to(device)
             sent = drawn.sent.to(device) if drawn.sent is not None and model.is_variable else None
-            with torch.autocast(device.type, torch.bfloat16, enabled=settings.bf16):
+            with torch.autocast(device.type, torch.bfloat16, enabled=self.bf16):
                 _, x_hat, _ = through_whole_link(model, x, draw, noise, sent)
                 if see is not None:
                     values = None if sent is None else sent.values
                     see(x, model.latent(x, draw.expected_snr_db, draw.is_qam, values), x_hat)
 
-    def export(self, valid: dict[str, float]) -> Path:
-        """Write the averaged weights in half precision with their manifest."""
+    def export(self, model: Transceiver, valid: dict[str, float]) -> Path:
+        """Write the averaged weights, as ``shippable`` gives them, in half precision with their manifest."""
         settings = self.settings
         weights = settings.out / f"{settings.architecture}.safetensors"
         plain = json.loads(json.dumps(asdict(settings), default=str))
         for folder in ("data", "valid", "out"):
             plain.pop(folder)
+        plain["bf16"] = self.bf16
         if settings.grow_from is not None:
             plain["grow_from"] = settings.grow_from.name
         save_transceiver(
-            self.shippable(),
+            model,
             weights,
             architecture=settings.architecture,
             sizes=architecture(settings.architecture).sizes,
@@ -299,7 +301,7 @@ class Run:
         is_ending = share >= 1.0 - settings.decay_share / 4.0
         with_heads = settings.only_heads or is_ending or self.step % settings.head_every == 0
         set_rate(self.optimisers, rate_factor(share, self.step, settings))
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=settings.bf16):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16):
             if share < settings.pretrain_share:
                 hiding = torch.Generator().manual_seed(seed + 2_000_003)
                 loss, logs = masked_image_loss(self.model, x, settings.mask_share, hiding)
@@ -413,19 +415,21 @@ def _train(
                 if on_progress is not None:
                     on_progress(report)
             if run.step % settings.valid_every == 0 and run.valid_images and run.rank == 0:
-                valid = validate(run.shippable(), run.valid_images, run.device, settings.bf16)
+                valid = validate(run.shippable(), run.valid_images, run.device, run.bf16)
                 append_row(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
             if run.step % settings.save_every == 0:
                 run.save()
     finally:
         run.ahead.close()
         run.save()
-    if run.rank == 0 and run.valid_images:
-        valid = validate(run.shippable(), run.valid_images, run.device, settings.bf16)
-        append_row(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
     weights = settings.out / f"{settings.architecture}.safetensors"
     if run.rank == 0:
-        weights = run.export(valid)
+        logger.info("step %d was the last; the weights are averaged, validated and written", run.step)
+        model = run.shippable()  # as long as some dozens of steps take
+        if run.valid_images:
+            valid = validate(model, run.valid_images, run.device, run.bf16)
+            append_row(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
+        weights = run.export(model, valid)
     return TrainResult(run.step, run.elapsed_s, weights, valid)
 
 

@@ -51,6 +51,8 @@ class LossSettings:
         for name in ("mse", "descriptor", "confidence", "mse_knee"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
+        if not (self.mse or self.descriptor or self.confidence):
+            raise ValueError("one of mse, descriptor and confidence must be > 0, got 0 for each")
         if not 0.0 < self.confidence_sharpness < math.inf:
             raise ValueError(f"confidence_sharpness must be > 0, got {self.confidence_sharpness}")
 

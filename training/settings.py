@@ -85,7 +85,7 @@ class TrainSettings:
     )
     seed: int = field(default=0, metadata={"help": "seed of weights, data order and links"})
     device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "device to train on"})
-    bf16: bool = field(default=True, metadata={"help": "bfloat16 autocast"})
+    bf16: bool = field(default=True, metadata={"help": "bfloat16 autocast where the hardware has it"})
     compile: bool = field(
         default=False,
         metadata={"help": "torch.compile encoder and decoder: a minute at first, faster steps on a GPU"},

@@ -202,6 +202,8 @@ def _show_all_names() -> None:
 def _plain(err: SemcastError) -> str:
     """Return an error in words: what the system said of a file without its number and the file again."""
     cause = err.__cause__
+    while isinstance(cause, SemcastError):
+        cause = cause.__cause__
     if isinstance(cause, OSError) and cause.strerror:
         return str(err).replace(str(cause), cause.strerror)
     return str(err)

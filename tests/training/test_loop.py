@@ -18,16 +18,17 @@ import semcast.common.nets.registry as registry
 import semcast.training.loop as loop
 from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import CheckpointError, ConfigError, SourceError
-from semcast.common.nets.checkpoint import load_transceiver
+from semcast.common.nets.checkpoint import load_transceiver, read_manifest
 from semcast.common.nets.codec import NeuralCodec
 from semcast.common.nets.mae import build_mae
 from semcast.common.nets.registry import architectures
 from semcast.common.nets.transceiver import Sizes, build_3dcsc, build_variable_3dcsc
 from semcast.common.nets.vit import VitSizes
+from semcast.training.centring import folded
 from semcast.training.channel import LinkDrawSettings
 from semcast.training.data import CropSettings
 from semcast.training.loop import train
-from semcast.training.losses import LossSettings
+from semcast.training.losses import LossSettings, transceiver_loss
 from semcast.training.optimisers import rate_factor
 from semcast.training.settings import TrainSettings
 
@@ -92,6 +93,30 @@ def test_a_run_leaves_weights_the_codec_can_use(tiny_network, photos, tmp_path):
     assert str(tmp_path) not in json.dumps(codec.manifest.made_by)
     rows = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows if "loss" in row] == [2, 4, 6]
+
+
+@pytest.mark.parametrize("has_bfloat16", [True, False])
+def test_bfloat16_is_used_where_the_hardware_has_it(
+    tiny_network, photos, tmp_path, monkeypatch, has_bfloat16
+):
+    monkeypatch.setattr(loop, "has_fast_bfloat16", lambda: has_bfloat16)
+    used = []
+    monkeypatch.setattr(
+        loop,
+        "transceiver_loss",
+        lambda *a: used.append(torch.is_autocast_enabled("cpu")) or transceiver_loss(*a),
+    )
+    result = train(settings_for(photos, tmp_path, steps=1, bf16=True))
+    assert used == [has_bfloat16]
+    assert read_manifest(result.weights).made_by["settings"]["bf16"] is has_bfloat16
+
+
+def test_hidden_units_are_folded_once_at_the_end(tiny_network, photos, tmp_path, monkeypatch):
+    """It takes as long as dozens of steps."""
+    folds = []
+    monkeypatch.setattr(loop, "folded", lambda *a: folds.append(a) or folded(*a))
+    train(settings_for(photos, tmp_path, steps=1, valid=photos))
+    assert len(folds) == 1
 
 
 def test_a_resumed_run_equals_one_without_a_break(tiny_network, photos, tmp_path):

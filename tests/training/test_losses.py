@@ -153,5 +153,7 @@ def test_bad_weights_are_refused():
         LossSettings(descriptor=-1.0)
     with pytest.raises(ValueError, match="mse must be >= 0, got nan"):
         LossSettings(mse=math.nan)
+    with pytest.raises(ValueError, match="one of mse, descriptor and confidence must be > 0"):
+        LossSettings(mse=0.0, descriptor=0.0, confidence=0.0)
     with pytest.raises(ValueError, match="confidence_sharpness must be > 0, got 0"):
         LossSettings(confidence_sharpness=0.0)
