@@ -40,7 +40,7 @@ from semcast.evaluation.image_quality import ms_ssim, ssim
 from semcast.evaluation.picture_strip import write_picture_strip
 from semcast.evaluation.pipeline import UNUSED_LINK_FIELDS
 from semcast.evaluation.plots import plot_against_snr
-from semcast.evaluation.report import json_ready, provenance, write_result
+from semcast.evaluation.report import json_ready, naming, provenance, short_names, write_result
 from semcast.evaluation.sounding import told_at_first
 from semcast.evaluation.statistics import finite_mean, percentiles, spearman
 from semcast.evaluation.trace_snr import check_snrs, snr_file_label, stated_snr_db
@@ -206,11 +206,11 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         ConfigError: A codec is unknown.
         SemcastError: A result can't be written.
     """
+    settings = naming(settings, codecs)
     images, left_out = read_images(settings.images, settings.max_images)
     if codecs is None:
-        under_name = {name: _load(name, settings) for name in settings.codec}
-    else:
-        under_name = {codec.name: codec for codec in codecs}
+        codecs = [_load(name, settings) for name in settings.codec]
+    under_name = dict(zip(short_names(settings.codec), codecs, strict=True))
     _warm_up(under_name.values(), next(iter(images.values())))
     strip_snr_db = min(settings.links, key=lambda snr_db: abs(snr_db - _STRIP_SNR_DB))
     strip: list[dict[str, NDArray[np.uint8]]] = []

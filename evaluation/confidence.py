@@ -18,7 +18,7 @@ from semcast.evaluation.pipeline import (
     select_frames,
 )
 from semcast.evaluation.plots import plot_reliability
-from semcast.evaluation.report import json_ready, provenance, write_result
+from semcast.evaluation.report import json_ready, naming, provenance, short_names, write_result
 from semcast.evaluation.statistics import finite_mean
 from semcast.evaluation.trace_snr import snr_label, stated_snr_db
 
@@ -67,6 +67,7 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
         SourceError: The sequence can't be read.
         ConfigError: The codec is unknown or no frame was received.
     """
+    settings = naming(settings, codec)
     sequence, codec = open_stream(settings, codec)
     chosen = select_frames(sequence, settings)
     results = [_grade_at(settings, sequence, chosen.ids, codec, snr_db) for snr_db in settings.snr_db]
@@ -83,7 +84,7 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
             for snr_db, result in zip(settings.snr_db, report["results"], strict=True)
         }
         label = f"1 - tanh({settings.pixel_alpha:g} |error|)"
-        title = f"{settings.codec}, {sequence.name}"
+        title = f"{short_names([settings.codec])[0]}, {sequence.name}"
         plot_reliability(settings.out / "reliability.png", tables, label, title)
     return report
 

@@ -30,7 +30,7 @@ from semcast.evaluation.cloud_error import CloudError, TrueView, cloud_error
 from semcast.evaluation.keyframe_depth import DepthKeyframe, cloud_points, confirmed_depths, reconstructed
 from semcast.evaluation.picture_strip import write_picture_strip
 from semcast.evaluation.pipeline import CLEAN, UNUSED_LINK_FIELDS, run_frames
-from semcast.evaluation.report import json_ready, provenance, write_result
+from semcast.evaluation.report import json_ready, naming, provenance, short_names, write_result
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.render import SCENES, RenderSettings, SceneName, render_scene
 from semcast.evaluation.scenes.surfaces import exact_depth
@@ -163,14 +163,13 @@ def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = Non
         ConfigError: A codec is unknown.
         SemcastError: A result can't be written.
     """
+    settings = naming(settings, codecs)
     if codecs is None:
         codecs = [
             load_codec(name, modulation=settings.modulation, num_threads=settings.threads)
             for name in settings.codec
         ]
-        under_name = dict(zip(settings.codec, codecs, strict=True))
-    else:
-        under_name = {codec.name: codec for codec in codecs}
+    under_name = dict(zip(short_names(settings.codec), codecs, strict=True))
     with tempfile.TemporaryDirectory() as folder:
         scene = _prepared(settings, Path(folder))
         originals = {k: scene.sequence.image(k) for k in scene.keyframes}

@@ -29,7 +29,7 @@ from semcast.evaluation.pipeline import (
     select_frames,
 )
 from semcast.evaluation.reconstruct import as_received, cut_to_frames
-from semcast.evaluation.report import json_ready, provenance, write_result
+from semcast.evaluation.report import json_ready, naming, provenance, write_result
 from semcast.evaluation.trace_snr import snr_label
 from semcast.server.export.outputs import trajectory_of
 from semcast.server.mapping.bundle_process import ProcessBundle
@@ -106,6 +106,7 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
         SourceError: The recording can't be read.
         ConfigError: The codec is unknown, or too few frames arrive.
     """
+    settings = naming(settings, codec)
     sequence, codec = open_stream(settings, codec)
     chosen = select_frames(sequence, settings)
     frames = _received(sequence, chosen.ids, codec, settings)

@@ -21,7 +21,7 @@ from semcast.evaluation.pipeline import (
     select_frames,
 )
 from semcast.evaluation.reconstruct import reconstruct
-from semcast.evaluation.report import json_ready, provenance, write_result
+from semcast.evaluation.report import json_ready, naming, provenance, write_result
 from semcast.evaluation.trace_snr import snr_label
 from semcast.server.frame_rows import FrameRow
 from semcast.server.frame_views import frame_view
@@ -141,6 +141,7 @@ def evaluate_latency(settings: LatencySettings, codec: Codec | None = None) -> d
         SourceError: The recording can't be read.
         ConfigError: The codec is unknown, or no frame is left behind the warm-up.
     """
+    settings = naming(settings, codec)
     sequence, codec = open_stream(settings, codec)
     chosen = select_frames(sequence, settings)
     frames = FrameRun(

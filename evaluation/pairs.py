@@ -38,7 +38,7 @@ from semcast.evaluation.pipeline import (
 )
 from semcast.evaluation.plots import plot_pair_errors
 from semcast.evaluation.pose_error import relative_pose_error
-from semcast.evaluation.report import json_ready, provenance, write_result
+from semcast.evaluation.report import json_ready, naming, provenance, short_names, write_result
 from semcast.evaluation.statistics import finite_mean, percentiles
 from semcast.evaluation.trace_snr import stated_snr_db
 from semcast.server.geometry.agreement import neighbour_agreement
@@ -152,6 +152,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
         SourceError: The recording can't be read.
         ConfigError: The codec is unknown, there is no ground truth, or no pair has the baseline asked for.
     """
+    settings = naming(settings, codec)
     sequence, codec = open_stream(settings, codec)
     chosen = select_frames(sequence, settings)
     motions = {gap: true_motions(sequence, chosen.ids, settings, gap) for gap in settings.gap}
@@ -183,7 +184,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
         {
             **provenance(VERB, settings),
             "sequence": sequence.name,
-            "title": f"{sequence.name}, {settings.codec}, {settings.link.channel}",
+            "title": f"{sequence.name}, {short_names([settings.codec])[0]}, {settings.link.channel}",
             "frames_left_out": chosen.left_out,
             "num_pairs": sum(len(of_gap) for of_gap in motions.values()),
             "results": merged.results(),

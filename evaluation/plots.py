@@ -111,9 +111,9 @@ def plot_against_snr(
         style = "-" if k < len(_COLOURS) else "--"
         axes.plot(snr_db, y, style, color=colour, marker=marker, markersize=4, label=name)
     axes.set(xlabel="SNR (dB)", ylabel=y_label)
-    axes.set_title(title, fontsize="medium")
+    figure.suptitle(title, fontsize="medium")  # which may be wider than the axes are
     # Inside the axes the names would hide points of the curves.
-    figure.legend(fontsize="small", loc="outside right upper")
+    figure.legend(fontsize="small", loc="outside right center")
     save_figure(figure, path)
 
 

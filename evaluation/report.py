@@ -3,16 +3,20 @@
 import platform
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from semcast.common.codec import Codec
 from semcast.common.config_flags import flag_words
 from semcast.common.cores import usable_cores
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.source_commit import source_commit
 from semcast.common.whole_file import check_writable
 from semcast.server.export.outputs import plain, versions_of, write_json
+
+Settings = TypeVar("Settings")
 
 #: File of a result in the folder its pictures go to.
 RESULT_NAME = "result.json"
@@ -90,6 +94,35 @@ def command_line(verb: str, settings: Any) -> str:
     """
     words = flag_words(settings, written=lambda value: str(json_ready(value)))
     return shlex.join(["semcast", *verb.split(), *words])
+
+
+def naming(settings: Settings, used: Codec | Sequence[Codec] | None) -> Settings:
+    """Return settings of a measurement that name the codecs used, where these were not loaded by name.
+
+    Args:
+        settings: With ``codec``, a name, and ``modulation``; or a tuple of names.
+        used: A codec or several, as ``settings.codec`` has; None leaves the settings as they are.
+
+    Raises:
+        ValueError: Two of them have the same name.
+    """
+    if used is None:
+        return settings
+    if not isinstance(used, Sequence):
+        return replace(settings, codec=used.name, modulation=used.modulation)  # type: ignore[type-var]
+    return replace(settings, codec=tuple(codec.name for codec in used))  # type: ignore[type-var]
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Return codecs' names for tables and pictures: of a weights file what of its path tells it apart."""
+    paths = [Path(name).parts for name in names]
+
+    def short(path: tuple[str, ...]) -> str:
+        tails = (path[-k:] for k in range(1, len(path)))
+        alone = (tail for tail in tails if sum(other[-len(tail) :] == tail for other in paths) == 1)
+        return str(Path(*next(alone, path)))
+
+    return [short(path) for path in paths]
 
 
 def provenance(verb: str, settings: Any) -> dict[str, Any]:

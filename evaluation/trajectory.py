@@ -23,7 +23,7 @@ from semcast.evaluation.pipeline import (
 )
 from semcast.evaluation.plots import plot_path
 from semcast.evaluation.reconstruct import ReconstructedRun, reconstruct
-from semcast.evaluation.report import json_ready, provenance, write_result
+from semcast.evaluation.report import json_ready, naming, provenance, write_result
 from semcast.evaluation.statistics import paired_bootstrap
 from semcast.evaluation.trace_snr import snr_file_label, stated_snr_db
 from semcast.server.geometry.weighting import ConfidenceMode
@@ -111,6 +111,7 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
         ConfigError: The codec is unknown.
         SemcastError: A result file can't be written.
     """
+    settings = naming(settings, codec)
     sequence, codec = open_stream(settings, codec)
     truth = sequence.groundtruth()
     has_truth = _is_usable(truth, sequence.name)

@@ -2,6 +2,7 @@ import cv2
 import numpy as np
 import pytest
 from full_disk import room_for
+from matplotlib.text import Text
 
 from semcast.common.errors import SemcastError
 from semcast.evaluation import plots
@@ -74,6 +75,20 @@ def test_curves_with_gaps_draw_and_wrong_lengths_raise(tmp_path):
     assert cv2.imread(str(path)) is not None
     with pytest.raises(ValueError, match="2 values"):
         plot_against_snr(path, [2, 4], {"x": [1.0]}, "y")
+
+
+def test_long_names_of_curves_leave_the_title_whole(monkeypatch, tmp_path):
+    curves = {"a/checkpoint/with/a/name/as/long.safetensors": [1.0, 2.0]}
+    title = "rayleigh, 16qam (learned codecs), CBR 1/16, mean of 24 images"
+    (figure,) = drawn_by(
+        monkeypatch, lambda: plot_against_snr(tmp_path / "a.png", [2, 4], curves, "y", title)
+    )
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    box = next(text for text in figure.findobj(Text) if text.get_text() == title).get_window_extent()
+    assert figure.bbox.x0 <= box.x0
+    assert box.x1 <= figure.bbox.x1
+    assert not box.overlaps(legend.get_window_extent())
 
 
 def test_path_and_reliability_are_drawn(tmp_path):

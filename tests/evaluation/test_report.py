@@ -9,14 +9,18 @@ import pytest
 
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.source_commit import source_commit
+from semcast.evaluation.codec import CodecSettings
 from semcast.evaluation.report import (
     check_outputs,
     command_line,
     json_ready,
     machine_kind,
+    naming,
     provenance,
+    short_names,
     write_result,
 )
+from semcast.evaluation.trajectory import TrajectorySettings
 
 
 class Colour(StrEnum):
@@ -35,6 +39,22 @@ class Settings:
     snr_db: tuple[float, ...] = (10.0,)
     seeds: int = field(default=1, metadata={"flag": "num_seeds"})
     plots: bool = True
+
+
+def test_a_weights_file_goes_by_as_much_of_its_path_as_tells_it_apart():
+    assert short_names(["/a/b/x.safetensors", "vit"]) == ["x.safetensors", "vit"]
+    assert short_names(["/a/b/x.safetensors", "/a/c/x.safetensors"]) == ["b/x.safetensors", "c/x.safetensors"]
+    assert short_names(["x.safetensors", "/a/x.safetensors"]) == ["x.safetensors", "a/x.safetensors"]
+
+
+def test_a_result_names_the_codec_that_was_used(phase_codec):
+    one, several = TrajectorySettings(sequence=Path(), modulation="analog"), CodecSettings(images=Path())
+    assert naming(one, None) is one
+    named = naming(one, phase_codec)
+    assert (named.codec, named.modulation) == ("phase", "16qam")
+    assert naming(several, [phase_codec]).codec == (phase_codec.name,)
+    with pytest.raises(ValueError, match=r"different names, got \('phase', 'phase'\)"):
+        naming(several, [phase_codec, phase_codec])
 
 
 def test_json_has_no_nan_no_arrays_and_no_absolute_path():

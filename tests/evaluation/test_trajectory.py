@@ -45,9 +45,10 @@ def without_times(report):
 
 def test_one_run_has_the_promised_keys_and_files(room, phase_codec, tmp_path):
     settings = TrajectorySettings(
-        sequence=room, codec="phase", snr_db=(20.0,), max_frames=16, json=tmp_path / "t.json", out=tmp_path
+        sequence=room, snr_db=(20.0,), max_frames=16, json=tmp_path / "t.json", out=tmp_path
     )
     report = evaluate_trajectory(settings, phase_codec)
+    assert report["settings"]["codec"] == "phase"
     assert json.loads(settings.json.read_text()) == report
     assert all(report[key] is not None for key in PROMISED)
     assert set(report["stage_ms"]["decode"]) >= {"p50", "p95"}
