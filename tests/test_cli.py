@@ -1,4 +1,7 @@
+import io
+import logging
 import os
+import re
 import resource
 import shutil
 import signal
@@ -11,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from semcast import cli
 from semcast.cli import VERBS, main, verb_parser
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -215,6 +219,17 @@ def test_help_is_a_verb_too(capsys):
         assert capsys.readouterr().out.startswith(first)
     assert main(["help", "rpelay"]) == 2
     assert "did you mean 'replay'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("is_terminal", "time"), [(True, r"..:..:.."), (False, r"\d{4}-..-..T..:..:..")])
+def test_a_log_that_is_kept_tells_the_day(monkeypatch, is_terminal, time):
+    log = io.StringIO()
+    monkeypatch.setattr(log, "isatty", lambda: is_terminal)
+    monkeypatch.setattr(sys, "stderr", log)
+    handler = cli._configure_logging(debug=False)
+    logging.getLogger("semcast.x").warning("lost")
+    logging.getLogger("semcast").removeHandler(handler)
+    assert re.fullmatch(time + r" WARNING semcast\.x: lost\n", log.getvalue())
 
 
 def test_a_missing_file_is_named_once(tmp_path, capsys):

@@ -52,10 +52,10 @@ def run(settings, tell=lambda line: None, progress=lambda done, text: None, stop
 def test_what_a_role_warns_of_is_told_once_and_nothing_else(tmp_path):
     child = Role("server", [], tmp_path / "log")
     child.log.write_text(
-        "11:58:03 INFO    semcast.server.session: frame 4: a map has begun\n"
-        "11:58:04 WARNING semcast.server.mapping.readout_watch: the focal length seems too short\n"
-        "11:58:05 WARNING semcast.server.session: 1 frames tracked, 0 with a pose\n"
-        "11:58:06 WARNING semcast.server.mapping.readout_watch: the focal length seems too short\n"
+        "2026-03-01T11:58:03 INFO    semcast.server.session: frame 4: a map has begun\n"
+        "2026-03-01T11:58:04 WARNING semcast.server.mapping.readout_watch: the focal length seems too short\n"
+        "2026-03-01T11:58:05 WARNING semcast.server.session: 1 frames tracked, 0 with a pose\n"
+        "2026-03-01T11:58:06 WARNING semcast.server.mapping.readout_watch: the focal length seems too short\n"
     )
     assert child.warnings() == ["the focal length seems too short", "1 frames tracked, 0 with a pose"]
 

@@ -165,7 +165,9 @@ def verb_parser(verb: str) -> argparse.ArgumentParser:
 
 def _configure_logging(debug: bool) -> logging.Handler:
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S"))
+    is_watched = sys.stderr is not None and sys.stderr.isatty()
+    time = "%H:%M:%S" if is_watched else "%Y-%m-%dT%H:%M:%S"  # a log is read another day
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", time))
     root = logging.getLogger("semcast")
     root.addHandler(handler)
     root.setLevel(logging.DEBUG if debug else logging.INFO)
