@@ -16,7 +16,7 @@ help:            ## what can be made
 demo: $(VENV)/.ready-run  ## stream the demo sequence over a noisy link and reconstruct it live
 	$(BIN)/semcast demo --out runs/demo $(ARGS)
 
-test: $(VENV)/.ready-dev  ## run all tests
+test: $(VENV)/.ready-dev  ## run all tests, or those named: ARGS=tests/channel
 	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadgroup $(ARGS)
 
 check: $(VENV)/.ready-dev  ## formatting, lint and types

@@ -279,6 +279,14 @@ def test_a_damaged_image_is_told_by_us_and_by_opencv_only_on_request(tmp_path):
         assert ("[ WARN:" in shown.stderr) == is_told
 
 
+def test_a_home_that_cant_be_written_is_nothing_to_talk_about(tmp_path):
+    (tmp_path / "file").touch()
+    script = "import semcast.cli as c; c._quieten_libraries(); import matplotlib as m; m.get_configdir()"
+    environment = {**os.environ, "MPLCONFIGDIR": str(tmp_path / "file" / "home")}
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment)
+    assert (shown.returncode, shown.stderr) == (0, "")
+
+
 def test_ctrl_c_while_a_verb_is_imported_waits_until_it_is(monkeypatch, capsys):
     done = []
 

@@ -5,9 +5,12 @@ import json
 import re
 import shlex
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from semcast.channel.registry import channel_names
+from semcast.channel.settings import ChannelName
 from semcast.cli import VERBS, verb_parser
 from semcast.common import keys
 from semcast.evaluation.markdown import with_part
@@ -173,6 +176,11 @@ def reasons_of_drops():
                 yield from (
                     o.value for o in outcomes if isinstance(o, ast.Constant) and isinstance(o.value, str)
                 )
+
+
+def test_every_channel_that_can_be_set_has_a_model_and_a_row_in_its_page():
+    rows = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs/channel-models.md").read_text("utf-8"), re.MULTILINE)
+    assert list(get_args(ChannelName)) == channel_names() == rows
 
 
 def test_every_reason_of_a_drop_is_explained_and_no_other():

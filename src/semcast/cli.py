@@ -175,10 +175,11 @@ def _configure_logging(debug: bool) -> logging.Handler:
 
 
 def _quieten_libraries() -> None:
-    """Keep lines of OpenCV, FFmpeg and Rerun, which say what we know or say in words, off the terminal.
+    """Keep what OpenCV, FFmpeg, Rerun and Matplotlib say, which we know or say in words, off the terminal.
 
     They read this when a verb imports them. What the user has set holds.
     """
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of a home that can't be written it makes do
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # AV_LOG_QUIET
     # Rerun warns of every file without a footer, and of full disks, which the server says by itself.
