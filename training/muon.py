@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
+from semcast.common.nets.codec import has_fast_bfloat16
+
 #: Of the iteration.
 _NUM_STEPS = 5
 
@@ -12,13 +14,15 @@ _NUM_STEPS = 5
 def orthogonalise(matrices: Tensor) -> Tensor:
     """Bring all singular values of each matrix close to 1 by a quintic Newton-Schulz iteration.
 
-    They end between about 0.7 and 1.2, which is all the optimiser needs. Runs in bfloat16.
+    They end between about 0.7 and 1.2, which is all the optimiser needs. Runs in bfloat16, but
+    on a CPU that would emulate it.
 
     Args:
         matrices: ``(N, rows, columns)``; a whole stack costs a GPU hardly more than one.
     """
     a, b, c = 3.4445, -4.7750, 2.0315
-    x = matrices.bfloat16()
+    is_emulated = matrices.device.type == "cpu" and not has_fast_bfloat16()
+    x = matrices if is_emulated else matrices.bfloat16()
     is_tall = x.shape[1] > x.shape[2]
     if is_tall:
         x = x.mT

@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from semcast.training import muon
 from semcast.training.muon import Muon, orthogonalise
 
 
@@ -10,6 +11,14 @@ def test_singular_values_come_close_to_one(shape):
     values = torch.linalg.svdvals(orthogonalise(matrices))
     assert values.max().item() < 1.35
     assert values.median().item() > 0.6
+
+
+@pytest.mark.parametrize("has_bfloat16", [True, False])
+def test_bfloat16_is_used_where_the_hardware_has_it(monkeypatch, has_bfloat16):
+    monkeypatch.setattr(muon, "has_fast_bfloat16", lambda: has_bfloat16)
+    nearest = orthogonalise(torch.randn(3, 8, 30, generator=torch.Generator().manual_seed(0)))
+    assert nearest.dtype == torch.float32
+    assert torch.equal(nearest, nearest.bfloat16().float()) == has_bfloat16
 
 
 def test_a_matrix_of_a_stack_comes_out_as_it_would_alone():
