@@ -5,10 +5,12 @@ import json
 import re
 import shlex
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import get_args
 
 import pytest
 
+from semcast.channel.link import Link
 from semcast.channel.registry import channel_names
 from semcast.channel.settings import ChannelName
 from semcast.cli import VERBS, verb_parser
@@ -176,6 +178,16 @@ def reasons_of_drops():
                 yield from (
                     o.value for o in outcomes if isinstance(o, ast.Constant) and isinstance(o.value, str)
                 )
+
+
+def test_the_names_on_the_library_page_are_there():
+    page = (ROOT / "docs/library.md").read_text("utf-8")
+    names = set(re.findall(r"semcast(?:\.\w+)+", page))
+    assert len(names) > 15
+    for name in names:
+        resolve_name(name)
+    for method in re.findall(r"`Link\.(\w+)", page):
+        assert hasattr(Link, method), method
 
 
 def test_every_channel_that_can_be_set_has_a_model_and_a_row_in_its_page():
