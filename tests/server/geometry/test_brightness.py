@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from semcast.common.codec import KLT_WINDOW_PX
-from semcast.server.geometry import features
+from semcast.server.geometry import brightness, features
 from semcast.server.geometry.brightness import brightness_change, with_brightness
 from semcast.server.geometry.features import detect_corners, track_points, track_through_light
 
@@ -42,6 +42,13 @@ def test_a_change_that_does_not_matter_is_none(grey, rng):
     told = [brightness_change(grey, grey, *pairs) for pairs in lost]
     assert sum(change is not None for change in told) <= 8, "points that are elsewhere tell nothing"
     assert brightness_change(black, grey, xy, xy) is None
+
+
+def test_the_brightness_of_a_point_is_the_mean_of_its_patch_as_far_as_that_is_in_the_image():
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    xy = np.array([[4.0, 3.0], [0.0, 0.0], [7.4, 9.0], [np.nan, 2.0]])
+    patches = [grey[2:5, 3:6], grey[:2, :2], grey[4:, 6:], grey[1:4, :2]]
+    assert brightness._patch_means(grey, xy, 3) == pytest.approx([patch.mean() for patch in patches])
 
 
 def test_an_image_clips_as_a_camera_does():
