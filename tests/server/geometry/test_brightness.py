@@ -95,6 +95,35 @@ def test_one_search_is_enough_where_guesses_are_near(grey, searches):
     assert gain * 100 + offset == pytest.approx(95, abs=1.0)
 
 
+def test_a_small_change_of_light_is_told_by_what_is_found_and_nothing_is_looked_for_twice(grey, searches):
+    corners = detect_corners(grey, 200).astype(np.float64)
+    corners = corners[((corners > 25) & (corners < (294, 214))).all(axis=1)]
+    moved = with_brightness(shifted(grey, 3, 2), 1.0, 3.0)
+    found, (gain, offset) = track_through_light(grey, moved, corners, corners + np.array([2.0, 3.0]))
+    assert searches == [len(corners)]
+    assert gain * 100 + offset == pytest.approx(103, abs=0.5)
+    error = np.linalg.norm(found.xy[found.ok] - corners[found.ok] - (3, 2), axis=1)
+    assert np.median(error) < 0.05
+
+
+def test_light_that_guesses_told_is_not_doubted_where_much_is_hidden(grey, searches, monkeypatch, rng):
+    corners = detect_corners(grey, 200).astype(np.float64)
+    corners = corners[((corners > 25) & (corners < (294, 214))).all(axis=1)]
+    moved = with_brightness(shifted(grey, 3, 2), 0.95, 0.0)
+    hidden = corners[:, 0] > np.quantile(corners[:, 0], 0.7)
+    first = round(float(corners[hidden, 0].min()))
+    moved[:, first:] = cv2.GaussianBlur(rng.integers(0, 255, moved.shape, np.uint8), (0, 0), 2.0)[:, first:]
+
+    def told(grey0, grey1, xy0, xy1, *patch_px):
+        return (0.95, 0.0) if patch_px else (0.85, 0.0)
+
+    monkeypatch.setattr(features, "brightness_change", told)
+    found, change = track_through_light(grey, moved, corners, corners + np.array([3.0, 2.0]))
+    assert 0.4 < found.ok.mean() < 0.6
+    assert change == (0.95, 0.0)
+    assert len(searches) == 2, "some, then all, once"
+
+
 def test_light_that_far_guesses_make_up_is_none(grey):
     # A wall is brighter the further to the right: where points are guessed to be, but not where they are.
     scene = np.rint(20 + 0.35 * np.arange(320) + 0.3 * grey).astype(np.uint8)
