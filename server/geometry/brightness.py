@@ -17,7 +17,7 @@ _PATCH_PX = 7
 _DARKEST = 8.0
 _BRIGHTEST = 247.0
 #: Points that tell a change at least.
-_MIN_POINTS = 20
+MIN_POINTS = 20
 #: Rounds of reweighting (Huber).
 _ITERATIONS = 5
 #: An exposure is a gain: an offset is taken to be no larger than about this, and matters for tone curves.
@@ -49,7 +49,7 @@ def brightness_change(
     before, after = _patch_means(grey0, xy0, patch_px), _patch_means(grey1, xy1, patch_px)
     inside = (np.minimum(before, after) > _DARKEST) & (np.maximum(before, after) < _BRIGHTEST)
     before, after = before[inside], after[inside]
-    if len(before) < _MIN_POINTS or abs(np.median(after - before)) < 0.5 * _MIN_CHANGE_GREY:
+    if len(before) < MIN_POINTS or abs(np.median(after - before)) < 0.5 * _MIN_CHANGE_GREY:
         return None
     design = np.stack([before, np.ones_like(before)], axis=1)
     model = np.array([np.median(after / before), 0.0])
