@@ -17,7 +17,7 @@ _PATCH_PX = 7
 _DARKEST = 8.0
 _BRIGHTEST = 247.0
 #: Points that tell a change at least.
-_MIN_POINTS = 20
+MIN_POINTS = 20
 #: Rounds of reweighting (Huber).
 _ITERATIONS = 5
 #: An exposure is a gain: an offset is taken to be no larger than about this, and matters for tone curves.
@@ -49,7 +49,7 @@ def brightness_change(
     before, after = _patch_means(grey0, xy0, patch_px), _patch_means(grey1, xy1, patch_px)
     inside = (np.minimum(before, after) > _DARKEST) & (np.maximum(before, after) < _BRIGHTEST)
     before, after = before[inside], after[inside]
-    if len(before) < _MIN_POINTS or abs(np.median(after - before)) < 0.5 * _MIN_CHANGE_GREY:
+    if len(before) < MIN_POINTS or abs(np.median(after - before)) < 0.5 * _MIN_CHANGE_GREY:
         return None
     design = np.stack([before, np.ones_like(before)], axis=1)
     model = np.array([np.median(after / before), 0.0])
@@ -75,9 +75,11 @@ def with_brightness(grey: Grey, gain: float, offset: float) -> Grey:
 
 
 def _patch_means(grey: Grey, xy: Array, patch_px: int) -> Array:
+    """Mean of what of the patch around each point lies in the image, by sums of a table."""
     height, width = grey.shape
-    mean = cv2.blur(grey, (patch_px, patch_px))
-    nearest = np.rint(np.nan_to_num(xy))
-    x = np.clip(nearest[:, 0], 0, width - 1).astype(np.intp)
-    y = np.clip(nearest[:, 1], 0, height - 1).astype(np.intp)
-    return mean[y, x].astype(np.float64)
+    table, half = cv2.integral(grey), patch_px // 2
+    nearest = np.clip(np.rint(np.nan_to_num(xy)), 0, (width - 1, height - 1)).astype(np.intp)
+    left, top = np.maximum(nearest - half, 0).T
+    right, bottom = np.minimum(nearest + half + 1, (width, height)).T
+    total = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]
+    return np.asarray(total / ((right - left) * (bottom - top)))

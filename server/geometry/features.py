@@ -60,8 +60,9 @@ _LEVELS_ANEW = 1
 _NUM_SCOUTS, _LEAST_STEP = 40, 3
 #: the share of them that must be found, and how far from where they are guessed they typically may be.
 _SCOUTS_FOUND, _NEAR_PX = 0.4, 2.0
-#: Two changes of brightness are one where they make as much of these grey levels, but for so much.
-_LEVELS_GREY, _SAME_LIGHT_GREY = np.array([64.0, 192.0]), 2.0
+#: Two changes of brightness are one where they make as much of these grey levels, but for so much: what that
+#: moves a point by, the small window takes back.
+_LEVELS_GREY, _SAME_LIGHT_GREY = np.array([64.0, 192.0]), 4.0
 #: With fewer, what they tell is right if it finds this factor as many.
 _CLEARLY_MORE = 1.2
 
@@ -260,11 +261,13 @@ def track_through_light(
     if count == 0 or grey0.shape != grey1.shape:
         return TrackedPoints.none(count), None
     told = _light_at_guesses(grey0, grey1, xy0, guess1_xy, max_level)
-    like_second = _in_light(grey0, told)
+    like_second, is_told = _in_light(grey0, told), told is not None
     found = _search(like_second, grey1, xy0, guess1_xy, max_forward_backward_px, max_level)
     for _ in range(2):
         # Where hardly any was found, the guesses are near enough for a first idea of the change.
         is_sure = bool(found.ok.mean() >= _MOSTLY_FOUND)
+        if not is_sure and is_told:
+            break  # what guesses told was found true, and they tell no more now
         rows = found.ok if is_sure else np.ones(count, bool)
         xy1 = np.where(found.ok[:, None], found.xy, guess1_xy)
         change = brightness_change(grey0, grey1, xy0[rows], xy1[rows])
@@ -288,12 +291,15 @@ def _light_at_guesses(
 ) -> tuple[float, float] | None:
     """Change of brightness where points are guessed to be, so that they need not be looked for twice.
 
-    It is believed where a few of them are found about there. If all guesses are off to one side, light that
-    falls off along a wall looks like a change, and points would be found where it says.
+    One that is too large for the small window to make up for is believed where a few of them are found about
+    there. If all guesses are off to one side, light that falls off along a wall looks like a change, and
+    points would be found where it says.
     """
-    change = brightness_change(grey0, grey1, xy0, guess1_xy, KLT_WINDOW_PX)
     step = len(xy0) // _NUM_SCOUTS
-    if change is None or step < _LEAST_STEP:
+    if step < _LEAST_STEP:
+        return None
+    change = brightness_change(grey0, grey1, xy0, guess1_xy, KLT_WINDOW_PX)
+    if _is_same_light(None, change):
         return None
     guess = guess1_xy[::step]
     found = _search(grey0, grey1, xy0[::step], guess, _MAX_FORWARD_BACKWARD_PX, max_level)

@@ -1,16 +1,22 @@
 """Looks again for landmarks that are in sight but have lost their track, where the pose expects them.
 
 Rows that did not arrive, a blur or a jerk end tracks; their landmarks are still in the map. They are followed
-from the newest keyframes they were seen in, whose images are kept.
+from the newest keyframes they were seen in, whose images are kept. How the light has changed since then is
+told by tracks that go on: where these are is known.
 """
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, transform_points
-from semcast.server.mapping.keyframe_images import ImagedMap
-from semcast.server.mapping.sight import Sight
+from semcast.server.geometry.brightness import MIN_POINTS, brightness_change, with_brightness
+from semcast.server.geometry.features import TrackedPoints, track_alike, track_points
+from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
+from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.tracks import TrackTable
+from semcast.server.mapping.world_map import Keyframe
 
 Array = NDArray[np.float64]
 
@@ -18,6 +24,8 @@ Array = NDArray[np.float64]
 _NUM_RECALLED = 3
 #: A point is looked for no nearer to the border than this.
 _BORDER_PX = 8
+#: Pyramid levels: where it is expected is known well.
+_LEVELS = 1
 
 
 def recall_landmarks(
@@ -42,7 +50,7 @@ def recall_landmarks(
     Returns:
         Ids of the tracks that were found.
     """
-    T_cam_world = invert_transform(T_world_cam)
+    T_cam_world, alive = invert_transform(T_world_cam), tracks.seen()
     found = [np.zeros(0, np.int64)]
     for image, keyframe in reversed(mapped.newest_views(_NUM_RECALLED)):
         if sum(map(len, found)) >= wanted:
@@ -54,6 +62,26 @@ def recall_landmarks(
         in_sight = sight.shows(expected, _BORDER_PX)
         lost, expected = lost[in_sight], expected[in_sight]
         if len(lost):
-            seen = keyframe.ids[lost], keyframe.xy[lost]
-            found.append(tracks.take_up(sight, image.grey, *seen, expected, reach_px))
+            points = _follow(image, keyframe, lost, sight, expected, alive)
+            near = np.linalg.norm(points.xy - expected, axis=1) < reach_px
+            points = replace(points, ok=points.ok & near)
+            found.append(tracks.bring_back(sight, keyframe.ids[lost], points))
     return np.concatenate(found)
+
+
+def _follow(
+    image: SeenFrom,
+    keyframe: Keyframe,
+    rows: NDArray[np.intp],
+    sight: Sight,
+    expected_xy: Array,
+    alive: Seen,
+) -> TrackedPoints:
+    """Follow some of what a keyframe saw into a new image, in the light that tracks seen in both tell of."""
+    xy0 = keyframe.xy[rows]
+    _, then, now = np.intersect1d(keyframe.ids, alive.ids, assume_unique=True, return_indices=True)
+    if len(then) < MIN_POINTS:
+        return track_points(image.grey, sight.grey, xy0, expected_xy, max_level=_LEVELS)
+    change = brightness_change(image.grey, sight.grey, keyframe.xy[then], alive.xy[now])
+    grey0 = image.grey if change is None else with_brightness(image.grey, *change)
+    return track_alike(grey0, sight.grey, xy0, expected_xy, max_level=_LEVELS)

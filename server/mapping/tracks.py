@@ -17,7 +17,6 @@ from semcast.server.geometry.features import (
     detect_corners,
     sample_map,
     track_alike,
-    track_points,
     track_through_light,
 )
 from semcast.server.geometry.warped_points import MAX_FROM_GUESS_PX, track_warped
@@ -374,26 +373,6 @@ class TrackTable:
         taken = (np.floor(xy / cell_px).astype(np.int64)[:, None] + around).reshape(-1, 2)
         cells = np.floor(self.xy / cell_px).astype(np.int64)
         return self.visible & np.isin(cell_keys(cells), cell_keys(taken))
-
-    def take_up(
-        self, sight: Sight, grey0: Grey, ids: Ids, xy0: Array, expected_xy: Array, reach_px: float
-    ) -> Ids:
-        """Bring tracks back that ended earlier, found from an older image.
-
-        Args:
-            sight: The newest image.
-            grey0: The older one.
-            ids: ``(N,)`` of the tracks, none of them alive.
-            xy0: ``(N, 2)`` where they are in ``grey0``.
-            expected_xy: ``(N, 2)`` where they should be now.
-            reach_px: A point further off is another one.
-
-        Returns:
-            Ids of those that were found.
-        """
-        points = track_points(grey0, sight.grey, xy0, expected_xy, max_level=1)
-        near = np.linalg.norm(points.xy - expected_xy, axis=1) < reach_px
-        return self.bring_back(sight, ids, replace(points, ok=points.ok & near))
 
     def bring_back(self, sight: Sight, ids: Ids, points: TrackedPoints) -> Ids:
         """Add tracks that ended earlier where they were found in the newest image.

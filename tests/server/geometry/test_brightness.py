@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from semcast.common.codec import KLT_WINDOW_PX
-from semcast.server.geometry import features
+from semcast.server.geometry import brightness, features
 from semcast.server.geometry.brightness import brightness_change, with_brightness
 from semcast.server.geometry.features import detect_corners, track_points, track_through_light
 
@@ -42,6 +42,13 @@ def test_a_change_that_does_not_matter_is_none(grey, rng):
     told = [brightness_change(grey, grey, *pairs) for pairs in lost]
     assert sum(change is not None for change in told) <= 8, "points that are elsewhere tell nothing"
     assert brightness_change(black, grey, xy, xy) is None
+
+
+def test_the_brightness_of_a_point_is_the_mean_of_its_patch_as_far_as_that_is_in_the_image():
+    grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    xy = np.array([[4.0, 3.0], [0.0, 0.0], [7.4, 9.0], [np.nan, 2.0]])
+    patches = [grey[2:5, 3:6], grey[:2, :2], grey[4:, 6:], grey[1:4, :2]]
+    assert brightness._patch_means(grey, xy, 3) == pytest.approx([patch.mean() for patch in patches])
 
 
 def test_an_image_clips_as_a_camera_does():
@@ -86,6 +93,35 @@ def test_one_search_is_enough_where_guesses_are_near(grey, searches):
     assert searches == [pytest.approx(len(corners) / 3, abs=1), len(corners)], "some, then all, once"
     assert found.ok.mean() > 0.95
     assert gain * 100 + offset == pytest.approx(95, abs=1.0)
+
+
+def test_a_small_change_of_light_is_told_by_what_is_found_and_nothing_is_looked_for_twice(grey, searches):
+    corners = detect_corners(grey, 200).astype(np.float64)
+    corners = corners[((corners > 25) & (corners < (294, 214))).all(axis=1)]
+    moved = with_brightness(shifted(grey, 3, 2), 1.0, 3.0)
+    found, (gain, offset) = track_through_light(grey, moved, corners, corners + np.array([2.0, 3.0]))
+    assert searches == [len(corners)]
+    assert gain * 100 + offset == pytest.approx(103, abs=0.5)
+    error = np.linalg.norm(found.xy[found.ok] - corners[found.ok] - (3, 2), axis=1)
+    assert np.median(error) < 0.05
+
+
+def test_light_that_guesses_told_is_not_doubted_where_much_is_hidden(grey, searches, monkeypatch, rng):
+    corners = detect_corners(grey, 200).astype(np.float64)
+    corners = corners[((corners > 25) & (corners < (294, 214))).all(axis=1)]
+    moved = with_brightness(shifted(grey, 3, 2), 0.95, 0.0)
+    hidden = corners[:, 0] > np.quantile(corners[:, 0], 0.7)
+    first = round(float(corners[hidden, 0].min()))
+    moved[:, first:] = cv2.GaussianBlur(rng.integers(0, 255, moved.shape, np.uint8), (0, 0), 2.0)[:, first:]
+
+    def told(grey0, grey1, xy0, xy1, *patch_px):
+        return (0.95, 0.0) if patch_px else (0.85, 0.0)
+
+    monkeypatch.setattr(features, "brightness_change", told)
+    found, change = track_through_light(grey, moved, corners, corners + np.array([3.0, 2.0]))
+    assert 0.4 < found.ok.mean() < 0.6
+    assert change == (0.95, 0.0)
+    assert len(searches) == 2, "some, then all, once"
 
 
 def test_light_that_far_guesses_make_up_is_none(grey):

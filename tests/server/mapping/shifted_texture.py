@@ -1,12 +1,16 @@
-"""A plain texture before which a camera moves sideways, and tracks that begin on it."""
+"""A plain texture before which a camera moves sideways, tracks that begin on it, and a map of it."""
 
 import cv2
 import numpy as np
 
+from semcast.common.camera import Intrinsics
+from semcast.common.geometry import make_transform
 from semcast.server.geometry.features import to_grey
+from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
 from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable
+from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 SHAPE = (192, 256)
 
@@ -42,3 +46,35 @@ def begin(x=20, **changes):
     tracks.remember(sight)
     tracks.refill(sight)
     return tracks
+
+
+#: A wall at distance 1: moving by 1/200 moves the image by a pixel.
+CAMERA = Intrinsics(fx=200.0, fy=200.0, cx=128.0, cy=96.0, width=SHAPE[1], height=SHAPE[0])
+START_X = 20
+
+
+def pose_at(x):
+    return make_transform(np.eye(3), [(x - START_X) / 200.0, 0.0, 0.0])
+
+
+def mapped_wall():
+    """A keyframe whose tracks are all landmarks, its image, and the tracks."""
+    tracks = begin(START_X)
+    world = WorldMap()
+    count = len(tracks)
+    world.add_keyframe(
+        Keyframe(
+            frame_id=0,
+            t_source_ns=0,
+            T_world_cam=pose_at(START_X),
+            submap=0,
+            ids=tracks.ids.copy(),
+            xy=tracks.xy.copy(),
+            confidence=tracks.confidence.copy(),
+        )
+    )
+    xyz = CAMERA.unproject(tracks.xy)
+    world.add_landmarks(tracks.ids, xyz, np.zeros((count, 3), np.uint8), np.ones(count), 0, 0)
+    images = KeyframeImages(10)
+    images.append(SeenFrom(0, sight_at(START_X).grey))
+    return world, images, tracks

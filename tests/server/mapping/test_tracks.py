@@ -1,22 +1,18 @@
-"""Tracks from image to image, their drift taken out, and landmarks that get their tracks back."""
+"""Tracks from image to image, and their drift taken out."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from shifted_texture import SHAPE, begin, sight_at
+from shifted_texture import CAMERA, SHAPE, START_X, begin, mapped_wall, pose_at, sight_at
 
-from semcast.common.camera import Intrinsics
-from semcast.common.geometry import make_transform
 from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.anchoring import anchor_tracks
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
-from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.sight import Sight, usable_rows
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracker import expected_positions
 from semcast.server.mapping.tracks import MAX_COAST, TrackTable
-from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 
 def test_usable_rows_follow_the_slots():
@@ -264,78 +260,9 @@ def test_a_second_look_that_finds_less_changes_nothing():
         np.testing.assert_array_equal(getattr(tracks, name), values)
 
 
-#: A wall at distance 1: moving by 1/200 moves the image by a pixel.
-CAMERA = Intrinsics(fx=200.0, fy=200.0, cx=128.0, cy=96.0, width=SHAPE[1], height=SHAPE[0])
-START_X = 20
-
-
-def pose_at(x):
-    return make_transform(np.eye(3), [(x - START_X) / 200.0, 0.0, 0.0])
-
-
 @pytest.fixture
 def mapped():
-    """A keyframe whose tracks are all landmarks, its image, and the tracks."""
-    tracks = begin(START_X)
-    world = WorldMap()
-    count = len(tracks)
-    world.add_keyframe(
-        Keyframe(
-            frame_id=0,
-            t_source_ns=0,
-            T_world_cam=pose_at(START_X),
-            submap=0,
-            ids=tracks.ids.copy(),
-            xy=tracks.xy.copy(),
-            confidence=tracks.confidence.copy(),
-        )
-    )
-    xyz = CAMERA.unproject(tracks.xy)
-    world.add_landmarks(tracks.ids, xyz, np.zeros((count, 3), np.uint8), np.ones(count), 0, 0)
-    images = KeyframeImages(10)
-    images.append(SeenFrom(0, sight_at(START_X).grey))
-    return world, images, tracks
-
-
-def recall(mapped, sight, x, reach_px=6.0, wanted=1000, submap=0):
-    world, images, tracks = mapped
-    imaged = ImagedMap(CAMERA, world, images, submap)
-    found = recall_landmarks(imaged, tracks, sight, pose_at(x), reach_px=reach_px, wanted=wanted)
-    assert np.isin(found, tracks.ids).all()
-    return len(found)
-
-
-def test_lost_landmarks_get_their_tracks_back(mapped):
-    _, _, tracks = mapped
-    ids, xy = tracks.ids.copy(), tracks.xy.copy()
-    tracks.keep(np.arange(len(tracks)) % 4 == 0)
-    kept = tracks.ids.copy()
-    sight = sight_at(30, frame_id=1)
-    tracks.follow(sight, tracks.xy - (10, 0))
-    found = recall(mapped, sight, 30)
-    assert found > 0.5 * (len(ids) - len(kept))
-    assert np.all(np.diff(tracks.ids) > 0)
-    back = ~np.isin(tracks.ids, kept)
-    assert back.sum() == found
-    where = xy[np.searchsorted(ids, tracks.ids[back])] - (10, 0)
-    assert np.abs(tracks.xy[back] - where).max() < 1.0
-    assert recall(mapped, sight, 30) == 0, "those found have a track now"
-
-
-def test_older_keyframes_are_not_looked_at_once_enough_is_found(mapped):
-    world, images, tracks = mapped
-    old = world.keyframes[0]
-    half = np.arange(len(old.ids)) % 2 == 0
-    newer = replace(old, frame_id=1)
-    newer.drop_observations(~half)
-    world.add_keyframe(newer)
-    images.append(SeenFrom(1, images.newest(1)[0].grey))
-    before = world.keyframes[-1].ids
-    sight = sight_at(24, frame_id=2)
-    for wanted, only_newest in ((5, True), (1000, False)):
-        tracks.keep(np.zeros(len(tracks), bool))
-        assert recall(mapped, sight, 24, wanted=wanted) > 5
-        assert np.isin(tracks.ids, before).all() == only_newest
+    return mapped_wall()
 
 
 def test_a_track_without_a_landmark_is_expected_from_where_it_was_last_seen(mapped):
@@ -354,31 +281,6 @@ def test_a_track_without_a_landmark_is_expected_from_where_it_was_last_seen(mapp
     expected = expected_positions(CAMERA, world, tracks, pose_at(44), [pose_at(34), pose_at(26), None])
     assert np.abs(expected - where)[~stays].max() < 1e-6
     np.testing.assert_array_equal(expected[stays], tracks.xy[stays])  # it did not move when last seen
-
-
-def test_a_wrong_pose_finds_next_to_nothing(mapped):
-    _, _, tracks = mapped
-    count = len(tracks)
-    tracks.keep(np.zeros(count, bool))
-    sight = sight_at(30, frame_id=1)
-    assert recall(mapped, sight, 75) < 0.05 * count
-
-
-def test_nothing_is_found_where_nothing_arrived(mapped):
-    world, _, tracks = mapped
-    tracks.keep(np.zeros(len(tracks), bool))
-    sight = sight_at(24, frame_id=1, lost=(3, 4, 5, 6))
-    assert recall(mapped, sight, 24) > 0
-    assert not np.any((tracks.xy[:, 1] > 48) & (tracks.xy[:, 1] < 112))
-    tracks.keep(np.zeros(len(tracks), bool))
-    world.landmarks.keep(np.zeros(len(world.landmarks), bool))
-    assert recall(mapped, sight_at(24, frame_id=2), 24) == 0
-
-
-def test_landmarks_of_another_submap_stay_where_they_are(mapped):
-    _, _, tracks = mapped
-    tracks.keep(np.zeros(len(tracks), bool))
-    assert recall(mapped, sight_at(24, frame_id=1), 24, submap=1) == len(tracks) == 0
 
 
 def anchor(mapped, sight, x, submap=0):
