@@ -202,7 +202,7 @@ class NeuralCodec:
             posinf=30.0,
             neginf=LOST_SLOT_SNR_DB,
         ).clip(LOST_SLOT_SNR_DB, 30.0)
-        arrived = np.isfinite(received.symbols).all(axis=1)
+        arrived = np.asarray(np.isfinite(received.symbols).all(axis=1))
         snr_db[~arrived] = LOST_SLOT_SNR_DB
         latent = latent_from_symbols(np.where(arrived[:, None], received.symbols, np.complex64(0.0)))
         latent = latent.clip(-_MAX_SYMBOL, _MAX_SYMBOL)
