@@ -89,16 +89,15 @@ class Recorder:
         """Their payload."""
         return self._writer.bytes_written
 
-    def put(self, topic: str, kind: str, data: bytes, log_time_ns: int | None = None) -> None:
+    def put(self, topic: str, kind: str, data: bytes) -> None:
         """Queue one message; returns at once.
 
         Args:
             topic: Its key expression.
             kind: Kind of message.
             data: Wire bytes.
-            log_time_ns: Wall time of arrival, now by default.
         """
-        now_ns = time.time_ns() if log_time_ns is None else log_time_ns
+        now_ns = time.time_ns()
         with self._condition:
             sequence = self._sequence[topic]
             self._sequence[topic] += 1

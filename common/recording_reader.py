@@ -24,6 +24,8 @@ MESSAGE_ENCODING = "msgpack"
 SCHEMA_PREFIX = "semcast."
 #: Name of the metadata record every recording starts with.
 RECORDING_METADATA = "semcast.recording"
+#: Of one that stands where something damaged was left out, in a recovered recording too.
+DAMAGE_METADATA = "semcast.damage"
 FORMAT = "1"
 MAX_RECORD_BYTES = 256 * 1024**2
 
@@ -31,8 +33,10 @@ _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x01, 0x02, 0
 _METADATA = 0x0C
 _FRAME = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
-_CHUNK_HEAD = struct.Struct("<QQQI")
-_U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
+#: Times, size and checksum of the records, length of the name of their compression, length of the records.
+_CHUNK_HEAD = struct.Struct("<QQQIIQ")
+_COMPRESSIONS = (b"lz4", b"zstd")
+_U16, _U32 = struct.Struct("<H"), struct.Struct("<I")
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,8 @@ class RecordingInfo:
         counts: Topic to number of messages.
         num_bytes: Topic to bytes of payload.
         kinds: Topic to kind.
-        missed: Topic to messages the recorder dropped, where it did.
+        missed: Topic to messages the recorder dropped, where it did; what was lost with a damaged chunk is
+            not among them.
         start_ns: Wall time of the first message, None without messages.
         end_ns: Wall time of the last message.
         complete: The file was closed; otherwise it was cut off.
@@ -132,7 +137,8 @@ class RecordingScan:
     Args:
         stream: Positioned at the start of the file.
         name: What to call it in messages.
-        strict: Raise on a chunk whose checksum does not match; otherwise leave it out and count it.
+        strict: Raise on a chunk whose checksum does not match; otherwise leave it out, count it, and yield
+            ``DAMAGE_METADATA`` in its place.
 
     Attributes:
         complete: After the pass: the file was closed and has its end mark.
@@ -180,20 +186,20 @@ class RecordingScan:
 
     def _chunk(self, size: int) -> Iterator[RecordedMessage | RecordedMetadata]:
         """Yield the records of a chunk; of an unfinished one those that are whole."""
-        if not _CHUNK_HEAD.size + 12 <= size <= MAX_RECORD_BYTES:
+        if not _CHUNK_HEAD.size <= size <= MAX_RECORD_BYTES:
             raise _CutError
         data = self._stream.read(size)
-        content = _Text(data)
-        _, _, _, crc = _CHUNK_HEAD.unpack(content.take(_CHUNK_HEAD.size))
-        compression = content.text()
-        if compression:
-            raise SourceError(f"{self._name} is compressed ({compression}); semcast writes and reads none")
-        (num_bytes,) = _U64.unpack(content.take(8))
-        start = _CHUNK_HEAD.size + 4 + 8
-        inner = memoryview(data)[start : start + num_bytes]
+        if len(data) < _CHUNK_HEAD.size:
+            raise _CutError
+        _, _, _, crc, name_size, _ = _CHUNK_HEAD.unpack_from(data)
+        name = data[_CHUNK_HEAD.size - 8 :][:name_size]
+        if name in _COMPRESSIONS:
+            raise SourceError(f"{self._name} is compressed ({name.decode()}); semcast writes and reads none")
+        # Records reach to the end of the chunk: of its head, damage to the checksum alone matters.
+        inner = memoryview(data)[_CHUNK_HEAD.size :]
         whole = len(data) == size
-        if whole and crc and zlib.crc32(inner) != crc:
-            self.num_damaged_chunks += 1
+        if whole and (crc or name_size) and zlib.crc32(inner) != crc:
+            damage = self._damage()
             if self._strict:
                 raise SourceError(
                     f"{self._name} is damaged: a checksum does not match; 'semcast recover' keeps the rest"
@@ -202,6 +208,7 @@ class RecordingScan:
             for opcode, record in _records_in(inner):
                 if opcode in (_SCHEMA, _CHANNEL):
                     yield from self._record(opcode, record)
+            yield damage
             return
         for opcode, record in _records_in(inner):
             yield from self._record(opcode, record)
@@ -234,10 +241,15 @@ class RecordingScan:
                 fields = _Text(content)
                 yield RecordedMetadata(fields.text(), fields.texts())
         except (struct.error, _CutError) as err:
-            self.num_damaged_chunks += 1
-            if not self._strict:
-                return
-            raise SourceError(f"{self._name} is damaged: a record of type {opcode} is too short") from err
+            damage = self._damage()
+            if self._strict:
+                raise SourceError(f"{self._name} is damaged: a record of type {opcode} is too short") from err
+            yield damage
+
+    def _damage(self) -> RecordedMetadata:
+        """Count what is left out, and return what stands in its place."""
+        self.num_damaged_chunks += 1
+        return RecordedMetadata(DAMAGE_METADATA, {"num_left_out": str(self.num_damaged_chunks)})
 
 
 def _records_in(chunk: memoryview) -> Iterator[tuple[int, memoryview]]:
@@ -322,15 +334,20 @@ def scan_info(stream: BinaryIO, name: str) -> RecordingInfo:
     """Count what a recording holds; damaged chunks are counted and left out."""
     info = RecordingInfo()
     next_sequence: dict[str, int] = {}
+    is_known = True
     scan = RecordingScan(stream, name, strict=False)
     for record in scan.records():
         if isinstance(record, RecordedMetadata):
             info.metadata[record.name] = record.values
+            if record.name == DAMAGE_METADATA:
+                # How many messages of a topic were lost here can't be told.
+                next_sequence.clear()
+                is_known = False
             continue
         info.counts[record.topic] += 1
         info.num_bytes[record.topic] += len(record.data)
         info.kinds[record.topic] = record.kind
-        gap = record.sequence - next_sequence.get(record.topic, 0)
+        gap = record.sequence - next_sequence.get(record.topic, 0 if is_known else record.sequence)
         if gap > 0:
             info.missed[record.topic] = info.missed.get(record.topic, 0) + gap
         next_sequence[record.topic] = record.sequence + 1

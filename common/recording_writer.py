@@ -144,6 +144,7 @@ def recover_stream(source: BinaryIO, target: BinaryIO, name: str) -> RecordingIn
             if writer is None and record.name == RECORDING_METADATA:
                 writer = RecordingWriter(target, record.values)
             elif writer is not None:
+                writer.flush()  # the chunk before it goes first, as in the source
                 writer.add_metadata(record.name, record.values)
         elif writer is not None:
             writer.add(record.topic, record.kind, record.log_time_ns, record.sequence, record.data)

@@ -155,7 +155,10 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
         if (change := best.change) is None:
             raise SemcastError(_NOT_TOLD)
         reaches = _reaches(best.evidence, change)
-        if _is_nothing(change) or num_steps == _MAX_STEPS:
+        if _is_nothing(change):
+            break
+        if num_steps == _MAX_STEPS:
+            reaches = np.maximum(reaches, np.abs(_values(change)))
             break
         is_near = np.abs(_values(change)).max() <= _NEAR
         most_px = (_WORSE if is_near else 1.0) * best.evidence.mean_px

@@ -13,6 +13,7 @@ from typing import Any
 from semcast.channel.settings import ChannelName, ChannelSettings
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.pairs import PairSettings, evaluate_pairs
+from semcast.evaluation.pipeline import CLEAN
 from semcast.evaluation.report import RESULTS, check_outputs
 from semcast.server.geometry.weighting import ConfidenceMode
 
@@ -81,7 +82,7 @@ def suite(data: Path, results: Path, seeds: int) -> Iterator[Run]:
         for channel, (many, few) in _SNRS_DB.items():
             yield _run(data, results, seeds, name, channel, many if recording.thorough else few)
         # What images that nothing was done to give: the floor that noise of matches and references set.
-        yield _run(data, results, seeds, name, "awgn", (10.0,), codec="none")
+        yield _run(data, results, seeds, name, "awgn", (10.0,), codec=CLEAN)
     # Below 8 dB this codec delivers nothing: no confidence can help.
     yield _run(data, results, seeds, "kitti_06", "awgn", (6.0, 8.0, 12.0), codec="jpeg-ldpc")
     yield _run(data, results, seeds, "chair", "awgn", (6.0, 8.0, 12.0), codec="jpeg-ldpc")
@@ -98,7 +99,7 @@ def _run(
 ) -> Run:
     recording = RECORDINGS[name]
     suffix = "" if codec == DEFAULT_CODEC else f"_{codec.replace('-', '_')}"
-    file = f"pairs_{name}_clean" if codec == "none" else f"pairs_{name}_{channel}{suffix}"
+    file = f"pairs_{name}_clean" if codec == CLEAN else f"pairs_{name}_{channel}{suffix}"
     settings = PairSettings(
         sequence=data / recording.path,
         codec=codec,

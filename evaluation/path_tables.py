@@ -12,6 +12,7 @@ from typing import Any
 
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import number, table
+from semcast.evaluation.pipeline import CLEAN
 from semcast.evaluation.trace_snr import level_name
 
 Report = Mapping[str, Any]
@@ -122,7 +123,7 @@ def readme_table(folder: Path) -> str:
         is_other = channel == "trace" or report["settings"]["link"].get("doppler_hz")
         if is_other or report["settings"].get("gap_s"):
             continue
-        if report["settings"]["codec"] not in ("none", DEFAULT_CODEC):
+        if report["settings"]["codec"] not in (CLEAN, DEFAULT_CODEC):
             continue
         for cell in report["cells"]:
             link = None if cell["snr_db"] is None else (channel, cell["snr_db"])

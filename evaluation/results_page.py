@@ -14,6 +14,7 @@ from semcast.evaluation.depth_summary import depth_summary
 from semcast.evaluation.markdown import number, table, with_part
 from semcast.evaluation.pair_summary import RIVAL, pair_headline, pair_summary
 from semcast.evaluation.path_tables import WORST_RATIO, readme_table, trajectory_table
+from semcast.evaluation.pipeline import CLEAN
 from semcast.evaluation.plots import variant_name
 from semcast.evaluation.report import RESULTS
 from semcast.evaluation.trace_snr import level_name
@@ -74,7 +75,7 @@ def _trajectory(report: Report) -> Iterator[str]:
 
 
 def _other_codec(report: Report) -> Iterator[str]:
-    if report["settings"]["codec"] not in ("none", DEFAULT_CODEC):
+    if report["settings"]["codec"] not in (CLEAN, DEFAULT_CODEC):
         yield from _named_codec(report)
 
 

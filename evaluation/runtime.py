@@ -109,7 +109,11 @@ class _Child:
             words = self._process.stderr.read().strip().splitlines()
             self.error = words[-1] if words else "ended without a word"
             return None
-        return json.loads(line)
+        try:
+            return json.loads(line)
+        except ValueError:
+            self.error = f"answered what is no JSON: {line.strip()}"
+            return None
 
     def turn(self, calls: int) -> None:
         """Time some calls."""

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from semcast import demo
+from semcast import demo, demo_watch
 from semcast.channel.settings import ChannelSettings
 from semcast.cli import main
 from semcast.commands.demo import few_poses, summary_table, why_no_pose
@@ -257,6 +257,30 @@ def test_the_status_line_says_what_the_server_is_at_after_the_last_frame(tmp_pat
         (50, "last adjustment of 9 keyframes"),
         (50, "depth 3 of 9 keyframes"),
     ]
+
+
+def test_the_page_of_the_viewer_is_told_once_from_what_the_log_of_the_server_gains(tmp_path, monkeypatch):
+    child, stop, told = Role("server", [], tmp_path / "log"), threading.Event(), []
+    child.log.write_text("11:58:03 INFO    semcast.server.viewing: viewer: http://127.0.0.1:90")
+    alive = Alive(set(), threading.Condition())
+    logs = ["90/?url=a\nviewer: http://127.0.0.1:1/\n", "read once: viewer: http://127.0.0.1:2/\n", "x\n"]
+    reads, take = [], demo_watch._NewLines.take
+
+    def taken(lines):
+        found = take(lines)
+        if lines._path == child.log:
+            reads.extend(found)
+            if not logs:
+                stop.set()
+            else:
+                with child.log.open("a") as log:
+                    log.write(logs.pop(0))
+        return found
+
+    monkeypatch.setattr(demo_watch._NewLines, "take", taken)
+    watch(tmp_path, {"server": child}, alive, stop, told.append, lambda *row: None)
+    assert told == ["open http://127.0.0.1:9090/?url=a"]
+    assert reads == child.log.read_text().splitlines()
 
 
 def test_a_folder_with_images_no_run_wrote_is_no_place_for_outputs(tmp_path):

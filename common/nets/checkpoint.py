@@ -20,7 +20,16 @@ MAX_BYTES = 16 * 1024 * 1024
 #: Raised when keys of the manifest change, or when the same weights mean another network (2: leaky units;
 #: 3: told how well values arrive, not how they travel).
 FORMAT = 3
-_KINDS = {"architecture": str, "sizes": dict, "sha256": str, "snr_range_db": list, "modulations": list}
+_KINDS = {
+    "architecture": str,
+    "sizes": dict,
+    "sha256": str,
+    "cbr": float,
+    "snr_range_db": list,
+    "modulations": list,
+    "made_by": dict,
+    "measured": dict,
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

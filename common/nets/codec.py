@@ -181,8 +181,8 @@ class NeuralCodec:
     def decode(self, received: ReceivedImage) -> DecodedImage:
         """Decode one frame with its two confidence maps.
 
-        Values that are not finite count as lost. Where everything is lost the image is the network's guess of
-        nothing and ``outage`` is set.
+        A slot with a value that is not finite counts as lost. Where everything is lost the image is the
+        network's guess of nothing and ``outage`` is set.
 
         Args:
             received: Equalised symbols; their number must fit the image's shape.
@@ -202,9 +202,9 @@ class NeuralCodec:
             posinf=30.0,
             neginf=LOST_SLOT_SNR_DB,
         ).clip(LOST_SLOT_SNR_DB, 30.0)
-        latent = latent_from_symbols(received.symbols)
-        if not np.isfinite(latent).all():
-            latent = np.nan_to_num(latent, nan=0.0, posinf=0.0, neginf=0.0)
+        arrived = np.asarray(np.isfinite(received.symbols).all(axis=1))
+        snr_db[~arrived] = LOST_SLOT_SNR_DB
+        latent = latent_from_symbols(np.where(arrived[:, None], received.symbols, np.complex64(0.0)))
         latent = latent.clip(-_MAX_SYMBOL, _MAX_SYMBOL)
         height, width = received.shape_hw
         allocation = self._allocation_of(received)

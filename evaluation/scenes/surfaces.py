@@ -19,6 +19,8 @@ NEAR_M = 0.05
 _LEAST_INVERSE_DEPTH = np.float32(1e-4)
 #: Places of a texture that are looked up in one row.
 _ROW = 128
+#: Brightness of a box's four sides, top and bottom.
+_BOX_LIGHTS = (0.75, 0.9, 1.0, 0.82, 1.1, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,6 @@ def box(
     size_m: Sequence[float],
     yaw_rad: float,
     textures: Sequence[Texture],
-    lights: Sequence[float] = (0.75, 0.9, 1.0, 0.82, 1.1, 0.5),
 ) -> list[Surface]:
     """Return the six sides of a box that stands upright.
 
@@ -61,7 +62,6 @@ def box(
         size_m: Length, width and height.
         yaw_rad: Turn about the vertical.
         textures: Used in turn for the four sides, top and bottom.
-        lights: Brightness of the four sides, top and bottom.
     """
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     along = np.array([cos, sin, 0.0]) * size_m[0] / 2
@@ -77,7 +77,7 @@ def box(
         (middle - along - across - up, 2 * along, 2 * across),
     ]
     return [
-        Surface(corner, edge_u, edge_v, textures[i % len(textures)], light=lights[i])
+        Surface(corner, edge_u, edge_v, textures[i % len(textures)], light=_BOX_LIGHTS[i])
         for i, (corner, edge_u, edge_v) in enumerate(sides)
     ]
 

@@ -58,19 +58,17 @@ def view_of(
     image: NDArray[np.uint8],
     confidence: NDArray[np.float32] | None,
     camera: Intrinsics,
-    max_pixels: int = MAX_PIXELS,
 ) -> View:
-    """Make a view of a received image.
+    """Make a view of a received image, of about ``MAX_PIXELS`` at most.
 
     Args:
         frame_id: Of the frame.
         image: ``(H, W, 3)`` uint8 RGB without distortion.
         confidence: ``(H, W)`` in [0, 1], the codec's pixel target, or None for a clean image.
         camera: Of the image.
-        max_pixels: The view has about so many at most.
     """
     height, width = image.shape[:2]
-    share = min(1.0, float(np.sqrt(max_pixels / (height * width))))
+    share = min(1.0, float(np.sqrt(MAX_PIXELS / (height * width))))
     size_wh = (max(1, round(width * share)), max(1, round(height * share)))
     rgb = np.asarray(cv2.resize(image, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
     grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,10 +38,22 @@ _MARKS = {"colmap": "sparse/0/points3D.txt", "nerfstudio": "points3D.ply"}
 FindPlacement = Callable[[RunData, Mapping[int, Path]], Placement]
 
 
+class Export(NamedTuple):
+    """What was written.
+
+    Attributes:
+        files: Those a person opens.
+        data: The run as it was exported: the part, placed.
+    """
+
+    files: list[Path]
+    data: RunData
+
+
 def export_run(
     folder: Path, format_name: str, out: Path, part: str = ALL, find_placement: FindPlacement | None = None
-) -> list[Path]:
-    """Write a run in another tool's format; returns the files a person opens.
+) -> Export:
+    """Write a run in another tool's format.
 
     Several parts in one model are told as a warning.
 
@@ -93,7 +106,7 @@ def export_run(
     try:
         if FORMATS[format_name].startswith("FOLDER"):
             _check_not_foreign(out, format_name, images)
-        return writers[format_name]()
+        return Export(writers[format_name](), data)
     except OSError as err:
         raise SemcastError(f"{out} can't be written: {err}") from err
 

@@ -149,7 +149,7 @@ class ViewerFeed:
         self._live: LiveStream | None = None
         self._threads = [threading.Thread(target=self._run_scene, name="semcast-scene", daemon=True)]
         if self._process is not None:
-            self._process.start()
+            self._start_viewer(self._process)
             self._live = LiveStream(lambda: self._open_stream(None), self.changes_since, settings.port)
             self._threads.append(threading.Thread(target=self._run_live, name="semcast-viewer", daemon=True))
         for thread in self._threads:
@@ -164,12 +164,6 @@ class ViewerFeed:
     def url(self) -> str | None:
         """Where the live viewer is, None without one."""
         return self._process.url if self._process is not None else None
-
-    @property
-    def num_pending(self) -> int:
-        """Updates that wait for the scene's thread."""
-        with self._queue_lock:
-            return len(self._pending)
 
     def changes_since(self, cursor: Cursor) -> Changes:
         """Return what a viewer has not seen of what is in the scene by now, and move its cursor on."""
@@ -232,6 +226,15 @@ class ViewerFeed:
             return FileStream(self._open_stream(file), file, self.changes_since, on_error)
         except RuntimeError as err:
             raise ConfigError(f"{file} can't be written: {err}") from err
+
+    def _start_viewer(self, process: ViewerProcess) -> None:
+        try:
+            process.start()
+        except ConfigError:
+            process.close()
+            if self._file is not None:
+                self._file.close()
+            raise
 
     def _run_scene(self) -> None:
         """Own the scene: take what was submitted, compress images, write the file."""

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import shlex
 import threading
 import time
@@ -65,15 +66,15 @@ class Alive:
                 self.changed.wait(0.1)
 
 
-class _NewRows:
-    """Rows that the server adds to a file, each once; a file that got shorter is read from its start."""
+class _NewLines:
+    """Lines that the server adds to a file, each once; a file that got shorter is read from its start."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self.read_bytes = 0
 
-    def take(self) -> list[dict[str, Any]]:
-        """Return the rows that are whole and were not returned yet."""
+    def take(self) -> list[str]:
+        """Return the lines that are whole and were not returned yet."""
         if not self._path.exists():
             return []
         size = self._path.stat().st_size
@@ -83,7 +84,7 @@ class _NewRows:
             file.seek(self.read_bytes)
             complete = file.read(size - self.read_bytes).rpartition(b"\n")[0]
         self.read_bytes += len(complete) + bool(complete)
-        return [json.loads(line) for line in complete.splitlines()]
+        return [line.decode("utf-8", "replace") for line in complete.splitlines()]
 
 
 def watch(
@@ -107,16 +108,18 @@ def watch(
     Returns:
         Which process gave up, and why; None where none did.
     """
-    rows = _NewRows(out / FRAMES_NAME)
+    rows, server_log = _NewLines(out / FRAMES_NAME), _NewLines(children["server"].log)
     num_done = num_outages = 0
     activity = ""
-    page: str | None = None
+    is_page_told = False  # a server that is started again serves the same one
     while not stop.is_set() and not (out / SUMMARY_NAME).exists():
-        if page is None and (page := children["server"].viewer_address()) is not None:
-            tell(f"open {page}")
+        for said in server_log.take():
+            if (page := re.search(r"viewer: (http\S+)", said)) is not None and not is_page_told:
+                is_page_told = True
+                tell(f"open {page.group(1)}")
         if (error := _who_gave_up(children.values(), tell)) is not None:
             return error
-        for row in rows.take():
+        for row in map(json.loads, rows.take()):
             num_done = row["frame_id"] + 1
             progress(num_done, _standing(row))
         if not rows.read_bytes and alive.num_outages > num_outages:

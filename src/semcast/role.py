@@ -49,12 +49,6 @@ class Role:
         log = self.log.read_text(encoding="utf-8", errors="replace")
         return list(dict.fromkeys(re.findall(r"^\S+ WARNING \S+: (.+)$", log, re.MULTILINE)))
 
-    def viewer_address(self) -> str | None:
-        """Return the address of the viewer's page, once the log names it."""
-        log = self.log.read_text(encoding="utf-8", errors="replace")
-        found = re.search(r"viewer: (http\S+)", log)
-        return found.group(1) if found else None
-
     def stop(self) -> None:
         """Ask the process to end; kill it when it does not in time."""
         if self._process is None or self._process.poll() is not None:

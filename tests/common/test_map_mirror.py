@@ -1,5 +1,4 @@
 import threading
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -74,13 +73,14 @@ def test_landmarks_and_keyframes_are_added_moved_and_removed(hub, client):
 
 def test_changes_that_come_before_the_answer_are_the_last_word(hub, client):
     """Of landmark 5 the answer knows nothing yet; 9 was removed before the answer was made."""
-    serving = Serving(hub[0], None)
+    serving, arrived = Serving(hub[0], None), []
+    client.subscribe(map_key("late"), "every", arrived.append)
 
     def late(_):
         serving.put(message([9]))
         serving.put(message([5], removed=[9]))
         # Answers and changes take different ways: these are there before the answer is.
-        time.sleep(0.3)
+        until(lambda: len(arrived) == 2)
         return pack(message([1, 2]))
 
     hub[0].answer(map_key("late"), late)

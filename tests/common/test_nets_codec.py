@@ -1,5 +1,6 @@
 import json
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,6 +107,21 @@ def test_damaged_symbols_never_raise(weights):
     assert np.isfinite(decoded.keypoint_confidence).all()
 
 
+def test_a_slot_with_a_value_that_is_not_finite_is_a_lost_one(weights):
+    codec = NeuralCodec.load(weights)
+    good = received(codec.encode(some_image((32, 32)), 7.0), 7.0)
+    damaged, lost = (replace(good, symbols=good.symbols.copy()) for _ in range(2))
+    damaged.symbols[1, 5] = np.nan
+    lost.symbols[1] = 0.0
+    lost = replace(lost, effective_snr_db=np.array([7.0, LOST_SLOT_SNR_DB], np.float32))
+    decoded, expected = codec.decode(damaged), codec.decode(lost)
+    np.testing.assert_array_equal(decoded.confidence, expected.confidence)
+    np.testing.assert_array_equal(decoded.image, expected.image)
+    assert not decoded.outage
+    damaged.symbols[0, 0] = np.inf
+    assert codec.decode(damaged).outage
+
+
 def test_a_frame_of_which_nothing_arrived_is_an_outage(weights):
     codec = NeuralCodec.load(weights)
     lost = ReceivedImage(
@@ -169,6 +185,8 @@ def test_a_changed_weights_file_is_refused(weights):
         ({"architecture": ["3dcsc"]}, "architecture in manifest .* must be str"),
         ({"sizes": 3}, "sizes in manifest .* must be dict, got 3"),
         ({"modulations": None}, "modulations in manifest .* must be list, got None"),
+        ({"cbr": "1/16"}, "cbr in manifest .* must be float, got '1/16'"),
+        ({"measured": []}, "measured in manifest .* must be dict"),
         ({"snr_range_db": [14.0, 0.0]}, "must be two ascending numbers"),
         ({"snr_range_db": ["low"]}, "must be two ascending numbers"),
         (

@@ -144,6 +144,17 @@ def test_a_last_step_that_makes_it_worse_widens_the_bounds(images, monkeypatch):
     assert [trial.lens.focal for trial in found.trials] == pytest.approx([1.0, 1.08, 1.08**2, 1.08 * 1.04])
 
 
+def test_what_the_last_step_still_asks_for_is_within_the_bounds(images, monkeypatch):
+    def tried(images, at: Lens, readout) -> LensTrial:
+        return LensTrial(at, CameraEvidence([], 0.2, 60), LensFit(0.02, (0.03, 0.0), sigma_focal=0.001))
+
+    monkeypatch.setattr(lens, "_tried", tried)
+    found = lens.find_lens(settings_of(images))
+    assert len(found.trials) == 1 + lens._MAX_STEPS
+    assert found.focal_reach == 0.02
+    assert found.radial_reach == (0.03,)
+
+
 def test_a_small_change_may_make_it_a_little_worse_by_chance(images, monkeypatch):
     def world(growth):
         def tried(images, at: Lens, readout) -> LensTrial:

@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -49,6 +51,22 @@ def test_an_unknown_codec_is_one_clear_error(monkeypatch):
 def test_no_variant_is_timed_twice_and_there_is_one(values):
     with pytest.raises(ValueError, match="(codec|threads) must be one or more different values, got"):
         RuntimeSettings(**values)
+
+
+def test_a_variant_that_answers_no_json_is_told_and_ended(monkeypatch):
+    children, popen = [], subprocess.Popen
+
+    def talkative(command, **options):
+        children.append(popen([sys.executable, "-c", "print('a library says hello'); input()"], **options))
+        return children[-1]
+
+    monkeypatch.setattr(runtime.subprocess, "Popen", talkative)
+    with pytest.raises(
+        SemcastError, match="^no variant ran: answered what is no JSON: a library says hello$"
+    ):
+        evaluate_runtime(RuntimeSettings(threads=(1,), rounds=1))
+    assert children
+    assert all(child.returncode is not None for child in children)
 
 
 def test_without_a_variant_that_ran_the_first_one_says_why(monkeypatch):

@@ -106,14 +106,13 @@ def _placement(arguments: argparse.Namespace) -> "FindPlacement | None":
 def run(arguments: argparse.Namespace) -> int:
     """Write the export and name its files on stdout."""
     from semcast.common.errors import ConfigError
-    from semcast.common.run_folder import read_run
     from semcast.server.export.formats import export_run
-    from semcast.server.export.parts import select_part
 
     if arguments.out.resolve() == arguments.run.resolve():
         raise ConfigError(f"--out must be another place than the run itself, got {arguments.out}")
-    files = export_run(arguments.run, arguments.format, arguments.out, arguments.part, _placement(arguments))
-    data = select_part(read_run(arguments.run), arguments.part)
+    files, data = export_run(
+        arguments.run, arguments.format, arguments.out, arguments.part, _placement(arguments)
+    )
     print(
         f"{len(data.frame_ids)} posed frames, {len(data.keyframe_ids)} keyframes, "
         f"{len(data.landmark_ids)} landmarks",

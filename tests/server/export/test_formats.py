@@ -237,7 +237,7 @@ def test_the_servers_own_rerun_recording_is_copied(tmp_path, arc_run, write_arc_
     write_arc_run(tmp_path / "run", arc_run())
     (tmp_path / "run" / "run.rrd").write_bytes(b"as the server wrote it")
     copy = tmp_path / "new" / "copy.rrd"
-    assert export_run(tmp_path / "run", "rrd", copy) == [copy]
+    assert export_run(tmp_path / "run", "rrd", copy).files == [copy]
     assert copy.read_bytes() == b"as the server wrote it"
     export_run(tmp_path / "run", "rrd", tmp_path / "part.rrd", part="0")
     assert (tmp_path / "part.rrd").read_bytes() == b"as the server wrote it", "there is no other part"

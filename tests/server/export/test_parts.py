@@ -9,7 +9,8 @@ import pytest
 from semcast import SourceError
 from semcast.cli import main
 from semcast.commands.demo import summary_table
-from semcast.common.run_folder import VIEWER_NAME
+from semcast.common.run_folder import VIEWER_NAME, read_run
+from semcast.server.export import formats
 from semcast.server.export.formats import export_run
 from semcast.server.export.parts import count_parts, parts_line, select_part
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -113,11 +114,14 @@ def test_several_parts_in_one_model_are_told_in_one_line(
     assert not caplog.records
 
 
-def test_the_command_writes_one_part(tmp_path, arc_run, write_arc_run, capsys):
+def test_the_command_writes_one_part(tmp_path, arc_run, write_arc_run, capsys, monkeypatch):
     data = two_parts(arc_run())
     write_arc_run(tmp_path / "run", data)
     words = ["export", str(tmp_path / "run"), "--format", "colmap", "--out", str(tmp_path / "out")]
+    reads = []
+    monkeypatch.setattr(formats, "read_run", lambda folder: reads.append(folder) or read_run(folder))
     assert main([*words, "--part", "2"]) == 0
+    assert reads == [tmp_path / "run"]
     assert capsys.readouterr().err.startswith("4 posed frames, 2 keyframes, 30 landmarks")
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     ids = sorted(int(image.name.removesuffix(".jpg")) for image in model.images.values())

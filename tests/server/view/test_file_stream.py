@@ -50,7 +50,7 @@ def test_a_full_disk_is_told_once_and_the_run_goes_on(full_disk, caplog):
     feed.close()
     assert told == [f"{full_disk} can't be written to its end (is there room on the disk?)"]
     assert caplog.messages == [f"{told[0]}, the run goes on without it"]
-    assert feed.num_pending == 0
+    assert not feed._pending
     assert full_disk.stat().st_size == ROOM_BYTES
 
 

@@ -31,7 +31,8 @@ pytest.importorskip("rerun")
 import rerun as rr
 
 from semcast.server.view.feed import ViewerFeed, check_view, resolve_view
-from semcast.server.view.live_stream import MAX_REFUSALS
+from semcast.server.view.file_stream import FileStream
+from semcast.server.view.live_stream import MAX_REFUSALS, LiveStream
 from semcast.server.view.picture import compress_picture
 from semcast.server.view.process import ViewerProcess, is_listening, rerun_binary
 from semcast.server.view.rerun_viewer import SERIES, RerunStream, blueprint
@@ -248,7 +249,15 @@ def test_a_page_on_the_port_of_another_program_is_refused():
             check_viewer(replace(settings, view=replace(settings.view, port=viewer.getsockname()[1])))
 
 
-def test_what_listens_and_is_no_viewer_is_left_alone(caplog):
+def test_what_listens_and_is_no_viewer_is_left_alone(caplog, monkeypatch):
+    rounds, serve = [], LiveStream.serve
+
+    def counted(live, *, may_connect):
+        rounds.append(may_connect)
+        serve(live, may_connect=may_connect)
+
+    monkeypatch.setattr(LiveStream, "serve", counted)
+
     class Quiet(BaseHTTPRequestHandler):
         def log_message(self, *_):
             pass
@@ -258,7 +267,8 @@ def test_what_listens_and_is_no_viewer_is_left_alone(caplog):
         feed = ViewerFeed(ViewSettings(view="web", port=other.server_port, web_port=free_port()), CAMERA, "r")
         feed.submit(frame(0))
         until(lambda: "is no viewer, nothing is shown" in caplog.text, "it is told")
-        time.sleep(1.0)
+        more = len(rounds) + 3
+        until(lambda: len(rounds) >= more, "it is not tried again")
         feed.close()
         other.shutdown()
     assert feed.num_connections == MAX_REFUSALS
@@ -345,6 +355,23 @@ def test_a_file_that_cannot_be_written_is_told(tmp_path):
     (tmp_path / "run.rrd").mkdir()
     with pytest.raises(ConfigError, match="run.rrd can't be written: .*Is a directory"):
         ViewerFeed(ViewSettings(view="file"), CAMERA, "x", file=tmp_path / "run.rrd")
+
+
+def test_the_file_is_finished_when_the_viewer_cannot_start(tmp_path, monkeypatch):
+    closed, close = [], FileStream.close
+
+    def noted(stream):
+        close(stream)
+        closed.append(stream)
+
+    monkeypatch.setattr(FileStream, "close", noted)
+    port = free_port()
+    absent = ViewerProcess("native", port, 1, "1GB", command=(str(tmp_path / "nowhere"),))
+    settings = ViewSettings(view="native", port=port)
+    with pytest.raises(ConfigError, match="the viewer can't be started"):
+        ViewerFeed(settings, CAMERA, "x", file=tmp_path / "run.rrd", process=absent)
+    assert len(closed) == 1
+    rr.chunk.RrdReader(tmp_path / "run.rrd")  # warns of a file without its end
 
 
 def test_a_viewer_that_cannot_start_is_given_up_with_its_last_words(caplog):
