@@ -120,11 +120,12 @@ def test_depth_of_a_smaller_image_is_that_at_the_centres_of_its_pixels():
     np.testing.assert_array_equal(depth._at_centres(depth_map, (6, 9)), depth_map)
 
 
-def test_wrong_poses_confirm_next_to_nothing(room):
+def test_wrong_poses_confirm_next_to_nothing(room, monkeypatch):
+    monkeypatch.setattr("semcast.server.dense.view.MAX_PIXELS", 8_000)
     sequence = open_sequence(room)
     ids = list(range(0, 24, 2))
     images = {k: sequence.image(k) for k in ids}
-    views = {k: view_of(k, image, None, sequence.intrinsics, 8_000) for k, image in images.items()}
+    views = {k: view_of(k, image, None, sequence.intrinsics) for k, image in images.items()}
     truth = sequence.groundtruth()
     place = {k: DepthKeyframe(truth.T_world_cam[k], DepthRange(2.0, 5.0, 9.0)) for k in ids}
     swapped = {k: place[(7 * k + 4) % 24] for k in ids}
