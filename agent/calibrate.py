@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
+from semcast.common.sequence import ImageRectifier
 
 Array = NDArray[np.float64]
 Corners = NDArray[np.float32]
-DistortionModel = Literal["none", "radtan4", "radtan5"]
+#: What is fitted: radial-tangential coefficients, five of them, four or none, or a fisheye's four.
+FittedLens = Literal["radtan5", "radtan4", "none", "equidistant"]
 
 MIN_VIEWS = 4
 GOOD_VIEWS = 10
@@ -35,7 +37,12 @@ _CV_FLAGS: dict[str, int] = {
     "radtan4": cv2.CALIB_FIX_K3,
     "radtan5": 0,
 }
-_NUM_COEFFICIENTS = {"none": 0, "radtan4": 4, "radtan5": 5}
+_NUM_COEFFICIENTS = {"none": 0, "radtan4": 4, "radtan5": 5, "equidistant": 4}
+#: Boards are placed anew after each step, and pixels are not skewed. OpenCV 4 has the names elsewhere.
+_FISHEYE_NAMES = cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye
+_FISHEYE_FLAGS: int = _FISHEYE_NAMES.CALIB_RECOMPUTE_EXTRINSIC | _FISHEYE_NAMES.CALIB_FIX_SKEW
+#: Fisheyes take more and smaller steps than the 30 that OpenCV would.
+_FISHEYE_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-9)
 
 
 @dataclass(frozen=True)
@@ -129,7 +136,7 @@ def calibrate(
     views: Sequence[BoardView],
     board: tuple[int, int],
     size_wh: tuple[int, int],
-    distortion: DistortionModel = "radtan5",
+    distortion: FittedLens = "radtan5",
 ) -> CalibrationResult:
     """Fit pinhole and distortion to views of the board.
 
@@ -140,7 +147,7 @@ def calibrate(
         views: At least ``MIN_VIEWS``, not all from the same direction.
         board: Inner corners: columns and rows.
         size_wh: Width and height of the pictures in pixels.
-        distortion: ``none``, ``radtan4`` (k1 k2 p1 p2) or ``radtan5`` (and k3).
+        distortion: ``none``, ``radtan4`` (k1 k2 p1 p2), ``radtan5`` (and k3), or a fisheye's ``equidistant``.
 
     Raises:
         SourceError: Too few views, or they do not determine the camera.
@@ -157,20 +164,13 @@ def calibrate(
 
 
 def _fit(
-    views: list[BoardView], board: tuple[int, int], size_wh: tuple[int, int], distortion: DistortionModel
+    views: list[BoardView], board: tuple[int, int], size_wh: tuple[int, int], distortion: FittedLens
 ) -> CalibrationResult:
-    points = board_points(board)
-    observed = [np.ascontiguousarray(view.corners_xy[:, None]) for view in views]
+    solve = _solved_fisheye if distortion == "equidistant" else _solved_pinhole
     try:
-        rms_px, K, coefficients, rotations, translations, deviations, _, per_view = (
-            cv2.calibrateCameraExtended(  # type: ignore[call-overload]  # the stubs refuse None matrices
-                [points] * len(views), observed, size_wh, None, None, flags=_CV_FLAGS[distortion]
-            )
+        K, coefficients, rotations, residuals, deviations = solve(
+            views, board_points(board), size_wh, distortion
         )
-        residuals = [
-            o[:, 0] - cv2.projectPoints(points, r, t, K, coefficients)[0].reshape(-1, 2)
-            for o, r, t in zip(observed, rotations, translations, strict=True)
-        ]
         intrinsics = Intrinsics(
             fx=float(K[0, 0]),
             fy=float(K[1, 1]),
@@ -179,22 +179,80 @@ def _fit(
             width=size_wh[0],
             height=size_wh[1],
             distortion=tuple(float(c) for c in coefficients.ravel()[: _NUM_COEFFICIENTS[distortion]]),
+            distortion_model="equidistant" if distortion == "equidistant" else "radtan",
         )
     except (cv2.error, ValueError) as err:
         raise SourceError(f"{_UNDETERMINED} ({err})") from err
     tilt_deg = _largest_angle_deg(rotations)
     if tilt_deg < _MIN_TILT_DEG:
         raise SourceError(f"{_UNDETERMINED} (all are parallel to within {tilt_deg:.1f} degrees)")
-    fx_fy_cx_cy = tuple(float(v) for v in deviations.ravel()[:4])
+    fx_fy_cx_cy = tuple(float(v) for v in deviations)
+    view_rms_px = np.sqrt((residuals**2).sum(axis=2).mean(axis=1))
     return CalibrationResult(
         intrinsics=intrinsics,
-        rms_px=float(rms_px),
+        rms_px=float(np.sqrt((view_rms_px**2).mean())),
         views=tuple(views),
-        view_rms_px=np.asarray(per_view, dtype=np.float64).ravel(),
-        residuals_xy=np.array(residuals, dtype=np.float64),
+        view_rms_px=view_rms_px,
+        residuals_xy=residuals,
         rejected=(),
         deviations=(fx_fy_cx_cy[0], fx_fy_cx_cy[1], fx_fy_cx_cy[2], fx_fy_cx_cy[3]),
         coverage=coverage(views, size_wh),
+    )
+
+
+#: ``K (3, 3)``, coefficients, rotation vectors of the boards, residuals ``(V, N, 2)`` in pixels, and standard
+#: deviations of fx, fy, cx, cy.
+_Solution = tuple[Array, Array, Sequence[Array], Array, Array]
+
+
+def _solved_pinhole(
+    views: list[BoardView], points: NDArray[np.float32], size_wh: tuple[int, int], distortion: FittedLens
+) -> _Solution:
+    observed = [np.ascontiguousarray(view.corners_xy[:, None]) for view in views]
+    _, K, coefficients, rotations, translations, deviations, _, _ = cv2.calibrateCameraExtended(  # type: ignore[call-overload]  # the stubs refuse None matrices
+        [points] * len(views), observed, size_wh, None, None, flags=_CV_FLAGS[distortion]
+    )
+    residuals = [
+        o[:, 0] - cv2.projectPoints(points, r, t, K, coefficients)[0].reshape(-1, 2)
+        for o, r, t in zip(observed, rotations, translations, strict=True)
+    ]
+    return K, coefficients, rotations, np.array(residuals, np.float64), deviations.ravel()[:4]
+
+
+def _solved_fisheye(
+    views: list[BoardView], points: NDArray[np.float32], size_wh: tuple[int, int], _distortion: FittedLens
+) -> _Solution:
+    board = points.astype(np.float64)[None]
+    observed = [view.corners_xy.astype(np.float64)[None] for view in views]
+    _, K, coefficients, turns, places = cv2.fisheye.calibrate(
+        [board] * len(views),
+        observed,
+        size_wh,
+        np.zeros((3, 3)),
+        np.zeros(4),
+        flags=_FISHEYE_FLAGS,
+        criteria=_FISHEYE_STOP,
+    )
+    rotations = [np.asarray(turn, np.float64).ravel() for turn in turns]
+    seen = [
+        cv2.fisheye.projectPoints(board, r, np.ravel(t), K, coefficients)
+        for r, t in zip(rotations, places, strict=True)
+    ]
+    residuals = np.array([o[0] - xy[0] for o, (xy, _) in zip(observed, seen, strict=True)])
+    # OpenCV gives a fisheye no deviations. Its Jacobians begin with fx fy cx cy, k1 to k4 and the pose.
+    normal = np.zeros((8, 8))
+    for _, by_all in seen:
+        jacobian = np.asarray(by_all, np.float64)
+        lens, pose = jacobian[:, :8], jacobian[:, 8:14]
+        normal += lens.T @ (lens - pose @ np.linalg.lstsq(pose, lens, rcond=None)[0])
+    num_free = residuals.size - 8 - 6 * len(views)
+    variance = (residuals**2).sum() / num_free * np.diag(np.linalg.inv(normal))
+    return (
+        np.asarray(K, np.float64),
+        np.asarray(coefficients, np.float64),
+        rotations,
+        residuals,
+        variance[:4] ** 0.5,
     )
 
 
@@ -233,7 +291,7 @@ def calibration_picture(result: CalibrationResult, sample: NDArray[np.uint8]) ->
         ``(H, 2 W, 3)`` uint8 RGB.
     """
     c = result.intrinsics
-    straight = cv2.undistort(sample, c.K, np.array(c.distortion)) if c.distortion else sample.copy()
+    straight = ImageRectifier(c, (c.width, c.height))(sample)
     canvas = np.full_like(sample, 255)
     magnification = c.width / 40 / max(result.rms_px, 1e-6)
     radius = max(1, c.width // 400)

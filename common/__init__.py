@@ -9,7 +9,7 @@ Images and cameras
     camera                  pinhole, lens distortion, readout of the shutter
     camera_file             calibration files of many tools
     camera_settings         the camera on the command line
-    lens                    names of distortion coefficients, one camera for all images
+    lens                    models of lenses and their names, one camera for all images
 
 Geometry and trajectories
     geometry                rotations, rigid and similarity transforms

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from semcast.common.errors import SourceError
-from semcast.common.lens import DISTORTION_COUNTS, check_pinhole, distortion_in
+from semcast.common.lens import DistortionModel, check_distortion, lens_in
 from semcast.common.whole_file import write_whole
 
 logger = logging.getLogger(__name__)
@@ -46,7 +46,11 @@ class Intrinsics:
         cy: Principal point y in pixels.
         width: Image width in pixels.
         height: Image height in pixels.
-        distortion: OpenCV coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``; empty means none.
+        distortion: OpenCV coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``, empty for none; of a fisheye
+            ``k1 k2 k3 k4``.
+        distortion_model: ``radtan``, or ``equidistant`` for a fisheye, whose image of a point lies
+            ``theta (1 + k1 theta^2 + k2 theta^4 + ...)`` focal lengths off the centre, theta being its angle
+            to the axis (Kannala and Brandt 2006, as OpenCV has it).
         readout_ms: Time a rolling shutter takes from the first row or column to the last; 0: a global one.
         readout_from: Side of the image it begins at.
     """
@@ -58,6 +62,7 @@ class Intrinsics:
     width: int
     height: int
     distortion: tuple[float, ...] = ()
+    distortion_model: DistortionModel = "radtan"
     readout_ms: float = 0.0
     readout_from: ReadoutFrom = "top"
 
@@ -77,8 +82,7 @@ class Intrinsics:
         for name in ("width", "height"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1 pixel, got {getattr(self, name)}")
-        if len(self.distortion) not in DISTORTION_COUNTS or not np.all(np.isfinite(self.distortion)):
-            raise ValueError(f"distortion must be 0, 4, 5 or 8 finite values, got {self.distortion}")
+        check_distortion(self.distortion_model, self.distortion)
         check_readout(self.readout_ms, self.readout_from)
 
     def check_possible(self, name: str) -> None:
@@ -159,9 +163,14 @@ class Intrinsics:
             height=height,
         )
 
+    @property
+    def is_distorted(self) -> bool:
+        """Whether images differ from a pinhole's."""
+        return self.distortion_model == "equidistant" or any(self.distortion)
+
     def undistorted(self) -> "Intrinsics":
         """Return the same pinhole without distortion: the camera of the undistorted image."""
-        return replace(self, distortion=())
+        return replace(self, distortion=(), distortion_model="radtan")
 
     def project(self, points_cam: ArrayLike) -> Array:
         """Project ``(N, 3)`` points in the camera frame to ``(N, 2)`` pixels, without distortion.
@@ -187,15 +196,16 @@ class Intrinsics:
     def from_dict(values: dict[str, Any]) -> "Intrinsics":
         """Build from a mapping with fx, fy, cx, cy, width and height.
 
-        ``distortion``, ``readout_ms`` and ``readout_from`` may be there. Distortion may have another of its
-        usual names, or be given as ``k1``, ``k2``, ``p1`` ... one by one.
-        Other keys are notes and ignored, but for those that name a lens which is none of a pinhole camera.
+        ``distortion``, ``distortion_model``, ``readout_ms`` and ``readout_from`` may be there. Distortion may
+        have another of its usual names, or be given as ``k1``, ``k2``, ``p1`` ... one by one.
+        Other keys are notes and ignored, but for those that name a camera which is not known here.
 
         Raises:
-            SourceError: A key is missing, a value is out of range, or the camera is a fisheye or panorama.
+            SourceError: A key is missing, a value is out of range, or the camera is one that is not known,
+                such as a panorama.
         """
         try:
-            check_pinhole(values)
+            distortion_model, distortion = lens_in(values)
             return Intrinsics(
                 fx=_number(values, "fx"),
                 fy=_number(values, "fy"),
@@ -203,7 +213,8 @@ class Intrinsics:
                 cy=_number(values, "cy"),
                 width=int(_number(values, "width")),
                 height=int(_number(values, "height")),
-                distortion=distortion_in(values),
+                distortion=distortion,
+                distortion_model=distortion_model,
                 readout_ms=_number(values, "readout_ms") if "readout_ms" in values else 0.0,
                 readout_from=values.get("readout_from", "top"),
             )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
-from semcast.common.lens import check_pinhole, distortion_in
+from semcast.common.lens import lens_in
 
 _LINE = re.compile(r"^(?P<indent> *)(?P<key>[A-Za-z_][\w.\- ]*?) *:(?: +|$)(?P<value>.*)$")
 _ITEM = re.compile(r"^(?P<indent> *)(?:- +)+(?P<value>.*)$")
@@ -28,7 +28,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
     """Read intrinsics from ``.json`` or from ``.yaml`` / ``.yml``.
 
     Raises:
-        SourceError: The file can't be read, misses a value or is not a pinhole camera.
+        SourceError: The file can't be read, misses a value, or the camera is not known here.
     """
     if path.suffix.lower() == ".json":
         return Intrinsics.load(path)
@@ -132,7 +132,7 @@ def transform_from_yaml(values: dict[str, Any], key: str) -> NDArray[np.float64]
 def _intrinsics_from_yaml(values: dict[str, Any]) -> Intrinsics:
     prefix = next((p for p in ("Camera.", "Camera1.") if f"{p}fx" in values), "")  # ORB-SLAM's
     lens = _lens_keys(values, prefix or "Camera.")
-    check_pinhole(lens)
+    distortion_model, distortion = lens_in(lens)
     if prefix:
         fx, fy, cx, cy = (float(values[prefix + name]) for name in ("fx", "fy", "cx", "cy"))
     elif "intrinsics" in values:
@@ -140,7 +140,16 @@ def _intrinsics_from_yaml(values: dict[str, Any]) -> Intrinsics:
     else:
         fx, _, cx, _, fy, cy, *_ = _numbers(values, _MATRIX_KEYS, 9)
     width, height = _size(values)
-    return Intrinsics(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height, distortion=distortion_in(lens))
+    return Intrinsics(
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        width=width,
+        height=height,
+        distortion=distortion,
+        distortion_model=distortion_model,
+    )
 
 
 def _lens_keys(values: dict[str, Any], prefix: str) -> dict[str, Any]:
@@ -149,7 +158,7 @@ def _lens_keys(values: dict[str, Any], prefix: str) -> dict[str, Any]:
     for key, value in values.items():
         head, _, inner = key.partition("/")
         if not inner:
-            lens[key.removeprefix(prefix)] = value
+            lens[key.removeprefix(prefix).removeprefix("Camera.")] = value  # type and size have no number
         elif head in lens:
             under = lens[head] if isinstance(lens[head], dict) else {}
             lens[head] = {**under, inner: value}

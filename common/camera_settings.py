@@ -7,6 +7,7 @@ from pathlib import Path
 from semcast.common.camera import Intrinsics
 from semcast.common.camera_file import read_intrinsics
 from semcast.common.errors import SourceError
+from semcast.common.lens import DistortionModel
 
 HOW_TO_GIVE = (
     "put intrinsics.json (fx fy cx cy width height) into its folder, or give --intrinsics FILE "
@@ -16,6 +17,8 @@ HOW_TO_GIVE = (
 )
 #: What a pinhole's numbers become as flags.
 _FLAGS = ("fx", "fy", "cx", "cy")
+#: What settings are that were not given.
+_UNSET = (None, (), "radtan")
 #: Diagonal of a 35 mm film frame, 36 x 24 mm.
 _FILM_DIAGONAL_MM = 43.27
 
@@ -39,6 +42,8 @@ def check_size(camera: Intrinsics, width: int, height: int, name: str) -> None:
         numbers = " ".join(f"--{flag} {getattr(same, flag):.6g}" for flag in _FLAGS)
         if camera.distortion:
             numbers += " --distortion " + " ".join(f"{k:.6g}" for k in camera.distortion)
+        if camera.distortion_model != "radtan":
+            numbers += f" --distortion-model {camera.distortion_model}"
         way = f"if they are the same images at another size, give {numbers}"
     elif camera.has_shape_of(height, width):
         way = "are they turned by 90 degrees? Calibrate with images as they are stored"
@@ -78,7 +83,11 @@ class CameraSettings:
         },
     )
     distortion: tuple[float, ...] = field(
-        default=(), metadata={"help": "OpenCV coefficients k1 k2 p1 p2 [k3 [k4 k5 k6]]"}
+        default=(),
+        metadata={"help": "OpenCV coefficients k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of a fisheye"},
+    )
+    distortion_model: DistortionModel = field(
+        default="radtan", metadata={"help": "what the coefficients are of; equidistant is a fisheye"}
     )
 
     def __post_init__(self) -> None:
@@ -91,8 +100,9 @@ class CameraSettings:
             raise ValueError("focal_35mm must be given alone: a calibration says more")
         if self.focal_35mm is not None and not 5.0 <= self.focal_35mm <= 1000.0:
             raise ValueError(f"focal_35mm must be in [5, 1000], got {self.focal_35mm:g}")
-        if self.distortion and not given:
-            raise ValueError("distortion must come with fx, fy, cx and cy")
+        for name in ("distortion", "distortion_model"):
+            if getattr(self, name) not in _UNSET and not given:
+                raise ValueError(f"{name} must come with fx, fy, cx and cy")
 
     def check_has(self, reference: Path | None) -> None:
         """Check that there is a reference these are the camera of, where a receiver was given any of them.
@@ -100,7 +110,7 @@ class CameraSettings:
         Raises:
             ValueError: There is none: they would do nothing.
         """
-        given = [entry.name for entry in fields(self) if getattr(self, entry.name) not in (None, ())]
+        given = [entry.name for entry in fields(self) if getattr(self, entry.name) not in _UNSET]
         if given and reference is None:
             raise ValueError(
                 f"{given[0]} is of the camera of the reference, and there is none (--reference); the camera "
@@ -131,6 +141,7 @@ class CameraSettings:
                 width=width,
                 height=height,
                 distortion=self.distortion,
+                distortion_model=self.distortion_model,
             )
         except ValueError as err:
             raise SourceError(f"intrinsics are not valid: {err}") from err

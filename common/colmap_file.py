@@ -21,7 +21,7 @@ from semcast.common.lens import check_one_camera
 T = TypeVar("T")
 
 _PLACES = ("sparse/0", "sparse", "colmap/sparse/0")
-#: Models by COLMAP's numbers, with the number of their parameters; fisheyes only to name what is refused.
+#: Models by COLMAP's numbers, with the number of their parameters; some only to name what is refused.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -35,8 +35,9 @@ _MODELS = {
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
 }
-_ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-_TWO_FOCAL_LENGTHS = ("PINHOLE", "OPENCV", "FULL_OPENCV")
+_FISHEYES = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
+_ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+_TWO_FOCAL_LENGTHS = ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE")
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def read_colmap(folder: Path) -> ColmapModel:
     """Read the model in a folder.
 
     Raises:
-        SourceError: A file is missing or damaged, or the images are of several cameras or of a fisheye.
+        SourceError: A file is missing or damaged, or the images are of several cameras or of an unknown one.
     """
     cameras = dict(_read(folder, "cameras", _cameras_in_bin, _cameras_in_text))
     images = _read(folder, "images", _images_in_bin, _images_in_text)
@@ -195,7 +196,7 @@ def _intrinsics(camera: _Camera) -> Intrinsics:
     """Return the pinhole and its distortion in OpenCV's order.
 
     Raises:
-        ValueError: It is a fisheye, or a parameter is missing or out of range.
+        ValueError: It is of a kind that is not known here, or a parameter is missing or out of range.
     """
     known = dict(_MODELS.values())
     if camera.model not in (*_ONE_FOCAL_LENGTH, *_TWO_FOCAL_LENGTHS):
@@ -207,8 +208,9 @@ def _intrinsics(camera: _Camera) -> Intrinsics:
         )
     one = camera.model in _ONE_FOCAL_LENGTH
     fx, fy, cx, cy, *lens = (camera.parameters[0], *camera.parameters) if one else camera.parameters
-    # Radial models stop after k1 or k2, where OpenCV's go on with p1 and p2.
-    distortion = (*lens, *[0.0] * (4 - len(lens))) if any(lens) else ()
+    # Radial models stop after k1 or k2, where OpenCV's go on with p1 and p2, or k3 and k4.
+    is_fisheye = camera.model in _FISHEYES
+    distortion = (*lens, *[0.0] * (4 - len(lens))) if is_fisheye or any(lens) else ()
     return Intrinsics(
         fx=fx,
         fy=fy,
@@ -217,4 +219,5 @@ def _intrinsics(camera: _Camera) -> Intrinsics:
         width=camera.width,
         height=camera.height,
         distortion=distortion,
+        distortion_model="equidistant" if is_fisheye else "radtan",
     )

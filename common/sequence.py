@@ -58,16 +58,18 @@ class ImageRectifier:
         camera: Of the images that go in; None when it is unknown and only the size changes.
         size_wh: Size that comes out.
 
-    The border that undistortion uncovers is black. Shrinking averages over areas.
+    The border that undistortion uncovers is black; what a fisheye sees outside the pinhole's image is left
+    out. Shrinking averages over areas.
     """
 
     def __init__(self, camera: Intrinsics | None, size_wh: tuple[int, int]) -> None:
         self._size_wh = size_wh
         self._maps: tuple[NDArray, NDArray] | None = None
-        if camera is not None and camera.distortion:
-            K = camera.K
-            x, y = cv2.initUndistortRectifyMap(
-                K, np.array(camera.distortion), None, K, (camera.width, camera.height), cv2.CV_16SC2
+        if camera is not None and camera.is_distorted:
+            K, size_wh = camera.K, (camera.width, camera.height)
+            of_lens = cv2.fisheye if camera.distortion_model == "equidistant" else cv2
+            x, y = of_lens.initUndistortRectifyMap(
+                K, np.array(camera.distortion), np.eye(3), K, size_wh, cv2.CV_16SC2
             )
             self._maps = (x, y)
 

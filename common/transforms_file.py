@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SourceError
 from semcast.common.geometry import T_opencv_opengl, project_to_so3
-from semcast.common.lens import check_one_camera, check_pinhole, distortion_in
+from semcast.common.lens import check_one_camera, lens_in
 
-#: Models that undistortion turns into a pinhole; nerfstudio's others are fisheyes and panoramas.
-_PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
+#: Models that undistortion turns into a pinhole; nerfstudio's others are panoramas and the like.
+_MODELS = ("OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 #: What frames may say each for themselves.
 _CAMERA_OF_FRAME = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x")
 
@@ -109,18 +109,20 @@ def _check_frames(document: dict[str, Any], frames: list[dict[str, Any]]) -> Non
 
 
 def _camera(values: dict[str, Any], width: int, height: int) -> Intrinsics | None:
-    """Read the pinhole; these files count pixels from their corners, so principal points move by half.
+    """Read the camera; these files count pixels from their corners, so principal points move by half.
 
     Raises:
-        ValueError: It is no pinhole, or a value is out of range.
+        ValueError: It is of another kind, or a value is out of range.
     """
     model = values.get("camera_model")
-    if model and str(model).upper() not in _PINHOLE_MODELS:
-        raise ValueError(f"camera_model must be one of {', '.join(_PINHOLE_MODELS)}, got {model!r}")
-    check_pinhole(values)
+    if model and str(model).upper() not in _MODELS:
+        raise ValueError(f"camera_model must be one of {', '.join(_MODELS)}, got {model!r}")
+    distortion_model, distortion = lens_in(values)
     width, height = int(values.get("w", width)), int(values.get("h", height))
     if "fl_x" in values:
         fx = float(values["fl_x"])
+    elif distortion_model == "equidistant":
+        raise ValueError("a fisheye must come with fl_x")  # camera_angle_x is meant for a pinhole
     elif "camera_angle_x" in values:
         angle_rad = float(values["camera_angle_x"])
         if not 0.0 < angle_rad < np.pi:
@@ -135,5 +137,6 @@ def _camera(values: dict[str, Any], width: int, height: int) -> Intrinsics | Non
         cy=float(values.get("cy", height / 2)) - 0.5,
         width=width,
         height=height,
-        distortion=distortion_in(values),
+        distortion=distortion,
+        distortion_model=distortion_model,
     )

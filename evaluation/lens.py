@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.errors import SemcastError
+from semcast.common.errors import SemcastError, SourceError
 from semcast.common.sequence import ImageRectifier
 from semcast.evaluation.moving_images import (
     NOT_MODELLED,
@@ -140,6 +140,11 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
         SemcastError: The images don't tell, or the result can't be written.
     """
     images = load_images(settings)
+    if images.stored.distortion_model != "radtan":
+        raise SourceError(
+            f"the camera of {images.name} must be a pinhole with radial-tangential distortion, got "
+            f"{images.stored.distortion_model}: a fisheye is calibrated with a chessboard (semcast calibrate)"
+        )
     readout = Readout.of(images.stored)
     trials: list[LensTrial] = []
 

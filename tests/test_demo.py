@@ -139,10 +139,11 @@ def test_the_camera_reaches_the_agent_and_the_reference_it_is_compared_with(tmp_
         return commands_of(settings)
 
     plain = commands(focal_35mm=26.0)
-    bent = commands(fx=500.0, fy=500.0, cx=320.0, cy=240.0, distortion=(0.1, 0.0, 0.0, 0.0))
+    lens = {"distortion": (0.1, 0.0, 0.0, 0.0), "distortion_model": "equidistant"}
+    bent = commands(fx=500.0, fy=500.0, cx=320.0, cy=240.0, **lens)
     for role in ("agent", "server"):
         assert "--focal-35mm 26.0" in " ".join(plain[role])
-        assert "--distortion 0.1 0.0 0.0 0.0" in " ".join(bent[role])
+        assert "--distortion 0.1 0.0 0.0 0.0 --distortion-model equidistant" in " ".join(bent[role])
 
 
 @pytest.mark.parametrize(

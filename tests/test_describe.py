@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -203,6 +204,8 @@ def test_a_video_is_described_with_the_camera_beside_it_or_without(tmp_path):
     text = text_of(video)
     assert "camera: fx 50.0 fy 50.0 cx 31.5 cy 23.5 px, with distortion -0.25 0.08 0 0\n" in text
     assert text.endswith(f"is reconstructed by: semcast demo --sequence '{video}'")
+    replace(camera, distortion_model="equidistant").save(video.with_suffix(".json"))
+    assert "cy 23.5 px, with equidistant distortion -0.25 0.08 0 0\n" in text_of(video)
     Intrinsics(fx=50, fy=50, cx=23.5, cy=31.5, width=48, height=64).save(video.with_suffix(".json"))
     assert "are for 48x64 images, its images are 64x48: are they turned by 90 degrees" in text_of(video)
 

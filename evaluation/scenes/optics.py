@@ -39,15 +39,12 @@ class Optics:
         Raises:
             SourceError: The distortion shows some pixels no ray, or one of more than a right angle.
         """
-        if not any(camera.distortion):
+        if not camera.is_distorted:
             return cls(camera.undistorted())
-        K, coefficients = camera.K, np.array(camera.distortion)
         shape = (camera.height, camera.width, 2)
         pixels = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1).astype(float)
         flat = pixels.reshape(-1, 1, 2)
-        rays = cv2.undistortPoints(flat, K, coefficients, criteria=_SEARCH).reshape(-1, 2)
-        points, still = np.column_stack([rays, np.ones(len(rays))]), np.zeros(3)
-        again, _ = cv2.projectPoints(points, still, still, K, coefficients)
+        rays, again = _rays_of(flat, camera)
         sources = rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
         most = (camera.width, camera.height)
         is_seen = np.isfinite(again).all() and np.abs(again - flat).max() < _MAX_ERROR_PX
@@ -82,3 +79,18 @@ class Optics:
         sources = self.sources[top:bottom] - np.array([0, first], np.float32)
         x, y = sources[..., 0], sources[..., 1]
         return np.asarray(cv2.remap(drawn, x, y, cv2.INTER_CUBIC), np.float32)
+
+
+def _rays_of(
+    pixels: NDArray[np.float64], camera: Intrinsics
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return rays of unit depth, ``(N, 2)``, for pixels ``(N, 1, 2)``, and the pixels they are seen at."""
+    K, coefficients = camera.K, np.array(camera.distortion)
+    if camera.distortion_model == "equidistant":
+        rays = cv2.fisheye.undistortPoints(pixels, K, coefficients, criteria=_SEARCH)
+        again = cv2.fisheye.distortPoints(rays, K, coefficients)
+    else:
+        rays = cv2.undistortPoints(pixels, K, coefficients, criteria=_SEARCH)
+        points, still = np.concatenate([rays, np.ones_like(rays[..., :1])], axis=2), np.zeros(3)
+        again, _ = cv2.projectPoints(points, still, still, K, coefficients)
+    return np.asarray(rays, np.float64).reshape(-1, 2), np.asarray(again, np.float64)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.lens import DISTORTION_COUNTS
+from semcast.common.lens import DistortionModel, check_distortion
 from semcast.common.new_folder import new_folder
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.whole_file import write_whole
@@ -133,7 +133,11 @@ class RenderSettings:
         metadata={"help": "time a rolling shutter takes from the top row to the bottom, 0 for none"},
     )
     distortion: tuple[float, ...] = field(
-        default=(), metadata={"help": "of the lens: OpenCV coefficients k1 k2 p1 p2 [k3 [k4 k5 k6]]"}
+        default=(),
+        metadata={"help": "of the lens: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of a fisheye"},
+    )
+    distortion_model: DistortionModel = field(
+        default="radtan", metadata={"help": "what the coefficients are of; equidistant is a fisheye"}
     )
     out: Path = field(metadata={"help": "folder to write; it must not exist or be empty"})
 
@@ -149,8 +153,7 @@ class RenderSettings:
             raise ValueError(f"brightness must be in (0, 1], got {self.brightness:g}")
         if not 0 <= self.readout_ms <= 100:
             raise ValueError(f"readout_ms must be in [0, 100], got {self.readout_ms:g}")
-        if len(self.distortion) not in DISTORTION_COUNTS or not np.all(np.isfinite(self.distortion)):
-            raise ValueError(f"distortion must be 4, 5 or 8 finite values, got {self.distortion}")
+        check_distortion(self.distortion_model, self.distortion)
 
 
 def render_scene(settings: RenderSettings, progress: Callable[[int, int], None] | None = None) -> int:
@@ -170,7 +173,12 @@ def render_scene(settings: RenderSettings, progress: Callable[[int, int], None] 
     """
     scene_type = SCENES[settings.scene]
     with new_folder(settings.out) as folder:  # this and the lens are refused before the scene is painted
-        camera = replace(scene_type.camera, readout_ms=settings.readout_ms, distortion=settings.distortion)
+        camera = replace(
+            scene_type.camera,
+            readout_ms=settings.readout_ms,
+            distortion=settings.distortion,
+            distortion_model=settings.distortion_model,
+        )
         Optics.of(camera)
         scene = scene_type(settings.seed, settings.pace)
         scene.camera = camera

@@ -225,7 +225,7 @@ def _checked_matches(
         raise ValueError(f"mode must be one of {', '.join(get_args(ConfidenceMode))}, got {mode!r}")
     if not threshold_px > 0.0:
         raise ValueError(f"threshold_px must be positive, got {threshold_px:g}")
-    if any(camera.distortion):
+    if camera.is_distorted:
         raise ValueError(f"camera must be without distortion, got {camera.distortion}")
     return xy0, xy1
 

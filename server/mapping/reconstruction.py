@@ -56,7 +56,7 @@ class Reconstruction:
     """
 
     def __init__(self, camera: Intrinsics, settings: ReconstructionSettings, bundle: BundleRunner) -> None:
-        if any(camera.distortion):
+        if camera.is_distorted:
             raise ValueError(f"camera must be without distortion, got {camera.distortion}")
         self._camera = camera
         self._settings = settings

@@ -232,7 +232,7 @@ def describe_sequence(path: Path) -> list[Section]:
         facts.append(("time", f"{times_s[-1] - times_s[0]:.1f} s, {rate_hz:.1f} images a second{note}"))
     try:
         camera = sequence.intrinsics
-        facts += camera_facts(camera, sequence.stored_camera.distortion)
+        facts += camera_facts(camera, sequence.stored_camera)
     except SourceError:
         facts.append(("camera", f"unknown: {HOW_TO_GIVE}"))
     truth = sequence.groundtruth()

@@ -44,7 +44,7 @@ def video_facts(path: Path) -> Facts | None:
         try:
             camera = Intrinsics.load(beside)
             check_size(camera, width, height, path.name)
-            facts += [*camera_facts(camera, camera.distortion), ("", f"as {beside} says")]
+            facts += [*camera_facts(camera, camera), ("", f"as {beside} says")]
         except SourceError as err:
             facts.append(("camera", str(err)))
     facts.append(("is reconstructed by", command))
@@ -69,18 +69,19 @@ def calibration_facts(path: Path) -> Facts:
         SourceError: It can't be read, or misses a value.
     """
     camera = read_intrinsics(path)
-    return [("images", f"{camera.width}x{camera.height} px"), *camera_facts(camera, camera.distortion)]
+    return [("images", f"{camera.width}x{camera.height} px"), *camera_facts(camera, camera)]
 
 
-def camera_facts(camera: Intrinsics, distortion: tuple[float, ...]) -> Facts:
+def camera_facts(camera: Intrinsics, stored: Intrinsics) -> Facts:
     """Return a camera's numbers in words.
 
     Args:
         camera: Its pinhole and shutter.
-        distortion: Of its images as stored.
+        stored: Camera of its images as stored, with their distortion.
     """
-    coefficients = " ".join(f"{k:.4g}" for k in distortion)
-    bent = f", with distortion {coefficients}" if coefficients else ""
+    coefficients = " ".join(f"{k:.4g}" for k in stored.distortion)
+    what = "distortion" if stored.distortion_model == "radtan" else f"{stored.distortion_model} distortion"
+    bent = f", with {what} {coefficients}" if coefficients else ""
     centre = f"cx {camera.cx:.1f} cy {camera.cy:.1f} px"
     facts = [("camera", f"fx {camera.fx:.1f} fy {camera.fy:.1f} {centre}{bent}")]
     if camera.readout_ms:

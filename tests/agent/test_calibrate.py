@@ -150,6 +150,30 @@ def test_exact_corners_give_the_exact_camera_and_no_error():
     assert result.rejected == ()
 
 
+def test_a_fisheye_is_found_with_how_well_it_is_known():
+    lens = np.array([0.02, -0.01, 0.004, -0.001])
+    K = np.array([[210.0, 0.0, 236.3], [0.0, 207.0, 181.8], [0.0, 0.0, 1.0]])
+    board, rng = board_points(BOARD).astype(np.float64)[None], np.random.default_rng(1)
+    found = []
+    for _ in range(8):
+        views = []
+        for k, T in enumerate(poses_of_the_board(16)):
+            t = T[:3, 3] - (0.0, 0.0, 5.0)  # so near that it reaches 70 degrees off the axis
+            xy, _ = cv2.fisheye.projectPoints(board, cv2.Rodrigues(T[:3, :3])[0], t, K, lens)
+            views.append(BoardView(f"{k}", (xy[0] + rng.normal(0, 0.2, xy[0].shape)).astype(np.float32)))
+        found.append(calibrate(views, BOARD, (480, 360), "equidistant"))
+    cameras = [result.intrinsics for result in found]
+    assert {camera.distortion_model for camera in cameras} == {"equidistant"}
+    values = np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras])
+    error = (values - [210.0, 207.0, 236.3, 181.8]) / [result.deviations for result in found]
+    assert 0.5 < np.sqrt((error**2).mean()) < 1.6
+    # Coefficients take each other's place; where a ray ends does not change with that.
+    powers = 0.7 ** np.array([3, 5, 7, 9])
+    ends = [camera.fx * (0.7 + camera.distortion @ powers) for camera in cameras]
+    assert np.mean(ends) == pytest.approx(210.0 * (0.7 + lens @ powers), abs=0.2)
+    assert found[0].rms_px == pytest.approx(0.2 * np.sqrt(2.0), rel=0.1)
+
+
 def test_the_error_is_the_noise_that_was_put_in():
     rng = np.random.default_rng(3)
     views = [

@@ -110,11 +110,20 @@ def test_a_camera_that_was_not_calibrated_is_unknown(tmp_path, caplog):
     assert not (tmp_path / "out" / "intrinsics.json").exists()
 
 
-def test_a_fisheye_is_refused_before_anything_is_written(tmp_path):
+def test_a_fisheye_stays_one(tmp_path):
     bag = BagMaker()
     add_images(bag)
     bag.camera_info("/cam/camera_info", K, D[:4], P, WH, model="equidistant", time_ns=START)
-    with pytest.raises(SourceError, match="/cam/camera_info: .*pinhole.*'equidistant'"):
+    unpack(settings(bag, tmp_path))
+    camera = open_sequence(tmp_path / "out").stored_camera
+    assert (camera.distortion_model, camera.distortion) == ("equidistant", D[:4])
+
+
+def test_an_unknown_lens_is_refused_before_anything_is_written(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    bag.camera_info("/cam/camera_info", K, D[:4], P, WH, model="omni", time_ns=START)
+    with pytest.raises(SourceError, match="/cam/camera_info: .*pinhole.*'omni'"):
         unpack(settings(bag, tmp_path))
     assert not (tmp_path / "out").exists()
 

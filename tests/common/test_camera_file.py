@@ -81,6 +81,23 @@ def test_what_opencv_writes_of_a_rational_model_is_read(tmp_path):
     assert found.distortion == tuple(coefficients[0, :8])
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{EUROC}camera_model: pinhole\ndistortion_model: equidistant\n"
+        "distortion_coeffs: [0.1, -0.2, 0.3, 0.4]\n",
+        'Camera.type: "KannalaBrandt8"\nCamera1.fx: 30\nCamera1.fy: 31\nCamera1.cx: 15.5\nCamera1.cy: 11.5\n'
+        "Camera1.k1: 0.1\nCamera1.k2: -0.2\nCamera1.k3: 0.3\nCamera1.k4: 0.4\n"
+        "Camera.width: 32\nCamera.height: 24\n",
+    ],
+    ids=["kalibr", "orbslam3"],
+)
+def test_a_fisheye_is_read_as_one(tmp_path, text):
+    found = read(tmp_path, text)
+    assert found.undistorted() == CAMERA
+    assert (found.distortion_model, found.distortion) == ("equidistant", (0.1, -0.2, 0.3, 0.4))
+
+
 def test_orbslam_without_tangential_distortion_is_read(tmp_path):
     text = (
         "Camera.type: PinHole\nCamera.fx: 30\nCamera.fy: 31\nCamera.cx: 15.5\nCamera.cy: 11.5\n"
@@ -116,21 +133,15 @@ def test_orbslam_without_tangential_distortion_is_read(tmp_path):
         ),
         (ROS_HEAD, "'camera_matrix or K' is missing"),
         ("resolution: [32, 24]\nintrinsics: [1, 2, 3, 4, 5]\n", "intrinsics must be a list of 4 numbers"),
-        (
-            f"{EUROC}distortion_model: equidistant\n",
-            "distortion_model must be a pinhole camera's .*'equidistant'",
-        ),
-        (f"{EUROC}distortion_type: fisheye\n", "distortion_type must be a pinhole camera's .*'fisheye'"),
         (f"{EUROC}camera_model: omni\n", "camera_model must be a pinhole camera's .*, got 'omni'"),
-        ("Camera.type: KannalaBrandt8\n", "type must be a pinhole camera's .*, got 'KannalaBrandt8'"),
         (
             f"{ROS_HEAD}{ROS_MATRIX}fisheye_model: 1\n",
-            "fisheye_model must be false for a pinhole camera, got 1.0",
+            "distortion_model and fisheye_model must say the same, got radtan, equidistant",
         ),
         (f"{EUROC}k1: 0.1\nD: [0.2, 0, 0, 0]\n", "k1 and D must say the same"),
         (
-            f"{EUROC}distortion:\n  model: equidistant\n  k1: 0.1\n",
-            "model must be a pinhole camera's .*, got 'equidistant'",
+            f"{EUROC}distortion:\n  model: equirectangular\n  k1: 0.1\n",
+            "model must be a pinhole camera's .*, got 'equirectangular'",
         ),
     ],
 )

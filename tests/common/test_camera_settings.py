@@ -35,14 +35,12 @@ def test_calibration_yaml_of_other_tools_is_read(tmp_path, text):
     assert found.distortion == (0.1, -0.2, 0.001, 0.002, 0.3)
 
 
-def test_a_fisheye_calibration_is_refused(tmp_path):
+def test_a_panorama_is_refused(tmp_path):
     (tmp_path / "camera.yaml").write_text(
-        "resolution: [32, 24]\nintrinsics: [30, 31, 15.5, 11.5]\ndistortion_model: equidistant\n"
+        "resolution: [32, 24]\nintrinsics: [30, 31, 15.5, 11.5]\ndistortion_model: spherical\n"
         "distortion_coefficients: [0.1, 0.2, 0.3, 0.4]\n"
     )
-    with pytest.raises(
-        SourceError, match="distortion_model must be a pinhole camera's .*, got 'equidistant'"
-    ):
+    with pytest.raises(SourceError, match="distortion_model must be a pinhole camera's .*, got 'spherical'"):
         CameraSettings(intrinsics=tmp_path / "camera.yaml").resolve(32, 24)
 
 
@@ -51,6 +49,21 @@ def test_camera_settings_must_be_complete_and_unambiguous(tmp_path):
         CameraSettings(fx=1.0, cy=2.0)
     with pytest.raises(ValueError, match="either intrinsics or"):
         CameraSettings(fx=1.0, fy=1.0, cx=1.0, cy=1.0, intrinsics=tmp_path)
+
+
+def test_a_fisheye_is_given_by_its_numbers():
+    pinhole = {"fx": 30.0, "fy": 31.0, "cx": 15.5, "cy": 11.5}
+    lens = {"distortion": (0.1, 0.2, 0.3, 0.4), "distortion_model": "equidistant"}
+    camera = CameraSettings(**pinhole, **lens).resolve(32, 24)
+    assert (camera.distortion, camera.distortion_model) == tuple(lens.values())
+    with pytest.raises(
+        SourceError, match=r"give --fx 60 .*--distortion 0.1 0.2 0.3 0.4 --distortion-model equid"
+    ):
+        check_size(camera, 64, 48, "walk")
+    with pytest.raises(ValueError, match="distortion_model must come with fx, fy, cx and cy"):
+        CameraSettings(distortion_model="equidistant")
+    with pytest.raises(SourceError, match=r"must be 4 finite values \(k1 to k4 of a fisheye\), got \(\)"):
+        CameraSettings(**pinhole, distortion_model="equidistant").resolve(32, 24)
 
 
 def test_a_phone_s_focal_length_gives_a_rough_camera():

@@ -193,12 +193,30 @@ def test_cameras_fitted_to_each_image_are_one_if_they_hardly_differ(
 
 
 @pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
-def test_a_fisheye_is_refused(tmp_path, write_images, poses, write):
+def test_an_unknown_camera_is_refused(tmp_path, write_images, poses, write):
     write_images(tmp_path / "images", 1)
-    camera = (5, "OPENCV_FISHEYE", (30.0, 31.0, 16.0, 12.0, 0.1, 0.0, 0.0, 0.0))
+    camera = (7, "FOV", (30.0, 31.0, 16.0, 12.0, 0.1))
     write(tmp_path / "sparse" / "0", [camera], _images(poses(1), ["000000.png"]))
-    with pytest.raises(SourceError, match=r"the camera model must be one of .*, got OPENCV_FISHEYE"):
+    with pytest.raises(SourceError, match=r"the camera model must be one of .*, got FOV"):
         open_sequence(tmp_path)
+
+
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+@pytest.mark.parametrize(
+    ("camera", "distortion"),
+    [
+        ((5, "OPENCV_FISHEYE", (30.0, 31.0, 16.0, 12.0, 0.1, 0.2, 0.3, 0.4)), (0.1, 0.2, 0.3, 0.4)),
+        ((8, "SIMPLE_RADIAL_FISHEYE", (30.0, 16.0, 12.0, 0.0)), (0.0, 0.0, 0.0, 0.0)),
+        ((9, "RADIAL_FISHEYE", (30.0, 16.0, 12.0, 0.1, 0.2)), (0.1, 0.2, 0.0, 0.0)),
+    ],
+    ids=["opencv", "simple radial", "radial"],
+)
+def test_a_fisheye_is_read_as_one(tmp_path, write_images, poses, write, camera, distortion):
+    write_images(tmp_path / "images", 1)
+    write(tmp_path / "sparse" / "0", [camera], _images(poses(1), ["000000.png"]))
+    stored = open_sequence(tmp_path).stored_camera
+    assert (stored.distortion_model, stored.distortion) == ("equidistant", distortion)
+    assert (stored.fx, stored.cx, stored.cy) == (30.0, 15.5, 11.5)
 
 
 def _cut(path, count):

@@ -61,18 +61,52 @@ def test_notes_about_a_lens_without_distortion_are_ignored(lens):
 
 
 @pytest.mark.parametrize(
+    "lens",
+    [
+        {"distortion_model": "equidistant", "D": [0.1, -0.2, 0.01, 0.02]},
+        {"distortion_model": "equidistant", "camera_model": "pinhole", "D": [0.1, -0.2, 0.01, 0.02, 0.0]},
+        {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k2": -0.2, "k3": 0.01, "k4": 0.02, "p1": 0, "p2": 0},
+        {"is_fisheye": True, "k1": 0.1, "k2": -0.2, "k3": 0.01, "k4": 0.02},
+        {"type": "KannalaBrandt8", "k1": 0.1, "k2": -0.2, "k3": 0.01, "k4": 0.02},
+        {"model": "distortion.kannala_brandt4", "coeffs": [0.1, -0.2, 0.01, 0.02, 0.0]},
+        {"distortion": {"model": "equidistant", "k1": 0.1, "k2": -0.2, "k3": 0.01, "k4": 0.02}},
+    ],
+)
+def test_a_fisheye_is_read_under_its_usual_names(lens):
+    camera = Intrinsics.from_dict({**PINHOLE, **lens})
+    assert camera.distortion_model == "equidistant"
+    assert camera.distortion == (0.1, -0.2, 0.01, 0.02)
+    assert Intrinsics.from_dict(camera.to_dict()) == camera
+
+
+def test_a_fisheye_without_coefficients_is_no_pinhole():
+    camera = Intrinsics.from_dict({**PINHOLE, "fisheye": 1})
+    assert camera.distortion == (0.0, 0.0, 0.0, 0.0)
+    assert camera.is_distorted
+    assert not camera.undistorted().is_distorted
+
+
+@pytest.mark.parametrize(
     ("lens", "message"),
     [
-        ({"distortion_model": "equidistant", "D": [0.1, 0, 0, 0]}, "distortion_model .* got 'equidistant'"),
-        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1}, "camera_model .* got 'OPENCV_FISHEYE'"),
-        ({"is_fisheye": True}, "is_fisheye must be false"),
+        ({"distortion_model": "omni-equidistant", "D": [0.1, 0, 0, 0]}, "distortion_model .* got 'omni-equi"),
+        ({"camera_model": "THIN_PRISM_FISHEYE", "k1": 0.1}, "camera_model .* got 'THIN_PRISM_FISHEYE'"),
+        (
+            {"camera_model": "OPENCV_FISHEYE", "distortion_model": "radtan"},
+            "camera_model and distortion_model",
+        ),
+        (
+            {"is_fisheye": True, "k1": 0.1, "p1": 0.01},
+            "distortion must be 4 finite values .k1 to k4 of a fish",
+        ),
+        ({"distortion_model": "equidistant", "D": [0.1, 0.2, 0.3]}, "distortion must be 4 finite values"),
         ({"distortion": "-0.3 0.1 0 0"}, "distortion must be a list of numbers"),
         ({"distortion_params": [0.1, 0, 0, 0]}, "distortion_params must be a list of numbers named"),
         ({"dist": [0.1, "x", 0, 0]}, "dist must be of numbers, got 'x'"),
         ({"k1": None}, "k1 must be of numbers, got None"),
         ({"D": [[0.1], [0], [0], [0]]}, r"D must be of numbers, got \[0.1\]"),
         ({"k1": 0.1, "k2": 0.1, "k3": 0.1, "k4": 0.1}, "k4 must be 0 or come with k5 and k6, got 0.1"),
-        ({"distortion": {"model": "equidistant", "k1": 0.1}}, "model must be a pinhole camera's"),
+        ({"distortion": {"model": "double_sphere", "k1": 0.1}}, "model must be a pinhole camera's"),
         ({"distortion": {"values": [0.1, 0, 0, 0]}}, "distortion must be a list of numbers named"),
         (
             {"model": "inverse_brown_conrady", "coeffs": [0.1, 0, 0, 0]},

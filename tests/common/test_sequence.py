@@ -109,14 +109,39 @@ def test_true_poses_at_times_that_are_no_seconds_are_refused(native, poses):
         open_sequence(native)
 
 
-def test_undistortion_moves_points_to_where_the_pinhole_has_them(tmp_path):
+def seen_by_radtan(camera, point_cam):
+    still = np.zeros(3)
+    return cv2.projectPoints(point_cam, still, still, camera.K, np.array(camera.distortion))[0].reshape(2)
+
+
+def seen_by_fisheye(camera, point_cam):
+    """Kannala and Brandt 2006, Eq. 6, with the first coefficient in the focal length."""
+    x, y, z = point_cam[0]
+    angle = np.arctan2(np.hypot(x, y), z)
+    away = angle * (1 + sum(k * angle ** (2 * n) for n, k in enumerate(camera.distortion, 1)))
+    return camera.K[:2, :2] @ np.array([x, y]) / np.hypot(x, y) * away + camera.K[:2, 2]
+
+
+@pytest.mark.parametrize(
+    ("distortion", "model", "seen", "point"),
+    [
+        ((-0.25, 0.08, 0.001, -0.002), "radtan", seen_by_radtan, (0.3, -0.2, 1.0)),
+        ((0.05, -0.02, 0.01, -0.003), "equidistant", seen_by_fisheye, (0.45, -0.3, 1.0)),
+    ],
+)
+def test_undistortion_moves_points_to_where_the_pinhole_has_them(tmp_path, distortion, model, seen, point):
     camera = Intrinsics(
-        fx=300.0, fy=300.0, cx=159.5, cy=119.5, width=320, height=240, distortion=(-0.25, 0.08, 0.001, -0.002)
+        fx=300.0,
+        fy=300.0,
+        cx=159.5,
+        cy=119.5,
+        width=320,
+        height=240,
+        distortion=distortion,
+        distortion_model=model,
     )
-    point_cam = np.array([[0.3, -0.2, 1.0]])
-    distorted_xy = cv2.projectPoints(
-        point_cam, np.zeros(3), np.zeros(3), camera.K, np.array(camera.distortion)
-    )[0].reshape(2)
+    point_cam = np.array([point])
+    distorted_xy = seen(camera, point_cam)
     image = np.zeros((240, 320), dtype=np.uint8)
     # Rendered with sub-pixel precision and blurred, so that its centre of mass is where it is.
     ys, xs = np.mgrid[0:240, 0:320]

@@ -295,16 +295,26 @@ def test_a_transforms_file_of_a_pinhole_model_is_read(transforms_folder, model):
     assert open_sequence(folder).stored_camera.distortion == (0.1, 0.0, 0.0, 0.0)
 
 
+def test_a_transforms_file_of_a_fisheye_is_read(transforms_folder):
+    stored = open_sequence(transforms_folder(camera_model="OPENCV_FISHEYE", k1=0.1, k4=0.2)).stored_camera
+    assert (stored.distortion_model, stored.distortion) == ("equidistant", (0.1, 0.0, 0.0, 0.2))
+
+
+def test_the_angle_of_a_fisheye_s_view_does_not_tell_its_focal_length(tmp_path, write_images):
+    write_images(tmp_path / "images", 1)
+    frames = [{"file_path": "images/000000.png", "transform_matrix": np.eye(4).tolist()}]
+    document = {"camera_model": "OPENCV_FISHEYE", "camera_angle_x": 2.0, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(SourceError, match="a fisheye must come with fl_x"):
+        open_sequence(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("document", "message"),
     [
-        (
-            {"camera_model": "OPENCV_FISHEYE", "k1": 0.1},
-            "camera_model must be one of OPENCV, .*'OPENCV_FISHEYE'",
-        ),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be one of OPENCV, .*'EQUIRECTANGULAR'"),
         ({"camera_model": "OPENCV", "k4": 0.01}, "k4 must be 0 or come with k5 and k6, got 0.01"),
-        ({"is_fisheye": True}, "is_fisheye must be false for a pinhole camera, got True"),
+        ({"camera_model": "FISHEYE624"}, "camera_model must be one of OPENCV, .*'FISHEYE624'"),
     ],
 )
 def test_a_transforms_file_of_another_model_is_refused(transforms_folder, document, message):

@@ -232,6 +232,15 @@ def test_a_principal_point_that_was_moved_is_told(images, tmp_path, capsys, monk
     assert json.loads(result.read_text())["centre_reach_px"] == pytest.approx([0.13, 0.07], abs=0.02)
 
 
+def test_a_fisheye_is_not_changed_as_if_it_were_a_pinhole(images, tmp_path, capsys):
+    camera = tmp_path / "camera.json"
+    stored = {"fx": 26.5, "fy": 26.5, "cx": 15.5, "cy": 11.5, "width": 32, "height": 24, "is_fisheye": True}
+    camera.write_text(json.dumps(stored))
+    assert main(["lens", str(images), "--intrinsics", str(camera), "--out", str(tmp_path / "new.json")]) == 1
+    assert "must be a pinhole with radial-tangential distortion, got equidistant" in capsys.readouterr().err
+    assert not (tmp_path / "new.json").exists()
+
+
 def test_bounds_hold_what_is_not_modelled_besides_chance(images, monkeypatch):
     def told(unit):
         change = LensFit(

@@ -29,17 +29,20 @@ def forgotten():
     painted.cache_clear()
 
 
-def seen(distortion, readout_s=0.0, name="room"):
+def seen(distortion, readout_s=0.0, name="room", model="radtan"):
     scene = copy.copy(painted(name))
-    scene.camera = replace(scene.camera, distortion=distortion)
+    scene.camera = replace(scene.camera, distortion=distortion, distortion_model=model)
     return frame_of(scene, 2.0, 0.0, np.random.default_rng(0), readout_s).astype(float), scene.camera
 
 
 @pytest.mark.parametrize("name", ["room", "street"])
-@pytest.mark.parametrize("distortion", [BARREL, PINCUSHION])
-def test_undistorted_it_is_the_pinhole_cameras_image(name, distortion):
+@pytest.mark.parametrize(
+    ("distortion", "model"),
+    [(BARREL, "radtan"), (PINCUSHION, "radtan"), ((0.05, -0.02, 0.0, 0.0), "equidistant")],
+)
+def test_undistorted_it_is_the_pinhole_cameras_image(name, distortion, model):
     straight, _ = seen((), name=name)
-    bent, camera = seen(distortion, name=name)
+    bent, camera = seen(distortion, name=name, model=model)
     rectified = ImageRectifier(camera, (camera.width, camera.height))(bent.astype(np.uint8))
     inside = (slice(80, -80), slice(100, -100))
     apart = np.abs(rectified - straight)[inside].mean()
@@ -65,5 +68,5 @@ def test_a_distortion_that_no_lens_has_is_refused(tmp_path):
     with pytest.raises(SourceError, match="must let every pixel .* in front of the camera, got -0.9 0 0 0"):
         render_scene(settings)
     assert not (tmp_path / "new").exists()
-    with pytest.raises(ValueError, match=r"distortion must be 4, 5 or 8 finite values, got \("):
+    with pytest.raises(ValueError, match=r"distortion must be 0, 4, 5 or 8 finite values, got \("):
         RenderSettings(distortion=(0.1, 0.0, 0.0), out=tmp_path)

@@ -41,9 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--distortion",
-        choices=("radtan5", "radtan4", "none"),
+        choices=("radtan5", "radtan4", "none", "equidistant"),
         default="radtan5",
-        help="lens model: k1 k2 p1 p2 k3, without k3, or none (default radtan5)",
+        help="lens model: k1 k2 p1 p2 k3, without k3, none, or k1 k2 k3 k4 of a fisheye (default radtan5)",
     )
     parser.add_argument(
         "--views",
@@ -249,7 +249,8 @@ def run(arguments: argparse.Namespace) -> int:
     print(f"{c.width}x{c.height}, {len(result.views)} views, reprojection error {result.rms_px:.3f} px rms")
     print(f"fx {c.fx:.2f} +- {deviation[0]:.2f} px, fy {c.fy:.2f} +- {deviation[1]:.2f} px")
     print(f"cx {c.cx:.2f} +- {deviation[2]:.2f} px, cy {c.cy:.2f} +- {deviation[3]:.2f} px")
-    print("distortion " + (" ".join(f"{k:.5f}" for k in c.distortion) or "none"))
+    what = "equidistant distortion " if c.distortion_model == "equidistant" else "distortion "
+    print(what + (" ".join(f"{k:.5f}" for k in c.distortion) or "none"))
     print(f"{arguments.out}\n{picture}")
     for name in result.rejected:
         print(f"left out: {name} fits far worse than the other views", file=sys.stderr)
