@@ -65,6 +65,7 @@ Settings, files, processes
     run_summary             the figures of a finished run
     new_folder              folders for output
     former_file             keeps a file that would be written over
+    file_lock               locks on what is being written
     whole_file              files that are never half written
     npz_file                arrays with a header
     source_commit           the commit that the code is of

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from semcast.common.errors import SourceError
+from semcast.common.file_lock import is_locked, lock
 from semcast.common.former_file import keep_former
 from semcast.common.recording_writer import FLUSH_INTERVAL_S, RecordingWriter
 
@@ -35,7 +36,7 @@ class Recorder:
         on_error: Is told in a line why recording ended before it was closed.
 
     Raises:
-        SourceError: The file can't be opened.
+        SourceError: The file can't be opened, or another recorder is writing it.
     """
 
     def __init__(
@@ -58,11 +59,15 @@ class Recorder:
         self.drops: Counter[str] = Counter()
         self.error: str | None = None
         self._former: Path | None = None
+        if is_locked(path):
+            raise SourceError(f"{path} can't be written: something else is being recorded into it")
         self._new_folders = [folder for folder in path.parents if not folder.exists()]
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._former = keep_former(path)
             self._stream = path.open("wb")
+            if path.is_file():  # not a device, such as /dev/null
+                lock(self._stream.fileno())
             self._writer = self._begun(header)
         except OSError as err:
             raise SourceError(f"{path} can't be written: {err}") from err
@@ -143,6 +148,8 @@ class Recorder:
 
     def _fail(self, err: Exception) -> None:
         """Say once that recording ended; what was written up to here stays readable."""
+        with contextlib.suppress(OSError):  # nobody is to take the file for one that is being recorded
+            self._stream.close()
         why = str(err) or type(err).__name__
         text = f"recording into {self._path} ended: {why}"
         logger.error(
@@ -165,10 +172,10 @@ class Recorder:
             already, self._closed = self._closed, True
             self._condition.notify()
         self._thread.join(deadline_s)
-        if not already and not self._thread.is_alive():
+        if not already and self.error is None and not self._thread.is_alive():
             try:
                 self._stream.close()
-                if self.num_written == 0 and self.error is None:
+                if self.num_written == 0:
                     self._leave_as_it_was()
             except OSError as err:
                 logger.error("closing %s failed: %s", self._path, err)

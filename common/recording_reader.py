@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from semcast.common.errors import SourceError
+from semcast.common.file_lock import is_locked
 from semcast.common.ros_bag_files import MCAP_MAGIC, check_no_ros_bag
 
 logger = logging.getLogger(__name__)
@@ -305,7 +306,7 @@ class RecordingReader:
     def messages(self, kinds: frozenset[str] | None = None) -> Iterator[RecordedMessage]:
         """Yield messages in the order they were recorded, of these kinds or of all.
 
-        Of a file that was cut off the first pass warns.
+        Of a file that was cut off, or is still being written, the first pass warns.
 
         Raises:
             SourceError: The file is damaged in the middle; a cut end only ends the iteration.
@@ -317,7 +318,8 @@ class RecordingReader:
                     yield record
             if not scan.complete and not self._is_cut_told:
                 self._is_cut_told = True
-                logger.warning("%s was cut off; everything up to its last whole record was read", self.path)
+                why = "is still being recorded" if is_locked(self.path) else "was cut off"
+                logger.warning("%s %s; everything up to its last whole record was read", self.path, why)
 
     def info(self) -> RecordingInfo:
         """Read the whole file and count what it holds."""

@@ -13,6 +13,7 @@ from typing import BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from semcast.common.errors import SourceError
+from semcast.common.file_lock import is_locked
 from semcast.common.recording_reader import (
     FORMAT,
     MESSAGE_ENCODING,
@@ -162,8 +163,11 @@ def recover_file(path: Path, out: Path) -> RecordingInfo:
     """Rewrite a recording; ``out`` may be ``path``, which is replaced only when the new file is whole.
 
     Raises:
-        SourceError: See ``recover_stream``; or a file can't be read or written.
+        SourceError: See ``recover_stream``; or a file can't be read or written, or ``out`` is still being
+            recorded.
     """
+    if is_locked(out):
+        raise SourceError(f"{out} can't be replaced: it is still being recorded, end that first")
     try:
         source = path.open("rb")
     except OSError as err:

@@ -1,7 +1,6 @@
 """What an earlier run left in an output folder: known by its rows, out of the way before a new run begins."""
 
 import contextlib
-import errno
 import logging
 import os
 import tempfile
@@ -9,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from semcast.common.errors import ConfigError
+from semcast.common.file_lock import lock
 from semcast.common.run_folder import (
     FRAMES_NAME,
     IMAGES_NAME,
@@ -16,11 +16,6 @@ from semcast.common.run_folder import (
     TRAJECTORY_NAME,
     read_image_paths,
 )
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 logger = logging.getLogger(__name__)
 
@@ -83,29 +78,17 @@ def output_folder(folder: Path | None) -> Iterator[None]:
         yield
         return
     make_output_folder(folder)
-    lock = _locked(folder)
     try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:  # Windows opens no folders
+        yield
+        return
+    try:
+        if not lock(descriptor):
+            raise ConfigError(f"out must not be in use, another run is writing into {folder}")
         yield
     finally:
-        if lock is not None:
-            os.close(lock)
-
-
-def _locked(folder: Path) -> int | None:
-    """Return an open folder that is locked until it is closed; None where there are no locks."""
-    if fcntl is None:
-        return None
-    lock = None
-    try:
-        lock = os.open(folder, os.O_RDONLY)
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as err:
-        if lock is not None:
-            os.close(lock)
-        if err.errno in (errno.EWOULDBLOCK, errno.EACCES) and lock is not None:
-            raise ConfigError(f"out must not be in use, another run is writing into {folder}") from err
-        return None
-    return lock
+        os.close(descriptor)
 
 
 def free_folder(folder: Path) -> Path:

@@ -13,6 +13,7 @@ from bags import SECOND, BagMaker
 from semcast.cli import main
 from semcast.common.camera import Intrinsics
 from semcast.common.errors import SemcastError, SourceError
+from semcast.common.file_lock import lock
 from semcast.common.nets.onnx_encoder import encoder_path
 from semcast.common.recording_writer import RecordingWriter, recording_metadata
 from semcast.common.run_folder import RECONSTRUCTION_NAME, PartInMetres, RunData, write_run
@@ -96,6 +97,9 @@ def test_a_recording_is_described(tmp_path):
 def test_a_cut_recording_says_so_and_a_lost_suffix_does_not_matter(tmp_path):
     write_recording(tmp_path / "r.bin", cut=1)
     assert "state: cut off" in text_of(tmp_path / "r.bin")
+    with (tmp_path / "r.bin").open("ab") as recorder:
+        lock(recorder.fileno())
+        assert "state: being recorded" in text_of(tmp_path / "r.bin")
 
 
 def test_a_run_without_summary_is_said_to_be_going_on(run_folder):

@@ -10,6 +10,7 @@ from typing import Any
 
 from semcast.common.camera_settings import HOW_TO_GIVE
 from semcast.common.errors import CheckpointError, SourceError
+from semcast.common.file_lock import is_locked
 from semcast.common.recording_reader import RECORDING_METADATA, RecordingReader
 from semcast.common.ros_bag_files import is_ros_bag
 from semcast.common.run_folder import (
@@ -100,11 +101,12 @@ def describe_recording(path: Path) -> list[Section]:
     reader = RecordingReader(path)
     info = reader.info()
     header = info.metadata.get(RECORDING_METADATA, {})
-    state = (
-        "whole, by its index; 'semcast replay' tests every checksum"
-        if info.complete
-        else "cut off: replay reads it up to there, 'semcast recover' mends it"
-    )
+    if info.complete:
+        state = "whole, by its index; 'semcast replay' tests every checksum"
+    elif is_locked(path):
+        state = "being recorded"
+    else:
+        state = "cut off: replay reads it up to there, 'semcast recover' mends it"
     facts = [("state", state), ("size", _bytes(reader.size_bytes))]
     if info.start_ns is not None and info.end_ns is not None:
         began = datetime.datetime.fromtimestamp(info.start_ns * 1e-9, datetime.UTC)

@@ -130,10 +130,10 @@ def test_where_there_are_no_locks_a_folder_is_used_without(tmp_path, monkeypatch
     def refuse(*_):
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr("semcast.server.former_run.fcntl.flock", refuse)
+    monkeypatch.setattr("semcast.common.file_lock.fcntl.flock", refuse)
     with output_folder(tmp_path), output_folder(tmp_path):
         pass
-    monkeypatch.setattr("semcast.server.former_run.fcntl", None)
+    monkeypatch.setattr("semcast.common.file_lock.fcntl", None)
     with output_folder(tmp_path), output_folder(tmp_path):
         pass
 
