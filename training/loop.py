@@ -1,6 +1,7 @@
 """The training loop: one process or several under torchrun, on CPU or GPU, resumable at any step."""
 
 import copy
+import io
 import json
 import logging
 import os
@@ -16,14 +17,14 @@ import torch
 import torch.distributed as dist
 from numpy.typing import NDArray
 
-from semcast.common.errors import CheckpointError, SourceError
+from semcast.common.errors import CheckpointError, SemcastError, SourceError
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.codec import check_device, has_fast_bfloat16
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, channel_bandwidth_ratio
 from semcast.common.source_commit import source_commit
-from semcast.common.whole_file import check_writable, whole_file
+from semcast.common.whole_file import check_writable, write_whole
 from semcast.training.centring import centre_hidden, folded, unfolded
 from semcast.training.channel import to_device
 from semcast.training.curve import CURVE_NAME, append_row, cut_to_step, mean_of
@@ -200,8 +201,9 @@ class Run:
             "step": self.step,
             "elapsed_s": self.elapsed_s,
         }
-        with whole_file(self.checkpoint_path) as file:
-            torch.save(state, file)
+        packed = io.BytesIO()  # torch gives an error of its own where a disk is full
+        torch.save(state, packed)
+        write_whole(self.checkpoint_path, packed.getvalue())
 
     def shippable(self) -> Transceiver:
         """Return the averaged weights as they run without the aids of training."""
@@ -371,6 +373,7 @@ def train(
         CheckpointError: The checkpoint in ``out`` belongs to another architecture or other optimisers, or is
             damaged.
         ConfigError: ``start`` or ``grow_from`` does not suit the architecture.
+        SemcastError: Checkpoint, curve or weights can't be written; what was there of them before stays.
     """
     world = int(os.environ.get("WORLD_SIZE", "1"))
     joined = world > 1 and not dist.is_initialized()
@@ -381,6 +384,8 @@ def train(
         torch.set_num_threads(settings.threads)
     try:
         return _train(Run(settings, dist.get_rank() if world > 1 else 0, world), on_progress, should_stop)
+    except OSError as err:
+        raise SemcastError(f"training into {settings.out} ended: {err}") from err
     finally:
         if joined:
             dist.destroy_process_group()

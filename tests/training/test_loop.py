@@ -2,6 +2,7 @@ import contextlib
 import json
 import math
 import os
+import resource
 import shutil
 import socket
 import subprocess
@@ -17,7 +18,7 @@ import torch
 import semcast.common.nets.registry as registry
 import semcast.training.loop as loop
 from semcast.common.config import build_settings, read_toml
-from semcast.common.errors import CheckpointError, ConfigError, SourceError
+from semcast.common.errors import CheckpointError, ConfigError, SemcastError, SourceError
 from semcast.common.nets.checkpoint import load_transceiver, read_manifest
 from semcast.common.nets.codec import NeuralCodec
 from semcast.common.nets.mae import build_mae
@@ -259,6 +260,21 @@ def test_a_damaged_checkpoint_is_refused(tiny_network, photos, tmp_path):
     (tmp_path / "last.pt").write_bytes(b"nothing")
     with pytest.raises(CheckpointError, match="can't be read"):
         train(settings_for(photos, tmp_path))
+
+
+def test_a_disk_that_takes_no_more_is_one_line_and_the_checkpoint_before_stays(
+    tiny_network, photos, tmp_path
+):
+    train(settings_for(photos, tmp_path / "out", steps=3))
+    before = (tmp_path / "out" / "last.pt").read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))
+    try:
+        with pytest.raises(SemcastError, match="training into .*out ended: .*File too large"):
+            train(settings_for(photos, tmp_path / "out"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert (tmp_path / "out" / "last.pt").read_bytes() == before
 
 
 @pytest.mark.parametrize("name", ["data", "valid"])
