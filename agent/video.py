@@ -54,7 +54,7 @@ def _why_not(source: str, live: bool) -> str:
             return ": 'semcast replay' takes recordings of a stream"
         return ": it is in no format of videos that OpenCV reads, or it is damaged or was cut off"
     if "://" in source:
-        return f": no stream came within {_OPEN_TIMEOUT_MS // 1000} s; are address and password right?"
+        return ": no stream came from there; are address and password right?"
     device = Path(f"/dev/video{int(source)}" if is_camera_number(source) else source)
     if sys.platform != "linux":
         return ""

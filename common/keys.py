@@ -19,7 +19,7 @@ def check_agent_id(agent_id: str) -> str:
     """
     if re.fullmatch(AGENT_ID_PATTERN, agent_id) is None:
         raise ValueError(
-            f"agent_id must be 1 to 64 letters, digits, '-' or '_', starting with no sign, got {agent_id!r}"
+            f"agent_id must be 1 to 64 of A-Z, a-z, 0-9, '-' and '_', the first no sign, got {agent_id!r}"
         )
     return agent_id
 

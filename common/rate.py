@@ -123,12 +123,15 @@ class RateControl:
     def __init__(self, rate: RateChoice, shape_hw: tuple[int, int]) -> None:
         if rate != "auto" and rate not in RATES:
             raise ValueError(f"rate must be auto or one of {', '.join(RATES)}, got {rate!r}")
+        size = f"{shape_hw[1]}x{shape_hw[0]}"
         self._rates = [known for known in RATES if _can_be_sent(shape_hw, known)]
         if not self._rates:
-            raise ConfigError(f"resize must make frames smaller: those of {shape_hw} can be sent at no rate")
+            raise ConfigError(f"resize must make frames smaller: those of {size} can be sent at no rate")
         if rate not in ("auto", *self._rates):
             allowed = ", ".join(self._rates)
-            raise ConfigError(f"rate must be one of {allowed} for frames of {shape_hw}, got {rate!r}")
+            raise ConfigError(
+                f"rate must be one of {allowed} for frames of {size}, got {rate!r}; resize makes them smaller"
+            )
         self._fixed = None if rate == "auto" else rate
         self._shape_hw = shape_hw
         self._rate: Rate = min(self._rates, key=lambda known: abs(_log_uses(known) - _log_uses(NATIVE_RATE)))

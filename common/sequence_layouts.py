@@ -140,7 +140,8 @@ def find_layout(path: Path) -> Layout:
         return "folder"
     raise SourceError(
         f"no sequence at {path}: expected images/ (native), rgb.txt (TUM), image_2/ or image_0/ (KITTI), "
-        "mav0/cam0/ (EuRoC), transforms.json (NeRF), images/ and sparse/ (COLMAP), or image files"
+        "mav0/cam0/ (EuRoC), transforms.json (NeRF), images/ and sparse/ (COLMAP), or image files "
+        f"({' '.join(IMAGE_SUFFIXES)})"
     )
 
 

@@ -112,6 +112,7 @@ class Session:
         self._newest_posed: FrameResult | None = None
         self._state = TrackingState.INITIALIZING
         self._is_concluded = False
+        self._told = ""
         self._last_checkpoint_s = time.monotonic()
         self._checkpoints: CheckpointWriter | None = None
         self._images: ImageWriter | None = None
@@ -398,7 +399,10 @@ class Session:
                 with each.attempt(folder / SUMMARY_NAME) as path:
                     write_json(path, summary)
             posed = summary["frames"]["posed"]
-            logger.log(logging.INFO if posed else logging.WARNING, "%s", run_line(summary))
+            line = run_line(summary)
+            if line != self._told:  # outputs are written again where another stream follows
+                logger.log(logging.INFO if posed else logging.WARNING, "%s", line)
+            self._told = line
         return summary
 
     def _summary(

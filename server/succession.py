@@ -223,6 +223,9 @@ class SuccessiveSessions:
             self._end(former, folder)
         except (OSError, SemcastError) as err:
             self.report(_not_written(folder, err))
+        else:
+            if folder is not None:
+                logger.info("outputs of the stream before are in %s", folder)
 
     def _end(self, session: Session, folder: Path | None) -> dict[str, Any]:
         """Write what a stream leaves behind into a folder and release it."""

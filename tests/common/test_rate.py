@@ -122,7 +122,7 @@ def test_channel_uses_by_hand():
 def test_rates_whose_frames_are_too_large_are_not_taken():
     huge = (4000, 6000)
     with pytest.raises(
-        ConfigError, match=r"rate must be one of 1/48, .* for frames of \(4000, 6000\), got '1/8'"
+        ConfigError, match=r"rate must be one of 1/48, .* for frames of 6000x4000, got '1/8'; resize"
     ):
         RateControl("1/8", huge)
     # Of the second each rate has few enough samples, and some have sides that are short enough.

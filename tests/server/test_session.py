@@ -215,12 +215,14 @@ def test_an_adjustment_that_can_not_be_applied_between_two_frames_does_not_end_t
 
 
 @pytest.mark.parametrize(("final", "source"), [(True, 4), (False, 98)])
-def test_a_source_had_as_many_frames_as_came_until_its_last(demo, final, source):
+def test_a_source_had_as_many_frames_as_came_until_its_last(demo, caplog, final, source):
     identity = replace(IDENTITY, camera=demo.intrinsics, num_frames=98, last_frame_id=97)
     with contextlib.closing(Session(ServerSettings(bundle="inline"), identity, None, None)) as session:
         for k in range(4):
             session.note_arrival(k, k, final=final and k == 3)
         summary = session.write_outputs(None, {}, complete=True)
+        session.write_outputs(None, {}, complete=True)
+        assert caplog.text.count("0 frames tracked") == 1, "the same line says nothing new"
         broken_off = session.write_outputs(None, {}, complete=False)
     assert (summary["frames"]["source"], summary["frames"]["sent"]) == (source, 4)
     assert broken_off["frames"]["source"] == 4, "of one that was broken off, what came"

@@ -28,7 +28,8 @@ def centre(pose):
     return np.array(pose.T_world_cam)[[3, 7, 11]]
 
 
-def test_a_restarted_agent_begins_a_new_map_and_the_former_run_is_kept(tmp_path, air):
+def test_a_restarted_agent_begins_a_new_map_and_the_former_run_is_kept(tmp_path, air, caplog):
+    caplog.set_level("INFO")
     running = air.serve(out=tmp_path)
     first = air.agent(100)
     first.stream(range(8))
@@ -39,6 +40,7 @@ def test_a_restarted_agent_begins_a_new_map_and_the_former_run_is_kept(tmp_path,
     assert summary["frames"]["tracked"] == 4
     former = json.loads((tmp_path / "previous-1" / "summary.json").read_text())
     assert former["frames"]["tracked"] == 8
+    assert f"outputs of the stream before are in {tmp_path / 'previous-1'}" in caplog.text
     assert len((tmp_path / "previous-1" / "frames.jsonl").read_text().splitlines()) == 8
     assert len((tmp_path / "frames.jsonl").read_text().splitlines()) == 4
 
