@@ -24,8 +24,8 @@ class MarkerSettings:
         default=None,
         metadata={
             "flag": "marker_m",
-            "help": "look for a printed square marker whose black square has this side, and publish poses in "
-            "metres and in its frame too: origin in its middle, x right, y up, z out of it",
+            "help": "look for a printed square marker whose black square has this side in metres, and "
+            "publish poses in metres and in its frame too: origin in its middle, x right, y up, z out of it",
         },
     )
     dictionary: str = field(

@@ -77,7 +77,8 @@ def weights_path(name_or_path: str | Path) -> Path:
         return path
     if path.suffix == ".onnx":
         raise CheckpointError(
-            f"{path} is an exported encoder, which can only send: give the .safetensors file it is of"
+            f"{path} is an exported encoder, which can only send: give the .safetensors file it is of, "
+            "or runtime onnx to an agent"
         )
     folder = Path(__file__).resolve().parent.parent / "weights"
     shipped = folder / f"{name_or_path}.safetensors"

@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="SIDE",
         help="export in metres and in the frame of a printed square marker that the kept images show, whose "
-        "black square has this side: origin in its middle, x right, y up, z out of it",
+        "black square has this side in metres: origin in its middle, x right, y up, z out of it",
     )
     parser.add_argument(
         "--marker-dictionary",
