@@ -64,15 +64,15 @@ class ReconstructionSettings:
     readout_ms: float | None = field(
         default=None,
         metadata={
-            "help": "time in ms a rolling shutter takes from the first row to the last, 0 for a global shutter; "
-            "default: what the camera's calibration says, else it is found while the camera moves"
+            "help": "time in ms a rolling shutter takes from the first row to the last, 0 for a global "
+            "shutter; default: what the camera's calibration says, else it is found while the camera moves"
         },
     )
     readout_from: ReadoutFrom | None = field(
         default=None,
         metadata={
-            "help": "side of the image at which the readout told by --readout-ms or the calibration begins; left "
-            "or right for upright phones"
+            "help": "side of the image at which the readout told by --readout-ms or the calibration begins; "
+            "left or right for upright phones"
         },
     )
     lost_after_s: float = field(
