@@ -114,7 +114,7 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     settings = naming(settings, codec)
     sequence, codec = open_stream(settings, codec)
     truth = sequence.groundtruth()
-    has_truth = _is_usable(truth, sequence.name)
+    has_truth = _is_usable(truth, sequence.name, len(sequence))
     chosen = select_frames(sequence, settings)
     # Without a link neither SNR nor channel seed changes an image: one SNR stands for all.
     snrs_db = settings.snr_db if codec is not None else settings.snr_db[:1]
@@ -164,10 +164,10 @@ def median_or_none(values: Sequence[float | None]) -> float | None:
     return median if np.isfinite(median) else None
 
 
-def _is_usable(truth: Trajectory | None, name: str) -> bool:
+def _is_usable(truth: Trajectory | None, name: str, num_images: int) -> bool:
     """Whether errors against this true path mean something; if not, that is told as a warning.
 
-    Then no run is to blame for having no error.
+    Then no run is to blame for having no error. A truth of less than half of the images is told as well.
     """
     if truth is None:
         logger.warning("%s has no true path: how far its poses are off is unknown", name)
@@ -178,6 +178,11 @@ def _is_usable(truth: Trajectory | None, name: str) -> bool:
             *(name, len(truth), truth.path_length),
         )
         return False
+    if 2 * len(truth) < num_images:
+        logger.warning(
+            "%s has true poses of %d of its %d images: errors are those of these alone",
+            *(name, len(truth), num_images),
+        )
     return True
 
 

@@ -173,6 +173,20 @@ def test_a_truth_that_measures_nothing_is_not_a_failure_of_the_run(room, tmp_pat
     assert "too short to say how far its poses are off" in caplog.text
 
 
+def test_a_truth_of_a_part_of_the_recording_is_told(room, tmp_path, caplog):
+    folder = tmp_path / "part"
+    shutil.copytree(room, folder)
+    lines = (folder / "groundtruth.txt").read_text().splitlines(keepends=True)
+    num_images = len(list((folder / "images").iterdir()))
+    settings = TrajectorySettings(sequence=folder, codec="none", max_frames=10)
+    evaluate_trajectory(settings)
+    assert "errors are those of these alone" not in caplog.text
+    (folder / "groundtruth.txt").write_text("".join(lines[:8]))
+    evaluate_trajectory(settings)
+    num_poses = len(open_sequence(folder).groundtruth())
+    assert f"part has true poses of {num_poses} of its {num_images} images: errors are those" in caplog.text
+
+
 def test_a_failed_run_counts_as_worse_than_any_number():
     assert median_or_none([1.0, None, 2.0]) == 2.0
     assert median_or_none([1.0, None, None]) is None
