@@ -102,6 +102,15 @@ def test_a_cut_recording_says_so_and_a_lost_suffix_does_not_matter(tmp_path):
         assert "state: being recorded" in text_of(tmp_path / "r.bin")
 
 
+def test_a_clock_that_was_set_back_gives_no_negative_length(tmp_path):
+    with (tmp_path / "r.mcap").open("wb") as stream:
+        writer = RecordingWriter(stream, recording_metadata('agent_id = "a"\n', "1.2.3"))
+        for t_s in (5000, 5001, 1402):
+            writer.add("semcast/a/tx/symbols", "symbols", t_s * 1_000_000_000, 0, bytes(8))
+        writer.finish()
+    assert "time: 1970-01-01 01:23:20 UTC, the clock was set back meanwhile" in text_of(tmp_path / "r.mcap")
+
+
 def test_a_run_without_summary_is_said_to_be_going_on(run_folder):
     assert "the run is going on, or was killed" in text_of(run_folder)
 

@@ -111,7 +111,8 @@ def describe_recording(path: Path) -> list[Section]:
     if info.start_ns is not None and info.end_ns is not None:
         began = datetime.datetime.fromtimestamp(info.start_ns * 1e-9, datetime.UTC)
         span_s = (info.end_ns - info.start_ns) * 1e-9
-        facts.append(("time", f"{began:%Y-%m-%d %H:%M:%S} UTC, {span_s:.1f} s"))
+        length = f"{span_s:.1f} s" if span_s >= 0 else "the clock was set back meanwhile"
+        facts.append(("time", f"{began:%Y-%m-%d %H:%M:%S} UTC, {length}"))
     facts.append(("written by", f"semcast {header.get('semcast', '?')}, format {header.get('format', '?')}"))
     if info.num_damaged_chunks:
         facts.append(("damaged", f"{info.num_damaged_chunks} chunks left out"))
