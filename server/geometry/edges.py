@@ -26,8 +26,8 @@ _REACH_PX = 8
 _STEP_PX = 2
 #: To what ``rounded`` rounds lengths,
 _LENGTH_STEP = 0.2
-#: and directions, in radians.
-_ANGLE_STEP = np.pi / 36
+#: and into how many parts half a turn: an edge lies the same way whichever end it points to.
+_NUM_ANGLES = 36
 
 
 def edges_at(grey: NDArray[np.uint8], xy: Array) -> Array:
@@ -72,7 +72,8 @@ def whitened(edge: Array, error_px: Array) -> Array:
 def rounded(edge: Array) -> Array:
     """Round edges ``(N, 2)`` to a few lengths and directions, so that many are equal."""
     length = np.rint(np.linalg.norm(edge, axis=1) / _LENGTH_STEP) * _LENGTH_STEP
-    angle = np.rint(np.arctan2(edge[:, 1], edge[:, 0]) % np.pi / _ANGLE_STEP) * _ANGLE_STEP
+    step = np.pi / _NUM_ANGLES
+    angle = np.rint(np.arctan2(edge[:, 1], edge[:, 0]) / step) % _NUM_ANGLES * step
     return np.asarray(length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]))
 
 

@@ -87,6 +87,13 @@ def test_rounding_leaves_few_edges_close_to_what_they_were():
     assert np.allclose(rounded(np.array([[0.6, 0.0], [-0.6, 0.0]])), [[0.6, 0.0], [0.6, 0.0]])
 
 
+def test_an_edge_is_rounded_to_one_vector_whichever_way_it_points():
+    angle = np.radians([0.0, 1.0, 42.0, 90.0, 179.0, 179.9])
+    edge = 0.6 * np.column_stack([np.cos(angle), np.sin(angle)])
+    np.testing.assert_array_equal(rounded(edge), rounded(-edge))
+    assert len(np.unique(rounded(edge[[0, 1, 4, 5]]), axis=0)) == 1, "all lie along the rows"
+
+
 def test_the_gradients_are_those_of_the_window_around_the_point():
     grey = half_plane(0.0)
     grey[:, 200:] = cv2.transpose(half_plane(0.0))[:240, :120]  # another scene to the right
