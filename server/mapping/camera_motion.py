@@ -118,7 +118,8 @@ class CameraMotion:
         """
         if len(self._came_ns) == 2:
             before_ns, last_ns = self._came_ns
-            self._has_gap |= t_source_ns - last_ns > _GAP_INTERVALS * (last_ns - before_ns)
+            # Of a source that gives two images one time, these tell no interval.
+            self._has_gap |= t_source_ns - last_ns > _GAP_INTERVALS * (last_ns - before_ns) > 0.0
         self._came_ns = [*self._came_ns[-1:], t_source_ns]
         return self._has_gap
 
@@ -184,8 +185,10 @@ class CameraMotion:
         while len(self._recent) > 2 and t_source_ns - self._recent[1][0] >= _REST_NS:
             del self._recent[0]
         since_ns, T_world_then = self._recent[0]
-        moved_px = _median_length(self._displacements(T_world_then, [T_world_cam], xyz)[0])
-        self._rests = t_source_ns - since_ns >= _REST_NS and moved_px <= _REST_SHARE * self._camera.width
+        moved = self._displacements(T_world_then, [T_world_cam], xyz)[0]
+        is_near = _median_length(moved) <= _REST_SHARE * self._camera.width
+        # A camera that turned right round has no point in front of it both then and now.
+        self._rests = t_source_ns - since_ns >= _REST_NS and len(moved) > 0 and is_near
 
     def _go_on(self, t_source_ns: int, T_world_cam: Array) -> None:
         self._motion.observe(t_source_ns, T_world_cam)

@@ -105,6 +105,12 @@ def test_a_gap_is_longer_than_the_frames_before_were_apart():
     assert motion.comes_after_gap(78 * FRAME_NS), "how often frames come is known still"
 
 
+def test_images_that_share_a_time_tell_no_interval():
+    motion = CameraMotion(CAMERA)
+    times = np.repeat(np.arange(4), 2) * FRAME_NS
+    assert not any(motion.comes_after_gap(int(t_ns)) for t_ns in times)
+
+
 def test_a_row_of_equal_houses_does_not_hold_the_camera_back_after_a_gap():
     """What is seen of the houses fits where the camera was before the gap, but for one house."""
     sequence = open_sequence(STREET)
@@ -187,6 +193,15 @@ def test_a_camera_rests_when_the_image_has_hardly_moved_for_a_second():
     assert motion.rests, "it sways"
     go(motion, [6.0, 6.5], first=28)
     assert not motion.rests
+
+
+def test_a_camera_that_turned_round_does_not_rest_though_no_point_was_in_sight_all_the_while():
+    motion = CameraMotion(CAMERA)
+    for k in range(12):
+        T_world_cam = make_transform(exp_so3((0.0, 0.25 * k, 0.0)), np.zeros(3))
+        ahead = POINTS @ T_world_cam[:3, :3].T
+        motion.observe(k, k * FRAME_NS, T_world_cam, ahead)
+        assert not motion.rests, f"frame {k}"
 
 
 def test_a_camera_before_which_something_passes_rests_at_once():
