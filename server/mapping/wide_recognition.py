@@ -287,9 +287,10 @@ class WideRecogniser:
 
 
 def _newest_views(world: WorldMap, images: KeyframeImages) -> list[_View]:
-    """What the newest keyframes with an image saw, newest first."""
+    """What the newest keyframes with an image saw that still see landmarks, newest first."""
     there = [(image, world.keyframe(image.frame_id)) for image in images.newest(_NUM_KEYFRAMES)]
-    return [_View.of(image, keyframe, world) for image, keyframe in reversed(there) if keyframe is not None]
+    views = [_View.of(image, keyframe, world) for image, keyframe in reversed(there) if keyframe is not None]
+    return [view for view in views if len(view.ids)]
 
 
 def _reductions(warps: Array) -> tuple[int, int]:

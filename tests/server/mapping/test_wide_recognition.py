@@ -1,5 +1,7 @@
 """A camera that went on for most of a second is found again by what looks as it did."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,6 +23,7 @@ from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.wide_recognition import WideRecogniser
+from semcast.server.mapping.world_map import WorldMap
 
 NUM_MAPPED = 14
 #: Of the still life that is drawn.
@@ -135,6 +138,16 @@ def test_what_is_not_found_in_eight_frames_is_not_looked_for_any_more(mapped):
         assert find(mapped, nothing, recogniser) is None
     assert find(mapped, seen, recogniser) is not None
     assert find(mapped, seen, recogniser) is None
+
+
+def test_a_keyframe_whose_landmarks_are_all_gone_is_no_place(mapped):
+    sequence, reconstruction = mapped
+    world, images = WorldMap(), reconstruction._map.images
+    for known in reconstruction.world.keyframes:
+        world.add_keyframe(replace(known))
+    sight = sight_of(sequence.image(NUM_MAPPED), NUM_MAPPED)
+    recogniser = WideRecogniser(sequence.intrinsics, seed=0)
+    assert recogniser.find(sight, world, images, NOISE, world.keyframes[-1].T_world_cam) is None
 
 
 def look(mapped, sight, T_world_cam):
