@@ -128,7 +128,7 @@ def _is_more(
 
 def _normal(total: Array, columns: list[int]) -> Array:
     normal = total[np.ix_(columns, columns)]
-    return np.asarray(normal + _DAMPING * np.diag(np.diag(normal)) + 1e-12)
+    return np.asarray(normal + _DAMPING * np.diag(np.diag(normal)) + 1e-12 * np.eye(len(columns)))
 
 
 def _solved(total: Array, columns: list[int]) -> Array:

@@ -143,3 +143,13 @@ def test_views_that_say_nothing_are_no_lens():
     flat[:, RESIDUAL, RESIDUAL] = 1.0
     assert fit_lens(flat, num_radial=0) is None
     assert grouped(flat).shape == (4, 9, 9)
+
+
+def test_one_view_that_says_all_leaves_a_fit_without_it_that_says_nothing():
+    silent = np.zeros((9, 9))
+    silent[RESIDUAL, RESIDUAL] = 1.0
+    telling = 2.0 * np.eye(9)
+    telling[RESIDUAL, FOCAL] = telling[FOCAL, RESIDUAL] = 0.1
+    fit = fit_lens([telling, silent, silent], num_radial=1)
+    assert fit.focal == pytest.approx(0.05)
+    assert fit.radial[0] == pytest.approx(0.0)
