@@ -249,7 +249,7 @@ class RollingShutter:
         return self._flows
 
     def _keep(self, frame_id: int, flow: ImageFlow) -> None:
-        """Keep a movement; with the second, that of the first image too, by the trend of both."""
+        """Keep a movement; with the one of the next image, that of the first image too, by their trend."""
         if len(self._flows) == 1 and self._first_id is not None:
             after = next(iter(self._flows.values()))
             self._flows[self._first_id] = ImageFlow(flow.camera, 2.0 * after.coefficients - flow.coefficients)
@@ -265,6 +265,8 @@ class RollingShutter:
         self._flow = self._measured(step_s, xy, way)
         if self._flow is not None:
             self._keep(frame_id, self._flow)
+        elif frame_id != self._first_id:
+            self._first_id = None  # what comes later tells no trend at the first image
 
     def _measured(self, step_s: float, xy: Array, way: Array) -> ImageFlow | None:
         mean = None

@@ -182,6 +182,21 @@ def test_without_enough_points_or_after_a_gap_nothing_is_assumed():
     assert not is_first
 
 
+@pytest.mark.parametrize("num_missed", [0, 1])
+def test_the_first_image_moved_as_the_two_after_it_tell_and_no_later_ones(num_missed):
+    shutter, tracks = shutter_of(READOUT_MS), TrackTable("robust", 200, 0)
+    for frame_id in range(num_missed + 4):
+        frame = seen((60.0 * frame_id, 0.0), frame_id)
+        sight = shutter.see(frame)
+        tracks.follow(sight, tracks.xy + tracks.velocity) if len(tracks) else tracks.remember(sight)
+        sight, _ = shutter.settle(frame, sight, tracks)
+        if frame_id == 0 < num_missed:
+            continue  # nothing is followed to the next one
+        tracks.refill(sight)
+    known = set(range(1 + num_missed, num_missed + 4))
+    assert set(shutter.flows) == known | ({0} if num_missed == 0 else set())
+
+
 def test_the_flow_of_a_turning_camera_is_exact_though_points_are_wrong(rng):
     turn = np.array([0.4, -0.7, 0.3])  # radians a second
     xy = rng.uniform((0, 0), (319, 239), (200, 2))
