@@ -14,7 +14,9 @@ from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.world_map import WorldMap
 
 Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
 
+_NONE: Ids = np.zeros(0, np.int64)
 #: Noise is judged by residuals that keep at least this share of its variance.
 _MIN_LEFT = 0.1
 #: The distance between keyframes tells a scale only above this share of the scene's depth.
@@ -65,7 +67,7 @@ def apply_result(world: WorldMap, result: BundleResult, noise: OnlineNoise) -> N
     )
     as_noise = np.abs(error[telling]) / np.sqrt(left[telling, None])
     noise.add(np.repeat(problem.confidence[telling], 2), as_noise.ravel())
-    drop_outliers(world, result, noise.model)
+    drop_outliers(world, result, noise.model, spared=later)
 
 
 def place_left_out(world: WorldMap, camera: Intrinsics, noise: NoiseModel, result: BundleResult) -> int:
@@ -132,11 +134,19 @@ def _ways(T_world_cam: Array) -> Array:
     return ways
 
 
-def drop_outliers(world: WorldMap, result: BundleResult, noise: NoiseModel) -> None:
-    """Drop observations outside the gate, and landmarks left with fewer than two of them."""
+def drop_outliers(world: WorldMap, result: BundleResult, noise: NoiseModel, spared: Ids = _NONE) -> None:
+    """Drop observations outside the gate, and landmarks left with fewer than two of them.
+
+    Args:
+        world: The map, with the adjustment applied.
+        result: The adjustment.
+        noise: Gives each observation its gate.
+        spared: Landmarks that are elsewhere by now: where they were says nothing against them.
+    """
     problem = result.problem
     size = np.linalg.norm(np.nan_to_num(result.whitened_px, nan=np.inf), axis=1)
-    _drop(world, problem, size > 1.3 * noise.threshold_px(problem.confidence))
+    bad = size > 1.3 * noise.threshold_px(problem.confidence)
+    _drop(world, problem, bad & ~np.isin(problem.landmark_ids, spared)[problem.point])
 
 
 def _share_left(problem: BundleProblem, known: NDArray[np.bool_]) -> Array:

@@ -82,13 +82,13 @@ class TrackTable:
         self._next_id = 0
         self._greys: list[Grey] = []
         self._frame_ids: list[int] = []
-        self._before: dict[str, Array] | None = None
         self._jumped = False
         self.passing = Passing(max_features, turntable)
         self.clear()
 
     def clear(self) -> None:
         """Forget all tracks; ids go on."""
+        self._before: dict[str, Array] | None = None
         self.ids: Ids = np.zeros(0, np.int64)
         self.xy: Array = np.zeros((0, 2))
         self.velocity: Array = np.zeros((0, 2))
@@ -151,6 +151,7 @@ class TrackTable:
 
         Ids that occur twice are taken once.
         """
+        self._before = None
         self.ids, first = np.unique(ids, return_index=True)
         self.xy = xy[first].copy()
         count = len(first)

@@ -135,6 +135,22 @@ def test_a_landmark_that_was_made_again_since_the_question_keeps_its_new_place()
     np.testing.assert_allclose(transform_points(invert_transform(world.poses[40]), moved), in_last, atol=1e-9)
 
 
+def test_a_landmark_that_was_made_again_is_not_judged_by_where_it_was():
+    world, _, _ = make_world(5, 100)
+    add_landmarks(world, CAMERA, NoiseModel(6.0, 0.0), IMAGE, 0.5)
+    problem = build_problem(world, CAMERA, NOISE, 10)
+    again = int(problem.landmark_ids[0])
+    xy = problem.xy + np.where(problem.point[:, None] == 0, 40.0 * (problem.view[:, None] - 2), 0.0)
+    result = optimise(replace(problem, xy=xy))
+    world.remove_landmarks(world.landmarks.ids == again)
+    world.add_keyframe(Keyframe(**{**vars(world.keyframes[-1]), "frame_id": 50}))
+    one = np.zeros((1, 3), np.uint8), np.ones(1), 0, 50
+    world.add_landmarks(np.array([again]), np.array([[1.0, 2, 33]]), *one)
+    apply_result(world, result, OnlineNoise("off", 0.5, 0.0, True))
+    assert again in world.landmarks.ids
+    assert all(again in keyframe.ids for keyframe in world.keyframes)
+
+
 def test_outliers_of_an_adjustment_are_dropped():
     world, _, _ = make_world(6, 100)
     add_landmarks(world, CAMERA, NOISE, IMAGE, 1.0)

@@ -178,6 +178,20 @@ def test_adopted_points_replace_all_tracks():
     assert tracks.velocity.tolist() == tracks.edge.tolist() == [[0, 0], [0, 0]]
 
 
+@pytest.mark.parametrize("given_up", ["clear", "adopt"])
+def test_tracks_that_were_given_up_are_not_brought_back_by_a_second_look(given_up):
+    tracks, sight = begin(), sight_at(24)
+    tracks.follow(sight, tracks.xy - (4, 0))
+    if given_up == "clear":
+        tracks.clear()
+    else:
+        tracks.adopt(np.array([7]), np.array([[30.0, 30.0]]), 0.5)
+    ids = tracks.ids.copy()
+    assert not tracks.follow_again(sight, lambda before: before.xy)
+    assert not tracks.follow_jump(sight)
+    np.testing.assert_array_equal(tracks.ids, ids)
+
+
 def test_off_ignores_the_maps():
     tracks = TrackTable("off", 100, 0)
     sight = sight_at(20, confidence=np.full(SHAPE, 0.1, np.float32))
