@@ -45,7 +45,7 @@ def may_join(
         scale: Units of the older one per unit of the newer one.
         T_join: ``(4, 4)``; ``T_join @ (scale * x)`` is where a point of the newer one would be.
         posed_ids: ``(N,)`` frames that have a pose, ascending.
-        depth: Of the scene before the gap, map units of the older one.
+        depth: Of the scene, map units of the older one.
     """
     first, newest = newer[0], newer[-1]
     before = [k for k in older if k.t_source_ns < first.t_source_ns]

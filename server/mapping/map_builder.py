@@ -457,7 +457,8 @@ class MapBuilder:
         join = (scale, T_place_mine) if is_newer else (1.0 / scale, T_mine_place)
         older, newer = map(self.world.keyframes_of, sorted((self.submap, place.submap)))
         posed_ids = self.world.frames.keyframes()[0]
-        if not may_join(older, newer, *join, posed_ids=posed_ids, depth=self.depth()):
+        depth = self.depth() * (scale if is_newer else 1.0)
+        if not may_join(older, newer, *join, posed_ids=posed_ids, depth=depth):
             return None
         self._abandon_adjustment()
         moving, staying = (self.submap, place.submap) if is_newer else (place.submap, self.submap)

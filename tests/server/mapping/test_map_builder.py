@@ -226,6 +226,24 @@ def test_an_update_after_a_join_has_the_poses_of_all_frames(builder):
         assert known.T_world_cam is builder.world.poses[known.frame_id]
 
 
+@pytest.mark.parametrize(("away", "may"), [(1.2, True), (3.5, False)])
+def test_how_far_a_part_may_begin_from_the_older_one_is_told_in_units_of_that(builder, away, may):
+    """A camera that stood can be off by a share of the scene's depth, in whatever unit the newer part is."""
+    ids, xyz = add_part(builder, 0, 4, 0)
+    for k in range(4):
+        builder.world.move_keyframe(k, np.eye(4))
+    there, unit = make_transform(np.eye(3), (away, 0.0, 0.0)), 4.0
+    builder.enter(1)
+    mine = 1000 + ids
+    xyz_mine = transform_points(invert_transform(there), xyz) / unit
+    for k in range(40, 43):
+        builder.world.add_keyframe(keyframe(k, 1, mine, np.eye(4), xyz_mine))
+    builder.world.add_landmarks(mine, xyz_mine, np.zeros((80, 3), np.uint8), np.ones(80), 1, 40)
+    place = Place(there, 3, ids, seen(xyz, there), 0)
+    scale = builder.join(place, np.eye(4), NewestFrame(mine, seen(xyz_mine, np.eye(4))))
+    assert (scale == pytest.approx(unit)) if may else (scale is None)
+
+
 def test_a_keyframe_keeps_no_track_that_may_stand_with_the_camera(builder):
     ids, xyz = add_part(builder, 0, 4, 0)
     sight = Sight(DecodedFrame(9, 9, IMAGE), IMAGE[..., 0], np.ones(480, bool))
