@@ -26,7 +26,7 @@ _FINE_WINDOW_PX = 15
 #: When a search ends: its steps, and the length of one in pixels.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.02)
 #: Distance in pixels within which a point that is followed forth and back must be back.
-_MAX_FORWARD_BACKWARD_PX = 1.5
+MAX_FORWARD_BACKWARD_PX = 1.5
 #: A small window that ends further from there has found something else.
 _MAX_FINE_MOVE_PX = 1.5
 #: OpenCV's KLT gives the smaller eigenvalue of the mean structure tensor in units of 32^2 / 2^20 grey^2.
@@ -216,7 +216,6 @@ def track_points(
     xy0: Array,
     guess1_xy: Array,
     *,
-    max_forward_backward_px: float = _MAX_FORWARD_BACKWARD_PX,
     max_level: int = 3,
 ) -> TrackedPoints:
     """Follow points by Lucas-Kanade, there and back.
@@ -229,18 +228,9 @@ def track_points(
         grey1: Image they are looked for in.
         xy0: ``(N, 2)`` pixels in ``grey0``.
         guess1_xy: ``(N, 2)`` where they are expected in ``grey1``.
-        max_forward_backward_px: Points that come back further off are not ``ok``.
         max_level: Pyramid levels above the full image.
     """
-    found, _ = track_through_light(
-        grey0,
-        grey1,
-        xy0,
-        guess1_xy,
-        max_forward_backward_px=max_forward_backward_px,
-        max_level=max_level,
-    )
-    return found
+    return track_through_light(grey0, grey1, xy0, guess1_xy, max_level=max_level)[0]
 
 
 def track_through_light(
@@ -249,7 +239,6 @@ def track_through_light(
     xy0: Array,
     guess1_xy: Array,
     *,
-    max_forward_backward_px: float = _MAX_FORWARD_BACKWARD_PX,
     max_level: int = 3,
 ) -> tuple[TrackedPoints, tuple[float, float] | None]:
     """Follow points as ``track_points`` does, and tell the change of brightness that was made up for.
@@ -262,7 +251,7 @@ def track_through_light(
         return TrackedPoints.none(count), None
     told = _light_at_guesses(grey0, grey1, xy0, guess1_xy, max_level)
     like_second, is_told = _in_light(grey0, told), told is not None
-    found = _search(like_second, grey1, xy0, guess1_xy, max_forward_backward_px, max_level)
+    found = _search(like_second, grey1, xy0, guess1_xy, max_level)
     for _ in range(2):
         # Where hardly any was found, the guesses are near enough for a first idea of the change.
         is_sure = bool(found.ok.mean() >= _MOSTLY_FOUND)
@@ -277,7 +266,7 @@ def track_through_light(
                 like_second, told = alike, change
             break
         levels = min(_LEVELS_ANEW, max_level) if is_sure else max_level
-        anew = _search(alike, grey1, xy0, xy1, max_forward_backward_px, levels)
+        anew = _search(alike, grey1, xy0, xy1, levels)
         if anew.ok.sum() < (1.0 if is_sure else _CLEARLY_MORE) * found.ok.sum():
             break
         found, like_second, told = anew, alike, change
@@ -302,7 +291,7 @@ def _light_at_guesses(
     if _is_same_light(None, change):
         return None
     guess = guess1_xy[::step]
-    found = _search(grey0, grey1, xy0[::step], guess, _MAX_FORWARD_BACKWARD_PX, max_level)
+    found = _search(grey0, grey1, xy0[::step], guess, max_level)
     if found.ok.mean() < _SCOUTS_FOUND:
         return None
     off_px = np.abs(np.median((found.xy - guess)[found.ok], axis=0)).max()
@@ -329,18 +318,11 @@ def track_alike(
     """Follow points as ``track_points`` does between images that are known to have the same brightness."""
     if len(xy0) == 0 or grey0.shape != grey1.shape:
         return TrackedPoints.none(len(xy0))
-    found = _search(grey0, grey1, xy0, guess1_xy, _MAX_FORWARD_BACKWARD_PX, max_level)
+    found = _search(grey0, grey1, xy0, guess1_xy, max_level)
     return _placed(grey0, grey1, xy0, found)
 
 
-def _search(
-    grey0: Grey,
-    grey1: Grey,
-    xy0: Array,
-    guess1_xy: Array,
-    max_forward_backward_px: float,
-    max_level: int,
-) -> TrackedPoints:
+def _search(grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, max_level: int) -> TrackedPoints:
     """Find points by a large window, there and back, between images of the same brightness."""
     height, width = grey1.shape
     start = np.ascontiguousarray(xy0, dtype=np.float32)
@@ -365,7 +347,7 @@ def _search(
         away = np.linalg.norm(back.reshape(-1, 2).astype(np.float64) - begin, axis=1)
         distance[there] = np.where((back_status.ravel() == 1) & np.isfinite(away), away, 99.0)
         gradient[there] = _where_found(np.asarray(eigen), np.asarray(back_status)) * _EIGEN_UNIT
-    ok &= distance <= max_forward_backward_px
+    ok &= distance <= MAX_FORWARD_BACKWARD_PX
     return TrackedPoints(
         xy=found.astype(np.float64),
         ok=ok,

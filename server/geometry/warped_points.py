@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.server.geometry.features import (
+    MAX_FORWARD_BACKWARD_PX,
     Grey,
     TrackedPoints,
     corner_strength,
@@ -22,10 +23,8 @@ Array = NDArray[np.float64]
 
 #: A point further from its guess than this is another one.
 MAX_FROM_GUESS_PX = 25.0
-#: So is one whose warped window looks less alike, by normalised correlation,
+#: So is one whose warped window looks less alike, by normalised correlation.
 _MIN_CORRELATION = 0.7
-#: or that does not come back to where it began when it is followed backwards.
-_MAX_FORWARD_BACKWARD_PX = 1.5
 #: Guesses are rough: the search takes more steps than one that begins within a pixel or two.
 _ITERATIONS = 15
 #: A window that is seen at less than this share of its area, or more than its inverse, has other details.
@@ -68,7 +67,7 @@ def _aligned(grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, warps: Arra
     back = align_patches(after, grey0, xy0, np.asarray(np.linalg.inv(warps), np.float64))
     distance = np.linalg.norm(back.xy - xy0, axis=1)
     inside = ((there.xy >= 1) & (there.xy < np.array(grey1.shape[::-1]) - 2)).all(axis=1)
-    alike = (there.correlation > _MIN_CORRELATION) & (distance < _MAX_FORWARD_BACKWARD_PX)
+    alike = (there.correlation > _MIN_CORRELATION) & (distance < MAX_FORWARD_BACKWARD_PX)
     unexplained = np.maximum(1.0 - there.correlation**2, 0.0) * np.square(before.values).mean(axis=1)
     photometric = _MEAN_OF_SIGMA * np.sqrt(unexplained)
     gradient = sample_map(corner_strength(grey1), there.xy)

@@ -17,7 +17,7 @@ from semcast.server.geometry.projection import project_in_front
 from semcast.server.geometry.weighting import HUBER_K
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
 from semcast.server.mapping.dense_bundle import Baseline, State, Window, last_covariance, minimise
-from semcast.server.mapping.pose_graph import PoseConstraint
+from semcast.server.mapping.pose_graph import FIXED_SIGMA, PoseConstraint
 from semcast.server.mapping.residual_patterns import pattern_products_of
 from semcast.server.worker import Inline
 
@@ -34,8 +34,6 @@ SIGMA_RANGE_PX = (0.1, 12.0)
 _MAX_DENSE_VIEWS = 60
 #: With fewer there is no window, but what is left of one.
 _MIN_OBSERVATIONS = 10
-#: Holds a fixed pose: radians and map units.
-_FIXED_SIGMA = 1e-6
 
 
 def quantised_sigma(sigma_px: Array) -> tuple[Array, NDArray[np.intp]]:
@@ -105,7 +103,7 @@ def _build(
     problem: BundleProblem, used: NDArray[np.bool_]
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    fixed_noise = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED_SIGMA)
+    fixed_noise = gtsam.noiseModel.Isotropic.Sigma(6, FIXED_SIGMA)
     for k, T in enumerate(problem.T_world_cam):
         pose = gtsam.Pose3(gtsam.Rot3(project_to_so3(T[:3, :3])), T[:3, 3])
         values.insert(X(k), pose)

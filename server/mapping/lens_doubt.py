@@ -7,15 +7,11 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.mapping.lens import LensFit, believed_lens, fit_lens
+from semcast.server.mapping.residual_patterns import LEAST_EXPLAINED, LEAST_SIGMAS
 
 Array = NDArray[np.float64]
 
-#: A change of the lens counts when it explains this share of the squared residuals. Where the lens was right
-#: it explained up to .008, with values up to ten of their standard deviations from 0: these alone don't tell.
-_LEAST_EXPLAINED = 0.03
-#: A value counts when it is this many standard deviations from 0,
-_LEAST_SIGMAS = 5.0
-#: and a focal length where it seems off by this share: one that is off by 2 %, which makes the path through a
+#: A focal length counts where it seems off by this share: one that is off by 2 %, which makes the path in a
 #: drawn room ten times worse, seems off by 1.2 to 1.9, as the map has come to terms with some of it;
 _LEAST_FOCAL = 0.012
 #: named alone up to this share, beyond which untold distortion has been taken for it,
@@ -41,9 +37,9 @@ def lens_doubt(views: Sequence[Array], sigma_factor: float, camera: Intrinsics) 
         camera: As it is believed to be, of the images that were tracked.
     """
     fit = believed_lens(views)
-    if fit is None or fit.explained < _LEAST_EXPLAINED:
+    if fit is None or fit.explained < LEAST_EXPLAINED:
         return None
-    least_sigmas = _LEAST_SIGMAS * sigma_factor
+    least_sigmas = LEAST_SIGMAS * sigma_factor
     is_focal = abs(fit.focal) >= max(_LEAST_FOCAL, least_sigmas * fit.sigma_focal)
     is_focal &= any(fit.radial) or _is_no_distortion(fit.focal, views)
     radial = zip(fit.radial, fit.sigma_radial, strict=True)

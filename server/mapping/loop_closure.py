@@ -18,7 +18,7 @@ from semcast.common.geometry import invert_transform, rotation_angle_deg
 from semcast.server.geometry.pnp import reprojection_residual, search_pose
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.mapping.pose_graph import PoseConstraint, SolvedGraph, solve_graph
-from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
+from semcast.server.mapping.relocalisation import MAX_CONSIDERED, Place, Relocaliser, submap_similarity
 from semcast.server.mapping.revisit import OLD_SIGMA_PX, Revisit, tells_depth
 from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.sight import Sight
@@ -33,8 +33,6 @@ Ids = NDArray[np.int64]
 _NUM_RECENT = 20
 #: Keyframes from one look to the next.
 _LOOK_INTERVAL = 4
-#: Old keyframes considered in each look, at most.
-_MAX_CONSIDERED = 40
 #: Drift at most, as a share of the distance travelled since.
 _MAX_DRIFT = 0.1
 #: How near to the old keyframe the camera must have come back, as a share of that distance.
@@ -237,7 +235,7 @@ class LoopFinder:
         near = (apart < _MAX_DRIFT * way + depth) & (apart < _MAX_APART * way)
         near &= turn < self._camera.half_diagonal_rad
         rows = np.flatnonzero(near)
-        return [older[row] for row in rows[:: 1 + len(rows) // _MAX_CONSIDERED].tolist()]
+        return [older[row] for row in rows[:: 1 + len(rows) // MAX_CONSIDERED].tolist()]
 
 
 def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGraph] | None:

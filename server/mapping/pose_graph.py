@@ -17,8 +17,8 @@ from semcast.common.geometry import make_transform, project_to_so3
 Array = NDArray[np.float64]
 
 _MAX_ITERATIONS = 20
-#: Holds the first keyframe.
-_FIXED_SIGMA = 1e-6
+#: Holds a pose that is fixed: radians and map units.
+FIXED_SIGMA = 1e-6
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def solve_graph(T_world_cam: Array, constraints: Sequence[PoseConstraint]) -> So
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, T in enumerate(T_world_cam):
         values.insert(X(k), _similarity(T, 1.0))
-    fixed = gtsam.noiseModel.Isotropic.Sigma(7, _FIXED_SIGMA)
+    fixed = gtsam.noiseModel.Isotropic.Sigma(7, FIXED_SIGMA)
     graph.add(gtsam.PriorFactorSimilarity3(X(0), values.atSimilarity3(X(0)), fixed))
     for constraint in constraints:
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(constraint.sigma, (3, 3, 1)))

@@ -11,7 +11,7 @@ from semcast.common.camera import MAX_READOUT_MS, Intrinsics
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
 from semcast.server.mapping.lens_doubt import lens_doubt
 from semcast.server.mapping.readout import Axis, Readout, body_velocity, fit_readout
-from semcast.server.mapping.residual_patterns import PatternEvidence
+from semcast.server.mapping.residual_patterns import LEAST_EXPLAINED, LEAST_SIGMAS, PatternEvidence
 from semcast.server.mapping.world_map import WorldMap
 
 logger = logging.getLogger(__name__)
@@ -32,11 +32,8 @@ _INTERVAL = 8
 _LEAST_MS = 4.0
 #: Change of a readout that was found before, at least.
 _LEAST_CHANGE_MS = 1.0
-#: An estimate counts when it is this many standard deviations from 0,
-_LEAST_SIGMAS = 5.0
-#: and explains this share of the squared residuals: global shutters explained up to .015, behind bad links.
-_LEAST_EXPLAINED = 0.03
-#: That share for a change of what was found: whether the shutter rolls is then no question any more.
+#: Share of the squared residuals that a change of what was found must explain: whether the shutter rolls is
+#: then no question any more.
 _LEAST_EXPLAINED_MORE = 0.002
 #: From this many keyframes on, an estimate is the last one if it is sure,
 _ENOUGH_VIEWS = 24
@@ -134,8 +131,8 @@ class ReadoutWatch:
         )
         is_first = self._axis is None
         least_ms = _LEAST_MS if is_first else _LEAST_CHANGE_MS
-        least_explained = _LEAST_EXPLAINED if is_first else _LEAST_EXPLAINED_MORE
-        is_sure = fit.readout.ms >= _LEAST_SIGMAS * sigma_ms and fit.explained >= least_explained
+        least_explained = LEAST_EXPLAINED if is_first else _LEAST_EXPLAINED_MORE
+        is_sure = fit.readout.ms >= LEAST_SIGMAS * sigma_ms and fit.explained >= least_explained
         # An object in the middle of the image is read in no time: what its corners do wrong would take a
         # readout longer than any camera's, and images put right for that would be spoilt.
         if is_sure and least_ms <= fit.readout.ms <= MAX_READOUT_MS:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.brightness import MIN_POINTS, brightness_change, with_brightness
-from semcast.server.geometry.features import TrackedPoints, track_alike, track_points
+from semcast.server.geometry.features import BORDER_PX, TrackedPoints, track_alike, track_points
 from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.tracks import TrackTable
@@ -22,8 +22,6 @@ Array = NDArray[np.float64]
 
 #: Keyframes that are looked at here, the newest ones.
 _NUM_RECALLED = 3
-#: A point is looked for no nearer to the border than this.
-_BORDER_PX = 8
 #: Pyramid levels: where it is expected is known well.
 _LEVELS = 1
 
@@ -59,7 +57,7 @@ def recall_landmarks(
         lost = np.flatnonzero((row >= 0) & ~np.isin(keyframe.ids, tracks.ids, assume_unique=True))
         points_cam = transform_points(T_cam_world, mapped.world.landmarks.xyz[row[lost]])
         expected = mapped.camera.project(points_cam)
-        in_sight = sight.shows(expected, _BORDER_PX)
+        in_sight = sight.shows(expected, BORDER_PX)
         lost, expected = lost[in_sight], expected[in_sight]
         if len(lost):
             points = _follow(image, keyframe, lost, sight, expected, alive)

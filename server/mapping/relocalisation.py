@@ -29,7 +29,7 @@ Ids = NDArray[np.int64]
 #: The newest keyframes, which are tried on every frame.
 _NUM_NEWEST = 2
 #: Older keyframes that are compared with an image, at most.
-_MAX_CONSIDERED = 40
+MAX_CONSIDERED = 40
 #: The likeliest of those, which are tried too.
 _NUM_LIKELIEST = 2
 #: Descriptors of the image by which likely keyframes are told.
@@ -46,7 +46,8 @@ _MIN_INLIERS = 20
 _MAX_MIN_INLIERS = 45
 #: Keyframes around the recognised one whose landmarks are looked for.
 _NEIGHBOURS = 5
-_SEARCH_ITERATIONS = 400
+#: Hypotheses of a search by the landmarks of one keyframe, at most: most keyframes are not the place.
+SEARCH_ITERATIONS = 400
 _GUIDED_RADIUS_PX = 14.0
 _GUIDED_MAX_BITS = 70
 _MIN_GUIDED_SHARE = 0.35
@@ -132,7 +133,7 @@ class Relocaliser:
         """
         known = [k for k in world.keyframes if submaps is None or k.submap in submaps]
         newest, older = known[-_NUM_NEWEST:], known[:-_NUM_NEWEST]
-        count = min(len(older), _MAX_CONSIDERED)
+        count = min(len(older), MAX_CONSIDERED)
         turn = [older[-1 - (self._turn + k) % len(older)] for k in range(count)]
         self._turn = (self._turn + count) % max(1, len(older))
         return self.recognise(sight, world, noise, turn, tried_anyway=newest[::-1], is_possible=is_possible)
@@ -185,7 +186,7 @@ class Relocaliser:
             GATE_SIGMAS * sigma,
             seed=self._seed,
             min_inliers=_MIN_FIRST,
-            max_iterations=_SEARCH_ITERATIONS,
+            max_iterations=SEARCH_ITERATIONS,
         )
 
     def _confirm(

@@ -32,6 +32,11 @@ _HUBER_MEDIANS = 1.5
 _DAMPING = 1e-6
 #: Step of the numerical derivative of a distortion, in normalised image coordinates.
 _STEP = 1e-5
+#: An estimate counts when it is this many standard deviations from 0,
+LEAST_SIGMAS = 5.0
+#: and explains this share of the squared residuals. Lenses that were right explained up to .008, with values
+#: up to ten of their standard deviations from 0, and global shutters up to .015, behind bad links.
+LEAST_EXPLAINED = 0.03
 #: Groups of views, one left out at a time, by which an estimate's standard deviation is found (jackknife).
 NUM_GROUPS = 10
 

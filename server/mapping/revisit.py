@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
+from semcast.common.codec import KLT_WINDOW_PX
 from semcast.common.geometry import angles_between_deg, invert_transform, transform_points
 from semcast.server.geometry.epipolar import fundamental_matrix, sampson_px
 from semcast.server.geometry.features import TrackedPoints, track_points
@@ -45,9 +46,9 @@ _NUM_TRIED = 2
 #: Landmarks of a keyframe that should be in sight for it to be looked at.
 _MIN_EXPECTED = 30
 #: Found landmarks that must agree with the relative pose.
-_MIN_AGREEING = 15
+_MIN_ON_LINES = 15
 #: The same as a share of those found.
-_MIN_SHARE = 0.6
+_MIN_ON_LINES_SHARE = 0.6
 #: How alike the patches of a landmark must be, as their correlation.
 _MIN_CORRELATION = 0.75
 #: How far from its expected place an old landmark is followed: it is not exactly where the map has it.
@@ -56,8 +57,8 @@ _REACH_PX = 40.0
 _MAX_MOVE_PX = 3.0
 #: Pyramid levels that reach so far.
 _KLT_LEVELS = 2
-#: A landmark is looked for no nearer to the border than this.
-_BORDER_PX = 10
+#: A landmark is looked for no nearer to the border: its window is whole.
+_MARGIN_PX = KLT_WINDOW_PX // 2
 #: Keyframes before and after the old one that help to triangulate.
 _NEIGHBOURS = 6
 #: Rays must be further apart than this to tell a depth.
@@ -154,7 +155,7 @@ def _expected(
     good = seen_alike(warps, depth_now)
     points_cam = transform_points(T_cam_world, world.landmarks.xyz[row[rows]])
     xy = camera.project(np.where(good[:, None], points_cam, (0.0, 0.0, 1.0)))
-    good &= sight.shows(xy, _BORDER_PX)
+    good &= sight.shows(xy, _MARGIN_PX)
     return _Expected(keyframe, image, rows[good], xy[good], warps[good])
 
 
@@ -173,11 +174,11 @@ def _look(
     moved = np.linalg.norm(aligned.xy - points.xy[tried], axis=1)
     fits = (aligned.correlation > _MIN_CORRELATION) & (moved < _MAX_MOVE_PX)
     tried, xy = tried[fits], aligned.xy[fits]
-    if len(tried) < _MIN_AGREEING:
+    if len(tried) < _MIN_ON_LINES:
         return None
     F = fundamental_matrix(camera, invert_transform(T_world_cam) @ keyframe.T_world_cam)
     agrees = np.abs(sampson_px(F, xy0[tried], xy)) < gate_px
-    if int(agrees.sum()) < max(_MIN_AGREEING, _MIN_SHARE * len(tried)):
+    if int(agrees.sum()) < max(_MIN_ON_LINES, _MIN_ON_LINES_SHARE * len(tried)):
         return None
     all_xy, ok = points.xy.copy(), np.zeros(len(rows), bool)
     all_xy[tried], ok[tried] = xy, agrees

@@ -81,7 +81,6 @@ class ReconstructionSettings:
             "help": "seconds a lost camera is searched for before a new map is begun, 3 at least if it rested"
         },
     )
-
     turntable: bool = field(
         default=False,
         metadata={

@@ -28,7 +28,7 @@ from semcast.server.geometry.square_distance import square_distances
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.geometry.wide_search import WideFeatures, match_near, match_wide
 from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
-from semcast.server.mapping.relocalisation import Place
+from semcast.server.mapping.relocalisation import SEARCH_ITERATIONS, Place
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -56,10 +56,10 @@ _COARSE = (4, 2, 1)
 #: Share of those that must agree with the pose of the next round.
 _MIN_AGREEING_SHARE = 0.5
 _ALIGNED_SIGMA_PX = 1.0
-_BORDER_PX = 8
+#: A landmark is looked for no nearer to the border: its patch is whole.
+_MARGIN_PX = ANCHOR_PATCH_PX // 2
 #: How far what a guess expects may be from there in the image.
 _REACH_PX = 60.0
-_SEARCH_ITERATIONS = 400
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class WideRecogniser:
             GATE_SIGMAS * sigma,
             seed=self._seed,
             min_inliers=_MIN_FIRST,
-            max_iterations=_SEARCH_ITERATIONS,
+            max_iterations=SEARCH_ITERATIONS,
         )
 
     def _expected(self, view: _View, xy: Array, T_cam_world: Array) -> Array:
@@ -261,7 +261,7 @@ class WideRecogniser:
         """Look for all landmarks of a keyframe where a pose has them, in images reduced by a factor."""
         depth0 = transform_points(invert_transform(view.keyframe.T_world_cam), view.xyz)[:, 2]
         expected = self._camera.project(transform_points(T_cam_world, view.xyz))
-        rows = np.flatnonzero(sight.shows(expected, _BORDER_PX) & (depth0 > 0.0))
+        rows = np.flatnonzero(sight.shows(expected, _MARGIN_PX) & (depth0 > 0.0))
         T_cam_keyframe = T_cam_world @ view.keyframe.T_world_cam
         warps, depth1 = affine_warps(self._camera, T_cam_keyframe, view.xy[rows], depth0[rows])
         there, here = (by * reduction for reduction in _reductions(warps))
