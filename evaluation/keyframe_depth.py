@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +11,14 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.evaluation.pipeline import LinkedFrame
 from semcast.evaluation.reconstruct import as_received
-from semcast.server.dense.consistency import OtherDepth, back_project, confirmed_depth, not_yet_seen
+from semcast.server.dense.consistency import OtherDepth, added_points, confirmed_by
 from semcast.server.dense.depth_map import DepthMap, DepthProblem, estimate_depth
 from semcast.server.dense.neighbours import (
-    NUM_CONFIRMING,
     NUM_COVERING,
     DepthRange,
-    choose_neighbours,
+    confirming,
+    depth_problem,
     depth_range,
-    num_to_confirm,
 )
 from semcast.server.dense.view import View
 from semcast.server.geometry.projection import depths_in
@@ -100,13 +99,10 @@ def confirmed_depths(
     """
     problems = {k: _problem(k, keyframes, views) for k in sorted(views)}
     maps = {k: estimate_depth(problem) for k, problem in problems.items() if problem is not None}
-    order, confirmed = sorted(maps), {}
-    for place, (k, found) in enumerate(maps.items()):
-        around = order[max(0, place - NUM_CONFIRMING) : place + NUM_CONFIRMING + 1]
-        others = _seen_from(k, [maps[j] for j in around if j != k], keyframes, views)
-        needed = num_to_confirm(len(others))
-        depth = confirmed_depth(found.inverse_depth, found.step, views[k].K, others, needed)
-        confirmed[k] = replace(found, inverse_depth=depth)
+    confirmed = {}
+    for k, found in maps.items():
+        others = _seen_from(k, [maps[j] for j in confirming(maps, k)], keyframes, views)
+        confirmed[k] = confirmed_by(found, views[k].K, others)
     return confirmed
 
 
@@ -122,10 +118,9 @@ def cloud_points(
     """
     added, order = {}, sorted(confirmed)
     for place, k in enumerate(order):
-        found = confirmed[k]
         covering = [confirmed[j] for j in order[max(0, place - NUM_COVERING) : place]]
-        points = back_project(found.inverse_depth, views[k].K)[np.isfinite(found.inverse_depth)]
-        added[k] = points[not_yet_seen(points, found.step, _seen_from(k, covering, keyframes, views))]
+        covering_here = _seen_from(k, covering, keyframes, views)
+        added[k], _ = added_points(confirmed[k], views[k].K, covering_here)
     return added
 
 
@@ -133,14 +128,8 @@ def _problem(
     k: int, keyframes: Mapping[int, DepthKeyframe], views: Mapping[int, View]
 ) -> DepthProblem | None:
     sides = (sorted((j for j in views if j < k), reverse=True), sorted(j for j in views if j > k))
-    of, sought = keyframes[k].T_world_cam, keyframes[k].sought
-    groups = [
-        choose_neighbours(of, sought.median, ((views[j], keyframes[j].T_world_cam) for j in side))
-        for side in sides
-    ]
-    if not any(groups):
-        return None
-    return DepthProblem(views[k], [group for group in groups if group], sought.nearest, sought.farthest)
+    posed = [((views[j], keyframes[j].T_world_cam) for j in side) for side in sides]
+    return depth_problem(views[k], keyframes[k].T_world_cam, keyframes[k].sought, posed)
 
 
 def _seen_from(

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.dense.cloud import CloudPoints, DenseCloud, DensePatch, landmark_depths, scale_since
-from semcast.server.dense.consistency import OtherDepth, back_project, confirmed_depth, not_yet_seen
+from semcast.server.dense.consistency import OtherDepth, added_points, confirmed_by
 from semcast.server.dense.depth_map import DepthMap, DepthProblem
 from semcast.server.dense.neighbours import (
     NUM_CONFIRMING,
@@ -19,10 +18,10 @@ from semcast.server.dense.neighbours import (
     NUM_NEIGHBOURS,
     DepthRange,
     choose_neighbours,
+    confirming,
+    depth_problem,
     depth_range,
-    num_to_confirm,
 )
-from semcast.server.dense.plane_sweep import Neighbour
 from semcast.server.dense.view import View, view_of
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -220,7 +219,10 @@ class DenseBuilder:
         if len(later) >= _MAX_LATER or keyframe is None:
             return True
         sought = depth_range(landmark_depths(world, keyframe)[1])
-        return len(self._neighbours(keyframe, sought, sorted(later), world)) >= NUM_NEIGHBOURS
+        if sought is None:
+            return False
+        posed = self._posed(keyframe, sorted(later), world)
+        return len(choose_neighbours(keyframe.T_world_cam, sought.median, posed)) >= NUM_NEIGHBOURS
 
     def _problem(self, keyframe: Keyframe, sought: DepthRange | None, world: WorldMap) -> DepthProblem | None:
         """What is asked about a keyframe; None where there is too little to tell its depth from."""
@@ -229,26 +231,17 @@ class DenseBuilder:
         frame_id = keyframe.frame_id
         before = sorted((k for k in self._kept if k < frame_id), reverse=True)
         after = sorted(k for k in self._kept if k > frame_id)
-        groups = [self._neighbours(keyframe, sought, side, world) for side in (before, after)]
-        groups = [group for group in groups if group]
-        if not groups:
-            return None
-        reference = self._kept[frame_id].to_compare()
-        return DepthProblem(reference, groups, sought.nearest, sought.farthest)
+        sides = [self._posed(keyframe, side, world) for side in (before, after)]
+        return depth_problem(self._kept[frame_id].to_compare(), keyframe.T_world_cam, sought, sides)
 
-    def _neighbours(
-        self, keyframe: Keyframe, sought: DepthRange | None, side: Sequence[int], world: WorldMap
-    ) -> list[Neighbour]:
-        """Choose views of a keyframe's part on one side of it, from the nearest in time on."""
-        if sought is None:
-            return []
-        posed = (
-            (self._kept[k].to_compare(), T_world_nbr)
-            for k in side
-            if world.submap_of.get(k) == keyframe.submap
-            and (T_world_nbr := world.pose_of_frame(k)) is not None
-        )
-        return choose_neighbours(keyframe.T_world_cam, sought.median, posed)
+    def _posed(
+        self, keyframe: Keyframe, frame_ids: Sequence[int], world: WorldMap
+    ) -> Iterator[tuple[View, Array]]:
+        """Yield views with their poses, of those keyframes that are in the same part as one."""
+        for k in frame_ids:
+            T_world_nbr = world.pose_of_frame(k)
+            if world.submap_of.get(k) == keyframe.submap and T_world_nbr is not None:
+                yield self._kept[k].to_compare(), T_world_nbr
 
     def _confirm(self, frame_id: int, world: WorldMap) -> None:
         """Make points of what other keyframes see too, and those before have not added yet."""
@@ -256,23 +249,14 @@ class DenseBuilder:
         if keyframe is None or view is None or world.pose_of_frame(frame_id) is None:
             return
         found = self._maps[frame_id]
-        before = sorted(k for k in self._maps if k < frame_id)[-NUM_CONFIRMING:]
-        after = sorted(k for k in self._maps if k > frame_id)[:NUM_CONFIRMING]
-        others = self._seen_from(keyframe, [self._maps[k] for k in (*before, *after)], world)
-        confirmed = replace(
-            found,
-            inverse_depth=confirmed_depth(
-                found.inverse_depth, found.step, view.K, others, num_to_confirm(len(others))
-            ),
-        )
-        sure = np.isfinite(confirmed.inverse_depth)
-        points = back_project(confirmed.inverse_depth, view.K)[sure]
+        others = [self._maps[k] for k in confirming(self._maps, frame_id)]
+        confirmed = confirmed_by(found, view.K, self._seen_from(keyframe, others, world))
         covering = self._seen_from(keyframe, list(self._confirmed.values()), world)
-        new = not_yet_seen(points, found.step, covering)
+        points, pixels = added_points(confirmed, view.K, covering)
         self._confirmed[frame_id] = confirmed
         for old in sorted(self._confirmed)[:-NUM_COVERING]:
             del self._confirmed[old]
-        patch = DensePatch(frame_id, points[new], view.rgb[sure][new], view.confidence[sure][new])
+        patch = DensePatch(frame_id, points, view.rgb[pixels], view.confidence[pixels])
         if len(patch.xyz):
             self._cloud.add(patch, *landmark_depths(world, keyframe))
 

@@ -1,12 +1,13 @@
 """Which depths other keyframes confirm, and which of their points are the same."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.server.dense.depth_map import DepthImage
+from semcast.server.dense.depth_map import DepthImage, DepthMap
+from semcast.server.dense.neighbours import num_to_confirm
 
 Array = NDArray[np.float64]
 
@@ -73,6 +74,32 @@ def confirmed_depth(
         count >= num_needed, inverse_depth[known] * (1.0 + total / weight), np.float32(np.nan)
     )
     return confirmed
+
+
+def confirmed_by(found: DepthMap, K: Array, others: Sequence[OtherDepth]) -> DepthMap:
+    """Keep of a depth map what enough of the others see too, see ``confirmed_depth``."""
+    needed = num_to_confirm(len(others))
+    return replace(found, inverse_depth=confirmed_depth(found.inverse_depth, found.step, K, others, needed))
+
+
+def added_points(
+    confirmed: DepthMap, K: Array, covering: Sequence[OtherDepth]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return what a keyframe adds to the cloud of those before it.
+
+    Args:
+        confirmed: Its depth.
+        K: ``(3, 3)`` of its pixels.
+        covering: Confirmed depth of keyframes before.
+
+    Returns:
+        Points ``(N, 3)`` in the camera frame, and their pixels ``(H, W)`` bool, row by row.
+    """
+    pixels = np.isfinite(confirmed.inverse_depth)
+    points = back_project(confirmed.inverse_depth, K)[pixels]
+    new = not_yet_seen(points, confirmed.step, covering)
+    pixels[pixels] = new
+    return points[new], pixels
 
 
 def not_yet_seen(

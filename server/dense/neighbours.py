@@ -1,12 +1,13 @@
 """Which views tell the depth of a keyframe, between which depths it is sought, and how many confirm it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, rotation_angle_deg
+from semcast.server.dense.depth_map import DepthProblem
 from semcast.server.dense.plane_sweep import Neighbour
 from semcast.server.dense.view import View
 
@@ -72,6 +73,29 @@ def choose_neighbours(
         if len(found) == NUM_NEIGHBOURS:
             break
     return found
+
+
+def depth_problem(
+    reference: View, T_world_ref: Array, sought: DepthRange, sides: Sequence[Iterable[tuple[View, Array]]]
+) -> DepthProblem | None:
+    """Ask for the depth of a keyframe; None where no view tells it.
+
+    Args:
+        reference: The keyframe's view.
+        T_world_ref: ``(4, 4)`` its pose.
+        sought: Between which depths.
+        sides: Views before it and after it, each as ``choose_neighbours`` takes them.
+    """
+    groups = [choose_neighbours(T_world_ref, sought.median, side) for side in sides]
+    groups = [group for group in groups if group]
+    return DepthProblem(reference, groups, sought.nearest, sought.farthest) if groups else None
+
+
+def confirming(frame_ids: Iterable[int], frame_id: int) -> list[int]:
+    """Of some keyframes those whose depth may confirm another's: the next ones before and after it."""
+    order = sorted(frame_ids)
+    before, after = [k for k in order if k < frame_id], [k for k in order if k > frame_id]
+    return before[-NUM_CONFIRMING:] + after[:NUM_CONFIRMING]
 
 
 def num_to_confirm(num_others: int) -> int:

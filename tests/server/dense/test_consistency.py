@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from semcast.common.geometry import exp_so3, make_transform
-from semcast.server.dense.consistency import OtherDepth, back_project, confirmed_depth, not_yet_seen
+from semcast.server.dense.consistency import (
+    OtherDepth,
+    added_points,
+    back_project,
+    confirmed_by,
+    confirmed_depth,
+    not_yet_seen,
+)
+from semcast.server.dense.depth_map import DepthMap
 
 STEP = 0.002
 
@@ -88,3 +96,23 @@ def test_what_another_keyframe_saw_is_not_new(row) -> None:
     assert not new[40:80, 60:100].any()
     assert new[:, :9].all()
     assert not_yet_seen(points.reshape(-1, 3), STEP, []).all()
+
+
+def test_of_three_others_two_have_to_confirm_a_map(row) -> None:
+    found = DepthMap(7, (1 / row.depths[0]).astype(np.float32), STEP)
+    away = make_transform(np.eye(3), (0.0, 0.0, -90.0))  # sees nothing of it where it is
+    one_of_three = [other(row, 1), other(row, 1, away), other(row, 1, away)]
+    assert np.isnan(confirmed_by(found, row.views[0].K, one_of_three).inverse_depth).all()
+    one_of_two = confirmed_by(found, row.views[0].K, one_of_three[:2])
+    assert (one_of_two.frame_id, one_of_two.step) == (7, STEP)
+    np.testing.assert_array_equal(one_of_two.inverse_depth, confirmed(row, one_of_three[:1]))
+
+
+def test_what_is_added_to_the_cloud_is_sure_and_new(row) -> None:
+    inverse = (1 / row.depths[0]).astype(np.float32)
+    inverse[:60] = np.nan
+    points, pixels = added_points(DepthMap(7, inverse, STEP), row.views[0].K, [other(row, 1)])
+    assert not pixels[:60].any()
+    assert not pixels[65:75, 65:95].any(), "the other one has the plate"
+    assert pixels[60:, :9].all(), "and not what is out of its sight"
+    np.testing.assert_array_equal(points, back_project(inverse, row.views[0].K)[pixels])
