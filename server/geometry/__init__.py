@@ -11,6 +11,7 @@ Points in images
     warped_points    KLT in windows that are turned, scaled or sheared
     patch_alignment  patches of two images, aligned to a fraction of a pixel
     wide_search      matches by SIFT, however far points moved
+    sampling         values of an image between its pixels
     brightness       change of exposure between two images
     cells            cells of an image by one number each
     square_distance  squared distances, all with all

@@ -6,7 +6,6 @@ searched for, so that the template's derivatives are computed once. All patches 
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +13,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.codec import KLT_WINDOW_PX
 from semcast.server.geometry.features import Grey
 from semcast.server.geometry.projection import MIN_DEPTH_MAP
+from semcast.server.geometry.sampling import bilinear
 
 Array = NDArray[np.float64]
 Values = NDArray[np.float32]
@@ -30,8 +30,6 @@ _MIN_CORRELATION = 0.7
 _STRIDE_PX = 2
 #: Range of the contrast of one patch against the other.
 _GAIN_RANGE = (0.5, 2.0)
-#: OpenCV takes no picture of more than 32 766 rows, and here a patch is a row.
-_MAX_ROWS = 16_384
 #: Patches that move less in a step are there.
 _SMALL_STEP_PX = 0.03
 #: A structure tensor whose determinant is smaller than this share of its squared trace is an edge.
@@ -75,10 +73,10 @@ class Templates:
         dy, dx = (d.ravel() for d in np.meshgrid(offset, offset, indexing="ij"))
         x, y = (centres_xy[:, k : k + 1].astype(np.float32) for k in range(2))
         grey = image.astype(np.float32)
-        east, west = _sample(grey, x + dx + 1, y + dy), _sample(grey, x + dx - 1, y + dy)
-        south, north = _sample(grey, x + dx, y + dy + 1), _sample(grey, x + dx, y + dy - 1)
+        east, west = bilinear(grey, x + dx + 1, y + dy), bilinear(grey, x + dx - 1, y + dy)
+        south, north = bilinear(grey, x + dx, y + dy + 1), bilinear(grey, x + dx, y + dy - 1)
         return Templates(
-            values=_centred(_sample(grey, x + dx, y + dy)),
+            values=_centred(bilinear(grey, x + dx, y + dy)),
             slope_x=_centred(0.5 * (east - west)),
             slope_y=_centred(0.5 * (south - north)),
             dx=dx,
@@ -189,7 +187,7 @@ def align_patches(
         if len(moving) == 0:
             break
         x, y = (xy[moving, k : k + 1].astype(np.float32) for k in range(2))
-        seen = _centred(_sample(grey, x + across_x[moving], y + across_y[moving]))
+        seen = _centred(bilinear(grey, x + across_x[moving], y + across_y[moving]))
         template = templates.values[moving]
         seen_energy, both = _products(seen, seen), _products(seen, template)
         correlation[moving] = both / np.sqrt(np.maximum(energy[moving] * seen_energy, 1e-9))
@@ -204,17 +202,6 @@ def align_patches(
         moving = moving[np.abs(step).max(axis=1) >= _SMALL_STEP_PX]
     sound = usable & np.isfinite(xy).all(axis=1)
     return AlignedPatches(np.where(sound[:, None], xy, start_xy), np.where(sound, correlation, -1.0))
-
-
-def _sample(grey: Values, x: Values, y: Values) -> Values:
-    """Bilinear values at ``(N, M)`` pixels; the border goes on outside."""
-    if x.size == 0:
-        return np.zeros(x.shape, np.float32)
-    parts = [
-        cv2.remap(grey, x[k:end], y[k:end], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for k, end in ((k, k + _MAX_ROWS) for k in range(0, len(x), _MAX_ROWS))
-    ]
-    return np.asarray(parts[0] if len(parts) == 1 else np.concatenate(parts), dtype=np.float32)
 
 
 def _centred(values: Values) -> Values:

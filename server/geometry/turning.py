@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3
 from semcast.server.geometry.features import Grey
+from semcast.server.geometry.sampling import bilinear
 
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
@@ -128,8 +129,7 @@ def _slope(image: Small, dx: int) -> Small:
 
 def _sampled(image: Small, xy: Array) -> Array:
     at = xy.astype(np.float32)
-    found = cv2.remap(image, at[:, :1], at[:, 1:], cv2.INTER_LINEAR)
-    return np.asarray(found, dtype=np.float64).ravel()
+    return np.asarray(bilinear(image, at[:, :1], at[:, 1:]), dtype=np.float64).ravel()
 
 
 def _correlation(a: Array, b: Array) -> float:

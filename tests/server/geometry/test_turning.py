@@ -49,6 +49,15 @@ def test_a_strip_whose_height_is_rounded_tells_as_much():
     assert up_deg == pytest.approx(2.0, abs=0.06)
 
 
+def test_an_image_of_any_shape_tells():
+    columns = slice(140, 180)  # a width of 80 makes it 480 pixels high
+    upright = Intrinsics(fx=260, fy=260, cx=159.5 - columns.start, cy=119.5, width=40, height=240)
+    R = exp_so3(np.radians((2, 0, 0)))
+    before, now = (np.rint(wall(turn, STAYED)[:, columns]).astype(np.uint8) for turn in (np.eye(3), R))
+    up_deg = np.degrees(log_so3(turn_between(upright, before, now, STAYED)))[0]
+    assert up_deg == pytest.approx(2.0, abs=0.06)
+
+
 def test_brightness_may_change():
     R = exp_so3((0, 0.08, 0))
     before, now = noisy(wall(np.eye(3), STAYED), 1), noisy(wall(R, STAYED) + 15.0, 2)
