@@ -25,15 +25,18 @@ _NUM_FEATURES = 2000
 _MIN_CONTRAST = 0.015
 #: By this ratio of distances a nearest descriptor is clearly the nearest (Lowe 2004).
 _MAX_RATIO = 0.8
+#: Distance from its epipolar line up to which a match agrees.
 _EPIPOLAR_PX = 3.0
+#: Matches next to one, like whose median it must move,
 _NEIGHBOURS = 7
+#: but for this many pixels and for this share of that motion: depth may differ much.
+_FREE_FLOW_PX, _FREE_FLOW_SHARE = 15.0, 0.5
 #: Matches next to a point that the warp around it is fitted to.
 _FITTED = 6
 #: Those within this distance count alike.
 _ALIKE_PX = 30.0
 #: Share of their spread that holds the warp near the turns of the features: they may lie on a line.
 _HELD_SHARE = 0.2
-_FREE_FLOW_PX = 15.0
 #: Matches that agree, at least; fewer prove nothing.
 _MIN_AGREEING = 15
 #: Nor does a share of all matches below this.
@@ -265,5 +268,5 @@ def _moves_like_its_neighbours(xy: Array, flow: Array, trusted: NDArray[np.bool_
     square = square_distances(xy, xy[trusted])
     nearest = np.argsort(square, axis=1, kind="stable")[:, :_NEIGHBOURS]
     around = np.median(flow[trusted][nearest], axis=1)
-    allowed_px = _FREE_FLOW_PX + 0.5 * np.linalg.norm(around, axis=1)
+    allowed_px = _FREE_FLOW_PX + _FREE_FLOW_SHARE * np.linalg.norm(around, axis=1)
     return np.asarray(np.linalg.norm(flow - around, axis=1) < allowed_px)

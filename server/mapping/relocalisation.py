@@ -48,8 +48,11 @@ _MAX_MIN_INLIERS = 45
 _NEIGHBOURS = 5
 #: Hypotheses of a search by the landmarks of one keyframe, at most: most keyframes are not the place.
 SEARCH_ITERATIONS = 400
+#: How far from where the first pose has a landmark its corner is looked for,
 _GUIDED_RADIUS_PX = 14.0
+#: by how many bits descriptors may differ there: more than where the whole image is a rival,
 _GUIDED_MAX_BITS = 70
+#: and share of those found that must agree with the refined pose.
 _MIN_GUIDED_SHARE = 0.35
 #: A wrong one of a row of equal houses has none of what stands around it. Found landmarks must be distributed
 #: over the image like those that should be in view: this is the Bhattacharyya coefficient they need. In 650
@@ -59,6 +62,8 @@ _LEAST_ALIKE = 0.73
 _FIELDS_XY = (12, 5)
 #: Of one frame's points in two submaps, those nearer than this in the image are the same.
 _SAME_PX = 3.0
+#: Corners of the query at most, and side of the cells over which they are spread.
+_NUM_CORNERS, _CELL_PX = 800, 40
 #: Octaves of the query, so that a view from nearer or further still matches.
 _OCTAVES = (0, 2, 4)
 #: Binary descriptors do not know the noise model: a match is good to about this.
@@ -159,7 +164,8 @@ class Relocaliser:
         """
         if not candidates and not tried_anyway:
             return None
-        corners = detect_corners(sight.grey, 800, None, sight.usable_pixels, cell_px=40).astype(np.float64)
+        seen = detect_corners(sight.grey, _NUM_CORNERS, usable=sight.usable_pixels, cell_px=_CELL_PX)
+        corners = seen.astype(np.float64)
         rows, descriptors = self._describer.describe(sight.grey, corners, _OCTAVES)
         if len(rows) < _MIN_FIRST:
             return None
