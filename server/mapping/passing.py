@@ -83,6 +83,13 @@ class Passing:
         """Whether what moves in the newest image passes before a scene at rest."""
         return self._now.until_ns is not None
 
+    def renew(self, before: Ids, after: Ids) -> None:
+        """Know tracks by the ids ``after`` that they have now instead of ``before``, both ascending."""
+        ids = self._now.ids.copy()
+        alive = np.isin(ids, before)
+        ids[alive] = after[np.searchsorted(before, ids[alive])]
+        self._now = replace(self._now, ids=ids)
+
     def scene_motion_px(
         self, sight: Sight, ids: Ids, xy: Array, motion_px: Array, sd_px: Array, fixed: NDArray[np.bool_]
     ) -> float:

@@ -181,6 +181,7 @@ class TrackTable:
         after = self._next_id + np.arange(len(before), dtype=np.int64)
         self.ids = after[np.searchsorted(before, self.ids)]
         self._next_id += len(before)
+        self.passing.renew(before, after)
         self._before = None
         return before, after
 

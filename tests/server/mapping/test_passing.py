@@ -77,6 +77,15 @@ def test_a_camera_sets_off_when_what_stood_moves():
     assert not passing.camera_stands
 
 
+def test_what_stood_is_known_by_the_ids_that_tracks_are_given_for_another_part_of_the_map():
+    passing, ids = Passing(NUM), IDS + 5000
+    cross(passing, 8)
+    passing.renew(IDS[:0], IDS[:0])  # where no track is left, what stood is still remembered
+    passing.renew(IDS, ids)
+    assert tell(passing, 8, np.full(len(PLACES), 9.0), xy=PLACES + 9.0, ids=ids) == 9.0
+    assert not passing.camera_stands
+
+
 def test_what_hides_everything_passes_for_two_seconds():
     passing = Passing(NUM)
     cross(passing, 8)

@@ -160,6 +160,15 @@ def test_ids_kept_elsewhere_become_new_with_those_of_tracks():
     assert tracks.next_id > after.max()
 
 
+def test_what_stands_in_the_image_goes_on_to_be_known_when_ids_are_renewed():
+    tracks = begin()
+    tracks.follow(sight_at(20), tracks.xy)
+    tracks.renew(np.array([1, 5000]))
+    stands = tracks.passing._now.ids
+    assert len(stands) > 50
+    assert np.isin(stands, tracks.ids).mean() > 0.9
+
+
 def test_ids_stay_small_however_often_landmarks_of_long_ago_are_among_the_tracks():
     tracks = TrackTable("robust", 150, 0)
     tracks.next_id = 5000
