@@ -79,13 +79,9 @@ class NoiseModel:
     huber_px: float | None = None
 
     def sigma_px(self, confidence: NDArray) -> Array:
-        """Standard deviation per coordinate, ``(N,)`` for ``(N,)`` confidences."""
+        """Standard deviation per coordinate, ``(N,)`` for ``(N,)`` confidences; weights are ``sigma^-2``."""
         c = np.asarray(confidence, dtype=np.float64)
         return np.asarray(self.sigma0_px * np.exp(0.5 * self.beta * (1.0 - c)))
-
-    def weight(self, confidence: NDArray) -> Array:
-        """``w = sigma^-2`` (Eq. 23), per square pixel."""
-        return self.sigma_px(confidence) ** -2
 
     def threshold_px(self, confidence: NDArray) -> Array:
         """Gate on a residual's length in 2D: 3 sigma, at most three times that of a fully trusted point.

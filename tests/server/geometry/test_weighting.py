@@ -44,12 +44,12 @@ def test_adaptive_threshold_grows_as_confidence_falls():
     assert np.allclose(delta, [2.0 / np.sqrt(1.0025), 2.0 / np.sqrt(0.2525), 2.0 / 0.05])
 
 
-def test_variance_and_weight_by_hand():
+def test_the_sigma_of_a_confidence_by_hand():
     model = NoiseModel(sigma0_px=2.0, beta=3.0)
     # c = 1: sigma^2 = 4; c = 0: sigma^2 = 4 e^3
     assert np.allclose(model.sigma_px(np.array([1.0, 0.0])) ** 2, [4.0, 4.0 * np.e**3])
-    assert np.allclose(model.weight(np.array([1.0, 1 / 3])), [0.25, 0.25 * np.exp(-2.0)])
-    assert np.all(np.diff(model.weight(np.linspace(0, 1, 11))) > 0)
+    assert np.allclose(model.sigma_px(np.array([1.0, 1 / 3])), [2.0, 2.0 * np.e])
+    assert np.all(np.diff(model.sigma_px(np.linspace(0, 1, 11))) < 0)
 
 
 def test_threshold_is_clamped_at_three_times_that_of_a_trusted_point():
