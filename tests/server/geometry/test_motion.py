@@ -56,6 +56,13 @@ def test_a_gap_is_bridged_by_what_came_before_and_after(rate_deg_per_s):
         assert rotation_angle_deg(guess[:3, :3].T @ after[:3, :3]) > 10.0, "going on as before does not"
 
 
+def test_turning_does_not_bend_the_way_in_the_frame_of_the_camera():
+    motion = ConstantVelocity()
+    for k in range(15):
+        motion.observe(k * FRAME_NS, arc(lambda t: 40.0, 0.1 * k))
+    np.testing.assert_allclose(motion.way_in(0.5), (0.0, 0.0, 5.0), atol=0.01)
+
+
 def test_a_speed_is_that_of_a_second_not_of_one_noisy_step():
     motion = ConstantVelocity()
     for k in range(30):

@@ -58,6 +58,23 @@ def test_outliers_do_not_move_the_pose():
     assert not found.inliers[:45].any()
 
 
+@pytest.mark.parametrize("sigma", [0.3, 4.0])
+def test_the_pose_is_where_hubers_loss_is_least(sigma):
+    T, points, xy = make_view(3, sigma=sigma)
+    xy[::5] += 2.5 * sigma  # all to one side, and near enough to count
+    found = refine(T, points, xy, sigma, iterations=40).T_cam_world
+
+    def loss(twist):
+        size = np.linalg.norm(CAMERA.project(transform_points(exp_se3(twist) @ found, points)) - xy, axis=1)
+        a = size / sigma
+        return np.where(a < 1.345, 0.5 * a * a, 1.345 * (a - 0.5 * 1.345)).sum()
+
+    for step in 1e-4 * np.eye(6):
+        slope = (loss(step) - loss(-step)) / 2e-4
+        bend = (loss(step) - 2.0 * loss(np.zeros(6)) + loss(-step)) / 1e-8
+        assert abs(slope) < 1e-6 * bend, "a step would be shorter than a millionth"
+
+
 def test_covariance_of_proposition_1_is_the_inverse_of_the_information():
     T, points, exact = make_view(2, num=20)
     sigma = np.linspace(0.2, 1.5, 20)

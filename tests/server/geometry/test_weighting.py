@@ -148,6 +148,16 @@ def test_what_each_mode_fits(mode, moves_sigma, moves_beta):
     assert again.model == noise.model
 
 
+def test_a_fit_moves_the_model_half_of_the_way():
+    rng = np.random.default_rng(3)
+    c = rng.uniform(0, 1, 3000)
+    residual = rng.standard_normal(3000) * NoiseModel(1.5, 4.0).sigma_px(c)
+    fitted, noise = fit_noise(c, residual), OnlineNoise("robust", 0.5, 2.0, True)
+    noise.add(c, residual)
+    assert noise.model.beta == pytest.approx(0.5 * fitted.beta), "it starts at 0"
+    assert noise.model.sigma0_px == pytest.approx(np.sqrt(0.5 * fitted.sigma0_px))
+
+
 def test_what_is_not_fitted_is_as_set_after_a_restart_too():
     state = OnlineNoise("robust", 0.3, 7.0, False).state()
     for mode, fit in (("paper", True), ("robust", False)):

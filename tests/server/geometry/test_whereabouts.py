@@ -41,6 +41,17 @@ def test_a_camera_that_swayed_may_be_where_swaying_leads():
     assert there.radius > 1.0
 
 
+def test_a_way_bends_as_the_camera_turned_by_hand():
+    there = Whereabouts(np.eye(4), np.array([0.0, 0.0, 1.0]), 0.1)
+    turned = make_transform(exp_so3((0.0, np.pi / 2, 0.0)), (9.0, 9.0, 9.0))
+    # A quarter of a circle as long as 1 has a radius of 2 / pi.
+    led = there.turned_alike(turned)
+    np.testing.assert_allclose(led, make_transform(turned[:3, :3], (2 / np.pi, 0.0, 2 / np.pi)), atol=1e-9)
+    assert there.astray(led) == pytest.approx(0.0, abs=1e-9)
+    straight_on = make_transform(turned[:3, :3], (0.0, 0.3, 1.0))
+    assert there.astray(straight_on) == pytest.approx(0.3), "or only the camera turned"
+
+
 def test_one_that_stood_may_set_off():
     motion, last_ns = went(np.zeros(30))
     there = motion.whereabouts(last_ns + 1_000_000_000, depth=4.0)

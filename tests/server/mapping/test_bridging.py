@@ -77,6 +77,13 @@ def test_half_of_a_bend_was_driven_out_of_sight():
     np.testing.assert_allclose(np.linalg.norm(T[:3, 3] - (0, 0, 0.4)), 2.0, atol=0.03)
 
 
+def test_images_of_the_gap_tell_the_turn_up_to_where_the_submap_begins():
+    start = start_at(12)
+    turned = [(k * FRAME_NS, exp_so3((0, np.radians(4.0 * (k - 2)), 0))) for k in range(2, 15)]
+    T, _ = bridge(moved(), start, start, 2 * FRAME_NS, 4.0, turned)
+    assert np.degrees(np.arctan2(T[0, 2], T[2, 2])) == pytest.approx(40.0, abs=1e-6)
+
+
 def test_what_is_seen_of_the_time_before_the_start_is_where_it_begins():
     start, grown = start_at(14), start_at(12, num=5)
     T, scale = bridge(moved(), start, grown, 2 * FRAME_NS, 4.0)

@@ -71,6 +71,16 @@ def test_a_camera_that_only_turns_needs_no_depth():
     np.testing.assert_allclose(rays.sigma_px, 0.5)
 
 
+def test_a_track_is_known_from_the_newest_keyframe_that_saw_it():
+    world, xyz = scene(20, noise_px=0.0)
+    some = np.arange(100)
+    seen = project(xyz[some], MOVED)
+    world.add_keyframe(Keyframe(1, 1, MOVED, 0, some, seen, np.full(100, 0.5)))
+    rays = rays_of(CAMERA, world, NoiseModel(0.5, 2.0), np.arange(20, NUM), np.eye(4), submap=0)
+    assert rays.row.tolist() == list(range(NUM - 20))
+    np.testing.assert_allclose(rays.sigma_px, np.where(rays.row < 80, 0.5 * np.exp(0.5), 0.5))
+
+
 def test_what_is_not_known_of_the_depth_lies_along_the_spread():
     world, xyz = scene(20, noise_px=0.0)
     rays = rays_of(CAMERA, world, NOISE, np.arange(20, NUM), MOVED, submap=0)

@@ -11,7 +11,7 @@ from semcast.server.geometry.features import to_grey
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction, ReconstructionSettings
 from semcast.server.mapping.sight import Sight
-from semcast.server.mapping.standing import is_fixed, may_be_fixed, scene_motion_px, stood
+from semcast.server.mapping.standing import is_fixed, least_motion_px, may_be_fixed, scene_motion_px, stood
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable
 
@@ -75,6 +75,21 @@ def test_on_a_turntable_the_scene_is_what_moves():
     assert scene_motion_px(xy, np.where(motion == 3.0, 3.0, 0.9), 640, 5 * noise) == 3.0, "the rest is noise"
     slipped = np.where(np.arange(len(xy)) < 5, 3.0, 0.2)
     assert scene_motion_px(xy, slipped, 640, noise) == 0.0
+
+
+def test_the_motion_of_a_cell_is_the_median_of_its_tracks():
+    xy = np.full((5, 2), 30.0)
+    assert scene_motion_px(xy, np.array([9.0, 1.0, 4.0, 3.0, 2.0]), 640) == 3.0
+    assert scene_motion_px(xy[:4], np.array([9.0, 1.0, 3.0, 2.0]), 640) == 2.0, "the lower one of both"
+
+
+def test_what_stands_may_move_by_a_share_of_the_width_and_by_its_noise():
+    assert least_motion_px(640, 0.0) == 1.0
+    assert least_motion_px(2000, 0.0) == pytest.approx(3.0)
+    np.testing.assert_allclose(least_motion_px(640, np.array([0.1, 1.0])), (1.0, 2.0 * np.sqrt(2.0)))
+    many, sd_px = np.full((20, 2), 30.0), np.ones(20)
+    assert scene_motion_px(many, np.full(20, 2.8), 640, sd_px) == 0.0, "on a turntable that is noise"
+    assert scene_motion_px(many, np.full(20, 2.9), 640, sd_px) == 2.9
 
 
 def test_a_track_that_moves_begins_anew():
