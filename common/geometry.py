@@ -77,6 +77,19 @@ def log_so3(R: ArrayLike) -> Array:
     return np.asarray(scale * quat_wxyz[1:])
 
 
+def logs_so3(R: Array) -> Array:
+    """Rotation vectors ``(..., 3)`` (radians) of many rotations ``(..., 3, 3)``, in a small part of the time.
+
+    Of half a turn itself nothing is told; ``log_so3`` takes one at a time and tells that too.
+    """
+    sine = 0.5 * np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
+    )
+    size = np.linalg.norm(sine, axis=-1, keepdims=True)
+    angle_rad = np.arctan2(size, 0.5 * (np.trace(R, axis1=-2, axis2=-1)[..., None] - 1.0))
+    return np.asarray(sine * angle_rad / np.maximum(size, 1e-12))
+
+
 def exp_se3(xi: ArrayLike) -> Array:
     """Rigid transforms ``(..., 4, 4)`` of twists ``(..., 6)``, by the closed form.
 

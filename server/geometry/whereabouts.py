@@ -10,7 +10,7 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.geometry import exp_se3
+from semcast.common.geometry import exp_se3, logs_so3
 
 Array = NDArray[np.float64]
 #: Seconds, ``T_before_now (4, 4)`` and the way ``(3,)`` in the camera's own frame, which turning does not
@@ -104,13 +104,7 @@ def _led(T_world_before: Array, T_world_after: Array, way: Array) -> Array:
         ``(2, ..., 3)``: by a way that bends as the camera turned, evenly, and straight on by that of a camera
         that turned and its way did not.
     """
-    R = np.swapaxes(T_world_before[..., :3, :3], -1, -2) @ T_world_after[..., :3, :3]
-    sine = 0.5 * np.stack(
-        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
-    )
-    size = np.linalg.norm(sine, axis=-1, keepdims=True)
-    angle_rad = np.arctan2(size, 0.5 * (np.trace(R, axis1=-2, axis2=-1)[..., None] - 1.0))
-    turn = sine * angle_rad / np.maximum(size, 1e-12)
+    turn = logs_so3(np.swapaxes(T_world_before[..., :3, :3], -1, -2) @ T_world_after[..., :3, :3])
     turns = np.stack([turn, np.zeros_like(turn)])
     twists = np.concatenate([turns, np.broadcast_to(way, turns.shape)], axis=-1)
     return np.asarray((T_world_before @ exp_se3(twists))[..., :3, 3])

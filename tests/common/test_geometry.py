@@ -27,6 +27,15 @@ def test_log_inverts_exp_below_half_a_turn(w):
     np.testing.assert_allclose(g.log_so3(g.exp_so3(w)), w, atol=1e-6)
 
 
+def test_logs_of_many_are_those_of_each(rng):
+    w = rng.normal(size=(40, 3))
+    angle_rad = np.append(0.0, np.geomspace(1e-9, 3.13, 39))
+    w *= (angle_rad / np.linalg.norm(w, axis=1))[:, None]
+    found = g.logs_so3(g.exp_so3(w).reshape(5, 8, 3, 3))
+    np.testing.assert_allclose(found.reshape(40, 3), w, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(found[3, 4], g.log_so3(g.exp_so3(w[28])), atol=1e-12)
+
+
 @given(vectors)
 def test_quaternions_round_trip(w):
     R = g.exp_so3(w)
