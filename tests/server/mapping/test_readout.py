@@ -9,7 +9,7 @@ from shaken_views import CAMERA, NUM_VIEWS, SIZE_WH, adjusted, pose_at, rolling_
 from semcast.common.geometry import exp_se3, invert_transform, transform_points
 from semcast.server.mapping.bundle_problem import ViewMotion
 from semcast.server.mapping.readout import Readout, body_velocity, fit_readout, lean
-from semcast.server.mapping.residual_patterns import pattern_products_of
+from semcast.server.mapping.residual_patterns import RESIDUAL, ROWS, pattern_products_of
 
 
 @pytest.mark.parametrize("readout_from", ["top", "bottom", "left", "right"])
@@ -120,3 +120,19 @@ def test_a_readout_has_a_side_and_goes_with_a_camera():
     assert readout.with_more(Readout("columns", 2.5)) == Readout("columns", -10.0)
     assert Readout("rows", 0.0).with_more(readout) == readout
     assert Readout("rows", 250.0).put_on(CAMERA).readout_ms == 100.0
+
+
+def test_by_hand_the_readout_is_the_slope_and_its_spread_that_of_what_is_left():
+    # A readout of a second would move the points of a view by 10 in all; they are off by .02 of that.
+    def view(slope):
+        told = np.zeros((9, 9))
+        told[RESIDUAL, RESIDUAL], told[ROWS, ROWS] = 4.0, 100.0
+        told[RESIDUAL, ROWS] = told[ROWS, RESIDUAL] = 100.0 * slope
+        return told
+
+    fit = fit_readout([view(0.01), view(0.02), view(0.03)])
+    assert (fit.readout.axis, fit.readout.signed_ms) == ("rows", pytest.approx(20.0))
+    assert fit.explained == pytest.approx(0.02**2 * 100.0 / 4.0)
+    # Leaving one of 10, 20, 30 out leaves means of 25, 20, 15: the jackknife has the error of the mean.
+    assert fit.sigma_ms == pytest.approx(10.0 / np.sqrt(3))
+    assert fit.unit_ms == pytest.approx(1e3 * np.sqrt(4.0 / 100.0)), "as much more of the squares as there is"

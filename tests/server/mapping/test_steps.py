@@ -42,6 +42,16 @@ def test_how_well_a_step_is_known_by_hand(num_shared, num_steps, gaps, sigma, is
     assert step.constraint.sigma == pytest.approx(sigma)
 
 
+def test_drift_grows_with_the_keyframes_that_were_thinned_out_of_each_step():
+    world = WorldMap()
+    for frame_id in (0, 4, 13, 14):
+        world.add_keyframe(make_keyframe(frame_id, np.eye(4), np.arange(10)))
+    world.submap_of |= dict.fromkeys(range(15), 0)
+    steps = list(steps_of(world, world.keyframes))
+    assert [step.constraint.sigma[2] for step in steps] == pytest.approx([0.01 * 2, 0.01 * 3, 0.01])
+    assert [step.is_thinned for step in steps] == [True, True, False]
+
+
 @pytest.mark.parametrize("behind", [1, 17, 33])
 def test_a_gap_stays_one_when_the_keyframes_on_both_sides_are_thinned_out(behind):
     world = WorldMap()
