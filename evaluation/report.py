@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from semcast.agent.video import public_name
 from semcast.common.codec import Codec
 from semcast.common.config_flags import flag_words
 from semcast.common.cores import usable_cores
@@ -90,10 +91,21 @@ def command_line(verb: str, settings: Any) -> str:
 
     Args:
         verb: Such as ``eval trajectory``.
-        settings: A settings dataclass; ``Path`` values are shown as in ``json_ready``.
+        settings: A settings dataclass; paths and addresses are shown as ``provenance`` shows them.
     """
-    words = flag_words(settings, written=lambda value: str(json_ready(value)))
+    words = flag_words(settings, written=lambda value: str(_public(json_ready(value))))
     return shlex.join(["semcast", *verb.split(), *words])
+
+
+def _public(value: Any) -> Any:
+    """Return a setting of plain values in which no text is an absolute path or has an address's password."""
+    if isinstance(value, dict):
+        return {name: _public(entry) for name, entry in value.items()}
+    if isinstance(value, list):
+        return [_public(entry) for entry in value]
+    if not isinstance(value, str):
+        return value
+    return json_ready(Path(value)) if Path(value).is_absolute() else public_name(value)
 
 
 def naming(settings: Settings, used: Codec | Sequence[Codec] | None) -> Settings:
@@ -126,10 +138,14 @@ def short_names(names: Sequence[str]) -> list[str]:
 
 
 def provenance(verb: str, settings: Any) -> dict[str, Any]:
-    """Return what a reader needs to repeat and place a result."""
+    """Return what a reader needs to repeat and place a result.
+
+    Absolute paths are cut to their last part, also those that a setting has as text (a file of weights, a
+    video), and addresses of network cameras are without their password.
+    """
     return {
         "command": command_line(verb, settings),
-        "settings": json_ready(settings),
+        "settings": _public(json_ready(settings)),
         "commit": source_commit(),
         "machine": machine_kind(),
         "platform": sys.platform,

@@ -10,6 +10,7 @@ import pytest
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.source_commit import source_commit
 from semcast.evaluation.codec import CodecSettings
+from semcast.evaluation.moving_images import ImagesSettings
 from semcast.evaluation.report import (
     check_outputs,
     command_line,
@@ -104,6 +105,17 @@ def test_the_command_names_only_what_differs_from_the_defaults():
     assert command_line("eval pairs", Settings(sequence=Path("a"))) == "semcast eval pairs --sequence a"
     nested = Settings(sequence=Path("a"), link=LinkSettings(loss=0.2))
     assert command_line("eval pairs", nested) == "semcast eval pairs --sequence a --loss 0.2"
+
+
+def test_a_result_tells_no_place_of_a_machine_and_no_password():
+    codec = CodecSettings(images=Path("/pictures/street"), codec=("vit", "/home/me/own.safetensors"))
+    note = provenance("eval codec", codec)
+    assert note["settings"]["codec"] == ["vit", "own.safetensors"]
+    assert note["command"].startswith("semcast eval codec --images street --codec vit own.safetensors")
+    lens = provenance("lens", ImagesSettings(source="rtsp://me:secret@10.0.0.7/stream"))
+    assert lens["command"] == "semcast lens rtsp://10.0.0.7/stream"
+    assert lens["settings"]["source"] == "rtsp://10.0.0.7/stream"
+    assert provenance("lens", ImagesSettings(source="/home/me/walk.mp4"))["settings"]["source"] == "walk.mp4"
 
 
 def test_provenance_names_kind_of_machine_commit_and_versions():
