@@ -100,6 +100,7 @@ class Arrivals:
         epoch: Of the newest agent, 0 before the first frame.
         arrived_seq: First frame that has not arrived.
         next_seq: Lossless: first frame the consumer is not done with.
+        taken_ns: When the newest frame that counts arrived, 0 before the first.
     """
 
     def __init__(
@@ -112,11 +113,11 @@ class Arrivals:
         self.epoch = 0
         self.arrived_seq = 0
         self.next_seq = 0
+        self.taken_ns = 0
         self._lossless = lossless
         self._drop = drop
         self._tell = tell
         self._last_ns = 0
-        self._taken_ns = 0
         self._num_taken = 0  # of this epoch and numbering
         self._is_announced = False
         self._odd_in_order, self._odd_seq = 0, 0
@@ -169,7 +170,7 @@ class Arrivals:
         self._odd_in_order = self._leaps_in_order = 0
         self.arrived_seq = frame.seq + 1
         self._frame_id = frame.frame_id
-        self._taken_ns = arrival_ns
+        self.taken_ns = arrival_ns
         self._num_taken += 1
         self._remember(frame.seq)
         self._age.arrived(frame.t_capture_ns, arrival_ns)
@@ -243,11 +244,11 @@ class Arrivals:
 
     def _farthest(self, arrival_ns: int) -> float:
         """Return how many frames an agent can have gone on since the newest that was taken."""
-        return _MAX_GAP + (arrival_ns - self._taken_ns) * 1e-9 * _MAX_RATE_HZ
+        return _MAX_GAP + (arrival_ns - self.taken_ns) * 1e-9 * _MAX_RATE_HZ
 
     def _is_believed(self, num_in_order: int, arrival_ns: int) -> bool:
         against_one = self._num_taken <= 1
-        return num_in_order >= _BELIEVED and (against_one or arrival_ns - self._taken_ns > SILENCE_NS)
+        return num_in_order >= _BELIEVED and (against_one or arrival_ns - self.taken_ns > SILENCE_NS)
 
     def _refuse(self, frame: SymbolFrame) -> None:
         if frame.seq > self.arrived_seq:

@@ -152,6 +152,12 @@ class Receiver:
         with self._lock:
             return self._arrivals.epoch
 
+    @property
+    def quiet_s(self) -> float:
+        """Time since the newest frame that counts arrived."""
+        with self._lock:
+            return (time.perf_counter_ns() - self._arrivals.taken_ns) * 1e-9
+
     def count_missing(self, agent_epoch: int, num_sent: int | None) -> None:
         """Count the frames behind the newest that never came, of so many that were sent; None: not known.
 
@@ -312,17 +318,22 @@ class Receiver:
 
     def is_too_old(self, message: SymbolFrame) -> bool:
         """Tell whether a frame is older than live frames may be, and count it as dropped if so."""
-        age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
+        return self._young_age_ms(message) is None
+
+    def _young_age_ms(self, message: SymbolFrame) -> float | None:
+        """Return the age of a frame; None for one that is older than live frames may be, which is dropped."""
+        with self._lock:
+            age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
         # The final one ends the stream.
-        too_old = self._mode == "live" and age_ms > self._max_age_ms and not message.final
-        if too_old:
+        if self._mode == "live" and age_ms > self._max_age_ms and not message.final:
             self._metrics.drop("too_old")
-        return too_old
+            return None
+        return age_ms
 
     def _prepare(self, message: SymbolFrame, arrival_ns: int) -> ReceivedFrame | None:
-        if self.is_too_old(message):
+        age_ms = self._young_age_ms(message)
+        if age_ms is None:
             return None
-        age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
         camera = self._camera_of(message.agent_epoch)
         if camera is None:
             self._complaints.tell("camera", "frames arrive, but the agent does not say what its camera is")

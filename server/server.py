@@ -170,7 +170,9 @@ class Server:
         if session is None or session.is_concluded:
             return False
         epoch, is_there = session.identity.agent_epoch, "agent" in self._receiver.roles_alive
-        if self._end_of.has_come(epoch, idle_s, agent_is_there=is_there, is_busy=self._ahead.is_busy):
+        # One that arrived just now may be on its way to the decoder, of which that does not know yet.
+        quiet_s = min(idle_s, self._receiver.quiet_s)
+        if self._end_of.has_come(epoch, quiet_s, agent_is_there=is_there, is_busy=self._ahead.is_busy):
             self._receiver.count_missing(epoch, self._end_of.num_sent(epoch))
             return True
         limit_s = self._settings.idle_timeout_s

@@ -59,7 +59,7 @@ class StreamEnd:
 
         Args:
             agent_epoch: Of the stream.
-            idle_s: Since its last frame.
+            idle_s: Since its last frame arrived, or came to the tracker if that was later.
             agent_is_there: An agent of this name is alive.
             is_busy: A frame is being decoded, or waits to be tracked.
         """
