@@ -143,7 +143,8 @@ def transceiver_loss(
     x_hat = x_hat.float()
     reconstruction, mse = reconstruction_loss(x_hat, x, settings.mse_knee)
     loss = settings.mse * reconstruction
-    power = 2.0 * symbols.square().mean(dim=(1, 2, 3))
+    num_values = symbols[0].numel() if sent is None else sent.values.sum(dim=(1, 2, 3))
+    power = 2.0 * symbols.square().sum(dim=(1, 2, 3)) / num_values
     logs = {
         "mse": mse.mean(),
         "power": (power * draw.is_qam).sum().detach() / draw.is_qam.sum().clamp_min(1.0),

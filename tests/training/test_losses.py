@@ -3,7 +3,8 @@ import math
 import pytest
 import torch
 
-from semcast.common.nets.transceiver import Sizes, build_3dcsc
+from semcast.common.nets.transceiver import Sizes, build_3dcsc, build_variable_3dcsc
+from semcast.training.allocations import AllocationDraw
 from semcast.training.channel import LinkDrawSettings, draw_links
 from semcast.training.descriptors import dense_descriptors, descriptor_loss
 from semcast.training.losses import (
@@ -116,6 +117,18 @@ def run_loss(settings, with_heads=True):
     loss, logs = transceiver_loss(model, x, draw, noise, settings, with_heads)
     loss.backward()
     return model, {**logs, "loss": loss.detach()}
+
+
+def test_the_log_has_the_power_of_what_is_sent():
+    generator = torch.Generator().manual_seed(0)
+    model = build_variable_3dcsc(TINY)
+    values = torch.tensor([[[[12, 94], [48, 24]]], [[[188, 94], [12, 282]]]])
+    sent = AllocationDraw(values, values.sum(dim=3, keepdim=True))
+    draw = draw_links(LinkDrawSettings(share_16qam=1.0), 2, 2, generator)
+    x = torch.rand(2, 3, 32, 32, generator=generator)
+    noise = torch.randn(2, 282, 2, 2, generator=generator)
+    _, logs = transceiver_loss(model, x, draw, noise, LossSettings(), False, sent)
+    assert logs["power"].item() == pytest.approx(1.0, abs=1e-3)
 
 
 def test_heads_never_change_the_image_path():
