@@ -206,11 +206,13 @@ class VideoSource(_Captured):
 
     @property
     def num_frames(self) -> int | None:
-        """Frames that will be sent, as far as the file says how many it has."""
-        if self._settings.repeat != "once" or self._stored_frames is None:
+        """Frames that will be sent, where the file says it or, repeated, as many as were asked for."""
+        most = self._settings.max_frames
+        if self._settings.repeat != "once":
+            return most
+        if self._stored_frames is None:
             return None
         count = -(-self._stored_frames // self._settings.stride)
-        most = self._settings.max_frames
         return count if most is None else min(count, most)
 
     @property
@@ -292,6 +294,7 @@ class LiveSource(_Captured):
     def __init__(self, settings: SourceSettings) -> None:
         super().__init__(settings, live=True, beside=None)
         assert self._capture is not None
+        self._first = None  # old by the time that frames are asked for
         self._fps = _stated_hz(self._capture, 30.0)
         self._trouble = ""  # why no image can be sent, as far as it was said
 

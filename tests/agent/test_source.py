@@ -274,7 +274,8 @@ def test_a_video_of_varying_rate_keeps_its_times_over_all_passes(video, uneven_v
     np.testing.assert_allclose(times_ms[:9], [40 * k for k in (0, 1, 2, 3, 6, 9, 12, 15, 18)], atol=1.0)
     np.testing.assert_allclose(np.diff(times_ms[9:]), np.diff(times_ms[:9]), atol=1e-3)
     assert times_ms[9] > times_ms[8]
-    _, frames = play(fast(video, camera=PINHOLE, repeat="loop", max_frames=30))
+    source, frames = play(fast(video, camera=PINHOLE, repeat="loop", max_frames=30))
+    assert (source.num_frames, source.last_frame_id) == (len(frames), frames[-1].frame_id) == (30, 29)
     assert [f.t_source_ns for f in frames] == [20_000_000 * k for k in range(30)]
 
 
