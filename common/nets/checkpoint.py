@@ -121,7 +121,10 @@ def read_manifest(weights: Path) -> Manifest:
     manifest = Manifest(
         **{**raw, "snr_range_db": (low_db, high_db), "modulations": tuple(raw["modulations"])}
     )
-    digest = file_sha256(weights)
+    try:
+        digest = file_sha256(weights)
+    except OSError as err:
+        raise CheckpointError(f"weights {weights} can't be read: {err}") from err
     if digest != manifest.sha256:
         raise CheckpointError(
             f"weights {weights} have sha256 {digest[:16]}, the manifest says {manifest.sha256[:16]}"

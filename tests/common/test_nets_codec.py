@@ -172,6 +172,9 @@ def test_a_changed_weights_file_is_refused(weights):
     weights.write_bytes(bytes(content))
     with pytest.raises(CheckpointError, match="sha256"):
         load_transceiver(weights)
+    weights.unlink()
+    with pytest.raises(CheckpointError, match=r"weights .* can't be read: .*No such file"):
+        load_transceiver(weights)
 
 
 @pytest.mark.parametrize(
