@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.channel.awgn import complex_noise
-from semcast.channel.power import mean_power, normalise_power
+from semcast.channel.power import normalise_power
 from semcast.channel.registry import ChannelModel, build_channel
 from semcast.channel.settings import ChannelSettings
 from semcast.channel.slot_time import SlotTime
@@ -131,8 +131,7 @@ class Link:
         start_s = self._trace_start_s if self._settings.channel == "trace" else self._start_s
         if self._settings.fades_over_time:
             self._slot_time.check(slots.shape[0], self._settings.slot_ms, t_s)
-        sent = normalise_power(slots)
-        power = mean_power(slots)
+        sent, power = normalise_power(slots)
         rng = np.random.default_rng((self._seed, _FRAME_STREAM, frame_id))
         frame_lost = bool(rng.random() < self._settings.frame_loss)
         draw = self._model.draw(slots.shape[0], t_s - start_s, rng)

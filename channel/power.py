@@ -19,8 +19,8 @@ def mean_power(symbols: NDArray[np.complex64]) -> float:
     return power
 
 
-def normalise_power(symbols: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """Scale the symbols of one image, never of a batch, to unit average power.
+def normalise_power(symbols: NDArray[np.complex64]) -> tuple[NDArray[np.complex64], float]:
+    """Scale the symbols of one image, never of a batch, to unit average power; and return what they had.
 
     The scale is not told to the receiver: the pilots go through it as well and carry it.
 
@@ -30,4 +30,4 @@ def normalise_power(symbols: NDArray[np.complex64]) -> NDArray[np.complex64]:
     power = mean_power(symbols)
     if power <= 0.0:
         raise ValueError("symbols must have power above 0, got 0")
-    return (symbols * np.float32(1.0 / np.sqrt(power))).astype(np.complex64, copy=False)
+    return (symbols * np.float32(1.0 / np.sqrt(power))).astype(np.complex64, copy=False), power

@@ -20,8 +20,6 @@ from semcast.channel.trace import ConstantTrace, RandomWalkTrace, SnrTrace, ramp
 from semcast.common.config import near_match
 from semcast.common.errors import ConfigError
 
-__all__ = ["ChannelModel", "ChannelSettings", "SlotDraw", "build_channel", "channel_names"]
-
 _FADING_STREAM = 0xFAD
 _SIGHT_STREAM = 0x105
 
@@ -139,20 +137,15 @@ class _Trace(_Model):
         return self._trace.snr_db(elapsed_s)
 
 
-def _registry() -> dict[str, Callable[[ChannelSettings, int], ChannelModel]]:
-    return {
-        "awgn": _Model,
-        "rayleigh": _Rayleigh,
-        "rician": _Rician,
-        "erasure": _Erasure,
-        "burst": _Burst,
-        "trace": _Trace,
-    }
-
-
-def channel_names() -> list[str]:
-    """Return the names ``build_channel`` knows."""
-    return list(_registry())
+#: The models by the names that settings have.
+MODELS: dict[str, Callable[[ChannelSettings, int], ChannelModel]] = {
+    "awgn": _Model,
+    "rayleigh": _Rayleigh,
+    "rician": _Rician,
+    "erasure": _Erasure,
+    "burst": _Burst,
+    "trace": _Trace,
+}
 
 
 def build_channel(settings: ChannelSettings, seed: int) -> ChannelModel:
@@ -161,8 +154,7 @@ def build_channel(settings: ChannelSettings, seed: int) -> ChannelModel:
     Raises:
         ConfigError: The name is unknown or a trace can't be read.
     """
-    registry = _registry()
-    if settings.channel not in registry:
-        hint = near_match(settings.channel, list(registry))
-        raise ConfigError(f"channel must be one of {', '.join(registry)}, got {settings.channel!r}{hint}")
-    return registry[settings.channel](settings, seed)
+    if settings.channel not in MODELS:
+        hint = near_match(settings.channel, list(MODELS))
+        raise ConfigError(f"channel must be one of {', '.join(MODELS)}, got {settings.channel!r}{hint}")
+    return MODELS[settings.channel](settings, seed)

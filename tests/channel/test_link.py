@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from semcast.channel.link import Link
-from semcast.channel.registry import build_channel, channel_names
+from semcast.channel.registry import MODELS, build_channel
 from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import LOST_SLOT_SNR_DB, EncodedImage
 from semcast.common.errors import ConfigError
@@ -45,7 +45,7 @@ def test_a_louder_codec_gains_nothing(slots):
     np.testing.assert_allclose(loud.truth.h * 7, quiet.truth.h, rtol=1e-5)
 
 
-@pytest.mark.parametrize("channel", channel_names())
+@pytest.mark.parametrize("channel", MODELS)
 def test_a_frame_is_the_same_after_lost_frames_and_restarts(channel, slots):
     settings = ChannelSettings(channel=channel, trace="walk")
     whole = Link(settings, 5)

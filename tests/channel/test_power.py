@@ -14,7 +14,8 @@ def test_mean_power_by_hand():
 def test_normalised_symbols_have_unit_power_and_the_same_direction(scale, seed):
     pairs = np.random.default_rng(seed).standard_normal((5, 8, 2)) @ np.array([1, 1j])
     symbols = (scale * pairs).astype(np.complex64)
-    out = normalise_power(symbols)
+    out, power = normalise_power(symbols)
+    assert power == mean_power(symbols)
     assert mean_power(out) == pytest.approx(1.0, rel=1e-4)
     np.testing.assert_allclose(np.angle(out), np.angle(symbols), atol=1e-4)
 

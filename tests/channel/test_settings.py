@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from semcast.channel.registry import build_channel, channel_names
+from semcast.channel.registry import MODELS, build_channel
 from semcast.channel.settings import ChannelSettings
 from semcast.common.config import build_settings, to_toml
 from semcast.common.errors import ConfigError
@@ -59,7 +59,7 @@ def draw_of(num_slots=4000, elapsed_s=0.0, seed=0, **values):
     return model.draw(num_slots, elapsed_s, np.random.default_rng(1))
 
 
-@pytest.mark.parametrize("name", channel_names())
+@pytest.mark.parametrize("name", MODELS)
 def test_a_channel_has_the_gains_the_noise_and_the_losses_of_its_name(name):
     draw = draw_of(channel=name, slot_loss=0.25, burst_slots=2.0, burst_noise_db=20.0)
     noisy = draw.noise_var > 0.2
