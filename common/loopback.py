@@ -47,9 +47,7 @@ def loopback_round_trip_ms(timeout_s: float = 3.0) -> float:
     hub, endpoint = open_hub()
     with hub:
         network = NetworkSettings(connect=(endpoint,))
-        asking = open_client(network, timeout_s)
-        answering = open_client(network, timeout_s)
-        with asking, answering:
+        with open_client(network, timeout_s) as asking, open_client(network, timeout_s) as answering:
             answering.answer("semcast/doctor/echo", lambda payload: payload)
             deadline_s = time.monotonic() + timeout_s
             while time.monotonic() < deadline_s:

@@ -76,15 +76,7 @@ def view_of(
     if confidence is not None:
         small = np.asarray(cv2.resize(confidence, size_wh, interpolation=cv2.INTER_AREA), np.float32)
         noise = float(np.hypot(noise, error_sd(float(np.median(small)))))
-    x_share, y_share = size_wh[0] / width, size_wh[1] / height
-    K = np.array(
-        [
-            [camera.fx * x_share, 0.0, (camera.cx + 0.5) * x_share - 0.5],
-            [0.0, camera.fy * y_share, (camera.cy + 0.5) * y_share - 0.5],
-            [0.0, 0.0, 1.0],
-        ]
-    )
-    return View(frame_id, grey, noise, K, rgb, small)
+    return View(frame_id, grey, noise, camera.scaled_to(*size_wh).K, rgb, small)
 
 
 def error_sd(confidence: float) -> float:
