@@ -2,12 +2,15 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import Grey
+from semcast.server.geometry.streaks import band_power
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 
@@ -22,6 +25,11 @@ class SeenFrom:
 
     frame_id: int
     grey: Grey
+
+    @cached_property
+    def band_power(self) -> NDArray[np.float64]:
+        """Of the image, see ``streaks``: by that streaks of motion blur are told."""
+        return band_power(self.grey)
 
 
 class KeyframeImages:

@@ -2,7 +2,7 @@
 
 Rows that did not arrive, a blur or a jerk end tracks; their landmarks are still in the map. They are followed
 from the newest keyframes they were seen in, whose images are kept. How the light has changed since then is
-told by tracks that go on: where these are is known.
+told by tracks that go on: where these are is known. Streaks of motion blur are told by the images as a whole.
 """
 
 from dataclasses import replace
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.brightness import MIN_POINTS, brightness_change, with_brightness
 from semcast.server.geometry.features import BORDER_PX, TrackedPoints, track_alike, track_points
+from semcast.server.geometry.streaks import blurred_alike
 from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.tracks import TrackTable
@@ -77,9 +78,10 @@ def _follow(
 ) -> TrackedPoints:
     """Follow some of what a keyframe saw into a new image, in the light that tracks seen in both tell of."""
     xy0 = keyframe.xy[rows]
+    grey0, grey1 = blurred_alike(image.grey, sight.grey, image.band_power, sight.band_power)
     _, then, now = np.intersect1d(keyframe.ids, alive.ids, assume_unique=True, return_indices=True)
     if len(then) < MIN_POINTS:
-        return track_points(image.grey, sight.grey, xy0, expected_xy, max_level=_LEVELS)
-    change = brightness_change(image.grey, sight.grey, keyframe.xy[then], alive.xy[now])
-    grey0 = image.grey if change is None else with_brightness(image.grey, *change)
-    return track_alike(grey0, sight.grey, xy0, expected_xy, max_level=_LEVELS)
+        return track_points(grey0, grey1, xy0, expected_xy, max_level=_LEVELS)
+    change = brightness_change(grey0, grey1, keyframe.xy[then], alive.xy[now])
+    grey0 = grey0 if change is None else with_brightness(grey0, *change)
+    return track_alike(grey0, grey1, xy0, expected_xy, max_level=_LEVELS)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.geometry.edges import alike, each_of
 from semcast.server.geometry.features import Grey
+from semcast.server.geometry.streaks import band_power
 from semcast.server.geometry.wide_search import WideFeatures
 from semcast.server.mapping.state import DecodedFrame
 
@@ -52,6 +53,11 @@ class Sight:
     def wide_features(self) -> WideFeatures:
         """Features of what arrived: found once, when first asked for."""
         return WideFeatures.of(self.grey, self.usable_pixels)
+
+    @cached_property
+    def band_power(self) -> Array:
+        """Of the image, see ``streaks``: by that streaks of motion blur are told."""
+        return band_power(self.grey)
 
     def shows(self, xy: Array, margin_px: int) -> NDArray[np.bool_]:
         """Which points are in the image, no nearer to its border and to lost rows than a margin, ``(N,)``.

@@ -19,6 +19,7 @@ from semcast.server.geometry.features import (
     track_alike,
     track_through_light,
 )
+from semcast.server.geometry.streaks import blurred_alike
 from semcast.server.geometry.warped_points import MAX_FROM_GUESS_PX, track_warped
 from semcast.server.geometry.weighting import (
     ConfidenceMode,
@@ -81,6 +82,7 @@ class TrackTable:
         self._rng = np.random.default_rng(seed)
         self._next_id = 0
         self._greys: list[Grey] = []
+        self._bands: list[Array] = []
         self._frame_ids: list[int] = []
         self._jumped = False
         self.passing = Passing(max_features, turntable)
@@ -207,10 +209,11 @@ class TrackTable:
         for back in behind[np.argsort(-count, kind="stable")]:
             rows = np.flatnonzero(self.missed == back)
             grey, way = self._greys[-1 - back], (self.xy[rows], guess_xy[rows])
+            images = blurred_alike(grey, sight.grey, self._bands[-1 - back], sight.band_power)
             if is_in_light:
-                points = track_alike(grey, sight.grey, *way, max_level=max_level)
+                points = track_alike(*images, *way, max_level=max_level)
             else:
-                points, change = track_through_light(grey, sight.grey, *way, max_level=max_level)
+                points, change = track_through_light(*images, *way, max_level=max_level)
                 self._bring_to_light(change)
                 grey, is_in_light = self._greys[-1 - back], True
             found.take(rows, points)
@@ -257,6 +260,7 @@ class TrackTable:
             setattr(self, name, values)
         self._before = None
         self._greys.pop()
+        self._bands.pop()
         self._frame_ids.pop()
 
     def follow_jump(self, sight: Sight) -> bool:
@@ -434,11 +438,12 @@ class TrackTable:
 
     def replace_newest(self, sight: Sight) -> None:
         """Take another version of the image that was taken last."""
-        self._greys[-1] = sight.grey
+        self._greys[-1], self._bands[-1] = sight.grey, sight.band_power
 
     def remember(self, sight: Sight) -> None:
         """Keep the image for tracks that are looked for in later ones."""
         self._greys = [*self._greys[-MAX_COAST:], sight.grey]
+        self._bands = [*self._bands[-MAX_COAST:], sight.band_power]
         self._frame_ids = [*self._frame_ids[-MAX_COAST:], sight.frame.frame_id]
 
     def refill(self, sight: Sight) -> int:
