@@ -50,6 +50,7 @@ The map
     scene_depth       how far away the scene is
     thinning          what goes when the map reaches its limits
     keyframe_images   images of keyframes, kept to look for landmarks by how they looked there
+    scale_watch       whether keyframes hold the scale of those before
     map_arrays        checks the arrays of a checkpoint
     map_update        what of the map goes out to those who follow it
 

@@ -20,6 +20,7 @@ from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
 from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter
+from semcast.server.mapping.scale_watch import ScaleWatch
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
@@ -73,6 +74,7 @@ class Reconstruction:
         self._motion = CameraMotion(self._camera)
         self._locator = Locator(self._camera, s, self._map, self._tracks, self._motion)
         self._placement = SubmapPlacement(self._camera, self._map.enough)
+        self._scale = ScaleWatch(self._camera)
         self._shutter = RollingShutter(camera, lambda: self._map.watch.is_on)
         self._state = TrackingState.INITIALIZING
         self._last_frame_id = -1
@@ -222,6 +224,7 @@ class Reconstruction:
             pose = self._improved(sight, pose)
             tracks.refill(sight)
             self._map.make_keyframe(sight, tracks, pose.T_world_cam)
+            self._scale.look(self._map.world, self._map.noise.model)
             self._frames_since_keyframe = 0
             self._lap("map", since)
             pose = pose.with_unit(self._try_to_join(sight, pose.T_world_cam))
