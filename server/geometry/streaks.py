@@ -64,7 +64,10 @@ def band_power(grey: Grey) -> Array:
     window, band, count = _bands(small.shape[0], small.shape[1])
     # Lengths whose transform is quick: what is filled up with zeros has the same spectrum, more finely told.
     lengths = tuple(map(cv2.getOptimalDFTSize, small.shape))
-    power = np.abs(np.fft.rfft2((small - small.mean()) * window, lengths)) ** 2
+    filled = np.zeros(lengths, np.float32)
+    filled[: small.shape[0], : small.shape[1]] = (small - small.mean()) * window
+    spectrum = cv2.dft(filled, flags=cv2.DFT_COMPLEX_OUTPUT)[:, : band.shape[1]]
+    power = np.einsum("vuk,vuk->vu", spectrum, spectrum)
     total = np.bincount(band.ravel(), power.ravel(), minlength=len(count) + 1)[:-1]
     log_power = np.log(total / np.maximum(1, count) + 1e-3)
     return np.asarray(log_power - log_power.mean())
