@@ -118,7 +118,6 @@ class _Captured:
 
     def __init__(self, settings: SourceSettings, live: bool, beside: Path | None) -> None:
         self._settings = settings
-        self._live = live
         self._capture: cv2.VideoCapture | None = open_capture(settings.source, live=live)
         name = public_name(settings.source)
         try:
