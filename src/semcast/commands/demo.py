@@ -140,7 +140,9 @@ def run(arguments: argparse.Namespace) -> int:
             talk.print("stopped before the first frame was tracked: there are no results")
         else:
             logs = settings.out / "logs"
-            talk.print("no summary was written; the logs of the three processes say why:", logs)
+            talk.print(
+                f"no summary was written; the logs of the three processes say why: {logs}", soft_wrap=True
+            )
         return code or 1
     shown = talk if json_to_stdout else plain_console()
     shown.print(summary_table(result))
