@@ -34,6 +34,7 @@ _OF_FISHEYE = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 #: Keys that may name a lens model or a fisheye.
 _MODEL_KEYS = ("distortion_model", "distortion_type", "camera_model", "model", "type")
 _FISHEYE_KEYS = ("is_fisheye", "fisheye", "fisheye_model")
+_YES, _NO = ("true", "yes", "on", "1", "1.0"), ("false", "no", "off", "0", "0.0", "none", "")
 #: Words for the equidistant fisheye, without what stands between their parts. COLMAP's radial ones have fewer
 #: of its coefficients; ORB-SLAM's KannalaBrandt8 counts those of the pinhole too.
 _EQUIDISTANT = (
@@ -137,7 +138,7 @@ def _model_in(values: dict[str, Any]) -> DistortionModel:
     said: dict[str, DistortionModel] = {}
     for key, value in (item for part in (values, *inner) for item in part.items()):
         word = str(value).lower()
-        if key.lower() in _FISHEYE_KEYS and value:
+        if key.lower() in _FISHEYE_KEYS and _is_true(key, value):
             said[key] = "equidistant"
         if key.lower() not in _MODEL_KEYS or word.startswith("none"):
             continue
@@ -190,6 +191,18 @@ def _distortions_in(values: dict[str, Any], model: DistortionModel) -> Iterator[
         if not is_spoken_of or key.lower() in _MODEL_KEYS or _says_none(value):
             continue
         yield key, _coefficients(key, value, model, is_known=is_known)
+
+
+def _is_true(key: str, value: Any) -> bool:
+    """Whether a key says yes; YAML's words come as text.
+
+    Raises:
+        ValueError: It says neither yes nor no.
+    """
+    word = str(value).lower()
+    if word not in (*_YES, *_NO):
+        raise ValueError(f"{key} must be true or false, got {value!r}")
+    return word in _YES
 
 
 def _says_none(value: Any) -> bool:

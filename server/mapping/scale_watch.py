@@ -51,8 +51,10 @@ class ScaleWatch:
 
     def look(self, world: WorldMap, noise: NoiseModel) -> None:
         """Look at the newest keyframe, once its landmarks are made."""
+        if self._has_told:
+            return
         error = handover_error(world, self._camera, noise)
-        if error is None or self._has_told:
+        if error is None:
             return
         self._recent.append((world.keyframes[-1].frame_id, error))
         typical = float(np.median([error for _, error in self._recent]))

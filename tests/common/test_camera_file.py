@@ -98,6 +98,11 @@ def test_a_fisheye_is_read_as_one(tmp_path, text):
     assert (found.distortion_model, found.distortion) == ("equidistant", (0.1, -0.2, 0.3, 0.4))
 
 
+@pytest.mark.parametrize("word", ["false", "no", "0", "off"])
+def test_a_camera_said_to_be_no_fisheye_is_none(tmp_path, word):
+    assert read(tmp_path, f"{EUROC}is_fisheye: {word}\n") == CAMERA
+
+
 def test_orbslam_without_tangential_distortion_is_read(tmp_path):
     text = (
         "Camera.type: PinHole\nCamera.fx: 30\nCamera.fy: 31\nCamera.cx: 15.5\nCamera.cy: 11.5\n"
@@ -133,6 +138,7 @@ def test_orbslam_without_tangential_distortion_is_read(tmp_path):
         ),
         (ROS_HEAD, "'camera_matrix or K' is missing"),
         ("resolution: [32, 24]\nintrinsics: [1, 2, 3, 4, 5]\n", "intrinsics must be a list of 4 numbers"),
+        (f"{EUROC}fisheye: perhaps\n", "fisheye must be true or false, got 'perhaps'"),
         (f"{EUROC}camera_model: omni\n", "camera_model must be a pinhole camera's .*, got 'omni'"),
         (
             f"{ROS_HEAD}{ROS_MATRIX}fisheye_model: 1\n",
