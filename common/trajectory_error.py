@@ -148,7 +148,7 @@ def rpe(estimate: Trajectory, truth: Trajectory, scale: float) -> RpeResult | No
         return None
     error = invert_transform(true_step) @ step
     trans_m = float(np.sqrt(np.mean((error[:, :3, 3] ** 2).sum(axis=1))))
-    angle_rad = _rotation_angles_rad(error[:, :3, :3])
+    angle_rad = rotation_angles_rad(error[:, :3, :3])
     return RpeResult(
         trans_percent=100.0 * trans_m / step_m,
         rot_deg=float(np.degrees(np.sqrt(np.mean(angle_rad**2)))),
@@ -202,7 +202,7 @@ def _has_extent(points: Array) -> bool:
     return spread > 1e-12 * max(1.0, float(np.abs(points).max()))
 
 
-def _rotation_angles_rad(R: Array) -> Array:
+def rotation_angles_rad(R: Array) -> Array:
     """Angles of ``(N, 3, 3)`` rotations, accurate near 0 where arccos of the trace is not."""
     axis = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
     trace = np.trace(R, axis1=1, axis2=2)

@@ -17,6 +17,7 @@ Verbs of ``semcast eval``
 Frames and reconstructions
     pipeline            recording, codec, link, decoded image
     reconstruct         reconstruction of one run in this thread
+    live_poses          errors of poses as they were published, and what they say of themselves
     gap                 a gap in the stream
     sounding            the SNR a transmitter is told first
     trace_snr           the SNR of a link that follows a trace

@@ -65,11 +65,12 @@ def most_parts(cell: Report) -> int:
 def trajectory_table(report: Report) -> Iterator[str]:
     """Yield the lines of the table of a result of ``semcast eval trajectory``.
 
-    Figures of the poses as they were published, and of the time after a gap, have columns where the file has
-    them; parts of the map where there is more than one.
+    Figures of the poses as they were published, how their errors compare with their covariances, and the time
+    after a gap have columns where the file has them; parts of the map where there is more than one.
     """
     cells = report["cells"]
     is_live = any("ate_at_once_percent" in cell for cell in cells)
+    says_how_sure = any(cell.get("stated_ratio_trans") is not None for cell in cells)
     in_parts = any(most_parts(cell) > 1 for cell in cells)
     gap_s = report["settings"].get("gap_s")
     if gap_s:
@@ -77,6 +78,7 @@ def trajectory_table(report: Report) -> Iterator[str]:
         yield "frame after that to the first with a pose.\n"
     head = ["SNR dB", "confidence", "ATE m", "ATE %", "least completeness"]
     head += ["live ATE %", "least completeness, live"] if is_live else []
+    head += ["live error / stated sigma: place, turn"] if says_how_sure else []
     head += ["most parts"] if in_parts else []
     head += ["RPE %", "RPE deg", "PSNR dB", "seeds", *(["again s"] if gap_s else [])]
     yield from table(
@@ -89,6 +91,7 @@ def trajectory_table(report: Report) -> Iterator[str]:
                 median_and_worst(cell, digits=3),
                 number(least_completeness(cell), 3),
                 *(_live(cell) if is_live else []),
+                *([_stated(cell)] if says_how_sure else []),
                 *([str(most_parts(cell))] if in_parts else []),
                 number(cell["rpe_trans_percent"]),
                 number(cell["rpe_rot_deg"], 3),
@@ -106,6 +109,11 @@ def _live(cell: Report) -> list[str]:
         return ["-", "-"]
     posed = least_completeness(cell, "completeness_at_once")
     return [median_and_worst(cell, "ate_at_once_percent", 3), number(posed, 3)]
+
+
+def _stated(cell: Report) -> str:
+    ratios = cell.get("stated_ratio_trans"), cell.get("stated_ratio_rot")
+    return ", ".join(number(ratio, 1) for ratio in ratios)
 
 
 def readme_table(folder: Path) -> str:

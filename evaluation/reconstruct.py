@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.image import psnr_db
 from semcast.common.trajectory import Trajectory
-from semcast.common.trajectory_error import ate, completeness, match_times
+from semcast.common.trajectory_error import ate, match_times
+from semcast.evaluation.live_poses import LivePose, live_figures
 from semcast.evaluation.pipeline import LinkedFrame
 from semcast.server.decoder import tracker_frame
 from semcast.server.export.outputs import trajectory_of
@@ -22,8 +22,6 @@ from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
 from semcast.server.sent_frames import stretches
-
-Array = NDArray[np.float64]
 
 #: Called after each processed frame; may add stages of its own to the row's ``stage_ms``.
 FrameHook = Callable[[DecodedFrame, FrameResult, FrameRow, MapUpdate | None], None]
@@ -60,7 +58,7 @@ class ReconstructedRun:
 
     Attributes:
         summary: The figures ``semcast demo`` reports, ``ate_rmse_m``, ``stage_ms`` and so on, which are of
-            the path after all corrections, and those of ``at_once``.
+            the path after all corrections, and those of ``live_figures``.
         rows: One mapping per frame that reached the tracker, with ``error_m`` after alignment where known,
             metres included.
         trajectory: All posed frames in the map's frame and unit.
@@ -108,7 +106,7 @@ def reconstruct(
     """
     rows: list[FrameRow] = []
     frame_times_ns: dict[int, int] = {}
-    published: dict[int, Array] = {}
+    published: dict[int, LivePose] = {}
     num_lost = 0
     bundle = TimedBundle()
     reconstruction = Reconstruction(camera, settings, bundle)
@@ -118,10 +116,10 @@ def reconstruct(
             if frame.decoded is None:
                 num_lost += 1
                 continue
-            row, T_world_cam = _process(reconstruction, bundle, frame, on_frame)
+            row, pose = _process(reconstruction, bundle, frame, on_frame)
             rows.append(row)
-            if T_world_cam is not None:
-                published[frame.frame_id] = T_world_cam.copy()
+            if pose is not None:
+                published[frame.frame_id] = pose
         reconstruction.conclude()
         poses = reconstruction.final_trajectory()
         num_landmarks = len(reconstruction.landmarks()[0])
@@ -134,7 +132,7 @@ def reconstruct(
     drops = {"lost": num_lost} if num_lost else {}
     sent = stretches({frame_id: k for k, frame_id in enumerate(frame_times_ns)})
     summary = summarise(rows, trajectory, part_of, truth, sent, len(sent), drops, num_keyframes)
-    summary |= at_once(trajectory_of(published, frame_times_ns), truth, summary["frames"]["sent"])
+    summary |= live_figures(published, frame_times_ns, truth, summary["frames"]["sent"])
     summary["readout_ms"] = reconstruction.camera.readout_ms
     summary["readout_from"] = reconstruction.camera.readout_from
     return ReconstructedRun(summary, _plain_rows(rows, trajectory, truth), trajectory, num_landmarks, truth)
@@ -142,7 +140,7 @@ def reconstruct(
 
 def _process(
     reconstruction: Reconstruction, bundle: TimedBundle, frame: LinkedFrame, on_frame: FrameHook | None
-) -> tuple[FrameRow, Array | None]:
+) -> tuple[FrameRow, LivePose | None]:
     """Return the row of a frame and the pose that is published for it, None without one."""
     decoded = frame.decoded
     assert decoded is not None
@@ -161,26 +159,8 @@ def _process(
     )
     if on_frame is not None:
         on_frame(received, result, row, reconstruction.take_map_update())
-    return row, result.T_world_cam
-
-
-def at_once(published: Trajectory, truth: Trajectory | None, num_sent: int) -> dict[str, float | None]:
-    """Return the figures of the poses as they were published, before any later image corrected them.
-
-    Args:
-        published: Pose of each frame that had one at once, all taken for one world.
-        truth: Reference poses, or None.
-        num_sent: Frames that were sent.
-
-    Returns:
-        ``ate_at_once_percent``, after one similarity like ``ate_percent``, None where it has no meaning, and
-        ``completeness_at_once``, the share of sent frames with such a pose.
-    """
-    absolute = ate(published, truth) if truth is not None else None
-    return {
-        "ate_at_once_percent": None if absolute is None else absolute.percent,
-        "completeness_at_once": completeness(len(published), num_sent),
-    }
+    T_world_cam = result.T_world_cam
+    return row, None if T_world_cam is None else LivePose(T_world_cam.copy(), result.covariance)
 
 
 def split_bundle(stage_ms: Mapping[str, float], bundle_ms: float) -> dict[str, float]:

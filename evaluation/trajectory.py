@@ -43,6 +43,8 @@ FIGURES = (
     "ate_at_once_percent",
     "completeness",
     "completeness_at_once",
+    "stated_ratio_trans",
+    "stated_ratio_rot",
     "rpe_trans_percent",
     "rpe_rot_deg",
     "psnr_db",
@@ -100,7 +102,8 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
         file and without a link) and mode with the median over seeds of each figure in ``FIGURES``,
         ``num_failed`` (runs without a path), and ``runs``, the full summary of each seed. Errors are of the
         path after all corrections, but for ``ate_at_once_percent``; ``completeness`` counts frames that got
-        their pose later as well, ``completeness_at_once`` does not.
+        their pose later as well, ``completeness_at_once`` does not. ``stated_ratio_trans`` and
+        ``stated_ratio_rot`` are those of ``live_poses.stated_ratios``.
         ``comparisons`` holds, per SNR, the paired difference in ATE of each mode to the mode ``off`` where
         that was run. ``frames_left_out`` are those that can't be read. With one cell its figures and
         ``stage_ms`` also stand at the top level. With a gap, runs have ``gap``, its first and last frame and

@@ -111,3 +111,13 @@ def test_figures_of_published_poses_have_columns_where_a_file_has_them():
     assert head.split(" | ")[5:7] == ["live ATE %", "least completeness, live"]
     assert old.split(" | ")[5:7] == ["-", "-"]
     assert new.split(" | ")[3:7] == ["0.200", "1.000", "0.300 (0.900)", "0.750"]
+
+
+def test_how_errors_compare_with_covariances_has_a_column_where_a_file_has_it():
+    shown = report(DEFAULT_CODEC, 0.25)
+    assert not any("sigma" in line for line in trajectory_table(shown))
+    shown["cells"].append(shown["cells"][0] | {"stated_ratio_trans": 1.26, "stated_ratio_rot": 0.5})
+    head, _, old, new = trajectory_table(shown)
+    column = head.split("|").index(" live error / stated sigma: place, turn ")
+    assert old.split("|")[column] == " -, - "
+    assert new.split("|")[column] == " 1.3, 0.5 "

@@ -3,9 +3,8 @@ import pytest
 
 from semcast.channel.settings import ChannelSettings
 from semcast.common.sequence import open_sequence
-from semcast.common.trajectory import Trajectory
 from semcast.evaluation.pipeline import FrameRun
-from semcast.evaluation.reconstruct import at_once, cut_to_frames, reconstruct, split_bundle
+from semcast.evaluation.reconstruct import cut_to_frames, reconstruct, split_bundle
 from semcast.server.mapping.settings import ReconstructionSettings
 
 
@@ -53,17 +52,9 @@ def test_poses_as_they_were_published_have_figures_of_their_own(sequence):
     assert run.summary["completeness_at_once"] < run.summary["completeness"]
     assert run.summary["ate_at_once_percent"] != run.summary["ate_percent"]
     assert run.summary["ate_at_once_percent"] < 5.0
-
-
-def test_an_error_of_published_poses_is_that_after_one_similarity(sequence):
-    truth = sequence.groundtruth()
-    moved = truth.T_world_cam.copy()
-    moved[:, :3, 3] = 3.0 * moved[:, :3, 3] + 1.0
-    half = Trajectory(truth.t_s[::2], moved[::2])
-    figures = at_once(half, truth, len(truth))
-    assert figures["ate_at_once_percent"] == pytest.approx(0.0, abs=1e-9)
-    assert figures["completeness_at_once"] == pytest.approx(len(half) / len(truth))
-    assert at_once(half, None, len(truth))["ate_at_once_percent"] is None
+    # Covariances as they come from the map: not off by orders of magnitude.
+    assert 0.1 < run.summary["stated_ratio_trans"] < 10.0
+    assert 0.1 < run.summary["stated_ratio_rot"] < 10.0
 
 
 def test_lost_frames_count_against_completeness(sequence, phase_codec):
