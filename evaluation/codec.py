@@ -40,7 +40,7 @@ from semcast.evaluation.image_quality import ms_ssim, ssim
 from semcast.evaluation.picture_strip import write_picture_strip
 from semcast.evaluation.pipeline import UNUSED_LINK_FIELDS
 from semcast.evaluation.plots import plot_against_snr
-from semcast.evaluation.report import json_ready, naming, provenance, short_names, write_result
+from semcast.evaluation.report import naming, provenance, short_names, write_result
 from semcast.evaluation.sounding import told_at_first
 from semcast.evaluation.statistics import finite_mean, percentiles, spearman
 from semcast.evaluation.trace_snr import check_snrs, snr_file_label, stated_snr_db
@@ -225,23 +225,22 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
                 strip.append(_strip_row(name, image, {n: s[-1] for n, s in samples.items()}))
         stated_db = stated_snr_db(snr_db, link)
         results += [_row(name, stated_db, list(images), rows) for name, rows in samples.items()]
-    report = json_ready(
+    report = write_result(
+        settings.json,
         {
             **provenance(VERB, settings),
             "num_images": len(images),
             "images_left_out": left_out,
             "results": results,
-        }
+        },
     )
-    if settings.json is not None:
-        write_result(settings.json, report)
     if settings.out is not None:
         if settings.link.channel != "trace":
             learned = {codec.modulation for codec in under_name.values() if not is_conventional(codec.name)}
             _draw(settings, sorted(learned), results)
         label = snr_file_label(strip_snr_db, settings.link)
         write_picture_strip(settings.out / f"pictures_{label}.png", strip)
-    return dict(report)
+    return report
 
 
 @dataclass(frozen=True)

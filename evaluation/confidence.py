@@ -18,7 +18,7 @@ from semcast.evaluation.pipeline import (
     select_frames,
 )
 from semcast.evaluation.plots import plot_reliability
-from semcast.evaluation.report import json_ready, naming, provenance, short_names, write_result
+from semcast.evaluation.report import naming, provenance, short_names, write_result
 from semcast.evaluation.statistics import finite_mean
 from semcast.evaluation.trace_snr import snr_label, stated_snr_db
 
@@ -71,13 +71,14 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
     sequence, codec = open_stream(settings, codec)
     chosen = select_frames(sequence, settings)
     results = [_grade_at(settings, sequence, chosen.ids, codec, snr_db) for snr_db in settings.snr_db]
-    report = {
-        **provenance(VERB, settings),
-        "frames_left_out": chosen.left_out,
-        "results": json_ready(results),
-    }
-    if settings.json is not None:
-        write_result(settings.json, report)
+    report = write_result(
+        settings.json,
+        {
+            **provenance(VERB, settings),
+            "frames_left_out": chosen.left_out,
+            "results": results,
+        },
+    )
     if settings.out is not None:
         tables = {
             f"SNR {snr_label(snr_db, settings.link)}": result["pixel"]["reliability"]

@@ -30,7 +30,7 @@ from semcast.evaluation.cloud_error import CloudError, TrueView, cloud_error
 from semcast.evaluation.keyframe_depth import DepthKeyframe, cloud_points, confirmed_depths, reconstructed
 from semcast.evaluation.picture_strip import write_picture_strip
 from semcast.evaluation.pipeline import CLEAN, UNUSED_LINK_FIELDS, run_frames
-from semcast.evaluation.report import json_ready, naming, provenance, short_names, write_result
+from semcast.evaluation.report import naming, provenance, short_names, write_result
 from semcast.evaluation.scenes.motion import Pace
 from semcast.evaluation.scenes.render import SCENES, RenderSettings, SceneName, render_scene
 from semcast.evaluation.scenes.surfaces import exact_depth
@@ -186,20 +186,19 @@ def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = Non
                 results += rows
                 pictures[f"{name}, {snr_label(snr_db, settings.link)}"] = picture
             strip.append(pictures)
-    report = json_ready(
+    report = write_result(
+        settings.json,
         {
             **provenance(VERB, settings),
             "sequence": settings.scene if settings.sequence is None else scene.sequence.name,
             "num_keyframes": len(scene.keyframes),
             "reference": "original" if scene.truth is None else "exact",
             "results": results,
-        }
+        },
     )
-    if settings.json is not None:
-        write_result(settings.json, report)
     if settings.out is not None:
         write_picture_strip(settings.out / "depth.png", strip)
-    return dict(report)
+    return report
 
 
 def _prepared(settings: DepthSettings, folder: Path) -> _Scene:

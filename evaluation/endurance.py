@@ -29,7 +29,7 @@ from semcast.evaluation.pipeline import (
     select_frames,
 )
 from semcast.evaluation.reconstruct import as_received, cut_to_frames
-from semcast.evaluation.report import json_ready, naming, provenance, write_result
+from semcast.evaluation.report import naming, provenance, write_result
 from semcast.evaluation.trace_snr import snr_label
 from semcast.server.export.outputs import trajectory_of
 from semcast.server.mapping.bundle_process import ProcessBundle
@@ -113,19 +113,15 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
     rows = _measure(frames, sequence, settings)
     middle, last = rows[len(rows) // 2], rows[-1]
     keys = ("frame_ms_p50", "frame_ms_p95", "landmarks", "keyframes", "memory_mb", "bundle_memory_mb")
-    report = json_ready(
-        {
-            **provenance(VERB, settings),
-            "sequence": sequence.name,
-            "image_wh": [sequence.intrinsics.width, sequence.intrinsics.height],
-            "frames_left_out": chosen.left_out,
-            "growth": {key: last[key] / middle[key] if middle[key] else None for key in keys},
-            "results": rows,
-        }
-    )
-    if settings.json is not None:
-        write_result(settings.json, report)
-    return dict(report)
+    report = {
+        **provenance(VERB, settings),
+        "sequence": sequence.name,
+        "image_wh": [sequence.intrinsics.width, sequence.intrinsics.height],
+        "frames_left_out": chosen.left_out,
+        "growth": {key: last[key] / middle[key] if middle[key] else None for key in keys},
+        "results": rows,
+    }
+    return write_result(settings.json, report)
 
 
 def _received(

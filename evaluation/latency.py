@@ -21,7 +21,7 @@ from semcast.evaluation.pipeline import (
     select_frames,
 )
 from semcast.evaluation.reconstruct import reconstruct
-from semcast.evaluation.report import json_ready, naming, provenance, write_result
+from semcast.evaluation.report import naming, provenance, write_result
 from semcast.evaluation.trace_snr import snr_label
 from semcast.server.frame_rows import FrameRow
 from semcast.server.frame_views import frame_view
@@ -166,17 +166,13 @@ def evaluate_latency(settings: LatencySettings, codec: Codec | None = None) -> d
         raise ConfigError(f"no frame was received at {level}: there is nothing to time")
     if not rows:
         raise ConfigError(f"warmup must leave frames to time, got {settings.warmup} of {len(run.rows)}")
-    report = json_ready(
-        {
-            **provenance(VERB, settings),
-            "sequence": sequence.name,
-            "image_wh": [sequence.intrinsics.width, sequence.intrinsics.height],
-            "num_frames": len(rows),
-            "frames_left_out": chosen.left_out,
-            "completeness": run.summary["completeness"],
-            **stage_profile(rows),
-        }
-    )
-    if settings.json is not None:
-        write_result(settings.json, report)
-    return dict(report)
+    report = {
+        **provenance(VERB, settings),
+        "sequence": sequence.name,
+        "image_wh": [sequence.intrinsics.width, sequence.intrinsics.height],
+        "num_frames": len(rows),
+        "frames_left_out": chosen.left_out,
+        "completeness": run.summary["completeness"],
+        **stage_profile(rows),
+    }
+    return write_result(settings.json, report)

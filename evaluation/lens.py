@@ -192,8 +192,7 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
         tuple((reaches[3:] * (camera.fx, camera.fy)).tolist()) if any(best.lens.centre) else (),
         tuple(trials),
     )
-    if settings.json is not None:
-        write_result(settings.json, _report(settings, images, found))
+    write_result(settings.json, _report(settings, images, found))
     return found
 
 

@@ -22,7 +22,7 @@ from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, LATENT_CHANNELS
 from semcast.common.source_commit import source_commit
 from semcast.evaluation.calibration import reliability
-from semcast.evaluation.report import RESULTS, check_outputs, json_ready, machine_kind, write_result
+from semcast.evaluation.report import RESULTS, check_outputs, machine_kind, write_result
 from semcast.evaluation.statistics import spearman
 from semcast.training.channel import LinkDrawSettings, draw_links, through_link
 from semcast.training.data import read_images
@@ -142,7 +142,7 @@ def main() -> None:
         "what": f"{len(images)} validation photos, 16-QAM, fading and sometimes lost slots, {_SNR_DB:g} dB",
         "results": results,
     }
-    write_result(arguments.json, json_ready(report))
+    write_result(arguments.json, report)
 
 
 if __name__ == "__main__":

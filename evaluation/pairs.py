@@ -38,7 +38,7 @@ from semcast.evaluation.pipeline import (
 )
 from semcast.evaluation.plots import plot_pair_errors
 from semcast.evaluation.pose_error import relative_pose_error
-from semcast.evaluation.report import json_ready, naming, provenance, short_names, write_result
+from semcast.evaluation.report import naming, provenance, short_names, write_result
 from semcast.evaluation.statistics import finite_mean, percentiles
 from semcast.evaluation.trace_snr import stated_snr_db
 from semcast.server.geometry.agreement import neighbour_agreement
@@ -180,7 +180,8 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
             for variant, cell in at_snr.items()
         ]
     merged = merge_cells(methods, cells)
-    report = json_ready(
+    report = write_result(
+        settings.json,
         {
             **provenance(VERB, settings),
             "sequence": sequence.name,
@@ -191,13 +192,11 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
             "auroc": merged.auroc_of_cues(),
             "auroc_confidence": _auroc_confidence(merged),
             "cells": entries,
-        }
+        },
     )
-    if settings.json is not None:
-        write_result(settings.json, report)
     if settings.out is not None and codec is not None and settings.link.channel != "trace":
         plot_pair_errors(settings.out, report)
-    return dict(report)
+    return report
 
 
 def true_motions(

@@ -142,8 +142,7 @@ def find_readout(
         readout_from="top" if is_global else readout.side,
     )
     estimate = ReadoutEstimate(readout, low_ms, high_ms, found, tuple(trials))
-    if settings.json is not None:
-        write_result(settings.json, _report(settings, images.name, estimate))
+    write_result(settings.json, _report(settings, images.name, estimate))
     return estimate
 
 

@@ -14,7 +14,7 @@ from semcast.common.errors import SourceError
 from semcast.common.recorder import Recorder
 from semcast.common.recording_reader import RecordedMessage, RecordingReader
 from semcast.common.recording_writer import recording_metadata
-from semcast.evaluation.report import json_ready, provenance, write_result
+from semcast.evaluation.report import provenance, write_result
 
 VERB = "eval recording"
 UNUSED_FIELDS: frozenset[str] = frozenset()
@@ -97,9 +97,7 @@ def evaluate_recording(settings: RecordingSettings) -> dict[str, Any]:
         "dropped": dropped,
         **provenance(VERB, settings),
     }
-    if settings.json is not None:
-        write_result(settings.json, report)
-    return dict(json_ready(report))
+    return write_result(settings.json, report)
 
 
 def _round(

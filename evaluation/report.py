@@ -61,17 +61,22 @@ def check_outputs(json: Path | None, out: Path | None) -> None:
         raise ConfigError(f"{err.filename} can't be written: {err.strerror}") from err
 
 
-def write_result(path: Path, result: Mapping[str, Any]) -> None:
-    """Write a result; the file is complete or absent, never half written.
+def write_result(path: Path | None, result: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a result as plain JSON values, and write it where there is a path for it.
+
+    The file is complete or absent, never half written.
 
     Raises:
         SemcastError: The folder can't be made or the file can't be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(path, json_ready(result))
-    except OSError as err:
-        raise SemcastError(f"{path} can't be written: {err}") from err
+    values = dict(json_ready(result))
+    if path is not None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(path, values)
+        except OSError as err:
+            raise SemcastError(f"{path} can't be written: {err}") from err
+    return values
 
 
 def machine_kind() -> str:

@@ -14,7 +14,7 @@ from semcast.common.codec import DEFAULT_CODEC
 from semcast.common.codecs import LEARNED_CODECS, available_codecs, check_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SemcastError
-from semcast.evaluation.report import json_ready, provenance, write_result
+from semcast.evaluation.report import provenance, write_result
 
 VERB = "eval runtime"
 UNUSED_FIELDS: frozenset[str] = frozenset()
@@ -157,9 +157,7 @@ def evaluate_runtime(settings: RuntimeSettings) -> dict[str, Any]:
     if not any(child.times_ms for child in children):
         raise SemcastError(f"no variant ran: {children[0].error}")
     report = {"results": [_row(child) for child in children], **provenance(VERB, settings)}
-    if settings.json is not None:
-        write_result(settings.json, report)
-    return dict(json_ready(report))
+    return write_result(settings.json, report)
 
 
 def _row(child: _Child) -> dict[str, Any]:

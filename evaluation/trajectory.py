@@ -23,7 +23,7 @@ from semcast.evaluation.pipeline import (
 )
 from semcast.evaluation.plots import plot_path
 from semcast.evaluation.reconstruct import ReconstructedRun, reconstruct
-from semcast.evaluation.report import json_ready, naming, provenance, write_result
+from semcast.evaluation.report import naming, provenance, write_result
 from semcast.evaluation.statistics import paired_bootstrap
 from semcast.evaluation.trace_snr import snr_file_label, stated_snr_db
 from semcast.server.geometry.weighting import ConfidenceMode
@@ -148,10 +148,7 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     if len(cells) == 1:
         report |= {key: value for key, value in cells[0].items() if key != "runs"}
         report["stage_ms"] = cells[0]["runs"][0]["stage_ms"]
-    report = json_ready(report)
-    if settings.json is not None:
-        write_result(settings.json, report)
-    return dict(report)
+    return write_result(settings.json, report)
 
 
 def _run_entry(run: ReconstructedRun, seed: int, gap: Gap | None, *, with_rows: bool) -> dict[str, Any]:

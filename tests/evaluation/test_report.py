@@ -85,9 +85,9 @@ def test_json_has_no_nan_no_arrays_and_no_absolute_path():
 
 def test_written_json_reads_back_and_leaves_no_partial_file(tmp_path):
     path = tmp_path / "new" / "result.json"
-    write_result(path, {"x": np.arange(3)})
-    assert json.loads(path.read_text()) == {"x": [0, 1, 2]}
+    assert write_result(path, {"x": np.arange(3)}) == json.loads(path.read_text()) == {"x": [0, 1, 2]}
     assert [p.name for p in path.parent.iterdir()] == ["result.json"]
+    assert write_result(None, {"x": np.arange(3)}) == {"x": [0, 1, 2]}
 
 
 def test_an_unwritable_place_is_one_clear_error(tmp_path):

@@ -155,7 +155,7 @@ def run(arguments: argparse.Namespace) -> int:
     report = {**result, **provenance("demo", settings)}
     if json_to_stdout:
         print(json.dumps(report, indent=1))
-    elif settings.json is not None:
+    else:
         write_result(settings.json, report)
     if not code and not result.get("completeness"):
         talk.print(f"semcast demo: {why_no_pose(result)}", soft_wrap=True)
