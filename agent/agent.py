@@ -202,7 +202,11 @@ def _send_lossless(
     agent_id: str,
     stop: threading.Event,
 ) -> None:
-    """Send every frame when the receiver wants it, until it has all of them."""
+    """Send every frame when the receiver wants it, until it has all of them.
+
+    Raises:
+        SourceError: A frame can't be encoded.
+    """
     window = ReplayWindow(sending.agent_epoch)
     changed = threading.Condition()
 
@@ -229,7 +233,7 @@ def _send_lossless(
         if encoded is None and not capture.ended:
             # While the receiver is busy, one frame is encoded ahead.
             frame = capture.get(_FLOW_POLL_S if window.all_taken else _BUSY_POLL_S)
-            encoded = sending.encode(frame) if frame is not None else None
+            encoded = _encoded(sending, frame) if frame is not None else None
         with changed:
             if encoded is not None and window.has_room:
                 window.add(encoded)
@@ -242,6 +246,15 @@ def _send_lossless(
             sending.send(message)
         if done:
             return
+
+
+def _encoded(sending: _Sending, frame: SourceFrame) -> SymbolFrame:
+    try:
+        return sending.encode(frame)
+    except ValueError as err:
+        raise SourceError(
+            f"frame {frame.frame_id} can't be encoded, and a replay leaves none out: {err}"
+        ) from err
 
 
 def _wait_for_peers(session: Session, agent_id: str, stop: threading.Event) -> None:
@@ -292,7 +305,8 @@ def run_agent(settings: AgentSettings, stop: threading.Event, codec: Codec | Non
         Counts, drops by reason and stage times, with ``agent_epoch``, ``source`` and ``complete``.
 
     Raises:
-        SourceError: The source can't be read, or failed later; what it gave before that was sent.
+        SourceError: The source can't be read, or failed later; what it gave before that was sent. Or a frame
+            that is to be replayed can't be encoded.
         ConfigError: The codec is unknown.
         CheckpointError: Its weights are missing or damaged.
         TransportError: Its port is taken, where it is the hub.

@@ -1,13 +1,14 @@
 """What the demo sends: as large and as often as this machine can serve."""
 
 import multiprocessing
+import os
 import threading
 
 import numpy as np
 import pytest
 
 from semcast import real_time
-from semcast.common.errors import ConfigError
+from semcast.common.errors import ConfigError, SemcastError
 from semcast.real_time import MAX_PIXELS, Plan, Speed, make_plan, measure_speed, plan_for
 
 pytestmark = pytest.mark.xdist_group("real-time")
@@ -75,6 +76,16 @@ def test_the_plan_follows_from_a_measurement_in_a_process_of_its_own():
     assert 0.0 < plan.rate_hz <= 10.0
     with pytest.raises(ConfigError, match="codec must be"):
         plan_for("3dcs", "16qam", noise(64, 64), 10.0)
+
+
+def die(*_given):
+    os._exit(9)
+
+
+def test_a_measurement_whose_process_dies_is_one_clear_error(monkeypatch):
+    monkeypatch.setattr(real_time, "measure_speed", die)
+    with pytest.raises(SemcastError, match="ended early, .* with --resize and --rate-hz nothing is measured"):
+        plan_for("3dcsc-lite", "16qam", noise(64, 64), 10.0)
 
 
 def test_a_measurement_is_given_up_when_the_demo_is_stopped():

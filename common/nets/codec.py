@@ -19,7 +19,7 @@ from semcast.common.codec import (
     check_fixed_rate,
     confidence_from_displacement_px,
 )
-from semcast.common.errors import ConfigError
+from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.checkpoint import Manifest, load_transceiver, weights_path
 from semcast.common.nets.coder_input import coder_input
 from semcast.common.nets.detail import allocation_for
@@ -108,7 +108,8 @@ class NeuralCodec:
             device: ``auto`` takes a GPU where there is one.
 
         Raises:
-            CheckpointError: There are no such weights, or they do not fit their manifest.
+            CheckpointError: There are no such weights, they do not fit their manifest, or are not for the
+                modulation.
             ConfigError: There is no such device.
             ValueError: The modulation or number of threads is not usable.
         """
@@ -119,6 +120,9 @@ class NeuralCodec:
         check_device(device)
         use_cuda = device == "cuda" or (device == "auto" and torch.cuda.is_available())
         model, manifest = load_transceiver(weights_path(name_or_path))
+        if modulation in MODULATIONS and modulation not in manifest.modulations:
+            ways = ", ".join(map(str, manifest.modulations))
+            raise CheckpointError(f"weights {name_or_path} are for the modulation {ways}, got {modulation!r}")
         return cls(model, manifest, modulation, torch.device("cuda" if use_cuda else "cpu"))
 
     @property

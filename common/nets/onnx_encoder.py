@@ -96,9 +96,12 @@ class OnnxEncoder:
                 f"encoder {path} must have format {FORMAT} or {VARIABLE_FORMAT}, "
                 f"got {facts.get('semcast_format')}"
             )
-        self._name, self._digest = str(facts["architecture"]), str(facts["digest"])
+        try:
+            self._name, self._digest = str(facts["architecture"]), str(facts["digest"])
+            self._snr_range_db = float(facts["snr_min_db"]), float(facts["snr_max_db"])
+        except KeyError as err:
+            raise CheckpointError(f"encoder {path} does not say its {err}") from err
         self._is_variable = facts["semcast_format"] == VARIABLE_FORMAT
-        self._snr_range_db = float(facts["snr_min_db"]), float(facts["snr_max_db"])
         #: ``int8`` where convolutions are, else ``float``.
         self.precision = str(facts.get("precision", "float"))
         self._modulation: Modulation = modulation

@@ -5,6 +5,7 @@ import multiprocessing
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 
 import cv2
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from semcast.common.codec import Codec, Modulation
 from semcast.common.codecs import load_codec
 from semcast.common.cores import usable_cores
+from semcast.common.errors import SemcastError
 from semcast.common.interrupts import deaf_children
 from semcast.common.rate import NATIVE_RATE, RateChoice, to_coded
 from semcast.parent import end_with_parent
@@ -191,6 +193,7 @@ def plan_for(
     Raises:
         ConfigError: The codec is unknown.
         CheckpointError: Its weights are missing or damaged.
+        SemcastError: The process of the measurement died.
     """
     height, width = image.shape[:2]
     cores = usable_cores()
@@ -206,5 +209,11 @@ def plan_for(
                 for child in children:
                     child.kill()
                 return None
-        speed = measured.result()
+        try:
+            speed = measured.result()
+        except BrokenProcessPool as err:
+            raise SemcastError(
+                "the process that measures this machine ended early, perhaps for want of memory: with "
+                "--resize and --rate-hz nothing is measured"
+            ) from err
     return make_plan(speed, (height, width), rate_hz, cores, resize)

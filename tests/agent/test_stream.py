@@ -436,6 +436,16 @@ def test_a_frame_that_can_not_be_sent_live_is_left_out_and_counted(bench, caplog
     assert "frame 3 is left out: this codec can't" in caplog.text
 
 
+def test_a_frame_that_can_not_be_encoded_ends_a_replay_that_may_leave_none_out(bench):
+    bench.codec = Picky(bench.codec)
+    bench.channel()
+    receiver, agent = bench.receiver("replay"), bench.agent("replay")
+    assert [f.message.frame_id for f in take(receiver, count=1)] == [0]
+    agent.join(40)
+    assert isinstance(agent.error, SourceError)
+    assert str(agent.error) == "frame 3 can't be encoded, and a replay leaves none out: this codec can't"
+
+
 def test_a_folder_whose_name_is_no_text_can_be_sent(recording, codec, tmp_path):
     folder = os.fsdecode(os.fsencode(tmp_path) + b"/room\xff")
     shutil.copytree(recording, folder)

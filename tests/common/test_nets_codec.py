@@ -227,6 +227,13 @@ def test_a_manifest_that_does_not_fit_is_refused_in_one_line(weights, changes, m
     assert "\n" not in str(caught.value)
 
 
+def test_weights_travel_only_in_the_ways_they_are_for(weights):
+    change_manifest(weights, modulations=["analog"])
+    assert NeuralCodec.load(weights, "analog").modulation == "analog"
+    with pytest.raises(CheckpointError, match="are for the modulation analog, got '16qam'"):
+        NeuralCodec.load(weights, "16qam")
+
+
 def test_missing_weights_say_what_is_shipped(tmp_path):
     with pytest.raises(CheckpointError, match="no trained weights for 'nonsense'; shipped are"):
         weights_path("nonsense")

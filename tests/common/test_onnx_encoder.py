@@ -168,6 +168,11 @@ def test_bad_files_are_one_clear_error(exported, tmp_path):
     onnx.save(other, str(tmp_path / "other.onnx"))
     with pytest.raises(CheckpointError, match="must have format 2 or 3, got 99"):
         OnnxEncoder(tmp_path / "other.onnx")
+    del other.metadata_props[:]
+    onnx.helper.set_model_props(other, {"semcast_format": "2", "architecture": "3dcsc", "digest": "ab"})
+    onnx.save(other, str(tmp_path / "other.onnx"))
+    with pytest.raises(CheckpointError, match="does not say its 'snr_min_db'"):
+        OnnxEncoder(tmp_path / "other.onnx")
     with pytest.raises(ValueError, match="num_threads must be >= 1, got 0"):
         OnnxEncoder(exported, num_threads=0)
 
