@@ -198,8 +198,8 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
         of a file) with means over the images of ``psnr_db``, ``ssim`` (None for images below 11 pixels),
         ``ms_ssim`` (below 176) and ``cbr``, pilots included; the share of ``outage``; ``snr_db_estimate`` of
         the receiver; ``encode_ms`` and ``decode_ms`` (p50, p95); ``confidence`` with ``mean``, ``ece``
-        against the pixel label and ``spearman_blocks``; and ``images``, one row per image. Written to
-        ``settings.json`` and drawn into ``settings.out`` where given.
+        against the pixel label and ``spearman_blocks``, which are such means too; and ``images``, one row
+        per image. Written to ``settings.json`` and drawn into ``settings.out`` where given.
 
     Raises:
         SourceError: The images can't be read.

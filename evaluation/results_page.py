@@ -39,7 +39,9 @@ with them counts in the error. `live` means poses as they were published with ea
 figures have no such columns. The true
 paths of `shelf_50` and `phone_150` are not exact ([references](reading-results.md#references)). In the
 codec tables PSNR of an outage counts the grey picture the receiver shows then (12.8 dB on Kodak); elsewhere
-PSNR is a mean over the frames that could be decoded. What the figures mean and what limits them is in
+PSNR is a mean over the frames that could be decoded. The calibration error (ECE) of a codec table is a mean
+over those of its images; in the tables of confidence it is that of all pixels together, which is smaller
+where images err to either side. What the figures mean and what limits them is in
 [reading the results](reading-results.md).
 """
 
@@ -377,36 +379,24 @@ def results_page(folder: Path = RESULTS) -> str:
     return "\n".join(lines)
 
 
-def confidence_part(folder: Path = RESULTS) -> str:
-    """Return the part of the page on confidence that is about pairs."""
-    files = sorted(folder.glob("pairs_*.json"))
-    return pair_summary(json.loads(file.read_text(encoding="utf-8")) for file in files)
+def _reports(pattern: str) -> Iterator[Report]:
+    for file in sorted(RESULTS.glob(pattern)):
+        yield json.loads(file.read_text(encoding="utf-8"))
 
 
-def headline_part(folder: Path = RESULTS) -> str:
-    """Return what the page on confidence says about pairs in short."""
-    files = sorted(folder.glob("pairs_*.json"))
-    return pair_headline(json.loads(file.read_text(encoding="utf-8")) for file in files)
-
-
-def depth_part(folder: Path = RESULTS) -> str:
-    """Return the part of the page on confidence that is about depth in the drawn room."""
-    return depth_summary(json.loads((folder / "depth_room.json").read_text(encoding="utf-8")))
-
-
-def trajectory_part(folder: Path = RESULTS) -> str:
-    """Return the part of the page on confidence that is about trajectories."""
-    files = sorted(folder.glob("trajectory_*.json"))
-    return trajectory_summary(json.loads(file.read_text(encoding="utf-8")) for file in files)
+#: Parts of the page on confidence by the names of their markers, and what makes each of them.
+CONFIDENCE_PARTS: dict[str, Callable[[], str]] = {
+    "in short": lambda: pair_headline(_reports("pairs_*.json")),
+    "pairs": lambda: pair_summary(_reports("pairs_*.json")),
+    "depth": lambda: depth_summary(next(_reports("depth_room.json"))),
+    "trajectories": lambda: trajectory_summary(_reports("trajectory_*.json")),
+}
 
 
 if __name__ == "__main__":
     PAGE.write_text(results_page(), encoding="utf-8")
     for page, name, part in (
         (README, "results", readme_table(RESULTS)),
-        (CONFIDENCE_PAGE, "in short", headline_part()),
-        (CONFIDENCE_PAGE, "pairs", confidence_part()),
-        (CONFIDENCE_PAGE, "depth", depth_part()),
-        (CONFIDENCE_PAGE, "trajectories", trajectory_part()),
+        *((CONFIDENCE_PAGE, name, make()) for name, make in CONFIDENCE_PARTS.items()),
     ):
         page.write_text(with_part(page.read_text(encoding="utf-8"), name, part), encoding="utf-8")

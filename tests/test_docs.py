@@ -17,14 +17,7 @@ from semcast.cli import VERBS, verb_parser
 from semcast.common import keys
 from semcast.evaluation.markdown import with_part
 from semcast.evaluation.path_tables import readme_table
-from semcast.evaluation.results_page import (
-    RESULTS,
-    confidence_part,
-    depth_part,
-    headline_part,
-    results_page,
-    trajectory_part,
-)
+from semcast.evaluation.results_page import CONFIDENCE_PARTS, RESULTS, results_page
 from semcast.reference import reference, with_messages
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -118,14 +111,8 @@ def test_the_figures_in_the_docs_are_those_of_the_result_files(monkeypatch):
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert readme == with_part(readme, "results", readme_table(RESULTS)), "run make results-page"
     confidence = (ROOT / "docs/confidence.md").read_text(encoding="utf-8")
-    parts = {
-        "in short": headline_part,
-        "pairs": confidence_part,
-        "depth": depth_part,
-        "trajectories": trajectory_part,
-    }
-    for name, part in parts.items():
-        assert confidence == with_part(confidence, name, part()), "run make results-page"
+    for name, make in CONFIDENCE_PARTS.items():
+        assert confidence == with_part(confidence, name, make()), "run make results-page"
 
 
 @pytest.mark.parametrize(
