@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.server.geometry.weighting import MAD_TO_SIGMA
+
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
@@ -55,7 +57,7 @@ def brightness_change(
     model = np.array([np.median(after / before), 0.0])
     for _ in range(_ITERATIONS):
         residual = np.abs(after - design @ model)
-        scale = 1.4826 * float(np.median(residual)) + 0.1
+        scale = MAD_TO_SIGMA * float(np.median(residual)) + 0.1
         weight = 1.0 / np.maximum(residual, scale) / scale
         normal = design.T @ (weight[:, None] * design)
         normal[1, 1] += _OFFSET_SIGMA_GREY**-2

@@ -13,6 +13,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3
 from semcast.server.geometry.features import Grey
 from semcast.server.geometry.sampling import bilinear
+from semcast.server.geometry.weighting import MAD_TO_SIGMA
 
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
@@ -108,7 +109,7 @@ def _step(at: Array, slope: Array, error: Array) -> Array | None:
         ]
     )
     off = np.abs(error - np.median(error))
-    limit = _HUBER_SIGMAS * max(_LEAST_SD_GREY, 1.4826 * float(np.median(off)))
+    limit = _HUBER_SIGMAS * max(_LEAST_SD_GREY, MAD_TO_SIGMA * float(np.median(off)))
     weighted = by_turn * (limit / np.maximum(off, limit))[:, None]
     information = by_turn.T @ weighted
     if np.linalg.eigvalsh(information[:3, :3])[0] < _LEAST_GREY_PER_RAD**2 * len(at):

@@ -237,8 +237,8 @@ def _as_in_the_paper(
     found = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
     if found is None:
         return None
-    near = np.abs(sampson_px(fundamental_matrix(camera, found.T_cam1_cam0), xy0, xy1)) < 2.0 * threshold_px
     T = found.T_cam1_cam0
+    near = _near_lines(camera, T, xy0, xy1, threshold_px)
     return most_in_front(camera, (T, make_transform(T[:3, :3], -T[:3, 3])), xy0[near], xy1[near])
 
 
@@ -337,8 +337,15 @@ def follows(
         xy1: ``(N, 2)`` pixels, matched row by row.
         threshold_px: Inlier threshold of the search.
     """
-    near = np.abs(sampson_px(fundamental_matrix(camera, T_cam1_cam0), xy0, xy1)) < 2.0 * threshold_px
-    return np.asarray(near & ~_behind(camera, T_cam1_cam0, xy0, xy1, threshold_px))
+    near = _near_lines(camera, T_cam1_cam0, xy0, xy1, threshold_px)
+    return near & ~_behind(camera, T_cam1_cam0, xy0, xy1, threshold_px)
+
+
+def _near_lines(
+    camera: Intrinsics, T: Array, xy0: Array, xy1: Array, threshold_px: float
+) -> NDArray[np.bool_]:
+    """Which matches are within two thresholds of their epipolar lines, ``(N,)``."""
+    return np.asarray(np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1)) < 2.0 * threshold_px)
 
 
 def _search(
@@ -459,8 +466,7 @@ def _result(
     threshold_px: float,
     choose_model: bool,
 ) -> TwoViewResult:
-    residual = np.abs(sampson_px(fundamental_matrix(camera, T), xy0, xy1))
-    near = residual < 2.0 * threshold_px
+    near = _near_lines(camera, T, xy0, xy1, threshold_px)
     depth0, depth1 = depths(camera, T, xy0, xy1)
     inliers = near & (depth0 > 0) & (depth1 > 0)
     angle = rays_angle_deg(camera, T, xy0, xy1)
