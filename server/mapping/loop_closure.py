@@ -175,7 +175,7 @@ class LoopFinder:
         has_say = found.points.ok & tells_depth(self._camera, world.keyframes_of(submap), found.ids)
         ids, xy = found.ids[has_say], found.points.xy[has_say]
         sigma = np.full(len(ids), max(OLD_SIGMA_PX, noise.sigma0_px))
-        xyz = world.landmarks.xyz[world.landmarks.rows(ids)]
+        xyz = world.landmarks.xyz_of(ids)
         pose = search_pose(self._camera, xyz, xy, sigma, GATE_SIGMAS * sigma, seed=self._seed)
         if pose is None or pose.num_inliers < max(_MIN_FOUND, _MIN_FOUND_SHARE * len(ids)):
             return None
@@ -193,7 +193,7 @@ class LoopFinder:
         is_sure: bool,
     ) -> Loop | None:
         """What a recognised place means: that nothing has drifted, or a loop."""
-        xyz = world.landmarks.xyz[world.landmarks.rows(place.ids)]
+        xyz = world.landmarks.xyz_of(place.ids)
         residual, in_front = reprojection_residual(
             self._camera, invert_transform(view.T_world_cam), xyz, place.xy
         )

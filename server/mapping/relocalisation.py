@@ -183,7 +183,7 @@ class Relocaliser:
 
     def _search(self, world: WorldMap, ids: Ids, xy: Array, sigma_px: float) -> PoseEstimate | None:
         sigma = np.full(len(xy), sigma_px)
-        points = world.landmarks.xyz[world.landmarks.rows(ids)]
+        points = world.landmarks.xyz_of(ids)
         return search_pose(
             self._camera,
             points,
@@ -208,7 +208,7 @@ class Relocaliser:
         mine = world.keyframes_of(keyframe.submap)
         near = sorted(mine, key=lambda k: abs(k.frame_id - keyframe.frame_id))[:_NEIGHBOURS]
         ids, known = _pool(world, near)
-        points = world.landmarks.xyz[world.landmarks.rows(ids)]
+        points = world.landmarks.xyz_of(ids)
         T = found.T_cam_world
         expected = self._camera.project(transform_points(T, points))
         size = (self._camera.width, self._camera.height)
@@ -291,7 +291,7 @@ def submap_similarity(
     close = square[np.arange(len(place.xy)), nearest] < _SAME_PX**2
     if int(close.sum()) < _MIN_SHARED:
         return None
-    xyz_old = world.landmarks.xyz[world.landmarks.rows(place.ids[close])]
+    xyz_old = world.landmarks.xyz_of(place.ids[close])
     xyz_new = world.landmarks.xyz[row_new[known][nearest[close]]]
     depth_old = depths_in(invert_transform(place.T_world_cam), xyz_old)
     depth_new = depths_in(invert_transform(T_world_cam_new), xyz_new)

@@ -236,7 +236,7 @@ def place_anew(
         np.concatenate([noise.sigma_px(confidence), np.full(count, sigma_px)]),
         count,
     )
-    before = world.landmarks.xyz[world.landmarks.rows(ids)]
+    before = world.landmarks.xyz_of(ids)
     told = placed.parallax_deg > _MIN_PARALLAX_DEG
     xyz = np.where(told[:, None], placed.xyz, before)
     residual, in_front = reprojection_residual(camera, T_cam_world, xyz, xy)

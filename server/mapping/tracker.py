@@ -208,7 +208,7 @@ class _SeenLandmarks:
 
     @classmethod
     def of(cls, tracks: Seen, world: WorldMap, noise: NoiseModel) -> "_SeenLandmarks":
-        xyz = world.landmarks.xyz[world.landmarks.rows(tracks.ids)]
+        xyz = world.landmarks.xyz_of(tracks.ids)
         return cls(tracks, xyz, noise.sigma_px(tracks.confidence), noise.threshold_px(tracks.confidence))
 
 

@@ -90,18 +90,27 @@ class TrackTable:
 
     def clear(self) -> None:
         """Forget all tracks; ids go on."""
+        self.adopt(np.zeros(0, np.int64), np.zeros((0, 2)), 0.0)
+
+    def adopt(self, ids: Ids, xy: Array, confidence: float) -> None:
+        """Replace all tracks by points of the newest image, as after relocalisation.
+
+        Ids that occur twice are taken once.
+        """
         self._before: dict[str, Array] | None = None
-        self.ids: Ids = np.zeros(0, np.int64)
-        self.xy: Array = np.zeros((0, 2))
-        self.velocity: Array = np.zeros((0, 2))
-        self.confidence: Array = np.zeros(0)
-        self.variance_px2: Array = np.zeros(0)
-        self.drift_px2: Array = np.zeros(0)
-        self.age: Ids = np.zeros(0, np.int64)
-        self.missed: Ids = np.zeros(0, np.int64)
-        self.anchor_xy: Array = np.zeros((0, 2))
-        self.stood_widths: Array = np.zeros(0)
-        self.edge: Array = np.zeros((0, 2))
+        distinct, first = np.unique(ids, return_index=True)
+        count = len(first)
+        self.ids: Ids = distinct
+        self.xy: Array = xy[first]
+        self.velocity: Array = np.zeros((count, 2))
+        self.confidence: Array = np.full(count, confidence)
+        self.variance_px2: Array = np.zeros(count)
+        self.drift_px2: Array = np.zeros(count)
+        self.age: Ids = np.ones(count, np.int64)
+        self.missed: Ids = np.zeros(count, np.int64)
+        self.anchor_xy: Array = self.xy.copy()
+        self.stood_widths: Array = np.zeros(count)
+        self.edge: Array = np.zeros((count, 2))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -147,25 +156,6 @@ class TrackTable:
         """Forget tracks outside the mask."""
         for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[mask])
-
-    def adopt(self, ids: Ids, xy: Array, confidence: float) -> None:
-        """Replace all tracks by points of the newest image, as after relocalisation.
-
-        Ids that occur twice are taken once.
-        """
-        self._before = None
-        self.ids, first = np.unique(ids, return_index=True)
-        self.xy = xy[first].copy()
-        count = len(first)
-        self.velocity = np.zeros((count, 2))
-        self.confidence = np.full(count, confidence)
-        self.variance_px2 = np.zeros(count)
-        self.drift_px2 = np.zeros(count)
-        self.age = np.ones(count, np.int64)
-        self.missed = np.zeros(count, np.int64)
-        self.anchor_xy = self.xy.copy()
-        self.stood_widths = np.zeros(count)
-        self.edge = np.zeros((count, 2))
 
     def renew(self, others: Ids) -> tuple[Ids, Ids]:
         """Give all tracks new ids, as if they began now, and ids kept elsewhere with them.

@@ -153,7 +153,7 @@ def _adjust(
         part,
         np.stack([k.T_world_cam for k in part]),
         landmark_ids,
-        world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
+        world.landmarks.xyz_of(landmark_ids),
         seen.of_rows(kept, point),
         noise,
         fixed=np.arange(len(part)) == 0,

@@ -104,7 +104,7 @@ def build_problem(
         views,
         np.stack([k.T_world_cam for k in views]),
         landmark_ids,
-        world.landmarks.xyz[world.landmarks.rows(landmark_ids)].copy(),
+        world.landmarks.xyz_of(landmark_ids),
         seen.of_rows(kept, point),
         noise,
         fixed=fixed,
