@@ -86,9 +86,7 @@ class ViewStage:
         since = time.perf_counter_ns()
         view = frame_view(frame, result, row, {})
         if update is not None:
-            self._scene.set_keyframes(update.keyframe_ids, update.keyframe_poses)
-            self._scene.move_frames(update.frame_ids, update.frame_poses)
-            self._scene.add_landmarks(update.ids, update.xyz, update.rgb, update.confidence, update.removed)
+            self._scene.update(update)
         self._scene.add_frame(view.without_image())
         self._scene.set_picture(compress_picture(view, self._quality))
         self._stream.write(self._scene.changes_since(self._cursor))

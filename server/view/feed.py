@@ -77,12 +77,8 @@ def _apply(scene: Scene, item: _Pending) -> None:
     """Bring what was submitted into the scene."""
     if item.new_map:
         scene.start_new_map()
-    if (update := item.update) is not None:
-        scene.set_keyframes(update.keyframe_ids, update.keyframe_poses)
-        scene.move_frames(update.frame_ids, update.frame_poses)
-        scene.withdraw_frames(update.withdrawn)
-        scene.set_marker(update.marker)
-        scene.add_landmarks(update.ids, update.xyz, update.rgb, update.confidence, update.removed)
+    if item.update is not None:
+        scene.update(item.update)
     scene.set_patches(item.patches)
     if item.view is not None:
         scene.add_frame(item.view)

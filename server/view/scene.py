@@ -16,7 +16,7 @@ from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import match_times
 from semcast.server.dense.cloud import DensePatch
-from semcast.server.mapping.state import Marker
+from semcast.server.mapping.state import MapUpdate, Marker
 from semcast.server.view.frame_view import MISSING, FrameView
 from semcast.server.view.landmark_table import LandmarkTable
 from semcast.server.view.patch_table import PatchTable, PlacedPatch
@@ -179,6 +179,14 @@ class Scene:
     def _insert_pose(self, frame_id: int, t_source_ns: int, T_world_cam: Array) -> None:
         T = np.asarray(T_world_cam, dtype=np.float64)
         self._path.insert(frame_id, t_source_ns, T, is_after_gap=self._lost_since_pose)
+
+    def update(self, update: MapUpdate) -> None:
+        """Take what changed in the map."""
+        self.set_keyframes(update.keyframe_ids, update.keyframe_poses)
+        self.move_frames(update.frame_ids, update.frame_poses)
+        self.withdraw_frames(update.withdrawn)
+        self.set_marker(update.marker)
+        self.add_landmarks(update.ids, update.xyz, update.rgb, update.confidence, update.removed)
 
     def move_frames(self, ids: NDArray[np.int64], T_world_cam: Array) -> None:
         """Set the poses ``(F, 4, 4)`` of frames that did not just move with a keyframe."""
