@@ -14,13 +14,13 @@ from semcast.common.trajectory_error import ate, match_times
 from semcast.evaluation.live_poses import LivePose, live_figures
 from semcast.evaluation.pipeline import LinkedFrame
 from semcast.server.decoder import tracker_frame
-from semcast.server.export.outputs import trajectory_of
 from semcast.server.frame_rows import FrameRow, summarise
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleProblem
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
+from semcast.server.run_results import results_of
 from semcast.server.sent_frames import stretches
 
 #: Called after each processed frame; may add stages of its own to the row's ``stage_ms``.
@@ -121,21 +121,20 @@ def reconstruct(
             if pose is not None:
                 published[frame.frame_id] = pose
         reconstruction.conclude()
-        poses = reconstruction.final_trajectory()
-        num_landmarks = len(reconstruction.landmarks()[0])
-        part_of = reconstruction.world.part_of_frames()
-        num_keyframes = len(np.unique(reconstruction.world.observations()[1]))
+        found = results_of(reconstruction, frame_times_ns)
     finally:
         reconstruction.close()
-    trajectory = trajectory_of(poses, frame_times_ns)
     truth = cut_to_frames(truth, frame_times_ns) if truth is not None else None
     drops = {"lost": num_lost} if num_lost else {}
     sent = stretches({frame_id: k for k, frame_id in enumerate(frame_times_ns)})
-    summary = summarise(rows, trajectory, part_of, truth, sent, len(sent), drops, num_keyframes)
+    summary = summarise(
+        rows, found.trajectory, found.part_of, truth, sent, len(sent), drops, found.num_keyframes
+    )
     summary |= live_figures(published, frame_times_ns, truth, summary["frames"]["sent"])
     summary["readout_ms"] = reconstruction.camera.readout_ms
     summary["readout_from"] = reconstruction.camera.readout_from
-    return ReconstructedRun(summary, _plain_rows(rows, trajectory, truth), trajectory, num_landmarks, truth)
+    plain_rows = _plain_rows(rows, found.trajectory, truth)
+    return ReconstructedRun(summary, plain_rows, found.trajectory, found.num_landmarks, truth)
 
 
 def _process(

@@ -28,6 +28,8 @@ _STATE_COLOURS = {"initializing": "#f0c040", "lost": "#d05050"}
 #: runs beside the frames, and the last is a sum of others.
 _NOT_TO_POSE = frozenset({"map", "bundle", "decoded_to_pose"})
 
+#: Curves of stages in their panel.
+_MAX_STAGES = 3
 #: A part of a recording without pose is common; beyond this factor the truth may be of another recording.
 _MAX_SPAN_RATIO = 1.5
 #: More numbers with decimals below a narrow panel run into each other.
@@ -329,11 +331,11 @@ def _column(rows: Sequence[FrameRow], name: str) -> Array:
     return np.array([np.nan if (v := getattr(row, name)) is None else v for row in rows], dtype=np.float64)
 
 
-def _stages(rows: Sequence[FrameRow], most: int = 3) -> dict[str, Array]:
+def _stages(rows: Sequence[FrameRow]) -> dict[str, Array]:
     """Return the stages to the pose that take longest in all, each with a value per row."""
     names = {name for row in rows for name in row.stage_ms} - _NOT_TO_POSE
     total = {name: sum(row.stage_ms.get(name, 0.0) for row in rows) for name in names}
-    longest = sorted(total, key=lambda name: (-total[name], name))[:most]
+    longest = sorted(total, key=lambda name: (-total[name], name))[:_MAX_STAGES]
     return {name: np.array([row.stage_ms.get(name, np.nan) for row in rows]) for name in longest}
 
 

@@ -28,6 +28,8 @@ from semcast.server.export.parts import count_parts, parts_line
 from semcast.server.export.placement import TWO_SIDED_95
 from semcast.server.recorded_streams import RecordedStream, recorded_streams
 
+#: Of a value that is shown; the rest is cut off.
+_MAX_CHARS = 160
 #: Heading and ``(name, value)`` lines; a name of "" goes on with the line before.
 Section = tuple[str, list[tuple[str, str]]]
 
@@ -339,10 +341,10 @@ def _flat_toml(text: str) -> list[tuple[str, str]]:
     return lines
 
 
-def _short(value: Any, most: int = 160) -> str:
+def _short(value: Any) -> str:
     text = value if isinstance(value, str) else json.dumps(value, default=str)
     text = " ".join(text.split())
-    return text if len(text) <= most else text[: most - 1] + "…"
+    return text if len(text) <= _MAX_CHARS else text[: _MAX_CHARS - 1] + "…"
 
 
 def _bytes(count: float) -> str:
