@@ -64,6 +64,23 @@ def test_brightness_may_change():
     assert rotation_angle_deg(turn_between(CAMERA, before, now, STAYED).T @ R) < 0.3
 
 
+def test_a_thing_in_another_light_does_not_turn_the_camera():
+    R = exp_so3((0, 0.05, 0))
+    brighter = wall(R, STAYED) + 20.0
+    brighter[60:100, 100:180] = 230.0
+    found = turn_between(CAMERA, noisy(wall(np.eye(3), STAYED), 1), noisy(brighter, 2), STAYED)
+    assert rotation_angle_deg(found.T @ R) < 0.15
+
+
+def test_stripes_and_views_with_little_in_common_tell_no_turn():
+    upright = np.tile(scene().mean(axis=0, dtype=np.float32), (480, 1))[120:360, 160:480]
+    stripes = np.rint(upright).astype(np.uint8)
+    assert turn_between(CAMERA, stripes, stripes, STAYED) is None, "none about the axis across them"
+    way = np.array([0.9, 0.0, 0.0])  # of 320 pixels 86 are in both
+    before, now = noisy(wall(np.eye(3), STAYED), 1), noisy(wall(np.eye(3), -way), 2)
+    assert turn_between(CAMERA, before, now, way) is None
+
+
 def test_what_moving_does_is_no_turn():
     R, way = exp_so3((0, 0.05, 0)), np.array([0.08, 0.0, 0.05])
     before, now = noisy(wall(np.eye(3), STAYED), 1), noisy(wall(R, -R @ way), 2)

@@ -75,6 +75,18 @@ def test_edges_are_weighed_by_what_they_are_worth():
     assert x[1] == pytest.approx(1.0 + 1 / 101, abs=0.005)
 
 
+@pytest.mark.parametrize("of", ["turn", "scale"])
+def test_what_contradicts_itself_is_weighed_by_the_deviations_of_its_kind(of):
+    turn = exp_se3([0, 0.02, 0, 0, 0, 0]) if of == "turn" else np.eye(4)
+    scale = np.exp(0.02) if of == "scale" else 1.0
+    sure, doubtful = ((s, 1.0, 5.0) if of == "turn" else (5.0, 1.0, s) for s in (0.01, 0.02))
+    said = [PoseConstraint(0, 1, np.eye(4), 1.0, sure), PoseConstraint(0, 1, turn, scale, doubtful)]
+    solved = solve_graph(np.stack([np.eye(4)] * 2), said)
+    found = np.radians(rotation_angle_deg(solved.T_world_cam[1][:3, :3])) + np.log(solved.scale[1])
+    assert found == pytest.approx(0.2 * 0.02, rel=0.01), "by variance: 1 to 4"
+    assert solved.cost == pytest.approx(0.5 * (0.4**2 + 0.8**2), rel=0.01)
+
+
 def test_a_keyframe_that_nothing_holds_stays():
     poses = circle(4)
     solved = solve_graph(poses, steps(poses)[:2])
