@@ -12,11 +12,15 @@ import shaken_views
 from drawn_boards import CAMERA, ate_percent, make, render
 
 from semcast.common.geometry import exp_se3, exp_so3, make_transform
+from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
+from semcast.server.mapping.late_readout import put_map_right
+from semcast.server.mapping.readout import lean
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.residual_patterns import COLUMNS, ROWS
-from semcast.server.mapping.rolling_shutter import RollingShutter
+from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.tracks import TrackTable
+from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 NUM_FRAMES, STEP_S, READOUT_S, NUM_BANDS = 50, 1 / 30, 0.025, 12
 
@@ -68,6 +72,37 @@ def test_the_readout_is_found_and_the_path_is_put_right(readout_s, axis, side, c
     as_global, _, ate_as_global = run(readout_s, axis, readout_ms=0.0)
     assert as_global.camera.readout_ms == 0.0
     assert ate < 0.65 * ate_as_global
+
+
+def test_keyframes_are_put_right_by_what_they_have_in_view(rng):
+    camera = replace(CAMERA, readout_ms=25.0)
+    flow = ImageFlow(camera, np.array([2.0, 0, 0, 0, 0, 0, 0, 0]))
+    size = camera.width, camera.height
+    in_view = camera.unproject(rng.uniform(0, size, (30, 2))) * rng.uniform(2.0, 6.0, (30, 1))
+    beside = camera.unproject(rng.uniform(2 * camera.width, 3 * camera.width, (30, 2))) * 3.0
+    xyz = np.concatenate([in_view, beside])
+    world, images = WorldMap(), KeyframeImages(3)
+    for frame_id, ids in ((0, np.arange(60)), (10, np.arange(11)), (20, np.arange(60))):
+        xy = camera.project(xyz[ids])
+        world.add_keyframe(Keyframe(frame_id, frame_id, exp_se3(np.zeros(6)), 0, ids, xy, np.ones(len(ids))))
+    world.add_landmarks(np.arange(60), xyz, np.zeros((60, 3), np.uint8), np.ones(60), 0, 0)
+    late_s = 0.025 * (np.arange(camera.height) / (camera.height - 1) - 0.5)
+    line_x = np.rint(camera.cx + 2.0 * camera.fx * late_s).astype(int)
+    leaning = np.zeros(camera.shape_hw, np.uint8)
+    leaning[np.arange(camera.height), line_x] = 255
+    images.append(SeenFrom(0, leaning))
+    put_map_right(world, images, camera, {0: flow, 10: flow})
+    assert np.ptp(line_x) > 10
+    (upright,) = images
+    assert np.ptp(upright.grey.argmax(axis=1)) <= 1
+    off = lean(camera, in_view, flow.at(camera.project(in_view)))
+    np.testing.assert_allclose(world.pose_of_frame(0), exp_se3(-off), atol=1e-12)
+    np.testing.assert_array_equal(world.pose_of_frame(10), np.eye(4), "eleven points are too few")
+    np.testing.assert_array_equal(world.pose_of_frame(20), np.eye(4), "how it moved is not known")
+    first, second, third = world.keyframes
+    assert np.abs(first.xy[:30] - camera.project(in_view)).max() > 5.0
+    np.testing.assert_array_equal(second.xy, first.xy[:11])
+    np.testing.assert_array_equal(third.xy[:30], camera.project(in_view))
 
 
 def test_what_was_found_outlives_a_restart_and_a_reset():
