@@ -235,7 +235,7 @@ class LoopFinder:
         near = (apart < _MAX_DRIFT * way + depth) & (apart < _MAX_APART * way)
         near &= turn < self._camera.half_diagonal_rad
         rows = np.flatnonzero(near)
-        return [older[row] for row in rows[:: 1 + len(rows) // MAX_CONSIDERED].tolist()]
+        return [older[row] for row in rows[:: max(1, -(-len(rows) // MAX_CONSIDERED))].tolist()]
 
 
 def share_out(world: WorldMap, submap: int, loop: Loop) -> tuple[Ids, SolvedGraph] | None:

@@ -250,7 +250,7 @@ class Relocaliser:
 
 def _likeliest(candidates: Sequence[Keyframe], descriptors: NDArray[np.uint8]) -> list[Keyframe]:
     """Return the keyframes with the most descriptors like those of an image."""
-    some = descriptors[:: 1 + len(descriptors) // _NUM_COMPARED]
+    some = descriptors[:: -(-len(descriptors) // _NUM_COMPARED)]
     alike = np.array([count_matches(some, keyframe.descriptors) for keyframe in candidates], dtype=np.int64)
     best = np.argsort(-alike, kind="stable")[:_NUM_LIKELIEST]
     return [candidates[k] for k in best.tolist() if alike[k] >= _MIN_ALIKE]

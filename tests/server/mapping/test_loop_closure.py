@@ -10,7 +10,7 @@ from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.features import TrackedPoints
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.loop_closure import _LOOK_INTERVAL, Loop, LoopFinder, LoopView, share_out
-from semcast.server.mapping.relocalisation import Place
+from semcast.server.mapping.relocalisation import MAX_CONSIDERED, Place
 from semcast.server.mapping.revisit import Revisit
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -204,6 +204,18 @@ def test_far_from_old_keyframes_nothing_is_compared(room):
     for _ in range(6):
         finder.look(LoopView(view(room, HERE).sight, away, *sees(HERE, room[1])), room[0], NOISE, 0, None)
     assert recogniser.asked == []
+
+
+@pytest.mark.parametrize(("num_old", "num_compared"), [(MAX_CONSIDERED, MAX_CONSIDERED), (41, 21), (80, 40)])
+def test_old_keyframes_are_thinned_out_only_where_they_are_too_many(num_old, num_compared):
+    world, nothing = WorldMap(), (np.zeros(0, np.int64), np.zeros((0, 2)))
+    for k in range(num_old + 20):  # the newest are never a loop
+        world.add_keyframe(Keyframe(k, k, make_transform(np.eye(3), [k % 2, 0, 0]), 0, *nothing, np.zeros(0)))
+    recogniser = Recogniser()
+    finder = LoopFinder(CAMERA, recogniser, 0)
+    for _ in range(_LOOK_INTERVAL):
+        finder.look(LoopView(None, np.eye(4), *nothing), world, NOISE, 0, None)
+    assert [len(ids) for ids in recogniser.asked] == [num_compared]
 
 
 def test_which_keyframes_are_compared_does_not_depend_on_the_shape_of_pixels(room):

@@ -9,7 +9,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import detect_corners
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.relocalisation import Relocaliser
+from semcast.server.mapping.relocalisation import _NUM_COMPARED, Relocaliser, _likeliest
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import DecodedFrame
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -108,6 +108,12 @@ def test_all_keyframes_have_their_turn_and_of_those_the_likeliest_is_looked_at(r
         )
     found = [relocaliser.find(SIGHT, world, NOISE) for _ in range(3)]
     assert [place and place.keyframe_id for place in found] == [None, None, 0]
+
+
+def test_a_likely_keyframe_is_told_by_as_many_descriptors_as_may_be_compared(rng):
+    descriptors = rng.integers(0, 256, (_NUM_COMPARED, 32), np.uint8)
+    known = Keyframe(0, 0, np.eye(4), 0, *(np.zeros(0) for _ in range(3)), descriptors=descriptors[1::2])
+    assert _likeliest([known], descriptors) == [known]
 
 
 def test_another_image_is_no_place():
