@@ -81,7 +81,7 @@ def rays_of(
             new = new[~refuted[new]]
         if len(new) == 0:
             continue
-        own = _usual_depth(world, views[position:])
+        own = _first_known_depth(world, views[position:])
         depth = own if np.isfinite(own) else depth
         if not np.isfinite(depth):
             break
@@ -106,6 +106,6 @@ def rays_of(
     return Rays(rows, xyz[rows], np.sqrt(len(rows)) * spread_px[rows], sigma_px[rows])
 
 
-def _usual_depth(world: WorldMap, views: list[Keyframe]) -> float:
+def _first_known_depth(world: WorldMap, views: list[Keyframe]) -> float:
     """Median depth of the landmarks of the first view that has some; infinite where none has."""
     return next((d for d in (median_depth(world, k) for k in views) if np.isfinite(d)), float("inf"))
