@@ -157,7 +157,8 @@ class RecordedSource:
     def __init__(self, sequence: Sequence, settings: SourceSettings) -> None:
         self._sequence = sequence
         self._settings = settings
-        self._intrinsics = sequence.intrinsics
+        #: Of the frames, without distortion.
+        self.intrinsics = sequence.intrinsics
         if doubt := sequence.doubt:
             logger.warning("%s is %s", sequence.name, doubt)
         self._num_unreadable = 0
@@ -191,11 +192,6 @@ class RecordedSource:
     def name(self) -> str:
         """Folder name."""
         return self._sequence.name
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """Of the frames, without distortion."""
-        return self._intrinsics
 
     @property
     def stored_camera(self) -> Intrinsics:

@@ -135,25 +135,17 @@ class _Captured:
                 raise SourceError(f"the camera of {name} is unknown: {HOW_TO_GIVE}")
             check_size(camera, width, height, name)
             camera.check_possible(name)
-            self._size_wh = resized_wh(width, height, settings.resize)
+            size_wh = resized_wh(width, height, settings.resize)
         except SourceError:
             self.close()
             raise
         self._stored_wh = (width, height)
-        self._stored_camera = camera
-        self._intrinsics = camera.undistorted().scaled_to(*self._size_wh)
-        self._rectify = ImageRectifier(camera, self._size_wh)
+        #: Of the images as they come.
+        self.stored_camera = camera
+        #: Of the frames, without distortion.
+        self.intrinsics = camera.undistorted().scaled_to(*size_wh)
+        self._rectify = ImageRectifier(camera, size_wh)
         self._first: NDArray[np.uint8] | None = first
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """Of the frames, without distortion."""
-        return self._intrinsics
-
-    @property
-    def stored_camera(self) -> Intrinsics:
-        """Of the images as they come."""
-        return self._stored_camera
 
     @property
     def num_unreadable(self) -> int:

@@ -149,7 +149,7 @@ class ConventionalCodec:
         self._modes = ADAPTIVE_MODES if adaptive else (FIXED_MODE,)
         self._adaptive = adaptive
         self._slow = slow
-        self._modulation: Modulation = "analog" if adaptive else modulation
+        self.modulation: Modulation = "analog" if adaptive else modulation
         self._quality_hint = 30
         self._layout: SlotLayout | None = None
         self._transports: dict[int, Transport | None] = {}
@@ -158,11 +158,6 @@ class ConventionalCodec:
     def name(self) -> str:
         """Registry name."""
         return f"{self._format}{'-slow' if self._slow else ''}-{'amc' if self._adaptive else 'ldpc'}"
-
-    @property
-    def modulation(self) -> Modulation:
-        """How the symbols travel."""
-        return self._modulation
 
     @property
     def digest(self) -> str:
@@ -196,7 +191,7 @@ class ConventionalCodec:
         if header:
             data[:, :header] = self._mode_words(layout)[mode_idx]
         data[:, header:] = symbols.reshape(layout.num_slots, -1)
-        return EncodedImage(shape_hw=shape_hw, symbols=data, modulation=self._modulation)
+        return EncodedImage(shape_hw=shape_hw, symbols=data, modulation=self.modulation)
 
     def decode(self, received: ReceivedImage) -> DecodedImage:
         """Decode one frame; a frame whose CRC fails comes back mid-grey, as an outage.

@@ -88,6 +88,7 @@ class Sequence:
         frame_ids: ``(N,)`` int64, the index of each frame in the whole recording: ``arange(N)`` unless a
             stride was asked for.
         times_ns: ``(N,)`` int64, recorded time of each frame, strictly increasing.
+        size_wh: Width and height of the images that ``image`` returns.
     """
 
     def __init__(
@@ -107,8 +108,8 @@ class Sequence:
         self._stored_wh = first.size_wh
         self._is_16_bit = first.is_16_bit
         self._stored_camera = camera
-        self._size_wh = resized_wh(*first.size_wh, resize)
-        self._rectify = ImageRectifier(camera, self._size_wh)
+        self.size_wh = resized_wh(*first.size_wh, resize)
+        self._rectify = ImageRectifier(camera, self.size_wh)
         self._truth = _truth_of(files, self.times_ns)
 
     def __len__(self) -> int:
@@ -125,18 +126,13 @@ class Sequence:
         return bits
 
     @property
-    def size_wh(self) -> tuple[int, int]:
-        """Width and height of the images that ``image`` returns."""
-        return self._size_wh
-
-    @property
     def intrinsics(self) -> Intrinsics:
         """Pinhole, without distortion, of the images that ``image`` returns.
 
         Raises:
             SourceError: The recording says nothing about its camera and none was given.
         """
-        return self.stored_camera.undistorted().scaled_to(*self._size_wh)
+        return self.stored_camera.undistorted().scaled_to(*self.size_wh)
 
     @property
     def stored_camera(self) -> Intrinsics:
@@ -164,7 +160,7 @@ class Sequence:
         if not 0 <= index < len(self._paths):
             raise IndexError(f"frame must be in [0, {len(self._paths) - 1}], got {index}")
         image = self._rectify(self._read(self._paths[index]))
-        if camera is None or (camera.width, camera.height) == self._size_wh:
+        if camera is None or (camera.width, camera.height) == self.size_wh:
             return image
         if self._stored_camera is not None:
             same = self.intrinsics.scaled_to(camera.width, camera.height)

@@ -66,13 +66,13 @@ class Server:
         load: Callable[[str, Modulation], Codec] | None = None,
     ) -> None:
         self._settings = settings
-        self._agent_id = settings.agent_id
+        agent_id = settings.agent_id
         self.metrics = Metrics("server")
-        self._codec: str | None = None
+        codec: str | None = None
         own: Path | None = None
         if settings.codec is not None:
-            self._codec, own = named_weights(settings.codec)
-        installed = codec_loader(settings.threads, settings.device, own, only_of=self._codec)
+            codec, own = named_weights(settings.codec)
+        installed = codec_loader(settings.threads, settings.device, own, only_of=codec)
         self._decoder = FrameDecoder(load if load is not None else installed)
         self._false_start = FalseStart()
         self._new_map = False
@@ -81,15 +81,15 @@ class Server:
             stack.enter_context(output_folder(settings.out))
             if settings.record is not None:
                 record, told = settings.record, self.metrics.error
-                stack.enter_context(recording(session, self._agent_id, record, to_toml(settings), told))
+                stack.enter_context(recording(session, agent_id, record, to_toml(settings), told))
             self._receiver = stack.enter_context(
-                Receiver(session, self._agent_id, settings.mode, self.metrics, settings.max_age_ms)
+                Receiver(session, agent_id, settings.mode, self.metrics, settings.max_age_ms)
             )
-            self._end_of = StreamEnd(session, self._agent_id)
-            self._outbox = Outbox(session, self._agent_id, self.metrics)
+            self._end_of = StreamEnd(session, agent_id)
+            self._outbox = Outbox(session, agent_id, self.metrics)
             stack.callback(self._outbox.close)
             self._beat = StatusBeat(
-                session, self._agent_id, "server", self.metrics, lambda: self._receiver.agent_epoch
+                session, agent_id, "server", self.metrics, lambda: self._receiver.agent_epoch
             )
             stack.callback(self._beat.close)
             self._control = Control(session, settings)
@@ -99,10 +99,10 @@ class Server:
                 settings, self.metrics, self._end_of, self._outbox, self._be_at
             )
             stack.callback(self._sessions.close)
-            if self._codec is not None:
-                ready = self._decoder.load(self._codec, settings.modulation)
+            if codec is not None:
+                ready = self._decoder.load(codec, settings.modulation)
                 self._decoder.warm_up(ready.name, settings.modulation, ready.digest, WARM_UP_SHAPE_HW)
-            self._announced = Announcement(session, self._agent_id)
+            self._announced = Announcement(session, agent_id)
             self._ahead = DecodeAhead(
                 self._receiver.next,
                 self._decoder.decode,
@@ -110,7 +110,7 @@ class Server:
                 lambda decoded: self._receiver.is_too_old(decoded.arrival.message),
             )
             stack.callback(self._ahead.close)
-            session.declare_alive(self._agent_id, "server")
+            session.declare_alive(agent_id, "server")
             self._resources = stack.pop_all()
 
     def _on_failure(self, arrival: ReceivedFrame, reason: str) -> None:

@@ -81,7 +81,7 @@ class NeuralCodec:
         if modulation not in MODULATIONS:
             raise ValueError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}")
         self.manifest = manifest
-        self._modulation: Modulation = modulation
+        self.modulation: Modulation = modulation
         self._device = device
         half = device.type == "cuda" or has_fast_bfloat16()
         model = model.to(device).eval().requires_grad_(False)
@@ -135,11 +135,6 @@ class NeuralCodec:
         """First 16 hex digits of the sha256 of the weights."""
         return self.manifest.sha256[:16]
 
-    @property
-    def modulation(self) -> Modulation:
-        """How this codec's symbols travel."""
-        return self._modulation
-
     def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
         """Encode one image for a link whose expected SNR is ``snr_db``.
 
@@ -163,7 +158,7 @@ class NeuralCodec:
         return EncodedImage(
             shape_hw=given.shape_hw,
             symbols=symbols_from_latent(symbols.cpu().numpy()),
-            modulation=self._modulation,
+            modulation=self.modulation,
             levels=given.levels,
             allocation=b"" if allocation is None else allocation.code,
         )
@@ -198,8 +193,8 @@ class NeuralCodec:
         layout = layout_for(received.shape_hw)
         check_shape(received.symbols, f"{layout.num_slots} {layout.data_per_slot}", "symbols")
         check_shape(received.effective_snr_db, f"{layout.num_slots}", "effective_snr_db")
-        if received.modulation != self._modulation:
-            raise ValueError(f"modulation must be {self._modulation!r}, got {received.modulation!r}")
+        if received.modulation != self.modulation:
+            raise ValueError(f"modulation must be {self.modulation!r}, got {received.modulation!r}")
         snr_db = np.nan_to_num(
             received.effective_snr_db.astype(np.float32),
             nan=LOST_SLOT_SNR_DB,

@@ -63,6 +63,13 @@ class OnnxEncoder:
         modulation: How symbols travel.
         num_threads: CPU threads; None leaves the library's choice.
 
+    Attributes:
+        name: Registry name of the architecture.
+        digest: Of the weights the encoder was exported from: the server decodes with the same.
+        modulation: How symbols travel.
+        snr_range_db: SNRs in dB the encoder was trained for; others are clipped to them.
+        precision: ``int8`` where convolutions are, else ``float``.
+
     Raises:
         CheckpointError: The file is missing, damaged or of another version.
         ValueError: The modulation or number of threads is not usable.
@@ -97,34 +104,13 @@ class OnnxEncoder:
                 f"got {facts.get('semcast_format')}"
             )
         try:
-            self._name, self._digest = str(facts["architecture"]), str(facts["digest"])
-            self._snr_range_db = float(facts["snr_min_db"]), float(facts["snr_max_db"])
+            self.name, self.digest = str(facts["architecture"]), str(facts["digest"])
+            self.snr_range_db = float(facts["snr_min_db"]), float(facts["snr_max_db"])
         except KeyError as err:
             raise CheckpointError(f"encoder {path} does not say its {err}") from err
         self._is_variable = facts["semcast_format"] == VARIABLE_FORMAT
-        #: ``int8`` where convolutions are, else ``float``.
         self.precision = str(facts.get("precision", "float"))
-        self._modulation: Modulation = modulation
-
-    @property
-    def snr_range_db(self) -> tuple[float, float]:
-        """SNRs in dB the encoder was trained for; others are clipped to them."""
-        return self._snr_range_db
-
-    @property
-    def name(self) -> str:
-        """Registry name of the architecture."""
-        return self._name
-
-    @property
-    def digest(self) -> str:
-        """Digest of the weights the encoder was exported from: the server decodes with the same."""
-        return self._digest
-
-    @property
-    def modulation(self) -> Modulation:
-        """How symbols travel."""
-        return self._modulation
+        self.modulation: Modulation = modulation
 
     def encode(self, image: NDArray[np.uint8], snr_db: float) -> EncodedImage:
         """Encode one image; see ``NeuralCodec.encode``.
@@ -132,8 +118,8 @@ class OnnxEncoder:
         Raises:
             ValueError: The image is not ``(H, W, 3)`` uint8, or has no pixel.
         """
-        given = coder_input(image, snr_db, self._snr_range_db)
-        is_qam = self._modulation == "16qam"
+        given = coder_input(image, snr_db, self.snr_range_db)
+        is_qam = self.modulation == "16qam"
         arriving_db = rounded_snr_db(given.snr_db) if is_qam else given.snr_db
         inputs = {"image": given.image[None], "snr_db": np.array([arriving_db], dtype=np.float32)}
         allocation = allocation_for(given.image) if self._is_variable else None
@@ -143,8 +129,8 @@ class OnnxEncoder:
         values = None if allocation is None else allocation.values
         return EncodedImage(
             shape_hw=given.shape_hw,
-            symbols=symbols_from_latent(transmit(latent, self._modulation, values)),
-            modulation=self._modulation,
+            symbols=symbols_from_latent(transmit(latent, self.modulation, values)),
+            modulation=self.modulation,
             levels=given.levels,
             allocation=b"" if allocation is None else allocation.code,
         )

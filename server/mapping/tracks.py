@@ -62,6 +62,7 @@ class TrackTable:
     """All tracks that are alive.
 
     Attributes:
+        next_id: Of the next track.
         ids: ``(N,)`` int64, ascending.
         xy: ``(N, 2)`` newest position, in the image of its last sight.
         velocity: ``(N, 2)`` pixels per frame at the last sight.
@@ -80,7 +81,7 @@ class TrackTable:
         self._mode: ConfidenceMode = mode
         self._max_features = max_features
         self._rng = np.random.default_rng(seed)
-        self._next_id = 0
+        self.next_id = 0
         self._greys: list[Grey] = []
         self._bands: list[Array] = []
         self._frame_ids: list[int] = []
@@ -114,15 +115,6 @@ class TrackTable:
 
     def __len__(self) -> int:
         return len(self.ids)
-
-    @property
-    def next_id(self) -> int:
-        """Id of the next track."""
-        return self._next_id
-
-    @next_id.setter
-    def next_id(self, value: int) -> None:
-        self._next_id = value
 
     @property
     def visible(self) -> NDArray[np.bool_]:
@@ -170,9 +162,9 @@ class TrackTable:
             The ids that were, ascending, and the new one of each, ascending too.
         """
         before = np.union1d(self.ids, others)
-        after = self._next_id + np.arange(len(before), dtype=np.int64)
+        after = self.next_id + np.arange(len(before), dtype=np.int64)
         self.ids = after[np.searchsorted(before, self.ids)]
-        self._next_id += len(before)
+        self.next_id += len(before)
         self.passing.renew(before, after)
         self._before = None
         return before, after
@@ -458,8 +450,8 @@ class TrackTable:
             return 0
         gradient = sample_map(strength, corners)
         cues = self._cues(sight, corners, np.full(count, 0.1), np.zeros(count), gradient)
-        self._append(self._next_id + np.arange(count, dtype=np.int64), corners, cues)
-        self._next_id += count
+        self._append(self.next_id + np.arange(count, dtype=np.int64), corners, cues)
+        self.next_id += count
         return count
 
     def _cues(
