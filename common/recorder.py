@@ -166,12 +166,12 @@ class Recorder:
             self._queue.clear()
             self._queued_bytes = 0
 
-    def close(self, deadline_s: float = 10.0) -> None:
+    def close(self) -> None:
         """Write what waits, the index and the end mark, and close the file. Idempotent."""
         with self._condition:
             already, self._closed = self._closed, True
             self._condition.notify()
-        self._thread.join(deadline_s)
+        self._thread.join(10.0)
         if not already and self.error is None and not self._thread.is_alive():
             try:
                 self._stream.close()

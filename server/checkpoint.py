@@ -194,7 +194,7 @@ class CheckpointWriter:
         if self._on_error is not None:
             self._on_error(f"no checkpoint: {text}")
 
-    def close(self, deadline_s: float = 10.0) -> None:
+    def close(self) -> None:
         """Write what waits and end the thread. Idempotent."""
         self._box.close()
-        self._thread.join(deadline_s)
+        self._thread.join(10.0)

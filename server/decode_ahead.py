@@ -101,10 +101,10 @@ class DecodeAhead(Generic[In, Out]):
             self._condition.notify_all()
         return decoded
 
-    def close(self, deadline_s: float = 10.0) -> None:
+    def close(self) -> None:
         """End the thread; a decoded frame still in the slot is dropped. Idempotent."""
         self._stopping.set()
         with self._condition:
             self._slot = None
             self._condition.notify_all()
-        self._thread.join(deadline_s)
+        self._thread.join(10.0)

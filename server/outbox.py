@@ -127,10 +127,10 @@ class Outbox:
         self._metrics.drop("unsent")
         self._metrics.error(text)
 
-    def close(self, deadline_s: float = 2.0) -> None:
+    def close(self) -> None:
         """Send what waits and end the thread. Idempotent."""
         self._box.close()
-        self._thread.join(deadline_s)
+        self._thread.join(2.0)
 
 
 def pose_message(agent_epoch: int, t_capture_ns: int, result: FrameResult) -> PoseMessage:
