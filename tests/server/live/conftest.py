@@ -159,8 +159,13 @@ class Running:
     """A server on its own thread."""
 
     def __init__(self, hub, codec, load=None, **settings):
-        # Without depth, which takes longer than all else of a run.
-        values = {"agent_id": AGENT, "bundle": "inline", "dense_cloud": "none"}
+        # Without depth, which takes longer than all else of a run; on a busy machine no frame gets too old.
+        values = {
+            "agent_id": AGENT,
+            "bundle": "inline",
+            "dense_cloud": "none",
+            "max_age_ms": 1e3 * DEADLINE_S,
+        }
         values["view"] = ViewSettings(view="none")
         self.settings = ServerSettings(**{**values, **settings})
         self.stop = threading.Event()
