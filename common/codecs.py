@@ -77,7 +77,7 @@ def codec_of_weights(weights: Path, runtime: Runtime = "auto") -> str:
     """
     if _choose_runtime(runtime, weights) == "onnx":
         return _onnx_encoder(weights, "16qam", 1).name
-    from semcast.common.nets.checkpoint import read_manifest, weights_path
+    from semcast.common.nets.manifest import read_manifest, weights_path
 
     return read_manifest(weights_path(weights)).architecture
 

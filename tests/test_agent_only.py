@@ -16,3 +16,13 @@ def test_it_imports_without_the_servers_libraries(module):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_shipped_weights_are_described_without_torch():
+    code = (
+        f"import sys\nfor name in {(*BLOCKED, 'safetensors')!r}: sys.modules[name] = None\n"
+        "from semcast.cli import main\nsys.exit(main(['info', '3dcsc-lite']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "3dcsc-lite" in done.stdout

@@ -12,7 +12,8 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from semcast.common.errors import CheckpointError
-from semcast.common.nets.checkpoint import load_transceiver, weights_path
+from semcast.common.nets.checkpoint import load_transceiver
+from semcast.common.nets.manifest import weights_path
 from semcast.common.nets.onnx_encoder import FORMAT, INPUTS, OUTPUT, VALUES_INPUT, VARIABLE_FORMAT
 from semcast.common.nets.packing import share_plane
 from semcast.common.nets.rounding import rounded_snr_db

@@ -3,7 +3,8 @@
 Codecs
     codec             a trained transceiver behind the codec interface
     inference         the same figures with fewer passes over memory
-    checkpoint        weights on disk, with a manifest
+    checkpoint        weights on disk
+    manifest          what weights are, beside them
     registry          architectures by name
     onnx_encoder      the sending end without torch
 

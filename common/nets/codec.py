@@ -20,11 +20,12 @@ from semcast.common.codec import (
     confidence_from_displacement_px,
 )
 from semcast.common.errors import CheckpointError, ConfigError
-from semcast.common.nets.checkpoint import Manifest, load_transceiver, weights_path
+from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.coder_input import coder_input
 from semcast.common.nets.detail import allocation_for
 from semcast.common.nets.inference import inference_net
 from semcast.common.nets.latent import latent_from_symbols, symbols_from_latent
+from semcast.common.nets.manifest import Manifest, weights_path
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.slots import layout_for

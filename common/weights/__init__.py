@@ -1,1 +1,1 @@
-"""Shipped weights with their manifests; ``semcast.common.nets.checkpoint`` reads them."""
+"""Shipped weights with their manifests; ``semcast.common.nets.checkpoint`` and ``manifest`` read them."""

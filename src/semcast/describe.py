@@ -266,7 +266,7 @@ def _refused(messages: list[str], num_skipped: int, most: int = 5) -> list[tuple
 
 def describe_weights(path: Path) -> list[Section]:
     """Say what weights are, how they were made and what they reached."""
-    from semcast.common.nets.checkpoint import read_manifest, weights_path
+    from semcast.common.nets.manifest import read_manifest, weights_path
 
     try:
         file = weights_path(path if path.suffix else str(path))

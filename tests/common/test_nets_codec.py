@@ -8,14 +8,9 @@ import torch
 
 from semcast.common.codec import LOST_SLOT_SNR_DB, ReceivedImage
 from semcast.common.errors import CheckpointError
-from semcast.common.nets.checkpoint import (
-    load_transceiver,
-    manifest_path,
-    read_manifest,
-    save_transceiver,
-    weights_path,
-)
+from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.codec import NeuralCodec, has_fast_bfloat16
+from semcast.common.nets.manifest import manifest_path, read_manifest, weights_path
 from semcast.common.nets.registry import architecture, architectures, build
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
 from semcast.common.phy.qam import SHAPED_SPACING, pam_levels

@@ -13,8 +13,9 @@ import torch
 from semcast.common.codecs import load_codec
 from semcast.common.errors import CheckpointError, ConfigError, SourceError
 from semcast.common.nets import modulation, modulation_numpy
-from semcast.common.nets.checkpoint import load_transceiver, read_manifest, save_transceiver, weights_path
+from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.latent import symbols_from_latent
+from semcast.common.nets.manifest import read_manifest, weights_path
 from semcast.common.nets.onnx_encoder import OnnxEncoder, encoder_path
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
 from semcast.training.onnx_export import export_encoder
