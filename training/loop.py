@@ -365,7 +365,7 @@ def train(
 
     Args:
         settings: Of the run.
-        on_progress: Called every ``log_every`` steps in the first process.
+        on_progress: Called after the first step and every ``log_every`` steps, in the first process.
         should_stop: Asked before every step; with several processes the first one to say so stops all.
 
     Raises:
@@ -397,6 +397,7 @@ def _train(
     settings, log = run.settings, run.settings.out / CURVE_NAME
     rows: list[dict[str, torch.Tensor]] = []
     valid: dict[str, float] = {}
+    is_first = True
     logger.info("training %s from step %d on %s", settings.architecture, run.step, run.device)
     if run.rank == 0:
         cut_to_step(log, run.step)
@@ -411,14 +412,17 @@ def _train(
             if run.rank == 0:  # the others log nothing
                 rows.append(row)
             run.elapsed_s += time.perf_counter() - start_s
-            if run.step % settings.log_every == 0 and run.rank == 0:
+            is_logged = run.step % settings.log_every == 0
+            if run.rank == 0 and (is_logged or is_first):
                 report = Progress(run.step, run.elapsed_s, run.share_done(), mean_of(rows))
-                rows.clear()
-                append_row(
-                    log, {"step": report.step, "elapsed_s": round(report.elapsed_s, 1), **report.values}
-                )
+                if is_logged:
+                    rows.clear()
+                    append_row(
+                        log, {"step": report.step, "elapsed_s": round(report.elapsed_s, 1), **report.values}
+                    )
                 if on_progress is not None:
                     on_progress(report)
+            is_first = False
             if run.step % settings.valid_every == 0 and run.valid_images and run.rank == 0:
                 valid = validate(run.shippable(), run.valid_images, run.device, run.bf16)
                 append_row(log, {"step": run.step, "elapsed_s": round(run.elapsed_s, 1), "valid": valid})
