@@ -5,6 +5,7 @@ pictures, ``<name>-*.png``, and by the command, commit and machine that made it.
 """
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -394,6 +395,8 @@ CONFIDENCE_PARTS: dict[str, Callable[[], str]] = {
 
 
 if __name__ == "__main__":
+    if not (PAGE.is_file() and RESULTS.is_dir()):
+        sys.exit(f"the pages are those of a checkout: there is no {PAGE} here; run this in its top folder")
     PAGE.write_text(results_page(), encoding="utf-8")
     for page, name, part in (
         (README, "results", readme_table(RESULTS)),

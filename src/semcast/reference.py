@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import inspect
+import sys
 import typing
 from collections.abc import Iterator
 from pathlib import Path
@@ -76,6 +77,8 @@ def with_messages(page: str) -> str:
 
 
 if __name__ == "__main__":
-    Path("docs/commands.md").write_text(reference(), encoding="utf-8")
     formats = Path("docs/file-formats.md")
+    if not formats.is_file():
+        sys.exit(f"the pages are those of a checkout: there is no {formats} here; run this in its top folder")
+    Path("docs/commands.md").write_text(reference(), encoding="utf-8")
     formats.write_text(with_messages(formats.read_text(encoding="utf-8")), encoding="utf-8")

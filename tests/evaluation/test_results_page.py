@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -37,3 +39,12 @@ def test_a_trial_whose_residuals_say_nothing_has_dashes(tmp_path, file, unknown)
     (tmp_path / f"{file}.json").write_text(json.dumps(report), encoding="utf-8")
     rows = [line for line in results_page(tmp_path).splitlines() if line.startswith("|")]
     assert [row.endswith("| - |") for row in rows[-2:]] == [False, True]
+
+
+@pytest.mark.parametrize("module", ["semcast.evaluation.results_page", "semcast.reference"])
+def test_outside_a_checkout_it_is_said_that_there_are_no_pages(tmp_path, module):
+    done = subprocess.run([sys.executable, "-m", module], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("the pages are those of a checkout: there is no docs/")
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
