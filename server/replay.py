@@ -175,6 +175,7 @@ def replay(
         view=settings.view,
     )
     check_viewer(server)
+    server.warn()
     with output_folder(settings.out):
         return _replayed(settings, server, reader, stream, stop or threading.Event(), on_frame, on_activity)
 

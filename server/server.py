@@ -299,6 +299,7 @@ def run_server(settings: ServerSettings, stop_event: threading.Event) -> dict[st
         SourceError: The reference can't be read, or the recording could not be written to its end.
         SemcastError: The outputs can't be written.
     """
+    settings.warn()
     network = open_session(settings.network, stop_event)
     if network is None:
         return {}

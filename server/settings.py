@@ -1,5 +1,6 @@
 """Settings of the server process."""
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -12,6 +13,8 @@ from semcast.common.network_settings import HubSettings
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.marker_settings import MarkerSettings
 from semcast.server.view.settings import ViewSettings
+
+logger = logging.getLogger(__name__)
 
 #: When the depth of keyframes is estimated.
 DenseWhen = Literal["auto", "live", "end", "none"]
@@ -127,6 +130,13 @@ class ServerSettings:
         """Whether depth waits for the end of the stream; a replay has nothing to show before."""
         too_few = self.mode == "replay" or usable_cores() < _CORES_FOR_LIVE_DEPTH
         return self.dense_cloud == "end" or (self.dense_cloud == "auto" and too_few)
+
+    def warn(self) -> None:
+        """Say which values do nothing beside the others."""
+        if idle := self.view.without_effect():
+            logger.warning("%s: no effect with view %s", ", ".join(idle), self.view.view)
+        if self.out is None and self.checkpoint_interval_s != ServerSettings.checkpoint_interval_s:
+            logger.warning("checkpoint_interval_s: no effect without out, a folder for checkpoints")
 
     def __post_init__(self) -> None:
         """Check ranges.

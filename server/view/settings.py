@@ -1,13 +1,23 @@
 """Settings of the viewer."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 #: Sizes the viewer understands.
 _MEMORY = re.compile(r"\d+(\.\d+)? ?(B|[kMGT]B|[KMGT]iB)|(100|\d{1,2}(\.\d+)?)%")
 
 ViewChoice = Literal["auto", "native", "web", "file", "none"]
+
+#: Settings that do nothing where the view is not among these.
+_VIEWS_OF: dict[str, tuple[ViewChoice, ...]] = {
+    "port": ("auto", "native", "web"),
+    "web_port": ("web",),
+    "leave_open": ("auto", "native"),
+    "memory_limit": ("auto", "native", "web"),
+    "image_rate_hz": ("auto", "native", "web", "file"),
+    "jpeg_quality": ("auto", "native", "web", "file"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,3 +79,12 @@ class ViewSettings:
             raise ValueError(f"image_rate_hz must be in [0.1, 60], got {self.image_rate_hz}")
         if not 10 <= self.jpeg_quality <= 100:
             raise ValueError(f"jpeg_quality must be in [10, 100], got {self.jpeg_quality}")
+
+    def without_effect(self) -> list[str]:
+        """Return the flags' names of values off their default that change nothing in this view."""
+        return [
+            str(entry.metadata.get("flag", entry.name))
+            for entry in fields(self)
+            if getattr(self, entry.name) != entry.default
+            and self.view not in _VIEWS_OF.get(entry.name, (self.view,))
+        ]

@@ -159,8 +159,8 @@ def role_commands(settings: DemoSettings, reference: Path | None, endpoint: str)
     server = [*_PROGRAM, "server", "--agent-id", AGENT_ID, "--listen", endpoint, "--out", str(settings.out)]
     if reference is not None:
         server += ["--reference", str(reference), *flag_words(settings.camera)]
-    server += ["--confidence", settings.confidence, "--view", settings.view]
-    server += ["--viewer-port", str(settings.viewer_port), "--web-port", str(settings.web_port)]
+    server += ["--confidence", settings.confidence]
+    server += flag_words(settings.view_settings, ("view",))
     server += ["--seed", str(settings.seed), "--codec", settings.codec, "--modulation", settings.modulation]
     server += ["--save-images", settings.save_images]
     server += ["--dense-cloud", settings.dense_cloud]

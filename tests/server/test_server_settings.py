@@ -70,6 +70,30 @@ def test_settings_out_of_range_say_so(changes, text):
         ServerSettings(**changes)
 
 
+@pytest.mark.parametrize(
+    ("settings", "idle"),
+    [
+        (ServerSettings(), ""),
+        (ServerSettings(view=ViewSettings(view="none")), ""),
+        (
+            ServerSettings(view=ViewSettings(view="none", web_port=9091, port=9877)),
+            "viewer_port, web_port: no effect",
+        ),
+        (ServerSettings(view=ViewSettings(view="web", web_port=9091, port=9877)), ""),
+        (
+            ServerSettings(view=ViewSettings(view="file", leave_open=False, jpeg_quality=50)),
+            "viewer_leave_open: no",
+        ),
+        (ServerSettings(checkpoint_interval_s=9.0), "checkpoint_interval_s: no effect"),
+        (ServerSettings(checkpoint_interval_s=9.0, out=Path("runs")), ""),
+    ],
+)
+def test_values_that_do_nothing_are_said(settings, idle, caplog):
+    settings.warn()
+    assert caplog.text.count("no effect") == bool(idle)
+    assert idle in caplog.text
+
+
 def test_the_hub_is_on_loopback_unless_told_otherwise():
     assert HubSettings().listens_on == ("tcp/127.0.0.1:7447",)
 
