@@ -1,6 +1,7 @@
 """Records everything a running system sends, beside it: nobody waits for the recorder."""
 
 import contextlib
+import logging
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -24,6 +25,8 @@ from semcast.common.recording_writer import recording_metadata
 from semcast.common.transport import Session, open_session
 from semcast.common.whole_file import check_writable
 from semcast.common.wire import WireError, unpack
+
+logger = logging.getLogger(__name__)
 
 #: How often a recorder with nothing else to do looks whether it still records.
 _LOOK_INTERVAL_S = 0.5
@@ -146,6 +149,14 @@ def recording(
         raise SourceError(f"{file} is not complete: {recorder.error}")
 
 
+def _warn_of_absence(session: Session, agent_id: str) -> None:
+    """Say that there is nothing to record yet, and whose processes are there: the name may be a wrong one."""
+    others = session.alive_agents()
+    if agent_id not in others:
+        there = f"; there are those of {', '.join(others)} (--agent-id)" if others else ""
+        logger.warning("no process of agent '%s' is there yet%s", agent_id, there)
+
+
 def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any]:
     """Record until ``stop`` is set.
 
@@ -165,6 +176,7 @@ def run_record(settings: RecordSettings, stop: threading.Event) -> dict[str, Any
         session,
         recording(session, settings.agent_id, settings.file, to_toml(settings)) as recorder,
     ):
+        _warn_of_absence(session, settings.agent_id)
         while not stop.wait(_LOOK_INTERVAL_S) and recorder.error is None:
             pass
     return {

@@ -1,7 +1,6 @@
 """A recording replays to the same poses every time; through another channel it does not."""
 
 import contextlib
-import errno
 import itertools
 import json
 import re
@@ -459,40 +458,3 @@ def test_the_seed_is_that_of_the_estimation_too(recording, tmp_path):
     replay(without_depth(recording, out=tmp_path, seed=7, end_s=0.6))
     in_force = read_toml(tmp_path / "settings.toml")
     assert in_force["seed"] == in_force["reconstruction"]["seed"] == 7
-
-
-def test_a_recorder_that_can_not_write_says_so_before_it_waits_for_anybody(tmp_path):
-    (tmp_path / "file").write_text("no folder")
-    stopped = threading.Event()
-    stopped.set()
-    with pytest.raises(ConfigError, match="file can't be written to"):
-        run_record(RecordSettings(file=tmp_path / "file" / "run.mcap"), stopped)
-
-
-def test_a_recorder_whose_disk_is_full_ends_with_an_error(tmp_path, monkeypatch):
-    def no_room(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("semcast.common.recorder.RecordingWriter.add", no_room)
-    hub, endpoint = open_hub()
-    stop = threading.Event()
-    timer = threading.Timer(20.0, stop.set)
-    publisher = hub.publisher("semcast/agent0/tx/symbols", "every")
-    sender = threading.Thread(target=_send_until, args=(publisher, stop))
-    sender.start()
-    timer.start()
-    try:
-        settings = RecordSettings(file=tmp_path / "run.mcap", network=NetworkSettings(connect=(endpoint,)))
-        with pytest.raises(SourceError, match=r"run\.mcap is not complete: .*No space left"):
-            run_record(settings, stop)
-        assert not stop.is_set(), "it ends by itself"
-    finally:
-        stop.set()
-        timer.cancel()
-        sender.join(60)
-        hub.close()
-
-
-def _send_until(publisher, stop):
-    while not stop.wait(0.1):
-        publisher.put(b"a message")
