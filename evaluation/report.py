@@ -61,13 +61,25 @@ def check_outputs(json: Path | None, out: Path | None) -> None:
         raise ConfigError(f"{err.filename} can't be written: {err.strerror}") from err
 
 
+class UnwrittenResultError(SemcastError):
+    """A result that was measured and can't be written, as where the disk has become full meanwhile.
+
+    Attributes:
+        result: What was to be written.
+    """
+
+    def __init__(self, message: str, result: Mapping[str, Any]) -> None:
+        super().__init__(message)
+        self.result = result
+
+
 def write_result(path: Path | None, result: Mapping[str, Any]) -> dict[str, Any]:
     """Return a result as plain JSON values, and write it where there is a path for it.
 
     The file is complete or absent, never half written.
 
     Raises:
-        SemcastError: The folder can't be made or the file can't be written.
+        UnwrittenResultError: The folder can't be made or the file can't be written.
     """
     values = dict(json_ready(result))
     if path is not None:
@@ -75,7 +87,7 @@ def write_result(path: Path | None, result: Mapping[str, Any]) -> dict[str, Any]
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, values)
         except OSError as err:
-            raise SemcastError(f"{path} can't be written: {err}") from err
+            raise UnwrittenResultError(f"{path} can't be written: {err}", values) from err
     return values
 
 

@@ -122,6 +122,7 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     # Without a link neither SNR nor channel seed changes an image: one SNR stands for all.
     snrs_db = settings.snr_db if codec is not None else settings.snr_db[:1]
     cells = []
+    to_draw: dict[str, ReconstructedRun] = {}
     for snr_db in snrs_db:
         runs: dict[str, list[dict[str, Any]]] = {mode: [] for mode in settings.confidence}
         for seed in settings.all_seeds:
@@ -132,9 +133,9 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
                 how = replace(settings.reconstruction, confidence=mode, seed=seed)
                 run = reconstruct(frames, sequence.intrinsics, how, truth)
                 runs[mode].append(_run_entry(run, seed, gap, with_rows=settings.rows))
-                if settings.out is not None and seed == settings.seed:
+                if seed == settings.seed:
                     label = CLEAN if codec is None else snr_file_label(snr_db, settings.link)
-                    _write_files(settings.out, f"{label}_{mode}", run)
+                    to_draw[f"{label}_{mode}"] = run
         level = None if codec is None else stated_snr_db(snr_db, settings.link)
         cells += [_cell(level, mode, runs[mode], has_truth=has_truth) for mode in settings.confidence]
     report = {
@@ -148,7 +149,11 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     if len(cells) == 1:
         report |= {key: value for key, value in cells[0].items() if key != "runs"}
         report["stage_ms"] = cells[0]["runs"][0]["stage_ms"]
-    return write_result(settings.json, report)
+    written = write_result(settings.json, report)
+    if settings.out is not None:  # last: a disk that is full costs the pictures, not the figures
+        for label, run in to_draw.items():
+            _write_files(settings.out, label, run)
+    return written
 
 
 def _run_entry(run: ReconstructedRun, seed: int, gap: Gap | None, *, with_rows: bool) -> dict[str, Any]:

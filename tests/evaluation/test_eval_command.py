@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+from full_disk import room_for
 
 from semcast.cli import main
 from semcast.commands.evaluate import EVALUATIONS
@@ -90,6 +91,17 @@ def test_of_an_input_that_is_missing_nothing_else_is_said(tmp_path, capsys):
     assert main(["eval", "trajectory", "--sequence", str(tmp_path / "none")]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "none" in line
+
+
+def test_a_table_whose_file_finds_no_room_in_the_end_is_shown_all_the_same(codec_words, tmp_path, capsys):
+    file = tmp_path / "result.json"
+    with room_for(10):
+        assert main([*codec_words, "--json", str(file)]) == 1
+    said = capsys.readouterr()
+    assert "jpeg-ldpc" in said.out
+    assert said.err.startswith(f"semcast eval: {file} can't be written: ")
+    assert "\nwritten: " not in said.err
+    assert not file.exists()
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from semcast.evaluation import (
     runtime,
     trajectory,
 )
-from semcast.evaluation.report import RESULT_NAME, STDOUT, check_outputs
+from semcast.evaluation.report import RESULT_NAME, STDOUT, UnwrittenResultError, check_outputs
 from semcast.evaluation.result_table import ResultTable, result_table
 
 _Evaluation = tuple[type, Callable[[Any], dict[str, Any]], frozenset[str], str]
@@ -142,12 +142,18 @@ def run(arguments: argparse.Namespace) -> int:
     check_outputs(settings.json, out)
     _warn_of_link(settings, read_given(cls, arguments))
     before_ns = _write_times_ns(out)
+    unwritten: UnwrittenResultError | None = None
     with talk.status(f"{text} ..."):
-        report = evaluate(settings)
+        try:
+            report = evaluate(settings)
+        except UnwrittenResultError as err:
+            report, unwritten = dict(err.result), err
     table = result_table(arguments.what, report)
     (talk if json_to_stdout else plain_console()).print(
         printed_table(arguments.what, table), *table.notes, sep="\n"
     )
+    if unwritten is not None:
+        raise unwritten
     if json_to_stdout:
         print(json.dumps(report, indent=1))
     written = [path for path, time_ns in _write_times_ns(out).items() if before_ns.get(path) != time_ns]
