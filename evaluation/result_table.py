@@ -75,6 +75,8 @@ def _cloud_note(row: Mapping[str, Any]) -> str:
         _cell(row["cloud"], name, form)
         for name, form in (("accuracy_median", ".2%"), ("accuracy_p90", ".2%"), ("completeness", ".1%"))
     ]
+    if not row["cloud"]["points"]:
+        return f"Cloud of {row['codec']}{link}: no points."
     return (
         f"Cloud of {row['codec']}{link}: {row['cloud']['points']:.0f} points, half of them within "
         f"{figures[0]} of a surface, nine in ten within {figures[1]}; {figures[2]} of what was seen has one."

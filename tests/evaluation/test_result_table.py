@@ -73,6 +73,8 @@ def test_figures_of_a_cloud_are_told_below_the_table():
     assert note.startswith("Cloud of none: 1234 points, half of them within 0.31% of a surface")
     assert note.endswith("within -; 40.0% of what was seen has one.")
     assert len(result_table("depth", report).notes) == 2
+    cloud |= {"points": 0.0, "accuracy_median": None, "completeness": 0.0}
+    assert result_table("depth", report).notes[-1] == "Cloud of none: no points."
 
 
 def test_a_long_name_takes_several_lines_and_cuts_no_other_column():
