@@ -7,6 +7,7 @@ import pytest
 import semcast
 from semcast.cli import main
 from semcast.commands.console import plain_console
+from semcast.training.loop import Progress, TrainResult
 
 
 @pytest.mark.parametrize("text", ["photos [indoor]", "walk [/end]", "install 'semcast[edge]'", "a :smile: b"])
@@ -30,3 +31,16 @@ def test_a_verb_that_can_not_begin_says_one_line(words, tmp_path, monkeypatch, c
     monkeypatch.chdir(tmp_path)  # for what it may write before
     assert main([*words, str(tmp_path)]) == 1
     assert len(capfd.readouterr().err.splitlines()) == 1
+
+
+def test_training_tells_its_step_and_the_time_left_however_many_figures_there_are(monkeypatch, capsys):
+    def train(settings, report, should_stop):
+        figures = {f"figure_{k}": 1.0 / 3.0 for k in range(9)}
+        report(Progress(123456, 60.0, 0.5, figures))
+        return TrainResult(123456, 60.0, "weights", {})
+
+    monkeypatch.setattr("semcast.commands.train.train", train)
+    assert main(["train"]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("step 123456 figure_0 0.3333")
+    assert line.rstrip().endswith("-:--:--")

@@ -4,6 +4,7 @@ import argparse
 import threading
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column
 
 from semcast.commands.console import plain_console
 from semcast.commands.running import add_settings, read_settings, run_until_stopped
@@ -23,13 +24,15 @@ def run(arguments: argparse.Namespace) -> int:
     talk = plain_console(stderr=True)
 
     def work(stop: threading.Event) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
-        bar = Progress(*columns, TimeRemainingColumn(), console=talk)
-        task = bar.add_task(settings.architecture, total=settings.steps)
+        # In a narrow window the figures are cut, and not the number of the step.
+        text = TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True))
+        columns = (TextColumn("step {task.fields[step]}"), text, BarColumn(10), TimeRemainingColumn())
+        bar = Progress(*columns, console=talk, expand=True)
+        task = bar.add_task(settings.architecture, total=1.0, step=0)
 
         def show(step: Step) -> None:
             figures = " ".join(f"{name} {value:.4g}" for name, value in step.values.items())
-            bar.update(task, completed=step.step, description=figures)
+            bar.update(task, completed=step.share, description=figures, step=step.step)
             bar.start()  # nothing is shown of a run that can't begin
 
         try:
