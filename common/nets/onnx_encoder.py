@@ -45,13 +45,15 @@ def encoder_path(name_or_path: str | Path) -> Path:
             raise CheckpointError(
                 f"no exported encoder {path} beside the weights; where torch is installed, {how} writes it"
             )
+    elif path.suffix == SUFFIX and not path.is_file():
+        raise CheckpointError(f"there is no exported encoder {path}")
     elif path.suffix != SUFFIX:
         folder = Path(__file__).resolve().parent.parent / "weights"
         path = folder / f"{name_or_path}{SUFFIX}"
-    if not path.is_file():
-        raise CheckpointError(
-            f"no exported encoder {path.name}; write one with 'semcast onnx' where torch is installed"
-        )
+        if not path.is_file():
+            raise CheckpointError(
+                f"no exported encoder {path.name}; write one with 'semcast onnx' where torch is installed"
+            )
     return path
 
 

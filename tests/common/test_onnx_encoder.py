@@ -1,5 +1,6 @@
 """The exported encoder sends what the torch encoder sends, and needs no torch."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -158,9 +159,11 @@ def test_bad_images_are_refused(exported, image, message):
 
 def test_bad_files_are_one_clear_error(exported, tmp_path):
     with pytest.raises(
-        CheckpointError, match="no exported encoder nothing.onnx; write one with 'semcast onnx'"
+        CheckpointError, match=re.escape(f"there is no exported encoder {tmp_path}/nothing.onnx")
     ):
         OnnxEncoder(tmp_path / "nothing.onnx")
+    with pytest.raises(CheckpointError, match="no exported encoder vit.onnx; write one with 'semcast onnx'"):
+        OnnxEncoder("vit")
     (tmp_path / "cut.onnx").write_bytes(exported.read_bytes()[:1000])
     with pytest.raises(CheckpointError, match="can't be read"):
         OnnxEncoder(tmp_path / "cut.onnx")
