@@ -6,9 +6,11 @@ import cv2
 import pytest
 
 from semcast.channel.settings import ChannelSettings
+from semcast.common.errors import SemcastError
 from semcast.common.geometry import T_opencv_opengl
 from semcast.common.sequence import open_sequence
 from semcast.common.trajectory import read_tum
+from semcast.evaluation.pipeline import CLEAN
 from semcast.evaluation.trajectory import TrajectorySettings, evaluate_trajectory, median_or_none
 
 PROMISED = (
@@ -60,6 +62,16 @@ def test_one_run_has_the_promised_keys_and_files(room, phase_codec, tmp_path):
     posed = read_tum(tmp_path / "trajectory_20db_robust.tum")
     assert len(posed) == cell["runs"][0]["num_posed"]
     assert cv2.imread(str(tmp_path / "path_20db_robust.png")) is not None
+
+
+def test_a_path_that_can_not_be_written_does_not_cost_the_figures(room, tmp_path):
+    (tmp_path / f"trajectory_{CLEAN}_robust.tum").mkdir()
+    settings = TrajectorySettings(
+        sequence=room, codec="none", max_frames=3, json=tmp_path / "t.json", out=tmp_path
+    )
+    with pytest.raises(SemcastError, match="can't be written"):
+        evaluate_trajectory(settings)
+    assert json.loads(settings.json.read_text())["num_frames"] == 3
 
 
 def test_a_damaged_image_is_told_and_counts_for_nothing(room, tmp_path):
