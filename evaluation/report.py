@@ -68,7 +68,7 @@ class UnwrittenResultError(SemcastError):
         result: What was to be written.
     """
 
-    def __init__(self, message: str, result: Mapping[str, Any]) -> None:
+    def __init__(self, message: str, result: dict[str, Any]) -> None:
         super().__init__(message)
         self.result = result
 

@@ -147,7 +147,7 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             report = evaluate(settings)
         except UnwrittenResultError as err:
-            report, unwritten = dict(err.result), err
+            report, unwritten = err.result, err
     table = result_table(arguments.what, report)
     (talk if json_to_stdout else plain_console()).print(
         printed_table(arguments.what, table), *table.notes, sep="\n"
