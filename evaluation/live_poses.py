@@ -67,15 +67,16 @@ def stated_ratios(
         ``stated_ratio_trans`` and ``stated_ratio_rot``, error over stated standard deviation: 1 is right, 2
         says that errors are twice what was stated. None where the ATE has no meaning.
     """
-    known = {k: pose for k, pose in published.items() if pose.covariance is not None}
-    path = trajectory_of({k: pose.T_world_cam for k, pose in known.items()}, frame_times_ns)
+    covariance_at = {
+        frame_times_ns[k]: pose.covariance for k, pose in published.items() if pose.covariance is not None
+    }
+    poses = {k: pose.T_world_cam for k, pose in published.items() if pose.covariance is not None}
+    path = trajectory_of(poses, frame_times_ns)
     absolute = ate(path, truth) if truth is not None else None
     if truth is None or absolute is None or path.times_ns is None:
         return {"stated_ratio_trans": None, "stated_ratio_rot": None}
     mine, theirs = match_times(path.t_s, truth.t_s)
-    frame_at = {frame_times_ns[k]: k for k in known}
-    covariances = [known[frame_at[int(t_ns)]].covariance for t_ns in path.times_ns[mine]]
-    variances = np.mean([np.diagonal(covariance) for covariance in covariances], axis=0)
+    variances = np.mean([np.diagonal(covariance_at[int(t)]) for t in path.times_ns[mine]], axis=0)
     R_true, R_found = truth.T_world_cam[theirs, :3, :3], path.T_world_cam[mine, :3, :3]
     R_truth_map = project_to_so3(np.einsum("nij,nkj->ik", R_true, R_found))
     angle_rad = rotation_angles_rad(R_true.transpose(0, 2, 1) @ R_truth_map @ R_found)
