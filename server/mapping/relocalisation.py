@@ -47,7 +47,7 @@ _MAX_MIN_INLIERS = 45
 #: Keyframes around the recognised one whose landmarks are looked for.
 _NEIGHBOURS = 5
 #: Hypotheses of a search by the landmarks of one keyframe, at most: most keyframes are not the place.
-SEARCH_ITERATIONS = 400
+_SEARCH_ITERATIONS = 400
 #: How far from where the first pose has a landmark its corner is looked for,
 _GUIDED_RADIUS_PX = 14.0
 #: by how many bits descriptors may differ there: more than where the whole image is a rival,
@@ -192,7 +192,7 @@ class Relocaliser:
             GATE_SIGMAS * sigma,
             seed=self._seed,
             min_inliers=_MIN_FIRST,
-            max_iterations=SEARCH_ITERATIONS,
+            max_iterations=_SEARCH_ITERATIONS,
         )
 
     def _confirm(

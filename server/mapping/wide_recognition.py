@@ -1,8 +1,10 @@
 """Where am I after a gap? SIFT against the newest keyframes, then their landmarks by warped patches.
 
 Binary descriptors of upright corners recognise a place from nearly where it was seen. A camera that went on
-for a second sees it turned and from elsewhere. What looks as it did there, once pose and depth have warped
-it, proves the place, and says to a fraction of a pixel where each landmark is.
+for a second sees it turned and from elsewhere: a handful of matches with any one keyframe are right, but all
+keyframes are of one map, and what is right of all their matches agrees on one pose. What looks as it did
+there, once pose and depth have warped it, proves the place, and says to a fraction of a pixel where each
+landmark is.
 """
 
 from collections.abc import Sequence
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.common.sequence import resized
-from semcast.server.geometry.features import Grey
+from semcast.server.geometry.features import Grey, deduplicate
 from semcast.server.geometry.patch_alignment import (
     ANCHOR_PATCH_PX,
     MIN_AREA_RATIO,
@@ -28,7 +30,7 @@ from semcast.server.geometry.square_distance import square_distances
 from semcast.server.geometry.weighting import GATE_SIGMAS, NoiseModel
 from semcast.server.geometry.wide_search import WideFeatures, match_near, match_wide
 from semcast.server.mapping.keyframe_images import KeyframeImages, SeenFrom
-from semcast.server.mapping.relocalisation import SEARCH_ITERATIONS, Place
+from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -36,7 +38,7 @@ Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
 #: Keyframes that are looked at, the newest ones.
-_NUM_KEYFRAMES = 3
+_NUM_KEYFRAMES = 5
 #: Frames after which a camera that was not found with them is somewhere else: a look takes as long as
 #: everything else of a frame.
 _MAX_FRAMES = 8
@@ -46,13 +48,18 @@ _MAX_RATIO = 0.85
 _MAX_OFFSET_PX = 15.0
 #: and its place is then good to this standard deviation.
 _CARRIED_SIGMA_PX = 2.5
-#: Landmarks that must agree with a pose. Of a few dozen wrong matches hardly two are within pixels of any.
+#: Landmarks that must agree with a pose, each in a place of its own: keyframes that see the same thing make
+#: the same wrong match. Images of other recordings had six at most.
 _MIN_FIRST = 8
+#: Hypotheses of a search: where one match of seven is right, 343 have one that rests on right ones alone.
+_SEARCH_ITERATIONS = 2000
 #: Share of a keyframe's landmarks that must look as they did where the pose has them, one for each round of
 #: looking: the first pose is a rough one.
 _LEAST_SHARES = (0.0, 0.0, 0.2)
-#: Where a pose is expected and nothing was matched, the images are so many times smaller in those rounds.
-_COARSE = (4, 2, 1)
+#: So many times smaller are the images in those rounds, for a pose by matches, which is a degree or two off,
+_MATCHED_COARSE = (2, 1, 1)
+#: and for one that is expected only.
+_EXPECTED_COARSE = (4, 2, 1)
 #: Share of those that must agree with the pose of the next round.
 _MIN_AGREEING_SHARE = 0.5
 _ALIGNED_SIGMA_PX = 1.0
@@ -150,11 +157,12 @@ class WideRecogniser:
         self._known = [(image, known) for image, known in self._known if any(image is v.image for v in views)]
         guesses = [None] if T_world_guess is None else [invert_transform(T_world_guess), None]
         for T_cam_world in guesses:
-            for view in views:
-                searched = self._search(sight, view, noise, T_cam_world)
-                found = None if searched is None else self._proved(sight, view, searched.T_cam_world, noise)
-                if found is not None:
-                    return self._place(sight, view, views, found, noise)
+            searched = self._search(sight, views, noise, T_cam_world)
+            if searched is None:
+                continue
+            place = self._look(sight, views, searched.T_cam_world, noise, _MATCHED_COARSE)
+            if place is not None:
+                return place
         return None
 
     def look(
@@ -170,8 +178,14 @@ class WideRecogniser:
             T_world_cam: The pose, turned to a degree and as near as things move by some ten pixels.
         """
         views = _newest_views(world, images)
+        return self._look(sight, views, invert_transform(T_world_cam), noise, _EXPECTED_COARSE)
+
+    def _look(
+        self, sight: Sight, views: list[_View], T_cam_world: Array, noise: NoiseModel, coarse: Sequence[int]
+    ) -> Place | None:
+        """Look at a pose for what one of the views saw."""
         for view in views:
-            found = self._proved(sight, view, invert_transform(T_world_cam), noise, _COARSE)
+            found = self._proved(sight, view, T_cam_world, noise, coarse)
             if found is not None:
                 return self._place(sight, view, views, found, noise)
         return None
@@ -185,9 +199,31 @@ class WideRecogniser:
         return known
 
     def _search(
-        self, sight: Sight, view: _View, noise: NoiseModel, T_cam_world: Array | None
+        self, sight: Sight, views: list[_View], noise: NoiseModel, T_cam_world: Array | None
     ) -> PoseEstimate | None:
-        """Rough pose, by landmarks next to matches: those near where a guess has them, or any."""
+        """Rough pose, by landmarks next to matches of any view: those near where a guess has them, or all.
+
+        Of views in another part of the map, matches agree with no pose of this one: they are wrong ones.
+        """
+        there, here = zip(*(self._matched(sight, view, T_cam_world) for view in views), strict=True)
+        xyz, xy = np.concatenate(there), np.concatenate(here)
+        sigma = np.full(len(xyz), max(_CARRIED_SIGMA_PX, noise.sigma0_px))
+        found = search_pose(
+            self._camera,
+            xyz,
+            xy,
+            sigma,
+            GATE_SIGMAS * sigma,
+            seed=self._seed,
+            min_inliers=_MIN_FIRST,
+            max_iterations=_SEARCH_ITERATIONS,
+        )
+        if found is None or deduplicate(xy[found.inliers], _MAX_OFFSET_PX).sum() < _MIN_FIRST:
+            return None
+        return found
+
+    def _matched(self, sight: Sight, view: _View, T_cam_world: Array | None) -> tuple[Array, Array]:
+        """Landmarks ``(K, 3)`` of a view that are next to matches, and where these take them, ``(K, 2)``."""
         features, here = self._features_of(view.image), sight.wide_features
         if T_cam_world is None:
             matches = match_wide(features, here, _MAX_RATIO)
@@ -195,17 +231,7 @@ class WideRecogniser:
             expected = self._expected(view, features.xy, T_cam_world)
             matches = match_near(features, here, expected, _REACH_PX, _MAX_RATIO)
         rows, carried = matches.carry(view.xy, _MAX_OFFSET_PX)
-        sigma = np.full(len(rows), max(_CARRIED_SIGMA_PX, noise.sigma0_px))
-        return search_pose(
-            self._camera,
-            view.xyz[rows],
-            carried,
-            sigma,
-            GATE_SIGMAS * sigma,
-            seed=self._seed,
-            min_inliers=_MIN_FIRST,
-            max_iterations=SEARCH_ITERATIONS,
-        )
+        return view.xyz[rows], carried
 
     def _expected(self, view: _View, xy: Array, T_cam_world: Array) -> Array:
         """Return where a pose has pixels ``(N, 2)`` of a keyframe, as deep as the landmarks next to them."""
@@ -215,12 +241,7 @@ class WideRecogniser:
         return self._camera.project(transform_points(T_cam_world, points))
 
     def _proved(
-        self,
-        sight: Sight,
-        view: _View,
-        T_cam_world: Array,
-        noise: NoiseModel,
-        coarse: Sequence[int] = (1, 1, 1),
+        self, sight: Sight, view: _View, T_cam_world: Array, noise: NoiseModel, coarse: Sequence[int]
     ) -> PoseEstimate | None:
         """Pose of landmarks that look as a keyframe saw them, None where those are too few."""
         found = None

@@ -1,5 +1,6 @@
 """A camera that went on for most of a second is found again by what looks as it did."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -18,11 +19,12 @@ from semcast.evaluation.scenes.render import frame_of
 from semcast.server.geometry.features import to_grey
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.keyframe_images import KeyframeImages
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import DecodedFrame
-from semcast.server.mapping.wide_recognition import WideRecogniser
+from semcast.server.mapping.wide_recognition import WideRecogniser, _newest_views
 from semcast.server.mapping.world_map import WorldMap
 
 NUM_MAPPED = 14
@@ -121,6 +123,46 @@ def test_landmarks_that_only_other_keyframes_saw_are_found_too(mapped):
     landmarks = reconstruction.world.landmarks
     xyz = transform_points(T_cam_world, landmarks.xyz[landmarks.rows(place.ids[elsewhere])])
     assert np.linalg.norm(camera.project(xyz) - place.xy[elsewhere], axis=1).max() < 3.0
+
+
+def thinned(world, num_each):
+    """The same map with so many landmarks for each keyframe, others for each."""
+    world = deepcopy(world)
+    for k, keyframe in enumerate(world.keyframes):
+        known = np.flatnonzero(world.landmarks.rows(keyframe.ids) >= 0)
+        rows = known[k :: len(known) // num_each][:num_each]
+        for name in ("ids", "xy", "confidence", "edge"):
+            setattr(keyframe, name, getattr(keyframe, name)[rows])
+    return world
+
+
+@pytest.mark.parametrize("further", [1, 3])
+def test_the_place_is_found_by_a_few_matches_with_each_of_several_keyframes(mapped, further):
+    """Where those of no single one are enough."""
+    sequence, reconstruction = mapped
+    k = NUM_MAPPED + further
+    world, images = thinned(reconstruction.world, 20), reconstruction._map.images
+    sight = sight_of(sequence.image(k), k)
+    place = WideRecogniser(sequence.intrinsics, seed=0).find(sight, world, images, NOISE)
+    true = find(mapped, sight).T_world_cam
+    assert rotation_angle_deg(place.T_world_cam[:3, :3].T @ true[:3, :3]) < 0.5
+    for image in images.newest(5):
+        alone = KeyframeImages(3)
+        alone.append(image)
+        assert WideRecogniser(sequence.intrinsics, seed=0).find(sight, world, alone, NOISE) is None
+
+
+def test_what_several_keyframes_match_in_one_spot_is_no_rough_pose(mapped):
+    """All of it may be one wrong match."""
+    sequence, reconstruction = mapped
+    world, images = reconstruction.world, reconstruction._map.images
+    newest = world.keyframes[-1]
+    image, spot = sequence.image(newest.frame_id), np.full_like(sequence.image(0), 90)
+    recogniser, views = WideRecogniser(sequence.intrinsics, seed=0), _newest_views(world, images)
+    spot[310:350, 290:330] = image[310:350, 290:330]
+    for shown, is_found in ((image, True), (spot, False)):
+        found = recogniser._search(sight_of(shown, NUM_MAPPED), views, NOISE, None)
+        assert (found is not None) == is_found
 
 
 def test_another_place_is_not_taken_for_it(mapped):
