@@ -1,30 +1,25 @@
 """Agent, channel and receiver together over loopback, started, slowed down, killed and restarted."""
 
-import os
 import shutil
 import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from waiting import until
 
-from semcast.agent.agent import camera_info, run_agent
+from semcast.agent.agent import run_agent
 from semcast.agent.settings import AgentSettings
-from semcast.agent.source import open_source
 from semcast.agent.source_settings import SourceSettings
 from semcast.channel.emulator import run_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.settings import ChannelSettings
-from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import SourceError
 from semcast.common.keys import link_key, status_key
 from semcast.common.loopback import free_endpoint, open_hub
-from semcast.common.messages import CameraInfo, LinkReport, StatusMessage
+from semcast.common.messages import LinkReport, StatusMessage
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
-from semcast.common.sequence import open_sequence
 from semcast.common.transport import open_session
 from semcast.common.wire import pack, unpack
 from semcast.server.receiver import Receiver
@@ -444,24 +439,6 @@ def test_a_frame_that_can_not_be_encoded_ends_a_replay_that_may_leave_none_out(b
     agent.join(40)
     assert isinstance(agent.error, SourceError)
     assert str(agent.error) == "frame 3 can't be encoded, and a replay leaves none out: this codec can't"
-
-
-def test_a_folder_whose_name_is_no_text_can_be_sent(recording, codec, tmp_path):
-    folder = os.fsdecode(os.fsencode(tmp_path) + b"/room\xff")
-    shutil.copytree(recording, folder)
-    settings = AgentSettings(source=SourceSettings(source=folder))
-    info = camera_info(settings, open_source(settings.source), codec, 1)
-    assert unpack(pack(info), CameraInfo).source_name == "room?"
-
-
-def test_the_camera_s_shutter_is_told(recording, codec, tmp_path):
-    camera = replace(open_sequence(recording).intrinsics, readout_ms=17.0, readout_from="left")
-    camera.save(tmp_path / "rolling.json")
-    source = SourceSettings(
-        source=str(recording), camera=CameraSettings(intrinsics=tmp_path / "rolling.json"), resize=0.5
-    )
-    info = camera_info(AgentSettings(source=source), open_source(source), codec, 1)
-    assert (info.readout_ms, info.readout_from) == (17.0, "left")
 
 
 class AfterTheSource:
