@@ -9,6 +9,7 @@ from semcast.common.camera import Intrinsics
 from semcast.server.geometry.whereabouts import Whereabouts
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.relocalisation import Place
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Seen, Sight
 from semcast.server.mapping.tracker import (
@@ -28,6 +29,8 @@ _START_LEVELS = 5
 _FEW_INLIERS_SHARE = 0.2
 #: How far from where they are expected lost landmarks are looked for, with a pose and with a prediction.
 _REACH_PX, _REACH_BLIND_PX = 6.0, 20.0
+#: Of a keypoint by which a place was recognised, until it is followed.
+RECOGNISED_CONFIDENCE = 0.5
 #: Landmarks a camera that was hidden is posed by: the first strip that comes into sight tells little.
 _LEAST_UNHIDDEN = 30
 
@@ -105,6 +108,20 @@ class Locator:
             may_carry=may_carry,
             is_after_gap=self._is_after_gap,
         )
+
+    def pose_at(self, place: Place) -> TrackedPose | None:
+        """Pose of an image whose place was recognised, None where too few landmarks agree with any.
+
+        From far off, landmarks are further from where the map has them than those of tracks ever are: what
+        patches have proved stands, if no fewer agree within the error of patches.
+        """
+        seen = Seen(place.ids, place.xy, np.full(len(place.ids), RECOGNISED_CONFIDENCE))
+        pose, proof = self.pose(place.T_world_cam, seen), place.proof
+        if pose is None and proof is not None and proof.num_inliers >= MIN_INLIERS:
+            return TrackedPose(
+                place.T_world_cam, proof.covariance, place.ids, proof.inliers, proof.residual_px
+            )
+        return pose
 
     def track(self, sight: Sight, T_world_guess: Array | None) -> TrackedPose | None:
         """Pose of a frame whose tracks were followed; None where it is not sure, and they may be gone."""

@@ -14,7 +14,7 @@ from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.camera_motion import CameraMotion
 from semcast.server.mapping.initialiser import MIN_POINTS, Initialiser, Start
 from semcast.server.mapping.kept_frames import backfill, observed_of
-from semcast.server.mapping.locator import Locator
+from semcast.server.mapping.locator import RECOGNISED_CONFIDENCE, Locator
 from semcast.server.mapping.look_back import look_back
 from semcast.server.mapping.map_arrays import RunState
 from semcast.server.mapping.map_builder import MapBuilder
@@ -22,7 +22,7 @@ from semcast.server.mapping.readout import Readout
 from semcast.server.mapping.rolling_shutter import ImageFlow, RollingShutter
 from semcast.server.mapping.scale_watch import ScaleWatch
 from semcast.server.mapping.settings import ReconstructionSettings
-from semcast.server.mapping.sight import Seen, Sight
+from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate, TrackingState
 from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.tracker import TrackedPose
@@ -40,8 +40,6 @@ _MIN_USABLE_SHARE = 0.5
 _JOIN_INTERVAL = 3
 #: Share of the landmarks in sight that must agree with a pose found without a prior.
 _MIN_SHARE_WHEN_LOST = 0.5
-#: Of a keypoint by which a place was recognised, until it is followed.
-_RECOGNISED_CONFIDENCE = 0.5
 
 
 class Reconstruction:
@@ -313,13 +311,11 @@ class Reconstruction:
         if (place := self._map.recognise(sight, T_world_guess, whereabouts)) is None:
             return None
         # Nothing is given up for a place before there is a pose in it.
-        seen = Seen(place.ids, place.xy, np.full(len(place.ids), _RECOGNISED_CONFIDENCE))
-        pose = self._locator.pose(place.T_world_cam, seen)
-        if pose is not None:
+        if (pose := self._locator.pose_at(place)) is not None:
             if whereabouts is None or place.submap != self._map.world.keyframes[-1].submap:
                 self._motion.reset()
             self._map.go_on_from(place)
-            self._tracks.adopt(place.ids, place.xy, _RECOGNISED_CONFIDENCE)
+            self._tracks.adopt(place.ids, place.xy, RECOGNISED_CONFIDENCE)
             self._initialiser.clear()
         return pose
 

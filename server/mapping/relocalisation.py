@@ -85,6 +85,8 @@ class Place:
         ids: ``(N,)`` landmarks that agree.
         xy: ``(N, 2)`` where they are in the image.
         submap: Of the keyframe.
+        proof: The pose as patches prove it, with which all these landmarks agree within the error of patches;
+            None where descriptors alone tell the place.
     """
 
     T_world_cam: Array
@@ -92,6 +94,7 @@ class Place:
     ids: Ids
     xy: Array
     submap: int
+    proof: PoseEstimate | None = None
 
 
 def _anywhere(_: Place) -> bool:

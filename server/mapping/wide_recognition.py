@@ -8,7 +8,7 @@ landmark is.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -276,7 +276,8 @@ class WideRecogniser:
         pose = self._refined(found.T_cam_world, xyz, xy, noise)
         good, keyframe = pose.inliers, proved.keyframe
         T_world_cam = invert_transform(pose.T_cam_world)
-        return Place(T_world_cam, keyframe.frame_id, ids[good], xy[good], keyframe.submap)
+        proof = replace(pose, inliers=good[good], residual_px=pose.residual_px[good])
+        return Place(T_world_cam, keyframe.frame_id, ids[good], xy[good], keyframe.submap, proof)
 
     def _aligned(self, sight: Sight, view: _View, T_cam_world: Array, by: int = 1) -> _Aligned:
         """Look for all landmarks of a keyframe where a pose has them, in images reduced by a factor."""

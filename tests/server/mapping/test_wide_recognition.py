@@ -71,6 +71,7 @@ def test_the_place_is_found_from_20_degrees_on(mapped, num_lost_rows):
     assert rotation_angle_deg(true) > 17.0
     assert rotation_angle_deg(ours.T @ true) < 1.0
     assert len(np.unique(place.ids)) == len(place.ids) > 20
+    assert place.proof.num_inliers == len(place.proof.residual_px) == len(place.ids)
     assert place.xy[:, 1].min() > num_lost_rows
     T = invert_transform(place.T_world_cam)
     xyz = world.landmarks.xyz[world.landmarks.rows(place.ids)] @ T[:3, :3].T + T[:3, 3]

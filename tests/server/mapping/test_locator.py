@@ -1,0 +1,54 @@
+"""The pose of an image whose place was recognised."""
+
+import numpy as np
+import pytest
+
+from semcast.common.camera import Intrinsics
+from semcast.server.geometry.pnp import refine_pose
+from semcast.server.geometry.weighting import GATE_SIGMAS
+from semcast.server.mapping.bundle import InlineBundle
+from semcast.server.mapping.camera_motion import CameraMotion
+from semcast.server.mapping.locator import Locator
+from semcast.server.mapping.map_builder import MapBuilder
+from semcast.server.mapping.relocalisation import Place
+from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.tracks import TrackTable
+
+CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
+#: The noise of tracks on images that came well: what is 1.9 pixels off is another point.
+SETTINGS = ReconstructionSettings(sigma0_px=0.25)
+#: Of a patch that is found, and by how much landmarks are off.
+PATCH_SIGMA_PX, OFF_PX = 1.0, 1.9
+
+
+def located(num, *, is_proved, off_px=OFF_PX):
+    """Pose at a place where so many landmarks are off, each in another direction."""
+    rng = np.random.default_rng(0)
+    builder = MapBuilder(CAMERA, SETTINGS, InlineBundle(), lambda _: None)
+    motion, tracks = CameraMotion(CAMERA), TrackTable(SETTINGS.confidence, SETTINGS.max_features, seed=0)
+    locator = Locator(CAMERA, SETTINGS, builder, tracks, motion)
+    ids, xyz = np.arange(num), rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (num, 3))
+    builder.world.add_landmarks(ids, xyz, np.zeros((num, 3), np.uint8), np.ones(num), 0, 0)
+    angle = 2.4 * np.arange(num)
+    xy = CAMERA.project(xyz) + off_px * np.column_stack([np.cos(angle), np.sin(angle)])
+    sigma = np.full(num, PATCH_SIGMA_PX)
+    proof = refine_pose(CAMERA, np.eye(4), xyz, xy, sigma, GATE_SIGMAS * sigma)
+    assert proof.num_inliers == num
+    return locator.pose_at(Place(np.eye(4), 0, ids, xy, 0, proof if is_proved else None))
+
+
+def test_what_patches_prove_from_far_off_is_a_pose_where_tracks_would_be_nearer():
+    pose = located(17, is_proved=True)
+    assert np.array_equal(pose.ids, np.arange(17))
+    assert pose.num_inliers == 17
+    assert np.linalg.norm(pose.T_world_cam[:3, 3]) < 0.1
+    assert pose.covariance is not None
+
+
+@pytest.mark.parametrize(("num", "is_proved"), [(14, True), (17, False)])
+def test_fewer_landmarks_or_descriptors_alone_are_none(num, is_proved):
+    assert located(num, is_proved=is_proved) is None
+
+
+def test_a_place_whose_landmarks_are_where_the_map_has_them_needs_no_proof():
+    assert located(17, is_proved=False, off_px=0.3).num_inliers == 17
