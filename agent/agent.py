@@ -352,6 +352,7 @@ def _codec_of(settings: AgentSettings) -> Codec:
         device=settings.device,
         weights=settings.weights,
         runtime=settings.runtime,
+        precision=settings.precision,
     )
     if "torch" in sys.modules:  # onnxruntime keeps its memory by itself
         keep_freed_memory()

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, get_args
 
-from semcast.common.codec import MODULATIONS, Codec, Modulation
+from semcast.common.codec import MODULATIONS, Codec, Modulation, Precision
 from semcast.common.config import near_match
 from semcast.common.conventional_source import ImageFormat
 from semcast.common.errors import ConfigError
@@ -114,14 +114,21 @@ def _load_learned(
     modulation: Modulation,
     num_threads: int | None,
     device: Literal["auto", "cpu", "cuda"],
+    precision: Precision,
 ) -> Codec:
     if runtime == "onnx":
         if device == "cuda":
             raise ConfigError("device must be auto or cpu with the onnx runtime, got 'cuda'")
+        if precision != "auto":
+            raise ConfigError(
+                f"precision must be auto with the onnx runtime, where the file decides, got {precision!r}"
+            )
         return _onnx_encoder(source, modulation, num_threads)
     from semcast.common.nets.codec import NeuralCodec
 
-    return NeuralCodec.load(source, modulation=modulation, num_threads=num_threads, device=device)
+    return NeuralCodec.load(
+        source, modulation=modulation, num_threads=num_threads, device=device, precision=precision
+    )
 
 
 def load_codec(
@@ -132,6 +139,7 @@ def load_codec(
     device: Literal["auto", "cpu", "cuda"] = "auto",
     weights: Path | None = None,
     runtime: Runtime = "torch",
+    precision: Precision = "auto",
 ) -> Codec:
     """Load a codec, ready for use.
 
@@ -144,10 +152,11 @@ def load_codec(
         weights: File to take instead of the shipped weights of a learned codec; it must be of that codec.
         runtime: What computes a learned codec: ``torch``; ``onnx``, which can only encode; ``auto``: torch
             where it is installed.
+        precision: Of a learned codec on torch; see ``semcast.common.nets.precision``.
 
     Raises:
         ConfigError: The name or modulation is unknown, weights were given for a codec without any or are
-            another codec's, or the runtime or device is not there.
+            another codec's, or the runtime, device or precision is not there.
         CheckpointError: The weights are missing or damaged.
     """
     if modulation not in MODULATIONS:
@@ -158,7 +167,7 @@ def load_codec(
     if name in LEARNED_CODECS or name in _shipped_weights():
         source = name if weights is None else weights
         chosen = _choose_runtime(runtime, weights)
-        codec = _load_learned(source, chosen, modulation, num_threads, device)
+        codec = _load_learned(source, chosen, modulation, num_threads, device, precision)
         if weights is not None and codec.name != name:
             raise ConfigError(f"codec must be {codec.name!r}, that of the weights {weights}, got {name!r}")
         return codec

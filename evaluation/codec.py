@@ -20,10 +20,12 @@ from semcast.common.codec import (
     DEFAULT_CODEC,
     LABEL_SHARPNESS,
     OUTAGE_GREY,
+    PRECISION_HELP,
     Codec,
     DecodedImage,
     EncodedImage,
     Modulation,
+    Precision,
     ReceivedImage,
 )
 from semcast.common.codecs import LEARNED_CODECS, is_conventional, load_codec
@@ -87,6 +89,7 @@ class CodecSettings:
     seed: int = field(default=0, metadata={"help": "seed of the channel"})
     max_images: int | None = field(default=None, metadata={"help": "images used at most"})
     threads: int = field(default=2, metadata={"help": "threads of a learned codec"})
+    precision: Precision = field(default="auto", metadata={"help": PRECISION_HELP})
     json: Path | None = field(default=None, metadata={"help": "file for the result, - for stdout"})
     out: Path | None = field(
         default=None,
@@ -270,7 +273,9 @@ class _Exported:
 
 
 def _load(name: str, settings: CodecSettings) -> Codec:
-    codec = load_codec(name, modulation=settings.modulation, num_threads=settings.threads)
+    codec = load_codec(
+        name, modulation=settings.modulation, num_threads=settings.threads, precision=settings.precision
+    )
     if settings.runtime == "torch" or codec.name not in LEARNED_CODECS:
         return codec
     encoder = load_codec(

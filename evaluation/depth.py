@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.codec import DEFAULT_CODEC, Codec, Modulation
+from semcast.common.codec import DEFAULT_CODEC, PRECISION_HELP, Codec, Modulation, Precision
 from semcast.common.codecs import load_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import SourceError
@@ -91,6 +91,7 @@ class DepthSettings:
     max_frames: int | None = field(default=None, metadata={"help": "frames used at most"})
     stride: int = field(default=1, metadata={"help": "use every n-th frame"})
     threads: int = field(default=2, metadata={"help": "threads of a learned codec"})
+    precision: Precision = field(default="auto", metadata={"help": PRECISION_HELP})
     json: Path | None = field(default=None, metadata={"help": "file for the result, - for stdout"})
     out: Path | None = field(
         default=None, metadata={"help": "folder for pictures of depth and, without --json, result.json"}
@@ -166,7 +167,12 @@ def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = Non
     settings = naming(settings, codecs)
     if codecs is None:
         codecs = [
-            load_codec(name, modulation=settings.modulation, num_threads=settings.threads)
+            load_codec(
+                name,
+                modulation=settings.modulation,
+                num_threads=settings.threads,
+                precision=settings.precision,
+            )
             for name in settings.codec
         ]
     under_name = dict(zip(short_names(settings.codec), codecs, strict=True))

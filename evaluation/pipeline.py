@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.codec import DEFAULT_CODEC, Codec, DecodedImage, Modulation
+from semcast.common.codec import DEFAULT_CODEC, PRECISION_HELP, Codec, DecodedImage, Modulation, Precision
 from semcast.common.codecs import load_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SourceError
@@ -68,6 +68,7 @@ class StreamSettings:
     stride: int = field(default=1, metadata={"help": "use every n-th frame"})
     resize: float = field(default=1.0, metadata={"help": "factor on the image size, at most 1"})
     threads: int = field(default=2, metadata={"help": "threads of the codec"})
+    precision: Precision = field(default="auto", metadata={"help": PRECISION_HELP})
     json: Path | None = field(default=None, metadata={"help": "file for the result, - for stdout"})
 
     def __post_init__(self) -> None:
@@ -298,5 +299,10 @@ def open_stream(
     """
     sequence = open_sequence(settings.sequence, settings.camera, resize=settings.resize)
     if codec is None and settings.codec != CLEAN:
-        codec = load_codec(settings.codec, modulation=settings.modulation, num_threads=settings.threads)
+        codec = load_codec(
+            settings.codec,
+            modulation=settings.modulation,
+            num_threads=settings.threads,
+            precision=settings.precision,
+        )
     return sequence, codec

@@ -220,6 +220,7 @@ LAYOUTS: dict[str, _Layout] = {
             "work": ("work", ""),
             "runtime": ("runtime", ""),
             "ISA": ("isa", ""),
+            "precision": ("precision", ""),
             "threads": ("threads", "d"),
             "p50 ms": ("p50_ms", ".1f"),
             "p95 ms": ("p95_ms", ".1f"),

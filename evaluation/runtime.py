@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from semcast.common.codec import DEFAULT_CODEC
+from semcast.common.codec import DEFAULT_CODEC, Precision
 from semcast.common.codecs import LEARNED_CODECS, available_codecs, check_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SemcastError
@@ -18,8 +18,9 @@ from semcast.evaluation.report import provenance, write_result
 
 VERB = "eval runtime"
 UNUSED_FIELDS: frozenset[str] = frozenset()
-#: Instruction sets oneDNN is held to; "all" leaves it free. onnxruntime always takes its best.
-_ISA = ("all", "AVX2")
+#: Instruction sets oneDNN is held to ("all" leaves it free), and the precision asked for there. onnxruntime
+#: always takes its best.
+_TORCH: tuple[tuple[str, Precision], ...] = (("all", "auto"), ("AVX2", "auto"), ("AVX2", "float32"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +61,7 @@ class Variant:
     work: str
     runtime: str
     isa: str
+    precision: Precision
     threads: int
 
 
@@ -69,9 +71,11 @@ def variants(settings: RuntimeSettings) -> list[Variant]:
     for codec in settings.codecs:
         for threads in settings.threads:
             found += [
-                Variant(codec, work, "torch", isa, threads) for work in ("encode", "decode") for isa in _ISA
+                Variant(codec, work, "torch", isa, precision, threads)
+                for work in ("encode", "decode")
+                for isa, precision in _TORCH
             ]
-            found.append(Variant(codec, "encode", "onnx", "all", threads))
+            found.append(Variant(codec, "encode", "onnx", "all", "auto", threads))
     return found
 
 
@@ -93,7 +97,7 @@ class _Child:
             text=True,
             env=environment,
         )
-        self._ask({**asdict(variant), "shape_hw": shape_hw})
+        self.precision = self._ask({**asdict(variant), "shape_hw": shape_hw})
 
     def _ask(self, value: Any) -> Any:
         assert self._process.stdin is not None
@@ -130,8 +134,8 @@ def evaluate_runtime(settings: RuntimeSettings) -> dict[str, Any]:
     """Time all variants in one run, taking turns.
 
     Returns:
-        ``results``: a row for each variant with ``p50_ms``, ``p95_ms`` and ``fps``, or ``error`` where a
-        codec has no weights or no exported encoder; and provenance.
+        ``results``: a row for each variant with the ``precision`` that was taken, ``p50_ms``, ``p95_ms`` and
+        ``fps``, or ``error`` where a codec has no weights or no exported encoder; and provenance.
 
     Raises:
         ConfigError: A codec is none there is, or not a learned one: neither runtime nor instruction set
@@ -162,6 +166,7 @@ def evaluate_runtime(settings: RuntimeSettings) -> dict[str, Any]:
 
 def _row(child: _Child) -> dict[str, Any]:
     row: dict[str, Any] = {**asdict(child.variant), "p50_ms": None, "p95_ms": None, "fps": None}
+    row["precision"] = child.precision
     if child.times_ms:
         p50, p95 = np.percentile(child.times_ms, [50, 95])
         row |= {"p50_ms": float(p50), "p95_ms": float(p95), "fps": 1000.0 / float(p50)}

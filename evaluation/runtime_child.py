@@ -1,7 +1,7 @@
 """One variant of a codec's runtime in its own process: instruction sets and threads are fixed at the start.
 
-Reads one JSON line with the variant, answers ``ready``; every further line with a count is answered with the
-wall times of that many calls.
+Reads one JSON line with the variant, answers with the precision when it is ready; every further line with a
+count is answered with the wall times of that many calls.
 """
 
 import json
@@ -20,7 +20,12 @@ def main() -> None:
     task = json.loads(sys.stdin.readline())
     height, width = task["shape_hw"]
     codec = load_codec(
-        task["codec"], modulation="16qam", num_threads=task["threads"], device="cpu", runtime=task["runtime"]
+        task["codec"],
+        modulation="16qam",
+        num_threads=task["threads"],
+        device="cpu",
+        runtime=task["runtime"],
+        precision=task["precision"],
     )
     rng = np.random.default_rng(0)
     coarse = rng.integers(0, 256, (height // 16 + 1, width // 16 + 1, 3), dtype=np.uint8)
@@ -38,7 +43,7 @@ def main() -> None:
 
     for _ in range(3):
         call()
-    print(json.dumps("ready"), flush=True)
+    print(json.dumps(getattr(codec, "precision", None)), flush=True)
     for line in sys.stdin:
         times_ms = []
         for _ in range(json.loads(line)):

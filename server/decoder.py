@@ -12,7 +12,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.codec import LOST_SLOT_SNR_DB, Codec, DecodedImage, Modulation, ReceivedImage
+from semcast.common.codec import (
+    LOST_SLOT_SNR_DB,
+    Codec,
+    DecodedImage,
+    Modulation,
+    Precision,
+    ReceivedImage,
+)
 from semcast.common.codecs import load_codec
 from semcast.common.errors import CheckpointError, ProtocolError
 from semcast.common.phy.slots import layout_for
@@ -34,6 +41,7 @@ def codec_loader(
     device: Literal["auto", "cpu", "cuda"] = "auto",
     weights: Path | None = None,
     only_of: str | None = None,
+    precision: Precision = "auto",
 ) -> CodecLoader:
     """Return what loads codecs by name and modulation.
 
@@ -43,6 +51,7 @@ def codec_loader(
         weights: Taken in place of the shipped ones.
         only_of: The codec they are for; others have the shipped ones. None: for any that is asked for, which
             must be theirs.
+        precision: Of a learned one.
     """
 
     def load(name: str, modulation: Modulation) -> Codec:
@@ -52,6 +61,7 @@ def codec_loader(
             num_threads=num_threads,
             device=device,
             weights=weights if only_of in (None, name) else None,
+            precision=precision,
         )
 
     return load

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
+from semcast.common.codec import PRECISION_HELP, Precision
 from semcast.common.cores import check_threads
 from semcast.common.errors import SemcastError, SourceError
 from semcast.common.keys import agent_of
@@ -102,6 +103,7 @@ class ReplaySettings:
         default=None, metadata={"help": "weights of the recorded agent, where they are not the shipped ones"}
     )
     threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})
+    precision: Precision = field(default="auto", metadata={"help": PRECISION_HELP})
     start_s: float = field(default=0.0, metadata={"help": "leave out frames before this time of the source"})
     end_s: float | None = field(default=None, metadata={"help": "leave out frames after this time"})
     marker: MarkerSettings = field(default=MarkerSettings(), metadata={"help": "marker that tells the metre"})
@@ -191,7 +193,9 @@ def _replayed(
 ) -> dict[str, Any]:
     """Decode and reconstruct the frames of a stream; return the summary."""
     agent_id, camera = stream.agent_id, stream.camera
-    decoder = FrameDecoder(codec_loader(settings.threads, weights=settings.weights))
+    decoder = FrameDecoder(
+        codec_loader(settings.threads, weights=settings.weights, precision=settings.precision)
+    )
     # Before a former run is set aside.
     decoder.codec_for(camera.codec, camera.modulation, camera.digest)
     identity = StreamIdentity.of(agent_id, camera)

@@ -72,7 +72,9 @@ class Server:
         own: Path | None = None
         if settings.codec is not None:
             codec, own = named_weights(settings.codec)
-        installed = codec_loader(settings.threads, settings.device, own, only_of=codec)
+        installed = codec_loader(
+            settings.threads, settings.device, own, only_of=codec, precision=settings.precision
+        )
         self._decoder = FrameDecoder(load if load is not None else installed)
         self._false_start = FalseStart()
         self._new_map = False

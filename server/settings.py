@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.codec import Modulation
+from semcast.common.codec import PRECISION_HELP, Modulation, Precision
 from semcast.common.cores import check_threads, usable_cores
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import HubSettings
@@ -83,6 +83,7 @@ class ServerSettings:
     )
     modulation: Modulation = field(default="16qam", metadata={"help": "modulation of that codec"})
     threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})
+    precision: Precision = field(default="auto", metadata={"help": PRECISION_HELP})
     device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "device of the decoder"})
     reference: Path | None = field(
         default=None, metadata={"help": "recorded sequence the agent sends: gives PSNR and ground truth"}

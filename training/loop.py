@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from semcast.common.errors import CheckpointError, SemcastError, SourceError
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
-from semcast.common.nets.codec import check_device, has_fast_bfloat16
+from semcast.common.nets.codec import check_device
+from semcast.common.nets.precision import has_fast_bfloat16
 from semcast.common.nets.registry import architecture
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.slots import BLOCK_PX, channel_bandwidth_ratio

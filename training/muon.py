@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
-from semcast.common.nets.codec import has_fast_bfloat16
+from semcast.common.nets.precision import has_fast_bfloat16
 
 #: Of the iteration.
 _NUM_STEPS = 5

@@ -3,6 +3,8 @@
 Codecs
     codec             a trained transceiver behind the codec interface
     inference         the same figures with fewer passes over memory
+    precision         what convolutions are computed in
+    int8              convolutions of eight-bit integers
     checkpoint        weights on disk
     manifest          what weights are, beside them
     registry          architectures by name

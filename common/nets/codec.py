@@ -1,6 +1,5 @@
 """A trained transceiver behind the codec interface: numpy in, numpy out, on CPU or GPU."""
 
-import os
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -15,6 +14,7 @@ from semcast.common.codec import (
     DecodedImage,
     EncodedImage,
     Modulation,
+    Precision,
     ReceivedImage,
     check_fixed_rate,
     confidence_from_displacement_px,
@@ -23,9 +23,10 @@ from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.checkpoint import load_transceiver
 from semcast.common.nets.coder_input import coder_input
 from semcast.common.nets.detail import allocation_for
-from semcast.common.nets.inference import inference_net
+from semcast.common.nets.inference import can_arrange, inference_net
 from semcast.common.nets.latent import latent_from_symbols, symbols_from_latent
 from semcast.common.nets.manifest import Manifest, weights_path
+from semcast.common.nets.precision import dtype_for
 from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.slots import layout_for
@@ -35,20 +36,6 @@ Device = Literal["auto", "cpu", "cuda"]
 
 #: No honest equaliser gives larger values; anything above is damage.
 _MAX_SYMBOL = 16.0
-#: Parts of the names of oneDNN's instruction sets that multiply bfloat16.
-_ISA_WITH_BFLOAT16 = ("BF16", "AMX", "FP16", "AVX10")
-
-
-def has_fast_bfloat16() -> bool:
-    """Tell whether this CPU multiplies bfloat16 in hardware (AVX512-BF16 or AMX), and oneDNN may use it.
-
-    Held to less by ``ONEDNN_MAX_CPU_ISA``, oneDNN would emulate it, far slower than float32.
-    """
-    allowed = os.environ.get("ONEDNN_MAX_CPU_ISA", os.environ.get("DNNL_MAX_CPU_ISA", "")).upper()
-    if allowed not in ("", "ALL", "DEFAULT") and not any(word in allowed for word in _ISA_WITH_BFLOAT16):
-        return False
-    probe = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
-    return bool(probe()) if probe is not None else False
 
 
 def check_device(device: Device) -> None:
@@ -74,20 +61,33 @@ class NeuralCodec:
         manifest: Of its weights.
         modulation: How symbols travel.
         device: Where to compute.
+        precision: What convolutions are computed in; see ``dtype_for``.
+
+    Attributes:
+        precision: That which was chosen, not ``auto``.
+
+    Raises:
+        ConfigError: The network can't be computed in that precision here.
     """
 
     def __init__(
-        self, model: Transceiver, manifest: Manifest, modulation: Modulation, device: torch.device
+        self,
+        model: Transceiver,
+        manifest: Manifest,
+        modulation: Modulation,
+        device: torch.device,
+        precision: Precision = "auto",
     ) -> None:
         if modulation not in MODULATIONS:
             raise ValueError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}")
         self.manifest = manifest
         self.modulation: Modulation = modulation
         self._device = device
-        half = device.type == "cuda" or has_fast_bfloat16()
+        dtype = dtype_for(precision, device, can_arrange(model))
+        self.precision = str(dtype).removeprefix("torch.")
         model = model.to(device).eval().requires_grad_(False)
         self._model = model
-        self._net = inference_net(model, torch.bfloat16 if half else torch.float32)
+        self._net = inference_net(model, dtype)
         self._is_qam = (
             torch.ones(1, device=device) if modulation == "16qam" else torch.zeros(1, device=device)
         )
@@ -99,6 +99,7 @@ class NeuralCodec:
         modulation: Modulation = "16qam",
         num_threads: int | None = None,
         device: Device = "auto",
+        precision: Precision = "auto",
     ) -> "NeuralCodec":
         """Load shipped weights by name, or any weights file with its manifest beside it.
 
@@ -107,11 +108,12 @@ class NeuralCodec:
             modulation: How symbols travel.
             num_threads: Threads of torch in this process; None leaves them as they are.
             device: ``auto`` takes a GPU where there is one.
+            precision: What convolutions are computed in; see ``dtype_for``.
 
         Raises:
             CheckpointError: There are no such weights, they do not fit their manifest, or are not for the
                 modulation.
-            ConfigError: There is no such device.
+            ConfigError: There is no such device, or the network can't be computed in that precision there.
             ValueError: The modulation or number of threads is not usable.
         """
         if num_threads is not None:
@@ -124,7 +126,7 @@ class NeuralCodec:
         if modulation in MODULATIONS and modulation not in manifest.modulations:
             ways = ", ".join(map(str, manifest.modulations))
             raise CheckpointError(f"weights {name_or_path} are for the modulation {ways}, got {modulation!r}")
-        return cls(model, manifest, modulation, torch.device("cuda" if use_cuda else "cpu"))
+        return cls(model, manifest, modulation, torch.device("cuda" if use_cuda else "cpu"), precision)
 
     @property
     def name(self) -> str:

@@ -4,6 +4,9 @@ On a CPU the convolutions of 3DC-SC take less than half of the time of its plain
 pixel-(un)shuffles, casts and activations. Here pixels stay in rows ``(H, W, C)`` from the camera's buffer to
 the last layer: weights are cast once, their channels are put into the order in which (un)folding is a copy of
 long runs, activations happen in place, and no picture is built where only its folded form is used.
+
+Where convolutions are of eight-bit integers, those that carry the picture itself are not: the linear
+transform, which takes a fiftieth of the work, and the layers whose sum with it is sent or shown.
 """
 
 from collections.abc import Callable
@@ -23,6 +26,7 @@ from semcast.common.nets.blocks import (
 from semcast.common.nets.confidence import ConfidenceBranch
 from semcast.common.nets.decoder import Decoder
 from semcast.common.nets.encoder import Encoder
+from semcast.common.nets.int8 import Int8Conv
 from semcast.common.nets.linear import MAX_LOG_GAIN, BlockSynthesis
 from semcast.common.nets.modulation import (
     analog_values,
@@ -65,12 +69,15 @@ def inference_net(model: Transceiver, dtype: torch.dtype) -> InferenceNet:
 
     Args:
         model: In evaluation mode, on the device it will run on.
-        dtype: Of convolutions: bfloat16 where the hardware multiplies it, else float32.
+        dtype: Of convolutions: bfloat16, float32, or int8 where it can be arranged (``can_arrange``).
     """
+    return ArrangedNet(model, dtype) if can_arrange(model) else PlainNet(model, dtype)
+
+
+def can_arrange(model: Transceiver) -> bool:
+    """Tell whether a network is 3DC-SC, of any size."""
     parts = (type(model.encoder), type(model.decoder), type(model.confidence))
-    if parts == (Encoder, Decoder, ConfidenceBranch):
-        return ArrangedNet(model, dtype)
-    return PlainNet(model, dtype)
+    return parts == (Encoder, Decoder, ConfidenceBranch)
 
 
 class PlainNet:
@@ -149,7 +156,7 @@ class _Conv:
 
     Args:
         conv: The trained layer.
-        dtype: To compute in.
+        dtype: To compute in; int8 takes and gives float32.
         inputs: Order of the input channels, None as trained.
         outputs: Order of the output channels.
         scale: Factor on the weights, not on the bias.
@@ -169,15 +176,29 @@ class _Conv:
         if outputs is not None:
             weight = weight[outputs.to(weight.device)]
             bias = None if bias is None else bias[outputs.to(weight.device)]
-        self._weight = weight.to(dtype).contiguous(memory_format=torch.channels_last)
-        self._bias = None if bias is None else bias.detach().to(dtype)
-        self._stride, self._padding = conv.stride, conv.padding
         self.num_inputs = conv.in_channels
+        self._convolve = _convolution(weight, None if bias is None else bias.detach(), conv, dtype)
 
     def __call__(self, x: Tensor) -> Tensor:
         """Convolve ``(1, C, h, w)``."""
-        y: Tensor = torch.conv2d(x, self._weight, self._bias, self._stride, self._padding)  # type: ignore[call-overload]
-        return y
+        return self._convolve(x)
+
+
+def _convolution(
+    weight: Tensor, bias: Tensor | None, like: nn.Conv2d, dtype: torch.dtype
+) -> Callable[[Tensor], Tensor]:
+    stride, padding = like.stride, like.padding
+    assert not isinstance(padding, str)
+    if dtype == torch.int8:
+        return Int8Conv(weight, bias, stride, padding)
+    cast = weight.to(dtype).contiguous(memory_format=torch.channels_last)
+    shift = None if bias is None else bias.to(dtype)
+    return lambda x: torch.conv2d(x, cast, shift, stride, padding)
+
+
+def _of_values(dtype: torch.dtype) -> torch.dtype:
+    """Return the type between convolutions, and of those that are never of integers."""
+    return torch.float32 if dtype == torch.int8 else dtype
 
 
 class _Stage:
@@ -217,16 +238,16 @@ class _ArrangedEncoder:
     """``Encoder`` for one frame."""
 
     def __init__(self, encoder: Encoder, dtype: torch.dtype) -> None:
-        self._dtype = dtype
+        self._dtype = exact = _of_values(dtype)
         # Pixels enter as value - 127.5, which bfloat16 holds exactly; 1/255 is in the weights.
         scale = 1.0 / 255.0
         self._stem = _Conv(encoder.stem, dtype, inputs=_fold_order(3), scale=scale)
         self._down8, self._down16 = _Conv(encoder.down8, dtype), _Conv(encoder.down16, dtype)
         self._stages = [_Stage(s, dtype) for s in (encoder.stage4, encoder.stage8, encoder.stage16)]
-        self._head = _Conv(encoder.head, dtype)
-        self._transform = _Conv(encoder.linear.transform, dtype, inputs=_block_order(), scale=scale)
-        self._mix = _Conv(encoder.linear.mix, dtype)
-        self._share = None if encoder.share is None else _Conv(encoder.share, dtype)
+        self._head = _Conv(encoder.head, exact)
+        self._transform = _Conv(encoder.linear.transform, exact, inputs=_block_order(), scale=scale)
+        self._mix = _Conv(encoder.linear.mix, exact)
+        self._share = None if encoder.share is None else _Conv(encoder.share, exact)
 
     def __call__(self, pixels: Tensor, snr_db: Tensor, share: Tensor | None) -> Tensor:
         """Encode ``(H, W, 3)`` uint8 to the float latent ``(1, C, H/16, W/16)``."""
@@ -248,17 +269,17 @@ class _ArrangedDecoder:
     """``Decoder`` and ``ConfidenceBranch`` for one frame."""
 
     def __init__(self, decoder: Decoder, branch: ConfidenceBranch, dtype: torch.dtype) -> None:
-        self._dtype = dtype
+        self._dtype = exact = _of_values(dtype)
         order = _fold_order(3)
         self._linear: BlockSynthesis = decoder.linear
-        self._unmix = _Conv(decoder.linear.unmix, dtype)
-        self._transform = _Conv(decoder.linear.transform, dtype, outputs=_block_order())
+        self._unmix = _Conv(decoder.linear.unmix, exact)
+        self._transform = _Conv(decoder.linear.transform, exact, outputs=_block_order())
         self._stem = _Conv(decoder.stem, dtype)
-        self._adapt = _Conv(decoder.adapt_head, dtype)
+        self._adapt = _Conv(decoder.adapt_head, exact)
         self._stages = [_Stage(s, dtype) for s in (decoder.stage16, decoder.stage8, decoder.stage4)]
         self._up8, self._up4 = _Upsample(decoder.up8.conv, dtype), _Upsample(decoder.up4.conv, dtype)
         self._estimate = _Conv(decoder.estimate, dtype, inputs=order)
-        self._head = _Conv(decoder.head, dtype, outputs=order)
+        self._head = _Conv(decoder.head, exact, outputs=order)
         self._start = _Conv(branch.start, dtype)
         self._fuse16, self._fuse8 = _Conv(branch.fuse16, dtype), _Conv(branch.fuse8, dtype)
         before = torch.arange(branch.fuse4.in_channels - order.numel())

@@ -87,6 +87,11 @@ def test_an_unknown_device_is_not_taken_for_the_cpu(files):
         load_codec("3dcsc", weights=files["torch"], device="gpu")
 
 
+def test_the_onnx_runtime_has_the_precision_of_its_file(files):
+    with pytest.raises(ConfigError, match="^precision must be auto with the onnx runtime.*got 'float32'$"):
+        load_codec(str(files["onnx"]), runtime="auto", precision="float32")
+
+
 def test_the_onnx_runtime_does_not_pretend_to_use_a_gpu(files):
     with pytest.raises(ConfigError, match="device must be auto or cpu with the onnx runtime, got 'cuda'"):
         load_codec("3dcsc", weights=files["onnx"], runtime="auto", device="cuda")

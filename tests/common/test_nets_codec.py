@@ -9,7 +9,7 @@ import torch
 from semcast.common.codec import LOST_SLOT_SNR_DB, ReceivedImage
 from semcast.common.errors import CheckpointError
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
-from semcast.common.nets.codec import NeuralCodec, has_fast_bfloat16
+from semcast.common.nets.codec import NeuralCodec
 from semcast.common.nets.manifest import manifest_path, read_manifest, weights_path
 from semcast.common.nets.registry import architecture, architectures, build
 from semcast.common.nets.transceiver import Sizes, build_3dcsc
@@ -290,10 +290,3 @@ def test_the_shipped_weights_load_fast_and_see_a_lost_band():
     assert damaged.confidence[52:76].mean() < 0.3
     assert damaged.confidence[:32].mean() > damaged.confidence[52:76].mean() + 0.15
     assert damaged.keypoint_confidence[:32].mean() > damaged.keypoint_confidence[52:76].mean()
-
-
-@pytest.mark.parametrize(("isa", "may_be_fast"), [("AVX2", False), ("AVX512_CORE", False), ("ALL", True)])
-def test_onednn_held_to_an_instruction_set_without_bfloat16_gets_float32(monkeypatch, isa, may_be_fast):
-    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True, raising=False)
-    monkeypatch.setenv("ONEDNN_MAX_CPU_ISA", isa)
-    assert has_fast_bfloat16() == may_be_fast

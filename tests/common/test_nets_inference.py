@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from semcast.common.nets.inference import ArrangedNet, PlainNet, inference_net
+from semcast.common.nets.int8 import has_int8
 from semcast.common.nets.modulation import modulate
 from semcast.common.nets.registry import build
 
@@ -82,6 +83,25 @@ def test_bfloat16_stays_close():
         images = [n.decode(y_rx, plane, flag)[0].float() for n in (exact, quick)]
     assert same.float().mean() > 0.95
     assert (images[0] - images[1]).abs().mean() < 2
+
+
+@pytest.mark.skipif(not has_int8(), reason="no fast convolutions of eight bits here")
+@pytest.mark.parametrize("name", ["3dcsc-lite", "3dcsc-vr"])
+def test_int8_stays_close(name):
+    model = perturbed(name)
+    exact, quick = (inference_net(copy.deepcopy(model), d) for d in (torch.float32, torch.int8))
+    pixels, snr_db, plane, y_rx, flag = example(is_qam=True)
+    values = torch.full((1, 1, 3, 5), 94) if model.is_variable else None
+    with torch.inference_mode():
+        latents = [n.latent(pixels, snr_db, flag, values) for n in (exact, quick)]
+        images, confidence, moved_px = zip(
+            *(n.decode(y_rx, plane, flag, values) for n in (exact, quick)), strict=True
+        )
+    for mine, expected in ((latents[1], latents[0]), (moved_px[1], moved_px[0])):
+        assert 0 < (mine - expected).std() < 0.1 * expected.std()  # other arithmetic, the same figures
+    # Most of what these networks draw is saturated, black to white.
+    assert (images[1].float() - images[0].float()).abs().mean() < 5
+    assert (confidence[1] - confidence[0]).abs().mean() < 0.02
 
 
 @pytest.mark.parametrize("name", ["cnn", "vit"])

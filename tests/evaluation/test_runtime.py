@@ -13,10 +13,12 @@ pytestmark = pytest.mark.xdist_group("real-time")
 
 def test_every_runtime_encodes_and_torch_alone_decodes():
     found = variants(RuntimeSettings(threads=(1, 2)))
-    assert len(found) == len(set(found)) == 10
+    assert len(found) == len(set(found)) == 14
     assert {(v.work, v.isa) for v in found if v.runtime == "onnx"} == {("encode", "all")}
-    assert {(v.work, v.isa) for v in found if v.runtime == "torch"} == {
-        (work, isa) for work in ("encode", "decode") for isa in ("all", "AVX2")
+    assert {(v.work, v.isa, v.precision) for v in found if v.runtime == "torch"} == {
+        (work, *how)
+        for work in ("encode", "decode")
+        for how in (("all", "auto"), ("AVX2", "auto"), ("AVX2", "float32"))
     }
 
 
@@ -26,7 +28,10 @@ def test_all_variants_are_timed(tmp_path):
     settings = RuntimeSettings(width=64, height=48, threads=(1,), rounds=2, calls=2, json=tmp_path / "r.json")
     report = evaluate_runtime(settings)
     assert json.loads(settings.json.read_text()) == report
-    assert len(report["results"]) == 5
+    assert len(report["results"]) == 7
+    exact = [row for row in report["results"] if row["precision"] == "float32"]
+    assert {row["work"] for row in exact} == {"encode", "decode"}
+    assert all(row["precision"] in ("float32", "bfloat16", "int8") for row in report["results"])
     for row in report["results"]:
         assert 0.0 < row["p50_ms"] <= row["p95_ms"]
         assert row["fps"] == pytest.approx(1000.0 / row["p50_ms"])
@@ -88,4 +93,4 @@ def test_without_a_variant_that_ran_the_first_one_says_why(monkeypatch):
     monkeypatch.setattr(runtime, "_Child", Child)
     with pytest.raises(SemcastError, match="^no variant ran: no encode$"):
         evaluate_runtime(RuntimeSettings(threads=(1,), rounds=1))
-    assert [child.closed for child in children] == [True] * 5
+    assert [child.closed for child in children] == [True] * 7
