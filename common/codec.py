@@ -20,10 +20,7 @@ MODULATIONS: tuple[Modulation, ...] = ("16qam", "analog")
 #: What the convolutions of a learned codec are computed in.
 Precision = Literal["auto", "float32", "bfloat16", "int8"]
 #: Of every command that computes them.
-PRECISION_HELP = (
-    "arithmetic of a learned codec's convolutions: bfloat16, int8, float32, or auto (the first of them that "
-    "is fast on this processor)"
-)
+PRECISION_HELP = "arithmetic of a learned codec's convolutions; auto: the fastest of this processor"
 
 #: Codec of every command that is not told another.
 DEFAULT_CODEC = "3dcsc-lite-vr"

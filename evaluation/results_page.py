@@ -169,12 +169,12 @@ def _demo(report: Report) -> Iterator[str]:
 def _runtime(report: Report) -> Iterator[str]:
     settings = report["settings"]
     yield f"Images of {settings['width']}x{settings['height']}; all variants take turns in one run.\n"
-    head = ["codec", "work", "runtime", "instruction sets", "threads", "p50 ms", "p95 ms", "per second"]
-    keys = ("codec", "work", "runtime", "isa", "threads")
+    head = ["codec", "work", "runtime", "instruction sets", "precision", "threads"]
+    keys = ("codec", "work", "runtime", "isa", "precision", "threads")
     yield from table(
-        head,
+        [*head, "p50 ms", "p95 ms", "per second"],
         [
-            [*(str(row[k]) for k in keys), *(number(row[k], 1) for k in ("p50_ms", "p95_ms", "fps"))]
+            [*(str(row.get(k, "-")) for k in keys), *(number(row[k], 1) for k in ("p50_ms", "p95_ms", "fps"))]
             for row in report["results"]
         ],
     )
