@@ -37,7 +37,7 @@ _LOOK_INTERVAL = 4
 _MAX_DRIFT = 0.1
 #: How near to the old keyframe the camera must have come back, as a share of that distance.
 _MAX_APART = 0.3
-#: Keyframes after which a place recognised once no longer counts.
+#: Keyframes after which a place recognised once no longer counts, nor a loop that was refused.
 _MAX_PENDING = 10
 #: Two recognitions of a place agree up to this distance, in median depths,
 _SAME_DEPTHS = 0.1
@@ -125,12 +125,12 @@ class LoopFinder:
         self._relocaliser = relocaliser
         self._pending: Loop | None = None
         self._since_pending = self._since_look = 0
-        self._settled = 0
+        self._settled = self._refused = 0
 
     @property
-    def pending(self) -> bool:
-        """Whether a place was recognised once."""
-        return self._pending is not None
+    def is_in_doubt(self) -> bool:
+        """Whether where the camera is contradicts a place: one recognised once, or that of a refused loop."""
+        return self._pending is not None or self._refused > 0
 
     def look(
         self, view: LoopView, world: WorldMap, noise: NoiseModel, submap: int, found: Revisit | None
@@ -150,6 +150,7 @@ class LoopFinder:
         self._since_look += 1
         self._since_pending += 1
         self._settled -= 1
+        self._refused -= 1
         if self._since_pending > _MAX_PENDING:
             self._pending = None
         if self._settled > 0:
@@ -199,7 +200,7 @@ class LoopFinder:
         )
         away_px = float(np.median(np.where(in_front, np.linalg.norm(residual, axis=1), np.inf)))
         if away_px < GATE_SIGMAS * max(OLD_SIGMA_PX, noise.sigma0_px):
-            self._pending, self._settled = None, _NUM_RECENT
+            self._pending, self._settled, self._refused = None, _NUM_RECENT, 0
             return None
         fresh = ~np.isin(view.ids, place.ids)  # what is followed anyway knows no other scale
         similarity = submap_similarity(place, world, view.T_world_cam, view.ids[fresh], view.xy[fresh])
@@ -211,8 +212,15 @@ class LoopFinder:
             depth = loop.scale * median_depth(world, newest)
             if before is None or not before.agrees(loop, view, depth):
                 return None
-        self._pending, self._settled = None, _NUM_RECENT
+        self._pending, self._settled, self._refused = None, _NUM_RECENT, 0
         return loop
+
+    def refuse(self) -> None:
+        """Take note that the loop just found can't be closed: it may be a wrong place, and is looked for again.
+
+        Until then nothing of such a place may be used, or the map would be tied to it landmark by landmark.
+        """
+        self._settled, self._refused = _LOOK_INTERVAL, _MAX_PENDING
 
     def note_tie(self) -> None:
         """Note that landmarks of long ago were found where they should be: no loop can open meanwhile."""

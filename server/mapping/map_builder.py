@@ -248,7 +248,7 @@ class MapBuilder:
             T_now = self.world.pose_of_frame(sight.frame.frame_id)
             T_world_cam = T_world_cam if T_now is None else T_now
             found = self._find_revisit(tracks, sight, T_world_cam)
-        elif self.loops.pending:
+        elif self.loops.is_in_doubt:
             return False
         return (found is not None and self._take_up(found, tracks, sight, T_world_cam) > 0) or closed
 
@@ -260,6 +260,7 @@ class MapBuilder:
         """Share out what drifted since the camera was at the loop's place; whether that was possible."""
         found = share_out(self.world, self.submap, loop)
         if found is None:
+            self.loops.refuse()
             return False
         keyframe_ids, solved = found
         self._abandon_adjustment()

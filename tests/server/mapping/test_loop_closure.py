@@ -130,7 +130,7 @@ def test_a_place_proved_by_too_few_is_none(room, rng):
     found = old_landmarks(room, HERE, rng, num_wrong=int(0.5 * len(found.ids)))
     finder = LoopFinder(CAMERA, Recogniser(), 0)
     assert look(finder, room, found) is None
-    assert not finder.pending
+    assert not finder.is_in_doubt
 
 
 def test_landmarks_of_unknown_depth_prove_no_place(room, rng):
@@ -158,7 +158,11 @@ def test_where_nothing_has_drifted_there_is_no_loop_and_none_is_looked_for(room,
     finder = LoopFinder(CAMERA, recogniser, 0)
     of_newest = view(room, HERE)
     here = LoopView(of_newest.sight, HERE, of_newest.ids, of_newest.xy)
-    assert finder.look(here, world, NOISE, 0, old_landmarks(room, HERE, rng)) is None
+    finder.refuse()
+    for _ in range(_LOOK_INTERVAL):
+        assert finder.is_in_doubt
+        assert finder.look(here, world, NOISE, 0, old_landmarks(room, HERE, rng)) is None
+    assert not finder.is_in_doubt, "what was refused before was a wrong place"
     assert all(finder.look(here, world, NOISE, 0, None) is None for _ in range(19))
     assert recogniser.asked == []
     finder.look(here, world, NOISE, 0, None)
@@ -178,7 +182,7 @@ def test_a_place_has_to_be_recognised_twice(room, rng):
     assert loops[-1].scale == pytest.approx(1 / DRIFT_SCALE, rel=0.03)
     assert set(recogniser.asked[0]) <= set(range(NUM - 20))
     assert 0 in recogniser.asked[0]
-    assert not finder.pending
+    assert not finder.is_in_doubt
 
 
 def test_two_recognitions_that_contradict_each_other_are_no_loop(room, rng):
@@ -186,15 +190,30 @@ def test_two_recognitions_that_contradict_each_other_are_no_loop(room, rng):
     elsewhere = Place(HERE @ make_transform(np.eye(3), [1.0, 0, 0]), 0, elsewhere.ids, elsewhere.xy, 0)
     finder = LoopFinder(CAMERA, Recogniser(place(room, HERE, rng), elsewhere), 0)
     assert all(look(finder, room) is None for _ in range(_LOOK_INTERVAL + 1))
-    assert finder.pending
+    assert finder.is_in_doubt
 
 
 def test_a_place_recognised_once_is_forgotten(room, rng):
     finder = LoopFinder(CAMERA, Recogniser(place(room, HERE, rng)), 0)
     assert all(look(finder, room) is None for _ in range(_LOOK_INTERVAL))
-    assert finder.pending
+    assert finder.is_in_doubt
     assert all(look(finder, room) is None for _ in range(11))
-    assert not finder.pending
+    assert not finder.is_in_doubt
+
+
+def test_a_refused_loop_leaves_doubt_until_it_is_found_again_or_long_ago(room, rng):
+    found = old_landmarks(room, HERE, rng)
+    finder = LoopFinder(CAMERA, Recogniser(), 0)
+    for _ in range(2):
+        assert look(finder, room, found) is not None
+        assert not finder.is_in_doubt
+        finder.refuse()
+        assert [look(finder, room, found) for _ in range(_LOOK_INTERVAL - 1)] == [None] * (_LOOK_INTERVAL - 1)
+        assert finder.is_in_doubt
+    assert all(look(finder, room) is None for _ in range(6))
+    assert finder.is_in_doubt
+    look(finder, room)
+    assert not finder.is_in_doubt
 
 
 def test_far_from_old_keyframes_nothing_is_compared(room):

@@ -11,6 +11,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
 from semcast.server.geometry.features import TrackedPoints, to_grey
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping import map_builder
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.keyframe_images import ImagedMap, KeyframeImages, SeenFrom
 from semcast.server.mapping.map_builder import MapBuilder
@@ -290,14 +291,14 @@ def test_an_adjustment_with_them_takes_the_drift_out_of_the_newest_pose(mapped):
     assert away < 0.3 * np.linalg.norm(believed[:3, 3] - true[:3, 3])
 
 
-def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped):
+def drifted(mapped, true, scale, moved):
+    """A builder, with sight, tracks and pose of a frame in a part of the map that has drifted."""
     world, images = mapped
-    settings, moved = ReconstructionSettings(confidence="off", max_features=120), []
+    settings = ReconstructionSettings(confidence="off", max_features=120)
     builder = MapBuilder(CAMERA, settings, InlineBundle(), on_moved=moved.append)
     builder.world, builder.images = world, images
-    true, scale = pose(0.1, 0.05), 1.1
     drift = pose(0.02, 0.03, 0.02, (0.3, 0.4, 0.0))
-    believed = drift @ pose(0.1 * scale, 0.05 * scale)
+    believed = drift @ make_transform(true[:3, :3], scale * true[:3, 3])
     sight = sight_from(true, 100)
     tracks = TrackTable("off", 80, 0)
     tracks.next_id = int(world.landmarks.ids[-1]) + 1
@@ -305,12 +306,20 @@ def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped
     tracks.refill(sight)
     # The young tracks have landmarks already, in the drifted part's place and unit.
     young = scale * on_wall(true, tracks.xy) @ drift[:3, :3].T + drift[:3, 3]
-    newest, young_ids = 90, tracks.ids
+    newest = 90
     seen = tracks.ids, tracks.xy, tracks.confidence
     world.add_keyframe(Keyframe(newest, newest * 10**8, drift @ pose(0.2 * scale), 0, *seen))
     colour = np.zeros((len(young), 3), np.uint8)
-    world.add_landmarks(young_ids, young, colour, np.ones(len(young)), 0, newest)
+    world.add_landmarks(tracks.ids, young, colour, np.ones(len(young)), 0, newest)
     world.add_frame(100, newest, believed)
+    return builder, sight, tracks, believed
+
+
+def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped):
+    world, _ = mapped
+    true, scale, moved = pose(0.1, 0.05), 1.1, []
+    builder, sight, tracks, believed = drifted(mapped, true, scale, moved)
+    young_ids = tracks.ids
     before = world.landmarks.xyz[world.landmarks.born == 0].copy()
     assert builder.revisit(tracks, sight, believed)
     assert moved == [pytest.approx(1 / scale, rel=0.04)]
@@ -319,7 +328,22 @@ def test_a_loop_is_closed_before_old_landmarks_are_placed_by_what_drifted(mapped
     assert np.median(np.abs(xyz_young[:, 2] - DEPTH)) < 0.05
     after = world.landmarks.xyz[world.landmarks.born == 0]
     assert np.median(np.linalg.norm(after - before, axis=1)) < 0.02, "the old part stays"
-    assert world.revisits[newest] in (0, 1)
+    assert world.revisits[90] in (0, 1)
+
+
+def test_nothing_is_taken_up_at_a_place_whose_loop_was_refused(mapped, monkeypatch):
+    world, _ = mapped
+    builder, sight, tracks, believed = drifted(mapped, pose(0.1, 0.05), 1.1, [])
+    before = world.landmarks.xyz.copy()
+    refused = []
+    monkeypatch.setattr(map_builder, "share_out", lambda *loop: refused.append(loop))
+    young_ids = tracks.ids
+    for _ in range(5):  # neither then nor at the next keyframes, which see the same
+        assert not builder.revisit(tracks, sight, believed)
+    assert len(refused) == 2
+    assert np.array_equal(tracks.ids, young_ids)
+    assert np.array_equal(world.landmarks.xyz, before)
+    assert world.revisits == {}
 
 
 def test_images_are_thinned_out_from_the_old_end():
