@@ -331,7 +331,7 @@ class PoseMessage:
 
     Attributes:
         T_world_cam: 4x4, row by row, or None while it is not known.
-        state: Of the tracker.
+        state: Of the tracker. It goes on tracking after images that show nothing, which have no pose.
         covariance: 6x6, row by row, rotation before translation, or None.
         map_epoch: Counts map resets; poses of two epochs have unrelated world frames.
         submap: Part of the map the frame belongs to. A new part's place and scale in the world are guessed

@@ -43,11 +43,14 @@ def _smooth_shades(shape_hw: tuple[int, int]) -> tuple[Array, Array]:
 
 
 def result_of_nothing(frame: DecodedFrame, state: TrackingState, map_epoch: int, submap: int) -> FrameResult:
-    """Return the result of a frame that shows nothing: no pose, and nothing followed."""
+    """Return the result of a frame that shows nothing: no pose, and nothing followed.
+
+    The tracker stands as it stood: a camera is not lost because its lens was covered for a frame.
+    """
     return FrameResult(
         frame_id=frame.frame_id,
         t_source_ns=frame.t_source_ns,
-        state=TrackingState.LOST if state is TrackingState.TRACKING else state,
+        state=state,
         T_world_cam=None,
         num_tracked=0,
         num_inliers=0,

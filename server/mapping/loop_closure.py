@@ -216,9 +216,9 @@ class LoopFinder:
         return loop
 
     def refuse(self) -> None:
-        """Take note that the loop just found can't be closed: it may be a wrong place, and is looked for again.
+        """Take note that the loop just found can't be closed: its place may be a wrong one.
 
-        Until then nothing of such a place may be used, or the map would be tied to it landmark by landmark.
+        Until it is looked for again, nothing of it may be used: landmark by landmark the map would be tied to it.
         """
         self._settled, self._refused = _LOOK_INTERVAL, _MAX_PENDING
 

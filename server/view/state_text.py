@@ -26,5 +26,7 @@ def _what(state: str, scalars: Mapping[str, float]) -> str:
     if "tracking/inliers" not in scalars:
         return ""
     num_inliers, num_tracked = scalars["tracking/inliers"], scalars["tracking/tracked"]
+    if not num_tracked and state == TrackingState.TRACKING.value:
+        return "the image shows nothing"
     enough = ", too few" if state == TrackingState.LOST.value else ""
     return f"{num_inliers:.0f} of {num_tracked:.0f} keypoints agree with the map{enough}"

@@ -17,6 +17,11 @@ FIGURES = {"tracking/inliers": 30.0, "tracking/tracked": 500.0, "link/psnr_db": 
             "**initializing**, frame 7: the map begins when the camera has moved sideways",
         ),
         (MISSING, {}, "**missing**, frame 7: no image could be decoded"),
+        (
+            "tracking",
+            {"tracking/inliers": 0.0, "tracking/tracked": 0.0},
+            "**tracking**, frame 7: the image shows nothing",
+        ),
         ("tracking", {}, "**tracking**, frame 7"),
     ],
 )
