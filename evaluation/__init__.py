@@ -50,6 +50,7 @@ Grades
 
 Reports, tables and pictures
     report              results as JSON with provenance
+    interruption        the finished part of a measurement that is ended
     result_table        what a verb prints
     results_page        docs/results.md and generated parts of other pages
     markdown            tables, and parts between markers

@@ -39,6 +39,7 @@ from semcast.common.rate import NATIVE_RATE, Rate, from_coded, to_coded
 from semcast.common.sequence_layouts import IMAGE_SUFFIXES, images_in
 from semcast.evaluation.calibration import reliability
 from semcast.evaluation.image_quality import ms_ssim, ssim
+from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.picture_strip import write_picture_strip
 from semcast.evaluation.pipeline import UNUSED_LINK_FIELDS
 from semcast.evaluation.plots import plot_against_snr
@@ -217,17 +218,18 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
     _warm_up(under_name.values(), next(iter(images.values())))
     strip_snr_db = min(settings.links, key=lambda snr_db: abs(snr_db - _STRIP_SNR_DB))
     strip: list[dict[str, NDArray[np.uint8]]] = []
-    results = []
-    for snr_db, link in settings.links.items():
-        streams = {label: _Stream(codec, images, link, settings) for label, codec in under_name.items()}
-        samples: dict[str, list[_Sample]] = {label: [] for label in streams}
-        for k, (name, image) in enumerate(images.items()):
-            for label, stream in streams.items():
-                samples[label].append(stream.send(image, k))
-            if snr_db == strip_snr_db and len(strip) < _STRIP_IMAGES:
-                strip.append(_strip_row(name, image, {n: s[-1] for n, s in samples.items()}))
-        stated_db = stated_snr_db(snr_db, link)
-        results += [_row(name, stated_db, list(images), rows) for name, rows in samples.items()]
+    results: list[dict[str, Any]] = []
+    with until_interrupted(results) as part:
+        for snr_db, link in settings.links.items():
+            streams = {label: _Stream(codec, images, link, settings) for label, codec in under_name.items()}
+            samples: dict[str, list[_Sample]] = {label: [] for label in streams}
+            for k, (name, image) in enumerate(images.items()):
+                for label, stream in streams.items():
+                    samples[label].append(stream.send(image, k))
+                if snr_db == strip_snr_db and len(strip) < _STRIP_IMAGES:
+                    strip.append(_strip_row(name, image, {n: s[-1] for n, s in samples.items()}))
+            stated_db = stated_snr_db(snr_db, link)
+            results += [_row(name, stated_db, list(images), rows) for name, rows in samples.items()]
     report = write_result(
         settings.json,
         {
@@ -236,6 +238,7 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
             "images_left_out": left_out,
             "results": results,
         },
+        part,
     )
     if settings.out is not None:
         if settings.link.channel != "trace":

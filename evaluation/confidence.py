@@ -9,6 +9,7 @@ from semcast.common.errors import ConfigError
 from semcast.common.image import psnr_db
 from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.evaluation.confidence_grades import KeypointGrader, PixelGrader, SlotGrader
+from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.pipeline import (
     CLEAN,
     UNUSED_LINK_FIELDS,
@@ -70,7 +71,10 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
     settings = naming(settings, codec)
     sequence, codec = open_stream(settings, codec)
     chosen = select_frames(sequence, settings)
-    results = [_grade_at(settings, sequence, chosen.ids, codec, snr_db) for snr_db in settings.snr_db]
+    results: list[dict[str, Any]] = []
+    with until_interrupted(results) as part:
+        for snr_db in settings.snr_db:
+            results.append(_grade_at(settings, sequence, chosen.ids, codec, snr_db))
     report = write_result(
         settings.json,
         {
@@ -78,6 +82,7 @@ def evaluate_confidence(settings: ConfidenceSettings, codec: Codec | None = None
             "frames_left_out": chosen.left_out,
             "results": results,
         },
+        part,
     )
     if settings.out is not None:
         tables = {

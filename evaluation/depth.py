@@ -27,6 +27,7 @@ from semcast.common.sequence import open_sequence
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import ate, match_times
 from semcast.evaluation.cloud_error import CloudError, TrueView, cloud_error
+from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.keyframe_depth import DepthKeyframe, cloud_points, confirmed_depths, reconstructed
 from semcast.evaluation.picture_strip import write_picture_strip
 from semcast.evaluation.pipeline import CLEAN, UNUSED_LINK_FIELDS, run_frames
@@ -185,13 +186,14 @@ def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = Non
         shown = sorted(views)[len(views) // 2]
         strip = [against.pictures(shown, views[shown])]
         results = [] if scene.truth is None else [_row(CLEAN, None, "off", against, [clean], [], 0.0)]
-        for snr_db in settings.snr_db[:1] if settings.link.has_own_snr else settings.snr_db:
-            pictures = {}
-            for name, codec in under_name.items():
-                rows, picture = _measured(settings, scene, against, name, codec, snr_db, shown)
-                results += rows
-                pictures[f"{name}, {snr_label(snr_db, settings.link)}"] = picture
-            strip.append(pictures)
+        with until_interrupted(results) as part:
+            for snr_db in settings.snr_db[:1] if settings.link.has_own_snr else settings.snr_db:
+                pictures = {}
+                for name, codec in under_name.items():
+                    rows, picture = _measured(settings, scene, against, name, codec, snr_db, shown)
+                    results += rows
+                    pictures[f"{name}, {snr_label(snr_db, settings.link)}"] = picture
+                strip.append(pictures)
     report = write_result(
         settings.json,
         {
@@ -201,6 +203,7 @@ def evaluate_depth(settings: DepthSettings, codecs: Sequence[Codec] | None = Non
             "reference": "original" if scene.truth is None else "exact",
             "results": results,
         },
+        part,
     )
     if settings.out is not None:
         write_picture_strip(settings.out / "depth.png", strip)

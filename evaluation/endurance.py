@@ -21,6 +21,7 @@ from semcast.common.playback import usual_period_ns
 from semcast.common.sequence import Sequence
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
+from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.pipeline import (
     UNUSED_LINK_FIELDS,
     FrameRun,
@@ -110,7 +111,9 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
     sequence, codec = open_stream(settings, codec)
     chosen = select_frames(sequence, settings)
     frames = _received(sequence, chosen.ids, codec, settings)
-    rows = _measure(frames, sequence, settings)
+    rows: list[dict[str, Any]] = []
+    with until_interrupted(rows) as part:
+        _measure(frames, sequence, settings, rows)
     middle, last = rows[len(rows) // 2], rows[-1]
     keys = ("frame_ms_p50", "frame_ms_p95", "landmarks", "keyframes", "memory_mb", "bundle_memory_mb")
     report = {
@@ -121,7 +124,7 @@ def evaluate_endurance(settings: EnduranceSettings, codec: Codec | None = None) 
         "growth": {key: last[key] / middle[key] if middle[key] else None for key in keys},
         "results": rows,
     }
-    return write_result(settings.json, report)
+    return write_result(settings.json, report, part)
 
 
 def _received(
@@ -143,12 +146,11 @@ def _received(
 
 
 def _measure(
-    frames: list[DecodedFrame], sequence: Sequence, settings: EnduranceSettings
-) -> list[dict[str, Any]]:
-    """Pass the frames back and forth; a row for every ``settings.every``."""
+    frames: list[DecodedFrame], sequence: Sequence, settings: EnduranceSettings, rows: list[dict[str, Any]]
+) -> None:
+    """Pass the frames back and forth and add to ``rows``, one for every ``settings.every``."""
     interval_ns = int(usual_period_ns(np.array([f.t_source_ns for f in frames])))
     truth = sequence.groundtruth()
-    rows: list[dict[str, Any]] = []
     times_ms: list[float] = []
     seen: list[tuple[int, int]] = []
     bundle = ProcessBundle(lossless=False)
@@ -169,7 +171,6 @@ def _measure(
                 times_ms, seen = [], []
     finally:
         reconstruction.close()
-    return rows
 
 
 def _row(

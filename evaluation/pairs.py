@@ -19,6 +19,7 @@ from semcast.common.image import psnr_db
 from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence_layouts import ns_to_seconds
 from semcast.evaluation.competitors import COMPETITORS
+from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.match_truth import epipolar_distance_px, track_error_px
 from semcast.evaluation.pair_cell import PairCell, PairOutcome, merge_cells
 from semcast.evaluation.pair_matches import Features, PairMatches, match_pair
@@ -162,24 +163,27 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
     variants = [
         _Variant(*choice) for choice in product(settings.gap, settings.features, settings.max_matches)
     ]
-    cells, entries = [], []
-    for snr_db in snrs_db:
-        quality_db: list[float] = []
-        link = settings.link_at(snr_db) if snr_db is not None else settings.link
-        at_snr = {variant: PairCell(methods) for variant in variants}
-        for seed in settings.all_seeds:
+    quality_db: dict[float | None, list[float]] = {snr_db: [] for snr_db in snrs_db}
+    cells: dict[tuple[float | None, _Variant], PairCell] = {}
+    with until_interrupted(cells) as part:
+        for snr_db, seed in product(snrs_db, settings.all_seeds):
+            link = settings.link_at(snr_db) if snr_db is not None else settings.link
             run = FrameRun(sequence, chosen.ids, codec, link, seed, cache_bytes=0)
-            for gap, pair_idx, pair in _pairs(run, settings.gap, motions, sequence.intrinsics, quality_db):
+            of_run = _pairs(run, settings.gap, motions, sequence.intrinsics, quality_db[snr_db])
+            for gap, pair_idx, pair in of_run:
                 for variant, outcome in _measure(pair, gap, settings, seed):
-                    at_snr[variant].add(pair_idx, seed, outcome)
-        cells += list(at_snr.values())
-        psnr = finite_mean(quality_db)
-        stated_db = None if snr_db is None else stated_snr_db(snr_db, settings.link)
-        entries += [
-            {"snr_db": stated_db, "psnr_db": psnr, **asdict(variant), **_entry(cell, variant, settings)}
-            for variant, cell in at_snr.items()
-        ]
-    merged = merge_cells(methods, cells)
+                    cells.setdefault((snr_db, variant), PairCell(methods)).add(pair_idx, seed, outcome)
+    entries = [
+        {
+            "snr_db": None if snr_db is None else stated_snr_db(snr_db, settings.link),
+            "psnr_db": finite_mean(quality_db[snr_db]),
+            **asdict(variant),
+            **_entry(cells[snr_db, variant], variant, settings),
+        }
+        for snr_db, variant in product(snrs_db, variants)
+        if (snr_db, variant) in cells
+    ]
+    merged = merge_cells(methods, [cells[key] for key in product(snrs_db, variants) if key in cells])
     report = write_result(
         settings.json,
         {
@@ -193,6 +197,7 @@ def evaluate_pairs(settings: PairSettings, codec: Codec | None = None) -> dict[s
             "auroc_confidence": _auroc_confidence(merged),
             "cells": entries,
         },
+        part,
     )
     if settings.out is not None and codec is not None and settings.link.channel != "trace":
         plot_pair_errors(settings.out, report)

@@ -15,6 +15,7 @@ from semcast.common.cores import usable_cores
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.source_commit import source_commit
 from semcast.common.whole_file import check_writable
+from semcast.evaluation.interruption import InterruptedMeasurementError, Part
 from semcast.server.export.outputs import plain, versions_of, write_json
 
 Settings = TypeVar("Settings")
@@ -73,21 +74,32 @@ class UnwrittenResultError(SemcastError):
         self.result = result
 
 
-def write_result(path: Path | None, result: Mapping[str, Any]) -> dict[str, Any]:
+def write_result(path: Path | None, result: Mapping[str, Any], part: Part | None = None) -> dict[str, Any]:
     """Return a result as plain JSON values, and write it where there is a path for it.
 
     The file is complete or absent, never half written.
 
+    Args:
+        path: File, or None.
+        result: What was measured.
+        part: Whether that is all. A part is marked as ``partial``, and its file ends in ``.partial.json``.
+
     Raises:
         UnwrittenResultError: The folder can't be made or the file can't be written.
+        InterruptedMeasurementError: It is a part; raised when that is written.
     """
-    values = dict(json_ready(result))
+    is_cut = part is not None and part.is_cut
+    values = {**({"partial": True} if is_cut else {}), **json_ready(result)}
+    if path is not None and part is not None:
+        path = part.name(path)
     if path is not None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, values)
         except OSError as err:
             raise UnwrittenResultError(f"{path} can't be written: {err}", values) from err
+    if is_cut:
+        raise InterruptedMeasurementError(values, path)
     return values
 
 

@@ -59,7 +59,8 @@ def result_table(what: str, report: Report) -> ResultTable:
         and (name not in layout.optional or any(_cell(entry, *column) != "-" for entry in entries))
     }
     rows = [[_cell(entry, *column) for column in columns.values()] for entry in entries]
-    return ResultTable(list(columns), rows, layout.notes(report))
+    partial = ["Partial: interrupted before all was measured."] if report.get("partial") else []
+    return ResultTable(list(columns), rows, [*partial, *layout.notes(report)])
 
 
 def _cell(row: Mapping[str, Any], where: str, form: str) -> str:

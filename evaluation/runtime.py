@@ -14,6 +14,7 @@ from semcast.common.codec import DEFAULT_CODEC, Precision
 from semcast.common.codecs import LEARNED_CODECS, available_codecs, check_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SemcastError
+from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.report import provenance, write_result
 
 VERB = "eval runtime"
@@ -149,19 +150,22 @@ def evaluate_runtime(settings: RuntimeSettings) -> dict[str, Any]:
         if name in available_codecs():
             raise ConfigError(f"codec must be a learned one, got {name!r}, which has no runtime to choose")
     children: list[_Child] = []
+    finished: list[int] = []
     try:
         for variant in variants(settings):
             children.append(_Child(variant, (settings.height, settings.width)))
-        for _ in range(settings.rounds):
-            for child in children:
-                child.turn(settings.calls)
+        with until_interrupted(finished) as part:
+            for k in range(settings.rounds):
+                for child in children:
+                    child.turn(settings.calls)
+                finished.append(k)
     finally:
         for child in children:
             child.close()
     if not any(child.times_ms for child in children):
         raise SemcastError(f"no variant ran: {children[0].error}")
     report = {"results": [_row(child) for child in children], **provenance(VERB, settings)}
-    return write_result(settings.json, report)
+    return write_result(settings.json, report, part)
 
 
 def _row(child: _Child) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from semcast.common.errors import SemcastError
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.trajectory_error import MIN_MATCHES, ate
 from semcast.evaluation.gap import Gap, gap_in, outside, recovery_s
+from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.pipeline import (
     CLEAN,
     UNUSED_LINK_FIELDS,
@@ -121,23 +123,30 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     chosen = select_frames(sequence, settings)
     # Without a link neither SNR nor channel seed changes an image: one SNR stands for all.
     snrs_db = settings.snr_db if codec is not None else settings.snr_db[:1]
-    cells = []
+    runs: dict[tuple[float, str], list[dict[str, Any]]] = {}
     to_draw: dict[str, ReconstructedRun] = {}
-    for snr_db in snrs_db:
-        runs: dict[str, list[dict[str, Any]]] = {mode: [] for mode in settings.confidence}
-        for seed in settings.all_seeds:
+    with until_interrupted(runs) as part:
+        for snr_db, seed in product(snrs_db, settings.all_seeds):
             gap = gap_in(chosen.ids, sequence.times_ns, settings.gap_s, seed) if settings.gap_s else None
             ids = chosen.ids if gap is None else outside(chosen.ids, gap)
             frames = FrameRun(sequence, ids, codec, settings.link_at(snr_db), seed)
             for mode in settings.confidence:
                 how = replace(settings.reconstruction, confidence=mode, seed=seed)
                 run = reconstruct(frames, sequence.intrinsics, how, truth)
-                runs[mode].append(_run_entry(run, seed, gap, with_rows=settings.rows))
+                entry = _run_entry(run, seed, gap, with_rows=settings.rows)
+                runs.setdefault((snr_db, mode), []).append(entry)
                 if seed == settings.seed:
                     label = CLEAN if codec is None else snr_file_label(snr_db, settings.link)
                     to_draw[f"{label}_{mode}"] = run
-        level = None if codec is None else stated_snr_db(snr_db, settings.link)
-        cells += [_cell(level, mode, runs[mode], has_truth=has_truth) for mode in settings.confidence]
+    cells = [
+        _cell(
+            None if codec is None else stated_snr_db(snr_db, settings.link),
+            mode,
+            of_cell,
+            has_truth=has_truth,
+        )
+        for (snr_db, mode), of_cell in runs.items()
+    ]
     report = {
         **provenance(VERB, settings),
         "sequence": sequence.name,
@@ -149,7 +158,7 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     if len(cells) == 1:
         report |= {key: value for key, value in cells[0].items() if key != "runs"}
         report["stage_ms"] = cells[0]["runs"][0]["stage_ms"]
-    written = write_result(settings.json, report)
+    written = write_result(settings.json, report, part)
     if settings.out is not None:  # last: a disk that is full costs the pictures, not the figures
         for label, run in to_draw.items():
             _write_files(settings.out, label, run)
@@ -221,7 +230,7 @@ def _comparisons(cells: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]
             continue
         pairs = [
             (a["ate_percent"], b["ate_percent"])
-            for a, b in zip(cell["runs"], rival["runs"], strict=True)
+            for a, b in zip(cell["runs"], rival["runs"], strict=False)  # a part may lack the last seed
             if a["ate_percent"] is not None and b["ate_percent"] is not None
         ]
         ours, theirs = np.array(pairs, dtype=np.float64).reshape(-1, 2).T
@@ -232,7 +241,7 @@ def _comparisons(cells: list[dict[str, Any]], seed: int) -> list[dict[str, Any]]
                 "against": "off",
                 "figure": "ate_percent",
                 "paired": paired_bootstrap(ours, theirs, np.random.default_rng(seed)),
-                "num_left_out": len(cell["runs"]) - len(pairs),
+                "num_left_out": max(len(cell["runs"]), len(rival["runs"])) - len(pairs),
             }
         )
     return found

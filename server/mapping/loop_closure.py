@@ -218,7 +218,7 @@ class LoopFinder:
     def refuse(self) -> None:
         """Take note that the loop just found can't be closed: its place may be a wrong one.
 
-        Until it is looked for again, nothing of it may be used: landmark by landmark the map would be tied to it.
+        Nothing of it may be used meanwhile: landmark by landmark the map would be tied to it.
         """
         self._settled, self._refused = _LOOK_INTERVAL, _MAX_PENDING
 

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from semcast.channel.emulator import warn_of_settings
 from semcast.commands.console import plain_console
-from semcast.commands.running import add_settings, read_given, read_settings
+from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings
 from semcast.evaluation import (
     codec,
     confidence,
@@ -27,6 +27,7 @@ from semcast.evaluation import (
     runtime,
     trajectory,
 )
+from semcast.evaluation.interruption import InterruptedMeasurementError, sigterm_as_ctrl_c
 from semcast.evaluation.report import RESULT_NAME, STDOUT, UnwrittenResultError, check_outputs
 from semcast.evaluation.result_table import ResultTable, result_table
 
@@ -126,7 +127,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Run one evaluation: a table on stdout, the names of the files it wrote on stderr.
 
     The JSON goes to the file of ``--json``, else to ``result.json`` in the folder of ``--out``. With
-    ``--json -`` it has stdout for itself and the table goes to stderr.
+    ``--json -`` it has stdout for itself and the table goes to stderr. A run that Ctrl-C or SIGTERM ends
+    leaves what was finished.
     """
     cls, evaluate, _, text = EVALUATIONS[arguments.what]
     settings: Any = read_settings(cls, arguments)
@@ -143,11 +145,14 @@ def run(arguments: argparse.Namespace) -> int:
     _warn_of_link(settings, read_given(cls, arguments))
     before_ns = _write_times_ns(out)
     unwritten: UnwrittenResultError | None = None
-    with talk.status(f"{text} ..."):
+    json_file: Path | None = settings.json
+    with talk.status(f"{text} ..."), sigterm_as_ctrl_c():
         try:
             report = evaluate(settings)
         except UnwrittenResultError as err:
             report, unwritten = err.result, err
+        except InterruptedMeasurementError as cut:
+            report, json_file = cut.result, cut.path
     table = result_table(arguments.what, report)
     (talk if json_to_stdout else plain_console()).print(
         printed_table(arguments.what, table), *table.notes, sep="\n"
@@ -157,11 +162,11 @@ def run(arguments: argparse.Namespace) -> int:
     if json_to_stdout:
         print(json.dumps(report, indent=1))
     written = [path for path, time_ns in _write_times_ns(out).items() if before_ns.get(path) != time_ns]
-    if settings.json is not None and settings.json not in written:
-        written.append(settings.json)
+    if json_file is not None and json_file not in written:
+        written.append(json_file)
     for path in written:
         _tell(f"written: {path}")
-    return 0
+    return INTERRUPTED if report.get("partial") else 0
 
 
 def _input_exists(settings: Any) -> bool:
