@@ -23,7 +23,7 @@ from semcast.evaluation.moving_images import (
     gather_evidence,
     load_images,
 )
-from semcast.evaluation.report import provenance, write_result
+from semcast.evaluation.report import provenance
 from semcast.server.mapping.lens import LensFit, believed_lens
 from semcast.server.mapping.readout import Readout
 
@@ -117,6 +117,8 @@ class LensEstimate:
         radial_reach: The same of the radial coefficients that were changed, the first ones, absolute.
         centre_reach_px: The same of the principal point, x and y, if it was moved.
         trials: All that were made, in order.
+        name: Of the images.
+        before: The camera as it was given.
     """
 
     camera: Intrinsics
@@ -124,6 +126,8 @@ class LensEstimate:
     radial_reach: tuple[float, ...]
     centre_reach_px: tuple[float, ...]
     trials: tuple[LensTrial, ...]
+    name: str
+    before: Intrinsics
 
 
 def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | None = None) -> LensEstimate:
@@ -137,7 +141,7 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
 
     Raises:
         SourceError: Images or intrinsics can't be read.
-        SemcastError: The images don't tell, or the result can't be written.
+        SemcastError: The images don't tell.
     """
     images = load_images(settings)
     if images.stored.distortion_model != "radtan":
@@ -185,15 +189,15 @@ def find_lens(settings: ImagesSettings, on_trial: Callable[[LensTrial], None] | 
     if reaches[0] > _MAX_REACH:
         raise SemcastError(_NOT_TOLD)
     camera = best.lens.put_on(images.stored)
-    found = LensEstimate(
+    return LensEstimate(
         camera,
         float(reaches[0]),
         tuple(reaches[1 : 1 + best.lens.num_radial].tolist()),
         tuple((reaches[3:] * (camera.fx, camera.fy)).tolist()) if any(best.lens.centre) else (),
         tuple(trials),
+        images.name,
+        images.stored,
     )
-    write_result(settings.json, _report(settings, images, found))
-    return found
 
 
 def _values(change: LensFit) -> Array:
@@ -243,12 +247,12 @@ def _tried(images: Images, lens: Lens, readout: Readout) -> LensTrial:
     return LensTrial(lens, evidence, believed_lens(evidence.views, lens.num_radial, any(lens.centre)))
 
 
-def _report(settings: ImagesSettings, images: Images, found: LensEstimate) -> dict[str, Any]:
-    """Return the result with its provenance."""
+def lens_report(settings: ImagesSettings, found: LensEstimate) -> dict[str, Any]:
+    """Return the result with its provenance, for ``write_result``."""
     return {
         **provenance("lens", settings),
-        "sequence": images.name,
-        "before": images.stored.to_dict(),
+        "sequence": found.name,
+        "before": found.before.to_dict(),
         "found": found.camera.to_dict(),
         "focal_reach": found.focal_reach,
         "radial_reach": found.radial_reach,

@@ -22,7 +22,7 @@ from semcast.evaluation.moving_images import (
     gather_evidence,
     load_images,
 )
-from semcast.evaluation.report import provenance, write_result
+from semcast.evaluation.report import provenance
 from semcast.server.mapping.readout import Readout, ReadoutFit, fit_readout
 
 #: Reconstructions at most, and the factor by which each has to make errors smaller for its readout to be
@@ -76,6 +76,7 @@ class ReadoutEstimate:
         high_ms: Upper bound.
         camera: As it was given, of the images as stored, with the readout found.
         trials: All that were made, in order.
+        name: Of the images.
     """
 
     readout: Readout
@@ -83,6 +84,7 @@ class ReadoutEstimate:
     high_ms: float
     camera: Intrinsics
     trials: tuple[Trial, ...]
+    name: str
 
     @property
     def is_global(self) -> bool:
@@ -101,7 +103,7 @@ def find_readout(
 
     Raises:
         SourceError: Images or intrinsics can't be read.
-        SemcastError: The images don't tell, or the result can't be written.
+        SemcastError: The images don't tell.
     """
     images = load_images(settings)
     if images.period_ms < _LEAST_PERIOD_MS:
@@ -141,16 +143,14 @@ def find_readout(
         readout_ms=0.0 if is_global else round(readout.ms, 1),
         readout_from="top" if is_global else readout.side,
     )
-    estimate = ReadoutEstimate(readout, low_ms, high_ms, found, tuple(trials))
-    write_result(settings.json, _report(settings, images.name, estimate))
-    return estimate
+    return ReadoutEstimate(readout, low_ms, high_ms, found, tuple(trials), images.name)
 
 
-def _report(settings: ImagesSettings, name: str, estimate: ReadoutEstimate) -> dict[str, Any]:
-    """Return the result with its provenance."""
+def readout_report(settings: ImagesSettings, estimate: ReadoutEstimate) -> dict[str, Any]:
+    """Return the result with its provenance, for ``write_result``."""
     return {
         **provenance("shutter", settings),
-        "sequence": name,
+        "sequence": estimate.name,
         "readout_ms": estimate.camera.readout_ms,
         "readout_from": estimate.camera.readout_from,
         "axis": estimate.readout.axis,

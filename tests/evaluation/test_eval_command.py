@@ -93,6 +93,13 @@ def test_of_an_input_that_is_missing_nothing_else_is_said(tmp_path, capsys):
     assert "none" in line
 
 
+def test_of_a_trace_that_can_not_be_read_nothing_else_is_said(codec_words, tmp_path, capsys):
+    trace = ["--channel", "trace", "--trace", "file", "--trace-file", str(tmp_path / "none.csv")]
+    assert main([*codec_words[:-2], *trace]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "none.csv can't be read as an SNR trace" in line
+
+
 def test_a_table_whose_file_finds_no_room_in_the_end_is_shown_all_the_same(codec_words, tmp_path, capsys):
     file = tmp_path / "result.json"
     with room_for(10):

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from full_disk import room_for
 
 from semcast.cli import main
 from semcast.common.camera import Intrinsics
@@ -230,6 +231,13 @@ def test_a_principal_point_that_was_moved_is_told(images, tmp_path, capsys, monk
     assert "principal point: 16.6 (+- 0.1), 11.0 (+- 0.1) px" in said.out
     assert "focal length x 1.1000, centre +0.0400 -0.0200: 60 frames with a pose" in said.err
     assert json.loads(result.read_text())["centre_reach_px"] == pytest.approx([0.13, 0.07], abs=0.02)
+    result.unlink()
+    with room_for(600):  # for the camera, and not for its result
+        assert main(["lens", str(images), "--out", str(out), "--json", str(result)]) == 1
+    unwritten = capsys.readouterr()
+    assert unwritten.out == said.out
+    assert f"semcast lens: {result} can't be written: " in unwritten.err
+    assert not result.exists()
 
 
 def test_a_fisheye_is_not_changed_as_if_it_were_a_pinhole(images, tmp_path, capsys):

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from full_disk import room_for
 
 from semcast.cli import main
 from semcast.common.camera import Intrinsics
@@ -43,6 +44,19 @@ def test_what_is_left_of_the_readout_is_added_until_it_is_nothing(rolling, axis,
     assert found.is_global == (true_ms == 0.0)
     if true_ms:
         assert found.camera.readout_from == Readout(axis, true_ms).side
+
+
+def test_a_result_that_finds_no_room_costs_neither_the_answer_nor_the_camera(
+    rolling, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(readout, "_tried", says(Readout("rows", 19.0)))
+    out, result = tmp_path / "camera.json", tmp_path / "result.json"
+    with room_for(600):  # for the camera, and not for its result
+        assert main(["shutter", str(rolling), "--out", str(out), "--json", str(result)]) == 1
+    said = capsys.readouterr()
+    assert "--readout-ms " in said.out
+    assert Intrinsics.load(out).readout_ms == pytest.approx(19.0, abs=0.3)
+    assert f"semcast shutter: {result} can't be written: " in said.err
 
 
 def test_a_readout_that_makes_nothing_better_is_not_believed(rolling, monkeypatch):

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from semcast.channel.emulator import warn_of_settings
+from semcast.channel.link import Link
 from semcast.commands.console import plain_console
 from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings
 from semcast.evaluation import (
@@ -139,10 +140,10 @@ def run(arguments: argparse.Namespace) -> int:
         settings = replace(settings, json=None)
     elif settings.json is None and out is not None:
         settings = replace(settings, json=out / RESULT_NAME)
-    elif settings.json is None and _input_exists(settings):
-        _tell("only the table will be left of this run: --json FILE keeps all figures")
     check_outputs(settings.json, out)
-    _warn_of_link(settings, read_given(cls, arguments))
+    _check_link(settings, read_given(cls, arguments))
+    if settings.json is None and not json_to_stdout and _input_exists(settings):
+        _tell("only the table will be left of this run: --json FILE keeps all figures")
     before_ns = _write_times_ns(out)
     unwritten: UnwrittenResultError | None = None
     json_file: Path | None = settings.json
@@ -175,9 +176,10 @@ def _input_exists(settings: Any) -> bool:
     return all(path is None or os.path.exists(path) for path in inputs)
 
 
-def _warn_of_link(settings: Any, given: Mapping[str, Any]) -> None:
-    """Say which of the given values of the channel do nothing on it, the SNRs of a trace from a file too."""
+def _check_link(settings: Any, given: Mapping[str, Any]) -> None:
+    """Refuse a trace that can't be read; say which of the given values do nothing, SNRs beside one too."""
     if hasattr(settings, "link"):
+        Link(settings.link, seed=0)
         warn_of_settings(settings.link, {*given.get("link", {}), *given})
 
 

@@ -4,7 +4,8 @@ import argparse
 import sys
 
 from semcast.commands.camera_out import add_images, images_of, quiet_reconstruction, write_camera
-from semcast.evaluation.lens import LensEstimate, LensTrial, find_lens
+from semcast.evaluation.lens import LensEstimate, LensTrial, find_lens, lens_report
+from semcast.evaluation.report import write_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = images_of(arguments)
     with quiet_reconstruction(arguments.debug):
         found = find_lens(settings, _show)
-    print(_answer(found))
+    print(_answer(found), flush=True)  # whatever can be written, the search is not lost
     write_camera(found.camera, arguments.out)
+    write_result(settings.json, lens_report(settings, found))
     return 0

@@ -4,7 +4,8 @@ import argparse
 import sys
 
 from semcast.commands.camera_out import add_images, images_of, quiet_reconstruction, write_camera
-from semcast.evaluation.readout import ReadoutEstimate, Trial, find_readout
+from semcast.evaluation.readout import ReadoutEstimate, Trial, find_readout, readout_report
+from semcast.evaluation.report import write_result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,6 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = images_of(arguments)
     with quiet_reconstruction(arguments.debug):
         found = find_readout(settings, _show)
-    print(_answer(found))
+    print(_answer(found), flush=True)  # whatever can be written, the search is not lost
     write_camera(found.camera, arguments.out)
+    write_result(settings.json, readout_report(settings, found))
     return 0
