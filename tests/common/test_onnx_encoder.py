@@ -221,6 +221,23 @@ load_codec("3dcsc-lite", runtime="auto")
     assert "semcast[edge]" in done.stderr.splitlines()[-1]
 
 
+def test_weights_without_torch_are_one_line_that_says_how_to_go_on(weights):
+    code = f"""
+import sys
+sys.modules["torch"] = None
+from semcast.cli import main
+sys.exit(main(["agent", "--source", "nowhere", "--weights", {str(weights)!r}]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    encoder = weights.with_suffix(".onnx")
+    assert done.stderr == (
+        f"semcast agent: no exported encoder {encoder} beside the weights, which sending without torch needs: "
+        "install torch (semcast[agent]) or, where it is installed, have it written by "
+        f"'semcast onnx {weights} --out {encoder}'\n"
+    )
+    assert done.returncode == 1
+
+
 def test_an_export_that_is_stopped_leaves_the_encoder_that_was_there(weights, tmp_path, monkeypatch):
     def stopped(graph):
         raise KeyboardInterrupt
