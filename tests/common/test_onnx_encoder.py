@@ -1,6 +1,7 @@
 """The exported encoder sends what the torch encoder sends, and needs no torch."""
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -221,7 +222,8 @@ load_codec("3dcsc-lite", runtime="auto")
     assert "semcast[edge]" in done.stderr.splitlines()[-1]
 
 
-def test_weights_without_torch_are_one_line_that_says_how_to_go_on(weights):
+def test_weights_without_torch_are_one_line_that_says_how_to_go_on(weights, tmp_path):
+    weights = shutil.copy(weights, tmp_path / "mine.safetensors")
     code = f"""
 import sys
 sys.modules["torch"] = None
@@ -231,8 +233,8 @@ sys.exit(main(["agent", "--source", "nowhere", "--weights", {str(weights)!r}]))
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     encoder = weights.with_suffix(".onnx")
     assert done.stderr == (
-        f"semcast agent: no exported encoder {encoder} beside the weights, which sending without torch needs: "
-        "install torch (semcast[agent]) or, where it is installed, have it written by "
+        f"semcast agent: no exported encoder {encoder} beside the weights, which sending without torch "
+        "needs: install torch (semcast[agent]) or, where it is installed, have it written by "
         f"'semcast onnx {weights} --out {encoder}'\n"
     )
     assert done.returncode == 1
