@@ -23,9 +23,9 @@ from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
 from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.pipeline import (
-    UNUSED_LINK_FIELDS,
+    UNUSED_IN_ONE_RUN,
     FrameRun,
-    StreamSettings,
+    OneRunSettings,
     open_stream,
     select_frames,
 )
@@ -35,30 +35,24 @@ from semcast.evaluation.trace_snr import snr_label
 from semcast.server.export.outputs import trajectory_of
 from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.mapping.reconstruction import Reconstruction
-from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame
 
 logger = logging.getLogger(__name__)
 
 VERB = "eval endurance"
-#: One run; its seed is also that of the search.
-UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.seed", "reconstruction.final_adjustment", "seeds"}
+UNUSED_FIELDS = UNUSED_IN_ONE_RUN
 
 
 @dataclass(frozen=True, kw_only=True)
-class EnduranceSettings(StreamSettings):
+class EnduranceSettings(OneRunSettings):
     """Settings of ``evaluate_endurance``.
 
     Raises:
         ValueError: A value is out of range.
     """
 
-    snr_db: tuple[float, ...] = field(default=(10.0,), metadata={"help": "SNR in dB, a single one"})
     frames: int = field(default=20_000, metadata={"help": "frames in all, back and forth"})
     every: int = field(default=1000, metadata={"help": "frames a row of the result is about"})
-    reconstruction: ReconstructionSettings = field(
-        default=ReconstructionSettings(), metadata={"help": "the server's estimation"}
-    )
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -67,8 +61,6 @@ class EnduranceSettings(StreamSettings):
             raise ValueError(f"frames must be at least 1, got {self.frames}")
         if not 1 <= self.every <= self.frames:
             raise ValueError(f"every must be in [1, {self.frames}], got {self.every}")
-        if len(self.snr_db) != 1 or self.seeds != 1:
-            raise ValueError("snr_db and seeds must be one each: it is one long run")
 
 
 def back_and_forth(num_frames: int, total: int) -> Iterator[int]:
@@ -131,12 +123,8 @@ def _received(
     sequence: Sequence, frame_ids: list[int], codec: Codec | None, settings: EnduranceSettings
 ) -> list[DecodedFrame]:
     """Frames that arrive, decoded."""
-    link = settings.link_at(settings.snr_db[0])
-    frames = [
-        as_received(frame)
-        for frame in FrameRun(sequence, frame_ids, codec, link, settings.seed, cache_bytes=0)
-        if frame.decoded is not None
-    ]
+    run = FrameRun(sequence, frame_ids, codec, settings.the_link, settings.seed, cache_bytes=0)
+    frames = [as_received(frame) for frame in run if frame.decoded is not None]
     if not frames:
         level = snr_label(settings.snr_db[0], settings.link)
         raise ConfigError(f"no frame was received at {level}: there is nothing to run")
@@ -154,8 +142,7 @@ def _measure(
     times_ms: list[float] = []
     seen: list[tuple[int, int]] = []
     bundle = ProcessBundle(lossless=False)
-    how = replace(settings.reconstruction, seed=settings.seed)
-    reconstruction = Reconstruction(sequence.intrinsics, how, bundle)
+    reconstruction = Reconstruction(sequence.intrinsics, settings.estimation, bundle)
     try:
         for k, index in enumerate(back_and_forth(len(frames), settings.frames)):
             since = time.perf_counter_ns()

@@ -2,7 +2,7 @@
 
 import tempfile
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,9 @@ from semcast.common.errors import ConfigError
 from semcast.common.metrics import duration_percentiles
 from semcast.common.trajectory import Trajectory
 from semcast.evaluation.pipeline import (
-    UNUSED_LINK_FIELDS,
+    UNUSED_IN_ONE_RUN,
     FrameRun,
-    StreamSettings,
+    OneRunSettings,
     open_stream,
     select_frames,
 )
@@ -25,29 +25,23 @@ from semcast.evaluation.report import naming, provenance, write_result
 from semcast.evaluation.trace_snr import snr_label
 from semcast.server.frame_rows import FrameRow
 from semcast.server.frame_views import frame_view
-from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.state import DecodedFrame, FrameResult, MapUpdate
 from semcast.server.view.picture import compress_picture
 from semcast.server.view.scene import Cursor, Scene
 from semcast.server.view.settings import ViewSettings
 
 VERB = "eval latency"
-#: Flags that have no meaning here: one run, whose seed is also that of the search.
-UNUSED_FIELDS = UNUSED_LINK_FIELDS | {"reconstruction.seed", "reconstruction.final_adjustment", "seeds"}
+UNUSED_FIELDS = UNUSED_IN_ONE_RUN
 
 
 @dataclass(frozen=True, kw_only=True)
-class LatencySettings(StreamSettings):
+class LatencySettings(OneRunSettings):
     """Settings of ``evaluate_latency``.
 
     Raises:
         ValueError: A value is out of range.
     """
 
-    snr_db: tuple[float, ...] = field(default=(10.0,), metadata={"help": "SNR in dB, a single one"})
-    reconstruction: ReconstructionSettings = field(
-        default=ReconstructionSettings(), metadata={"help": "the server's estimation"}
-    )
     warmup: int = field(default=5, metadata={"help": "first frames left out of the figures"})
 
     def __post_init__(self) -> None:
@@ -55,8 +49,6 @@ class LatencySettings(StreamSettings):
         super().__post_init__()
         if self.warmup < 0:
             raise ValueError(f"warmup must be at least 0, got {self.warmup}")
-        if len(self.snr_db) != 1 or self.seeds != 1:
-            raise ValueError("snr_db and seeds must be one each: stages are timed in one run")
 
 
 class ViewStage:
@@ -146,16 +138,15 @@ def evaluate_latency(settings: LatencySettings, codec: Codec | None = None) -> d
         sequence,
         chosen.ids,
         codec,
-        settings.link_at(settings.snr_db[0]),
+        settings.the_link,
         settings.seed,
         cache_bytes=0,
     )
     truth = sequence.groundtruth()
-    how = replace(settings.reconstruction, seed=settings.seed)
     with tempfile.TemporaryDirectory(prefix="semcast-") as folder:
         view = ViewStage(Path(folder) / "run.rrd", sequence.intrinsics, truth)
         try:
-            run = reconstruct(frames, sequence.intrinsics, how, truth, view)
+            run = reconstruct(frames, sequence.intrinsics, settings.estimation, truth, view)
         finally:
             view.close()
     rows = run.rows[settings.warmup :]

@@ -27,7 +27,7 @@ from semcast.common.sequence import Sequence as RecordedSequence
 from semcast.common.sequence import open_sequence
 from semcast.evaluation.sounding import told_at_first
 from semcast.evaluation.trace_snr import check_snrs
-from semcast.server.mapping.settings import MAX_SEED
+from semcast.server.mapping.settings import MAX_SEED, ReconstructionSettings
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +35,8 @@ logger = logging.getLogger(__name__)
 CLEAN = "none"
 #: Fields of a ``link`` that have no meaning in evaluations: the SNR is a list, and nothing is delayed.
 UNUSED_LINK_FIELDS = frozenset({"link.snr_db", "link.delay_ms", "link.jitter_ms"})
+#: The same of evaluations that are one run, whose seed is also that of the search.
+UNUSED_IN_ONE_RUN = UNUSED_LINK_FIELDS | {"reconstruction.seed", "reconstruction.final_adjustment", "seeds"}
 
 #: Decoded frames kept for further passes; beyond it frames are sent and decoded again.
 CACHE_BYTES = 2 * 1024**3
@@ -90,6 +92,36 @@ class StreamSettings:
     def link_at(self, snr_db: float) -> ChannelSettings:
         """Return the channel settings for one of the SNRs."""
         return replace(self.link, snr_db=snr_db)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneRunSettings(StreamSettings):
+    """What evaluations have in common that reconstruct once: a single SNR and seed.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    snr_db: tuple[float, ...] = field(default=(10.0,), metadata={"help": "SNR in dB, a single one"})
+    reconstruction: ReconstructionSettings = field(
+        default=ReconstructionSettings(), metadata={"help": "the server's estimation"}
+    )
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        super().__post_init__()
+        if len(self.snr_db) != 1 or self.seeds != 1:
+            raise ValueError(f"snr_db and seeds must be one each, got {self.snr_db} and {self.seeds} seeds")
+
+    @property
+    def the_link(self) -> ChannelSettings:
+        """Channel of the run."""
+        return self.link_at(self.snr_db[0])
+
+    @property
+    def estimation(self) -> ReconstructionSettings:
+        """Estimation of the run, with its seed."""
+        return replace(self.reconstruction, seed=self.seed)
 
 
 @dataclass(frozen=True)
