@@ -33,6 +33,8 @@ logger = logging.getLogger(__name__)
 
 ROLE = "channel"
 _POLL_S = 0.1
+#: How long a hub, and then a channel, has to answer who changes its settings.
+_ANSWER_S = 3.0
 _REPLAY_CAPACITY = 64
 #: Frames that an agent may send again: more than it ever has under way.
 _REMEMBERED = 1024
@@ -259,16 +261,13 @@ def run_channel(settings: EmulatorSettings, stop: threading.Event) -> dict[str, 
     return metrics.summary()
 
 
-def set_channel(
-    network: NetworkSettings, agent_id: str, changes: Mapping[str, Any], timeout_s: float = 3.0
-) -> dict[str, Any]:
+def set_channel(network: NetworkSettings, agent_id: str, changes: Mapping[str, Any]) -> dict[str, Any]:
     """Change the settings of a running channel, or read them with no changes.
 
     Args:
         network: Where the hub is.
         agent_id: Whose channel.
         changes: Fields of ``ChannelSettings`` and their new values.
-        timeout_s: For connecting and for the answer.
 
     Returns:
         All settings now in force.
@@ -282,9 +281,9 @@ def set_channel(
             build_settings(ChannelSettings, {name: value})
     op = "set" if changes else "get"
     plain = {name: str(value) if hasattr(value, "__fspath__") else value for name, value in changes.items()}
-    with open_client(network, timeout_s) as session:
+    with open_client(network, _ANSWER_S) as session:
         answer = session.request(
-            control_key(agent_id, ROLE), pack(ControlRequest(op=op, settings=plain)), timeout_s
+            control_key(agent_id, ROLE), pack(ControlRequest(op=op, settings=plain)), _ANSWER_S
         )
         others = [] if answer is not None else session.alive_agents()
     if answer is None:

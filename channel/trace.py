@@ -66,16 +66,13 @@ def ramp(start_db: float, end_db: float, duration_s: float) -> TableTrace:
 class RandomWalkTrace:
     """Gaussian steps every ``WALK_INTERVAL_S``, reflected at the SNR range."""
 
-    def __init__(
-        self, start_db: float, step_db: float, seed: int, range_db: tuple[float, float] = SNR_RANGE_DB
-    ) -> None:
+    def __init__(self, start_db: float, step_db: float, seed: int) -> None:
         self._knots_db = [start_db]
         self._step_db = step_db
-        self._range_db = range_db
         self._rng = np.random.default_rng((seed, 0x57A1))
 
     def _extend(self, num: int) -> None:
-        low, high = self._range_db
+        low, high = SNR_RANGE_DB
         while len(self._knots_db) < num:
             value = self._knots_db[-1] + self._step_db * float(self._rng.standard_normal())
             # A step is far smaller than the range; the clip catches the rest.

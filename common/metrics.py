@@ -55,13 +55,13 @@ class Metrics:
         self._activity = ""
         self._ended = False
 
-    def count(self, event: str, by: int = 1) -> None:
+    def count(self, event: str) -> None:
         """Count an event; its rate is reported too."""
         now_ns = self._clock_ns()
         with self._lock:
-            self._counts[event] = self._counts.get(event, 0) + by
+            self._counts[event] = self._counts.get(event, 0) + 1
             times_ns = self._events_ns.setdefault(event, deque())
-            times_ns.extend([now_ns] * min(by, 1000))
+            times_ns.append(now_ns)
             self._forget(times_ns, now_ns)
 
     def drop(self, reason: str, by: int = 1) -> None:

@@ -329,7 +329,8 @@ def test_doctor_names_the_agents_that_go_by_another_name():
 def test_doctor_tells_what_a_running_system_says_of_itself():
     hub, endpoint = open_hub()
     metrics = Metrics("agent")
-    metrics.count("sent", 40)
+    for _ in range(40):
+        metrics.count("sent")
     metrics.drop("thinned", 3)
     with hub, contextlib.closing(StatusBeat(hub, "cam0", "agent", metrics, lambda: 1)):
         for role in ("agent", "channel"):

@@ -174,12 +174,12 @@ def test_a_trace_file_whose_name_is_no_text_does_not_silence_the_channel(ends, t
 def test_nobody_to_set_is_said(ends):
     e = ends()
     with pytest.raises(TransportError, match=r"no channel of other answers.*running\?$"):
-        set_channel(e.network, "other", {"snr_db": 4.0}, timeout_s=0.5)
+        set_channel(e.network, "other", {"snr_db": 4.0})
     with open_client(e.network, 5.0) as agents:
         agents.declare_alive("other", "agent")
         agents.declare_alive("left", "agent")
         with pytest.raises(TransportError, match="--agent-id says which is meant; there are agents left$"):
-            set_channel(e.network, "other", {"snr_db": 4.0}, timeout_s=0.5)
+            set_channel(e.network, "other", {"snr_db": 4.0})
 
 
 def test_lost_frames_never_arrive_live_but_are_announced_in_replay(ends, make):

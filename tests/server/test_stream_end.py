@@ -23,7 +23,8 @@ def network():
 
 def ended(epoch, num_sent):
     metrics = Metrics("agent")
-    metrics.count("sent", num_sent)
+    for _ in range(num_sent):
+        metrics.count("sent")
     metrics.end()
     return pack(metrics.status(epoch))
 
