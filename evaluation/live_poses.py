@@ -63,6 +63,11 @@ def stated_ratios(
     exactly don't outweigh all others. Places are compared after the similarity of the ATE, turns after the
     rotation that fits all of them best: a straight path says nothing about the roll around it.
 
+    Args:
+        published: By frame, for those that had a pose at once.
+        frame_times_ns: Time of each frame.
+        truth: Reference poses, or None.
+
     Returns:
         ``stated_ratio_trans`` and ``stated_ratio_rot``, error over stated standard deviation: 1 is right, 2
         says that errors are twice what was stated. None where the ATE has no meaning.
