@@ -114,13 +114,17 @@ def check_processor() -> Iterator[Finding]:
 
 
 def check_weights() -> Iterator[Finding]:
-    """Load every codec as an agent would: a learned one on torch, or else on onnxruntime."""
+    """Load every codec as an agent would: a learned one on torch, or else on onnxruntime.
+
+    In one thread: several take as long, and each spins while it waits for the others.
+    """
     from semcast import SemcastError
     from semcast.common.codecs import available_codecs, load_codec
 
     for name in available_codecs():
         try:
-            yield Finding(f"codec {name}", "good", f"digest {load_codec(name, runtime='auto').digest}")
+            codec = load_codec(name, runtime="auto", num_threads=1)
+            yield Finding(f"codec {name}", "good", f"digest {codec.digest}")
         except SemcastError as err:
             yield Finding(f"codec {name}", "note", str(err))
 
