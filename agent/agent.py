@@ -19,9 +19,9 @@ from semcast.common.codecs import load_codec
 from semcast.common.complaints import Complaints
 from semcast.common.errors import SourceError, TransportError
 from semcast.common.heap import keep_freed_memory
-from semcast.common.keys import camera_key, flow_key, link_key, tx_key
+from semcast.common.keys import camera_key, flow_key, link_key, role_of, status_keys, tx_key
 from semcast.common.message_fields import sendable
-from semcast.common.messages import CameraInfo, FlowMessage, LinkReport, SymbolFrame
+from semcast.common.messages import CameraInfo, FlowMessage, LinkReport, StatusMessage, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.rate import RateControl
 from semcast.common.status_beat import StatusBeat
@@ -94,6 +94,7 @@ class _Sending:
         camera = pack(camera_info(settings, source, codec, self.agent_epoch))
         session.answer(camera_key(agent_id), lambda request: camera)
         session.subscribe(link_key(agent_id), "newest", self._on_link)
+        session.subscribe_keyed(status_keys(agent_id), self._on_status)
         self._symbols = session.publisher(tx_key(agent_id), "every" if self.lossless else "newest")
         session.publisher(camera_key(agent_id), "every").put(camera)
         self._originals = (
@@ -125,6 +126,14 @@ class _Sending:
         if self._pace is not None:
             self._pace.on_report(report)
         self.metrics.count("link_reports")
+
+    def _on_status(self, key: str, payload: bytes) -> None:
+        """Say where a channel or server is of another version: it takes no frame, and so reports on none."""
+        try:
+            unpack(payload, StatusMessage)
+        except WireError as err:
+            if err.reason == "version":
+                self.complaints.tell("version", f"the {role_of(key)} takes no frames of this agent: {err}")
 
     @property
     def channel_uses(self) -> str:

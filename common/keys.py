@@ -89,6 +89,11 @@ def status_key(agent_id: str, role: str) -> str:
     return _key(agent_id, f"status/{_check_role(role)}")
 
 
+def status_keys(agent_id: str) -> str:
+    """Key expression that matches the statuses of all roles."""
+    return _key(agent_id, "status/*")
+
+
 def control_key(agent_id: str, role: str) -> str:
     """Queryable of one role: ``ControlRequest`` and ``ControlReply``."""
     return _key(agent_id, f"control/{_check_role(role)}")
@@ -120,6 +125,6 @@ def all_keys(agent_id: str) -> str:
     return _key(agent_id, "**")
 
 
-def role_of(alive: str) -> str:
-    """Return the role in a key that ``alive_key`` made."""
-    return alive.rsplit("/", 1)[-1]
+def role_of(key: str) -> str:
+    """Return the role in a key that ends in one: ``alive_key``, ``status_key``, ``control_key``."""
+    return key.rsplit("/", 1)[-1]

@@ -34,6 +34,9 @@ class FailingSession:
     def subscribe(self, key, service, deliver):
         self._do("subscribe")
 
+    def subscribe_keyed(self, key, deliver):
+        self._do("subscribe_keyed")
+
     def publisher(self, key, service):
         self._do("publisher")
         return self
@@ -60,7 +63,7 @@ def opened(monkeypatch):
     return sources, closed
 
 
-@pytest.mark.parametrize("at", ["publisher", "answer", "subscribe", "declare_alive"])
+@pytest.mark.parametrize("at", ["publisher", "answer", "subscribe", "subscribe_keyed", "declare_alive"])
 def test_an_agent_that_fails_to_start_closes_its_source_and_ends_its_threads(
     recording, codec, monkeypatch, opened, at
 ):

@@ -4,6 +4,7 @@ import shutil
 import threading
 import time
 
+import msgpack
 import numpy as np
 import pytest
 from waiting import until
@@ -283,6 +284,20 @@ def test_of_two_agents_of_one_name_the_one_that_is_left_out_says_so_once(bench, 
     second.end()
     assert len(told()) == 1
     first.end()
+
+
+def test_a_server_of_another_version_is_told_of_once(bench, caplog):
+    server, agent = bench.hub.publisher(status_key("agent0", "server"), "newest"), bench.agent()
+    status = msgpack.packb({**msgpack.unpackb(pack(bench.metrics.status(1))), "version": 2})
+    text = "the server takes no frames of this agent: status: protocol version must be 1, got 2: install the"
+
+    def told():
+        server.put(status)
+        return [r.message for r in caplog.records if r.message.startswith(text)]
+
+    until(told)
+    agent.end()
+    assert len(told()) == 1
 
 
 def test_an_agent_waits_for_the_others_unless_told_not_to(bench, caplog):
