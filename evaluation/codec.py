@@ -8,6 +8,7 @@ import logging
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -215,7 +216,8 @@ def evaluate_codec(settings: CodecSettings, codecs: Sequence[Codec] | None = Non
     if codecs is None:
         codecs = [_load(name, settings) for name in settings.codec]
     under_name = dict(zip(short_names(settings.codec), codecs, strict=True))
-    _warm_up(under_name.values(), next(iter(images.values())))
+    sizes = {image.shape: to_coded(image, settings.rate) for image in images.values()}
+    _warm_up(under_name.values(), list(sizes.values()))
     strip_snr_db = min(settings.links, key=lambda snr_db: abs(snr_db - _STRIP_SNR_DB))
     strip: list[dict[str, NDArray[np.uint8]]] = []
     results: list[dict[str, Any]] = []
@@ -292,9 +294,9 @@ def _load(name: str, settings: CodecSettings) -> Codec:
     return _Exported(encoder, codec)
 
 
-def _warm_up(codecs: Iterable[Codec], image: NDArray[np.uint8]) -> None:
-    """Let every codec build what it builds at its first image, outside the measured times."""
-    for codec in codecs:
+def _warm_up(codecs: Iterable[Codec], images: Sequence[NDArray[np.uint8]]) -> None:
+    """Let every codec build what it builds at its first image of a size, outside the measured times."""
+    for codec, image in product(codecs, images):
         received = Link(ChannelSettings(snr_db=15.0), 0).carry(codec.encode(image, 15.0), 0.0)
         if received is not None:
             codec.decode(received)

@@ -12,6 +12,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codecs import load_codec
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.link_report import LinkReporter
+from semcast.common.rate import coded_shape
 from semcast.evaluation import codec as codec_evaluation
 from semcast.evaluation.codec import CodecSettings, evaluate_codec, read_images
 from semcast.evaluation.picture_strip import picture_strip, write_picture_strip
@@ -44,6 +45,20 @@ def report(folder, tmp_path_factory):
         max_images=2,
     )
     return settings, evaluate_codec(settings)
+
+
+def test_no_image_that_is_timed_is_the_first_of_its_size(phase_codec, tmp_path, monkeypatch):
+    for k, shape in enumerate([(64, 96), (64, 96), (96, 64)]):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((*shape, 3), 90, np.uint8))
+    sizes, encode = [], phase_codec.encode
+    monkeypatch.setattr(
+        phase_codec, "encode", lambda image, snr_db: sizes.append(image.shape) or encode(image, snr_db)
+    )
+    settings = CodecSettings(images=tmp_path, codec=("phase",), snr_db=(20.0,), rate="1/48")
+    evaluate_codec(settings, [phase_codec])
+    wide, high = ((*coded_shape(shape, "1/48"), 3) for shape in ((64, 96), (96, 64)))
+    assert wide != (64, 96, 3)
+    assert sizes == [wide, high, wide, wide, high]
 
 
 def trace_file(tmp_path):
