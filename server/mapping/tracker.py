@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,18 +173,17 @@ def track_pose(
     known = world.landmarks.rows(seen.ids) >= 0
     marks, others = _SeenLandmarks.of(seen[known], world, noise), seen[~known]
     best = _pose_from_landmarks(camera, marks, T_world_guess, seed, is_after_gap=is_after_gap)
+    with_rays = partial(_with_rays, camera, world, noise, marks, others, submap)
     enough = max(MIN_INLIERS, min_share * len(marks.xyz))
-    if best is not None and (best.num_inliers < enough or not np.isfinite(best.T_cam_world).all()):
-        best = None
-    if best is None and may_carry and T_world_guess is not None and len(marks.xyz) < _RUN_OUT:
-        left = max(_MIN_LEFT, min_share * len(marks.xyz))
-        best = _steadied(camera, world, noise, marks, others, T_world_guess, submap, _CARRY, left)
-    elif best is not None and len(others):
-        T, kept = invert_transform(best.T_cam_world), max(enough, _MIN_KEPT_SHARE * best.num_inliers)
-        steadied = _steadied(camera, world, noise, marks, others, T, submap, _STEADY, kept)
-        most = _cost(best, marks.sigma_px) + (_MOST_TAKEN + _MOST_TAKEN_EACH * len(marks.xyz))
-        if steadied is not None and _cost(steadied, marks.sigma_px) < most:
+    if best is not None and best.num_inliers >= enough and np.isfinite(best.T_cam_world).all():
+        kept = max(enough, _MIN_KEPT_SHARE * best.num_inliers)
+        steadied = with_rays(invert_transform(best.T_cam_world), _STEADY, kept)
+        if steadied is not None and _is_borne_out(steadied, best, marks):
             best = steadied
+    elif may_carry and T_world_guess is not None and len(marks.xyz) < _RUN_OUT:
+        best = with_rays(T_world_guess, _CARRY, max(_MIN_LEFT, min_share * len(marks.xyz)))
+    else:
+        best = None
     if best is None:
         return None
     T_world_cam = invert_transform(best.T_cam_world)
@@ -235,19 +235,25 @@ def _pose_from_landmarks(
     return best
 
 
+def _is_borne_out(steadied: PoseEstimate, before: PoseEstimate, marks: _SeenLandmarks) -> bool:
+    """Whether landmarks agree with a pose that rays have steadied, but for what noise does to them."""
+    most_taken = _MOST_TAKEN + _MOST_TAKEN_EACH * len(marks.xyz)
+    return _cost(steadied, marks.sigma_px) < _cost(before, marks.sigma_px) + most_taken
+
+
 def _cost(pose: PoseEstimate, sigma_px: Array) -> float:
     """Sum of the squared errors of landmarks in standard deviations, each cut off."""
     return float((np.minimum(pose.residual_px / sigma_px, _CUT_SIGMAS) ** 2).sum())
 
 
-def _steadied(
+def _with_rays(
     camera: Intrinsics,
     world: WorldMap,
     noise: NoiseModel,
     marks: _SeenLandmarks,
     others: Seen,
-    T_world_cam: Array,
     submap: int,
+    T_world_cam: Array,
     needed: tuple[int, float],
     min_inliers: float,
 ) -> PoseEstimate | None:
@@ -259,8 +265,8 @@ def _steadied(
         noise: Gives each observation its sigma.
         marks: Tracks that have a landmark.
         others: Those that have none.
-        T_world_cam: Where to begin.
         submap: Part of the map the camera is in.
+        T_world_cam: Where to begin.
         needed: Number of rays that must agree, and the share of all rays.
         min_inliers: Landmarks that must agree.
 
