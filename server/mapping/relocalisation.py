@@ -217,16 +217,7 @@ class Relocaliser:
         size = (self._camera.width, self._camera.height)
         in_view = ((expected >= 0) & (expected < size)).all(axis=1)
         ids, known, points, expected = ids[in_view], known[in_view], points[in_view], expected[in_view]
-        square = square_distances(expected, xy)
-        point, row = np.nonzero(square < _GUIDED_RADIUS_PX**2)
-        if len(point) < self._min_inliers:
-            return None
-        distance = hamming(known[point], descriptors[row])
-        order = np.lexsort((row, distance, point))
-        first = np.unique(point[order], return_index=True)[1]
-        best = order[first]
-        best = best[distance[best] <= _GUIDED_MAX_BITS]
-        point, row = point[best], row[best]
+        point, row = _guided_matches(expected, known, xy, descriptors)
         if len(point) < self._min_inliers:
             return None
         sigma = np.full(len(point), sigma_px)
@@ -249,6 +240,28 @@ class Relocaliser:
         size = ((0, self._camera.width), (0, self._camera.height))
         p, q = (np.histogramdd(xy, _FIELDS_XY, size)[0] / len(xy) for xy in (in_view_xy, found_xy))
         return float(np.sqrt(p * q).sum())
+
+
+def _guided_matches(
+    expected_xy: Array, known: NDArray[np.uint8], xy: Array, descriptors: NDArray[np.uint8]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Match landmarks with the most similar of the corners near to where they are expected.
+
+    Args:
+        expected_xy: ``(N, 2)`` where landmarks are expected.
+        known: ``(N, 32)`` their descriptors.
+        xy: ``(M, 2)`` corners.
+        descriptors: ``(M, 32)`` theirs.
+
+    Returns:
+        Rows of the landmarks that have a match, ascending, and of the corners.
+    """
+    point, row = np.nonzero(square_distances(expected_xy, xy) < _GUIDED_RADIUS_PX**2)
+    distance = hamming(known[point], descriptors[row])
+    order = np.lexsort((row, distance, point))
+    best = order[np.unique(point[order], return_index=True)[1]]
+    best = best[distance[best] <= _GUIDED_MAX_BITS]
+    return point[best], row[best]
 
 
 def _likeliest(candidates: Sequence[Keyframe], descriptors: NDArray[np.uint8]) -> list[Keyframe]:
