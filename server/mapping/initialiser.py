@@ -22,11 +22,12 @@ from semcast.server.geometry.triangulation import Triangulation, triangulate
 from semcast.server.geometry.two_view import MIN_MATCHES
 from semcast.server.geometry.weighting import MAD_TO_SIGMA, ConfidenceMode, NoiseModel, fuse_confidence
 from semcast.server.mapping.ambiguity import Structure, decide
-from semcast.server.mapping.hypotheses import Hypothesis, hypothesis_of, poses_in, problem_of
+from semcast.server.mapping.hypotheses import hypothesis_of, poses_in, problem_of
 from semcast.server.mapping.kept_frames import Observed, keyframe_of, pose_of
 from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.scene_motion import SceneMotion, motion_of_scene
 from semcast.server.mapping.start_alignment import aligned_views
+from semcast.server.mapping.start_attempts import Patience, Undecided
 from semcast.server.mapping.world_map import Keyframe
 
 Array = NDArray[np.float64]
@@ -45,15 +46,8 @@ MIN_POINTS = 40
 _MIN_VIEWS = 3
 #: Attempts in which tracks did not last for that many views, after which two have to do.
 _MAX_TOO_SHORT = 2
-#: Attempts after which the best structure is taken though none is clearly better than the others.
-_MAX_UNDECIDED = 12
-#: The same as a number of frames.
-_MAX_UNDECIDED_FRAMES = 60
 #: Attempts in which another motion explained almost as much of the image, after which that does not hinder.
 _MAX_CONTESTED = 12
-#: The evidence grows with the motion of the tracks, and with what of it is not the camera's rotation: the
-#: decision is taken again when one of them has grown by this factor.
-_RETRY_GROWTH = 1.15
 #: Structures that go on to the next attempt, at most.
 _MAX_HYPOTHESES = 3
 #: Those that are more doubtful than the best one by this do not go on.
@@ -158,32 +152,30 @@ class Initialiser:
         self.history: list[Observed] = []
         self._reference = 0
         self._is_tried = False
-        self._num_too_short = 0
-        self._num_contested = 0
-        self._num_undecided = 0
-        self._num_since_undecided = 0
-        self._undecided_px = np.zeros(2)
-        self._hypotheses: list[Hypothesis] = []
         self._agreeing = 1.0
+        self._too_short = Patience(_MAX_TOO_SHORT)
+        self._contested = Patience(_MAX_CONTESTED)
+        self._undecided = Undecided()
 
     @property
     def ids(self) -> Ids:
         """Ids of all tracks that are remembered, ascending."""
-        remembered = [*(o.ids for o in self.history), *(h.ids for h in self._hypotheses)]
+        remembered = [*(o.ids for o in self.history), *(h.ids for h in self._undecided.hypotheses)]
         return np.unique(np.concatenate([np.zeros(0, np.int64), *remembered]))
 
     def renew(self, before: Ids, after: Ids) -> None:
         """Give all tracks that are remembered the ids ``after`` instead of ``before``, both ascending."""
         self.history = [replace(o, ids=after[np.searchsorted(before, o.ids)]) for o in self.history]
-        self._hypotheses = [replace(h, ids=after[np.searchsorted(before, h.ids)]) for h in self._hypotheses]
+        going_on = self._undecided.hypotheses
+        self._undecided.hypotheses = [replace(h, ids=after[np.searchsorted(before, h.ids)]) for h in going_on]
 
     def leave_out(self, ids: Ids) -> None:
         """Forget tracks that turned out to be of no scene, in the frames that saw them too."""
         if self.history and np.isin(self.history[-1].ids, ids).any():
             self.history = [o.without(ids) for o in self.history]
             # What they took part in says nothing any more.
-            self._hypotheses = []
-            self._undecided_px = np.zeros(2)
+            self._undecided.hypotheses = []
+            self._undecided.forget_evidence()
 
     def add(
         self, observed: Observed, noise: NoiseModel, suspect: Ids = _NONE, *, waits: bool = False
@@ -213,10 +205,21 @@ class Initialiser:
             pair = self._from_nearest(pair, suspect)
         self._is_tried = True
         evidence_px = np.array([pair.flow_px, self._relief_px(pair.xy0, pair.xy1)])
-        if not self._is_new_evidence(evidence_px):
+        if not self._undecided.wants(evidence_px):
             return None
-        if self._reference + 1 == len(self.history) - 1 and self._is_too_short():
+        # Two views in succession: the search that would tell whether they are good is what waiting saves.
+        if self._reference + 1 == len(self.history) - 1 and self._too_short.puts_off():
             return None
+        return self._attempt(pair, evidence_px, noise)
+
+    def _attempt(self, pair: _Pair, evidence_px: Array, noise: NoiseModel) -> Start | None:
+        """Try to start a map from the newest frame and the reference, and from those between.
+
+        Args:
+            pair: Tracks of the two.
+            evidence_px: By what the attempt goes, see ``Undecided.wants``.
+            noise: Of the observations.
+        """
         scene = motion_of_scene(
             self._camera, pair.xy0, pair.xy1, pair.confidence, noise, mode=self._mode, seed=self._seed
         )
@@ -224,15 +227,15 @@ class Initialiser:
         self._agreeing = max(_LEAST_AGREEING, agreeing)
         if scene is None or not self._is_good(scene) or not self._has_gone(pair, scene):
             return None
-        if scene.is_contested and self._may_wait_for_the_other():
+        if scene.is_contested and self._contested.puts_off():
             return None
         history = [o.without(pair.left_out) for o in self.history]
         span = [o.without(pair.ids[scene.alone]) for o in history[self._reference :]]
         start = self._build(span, scene, pair.ids[scene.motion.inliers], noise)
-        if start is not None:
+        if start is None:
+            self._undecided.note_evidence(evidence_px)
+        else:
             self.history = history
-        elif self._num_undecided:
-            self._undecided_px = evidence_px
         return start
 
     def _remember(self, observed: Observed, suspect: Ids) -> None:
@@ -270,28 +273,6 @@ class Initialiser:
         R_cam1_cam0 = fit_rotation(self._camera, xy0, xy1, iterations=1)
         return float(np.median(rotation_residual_px(self._camera, R_cam1_cam0, xy0, xy1)))
 
-    def _is_new_evidence(self, evidence_px: Array) -> bool:
-        """Whether a start that could not be decided is worth another look.
-
-        Args:
-            evidence_px: ``(2,)`` median way of the tracks, and what turning leaves of it.
-        """
-        if not self._num_undecided:
-            return True
-        self._num_since_undecided += 1
-        return self._is_overdue() or bool((evidence_px >= _RETRY_GROWTH * self._undecided_px).any())
-
-    def _is_too_short(self) -> bool:
-        """Whether to wait for a third view; asked, and counted, each time there are only two.
-
-        The pair need not be good for a start: the search that would tell is what waiting saves.
-        """
-        self._num_too_short += 1
-        return self._num_too_short <= _MAX_TOO_SHORT
-
-    def _is_overdue(self) -> bool:
-        return self._num_undecided >= _MAX_UNDECIDED or self._num_since_undecided >= _MAX_UNDECIDED_FRAMES
-
     def _min_points(self) -> int:
         """A start from a few points of a damaged image costs the whole map; waiting costs a few frames."""
         return MIN_POINTS if len(self.history) >= _PATIENCE_FRAMES else _PLENTY_OF_POINTS
@@ -318,11 +299,6 @@ class Initialiser:
         doubt_deg = turn_in_doubt_deg(self._camera, found.T_cam1_cam0, xy0, xy1)
         return found.parallax_deg > _MIN_PARALLAX_DOUBTS * doubt_deg
 
-    def _may_wait_for_the_other(self) -> bool:
-        """Whether to wait until it is clear which motion is the scene's; asked, and counted, each time."""
-        self._num_contested += 1
-        return self._num_contested <= _MAX_CONTESTED
-
     def _move_reference(self, suspect: Ids) -> None:
         """Let the reference be the oldest frame that still shares enough tracks with the newest.
 
@@ -339,7 +315,7 @@ class Initialiser:
             self._reference += 1
             self._is_tried = False
             # Its tracks begin anew. Attempts are counted on: a fast camera would never use them up.
-            self._undecided_px = np.zeros(2)
+            self._undecided.forget_evidence()
 
     def _forget_images(self) -> None:
         """Keep the images of a few frames among those that may become keyframes of the start."""
@@ -353,33 +329,47 @@ class Initialiser:
     def _build(
         self, span: list[Observed], scene: SceneMotion, ids: Ids, expected: NoiseModel
     ) -> Start | None:
-        """Triangulate, place the frames between, and triangulate again from all."""
-        first, last = span[0], span[-1]
-        found, noise = scene.motion, scene.noise
-        T_world_cam = {0: np.eye(4), len(span) - 1: invert_transform(found.T_cam1_cam0)}
-        points = self._triangulate([first, last], np.stack([np.eye(4), found.T_cam1_cam0]), ids, noise)
-        good = self._passes(points)
-        if int(good.sum()) < MIN_POINTS:
+        """Place the frames between two views, decide what they show, and triangulate from all.
+
+        Args:
+            span: Frames from the first of the two views to the second.
+            scene: Their relative pose.
+            ids: Tracks that agree with it.
+            expected: Noise of observations, as it was before this scene was seen.
+        """
+        T_world_cam = self._poses_in(span, scene, ids)
+        if T_world_cam is None or (len(T_world_cam) < _MIN_VIEWS and self._too_short.puts_off()):
             return None
-        for k in _between(span):
-            guess = interpolate_pose(T_world_cam[0], T_world_cam[len(span) - 1], k / (len(span) - 1))
-            T_world_inner = pose_of(
-                self._camera, span[k], ids[good], points.xyz[good], noise, guess, self._seed
-            )
-            if T_world_inner is not None:
-                T_world_cam[k] = T_world_inner
-        if len(T_world_cam) < _MIN_VIEWS and self._is_too_short():
-            return None
-        chosen = [span[k] for k in sorted(T_world_cam)]
         poses = np.stack([T_world_cam[k] for k in sorted(T_world_cam)])
-        chosen = aligned_views(self._camera, chosen, poses)
-        structure = self._decide(chosen, poses, noise)
+        views = aligned_views(self._camera, [span[k] for k in sorted(T_world_cam)], poses)
+        structure = self._decide(views, poses, scene.noise)
         if structure is None:
             return None
         T_cam_world = invert_transform(structure.T_world_cam) @ structure.T_world_cam[0]
-        all_ids = np.unique(np.concatenate([o.ids for o in chosen]))
         # Where nothing moves by itself, points may err as they are expected to: the more the better.
-        points = self._triangulate(chosen, T_cam_world, all_ids, noise if scene.alone.any() else expected)
+        return self._start_of(views, T_cam_world, scene.noise if scene.alone.any() else expected)
+
+    def _poses_in(self, span: list[Observed], scene: SceneMotion, ids: Ids) -> dict[int, Array] | None:
+        """Poses of the ends and of frames between, by place in the span; None where nothing has depth."""
+        T_last_first, last = scene.motion.T_cam1_cam0, len(span) - 1
+        T_world_cam = {0: np.eye(4), last: invert_transform(T_last_first)}
+        ends = np.stack([np.eye(4), T_last_first])
+        points = self._triangulate([span[0], span[-1]], ends, ids, scene.noise)
+        good = self._passes(points)
+        if int(good.sum()) < MIN_POINTS:
+            return None
+        known = ids[good], points.xyz[good]
+        for k in _between(span):
+            guess = interpolate_pose(T_world_cam[0], T_world_cam[last], k / last)
+            T_world_inner = pose_of(self._camera, span[k], *known, scene.noise, guess, self._seed)
+            if T_world_inner is not None:
+                T_world_cam[k] = T_world_inner
+        return T_world_cam
+
+    def _start_of(self, views: list[Observed], T_cam_world: Array, noise: NoiseModel) -> Start | None:
+        """Triangulate all tracks of posed views; None where too few of them have a depth."""
+        all_ids = np.unique(np.concatenate([o.ids for o in views]))
+        points = self._triangulate(views, T_cam_world, all_ids, noise)
         good = self._passes(points)
         if int(good.sum()) < MIN_POINTS:
             return None
@@ -387,10 +377,10 @@ class Initialiser:
         if not 0 < scale < np.inf:
             return None
         keyframes = []
-        for o, T in zip(chosen, invert_transform(T_cam_world), strict=True):
+        for o, T in zip(views, invert_transform(T_cam_world), strict=True):
             T[:3, 3] *= scale
             keyframes.append(keyframe_of(o, T))
-        _, point, _, confidence, _ = gather_observations(chosen, all_ids[good])
+        _, point, _, confidence, _ = gather_observations(views, all_ids[good])
         mean = np.bincount(point, weights=confidence) / np.bincount(point)
         return Start(keyframes, all_ids[good], scale * points.xyz[good], mean)
 
@@ -400,19 +390,19 @@ class Initialiser:
         if problem is None:
             return None
         carried = []
-        for hypothesis in self._hypotheses:
+        for hypothesis in self._undecided.hypotheses:
             T = poses_in(hypothesis, views, self._camera, noise, self._seed)
             again = None if T is None else problem_of(views, T, self._camera, noise)
             if again is not None:
                 carried.append((again, hypothesis.doubt))
-        structure, structures = decide(problem, carried, at_last=self._is_overdue())
+        structure, structures = decide(problem, carried, at_last=self._undecided.is_overdue)
         if structure is None:
-            self._num_undecided += 1
-            self._hypotheses = [
+            going_on = [
                 hypothesis_of(s, views, self._camera, noise)
                 for s in structures[:_MAX_HYPOTHESES]
                 if s.ok and s.doubt < structures[0].doubt + _HOPELESS
             ]
+            self._undecided.note_attempt(going_on)
         return structure
 
     def _triangulate(
