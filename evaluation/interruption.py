@@ -1,4 +1,4 @@
-"""What is left of a measurement that Ctrl-C or SIGTERM ends after an hour: the part that was finished."""
+"""What is left of a measurement that Ctrl-C or another signal ends: the part that was finished."""
 
 import signal
 import threading
@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 
 class InterruptedMeasurementError(KeyboardInterrupt):
-    """Ctrl-C or SIGTERM in a measurement of which a part was finished.
+    """Ctrl-C, or what does the same, in a measurement of which a part was finished.
 
     Attributes:
         result: That part, marked as ``partial``.
@@ -50,8 +50,11 @@ def until_interrupted(finished: Sized) -> Iterator[Part]:
 
 
 @contextmanager
-def sigterm_as_ctrl_c() -> Iterator[None]:
-    """Let a request to end do what Ctrl-C does in this context; it would end the process on the spot."""
+def ended_like_ctrl_c() -> Iterator[None]:
+    """Let a request to end, or a terminal that is gone, do what Ctrl-C does in this context.
+
+    They would end the process on the spot. Under nohup, which has it ignored, a hang-up does nothing.
+    """
     if threading.current_thread() is not threading.main_thread():  # the only one that may set handlers
         yield
         return
@@ -59,8 +62,13 @@ def sigterm_as_ctrl_c() -> Iterator[None]:
     def end(_number: int, _frame: object) -> NoReturn:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, end)
+    numbers = [signal.SIGTERM]
+    hang_up = getattr(signal, "SIGHUP", None)  # Windows has none
+    if hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN:
+        numbers.append(hang_up)
+    before = {number: signal.signal(number, end) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

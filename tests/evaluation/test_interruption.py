@@ -194,7 +194,7 @@ def test_nothing_finished_is_no_result(images, interrupted, tmp_path):
     assert not part.is_cut
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize("to_stdout", [False, True])
 def test_the_table_of_an_interrupted_run_is_printed(
     number, to_stdout, images, interrupted, tmp_path, capsys, monkeypatch
@@ -206,9 +206,9 @@ def test_the_table_of_an_interrupted_run_is_printed(
     file = tmp_path / "whole.json"
     file.write_text("of the last run")
     words = ["eval", "codec", "--images", str(images), "--codec", "jpeg-ldpc", "--snr-db", "12", "9"]
-    before = signal.getsignal(signal.SIGTERM)
+    before = [signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGHUP)]
     assert main([*words, "--json", "-" if to_stdout else str(file)]) == 130
-    assert signal.getsignal(signal.SIGTERM) == before
+    assert [signal.getsignal(n) for n in (signal.SIGTERM, signal.SIGHUP)] == before
     said = capsys.readouterr()
     table = said.err if to_stdout else said.out
     assert "Partial: interrupted before all was measured." in table

@@ -28,7 +28,7 @@ from semcast.evaluation import (
     runtime,
     trajectory,
 )
-from semcast.evaluation.interruption import InterruptedMeasurementError, sigterm_as_ctrl_c
+from semcast.evaluation.interruption import InterruptedMeasurementError, ended_like_ctrl_c
 from semcast.evaluation.report import RESULT_NAME, STDOUT, UnwrittenResultError, check_outputs
 from semcast.evaluation.result_table import ResultTable, result_table
 
@@ -128,8 +128,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Run one evaluation: a table on stdout, the names of the files it wrote on stderr.
 
     The JSON goes to the file of ``--json``, else to ``result.json`` in the folder of ``--out``. With
-    ``--json -`` it has stdout for itself and the table goes to stderr. A run that Ctrl-C or SIGTERM ends
-    leaves what was finished.
+    ``--json -`` it has stdout for itself and the table goes to stderr. A run that a signal ends leaves
+    what was finished.
     """
     cls, evaluate, _, text = EVALUATIONS[arguments.what]
     settings: Any = read_settings(cls, arguments)
@@ -147,7 +147,7 @@ def run(arguments: argparse.Namespace) -> int:
     before_ns = _write_times_ns(out)
     unwritten: UnwrittenResultError | None = None
     json_file: Path | None = settings.json
-    with talk.status(f"{text} ..."), sigterm_as_ctrl_c():
+    with talk.status(f"{text} ..."), ended_like_ctrl_c():
         try:
             report = evaluate(settings)
         except UnwrittenResultError as err:
