@@ -111,6 +111,7 @@ class Session:
         self._last_frame_id = -1
         self._newest_posed: FrameResult | None = None
         self._state = TrackingState.INITIALIZING
+        self._is_blank = False
         self._is_concluded = False
         self._told = ""
         self._last_checkpoint_s = time.monotonic()
@@ -258,11 +259,17 @@ class Session:
         return Outcome(result, update, view, patches)
 
     def _log_state(self, result: FrameResult) -> None:
-        """Say where a map begins and where the camera is lost."""
+        """Say where a map begins, where the camera is lost, and where images show nothing without that."""
+        is_tracking = result.state is TrackingState.TRACKING
+        was_blank, self._is_blank = self._is_blank, is_tracking and not result.num_tracked
         before, self._state = self._state, result.state
-        if result.state is before:
+        if result.state is before and self._is_blank == was_blank:
             return
-        if result.state is TrackingState.TRACKING:
+        if self._is_blank:
+            what = "the image shows nothing: is the lens covered?"
+        elif is_tracking and was_blank:
+            what = "the image shows something again"
+        elif is_tracking:
             what = "a map has begun" if before is TrackingState.INITIALIZING else "the camera is found again"
         else:
             is_lost = result.state is TrackingState.LOST

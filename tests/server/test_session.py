@@ -241,12 +241,20 @@ def test_the_map_is_kept_as_often_as_is_said(process, monkeypatch, interval_s, s
 
 def test_where_a_map_begins_and_the_camera_is_lost_is_said_once(demo, tmp_path, caplog):
     caplog.set_level("INFO", logger="semcast.server.session")
-    run_session(
-        demo, tmp_path, range(11), picture=lambda demo, k: demo.image(k) if k < 8 else 0 * demo.image(k)
-    )
+    noise = np.random.default_rng(0).integers(0, 255, demo.image(0).shape, dtype=np.uint8)
+
+    def picture(demo, k):
+        return noise if k > 12 else demo.image(k) * (k not in (8, 9))
+
+    run_session(demo, tmp_path, range(15), picture=picture)
     said = [record.message for record in caplog.records if record.message.startswith("frame ")]
-    assert [text.partition(": ")[2] for text in said] == ["a map has begun", "the camera is lost"]
-    assert said[1].startswith("frame 8:")
+    assert [text.partition(": ")[2] for text in said] == [
+        "a map has begun",
+        "the image shows nothing: is the lens covered?",
+        "the image shows something again",
+        "the camera is lost",
+    ]
+    assert [text.partition(":")[0] for text in said[1:]] == ["frame 8", "frame 10", "frame 13"]
 
 
 def test_frames_that_the_agent_left_out_don_t_count_as_unposed(demo, tmp_path):
