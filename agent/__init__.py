@@ -3,6 +3,7 @@
 Process
     agent            captures, encodes and publishes, in live or lossless service
     settings         settings of the process
+    peers            waits until channel and server are there
     capture          reads the source on a thread of its own
     encoder          from an image to the message with its channel symbols
     pace_control     how many of the camera's frames are sent

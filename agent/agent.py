@@ -11,6 +11,7 @@ from semcast.agent.capture import Capture
 from semcast.agent.encoder import FrameEncoder, LinkFeedback
 from semcast.agent.originals import OriginalSharer
 from semcast.agent.pace_control import PaceControl
+from semcast.agent.peers import READY_S, wait_for_peers, wait_until_ready
 from semcast.agent.replay_window import ReplayWindow
 from semcast.agent.settings import AgentSettings
 from semcast.agent.source import Source, SourceFrame, open_source
@@ -37,8 +38,6 @@ _FLOW_POLL_S = 0.05
 _BUSY_POLL_S = 0.005
 #: Live: the last frame is repeated until the receiver reports on it, for at most this long.
 _FAREWELL_S = 2.0
-#: Longest wait for a server that is alive but does not say it is ready.
-_READY_S = 5.0
 _REPEAT_S = 0.2
 
 
@@ -231,7 +230,7 @@ def _send_lossless(
 
     session.subscribe(flow_key(agent_id), "newest", on_flow)
     encoded: SymbolFrame | None = None
-    expected_s = time.monotonic() + _READY_S
+    expected_s = time.monotonic() + READY_S
     is_told = False
     while not stop.is_set():
         if not is_told and not window.is_wanted and time.monotonic() > expected_s:
@@ -264,42 +263,6 @@ def _encoded(sending: _Sending, frame: SourceFrame) -> SymbolFrame:
         raise SourceError(
             f"frame {frame.frame_id} can't be encoded, and a replay leaves none out: {err}"
         ) from err
-
-
-def _wait_for_peers(session: Session, agent_id: str, stop: threading.Event) -> None:
-    """Wait until channel and server are alive, or ``stop`` is set; say later when one goes or comes back."""
-    missing = set(_PEERS)
-    both = threading.Event()
-
-    def on_change(role: str, alive: bool | None) -> None:
-        if role not in _PEERS or bool(alive) == (role not in missing):
-            return
-        (missing.discard if alive else missing.add)(role)
-        if both.is_set() and alive is not None:  # live frames are lost, or not even encoded
-            logger.info("%s %s", role, "is there" if alive else "is gone")
-        elif not missing:
-            both.set()
-
-    session.watch_alive(agent_id, on_change)
-    if not both.wait(0.5):
-        logger.info("waiting for %s of %r (another --agent-id?)", " and ".join(sorted(missing)), agent_id)
-    while not stop.is_set() and not both.wait(_POLL_S):
-        pass
-
-
-def _wait_until_ready(session: Session, agent_id: str, agent_epoch: int, stop: threading.Event) -> None:
-    """Wait until the server has its decoder, map and viewer ready for this stream, at most a while."""
-    ready = threading.Event()
-
-    def on_flow(payload: bytes) -> None:
-        with contextlib.suppress(WireError):
-            if unpack(payload, FlowMessage).agent_epoch == agent_epoch:
-                ready.set()
-
-    session.subscribe(flow_key(agent_id), "newest", on_flow)
-    until_s = time.monotonic() + _READY_S
-    while not stop.is_set() and not ready.wait(_POLL_S) and time.monotonic() < until_s:
-        pass
 
 
 def run_agent(settings: AgentSettings, stop: threading.Event, codec: Codec | None = None) -> dict[str, Any]:
@@ -339,9 +302,9 @@ def run_agent(settings: AgentSettings, stop: threading.Event, codec: Codec | Non
         stack.callback(sending.close)
         session.declare_alive(settings.agent_id, ROLE)
         if settings.wait:
-            _wait_for_peers(session, settings.agent_id, stop)
+            wait_for_peers(session, settings.agent_id, _PEERS, stop)
             if not sending.lossless:
-                _wait_until_ready(session, settings.agent_id, agent_epoch, stop)
+                wait_until_ready(session, settings.agent_id, agent_epoch, stop)
         if not stop.is_set():
             what = f"sending {source.name} with {codec.name}, {settings.mode}"
             logger.info("%s, %s channel uses a frame", what, sending.channel_uses)

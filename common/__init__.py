@@ -54,6 +54,7 @@ Recorded sequences and recordings
     recorder                records messages beside a running system
     recording_writer        MCAP files
     recording_reader        reads them, also cut off ones
+    recorded_streams        the streams in a recording
 
 Settings, files, processes
     config                  settings as frozen dataclasses, TOML

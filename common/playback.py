@@ -1,5 +1,7 @@
 """How the frames of a recording are played: the ranges that all programs share, and the pace of its own."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +34,18 @@ def check_playback(
             raise ValueError(f"{name} must be at least 1, got {count}")
     if rate_hz is not None and not 0.01 <= rate_hz <= 1000.0:
         raise ValueError(f"rate_hz must be in [0.01, 1000], got {rate_hz:g}")
+
+
+def check_part(start_s: float, end_s: float | None) -> None:
+    """Check which part of a recorded stream is taken, in seconds since it began; None is to its end.
+
+    Raises:
+        ValueError: It is none.
+    """
+    if not 0.0 <= start_s < math.inf:
+        raise ValueError(f"start_s must be at least 0 and finite, got {start_s:g}")
+    if end_s is not None and not end_s > start_s:
+        raise ValueError(f"end_s must be later than start_s ({start_s:g}), got {end_s:g}")
 
 
 def usual_period_ns(times_ns: NDArray[np.int64]) -> float:

@@ -21,7 +21,6 @@ Arrival of frames
     decoder           from symbols to an image with confidence
     decode_ahead      decodes one frame ahead of the tracker, on a thread
     recorded_order    frames of a recording in order
-    recorded_streams  the streams in a recording
     sent_frames       which frames were sent, told by those that arrived
 
 Beginning and end of a stream

@@ -3,7 +3,6 @@
 import contextlib
 import itertools
 import logging
-import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -22,7 +21,9 @@ from semcast.common.keys import agent_of
 from semcast.common.messages import SymbolFrame
 from semcast.common.phy.equaliser import Equalised
 from semcast.common.phy.pilots import insert_pilots
+from semcast.common.playback import check_part
 from semcast.common.rate import belongs_to
+from semcast.common.recorded_streams import RecordedStream, choose_stream
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.symbol_payload import encoded_image, equalise_frame
 from semcast.common.wire import WireError, unpack
@@ -34,7 +35,6 @@ from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.marker_settings import MarkerSettings
 from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_order import in_order
-from semcast.server.recorded_streams import RecordedStream, choose_stream
 from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Session
 from semcast.server.settings import DenseWhen, ServerSettings, check_save_images
@@ -124,10 +124,7 @@ class ReplaySettings:
         replace(self.reconstruction, seed=self.seed)  # which has the narrower range of the two
         self.camera.check_has(self.reference)
         check_save_images(self.save_images, self.out)
-        if not 0.0 <= self.start_s < math.inf:
-            raise ValueError(f"start_s must be at least 0 and finite, got {self.start_s:g}")
-        if self.end_s is not None and not self.end_s > self.start_s:
-            raise ValueError(f"end_s must be later than start_s ({self.start_s:g}), got {self.end_s:g}")
+        check_part(self.start_s, self.end_s)
 
     @property
     def source(self) -> Literal["received", "transmitted"]:

@@ -11,6 +11,7 @@ from typing import Any
 from semcast.common.camera_settings import HOW_TO_GIVE
 from semcast.common.errors import CheckpointError, SourceError
 from semcast.common.file_lock import is_locked
+from semcast.common.recorded_streams import RecordedStream, recorded_streams
 from semcast.common.recording_reader import RECORDING_METADATA, RecordingReader
 from semcast.common.ros_bag_files import is_ros_bag
 from semcast.common.run_folder import (
@@ -26,7 +27,6 @@ from semcast.common.trajectory import Trajectory
 from semcast.describe_video import calibration_facts, camera_facts, is_calibration, video_facts
 from semcast.server.export.parts import count_parts, parts_line
 from semcast.server.export.placement import TWO_SIDED_95
-from semcast.server.recorded_streams import RecordedStream, recorded_streams
 
 #: Of a value that is shown; the rest is cut off.
 _MAX_CHARS = 160

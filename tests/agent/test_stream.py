@@ -207,7 +207,7 @@ def test_replay_delivers_every_frame_to_a_slow_consumer(bench, caplog):
 
 
 def test_a_live_server_that_takes_no_replay_is_told_of(bench, caplog, monkeypatch):
-    monkeypatch.setattr("semcast.agent.agent._READY_S", 0.3)
+    monkeypatch.setattr("semcast.agent.agent.READY_S", 0.3)
     bench.channel()
     bench.receiver("live")
     agent = bench.agent("replay")
@@ -320,12 +320,12 @@ def test_an_agent_waits_for_the_others_unless_told_not_to(bench, caplog):
 
 def presence(caplog):
     """What the agent said of the others; the receiver says so too."""
-    own = [r.message for r in caplog.records if r.name == "semcast.agent.agent"]
+    own = [r.message for r in caplog.records if r.name in ("semcast.agent.agent", "semcast.agent.peers")]
     return [text for text in own if text.endswith(("is gone", "is there"))]
 
 
 def test_an_agent_says_when_the_channel_is_gone_and_when_it_is_back(bench, caplog):
-    caplog.set_level("INFO", "semcast.agent.agent")
+    caplog.set_level("INFO", "semcast.agent")
     first = bench.channel()
     receiver = bench.receiver()
     bench.agent(source={"repeat": "loop"})
@@ -338,7 +338,7 @@ def test_an_agent_says_when_the_channel_is_gone_and_when_it_is_back(bench, caplo
 
 def test_an_agent_that_loses_its_hub_does_not_say_that_the_others_are_gone(bench, caplog):
     caplog.set_level("INFO", "semcast.common.transport")
-    caplog.set_level("INFO", "semcast.agent.agent")
+    caplog.set_level("INFO", "semcast.agent")
     bench.channel()
     first = bench.receiver()
     bench.agent(source={"repeat": "loop"})
@@ -408,7 +408,7 @@ def test_a_source_that_fails_ends_the_agent_with_its_error(bench, tmp_path):
 
 
 def test_a_last_frame_that_is_sent_again_is_counted_once(bench, monkeypatch):
-    monkeypatch.setattr("semcast.agent.agent._READY_S", 0.3)  # nobody says that it is ready
+    monkeypatch.setattr("semcast.agent.peers.READY_S", 0.3)  # nobody says that it is ready
     bench.channel(frame_loss=1.0)
     bench.receiver()
     agent = bench.agent(follow_server=False)

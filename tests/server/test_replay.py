@@ -26,6 +26,7 @@ from semcast.common.loopback import open_hub
 from semcast.common.messages import CameraInfo, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
+from semcast.common.recorded_streams import recorded_streams
 from semcast.common.recorder import Recorder
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.recording_writer import RecordingWriter, recording_metadata, recover_file
@@ -36,7 +37,6 @@ from semcast.describe import describe_recording
 from semcast.server.marker_settings import MarkerSettings
 from semcast.server.receiver import Receiver
 from semcast.server.record import RecordSettings, StreamNotes, kind_of_key, run_record
-from semcast.server.recorded_streams import recorded_streams
 from semcast.server.replay import ReplaySettings, replay
 from semcast.server.session import Session
 from semcast.server.view.settings import ViewSettings

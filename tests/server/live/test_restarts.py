@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from semcast.common.errors import ConfigError
+from semcast.common.recorded_streams import recorded_streams
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.run_folder import read_run
 from semcast.common.wire import pack
 from semcast.server.export.outputs import write_ply
 from semcast.server.feedback import WINDOW
-from semcast.server.recorded_streams import recorded_streams
 from semcast.server.view.rerun_viewer import RerunStream
 from semcast.server.view.settings import ViewSettings
 

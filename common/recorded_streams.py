@@ -93,5 +93,5 @@ def choose_stream(reader: RecordingReader, number: int | None, symbols: Symbols)
         raise SourceError(f"{reader.path} holds no {symbols} frames{which} ({told})")
     last = with_frames[-1]
     if number is None and sum(count > 0 for count in counts) > 1:
-        logger.warning("stream %d of %s is replayed; frames by stream: %s", last + 1, reader.path, told)
+        logger.warning("stream %d of %s is taken; frames by stream: %s", last + 1, reader.path, told)
     return streams[last]
