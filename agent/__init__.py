@@ -9,6 +9,7 @@ Process
     pace_control     how many of the camera's frames are sent
     replay_window    lossless sending: repeats what got lost
     originals        publishes original frames for recordings
+    play             puts a recorded stream back on the network
 
 Sources of frames
     source           one interface over sequences, videos and live cameras

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from semcast.agent.play import PlaySettings
 from semcast.agent.settings import AgentSettings
 from semcast.agent.source_settings import SourceSettings
 from semcast.channel.emulator import run_channel, set_channel
@@ -47,6 +48,7 @@ SETTINGS = {
     ("demo",): DemoSettings,
     ("record",): RecordSettings,
     ("replay",): ReplaySettings,
+    ("play",): PlaySettings,
     ("train",): TrainSettings,
     **{("eval", what): row[0] for what, row in EVALUATIONS.items()},
 }
@@ -132,6 +134,7 @@ def test_record_writes_run_mcap_unless_told_otherwise(tmp_path):
         (["eval", "codec"], "--images"),
         (["eval", "recording"], "FILE"),
         (["replay"], "FILE"),
+        (["play"], "FILE"),
     ],
 )
 def test_a_missing_setting_is_wrong_usage(words, missing, capsys):

@@ -37,6 +37,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "server": ("server", "decode, track, map and show what an agent sends"),
     "record": ("record", "keep everything a running system sends in one file"),
     "replay": ("replay", "reconstruct again from a recording, as received or through another channel"),
+    "play": ("play", "send a recorded stream again, to a live server or channel"),
     "recover": ("recover", "make a recording that was cut off whole again"),
     "export": ("export", "write a run in the format of COLMAP, nerfstudio, evo, Rerun or as points"),
     "plot": ("plot", "draw a run: its path against the truth, and what happened over time"),
@@ -59,7 +60,7 @@ VERBS: dict[str, tuple[str, str]] = {
 }
 
 #: verb -> extra of the package with all it needs; of verbs that are not named it is ``server``.
-_EXTRAS = {"agent": "agent", "unpack": "ros", "train": "train", "onnx": "train"}
+_EXTRAS = {"agent": "agent", "play": "agent", "unpack": "ros", "train": "train", "onnx": "train"}
 
 EXIT_OK, EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
 
