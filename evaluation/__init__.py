@@ -11,6 +11,7 @@ Verbs of ``semcast eval``
     depth               depth maps from decoded images
     latency             time of each stage of a frame
     endurance           cost and memory over a long run
+    server              time a live server takes, without agent and channel
     recording           cost of recording beside a stream
     runtime             speed of codecs
 

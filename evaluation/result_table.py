@@ -233,6 +233,20 @@ LAYOUTS: dict[str, _Layout] = {
             if "error" in row
         ],
     ),
+    "server": _Layout(
+        lambda report: report["results"],
+        {
+            "sent": ("frames.sent", "d"),
+            "tracked": ("frames.tracked", "d"),
+            "posed": ("completeness", ".1%"),
+            "to pose p50 ms": ("stage_ms.decoded_to_pose.p50", ".1f"),
+            "p95 ms": ("stage_ms.decoded_to_pose.p95", ".1f"),
+            "decode p50 ms": ("stage_ms.decode.p50", ".1f"),
+        },
+        lambda report: [
+            f"{report['rate_hz']:.1f} frames a second; 'to pose' is from the end of the decoder to the pose"
+        ],
+    ),
     "recording": _Layout(
         lambda report: [dict(report)],
         {

@@ -166,6 +166,28 @@ def _demo(report: Report) -> Iterator[str]:
     yield from table(["figure", "value"], rows)
 
 
+def _server(report: Report) -> Iterator[str]:
+    width, height = report["image_wh"]
+    yield f"Codec `{report['codec']}`.\n"
+    yield f"{report['rate_hz']:.1f} frames a second of {width}x{height}; each row is a run of a new server.\n"
+    stages = {"decode": "decode", "decoded_to_pose": "decoded to pose", "arrival_to_pose": "arrival to pose"}
+    yield from table(
+        ["sent", "tracked", "with a pose", *(f"{name}, p50 / p95 ms" for name in stages.values())],
+        [
+            [
+                str(run["frames"]["sent"]),
+                str(run["frames"]["tracked"]),
+                f"{run['completeness']:.1%}",
+                *(
+                    " / ".join(number(run["stage_ms"].get(stage, {}).get(q), 1) for q in ("p50", "p95"))
+                    for stage in stages
+                ),
+            ]
+            for run in report["results"]
+        ],
+    )
+
+
 def _runtime(report: Report) -> Iterator[str]:
     settings = report["settings"]
     yield f"Images of {settings['width']}x{settings['height']}; all variants take turns in one run.\n"
@@ -351,6 +373,7 @@ SECTIONS: dict[str, tuple[str, Tables]] = {
     "confidence": ("What the confidence maps are worth", _confidence),
     "depth": ("Depth from decoded images", _depth),
     "latency": ("Where the time goes", _latency),
+    "server": ("The server alone, live", _server),
     "runtime": ("How fast encoder and decoder are", _runtime),
     "recording": ("What recording costs", _recording),
     "endurance": ("Running for long", _endurance),

@@ -11,7 +11,12 @@ from semcast.cli import main
 from semcast.commands.evaluate import EVALUATIONS
 
 #: Inputs that are not there: that they are missing is said by the measurement itself.
-INPUTS = {"codec": ["--images", "missing"], "recording": ["missing.mcap"], "runtime": ["--codec", "missing"]}
+INPUTS = {
+    "codec": ["--images", "missing"],
+    "recording": ["missing.mcap"],
+    "runtime": ["--codec", "missing"],
+    "server": ["missing.mcap"],
+}
 
 
 @pytest.mark.parametrize("what", EVALUATIONS)

@@ -41,6 +41,21 @@ def test_a_trial_whose_residuals_say_nothing_has_dashes(tmp_path, file, unknown)
     assert [row.endswith("| - |") for row in rows[-2:]] == [False, True]
 
 
+def test_a_server_alone_has_a_row_for_each_run_and_dashes_where_nothing_was_timed(tmp_path):
+    run = {
+        "frames": {"sent": 50, "tracked": 48}, "drops": {}, "completeness": 0.94,
+        "stage_ms": {"decode": {"p50": 90.04, "p95": 110.0}, "decoded_to_pose": {"p50": 41.0, "p95": 83.0}},
+    }  # fmt: skip
+    none = {"frames": {"sent": 50, "tracked": 0}, "drops": {}, "completeness": 0.0, "stage_ms": {}}
+    report = {"rate_hz": 10.0, "image_wh": [640, 480], "codec": "jpeg-ldpc", "results": [run, none]}
+    (tmp_path / "server_shelf.json").write_text(json.dumps(report), encoding="utf-8")
+    page = results_page(tmp_path)
+    assert "## The server alone, live\n\n### shelf\n\nCodec `jpeg-ldpc`.\n" in page
+    assert "10.0 frames a second of 640x480" in page
+    assert "| 50 | 48 | 94.0% | 90.0 / 110.0 | 41.0 / 83.0 | - / - |" in page
+    assert "| 50 | 0 | 0.0% | - / - | - / - | - / - |" in page
+
+
 @pytest.mark.parametrize("module", ["semcast.evaluation.results_page", "semcast.reference"])
 def test_outside_a_checkout_it_is_said_that_there_are_no_pages(tmp_path, module):
     done = subprocess.run([sys.executable, "-m", module], cwd=tmp_path, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""``semcast eval``: measure on recorded data, in one process and without a network."""
+"""``semcast eval``: measure on recorded data."""
 
 import argparse
 import json
@@ -26,6 +26,7 @@ from semcast.evaluation import (
     pairs,
     recording,
     runtime,
+    server,
     trajectory,
 )
 from semcast.evaluation.interruption import InterruptedMeasurementError, ended_like_ctrl_c
@@ -82,6 +83,12 @@ EVALUATIONS: dict[str, _Evaluation] = {
         runtime.evaluate_runtime,
         runtime.UNUSED_FIELDS,
         "time encoder and decoder by runtime, instruction set and threads",
+    ),
+    "server": (
+        server.ServerRunSettings,
+        server.evaluate_server,
+        server.UNUSED_FIELDS,
+        "play a recorded stream to a live server alone and time its frames",
     ),
     "recording": (
         recording.RecordingSettings,

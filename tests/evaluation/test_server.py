@@ -1,0 +1,98 @@
+"""A live server alone, timed on a recorded stream."""
+
+import json
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from semcast.agent.agent import camera_info
+from semcast.agent.encoder import FrameEncoder
+from semcast.agent.settings import AgentSettings
+from semcast.agent.source import open_source
+from semcast.agent.source_settings import SourceSettings
+from semcast.channel.link import Link
+from semcast.channel.settings import ChannelSettings
+from semcast.cli import main
+from semcast.common.codecs import load_codec
+from semcast.common.errors import SemcastError, SourceError
+from semcast.common.phy.pilots import insert_pilots
+from semcast.common.recording_writer import RecordingWriter, recording_metadata
+from semcast.common.symbol_payload import data_symbols, pack_iq, pack_lost
+from semcast.common.wire import pack
+from semcast.evaluation.server import ServerRunSettings, evaluate_server
+
+pytestmark = pytest.mark.xdist_group("real-time")
+
+SEQUENCE = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
+NUM_FRAMES = 4
+EPOCH = 1_700_000_000_000_000_000
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """Four small frames as they were received, four a second."""
+    path = tmp_path_factory.mktemp("recording") / "run.mcap"
+    source = SourceSettings(source=str(SEQUENCE), resize=0.3, max_frames=NUM_FRAMES, pace="receiver")
+    opened, codec = open_source(source), load_codec("jpeg-ldpc")
+    agent = AgentSettings(source=source, codec=codec.name, mode="replay")
+    camera = camera_info(agent, opened, codec, EPOCH)
+    encoder, link = FrameEncoder(codec, EPOCH, lossless=True), Link(ChannelSettings(snr_db=15.0), 0)
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, recording_metadata("", "test"))
+        writer.add("semcast/agent0/camera", "camera", EPOCH, 0, pack(camera))
+        for k, frame in enumerate(opened.frames(threading.Event())):
+            tx = encoder.encode(frame, 15.0)
+            sent = link.transmit(insert_pilots(data_symbols(tx)), 0.1 * k, k)
+            received = {"payload": pack_iq(sent.slots_rx), "slot_lost": pack_lost(sent.slot_lost)}
+            rx = replace(tx, direction="rx", payload_format="iq16", **received)
+            writer.add("semcast/agent0/rx/symbols", "symbols", EPOCH + k * 250_000_000, k, pack(rx))
+        writer.finish()
+    opened.close()
+    return path
+
+
+def test_each_run_is_of_a_new_server_that_takes_the_whole_stream(file, tmp_path, capsys):
+    words = ["eval", "server", str(file), "--pace", "2", "--runs", "2", "--json", str(tmp_path / "r.json")]
+    assert main(words) == 0
+    report = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    assert report["command"].startswith("semcast eval server run.mcap --pace 2.0 --runs 2")
+    assert (report["sequence"], report["codec"]) == ("kitti_06", "jpeg-ldpc")
+    assert report["rate_hz"] == pytest.approx(8.0)
+    assert len(report["results"]) == 2
+    for run in report["results"]:
+        assert run["frames"]["sent"] == NUM_FRAMES
+        assert run["frames"]["tracked"] + sum(run["drops"].values()) == NUM_FRAMES
+        assert run["stage_ms"]["decode"]["p50"] > 0.0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert sum(row[:1] == [str(NUM_FRAMES)] for row in rows) == 2
+
+
+def test_a_server_that_does_not_start_is_told_in_its_own_words(file, tmp_path, monkeypatch):
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\necho first >&2\necho no torch here >&2\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    with pytest.raises(SemcastError, match="the server did not get to the end: no torch here"):
+        evaluate_server(ServerRunSettings(file=file))
+
+
+def test_a_recording_without_the_stream_is_refused_before_a_server_is_started(file, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "nothing that could be started")
+    with pytest.raises(SourceError, match=r"stream must be in \[1, 1\]"):
+        evaluate_server(ServerRunSettings(file=file, stream=2))
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"pace": 0.0}, r"pace must be in \[0.01, 100\], got 0"),
+        ({"runs": 0}, "runs must be at least 1, got 0"),
+        ({"threads": 0}, "threads must be"),
+    ],
+)
+def test_settings_out_of_range_are_refused(file, given, text):
+    with pytest.raises(ValueError, match=text):
+        ServerRunSettings(file=file, **given)
