@@ -106,7 +106,12 @@ def _run(settings: ServerRunSettings, stream: RecordedStream) -> dict[str, Any]:
         with log.open("wb") as sink:
             server = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink)
         has_ended = threading.Event()
-        threading.Thread(target=lambda: (server.wait(), has_ended.set()), daemon=True).start()
+
+        def watch() -> None:
+            server.wait()
+            has_ended.set()  # also where it never gets as far as to be played to
+
+        threading.Thread(target=watch, name="semcast-server", daemon=True).start()
         try:
             played = run_play(settings.play_to(NetworkSettings(connect=(endpoint,))), has_ended)
             has_ended.wait(_CONCLUDED_S)
