@@ -84,12 +84,14 @@ def stream_of(codec, epoch=EPOCH, period_s=0.02, **how):
 KEYS = {"camera": camera_key, "source": source_key, "channel": channel_key}
 
 
-def write(path, timed, *, finish=True):
+def write(path, timed, *, finish=True, of_another=()):
     with path.open("wb") as file:
         writer = RecordingWriter(file, recording_metadata("", "test"))
         for count, (t_s, message) in enumerate(timed):
             make = KEYS.get(message.kind) or (tx_key if message.direction == "tx" else rx_key)
             writer.add(make(AGENT), message.kind, EPOCH + round(t_s * 1e9), count, pack(message))
+        for message in of_another:
+            writer.add("semcast/right/rx/symbols", "symbols", EPOCH, 0, pack(message))
         if finish:
             writer.finish()
         else:
@@ -110,7 +112,8 @@ class Bench:
         self.network = NetworkSettings(connect=(self.endpoint,))
         self.metrics = Metrics("server")
         self.agent_id = agent_id
-        self.heard = {name: [] for name in ("camera", "source", "channel", "tx/symbols", "status/agent")}
+        self.heard = {name: [] for name in ("camera", "source", "channel", "tx/symbols")}
+        self.heard |= {"status/agent": [], "status/channel": []}
         for name, heard in self.heard.items():
             self.hub.subscribe(f"semcast/{agent_id}/{name}", "every", heard.append)
         self.receiver = Receiver(self.hub, agent_id, "live", self.metrics)
@@ -223,6 +226,15 @@ def test_frames_that_were_lost_on_the_air_count_as_sent(bench, tmp_path, codec):
     assert play.result["counts"]["played"] == 4
 
 
+def test_where_only_the_received_side_was_recorded_gaps_in_it_tell_what_was_sent(bench, tmp_path, codec):
+    timed = stream_of(codec, lost=(2, 3))
+    received = [(t_s, m) for t_s, m in timed if getattr(m, "direction", "rx") == "rx"]
+    play = bench.play(write(tmp_path / "run.mcap", received), wait=False)
+    play.join(30)
+    assert play.result["counts"]["sent"] == NUM_FRAMES
+    assert play.result["counts"]["played"] == NUM_FRAMES - 2
+
+
 def test_transmitted_symbols_go_through_a_channel_that_runs(bench, file):
     stop = threading.Event()
     radio = EmulatorSettings(network=bench.network, link=ChannelSettings(snr_db=7.0))
@@ -246,6 +258,9 @@ def test_nothing_is_played_before_the_server_is_there_and_ctrl_c_ends_the_waitin
     until(lambda: "waiting for server of 'agent0'" in caplog.text, "the waiting")
     answer = bench.hub.request(camera_key(AGENT), b"", 5.0)
     assert unpack(answer, CameraInfo).source_name == "steps", "who comes late may ask"
+    assert bench.messages("camera", CameraInfo) == [unpack(answer, CameraInfo)], "who was there is told"
+    until(lambda: bench.receiver.roles_alive == {"agent", "channel"}, "both are there")
+    until(lambda: bench.heard["status/channel"], "the channel's status")
     play.stop.set()
     play.join(30)
     assert not play.result["complete"]
@@ -279,15 +294,24 @@ def test_a_part_begins_with_number_0(bench, file):
     assert play.result["counts"]["sent"] == 3
 
 
-def test_a_frame_on_its_way_when_a_part_begins_is_left_out(bench, file):
+def test_a_frame_on_its_way_when_a_part_begins_is_left_out(bench, tmp_path, codec):
+    late = [
+        (t_s + 0.03 * (getattr(m, "direction", "tx") == "rx"), m) for t_s, m in stream_of(codec)
+    ]  # frame 1 arrives 51 ms after the first was sent, frame 2 is sent after 40 ms
+    late.sort(key=lambda timed: timed[0])
     bench.begin_server()
-    play = bench.play(file, start_s=0.0205)  # between the two sides of frame 1
+    play = bench.play(write(tmp_path / "run.mcap", late), start_s=0.035)
     frames = bench.take(play)
-    assert [f.message.frame_id for f in frames] == list(range(1, NUM_FRAMES))
-    play = bench.play(file, start_s=0.0205, symbols="transmitted", wait=False)
+    assert [f.message.frame_id for f in frames] == list(range(2, NUM_FRAMES))
+    assert play.result["drops"] == {"stale": 1}
+
+
+def test_what_another_agent_sent_is_left_out(bench, tmp_path, codec):
+    another = [replace(rx, seq=rx.seq + 10) for _, rx in frames_of(codec)]
+    file = write(tmp_path / "run.mcap", stream_of(codec), of_another=another)
+    play = bench.play(file, wait=False)
     play.join(30)
-    until(lambda: len(bench.heard["tx/symbols"]) == NUM_FRAMES - 2, "what was sent")
-    assert [f.frame_id for f in bench.messages("tx/symbols", SymbolFrame)] == list(range(2, NUM_FRAMES))
+    assert play.result["counts"]["played"] == NUM_FRAMES
 
 
 def test_a_part_that_holds_nothing_is_told_with_the_length_before_anybody_is_waited_for(file, capsys):
