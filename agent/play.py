@@ -112,7 +112,8 @@ class _Sending:
         stream: The same.
         agent_id: Name it is played under.
         metrics: Of the agent: ``sent`` counts what it had sent, ``played`` the frames that are put. Drops:
-            ``lost`` (on the air, as lossless recordings tell) and ``stale`` (from before the part played).
+            ``lost`` (on the air, as lossless recordings tell), ``stale`` (from before the part played) and
+            ``unheard`` (nobody takes frames now; told not to wait, it is not asked).
         radio: Of the channel.
     """
 
@@ -130,6 +131,7 @@ class _Sending:
         self._metrics, self._radio = metrics, radio
         is_received = settings.symbols == "received"
         self._direction = "rx" if is_received else "tx"
+        self._asks = settings.wait
         self._first_seq: int | None = None
         self._num_sent = 0
         self._played: set[int] = set()
@@ -162,6 +164,9 @@ class _Sending:
         self._played.add(seq)
         if seq < 0 or frame.payload_format == "lost":
             self._metrics.drop("stale" if seq < 0 else "lost")
+            return
+        if self._asks and not self._symbols.has_receiver:
+            self._metrics.drop("unheard")
             return
         as_new = replace(
             frame,

@@ -273,6 +273,17 @@ def test_without_waiting_whoever_subscribes_hears_it(bench, file):
     assert len(frames) == NUM_FRAMES
 
 
+def test_frames_that_nobody_takes_are_told(file, monkeypatch):
+    monkeypatch.setattr("semcast.agent.peers.READY_S", 0.1)
+    with contextlib.closing(Bench("left")) as bench:
+        bench.hub.declare_alive(AGENT, "server")  # which has gone deaf
+        play = bench.play(file)
+        play.join(30)
+    assert play.result["drops"] == {"unheard": NUM_FRAMES}
+    assert "played" not in play.result["counts"]
+    assert play.result["counts"]["sent"] == NUM_FRAMES, "a server that comes back misses them"
+
+
 def test_a_lossless_recording_is_played_live_and_each_frame_once(bench, tmp_path, codec):
     timed = list(stream_of(codec, lossless=True, lost=(3,)))
     again = [(t_s, m) for t_s, m in timed if isinstance(m, SymbolFrame)][-4:]
