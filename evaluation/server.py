@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from semcast.agent.play import PlaySettings, run_play
+from semcast.common.codec import PRECISION_HELP, Precision
 from semcast.common.cores import check_threads
 from semcast.common.errors import SemcastError
 from semcast.common.keys import rx_key
@@ -48,6 +49,7 @@ class ServerRunSettings:
     stream: int | None = field(default=None, metadata={"help": "which start of an agent, counted from 1"})
     pace: float = field(default=1.0, metadata={"help": "1: as recorded, 2: twice as fast"})
     threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})
+    precision: Precision = field(default="auto", metadata={"help": PRECISION_HELP})
     runs: int = field(default=3, metadata={"help": "runs, each of a new server"})
     json: Path | None = field(default=None, metadata={"help": "file for the result, - for stdout"})
 
@@ -101,8 +103,8 @@ def _run(settings: ServerRunSettings, stream: RecordedStream) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="semcast-") as folder:
         out, log = Path(folder) / "run", Path(folder) / "server.log"
         command = [sys.executable, "-m", "semcast", "server", "--agent-id", stream.agent_id]
-        command += ["--listen", endpoint, "--threads", str(settings.threads), "--out", str(out)]
-        command += ["--view", "none", "--dense-cloud", "none"]
+        command += ["--listen", endpoint, "--view", "none", "--dense-cloud", "none", "--out", str(out)]
+        command += ["--threads", str(settings.threads), "--precision", settings.precision]
         with log.open("wb") as sink:
             server = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink)
         has_ended = threading.Event()
