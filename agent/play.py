@@ -158,7 +158,8 @@ class _Sending:
         seq = frame.seq - self._first_seq
         if 0 < (num_more := seq + 1 - self._num_sent) <= _MAX_GAP:
             self._num_sent += num_more
-            self._metrics.count("sent", num_more)
+            for _ in range(num_more):
+                self._metrics.count("sent")
         if frame.direction != self._direction or seq in self._played:
             return
         self._played.add(seq)
