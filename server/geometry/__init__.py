@@ -30,6 +30,7 @@ Pose and structure
     triangulation    points from rays
     projection       world points in a camera
     motion           constant-velocity prior
+    gap_bridge       how the camera got across a gap, and how far off that is
     whereabouts      where the camera can have got to in a gap
 
 Numbers

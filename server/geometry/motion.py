@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform
+from semcast.server.geometry.gap_bridge import cross_gap, even_turns, hindcast, way_of
 from semcast.server.geometry.whereabouts import Step, Whereabouts, last_by, mean_way
 
 Array = NDArray[np.float64]
@@ -15,8 +16,6 @@ Array = NDArray[np.float64]
 MAX_EXTRAPOLATION_S = 1.5
 #: What came before and after a gap says nothing of one that is longer.
 MAX_GAP_S = 3.0
-#: Parts of a gap in which the motion is taken to be steady.
-_BRIDGE_STEPS = 10
 #: The way from one pose to the next is mostly noise where poses are poor, as they are before a loss: a speed
 #: is that of so long a time.
 _SPEED_S = 1.0
@@ -172,21 +171,20 @@ class ConstantVelocity:
         if not 0.0 < gap_s <= MAX_GAP_S:
             return None
         turn_later = log_so3(T_after_later[:3, :3])
-        way_later = exp_so3(-0.5 * turn_later) @ T_after_later[:3, 3]
+        way_later = way_of(T_after_later, turn_later)
+        gap = np.asarray(gap_s)
         if turned and (turned[0][0], turned[-1][0]) == (t_ns, t_source_ns):
             ends = np.array([then_ns - t_ns for then_ns, _ in turned]) * 1e-9 / gap_s
-            turns = [log_so3(before.T @ after) for (_, before), (_, after) in pairwise(turned)]
+            turns = np.stack([log_so3(before.T @ after) for (_, before), (_, after) in pairwise(turned)])
         else:
-            ends = np.linspace(0.0, 1.0, _BRIDGE_STEPS + 1)
-            mixed = [
-                (1.0 - share) * self._rotation_rad_per_s + share * turn_later / later_s
-                for share in 0.5 * (ends[1:] + ends[:-1])
-            ]
-            turns = [gap_s / _BRIDGE_STEPS * turn for turn in mixed]
-        for (begin, end), turn in zip(pairwise(ends.tolist()), turns, strict=True):
-            share, step_s = 0.5 * (begin + end), (end - begin) * gap_s
-            half = exp_so3(0.5 * turn)
-            way = (1.0 - share) * self._way_per_s() + share * way_later / later_s
-            T_world_cam = T_world_cam @ make_transform(half, half @ (step_s * way))
-            T_world_cam = T_world_cam @ make_transform(half, np.zeros(3))
-        return np.asarray(T_world_cam)
+            ends, turns = even_turns(gap, self._rotation_rad_per_s, turn_later / later_s)
+        return cross_gap(T_world_cam, gap, (self._way_per_s(), way_later / later_s), ends, turns)
+
+    def bridge_variances(self, t_source_ns: int, later_s: float) -> tuple[float, float] | None:
+        """How far off ``bridge`` is, as it would have been in the camera's past: see ``hindcast``.
+
+        What images tell of turning is not counted on: none were asked for then.
+        """
+        if self._last is None:
+            return None
+        return hindcast(self._steps, (t_source_ns - self._last[0]) * 1e-9, later_s, _SPEED_S)

@@ -30,7 +30,7 @@ _DEPTH_SHARE = 0.3
 _SPANS_S = (0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0)
 _GROWTH = 1.5
 #: Sums of intervals that differ by less are the same time.
-_SAME_S = 1e-6
+SAME_S = 1e-6
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def mean_way(steps: Sequence[Step], span_s: float) -> Array:
     """Mean way ``(3,)`` per second of the newest steps that make up so long a time; of none it is zero."""
     total_s, total = 0.0, np.zeros(3)
     for step_s, _, way in reversed(steps):
-        if total_s >= span_s - _SAME_S:
+        if total_s >= span_s - SAME_S:
             break
         total_s, total = total_s + step_s, total + way
     return total / total_s if total_s > 0.0 else total
@@ -94,7 +94,7 @@ def mean_way(steps: Sequence[Step], span_s: float) -> Array:
 
 def last_by(ascending_s: Array, at_s: Array) -> NDArray[np.int64]:
     """Index of the last time that is not after another one, for each of these; -1 where there is none."""
-    return np.searchsorted(ascending_s, at_s + _SAME_S, side="right") - 1
+    return np.searchsorted(ascending_s, at_s + SAME_S, side="right") - 1
 
 
 def _led(T_world_before: Array, T_world_after: Array, way: Array) -> Array:
@@ -134,7 +134,7 @@ def _strayed(steps: Sequence[Step], elapsed_s: float) -> float:
     speed[known] = (gone[known] - gone[before]) / (t_s[known] - t_s[before])[:, None]
     furthest = 0.0
     for span_s in [*(s for s in _SPANS_S if s < elapsed_s), elapsed_s]:
-        after = np.searchsorted(t_s, t_s + span_s - _SAME_S)
+        after = np.searchsorted(t_s, t_s + span_s - SAME_S)
         now = known[after[known] < len(t_s)]
         after = after[now]
         way = speed[now] * (t_s[after] - t_s[now])[:, None]

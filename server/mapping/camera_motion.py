@@ -109,6 +109,10 @@ class CameraMotion:
         """As ``ConstantVelocity.bridge``; None while the camera stands."""
         return None if self._still else self._motion.bridge(t_source_ns, T_after_later, later_s, turned)
 
+    def bridge_variances(self, t_source_ns: int, later_s: float) -> tuple[float, float] | None:
+        """As ``ConstantVelocity.bridge_variances``."""
+        return self._motion.bridge_variances(t_source_ns, later_s)
+
     def comes_after_gap(self, t_source_ns: int) -> bool:
         """Note that a frame has come, and tell whether frames are missing between the last pose and it.
 
