@@ -48,6 +48,7 @@ The map
     keyframe_rule     when a frame becomes a keyframe
     new_landmarks     tracks of keyframes, triangulated
     observations      what keyframes saw of some tracks
+    pose_covariance   how well a pose is known, against the newest keyframes and with these in the world
     scene_depth       how far away the scene is
     thinning          what goes when the map reaches its limits
     keyframe_images   images of keyframes, kept to look for landmarks by how they looked there
@@ -70,6 +71,7 @@ Getting lost, and places seen again
     wide_recognition  the same by SIFT and warped patches, from further off
     visual_gyroscope  how a camera without a pose turns
     bridging          where a new submap begins and its unit, told by how the camera moved
+    guessed_place     how far off that may be, for every pose there until the submap is joined
     submap_placement  puts it there, and again once it has settled
     joining           whether the camera can have got to where a place joins two submaps
     revisit           old landmarks that are in sight again get their tracks back

@@ -1,6 +1,7 @@
 """Pose and scale of a new submap, extrapolated from the camera's motion until something better is known."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,20 @@ _SPEED_ERROR_DEPTHS_S = 0.03
 _LATER_NS = 500_000_000
 
 
+class Bridge(NamedTuple):
+    """Where a new submap is guessed to be.
+
+    Attributes:
+        T_world_cam: ``(4, 4)`` of its first camera.
+        scale: World units per unit of its start.
+        covariance: What that is worth, as of ``GuessedPlace``; None where nothing tells.
+    """
+
+    T_world_cam: Array
+    scale: float
+    covariance: Array | None
+
+
 def bridge(
     motion: CameraMotion,
     start: Start,
@@ -33,7 +48,7 @@ def bridge(
     last_ns: int | None,
     depth: float,
     turned: Sequence[tuple[int, Array]] = (),
-) -> tuple[Array, float]:
+) -> Bridge:
     """Estimate pose and scale of a new submap from how the camera moved before and after the gap.
 
     The scale is a weighted mean of two guesses: that the camera goes on at the speed expected of it, and that
@@ -53,22 +68,25 @@ def bridge(
         turned: How the camera turned since its last pose, see ``VisualGyroscope``.
 
     Returns:
-        ``T_world_cam (4, 4)`` of the first camera of ``grown``, and world units per unit of the start.
+        The pose of the first camera of ``grown``, the scale, and how far off they may be: what the weighted
+        mean leaves of the scale's, and of pose what ``bridge_variances`` tells. Nothing is known of it where
+        the motion did not tell the scale, or its past is too short.
     """
     at_ns = grown.keyframes[0].t_source_ns
     T_world_guess = motion.predict(at_ns)
     if T_world_guess is None or last_ns is None:
-        return np.eye(4), 1.0
+        return Bridge(np.eye(4), 1.0, None)
     first, last = start.keyframes[0], start.keyframes[-1]
     way = float(np.linalg.norm(last.T_world_cam[:3, 3] - first.T_world_cam[:3, 3]))
     elapsed_s = (last.t_source_ns - first.t_source_ns) * 1e-9
     since_s = (first.t_source_ns - last_ns) * 1e-9
     speed, speed_sigma = motion.speed_at(first.t_source_ns)
+    by_depth = Bridge(T_world_guess, depth, None)
     gone = speed * elapsed_s
     if since_s >= _MAX_BRIDGE_S or way <= 0.0 or gone <= _LEAST_WAY * depth:
-        return T_world_guess, depth
+        return by_depth
     if not depth / _MOST_FARTHER < gone / way < _MOST_FARTHER * depth:
-        return T_world_guess, depth
+        return by_depth
     error = _SPEED_ERROR_DEPTHS_S * depth / speed
     weights = _DEPTH_SIGMA**-2, 1.0 / (_SPEED_SIGMA**2 + error**2 + speed_sigma**2)
     scale = float(np.exp(np.average(np.log((depth, gone / way)), weights=weights)))
@@ -76,7 +94,20 @@ def bridge(
     # Of a source that gives two images one time, the second tells no speed.
     later = [k for k in grown.keyframes if k.t_source_ns > at_ns]
     soon = ([k for k in later if k.t_source_ns - at_ns <= _LATER_NS] or later[:1])[-1]
-    T_later = soon.T_world_cam.copy()
+    T_later, later_s = soon.T_world_cam.copy(), (soon.t_source_ns - at_ns) * 1e-9
     T_later[:3, 3] *= scale
-    T_world_first = motion.bridge(at_ns, T_later, (soon.t_source_ns - at_ns) * 1e-9, turned)
-    return T_world_guess if T_world_first is None else T_world_first, scale
+    T_world_first = motion.bridge(at_ns, T_later, later_s, turned)
+    if T_world_first is None:
+        return Bridge(T_world_guess, scale, None)
+    variances = motion.bridge_variances(at_ns, later_s)
+    if variances is None:
+        return Bridge(T_world_first, scale, None)
+    # The unit tells how fast the camera goes after the gap, and so a part of how far it got.
+    T_later[:3, 3] = 0.0
+    T_world_short = motion.bridge(at_ns, T_later, later_s, turned)
+    assert T_world_short is not None
+    by_scale = np.zeros(7)
+    by_scale[3:6] = T_world_first[:3, :3].T @ (T_world_first[:3, 3] - T_world_short[:3, 3])
+    by_scale[6] = 1.0
+    covariance = np.diag(np.repeat((*variances, 0.0), (3, 3, 1)))
+    return Bridge(T_world_first, scale, covariance + np.outer(by_scale, by_scale) / sum(weights))

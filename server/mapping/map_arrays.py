@@ -34,8 +34,10 @@ _SHAPES = {
     "frames.keyframe_id": "F",
     "frames.T_keyframe_cam": "F 4 4",
 }
+#: Submaps whose place was guessed, and what the guesses are worth: all of these or none.
+_GUESSES = {"guesses": "S 2", "guesses.is_known": "S", "guesses.covariance": "S 7 7"}
 #: Arrays that older checkpoints lack; so they do ``readout``.
-_ADDED = {"revisits": "R 2", "gaps": "G", "keyframes.edge": "O 2"}
+_ADDED = {"revisits": "R 2", "gaps": "G", "keyframes.edge": "O 2", **_GUESSES}
 #: Keyframes and frames refer to poses by frame id.
 _OF_POSES = {"keyframes.frame_id": "keyframes", "frames.keyframe_id": "frames"}
 
@@ -53,6 +55,8 @@ def check_map_arrays(arrays: Mapping[str, NDArray], parts: tuple[str, ...]) -> N
     """
     sizes: dict[str, int] = {}
     added = {name: shape for name, shape in _ADDED.items() if name in arrays}
+    if "guesses" in arrays:
+        added |= _GUESSES
     for name, shape in {**_SHAPES, **added}.items():
         for word, size in check_shape(arrays[name], shape, name).items():
             if sizes.setdefault(word, size) != size:
@@ -66,8 +70,11 @@ def check_map_arrays(arrays: Mapping[str, NDArray], parts: tuple[str, ...]) -> N
             )
     if (np.diff(arrays["landmarks.ids"]) <= 0).any():
         raise ValueError("landmarks.ids must ascend")
-    for name, what in _OF_POSES.items():
-        unknown = np.setdiff1d(arrays[name], arrays["poses.frame_id"])
+    refer = [(arrays[name], what) for name, what in _OF_POSES.items()]
+    if "guesses" in arrays:
+        refer.append((arrays["guesses"][:, 1], "guesses"))
+    for frame_ids, what in refer:
+        unknown = np.setdiff1d(frame_ids, arrays["poses.frame_id"])
         if len(unknown):
             raise ValueError(f"{what} refer to keyframe {unknown[0]}, which is not there")
 

@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform, make_transform, skew, transform_points
+from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.weighting import GATE_SIGMAS, OnlineNoise
 from semcast.server.geometry.whereabouts import Whereabouts
 from semcast.server.mapping.adjustment import apply_result, place_left_out
 from semcast.server.mapping.anchoring import anchor_tracks, resembles
+from semcast.server.mapping.bridging import Bridge
 from semcast.server.mapping.bundle_problem import BundleResult, BundleRunner
+from semcast.server.mapping.guessed_place import GuessedPlace
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.joining import may_join
 from semcast.server.mapping.kept_frames import Observed, colours_of
@@ -23,6 +25,7 @@ from semcast.server.mapping.late_readout import put_map_right
 from semcast.server.mapping.loop_closure import Loop, LoopFinder, LoopView, share_out
 from semcast.server.mapping.map_update import update_of
 from semcast.server.mapping.new_landmarks import add_landmarks
+from semcast.server.mapping.pose_covariance import pose_covariance
 from semcast.server.mapping.readout_watch import ReadoutWatch
 from semcast.server.mapping.recall import recall_landmarks
 from semcast.server.mapping.relocalisation import Place, Relocaliser, submap_similarity
@@ -134,8 +137,7 @@ class MapBuilder:
         start: Start,
         sight: Sight,
         tracks: TrackTable,
-        T_world_ref: Array,
-        scale: float,
+        place: Bridge,
         history: Sequence[Observed],
     ) -> None:
         """Bring a new map in and adjust it at once.
@@ -144,11 +146,14 @@ class MapBuilder:
             start: The new map, first keyframe at the origin.
             sight: The newest image.
             tracks: Tracks in it; put where the start has them.
-            T_world_ref: Pose of the first keyframe in the world.
-            scale: World units per unit of the start.
+            place: Pose of the first keyframe in the world, and world units per unit of the start: a guess,
+                unless the map is empty.
             history: The frames it was made from, with colours, and with the images of keyframes.
         """
-        placed = make_transform(T_world_ref[:3, :3], T_world_ref[:3, 3])
+        placed, scale = place.T_world_cam, place.scale
+        if self.world.keyframes:
+            first_id = start.keyframes[0].frame_id
+            self.world.guesses[self.submap] = GuessedPlace(first_id, place.covariance)
         for keyframe in start.keyframes:
             T = keyframe.T_world_cam.copy()
             T[:3, 3] *= scale
@@ -424,11 +429,13 @@ class MapBuilder:
         found = placement.place_again(self.world, self.submap)
         if found is None:
             return 1.0
+        scale, T_new_old, guess = found
         self._abandon_adjustment()
-        self.world.transform_submap(self.submap, self.submap, *found)
+        self.world.transform_submap(self.submap, self.submap, scale, T_new_old)
+        self.world.guesses[self.submap] = guess
         self._adjusted = None
-        self._on_moved(found[0])
-        return found[0]
+        self._on_moved(scale)
+        return scale
 
     def recognise_other_submap(self, sight: Sight) -> Place | None:
         """Look for the place of an image in the submaps other than the current one."""
@@ -480,20 +487,5 @@ class MapBuilder:
         return update_of(self.world, self.world.everything(), map_epoch)
 
     def pose_covariance(self, covariance_in_map: Array | None, T_world_cam: Array) -> Array | None:
-        """Covariance of a frame: that of the last adjusted keyframe carried over, plus its own.
-
-        Args:
-            covariance_in_map: ``(6, 6)`` of the frame relative to the map, in the camera frame.
-            T_world_cam: Its pose.
-        """
-        if covariance_in_map is None or self._adjusted is None:
-            return covariance_in_map
-        keyframe_id, covariance = self._adjusted
-        if self.world.submap_of[keyframe_id] != self.submap:
-            return covariance_in_map
-        T = invert_transform(T_world_cam) @ self.world.poses[keyframe_id]
-        R, t = T[:3, :3], T[:3, 3]
-        adjoint = np.zeros((6, 6))
-        adjoint[:3, :3] = adjoint[3:, 3:] = R
-        adjoint[3:, :3] = skew(t) @ R
-        return np.asarray(adjoint @ covariance @ adjoint.T + covariance_in_map)
+        """Covariance of a frame in the current submap, ``(6, 6)`` or None: see ``pose_covariance``."""
+        return pose_covariance(self.world, self.submap, self._adjusted, covariance_in_map, T_world_cam)

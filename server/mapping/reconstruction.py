@@ -325,10 +325,8 @@ class Reconstruction:
         history = self._initialiser.history
         self._map.finish()  # a new part is placed by where the old one ends
         grown = look_back(self._camera, start, history, self._map.noise.model, self._settings)
-        T_world_ref, scale = self._placement.place(
-            self._motion, start, grown, self._map.world, self._map.submap
-        )
-        self._map.take_start(grown, sight, self._tracks, T_world_ref, scale, history)
+        place = self._placement.place(self._motion, start, grown, self._map.world, self._map.submap)
+        self._map.take_start(grown, sight, self._tracks, place, history)
         noise, seed = self._map.noise.model, self._settings.seed
         backfilled = backfill(self._camera, self._map.world, grown.keyframes, history[:-1], noise, seed)
         self._motion.reset()

@@ -73,7 +73,7 @@ class FrameResult:
         num_inliers: Landmark observations that agree with the pose.
         reprojection_error_px: Median over inliers, or None without a pose.
         covariance: ``(6, 6)`` of the pose in the camera frame, rotation before translation (gtsam's order),
-            or None.
+            or None; see ``pose_covariance``.
         is_keyframe: Whether it became a keyframe.
         map_epoch: Counts resets; poses of two epochs have unrelated world frames.
         submap: Part of the map the frame belongs to. A new part's place and scale in the world are guessed

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
-from semcast.server.mapping.bridging import bridge
+from semcast.server.mapping.bridging import Bridge, bridge
 from semcast.server.mapping.camera_motion import CameraMotion
+from semcast.server.mapping.guessed_place import GuessedPlace
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.scene_depth import median_depth, usual_depth
 from semcast.server.mapping.sight import Sight
@@ -38,7 +39,8 @@ class _Before:
         last_ns: Time of the newest keyframe before.
         depth: Median depth before, map units.
         turned: Rotation of the camera since, see ``VisualGyroscope``.
-        submap: Number of the new submap.
+        former: Number of the submap before.
+        submap: That of the new one.
         start_ns: Time of the first view that told its scale.
     """
 
@@ -46,6 +48,7 @@ class _Before:
     last_ns: int
     depth: float
     turned: list[tuple[int, Array]]
+    former: int
     submap: int
     start_ns: int
 
@@ -70,21 +73,22 @@ class SubmapPlacement:
         elif world.keyframes:
             self._gyroscope.go_on(sight, motion, usual_depth(world, self._enough))
 
-    def place(
-        self, motion: CameraMotion, start: Start, grown: Start, world: WorldMap, submap: int
-    ) -> tuple[Array, float]:
-        """Pose and scale of a new submap, see ``bridging.bridge``."""
+    def place(self, motion: CameraMotion, start: Start, grown: Start, world: WorldMap, submap: int) -> Bridge:
+        """Pose and scale of a new submap and what they are worth, see ``bridging.bridge``.
+
+        The submap before may have been placed by a guess too: the new one is off by both.
+        """
         depth = usual_depth(world, self._enough)
         self._before = None
         if not world.keyframes or motion.predict(grown.keyframes[0].t_source_ns) is None:
             # The first part; or, after a restart of the server, one whose second will tell nothing either.
             return bridge(motion, start, grown, None, depth)
-        last_ns, turned = world.keyframes[-1].t_source_ns, self._gyroscope.turned.copy()
-        start_ns = start.keyframes[0].t_source_ns
-        self._before = _Before(deepcopy(motion), last_ns, depth, turned, submap, start_ns)
-        return bridge(motion, start, grown, last_ns, depth, turned)
+        newest, turned = world.keyframes[-1], self._gyroscope.turned.copy()
+        last_ns, start_ns = newest.t_source_ns, start.keyframes[0].t_source_ns
+        self._before = _Before(deepcopy(motion), last_ns, depth, turned, newest.submap, submap, start_ns)
+        return _with_former(bridge(motion, start, grown, last_ns, depth, turned), world, newest.submap)
 
-    def place_again(self, world: WorldMap, submap: int) -> tuple[float, Array] | None:
+    def place_again(self, world: WorldMap, submap: int) -> tuple[float, Array, GuessedPlace] | None:
         """Similarity that moves a submap to where its first second says it is.
 
         Args:
@@ -92,8 +96,9 @@ class SubmapPlacement:
             submap: The one that was placed last.
 
         Returns:
-            ``(scale, T)`` with ``x_new = T @ (scale * x)``, once for each submap; None while it is too young,
-            when it is too old, and when it has been joined with an older one.
+            ``(scale, T)`` with ``x_new = T @ (scale * x)`` and what that place is worth, once for each
+            submap; None while it is too young, when it is too old, and when it has been joined with an older
+            one.
         """
         before = self._before
         if before is None or before.submap != submap:
@@ -117,10 +122,19 @@ class SubmapPlacement:
         none = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0)
         grown = Start(keyframes, *none)
         start = Start([k for k in keyframes if k.t_source_ns >= before.start_ns], *none)
-        T_world_first, scale = bridge(
-            before.motion, start, grown, before.last_ns, before.depth, before.turned
-        )
-        scale /= unit
+        found = bridge(before.motion, start, grown, before.last_ns, before.depth, before.turned)
+        found = _with_former(found, world, before.former)
+        scale = found.scale / unit
         T_scaled_first = mine[0].T_world_cam.copy()
         T_scaled_first[:3, 3] *= scale
-        return scale, T_world_first @ invert_transform(T_scaled_first)
+        guess = GuessedPlace(mine[0].frame_id, found.covariance)
+        return scale, found.T_world_cam @ invert_transform(T_scaled_first), guess
+
+
+def _with_former(found: Bridge, world: WorldMap, former: int) -> Bridge:
+    """Add what the place of the submap is worth from which the bridge leads."""
+    guess = world.guesses.get(former)
+    if guess is None or found.covariance is None:
+        return found
+    behind = guess.seen_from(invert_transform(world.poses[guess.frame_id]) @ found.T_world_cam)
+    return found._replace(covariance=None if behind is None else found.covariance + behind)

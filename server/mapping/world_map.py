@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.edges import alike, each_of
+from semcast.server.mapping.guessed_place import GuessedPlace, guesses_as_arrays, guesses_of
 from semcast.server.mapping.landmarks import Landmarks
 from semcast.server.mapping.map_arrays import check_map_arrays
 from semcast.server.mapping.posed_frames import PosedFrames
@@ -94,6 +95,7 @@ class WorldMap:
         frames: Of each its keyframe and ``T_keyframe_cam``.
         revisits: Frame id of a keyframe -> that of an older one whose landmarks it saw again.
         gaps: Frame ids of keyframes behind a gap in the tracks, noted when keyframes are thinned out.
+        guesses: Submap whose place in the world was guessed -> what that is worth, until it joins another.
     """
 
     def __init__(self) -> None:
@@ -107,6 +109,7 @@ class WorldMap:
         self.frames = PosedFrames()
         self.revisits: dict[int, int] = {}
         self.gaps: set[int] = set()
+        self.guesses: dict[int, GuessedPlace] = {}
         self._changed: set[int] = set()
         self._moved_keyframes: set[int] = set()
         self._frames_moved: set[int] = set()
@@ -204,6 +207,8 @@ class WorldMap:
             scale: Units of the other in one of its own.
             T_new_old: ``(4, 4)``.
         """
+        if (guess := self.guesses.pop(submap, None)) is not None and into == submap:
+            self.guesses[submap] = guess.in_unit(scale)
         mine = self.landmarks.submap == submap
         xyz = scale * self.landmarks.xyz[mine]
         self.landmarks.xyz[mine] = transform_points(T_new_old, xyz)
@@ -360,6 +365,7 @@ class WorldMap:
             "frames.T_keyframe_cam": T_keyframe_cam,
             "revisits": np.array(list(self.revisits.items()), dtype=np.int64).reshape(-1, 2),
             "gaps": np.array(sorted(self.gaps), dtype=np.int64),
+            **guesses_as_arrays(self.guesses),
         }
 
     def restore(self, arrays: dict[str, NDArray]) -> None:
@@ -405,6 +411,7 @@ class WorldMap:
         revisits = arrays.get("revisits", np.zeros((0, 2), np.int64))  # older checkpoints have none
         self.revisits = {new: old for new, old in revisits.tolist() if {new, old} <= there}
         self.gaps = set(arrays.get("gaps", np.zeros(0, np.int64)).tolist())
+        self.guesses = guesses_of(arrays)
         self._changed = set(self.landmarks.ids.tolist())
         self._moved_keyframes = set(self.poses)
 

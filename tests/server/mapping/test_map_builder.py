@@ -8,7 +8,9 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.geometry.whereabouts import Whereabouts
+from semcast.server.mapping.bridging import Bridge
 from semcast.server.mapping.bundle import optimise
+from semcast.server.mapping.guessed_place import GuessedPlace
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.kept_frames import Observed
 from semcast.server.mapping.map_builder import MapBuilder
@@ -20,6 +22,7 @@ from semcast.server.mapping.world_map import Keyframe
 
 CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
 IMAGE = np.full((480, 640, 3), 90, np.uint8)
+AT_ORIGIN = Bridge(np.eye(4), 1.0, None)
 
 
 class Asked:
@@ -161,6 +164,63 @@ def test_covariance_of_another_part_is_not_carried_over(builder):
     np.testing.assert_array_equal(builder.pose_covariance(own, np.eye(4)), own)
 
 
+def begin_part(builder, first_id, place):
+    """A start that becomes a part of its own; its newest pose."""
+    builder.begin_submap()
+    xyz = np.random.default_rng(7).uniform((-0.5, -0.4, 0.8), (0.5, 0.4, 1.4), (160, 3))
+    ids = 5000 + np.arange(160)
+    views = [keyframe(first_id + k, builder.submap, ids, pose(0.05 * k), xyz) for k in range(5)]
+    sight = Sight(DecodedFrame(views[-1].frame_id, 0, IMAGE), IMAGE[..., 0], np.ones(480, bool))
+    start = Start(views, ids, xyz, np.ones(160))
+    builder.take_start(start, sight, NewestFrame(ids, views[-1].xy), place, observed(views))
+    return builder.world.poses[first_id + 4]
+
+
+def test_a_part_whose_place_was_guessed_says_so_until_it_is_joined(builder):
+    add_part(builder, 0, 6, 0)
+    guess, own = np.diag([0.01, 0.01, 0.01, 0.2, 0.2, 0.2, 0.04]), 1e-6 * np.eye(6)
+    T_newest = begin_part(builder, 40, AT_ORIGIN._replace(covariance=guess))
+    found = builder.pose_covariance(own, T_newest)
+    # The lever is 0.2 long, to the right of the first camera.
+    np.testing.assert_allclose(np.diag(found)[:3], 0.01, rtol=0.01)
+    np.testing.assert_allclose(np.diag(found)[3:], [0.2 + 0.04 * 0.04, *[0.2 + 0.04 * 0.01] * 2], rtol=0.01)
+    part = builder.submap
+    builder.enter(0)
+    assert builder.pose_covariance(own, T_newest).max() < 1e-4, "the older part is where it is"
+    builder.enter(part)
+    builder.world.transform_submap(part, 0, 1.0, np.eye(4))
+    builder.enter(0)
+    assert builder.world.guesses == {}
+    assert builder.pose_covariance(own, T_newest).max() < 1e-4
+
+
+def test_poses_of_a_part_that_may_be_anywhere_have_no_covariance(builder):
+    add_part(builder, 0, 6, 0)
+    T_newest = begin_part(builder, 40, AT_ORIGIN)
+    assert builder.pose_covariance(np.eye(6), T_newest) is None
+
+
+def test_the_first_part_is_no_guess(builder):
+    T_newest = begin_part(builder, 40, AT_ORIGIN)
+    assert builder.world.guesses == {}
+    assert builder.pose_covariance(1e-6 * np.eye(6), T_newest) is not None
+
+
+def test_a_part_that_is_placed_again_is_worth_what_that_is(builder):
+    add_part(builder, 0, 6, 0)
+    begin_part(builder, 40, AT_ORIGIN._replace(covariance=np.eye(7)))
+    better = GuessedPlace(40, 0.1 * np.eye(7))
+
+    class Placed:
+        def place_again(self, world, submap):
+            assert (world, submap) == (builder.world, 1)
+            return 2.0, pose(0.3), better
+
+    builder._on_moved = lambda _: None
+    assert builder.place_again(Placed()) == 2.0
+    assert builder.world.guesses == {1: better}
+
+
 def test_parts_that_begin_and_are_lost_again_keep_the_map_within_its_size():
     builder = MapBuilder(
         CAMERA, ReconstructionSettings(max_landmarks=500, max_keyframes=20), Asked(), on_moved=print
@@ -174,7 +234,7 @@ def test_parts_that_begin_and_are_lost_again_keep_the_map_within_its_size():
         frame = DecodedFrame(views[-1].frame_id, 0, IMAGE)
         sight = Sight(frame, IMAGE[..., 0], np.ones(480, bool))
         start = Start(views, ids, xyz, np.ones(150))
-        builder.take_start(start, sight, NewestFrame(ids, views[-1].xy), np.eye(4), 1.0, observed(views))
+        builder.take_start(start, sight, NewestFrame(ids, views[-1].xy), AT_ORIGIN, observed(views))
         assert len(builder.world.landmarks) <= 500
         assert len(builder.world.keyframes) <= 20
         assert {k.frame_id for k in views} <= {k.frame_id for k in builder.world.keyframes}
@@ -190,7 +250,7 @@ def test_landmarks_of_a_start_belong_to_the_last_keyframe_that_saw_them(builder,
     sight = Sight(frame, IMAGE[..., 0], np.ones(480, bool))
     start = Start(views, ids, xyz, np.ones(160))
     tracks = NewestFrame(views[-1].ids, views[-1].xy)
-    builder.take_start(start, sight, tracks, np.eye(4), 1.0, observed(views))
+    builder.take_start(start, sight, tracks, AT_ORIGIN, observed(views))
     marks = builder.world.landmarks
     assert set(marks.born[marks.ids < 60].tolist()) == {1}
     assert set(marks.born[marks.ids >= 60].tolist()) == {4}
@@ -205,7 +265,7 @@ def test_a_start_leaves_its_images_and_the_tracks_where_it_has_them(builder, rng
     tracks = NewestFrame(np.arange(10, 200), np.zeros((190, 2)))
     sight = Sight(DecodedFrame(4, 0, IMAGE), IMAGE[..., 0], np.ones(480, bool))
     start = Start(views, np.arange(160), xyz, np.ones(160))
-    builder.take_start(start, sight, tracks, np.eye(4), 1.0, [other, *history])
+    builder.take_start(start, sight, tracks, AT_ORIGIN, [other, *history])
     assert [image.frame_id for image in builder.images] == [0, 1, 2, 4]
     np.testing.assert_array_equal(tracks.xy[:150], views[4].xy[10:])
     np.testing.assert_array_equal(tracks.xy[150:], 0.0)

@@ -137,7 +137,7 @@ def test_a_new_part_is_placed_by_the_old_one_as_its_last_adjustment_leaves_it():
 
 
 def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch):
-    scales, covariances = [], []
+    scales, covariances, results = [], [], []
     join, carried_over = MapBuilder.join, MapBuilder.pose_covariance
     monkeypatch.setattr(MapBuilder, "join", lambda *a: scales.append(join(*a)) or scales[-1])
     monkeypatch.setattr(
@@ -149,7 +149,7 @@ def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch
     reconstruction = make(lost_after_s=0.05)
     with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
         for k, T in enumerate(truth):
-            reconstruction.process(frame_of(k, render(T)), lambda _: None)
+            results.append(reconstruction.process(frame_of(k, render(T)), lambda _: None))
             if "submaps are joined" in caplog.text and len(scales) == 1:
                 # Told before the join and after it, the latter in the unit of the older part.
                 before, after = covariances[-2:]
@@ -160,6 +160,11 @@ def test_a_new_map_joins_the_old_one_when_it_comes_into_view(caplog, monkeypatch
     assert "a new map is begun" in caplog.text
     assert "submaps are joined" in caplog.text
     assert None in scales, "what is told before and after the join was compared"
+    guessed, known = (
+        [np.sqrt(r.covariance[3:, 3:].trace()) for r in results[9:] if r.submap == part and r.num_inliers]
+        for part in (1, 0)
+    )
+    assert guessed[-1] > 10.0 * max(known), "until then it was a guess"
     trajectory = reconstruction.final_trajectory()
     assert len(trajectory) >= len(x) - 3
     assert ate_percent(trajectory, truth) < 1.0
@@ -289,8 +294,8 @@ def test_a_part_after_a_turn_in_bad_images_begins_as_they_say_and_gets_its_unit_
     lay, rng = SubmapPlacement.place, np.random.default_rng(0)
 
     def laid_too_large(placement, *how):
-        T_world_ref, scale = lay(placement, *how)
-        return T_world_ref, scale if placement._before is None else 1.5 * scale
+        place = lay(placement, *how)
+        return place if placement._before is None else place._replace(scale=1.5 * place.scale)
 
     monkeypatch.setattr(SubmapPlacement, "place", laid_too_large)
     truth, images = turn_in_bad_images(42)

@@ -6,6 +6,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, invert_transform, make_transform
 from semcast.server.mapping.camera_motion import CameraMotion
+from semcast.server.mapping.guessed_place import GuessedPlace
 from semcast.server.mapping.initialiser import Start
 from semcast.server.mapping.submap_placement import SubmapPlacement
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -47,8 +48,9 @@ def laid(world, submap=1):
         motion.observe(k, k * FRAME_NS, path(k), world.landmarks.xyz)
     begun = Start([keyframe(15 + k, make_transform(np.eye(3), (0, 0, 0.04 * k)), 0) for k in range(3)], *NONE)
     placement = SubmapPlacement(CAMERA, 20)
-    T, scale = placement.place(motion, begun, begun, world, submap)
+    T, scale, covariance = placement.place(motion, begun, begun, world, submap)
     motion.reset()
+    world.guesses[submap] = GuessedPlace(15, covariance)
     np.testing.assert_allclose(T, path(15), atol=0.02)
     assert scale == pytest.approx(5.0, rel=0.03)
     return placement
@@ -71,7 +73,9 @@ def test_a_part_whose_unit_changed_after_its_start_is_placed_again(world, drift)
     assert placement.place_again(world, 1) is None, "it is too young"
     world.add_keyframe(keyframe(26, T_drifted(26), 1))
     assert placement.place_again(world, 2) is None, "that is another part"
-    scale, T = placement.place_again(world, 1)
+    scale, T, guess = placement.place_again(world, 1)
+    assert guess.frame_id == 15
+    np.testing.assert_allclose(guess.covariance, world.guesses[1].covariance, rtol=0.2, atol=1e-6)
     assert scale == pytest.approx(1.0 / drift, rel=0.03)
     world.transform_submap(1, 1, scale, T)
     for frame in (15, 18, 21, 24, 26):
@@ -99,7 +103,8 @@ def test_a_part_that_nothing_led_to_is_not_placed_again(world):
     """The server was started again, and its camera sees nothing of the map so far."""
     begun = Start([keyframe(15 + k, make_transform(np.eye(3), (0, 0, 0.04 * k)), 0) for k in range(3)], *NONE)
     placement = SubmapPlacement(CAMERA, 20)
-    T, scale = placement.place(CameraMotion(CAMERA), begun, begun, world, 1)
+    T, scale, covariance = placement.place(CameraMotion(CAMERA), begun, begun, world, 1)
+    assert covariance is None
     np.testing.assert_array_equal(T, np.eye(4))
     assert scale == 1.0
     in_front = np.random.default_rng(1).uniform((-2, -2, 7), (2, 2, 9), (len(IDS), 3))
@@ -110,8 +115,30 @@ def test_a_part_that_nothing_led_to_is_not_placed_again(world):
 def test_a_first_map_is_where_it_is():
     placement, empty = SubmapPlacement(CAMERA, 20), WorldMap()
     begun = Start([keyframe(k, path(k), 0) for k in range(3)], *NONE)
-    T, scale = placement.place(CameraMotion(CAMERA), begun, begun, empty, 0)
+    T, scale, _ = placement.place(CameraMotion(CAMERA), begun, begun, empty, 0)
     np.testing.assert_array_equal(T, np.eye(4))
     assert scale == 1.0
     add(empty, range(30), path, 0, np.full((len(IDS), 3), 9.0))
     assert placement.place_again(empty, 0) is None
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["at its start", "placed again"])
+def test_a_part_behind_one_that_was_guessed_is_off_by_both_guesses(again):
+    """What turned the part before by a little moves this one by as much times the way from there."""
+
+    def worth(guess):
+        world = WorldMap()
+        add(
+            world, range(0, 10, 3), path, 0, np.random.default_rng(0).uniform((-2, -2, 5), (2, 2, 7), (60, 3))
+        )
+        world.guesses = {} if guess is None else {0: guess}
+        placement = laid(world)
+        if not again:
+            return world.guesses[1].covariance
+        add(world, [15, 18, 26], path, 1, np.random.default_rng(1).uniform((-2, -2, 9), (2, 2, 11), (60, 3)))
+        return placement.place_again(world, 1)[2].covariance
+
+    added = worth(GuessedPlace(0, np.diag([0.0, 0.01, 0, 0, 0, 0, 0.02]))) - worth(None)
+    at_3 = [0, 0.01, 0, 0.01 * 3.0**2, 0, 0.02 * 3.0**2, 0.02]
+    np.testing.assert_allclose(np.diag(added), at_3, rtol=0.03, atol=1e-9)
+    assert worth(GuessedPlace(0, None)) is None, "that one may be anywhere, and so may this one"

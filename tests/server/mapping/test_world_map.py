@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from semcast.common.geometry import exp_se3, invert_transform, transform_points
+from semcast.server.mapping.guessed_place import GuessedPlace
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 
@@ -29,6 +30,7 @@ def make_world():
         world.add_frame(10 * k + 3, 10 * k, world.poses[10 * k] @ exp_se3(np.full(6, 0.1)))
     add_world(world, [1, 2, 3], 0, 10)
     add_world(world, [5, 6], 1, 30)
+    world.guesses = {1: GuessedPlace(20, np.diag(np.arange(1.0, 8.0))), 0: GuessedPlace(10, None)}
     return world
 
 
@@ -104,6 +106,15 @@ def test_a_similarity_moves_everything_of_a_submap_alike():
     assert set(world.submap_of.values()) == {0}
     assert {k.submap for k in world.keyframes} == {0}
     assert set(world.landmarks.submap.tolist()) == {0}
+    assert set(world.guesses) == {0}, "of what was guessed of the other one nothing is left"
+
+
+def test_a_submap_that_is_moved_stays_a_guess_in_its_new_unit():
+    world = make_world()
+    world.transform_submap(1, 1, 2.0, np.eye(4))
+    world.transform_submap(0, 0, 2.0, np.eye(4))
+    assert np.diag(world.guesses[1].covariance).tolist() == [1, 2, 3, 16, 20, 24, 7]
+    assert world.guesses[0] == GuessedPlace(10, None)
 
 
 def test_bending_moves_what_each_keyframe_made_with_it_and_in_its_scale():
@@ -222,6 +233,16 @@ def test_arrays_bring_the_map_back():
         assert np.array_equal(array, arrays[name]), name
     assert again.keyframes[2].submap == 1
     assert np.array_equal(again.keyframes[2].edge, world.keyframes[2].edge)
+    assert again.guesses[0] == world.guesses[0]
+    assert np.array_equal(again.guesses[1].covariance, world.guesses[1].covariance)
+    assert again.guesses[1].frame_id == 20
+
+
+def test_older_checkpoints_tell_of_no_guess():
+    arrays = {name: array for name, array in make_world().arrays().items() if not name.startswith("guesses")}
+    again = WorldMap()
+    again.restore(arrays)
+    assert again.guesses == {}
 
 
 def test_observations_of_older_checkpoints_have_no_edges():
@@ -238,6 +259,12 @@ def test_contradicting_arrays_are_refused():
     arrays = make_world().arrays()
     with pytest.raises(ValueError, match="refer to keyframe 999"):
         WorldMap().restore({**arrays, "frames.keyframe_id": arrays["frames.keyframe_id"] * 0 + 999})
+    with pytest.raises(ValueError, match="guesses refer to keyframe 999"):
+        WorldMap().restore({**arrays, "guesses": np.array([[1, 20], [0, 999]])})
+    del arrays["guesses.is_known"]
+    with pytest.raises(KeyError, match="guesses.is_known"):
+        WorldMap().restore(arrays)
+    arrays = make_world().arrays()
     missing = {k: v for k, v in arrays.items() if k != "landmarks.xyz"}
     with pytest.raises(KeyError):
         WorldMap().restore(missing)
