@@ -44,7 +44,7 @@ def encoder_path(name_or_path: str | Path) -> Path:
             how = shlex.join(("semcast", "onnx", str(weights), "--out", str(path)))
             raise CheckpointError(
                 f"no exported encoder {path} beside the weights, which sending without torch needs: install "
-                f"torch (semcast[agent]) or, where it is installed, have it written by '{how}'"
+                f"torch (semcast[agent]) or, where it is installed, have it written: {how}"
             )
     elif path.suffix == SUFFIX and not path.is_file():
         raise CheckpointError(f"there is no exported encoder {path}")

@@ -41,7 +41,7 @@ def test_weights_are_sent_with_by_the_exported_encoder_beside_them(files, tmp_pa
     assert beside.digest == load_codec(str(files["torch"])).digest
     alone = tmp_path / "two words.safetensors"
     with pytest.raises(
-        CheckpointError, match=r"two words\.onnx beside the weights; .* semcast onnx '.*' --out '"
+        CheckpointError, match=r"two words\.onnx beside the weights, .*: semcast onnx '.*' --out '"
     ):
         load_codec(str(alone), runtime="onnx")
 

@@ -35,7 +35,7 @@ SHIPPED = {
     "latency": "latency_kitti_06",
     "depth": "depth_room",
     "endurance": "endurance_parking_synth_60",
-    "runtime": "runtime_3dcsc",
+    "runtime": "runtime_3dcsc_avx2",
     "recording": "recording_cost",
 }
 
