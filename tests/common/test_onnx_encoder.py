@@ -234,8 +234,8 @@ sys.exit(main(["agent", "--source", "nowhere", "--weights", {str(weights)!r}]))
     encoder = weights.with_suffix(".onnx")
     assert done.stderr == (
         f"semcast agent: no exported encoder {encoder} beside the weights, which sending without torch "
-        "needs: install torch (semcast[agent]) or, where it is installed, have it written by "
-        f"'semcast onnx {weights} --out {encoder}'\n"
+        "needs: install torch (semcast[agent]) or, where it is installed, have it written: "
+        f"semcast onnx {weights} --out {encoder}\n"
     )
     assert done.returncode == 1
 
