@@ -254,6 +254,16 @@ def test_a_server_without_a_gpu_says_so_at_once(capsys):
     assert "device must be auto or cpu on this machine" in capsys.readouterr().err
 
 
+def test_a_server_says_at_once_that_it_cannot_compute_in_a_precision(capsys, monkeypatch):
+    from semcast.commands import server
+    from semcast.common.nets import precision
+
+    monkeypatch.setattr(server, "run_server", lambda *_: pytest.fail("it runs"))
+    monkeypatch.setattr(precision, "has_fast_bfloat16", lambda: False)
+    assert main(["server", "--precision", "bfloat16", "--device", "cpu"]) == 1
+    assert re.search(r"precision must be one of auto, .*float32 for .*'bfloat16'", capsys.readouterr().err)
+
+
 def test_doctor_says_what_runs_an_agent_without_torch(monkeypatch):
     def missing(name):
         raise importlib.metadata.PackageNotFoundError(name)

@@ -50,6 +50,16 @@ def check_device(device: Device) -> None:
         raise ConfigError("device must be auto or cpu on this machine, which has no usable GPU, got 'cuda'")
 
 
+def torch_device(device: Device) -> torch.device:
+    """Return the device that is asked for; ``auto`` takes a GPU where there is one.
+
+    Raises:
+        ConfigError: See ``check_device``.
+    """
+    check_device(device)
+    return torch.device("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
 class NeuralCodec:
     """Encoder and decoder of one learned transceiver.
 
@@ -120,13 +130,12 @@ class NeuralCodec:
             if num_threads < 1:
                 raise ValueError(f"num_threads must be >= 1, got {num_threads}")
             torch.set_num_threads(num_threads)
-        check_device(device)
-        use_cuda = device == "cuda" or (device == "auto" and torch.cuda.is_available())
+        where = torch_device(device)
         model, manifest = load_transceiver(weights_path(name_or_path))
         if modulation in MODULATIONS and modulation not in manifest.modulations:
             ways = ", ".join(map(str, manifest.modulations))
             raise CheckpointError(f"weights {name_or_path} are for the modulation {ways}, got {modulation!r}")
-        return cls(model, manifest, modulation, torch.device("cuda" if use_cuda else "cpu"), precision)
+        return cls(model, manifest, modulation, where, precision)
 
     @property
     def name(self) -> str:

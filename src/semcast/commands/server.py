@@ -15,9 +15,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Serve until the source ends or the process is stopped; outputs are always written."""
     settings = read_settings(ServerSettings, arguments)
-    if settings.device == "cuda":
+    if settings.device == "cuda" or settings.precision not in ("auto", "float32"):
         # Without --codec the decoder is loaded when the first frame arrives: too late to say this.
-        from semcast.common.nets.codec import check_device
+        from semcast.common.nets.codec import torch_device
+        from semcast.common.nets.precision import dtype_for
 
-        check_device(settings.device)
+        dtype_for(settings.precision, torch_device(settings.device), can_be_int8=True)
     return run_until_stopped(lambda stop: run_server(settings, stop))
