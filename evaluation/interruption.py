@@ -7,6 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
+#: Before the suffix of a file with a part.
+_MARK = ".partial"
+
 
 class InterruptedMeasurementError(KeyboardInterrupt):
     """Ctrl-C, or what does the same, in a measurement of which a part was finished.
@@ -30,7 +33,12 @@ class Part:
 
     def name(self, path: Path) -> Path:
         """Return the file for a result: that of a part replaces none that is whole."""
-        return path.with_suffix(f".partial{path.suffix}") if self.is_cut else path
+        return path.with_suffix(f"{_MARK}{path.suffix}") if self.is_cut else path
+
+
+def is_part(path: Path) -> bool:
+    """Tell whether a file is named as ``Part.name`` names that of a part."""
+    return path.stem.endswith(_MARK)
 
 
 @contextmanager

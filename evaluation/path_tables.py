@@ -13,6 +13,7 @@ from typing import Any
 from semcast.common.codec import DEFAULT_CODEC
 from semcast.evaluation.markdown import number, table
 from semcast.evaluation.pipeline import CLEAN
+from semcast.evaluation.report import result_files
 from semcast.evaluation.trace_snr import level_name
 
 Report = Mapping[str, Any]
@@ -124,7 +125,7 @@ def readme_table(folder: Path) -> str:
     """
     errors: dict[str, dict[str, str]] = {}
     live: dict[str, str] = {}
-    for file in sorted(folder.glob("trajectory_*.json")):
+    for file in result_files(folder, "trajectory_*.json"):
         report = json.loads(file.read_text(encoding="utf-8"))
         channel = report["settings"]["link"]["channel"]
         # The SNR of a trace is but its start, and fading with Doppler is another link than without.

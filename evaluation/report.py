@@ -15,7 +15,7 @@ from semcast.common.cores import usable_cores
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.source_commit import source_commit
 from semcast.common.whole_file import check_writable
-from semcast.evaluation.interruption import InterruptedMeasurementError, Part
+from semcast.evaluation.interruption import InterruptedMeasurementError, Part, is_part
 from semcast.server.export.outputs import plain, versions_of, write_json
 
 Settings = TypeVar("Settings")
@@ -60,6 +60,11 @@ def check_outputs(json: Path | None, out: Path | None) -> None:
             check_writable(json, "json")
     except OSError as err:  # is_file and is_dir raise below a folder that may not be looked into
         raise ConfigError(f"{err.filename} can't be written: {err.strerror}") from err
+
+
+def result_files(folder: Path, pattern: str) -> list[Path]:
+    """Return the files that match a pattern and hold whole results, not what an interruption left."""
+    return [file for file in sorted(folder.glob(pattern)) if not is_part(file)]
 
 
 class UnwrittenResultError(SemcastError):

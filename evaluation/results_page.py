@@ -17,7 +17,7 @@ from semcast.evaluation.pair_summary import RIVAL, pair_headline, pair_summary
 from semcast.evaluation.path_tables import WORST_RATIO, readme_table, trajectory_table
 from semcast.evaluation.pipeline import CLEAN
 from semcast.evaluation.plots import variant_name
-from semcast.evaluation.report import RESULTS
+from semcast.evaluation.report import RESULTS, result_files
 from semcast.evaluation.trace_snr import level_name
 from semcast.evaluation.trajectory_summary import trajectory_summary
 
@@ -386,7 +386,7 @@ def results_page(folder: Path = RESULTS) -> str:
     """Return the page for all result files of a folder as Markdown."""
     lines = [HEAD]
     for kind, (title, tables) in SECTIONS.items():
-        files = sorted(folder.glob(f"{kind}_*.json"))
+        files = result_files(folder, f"{kind}_*.json")
         if files:
             lines.append(f"## {title}\n")
         for file in files:
@@ -404,7 +404,7 @@ def results_page(folder: Path = RESULTS) -> str:
 
 
 def _reports(pattern: str) -> Iterator[Report]:
-    for file in sorted(RESULTS.glob(pattern)):
+    for file in result_files(RESULTS, pattern):
         yield json.loads(file.read_text(encoding="utf-8"))
 
 

@@ -56,6 +56,12 @@ def test_other_codecs_and_links_are_not_in_it(tmp_path, other):
     assert "7.77" not in rows
 
 
+def test_a_part_that_an_interrupted_run_left_is_not_in_it(tmp_path):
+    (tmp_path / "trajectory_a.json").write_text(json.dumps(report(DEFAULT_CODEC, 0.25)))
+    (tmp_path / "trajectory_b.partial.json").write_text(json.dumps(report(DEFAULT_CODEC, 7.77)))
+    assert "7.77" not in readme_table(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("errors_percent", "text"),
     [

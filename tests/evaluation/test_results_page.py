@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from semcast.common.codec import DEFAULT_CODEC
+from semcast.evaluation.interruption import Part
 from semcast.evaluation.results_page import results_page
 
 RESULTS = Path(__file__).resolve().parents[2] / "evaluation" / "results"
@@ -54,6 +55,16 @@ def test_a_server_alone_has_a_row_for_each_run_and_dashes_where_nothing_was_time
     assert "10.0 frames a second of 640x480" in page
     assert "| 50 | 48 | 94.0% | 90.0 / 110.0 | 41.0 / 83.0 | - / - |" in page
     assert "| 50 | 0 | 0.0% | - / - | - / - | - / - |" in page
+
+
+def test_what_an_interrupted_measurement_left_is_on_no_page(tmp_path):
+    report = {"rate_hz": 10.0, "image_wh": [640, 480], "codec": "jpeg-ldpc", "results": []}
+    whole = tmp_path / "server_shelf.json"
+    part = Part()
+    part.is_cut = True
+    for file in (whole, part.name(whole)):
+        file.write_text(json.dumps(report), encoding="utf-8")
+    assert [line for line in results_page(tmp_path).splitlines() if line.startswith("### ")] == ["### shelf"]
 
 
 @pytest.mark.parametrize("module", ["semcast.evaluation.results_page", "semcast.reference"])
