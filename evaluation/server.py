@@ -26,6 +26,7 @@ from semcast.common.playback import usual_period_ns
 from semcast.common.recorded_streams import RecordedStream, choose_stream
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.run_folder import SUMMARY_NAME
+from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.report import provenance, write_result
 
 VERB = "eval server"
@@ -75,19 +76,23 @@ def evaluate_server(settings: ServerRunSettings) -> dict[str, Any]:
 
     Raises:
         SourceError: The file is no recording or holds no frames that were received.
-        SemcastError: The server ended before the stream did, or left no summary.
+        SemcastError: The server ended before the stream did, left no summary, or decoded none of the frames.
     """
     reader = RecordingReader(settings.file)
     stream = choose_stream(reader, settings.stream, "received")
+    results: list[dict[str, Any]] = []
+    with until_interrupted(results) as part:
+        for _ in range(settings.runs):
+            results.append(_run(settings, stream))
     report = {
         **provenance(VERB, settings),
         "sequence": stream.camera.source_name,
         "codec": stream.camera.codec,
         "image_wh": list(stream.camera.image_wh),
         "rate_hz": _rate_hz(reader, stream) * settings.pace,
-        "results": [_run(settings, stream) for _ in range(settings.runs)],
+        "results": results,
     }
-    return write_result(settings.json, report)
+    return write_result(settings.json, report, part)
 
 
 def _rate_hz(reader: RecordingReader, stream: RecordedStream) -> float:
@@ -123,6 +128,9 @@ def _run(settings: ServerRunSettings, stream: RecordedStream) -> dict[str, Any]:
             words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             raise SemcastError(f"the server did not get to the end: {words[-1] if words else 'no output'}")
         summary = json.loads((out / SUMMARY_NAME).read_text(encoding="utf-8"))
+    if not summary["frames"]["tracked"]:
+        drops = ", ".join(f"{count} {reason}" for reason, count in summary["drops"].items())
+        raise SemcastError(f"the server decoded no frame of {settings.file}; dropped: {drops or 'none'}")
     return {key: summary[key] for key in ("frames", "drops", "completeness", "stage_ms")}
 
 

@@ -22,6 +22,8 @@ from semcast.common.phy.pilots import insert_pilots
 from semcast.common.recording_writer import RecordingWriter, recording_metadata
 from semcast.common.symbol_payload import data_symbols, pack_iq, pack_lost
 from semcast.common.wire import pack
+from semcast.evaluation import server
+from semcast.evaluation.interruption import InterruptedMeasurementError
 from semcast.evaluation.server import ServerRunSettings, evaluate_server
 
 pytestmark = pytest.mark.xdist_group("real-time")
@@ -31,14 +33,12 @@ NUM_FRAMES = 4
 EPOCH = 1_700_000_000_000_000_000
 
 
-@pytest.fixture(scope="module")
-def file(tmp_path_factory):
+def record(path, **of_encoder):
     """Four small frames as they were received, four a second."""
-    path = tmp_path_factory.mktemp("recording") / "run.mcap"
     source = SourceSettings(source=str(SEQUENCE), resize=0.3, max_frames=NUM_FRAMES, pace="receiver")
     opened, codec = open_source(source), load_codec("jpeg-ldpc")
     agent = AgentSettings(source=source, codec=codec.name, mode="replay")
-    camera = camera_info(agent, opened, codec, EPOCH)
+    camera = replace(camera_info(agent, opened, codec, EPOCH), **of_encoder)
     encoder, link = FrameEncoder(codec, EPOCH, lossless=True), Link(ChannelSettings(snr_db=15.0), 0)
     with path.open("wb") as stream:
         writer = RecordingWriter(stream, recording_metadata("", "test"))
@@ -47,11 +47,16 @@ def file(tmp_path_factory):
             tx = encoder.encode(frame, 15.0)
             sent = link.transmit(insert_pilots(data_symbols(tx)), 0.1 * k, k)
             received = {"payload": pack_iq(sent.slots_rx), "slot_lost": pack_lost(sent.slot_lost)}
-            rx = replace(tx, direction="rx", payload_format="iq16", **received)
+            rx = replace(tx, direction="rx", payload_format="iq16", **received, **of_encoder)
             writer.add("semcast/agent0/rx/symbols", "symbols", EPOCH + k * 250_000_000, k, pack(rx))
         writer.finish()
     opened.close()
     return path
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return record(tmp_path_factory.mktemp("recording") / "run.mcap")
 
 
 def test_each_run_is_of_a_new_server_that_takes_the_whole_stream(file, tmp_path, capsys):
@@ -77,6 +82,28 @@ def test_a_server_that_does_not_start_is_told_in_its_own_words(file, tmp_path, m
     monkeypatch.setattr(sys, "executable", str(program))
     with pytest.raises(SemcastError, match="the server did not get to the end: no torch here"):
         evaluate_server(ServerRunSettings(file=file))
+
+
+def test_a_stream_that_the_server_cannot_decode_is_no_result(tmp_path):
+    other = record(tmp_path / "other.mcap", digest="0" * 16)
+    with pytest.raises(SemcastError, match=r"the server decoded no frame of .*other.mcap; dropped: \d"):
+        evaluate_server(ServerRunSettings(file=other, pace=4.0, runs=1))
+
+
+def test_an_interruption_leaves_the_runs_before_it(file, tmp_path, monkeypatch):
+    runs = iter([{"frames": {}, "drops": {}, "completeness": 1.0, "stage_ms": {}}])
+
+    def run(*_):
+        if (result := next(runs, None)) is None:
+            raise KeyboardInterrupt
+        return result
+
+    monkeypatch.setattr(server, "_run", run)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        evaluate_server(ServerRunSettings(file=file, json=tmp_path / "r.json"))
+    assert caught.type is InterruptedMeasurementError
+    report = json.loads((tmp_path / "r.partial.json").read_text(encoding="utf-8"))
+    assert (report["partial"], len(report["results"])) == (True, 1)
 
 
 def test_a_recording_without_the_stream_is_refused_before_a_server_is_started(file, monkeypatch):
