@@ -6,7 +6,7 @@ to a pose grows with the way from there.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,13 +35,6 @@ class GuessedPlace:
             return None
         carried = similarity_adjoint(T_first_cam)
         return np.asarray(carried @ self.covariance @ carried.T)
-
-    def in_unit(self, scale: float) -> "GuessedPlace":
-        """Return the same in a map whose lengths are so many times as large."""
-        if self.covariance is None:
-            return self
-        unit = np.array([1.0, 1.0, 1.0, scale, scale, scale, 1.0])
-        return replace(self, covariance=self.covariance * np.outer(unit, unit))
 
 
 def similarity_adjoint(T_first_cam: Array) -> Array:

@@ -95,7 +95,7 @@ class WorldMap:
         frames: Of each its keyframe and ``T_keyframe_cam``.
         revisits: Frame id of a keyframe -> that of an older one whose landmarks it saw again.
         gaps: Frame ids of keyframes behind a gap in the tracks, noted when keyframes are thinned out.
-        guesses: Submap whose place in the world was guessed -> what that is worth, until it joins another.
+        guesses: Submap whose place in the world was guessed -> what that is worth, until it is moved.
     """
 
     def __init__(self) -> None:
@@ -201,14 +201,15 @@ class WorldMap:
     def transform_submap(self, submap: int, into: int, scale: float, T_new_old: Array) -> None:
         """Move a submap by a similarity ``x' = T (s x)`` and make it part of another.
 
+        What a guess of its place was worth is forgotten: another guess is worth something else.
+
         Args:
             submap: The one that moves: landmarks, keyframes and frames.
             into: The one it becomes part of.
             scale: Units of the other in one of its own.
             T_new_old: ``(4, 4)``.
         """
-        if (guess := self.guesses.pop(submap, None)) is not None and into == submap:
-            self.guesses[submap] = guess.in_unit(scale)
+        self.guesses.pop(submap, None)
         mine = self.landmarks.submap == submap
         xyz = scale * self.landmarks.xyz[mine]
         self.landmarks.xyz[mine] = transform_points(T_new_old, xyz)

@@ -38,13 +38,6 @@ def test_it_is_carried_on_from_camera_to_camera():
     np.testing.assert_allclose(on, guess.seen_from(T_FIRST_CAM), atol=1e-9)
 
 
-def test_another_unit_changes_places_and_no_turn():
-    guess = GuessedPlace(3, np.diag([1.0, 1, 1, 1, 1, 1, 1])).in_unit(2.0)
-    assert np.diag(guess.covariance).tolist() == [1, 1, 1, 4, 4, 4, 1]
-    assert guess.frame_id == 3
-
-
 def test_of_an_unknown_place_nothing_is_known_anywhere():
     nowhere = GuessedPlace(3, None)
     assert nowhere.seen_from(T_FIRST_CAM) is None
-    assert nowhere.in_unit(2.0) == nowhere
