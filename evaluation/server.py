@@ -4,6 +4,7 @@ A recorded stream is played to a server of its own process, as ``semcast play`` 
 ``semcast server``, but shows nothing and leaves out the dense cloud.
 """
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -21,11 +22,13 @@ from semcast.common.cores import check_threads
 from semcast.common.errors import SemcastError
 from semcast.common.keys import rx_key
 from semcast.common.loopback import free_endpoint
+from semcast.common.messages import SymbolFrame
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.playback import usual_period_ns
 from semcast.common.recorded_streams import RecordedStream, choose_stream
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.run_folder import SUMMARY_NAME
+from semcast.common.wire import WireError, unpack
 from semcast.evaluation.interruption import until_interrupted
 from semcast.evaluation.report import provenance, write_result
 
@@ -96,10 +99,16 @@ def evaluate_server(settings: ServerRunSettings) -> dict[str, Any]:
 
 
 def _rate_hz(reader: RecordingReader, stream: RecordedStream) -> float:
-    """Return how many frames a second arrived, usually."""
-    key = rx_key(stream.agent_id)
-    times_ns = [m.log_time_ns for m in reader.messages(frozenset({"symbols"})) if m.topic == key]
-    return 1e9 / max(1.0, usual_period_ns(np.array(times_ns, np.int64)))
+    """Return how many frames a second arrived, usually; one that was sent again counts once."""
+    first_ns: dict[int, int] = {}
+    for message in reader.messages(frozenset({"symbols"})):
+        if message.topic != rx_key(stream.agent_id):
+            continue
+        with contextlib.suppress(WireError):  # it is not played either, which is said then
+            frame = unpack(message.data, SymbolFrame)
+            if frame.agent_epoch == stream.camera.agent_epoch:
+                first_ns.setdefault(frame.seq, message.log_time_ns)
+    return 1e9 / max(1.0, usual_period_ns(np.array(list(first_ns.values()), np.int64)))
 
 
 def _run(settings: ServerRunSettings, stream: RecordedStream) -> dict[str, Any]:

@@ -34,7 +34,7 @@ EPOCH = 1_700_000_000_000_000_000
 
 
 def record(path, **of_encoder):
-    """Four small frames as they were received, four a second."""
+    """Four small frames as they were received, four a second, and what does not count."""
     source = SourceSettings(source=str(SEQUENCE), resize=0.3, max_frames=NUM_FRAMES, pace="receiver")
     opened, codec = open_source(source), load_codec("jpeg-ldpc")
     agent = AgentSettings(source=source, codec=codec.name, mode="replay")
@@ -48,7 +48,11 @@ def record(path, **of_encoder):
             sent = link.transmit(insert_pilots(data_symbols(tx)), 0.1 * k, k)
             received = {"payload": pack_iq(sent.slots_rx), "slot_lost": pack_lost(sent.slot_lost)}
             rx = replace(tx, direction="rx", payload_format="iq16", **received, **of_encoder)
-            writer.add("semcast/agent0/rx/symbols", "symbols", EPOCH + k * 250_000_000, k, pack(rx))
+            at_ns = EPOCH + k * 250_000_000
+            writer.add("semcast/agent0/rx/symbols", "symbols", at_ns, k, pack(rx))
+        for k in range(1, 6):  # an agent repeats its last frame; another start of it left some as well
+            for again in (rx, replace(rx, agent_epoch=EPOCH - 1, seq=k)):
+                writer.add("semcast/agent0/rx/symbols", "symbols", at_ns + k * 10_000_000, k, pack(again))
         writer.finish()
     opened.close()
     return path
