@@ -73,5 +73,7 @@ Settings, files, processes
     cores                   processor cores and threads
     heap                    memory that frames take again and again
     interrupts              Ctrl-C
+    role                    a process of a running system as a child
+    parent                  children that end with the process that started them
     worker_guard            unexpected exceptions in worker threads
 """

@@ -6,7 +6,6 @@ A recorded stream is played to a server of its own process, as ``semcast play`` 
 
 import contextlib
 import json
-import subprocess
 import sys
 import tempfile
 import threading
@@ -27,6 +26,7 @@ from semcast.common.network_settings import NetworkSettings
 from semcast.common.playback import usual_period_ns
 from semcast.common.recorded_streams import RecordedStream, choose_stream
 from semcast.common.recording_reader import RecordingReader
+from semcast.common.role import Role
 from semcast.common.run_folder import SUMMARY_NAME
 from semcast.common.wire import WireError, unpack
 from semcast.evaluation.interruption import until_interrupted
@@ -36,7 +36,6 @@ VERB = "eval server"
 UNUSED_FIELDS: frozenset[str] = frozenset()
 #: Longest time from the last frame to the summary: the adjustment of a long map takes a minute.
 _CONCLUDED_S = 300.0
-_END_S = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,12 +114,12 @@ def _run(settings: ServerRunSettings, stream: RecordedStream) -> dict[str, Any]:
     """Play the stream to a server and return what it tells of it."""
     endpoint = free_endpoint()
     with tempfile.TemporaryDirectory(prefix="semcast-") as folder:
-        out, log = Path(folder) / "run", Path(folder) / "server.log"
+        out = Path(folder) / "run"
         command = [sys.executable, "-m", "semcast", "server", "--agent-id", stream.agent_id]
         command += ["--listen", endpoint, "--view", "none", "--dense-cloud", "none", "--out", str(out)]
         command += ["--threads", str(settings.threads), "--precision", settings.precision]
-        with log.open("wb") as sink:
-            server = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink)
+        server = Role("server", command, Path(folder) / "server.log")
+        server.start()
         has_ended = threading.Event()
 
         def watch() -> None:
@@ -132,22 +131,11 @@ def _run(settings: ServerRunSettings, stream: RecordedStream) -> dict[str, Any]:
             played = run_play(settings.play_to(NetworkSettings(connect=(endpoint,))), has_ended)
             has_ended.wait(_CONCLUDED_S)
         finally:
-            _end(server)
+            server.stop()
         if not played["complete"] or server.returncode or not (out / SUMMARY_NAME).is_file():
-            words = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            raise SemcastError(f"the server did not get to the end: {words[-1] if words else 'no output'}")
+            raise SemcastError(f"the server did not get to the end: {server.last_words()}")
         summary = json.loads((out / SUMMARY_NAME).read_text(encoding="utf-8"))
     if not summary["frames"]["tracked"]:
         drops = ", ".join(f"{count} {reason}" for reason, count in summary["drops"].items())
         raise SemcastError(f"the server decoded no frame of {settings.file}; dropped: {drops or 'none'}")
     return {key: summary[key] for key in ("frames", "drops", "completeness", "stage_ms")}
-
-
-def _end(server: "subprocess.Popen[bytes]") -> None:
-    """End the process of a server, which has ended by itself where all went well."""
-    server.terminate()
-    try:
-        server.wait(_END_S)
-    except subprocess.TimeoutExpired:
-        server.kill()
-        server.wait()

@@ -23,6 +23,7 @@ from semcast.common.errors import ConfigError, SemcastError, SourceError
 from semcast.common.loopback import free_endpoint
 from semcast.common.metrics import Metrics
 from semcast.common.recording_reader import RecordingReader
+from semcast.common.role import Role
 from semcast.common.sequence import open_sequence
 from semcast.common.wire import pack
 from semcast.demo import (
@@ -37,7 +38,6 @@ from semcast.demo import (
 from semcast.demo_recording import look_at
 from semcast.demo_watch import Alive, watch
 from semcast.real_time import Plan
-from semcast.role import Role
 from semcast.server.replay import ReplaySettings, replay
 
 pytestmark = pytest.mark.xdist_group("real-time")

@@ -11,7 +11,7 @@ import pytest
 from semcast.agent.settings import AgentSettings
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.common.config import build_settings, read_toml
-from semcast.role import STOP_DEADLINE_S
+from semcast.common.role import STOP_DEADLINE_S
 from semcast.server.settings import ServerSettings
 
 DEPLOY = Path(__file__).resolve().parents[1] / "deploy"

@@ -24,13 +24,13 @@ from semcast.common.loopback import free_endpoint
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.playback import check_playback
 from semcast.common.rate import NATIVE_RATE, RateChoice
+from semcast.common.role import Role
 from semcast.common.run_folder import DEMO_SETTINGS_NAME, SUMMARY_NAME
 from semcast.common.transport import Session, open_session
 from semcast.common.whole_file import check_writable, write_whole
 from semcast.demo_recording import DemoRecording, look_at
 from semcast.demo_watch import ERROR_CODE, START_DEADLINE_S, Alive, watch
 from semcast.real_time import plan_for
-from semcast.role import Role
 from semcast.server.former_run import check_not_foreign, discard, output_folder
 from semcast.server.frame_rows import run_line
 from semcast.server.mapping.settings import ReconstructionSettings

@@ -13,9 +13,9 @@ from typing import Any
 
 from semcast.common.errors import SemcastError
 from semcast.common.messages import StatusMessage
+from semcast.common.role import Role
 from semcast.common.run_folder import FRAMES_NAME, SUMMARY_NAME
 from semcast.common.wire import WireError, unpack
-from semcast.role import Role
 
 #: How long a role may take from its start until it is seen: imports and weights on a slow machine.
 START_DEADLINE_S = 180.0

@@ -17,8 +17,8 @@ from semcast.common.codecs import load_codec
 from semcast.common.cores import usable_cores
 from semcast.common.errors import SemcastError
 from semcast.common.interrupts import deaf_children
+from semcast.common.parent import end_with_parent
 from semcast.common.rate import NATIVE_RATE, RateChoice, to_coded
-from semcast.parent import end_with_parent
 
 #: Larger images gain little.
 MAX_PIXELS = 250_000

@@ -1,6 +1,7 @@
 """A live server alone, timed on a recorded stream."""
 
 import json
+import os
 import sys
 import threading
 from dataclasses import replace
@@ -108,6 +109,16 @@ def test_an_interruption_leaves_the_runs_before_it(file, tmp_path, monkeypatch):
     assert caught.type is InterruptedMeasurementError
     report = json.loads((tmp_path / "r.partial.json").read_text(encoding="utf-8"))
     assert (report["partial"], len(report["results"])) == (True, 1)
+
+
+def test_its_server_ends_with_it_however_that_ends(file, tmp_path, monkeypatch):
+    """In a group of its own, so that Ctrl-C in a terminal reaches the server through the evaluation alone."""
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\necho of $SEMCAST_PARENT_PID, $(($(ps -o pgid= -p $$) - $$))\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    with pytest.raises(SemcastError, match=f"of {os.getpid()}, 0$"):
+        evaluate_server(ServerRunSettings(file=file))
 
 
 def test_a_recording_without_the_stream_is_refused_before_a_server_is_started(file, monkeypatch):

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from semcast.commands.paths import named_path
 from semcast.common.config_flags import add_flags, given_values, settings_from
-from semcast.parent import stop_with_parent
+from semcast.common.parent import stop_with_parent
 
 S = TypeVar("S")
 

@@ -1,11 +1,11 @@
-"""A role of the demo as a child process: its command, its log, its end."""
+"""A role of a running system as a child process: its command, its log, its end."""
 
 import re
 import signal
 import subprocess
 from pathlib import Path
 
-from semcast.parent import bound_to_this
+from semcast.common.parent import bound_to_this
 
 #: How long a role may take to write everything after it was asked to stop.
 STOP_DEADLINE_S = 30.0
@@ -48,6 +48,11 @@ class Role:
         """Return what the log warns of, each once, in the order in which it came."""
         log = self.log.read_text(encoding="utf-8", errors="replace")
         return list(dict.fromkeys(re.findall(r"^\S+ WARNING \S+: (.+)$", log, re.MULTILINE)))
+
+    def wait(self) -> None:
+        """Wait until the process has ended; it was started."""
+        assert self._process is not None
+        self._process.wait()
 
     def stop(self) -> None:
         """Ask the process to end; kill it when it does not in time."""

@@ -1,4 +1,4 @@
-"""Children of the demo end with it, also where it is killed and can ask nobody to end."""
+"""Child processes end with their parent, also where that is killed and can ask nobody to end."""
 
 import logging
 import multiprocessing

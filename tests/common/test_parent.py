@@ -15,7 +15,7 @@ print("ended in order", flush=True)
 DEMO = """
 import sys, time
 from pathlib import Path
-from semcast.role import Role
+from semcast.common.role import Role
 Role("role", [sys.executable, "-c", sys.argv[1]], Path(sys.argv[2])).start()
 time.sleep(60)
 """
@@ -23,7 +23,7 @@ time.sleep(60)
 MEASURING = """
 import multiprocessing, time
 from concurrent.futures import ProcessPoolExecutor
-from semcast.parent import end_with_parent
+from semcast.common.parent import end_with_parent
 pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent)
 print(pool.submit(abs, -1).result(), flush=True)
 time.sleep(60)
