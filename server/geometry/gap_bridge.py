@@ -6,13 +6,12 @@ gets other figures than a car, and nobody has to say which of them it is.
 """
 
 from collections.abc import Sequence
-from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.geometry import exp_so3, invert_transform, logs_so3
-from semcast.server.geometry.whereabouts import SAME_S, Step, last_by
+from semcast.server.geometry.whereabouts import SAME_S, Step, last_by, path_of
 
 Array = NDArray[np.float64]
 
@@ -86,9 +85,7 @@ def hindcast(
     """
     if not steps:
         return None
-    T_first_cam = np.array(list(accumulate((T for _, T, _ in steps), np.matmul, initial=np.eye(4))))
-    gone = np.concatenate([np.zeros((1, 3)), np.cumsum([way for _, _, way in steps], axis=0)])
-    t_s = np.concatenate([[0.0], np.cumsum([step_s for step_s, _, _ in steps])])
+    t_s, T_first_cam, gone = path_of(steps)
     for share in _SHARES:
         now, after, later = _gaps_in(t_s, share * gap_s, later_s)
         if t_s[-1] >= _TIMES_HELD * share * gap_s and len(now):

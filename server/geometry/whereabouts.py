@@ -92,6 +92,19 @@ def mean_way(steps: Sequence[Step], span_s: float) -> Array:
     return total / total_s if total_s > 0.0 else total
 
 
+def path_of(steps: Sequence[Step]) -> tuple[Array, Array, Array]:
+    """Return what ``N`` steps add up to, one at least.
+
+    Returns:
+        Of where each of them begins, and the last one ends: seconds ``(N + 1,)`` since the first one began,
+        ``T_first_cam (N + 1, 4, 4)``, and the way gone ``(N + 1, 3)``, the sum of the steps' own.
+    """
+    T_first_cam = np.array(list(accumulate((T for _, T, _ in steps), np.matmul, initial=np.eye(4))))
+    gone = np.concatenate([np.zeros((1, 3)), np.cumsum([way for _, _, way in steps], axis=0)])
+    t_s = np.concatenate([[0.0], np.cumsum([step_s for step_s, _, _ in steps])])
+    return t_s, T_first_cam, gone
+
+
 def last_by(ascending_s: Array, at_s: Array) -> NDArray[np.int64]:
     """Index of the last time that is not after another one, for each of these; -1 where there is none."""
     return np.searchsorted(ascending_s, at_s + SAME_S, side="right") - 1
@@ -124,9 +137,7 @@ def _strayed(steps: Sequence[Step], elapsed_s: float) -> float:
     """
     if not steps:
         return 0.0
-    T_first_cam = np.array(list(accumulate((T for _, T, _ in steps), np.matmul, initial=np.eye(4))))
-    gone = np.concatenate([np.zeros((1, 3)), np.cumsum([way for _, _, way in steps], axis=0)])
-    t_s = np.concatenate([[0.0], np.cumsum([step_s for step_s, _, _ in steps])])
+    t_s, T_first_cam, gone = path_of(steps)
     before = last_by(t_s, t_s - _SPEED_S)
     known = np.flatnonzero(before >= 0)
     before = before[known]
