@@ -60,9 +60,14 @@ def guesses_as_arrays(guesses: Mapping[int, GuessedPlace]) -> dict[str, NDArray]
 
 
 def guesses_of(arrays: Mapping[str, NDArray]) -> dict[int, GuessedPlace]:
-    """Take what ``guesses_as_arrays`` gave; an older checkpoint has none."""
+    """Take what ``guesses_as_arrays`` gave, from the arrays of a map.
+
+    Of an older checkpoint, which has none, every part but the first was guessed, and nothing tells how well.
+    """
     if "guesses" not in arrays:
-        return {}
+        frame_ids, submaps = arrays["poses.frame_id"], arrays["poses.submap"]
+        later = np.unique(submaps)[1:].tolist()
+        return {submap: GuessedPlace(int(frame_ids[submaps == submap].min()), None) for submap in later}
     rows = zip(
         arrays["guesses"].tolist(), arrays["guesses.is_known"], arrays["guesses.covariance"], strict=True
     )
