@@ -33,7 +33,15 @@ class Part:
 
     def name(self, path: Path) -> Path:
         """Return the file for a result: that of a part replaces none that is whole."""
-        return path.with_suffix(f"{_MARK}{path.suffix}") if self.is_cut else path
+        return _part_of(path) if self.is_cut else path
+
+    def forget(self, path: Path) -> None:
+        """Delete the part that an earlier run left of a result that is whole now."""
+        _part_of(path).unlink(missing_ok=True)
+
+
+def _part_of(path: Path) -> Path:
+    return path.with_suffix(f"{_MARK}{path.suffix}")
 
 
 def is_part(path: Path) -> bool:

@@ -87,7 +87,8 @@ def write_result(path: Path | None, result: Mapping[str, Any], part: Part | None
     Args:
         path: File, or None.
         result: What was measured.
-        part: Whether that is all. A part is marked as ``partial``, and its file ends in ``.partial.json``.
+        part: Whether that is all. A part is marked as ``partial``, and its file ends in ``.partial.json``; the
+            whole takes that one's place.
 
     Raises:
         UnwrittenResultError: The folder can't be made or the file can't be written.
@@ -101,6 +102,8 @@ def write_result(path: Path | None, result: Mapping[str, Any], part: Part | None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_json(path, values)
+            if part is not None and not is_cut:
+                part.forget(path)
         except OSError as err:
             raise UnwrittenResultError(f"{path} can't be written: {err}", values) from err
     if is_cut:

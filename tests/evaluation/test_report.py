@@ -10,6 +10,7 @@ import pytest
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.common.source_commit import source_commit
 from semcast.evaluation.codec import CodecSettings
+from semcast.evaluation.interruption import InterruptedMeasurementError, Part
 from semcast.evaluation.moving_images import ImagesSettings
 from semcast.evaluation.report import (
     check_outputs,
@@ -88,6 +89,16 @@ def test_written_json_reads_back_and_leaves_no_partial_file(tmp_path):
     assert write_result(path, {"x": np.arange(3)}) == json.loads(path.read_text()) == {"x": [0, 1, 2]}
     assert [p.name for p in path.parent.iterdir()] == ["result.json"]
     assert write_result(None, {"x": np.arange(3)}) == {"x": [0, 1, 2]}
+
+
+def test_a_whole_result_takes_the_place_of_its_part(tmp_path):
+    path, part = tmp_path / "r.json", Part()
+    part.is_cut = True
+    with pytest.raises(InterruptedMeasurementError):
+        write_result(path, {"x": 1}, part)
+    assert [p.name for p in tmp_path.iterdir()] == ["r.partial.json"]
+    write_result(path, {"x": 2}, Part())
+    assert [p.name for p in tmp_path.iterdir()] == ["r.json"]
 
 
 def test_an_unwritable_place_is_one_clear_error(tmp_path):

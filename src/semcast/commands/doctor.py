@@ -96,21 +96,14 @@ def check_processor() -> Iterator[Finding]:
     )
     if importlib.util.find_spec("torch") is None:
         return  # exported encoders compute in eight bits or fp32
-    try:
-        flags = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        return
-    if "amx_bf16" in flags:
-        yield Finding("bfloat16", "good", "in hardware (AMX): the networks run in bf16")
-    elif "avx512_bf16" in flags:
-        yield Finding("bfloat16", "good", "in hardware (AVX512): the networks run in bf16")
-    else:
-        from semcast.common.nets.int8 import has_int8
+    from semcast.common.nets.int8 import has_int8
+    from semcast.common.nets.precision import has_fast_bfloat16
 
-        instead = "int8, half as fast" if has_int8() else "fp32, 3-5 times slower"
-        yield Finding(
-            "bfloat16", "note", f"not in hardware: {instead}; use --resize 0.5 or a conventional codec"
-        )
+    if has_fast_bfloat16():
+        yield Finding("bfloat16", "good", "in hardware: the networks run in it")
+        return
+    instead = "int8, slower" if has_int8() else "float32, slowest"
+    yield Finding("bfloat16", "note", f"not in hardware: {instead}; use --resize 0.5 or a conventional codec")
 
 
 def check_weights() -> Iterator[Finding]:
