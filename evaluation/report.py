@@ -87,8 +87,8 @@ def write_result(path: Path | None, result: Mapping[str, Any], part: Part | None
     Args:
         path: File, or None.
         result: What was measured.
-        part: Whether that is all. A part is marked as ``partial``, and its file ends in ``.partial.json``; the
-            whole takes that one's place.
+        part: Whether that is all. A part is marked as ``partial``, and its file ends in ``.partial.json``;
+            the whole takes that one's place.
 
     Raises:
         UnwrittenResultError: The folder can't be made or the file can't be written.
