@@ -64,27 +64,22 @@ class PairCell:
     def errors(self, method: str) -> dict[str, Array]:
         """Return ``rot_deg``, ``tdir_deg``, ``failed``, each ``(num_pairs, num_seeds)``.
 
-        Raises:
-            ValueError: Some pair lacks a seed.
+        Of the seeds that all pairs have: a measurement that was interrupted has done some pairs of its last.
         """
         pairs = sorted({pair for pair, _ in self._outcomes})
         seeds = sorted({seed for _, seed in self._outcomes})
-        if len(self._outcomes) != len(pairs) * len(seeds):
-            raise ValueError("every pair needs an outcome under every seed")
-        grid = [[self._outcomes[p, s].errors[method] for s in seeds] for p in pairs]
+        seeds = [s for s in seeds if all((p, s) in self._outcomes for p in pairs)]
         shape = (len(pairs), len(seeds))
-        return {
-            name: np.array([[getattr(e, name) for e in row] for row in grid]).reshape(shape)
-            for name in ("rot_deg", "tdir_deg", "failed")
-        }
+        grid = [self._outcomes[p, s].errors[method] for p in pairs for s in seeds]
+        return {name: values.reshape(shape) for name, values in _columns(grid).items()}
 
     def results(self) -> dict[str, dict[str, Any]]:
-        """Return per method the summary of its errors and ``cpu_ms``."""
+        """Return per method the summary of its errors and ``cpu_ms``, over all outcomes."""
         summary = {}
         for method in self._methods:
-            flat = {name: values.ravel() for name, values in self.errors(method).items()}
+            errors = _columns([o.errors[method] for o in self.outcomes])
             times = [o.cpu_ms[method] for o in self.outcomes if method in o.cpu_ms]
-            summary[method] = {**summarise_pose_errors(flat), "cpu_ms": percentiles(times)}
+            summary[method] = {**summarise_pose_errors(errors), "cpu_ms": percentiles(times)}
         return summary
 
     def auroc_of_cues(self) -> dict[str, dict[str, float | None]]:
@@ -133,6 +128,11 @@ class PairCell:
                     for name in ("rot_deg", "tdir_deg")
                 ]
         return found
+
+
+def _columns(errors: Sequence[PoseError]) -> dict[str, Array]:
+    """Return errors ``(N,)`` by figure."""
+    return {name: np.array([getattr(e, name) for e in errors]) for name in ("rot_deg", "tdir_deg", "failed")}
 
 
 def merge_cells(methods: Sequence[str], cells: Sequence[PairCell]) -> PairCell:

@@ -126,6 +126,22 @@ def test_pairs_keep_every_pair(room, interrupted, tmp_path):
     assert pairs == [(20.0, 2, 2), (20.0, 1, 3)]
 
 
+def test_pairs_of_a_seed_that_is_not_finished_are_kept_and_not_compared(room, interrupted, tmp_path):
+    settings = PairSettings(
+        sequence=room,
+        codec="phase",
+        snr_db=(20.0,),
+        seeds=3,
+        max_frames=4,
+        competitors=False,
+        json=tmp_path / "r.json",
+    )
+    report = left_of(evaluate_pairs, settings, interrupted(2 * 4 + 3))
+    (cell,) = report["cells"]
+    assert cell["results"]["robust"]["num_pairs"] == report["results"]["robust"]["num_pairs"] == 2 * 3 + 1
+    assert cell["comparisons"][0]["paired"]["num_samples"] == 3
+
+
 @pytest.mark.parametrize(
     ("evaluate", "cls", "num_before", "given"),
     [

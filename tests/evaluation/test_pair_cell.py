@@ -63,12 +63,18 @@ def test_comparisons_pair_the_same_pairs(cell):
     assert paired.num_samples == 6
 
 
-def test_gaps_and_doubles_are_refused(cell):
+def test_a_seed_that_lacks_pairs_counts_in_results_and_in_no_comparison(cell):
+    cell.add(6, 0, outcome((0, 0), (0, 0)))
+    assert cell.errors("off")["tdir_deg"].shape == (7, 1)
+    assert cell.results()["off"]["num_pairs"] == 13
+    assert (
+        cell.comparisons(["robust"], ["off"], np.random.default_rng(0), block=1)[0]["paired"].num_samples == 7
+    )
+
+
+def test_doubles_and_missing_methods_are_refused(cell):
     with pytest.raises(ValueError, match="before"):
         cell.add(0, 0, outcome((0, 0), (0, 0)))
-    cell.add(6, 0, outcome((0, 0), (0, 0)))
-    with pytest.raises(ValueError, match="every seed"):
-        cell.errors("off")
     with pytest.raises(ValueError, match="missing paper"):
         PairCell(["paper"]).add(0, 0, outcome((0, 0), (0, 0)))
 
