@@ -39,7 +39,8 @@ class StreamEnd:
             if status.ended:
                 self._num_sent[status.agent_epoch] = status.counts.get("sent", 0)
                 if len(self._num_sent) > _REMEMBERED:
-                    self._num_sent.pop(min(self._num_sent))
+                    # Not the lowest one: that of an agent whose clock was set back is the newest.
+                    del self._num_sent[next(iter(self._num_sent))]
 
     def begin(self) -> None:
         """Begin on another stream."""
