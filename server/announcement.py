@@ -22,9 +22,15 @@ def _unpack_or_none(payload: bytes) -> CameraInfo | None:
 
 
 def answered_camera(
-    session: Session, agent_id: str, agent_epoch: int, timeout_s: float = CAMERA_TIMEOUT_S
+    session: Session, agent_id: str, agent_epoch: int | None = None, timeout_s: float = CAMERA_TIMEOUT_S
 ) -> CameraInfo | None:
-    """Ask for the camera of one start of an agent; None where nobody answers: two may have one name.
+    """Ask for the camera of a start of an agent; None where nobody answers: two may have one name.
+
+    Args:
+        session: Where they are asked.
+        agent_id: Their name.
+        agent_epoch: Of the start; None for the first that answers.
+        timeout_s: How long they have for it.
 
     Raises:
         TransportError: The session is closed.
@@ -32,7 +38,7 @@ def answered_camera(
 
     def is_wanted(answer: bytes) -> bool:
         camera = _unpack_or_none(answer)
-        return camera is not None and camera.agent_epoch == agent_epoch
+        return camera is not None and agent_epoch in (None, camera.agent_epoch)
 
     answer = session.request(camera_key(agent_id), b"", timeout_s, is_wanted)
     return _unpack_or_none(answer) if answer is not None else None
@@ -53,9 +59,7 @@ class Announcement:
         self._newest: CameraInfo | None = None
         session.subscribe(camera_key(agent_id), "every", self._hear)
         if "agent" in session.alive_roles(agent_id, CAMERA_TIMEOUT_S):
-            answer = session.request(camera_key(agent_id), b"", CAMERA_TIMEOUT_S)
-            if answer is not None:
-                self._note(_unpack_or_none(answer))
+            self._note(answered_camera(session, agent_id))
 
     def _hear(self, payload: bytes) -> None:
         """Note an announced stream; the receiver counts and reports what is not valid.

@@ -10,21 +10,15 @@ from typing import Any
 
 from semcast import SourceError, TransportError, __version__
 from semcast.common.config import to_toml
-from semcast.common.keys import (
-    CAMERA_TIMEOUT_S,
-    DEFAULT_AGENT_ID,
-    agent_of,
-    all_keys,
-    camera_key,
-    check_agent_id,
-)
+from semcast.common.keys import DEFAULT_AGENT_ID, agent_of, all_keys, camera_key, check_agent_id
 from semcast.common.messages import CameraInfo, StatusMessage
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.recorder import Recorder
 from semcast.common.recording_writer import recording_metadata
 from semcast.common.transport import Session, open_session
 from semcast.common.whole_file import check_writable
-from semcast.common.wire import WireError, unpack
+from semcast.common.wire import WireError, pack, unpack
+from semcast.server.announcement import answered_camera
 
 logger = logging.getLogger(__name__)
 
@@ -69,10 +63,10 @@ class StreamNotes:
 
     Args:
         recorder: Where to.
-        ask: Returns an agent's camera message, given the key, or None.
+        ask: Returns the camera of a start of an agent, or of any where that is None; None without an answer.
     """
 
-    def __init__(self, recorder: Recorder, ask: Callable[[str], bytes | None]) -> None:
+    def __init__(self, recorder: Recorder, ask: Callable[[str, int | None], CameraInfo | None]) -> None:
         self._recorder = recorder
         self._ask = ask
         self._epochs: set[int] = set()
@@ -89,14 +83,13 @@ class StreamNotes:
 
     def _look_for_camera(self, key: str, status: StatusMessage) -> None:
         if status.role == "agent" and status.agent_epoch not in self._epochs:
-            self.put_camera(agent_of(key))
+            self.put_camera(agent_of(key), status.agent_epoch)
 
-    def put_camera(self, agent_id: str) -> None:
-        """Ask an agent for its camera and record that; nothing happens where there is no answer."""
-        key = camera_key(agent_id)
-        answer = self._ask(key)
-        if answer is not None:
-            self.put(key, answer)
+    def put_camera(self, agent_id: str, agent_epoch: int | None = None) -> None:
+        """Ask for the camera of an agent's start and record that; nothing happens where nobody answers."""
+        camera = self._ask(agent_id, agent_epoch)
+        if camera is not None:
+            self.put(camera_key(agent_id), pack(camera))
 
     def _note(self, camera: CameraInfo) -> None:
         if camera.agent_epoch in self._epochs:
@@ -136,9 +129,9 @@ def recording(
     """
     with Recorder(file, recording_metadata(settings_toml, __version__), on_error=on_error) as recorder:
 
-        def ask(key: str) -> bytes | None:
+        def ask(agent_id: str, agent_epoch: int | None) -> CameraInfo | None:
             with contextlib.suppress(TransportError):  # the session ends while we are at it
-                return session.request(key, b"", CAMERA_TIMEOUT_S)
+                return answered_camera(session, agent_id, agent_epoch)
             return None
 
         notes = StreamNotes(recorder, ask)

@@ -102,19 +102,20 @@ def test_a_key_tells_the_kind_of_its_messages():
 
 def test_the_camera_of_an_agent_that_came_back_is_asked_for(tmp_path, recording):
     messages = list(RecordingReader(recording).messages(frozenset({"camera", "status", "symbols"})))
-    camera = next(m for m in messages if m.kind == "camera")
+    camera = unpack(next(m for m in messages if m.kind == "camera").data, CameraInfo)
     asked = []
 
-    def answer(key):
-        asked.append(key)
-        return camera.data if len(asked) > 1 else None
+    def answer(agent_id, agent_epoch):
+        asked.append((agent_id, agent_epoch))
+        return camera if len(asked) > 1 else None
 
     with Recorder(tmp_path / "late.mcap", recording_metadata("", "test")) as recorder:
         notes = StreamNotes(recorder, answer)
         status = next(m for m in messages if m.topic.endswith("status/agent"))
         for message in (*(m for m in messages if m.kind == "symbols"), status, status, status):
             notes.put(message.topic, message.data)
-    assert asked == 2 * ["semcast/agent0/camera"], "again after silence, and not once it is known"
+    # Two agents of one name would answer each for the other.
+    assert asked == 2 * [("agent0", camera.agent_epoch)], "again after silence, and not once it is known"
     (stream,) = recorded_streams(RecordingReader(tmp_path / "late.mcap"))
     assert stream.num_received == FRAMES
 
