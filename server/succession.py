@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from semcast.common.errors import ConfigError, SemcastError
+from semcast.common.errors import ConfigError, SemcastError, SourceError
 from semcast.common.messages import CameraInfo
 from semcast.common.metrics import Metrics
 from semcast.common.sequence import open_sequence
@@ -35,8 +35,8 @@ _IN_A_HURRY_S, _STOPPED_S = 2.0, 12.0
 class SuccessiveSessions:
     """Begins the session of each stream, with what is shown of it, and writes what it leaves.
 
-    Files that can't be written, and a stream after the first that can't be shown, are reported and nothing
-    ends. Used from one thread.
+    Files that can't be written, and a stream after the first that can't be shown or compared with its
+    reference, are reported and nothing ends. Used from one thread.
 
     Args:
         settings: Of the server.
@@ -92,10 +92,8 @@ class SuccessiveSessions:
         self._end_of.begin()
         if former is not None and former.identity.camera != identity.camera:
             self._close_reference()
-        if self._settings.reference is not None and self._reference is None:
-            self._reference = sequence_reference(
-                self._settings.reference, identity.camera, self._settings.camera
-            )
+        if self._reference is None:
+            self._reference = self._new_reference(identity, goes_on=former is not None)
         self.current = self._new_session(identity, goes_on=former is not None)
         self._former_starts.begin(identity.agent_epoch)
         self._drops_before = self._metrics.drops if former is not None else {}
@@ -105,6 +103,19 @@ class SuccessiveSessions:
             *(identity.agent_id, camera.source_name, *camera.image_wh, camera.codec, self._settings.mode),
         )
         return self.current
+
+    def _new_reference(self, identity: StreamIdentity, *, goes_on: bool) -> Reference | None:
+        """Return the reference for a camera; a server that ``goes_on`` does without one if need be."""
+        folder = self._settings.reference
+        if folder is None:
+            return None
+        try:
+            return sequence_reference(folder, identity.camera, self._settings.camera)
+        except SourceError as err:
+            if not goes_on:
+                raise
+            self.report(f"the new stream has no PSNR and no true path: {err}")
+            return None
 
     def _new_session(self, identity: StreamIdentity, *, goes_on: bool) -> Session:
         """Return the session of a stream; a server that ``goes_on`` keeps it in memory if need be."""

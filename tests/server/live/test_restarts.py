@@ -3,8 +3,10 @@
 import contextlib
 import json
 import logging
+import shutil
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from semcast.common.errors import ConfigError
 from semcast.common.recorded_streams import recorded_streams
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.run_folder import read_run
+from semcast.common.sequence import open_sequence
 from semcast.common.wire import pack
 from semcast.server.export.outputs import write_ply
 from semcast.server.feedback import WINDOW
@@ -22,6 +25,7 @@ from semcast.server.view.settings import ViewSettings
 pytestmark = pytest.mark.xdist_group("real-time")
 
 DEADLINE_S = 60.0
+DEMO = Path(__file__).resolve().parents[3] / "deploy" / "demo" / "kitti_06"
 
 
 def centre(pose):
@@ -125,6 +129,25 @@ def test_a_new_start_that_cannot_be_shown_is_tracked_all_the_same(tmp_path, air,
     assert running.finish(stop=True)["frames"]["tracked"] == 4
     assert "run.rrd can't be written: No space left on device" in caplog.text
     assert (tmp_path / "previous-1" / "run.rrd").stat().st_size > 0
+
+
+def test_a_new_start_whose_reference_is_gone_is_tracked_without(tmp_path, air, caplog):
+    reference = shutil.copytree(DEMO, tmp_path / "reference")
+    running = air.serve(reference=reference)
+    first = air.agent(100)
+    first.stream(range(3))
+    first.close()
+    shutil.rmtree(reference)
+    # It is read again for another camera.
+    stored = air.sequence.stored_camera
+    air.sequence = open_sequence(DEMO, replace(stored, fx=1.01 * stored.fx), resize=0.5, max_frames=24)
+    second = air.agent(200)
+    second.stream(range(4))
+    second.close()
+    summary = running.finish(stop=True)
+    assert summary["frames"]["tracked"] == 4
+    assert summary["psnr_db"] is None
+    assert f"the new stream has no PSNR and no true path: no sequence at {reference}" in caplog.text
 
 
 def test_a_folder_that_another_server_writes_into_is_refused(tmp_path, open_air):
