@@ -18,6 +18,7 @@ times and ``final_trajectory()`` of all posed frames, keyframe ids, ``landmarks(
 (landmark id, keyframe id, x, y), and the parts of the map that frames and landmarks are in.
 """
 
+import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -49,6 +50,10 @@ RESULT_FILES = (TRAJECTORY_NAME, MAP_NAME, DENSE_NAME, RECONSTRUCTION_NAME, SUMM
 RECORD_FILES = (FRAMES_NAME, VIEWER_NAME, CHECKPOINT_NAME)
 #: All files a run may leave, besides those in the folder ``IMAGES_NAME``.
 RUN_FILES = (*RESULT_FILES, DEMO_SETTINGS_NAME, *RECORD_FILES)
+
+#: What images and ``run.rrd`` leave free of a disk: the path, the map and the dense cloud, up to some 50 MB,
+#: come last.
+RESERVED_BYTES = 100_000_000
 
 FORMAT = 1
 MAX_UNPACKED_BYTES = 4 * 1024**3
@@ -250,6 +255,19 @@ def read_run(folder: Path) -> RunData:
 def files_of_run(folder: Path) -> list[Path]:
     """Return the files that a run left in its folder, those of results first, without images."""
     return [folder / name for name in RUN_FILES if (folder / name).is_file()]
+
+
+def shortage(folder: Path) -> str | None:
+    """Say how little of a folder's disk is free where no more than results need is; None where more is."""
+    try:
+        free = shutil.disk_usage(folder).free
+    except OSError:  # who writes will say it
+        return None
+    if free >= RESERVED_BYTES:
+        return None
+    return (
+        f"{free / 1e6:.0f} MB of the disk are free, of which {RESERVED_BYTES / 1e6:.0f} are kept for results"
+    )
 
 
 def image_name(frame_id: int) -> str:

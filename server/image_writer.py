@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import shutil
 import threading
 import time
 from collections import deque
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from semcast.common.errors import SourceError
 from semcast.common.mailbox import Mailbox
-from semcast.common.run_folder import IMAGES_NAME, image_name
+from semcast.common.run_folder import IMAGES_NAME, image_name, shortage
 
 logger = logging.getLogger(__name__)
 
@@ -25,8 +24,6 @@ MAX_PROVISIONAL = 300
 #: How long no image is written after one that could not be.
 RETRY_S = 5.0
 _JPEG_QUALITY = 95
-#: What images leave free of a disk: the path, the map and the dense cloud, up to some 50 MB, come last.
-RESERVED_BYTES = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class _Image:
 class ImageWriter:
     """Writes decoded images into ``images/``.
 
-    A disk with less than ``RESERVED_BYTES`` free, or whatever else keeps an image from being written, is
+    A disk with less free than is kept for results, or whatever else keeps an image from being written, is
     reported; the stream goes on, images are left out and counted as dropped, and it is tried again every
     ``RETRY_S``.
 
@@ -126,11 +123,8 @@ class ImageWriter:
         self._drop_provisional(frozenset())
 
     def _write(self, item: _Image) -> None:
-        if (free := shutil.disk_usage(self._images).free) < RESERVED_BYTES:
-            raise OSError(
-                f"{free / 1e6:.0f} MB of the disk are free, of which {RESERVED_BYTES / 1e6:.0f} are kept for "
-                "results"
-            )
+        if (why := shortage(self._images)) is not None:
+            raise OSError(why)
         bgr = cv2.cvtColor(item.image, cv2.COLOR_RGB2BGR)
         good, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         if not good:

@@ -1,4 +1,6 @@
-"""A disk that takes no more ends the file and not the run, and who watches the run is told."""
+"""A disk without room keeps the file waiting, or ends it, and not the run; who watches that is told."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -86,6 +88,32 @@ def test_a_file_whose_end_did_not_go_out_is_told(tmp_path, delivery):
     FileStream(stream, tmp_path / "run.rrd", lambda cursor: None, told.append).close()
     assert len(told) == (delivery is not Delivery.DONE)
     assert stream.closed
+
+
+def test_the_file_leaves_the_end_of_a_disk_to_the_results(tmp_path, monkeypatch, caplog):
+    class Stream:
+        def __init__(self):
+            self.written = []
+
+        def write(self, changes):
+            self.written.append(changes)
+
+        def flush(self, timeout_s):
+            return Delivery.DONE
+
+    stream, told, rounds = Stream(), [], iter(range(100))
+    file = FileStream(stream, tmp_path / "run.rrd", lambda cursor: next(rounds), told.append)
+    monkeypatch.setattr("semcast.server.view.file_stream._FLUSH_INTERVAL_S", 0.0)
+    for free, written in ((101e6, [0]), (99e6, [0, 1]), (98e6, [0, 1]), (101e6, [0, 1]), (101e6, [0, 1, 2])):
+        monkeypatch.setattr("shutil.disk_usage", lambda path, free=free: SimpleNamespace(free=free))
+        file.write()
+        assert stream.written == written, "what waits is written when there is room again"
+    why = "99 MB of the disk are free, of which 100 are kept for results"
+    assert told == [f"{tmp_path / 'run.rrd'} is not written any further: {why}"]
+    assert [message.partition(";")[0] for message in caplog.messages] == [
+        told[0],
+        f"{tmp_path / 'run.rrd'} is written again, with what waited",
+    ]
 
 
 def test_a_file_that_is_whole_is_no_error(tmp_path):
