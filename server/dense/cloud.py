@@ -43,11 +43,16 @@ class DensePatch:
 
     def thinned(self) -> "DensePatch":
         """Return it with every second point, rather one less than one more."""
-        return replace(self, xyz=self.xyz[1::2], rgb=self.rgb[1::2], confidence=self.confidence[1::2])
+        return self._only(slice(1, None, 2))
 
     def emptied(self) -> "DensePatch":
         """Return it without points, for who has to take away what it had."""
-        return replace(self, xyz=self.xyz[:0], rgb=self.rgb[:0], confidence=self.confidence[:0])
+        return self._only(slice(0))
+
+    def _only(self, rows: slice) -> "DensePatch":
+        xyz, rgb, confidence = self.xyz[rows], self.rgb[rows], self.confidence[rows]
+        # As views they would keep all points in memory.
+        return replace(self, xyz=xyz.copy(), rgb=rgb.copy(), confidence=confidence.copy())
 
 
 @dataclass(frozen=True)
@@ -118,35 +123,46 @@ class DenseCloud:
             ids: ``(L,)`` landmarks that the keyframe sees.
             depth: ``(L,)`` how far they are from it, in the units of the points.
         """
-        self._patches[patch.frame_id] = patch
         self._landmarks[patch.frame_id] = (ids, depth)
-        self._changed.add(patch.frame_id)
+        self._put(patch)
         while len(self) > self._max_points:
             holding = [k for k in sorted(self._patches) if len(self._patches[k].xyz)]
             for frame_id in holding[: (len(holding) + 1) // 2]:
-                self._patches[frame_id] = self._patches[frame_id].thinned()
-                self._changed.add(frame_id)
+                self._put(self._patches[frame_id].thinned())
+
+    def _put(self, patch: DensePatch) -> None:
+        """Let a patch take the place of the one before it; of an empty one the scale is of no interest."""
+        self._patches[patch.frame_id] = patch
+        self._changed.add(patch.frame_id)
+        if not len(patch.xyz):
+            self._landmarks.pop(patch.frame_id, None)
 
     def follow(self, world: WorldMap, frame_ids: Collection[int]) -> None:
         """Take the scale of keyframes that moved from their landmarks: joined parts and loops change it."""
         for frame_id in frame_ids:
-            patch = self._patches.get(frame_id)
-            scale = None if patch is None else scale_since(world, frame_id, *self._landmarks[frame_id])
-            if patch is not None and scale is not None and abs(scale / patch.scale - 1.0) > _SCALE_CHANGE:
-                self._patches[frame_id] = replace(patch, scale=scale)
-                self._changed.add(frame_id)
+            if frame_id not in self._landmarks:
+                continue
+            patch, scale = self._patches[frame_id], scale_since(world, frame_id, *self._landmarks[frame_id])
+            if scale is not None and abs(scale / patch.scale - 1.0) > _SCALE_CHANGE:
+                self._put(replace(patch, scale=scale))
 
     def withdraw(self, frame_ids: Collection[int]) -> None:
         """Empty the patches of keyframes whose pose was taken back."""
         for frame_id in frame_ids:
             if (patch := self._patches.get(frame_id)) is not None and len(patch.xyz):
-                self._patches[frame_id] = patch.emptied()
-                self._changed.add(frame_id)
+                self._put(patch.emptied())
 
     def take_changes(self) -> tuple[DensePatch, ...]:
-        """Return patches that were added or changed since this was last called, by frame id."""
+        """Return patches that were added or changed since this was last called, by frame id.
+
+        Those that were emptied are forgotten then: a camera that runs for days has keyframes without end.
+        """
         changed, self._changed = sorted(self._changed), set()
-        return tuple(self._patches[frame_id] for frame_id in changed)
+        patches = tuple(self._patches[frame_id] for frame_id in changed)
+        for patch in patches:
+            if not len(patch.xyz):
+                del self._patches[patch.frame_id]
+        return patches
 
     def points(self, world: WorldMap) -> CloudPoints:
         """Return all points with the present poses; those of keyframes without a pose are left out."""

@@ -94,6 +94,31 @@ def test_what_is_too_much_is_taken_from_the_older_half():
         assert 20 <= len(cloud) <= 39
 
 
+@pytest.mark.parametrize("less", [DensePatch.thinned, DensePatch.emptied])
+def test_what_is_taken_away_is_not_kept_in_memory(less):
+    whole = patch(0)
+    left = less(whole)
+    for name in ("xyz", "rgb", "confidence"):
+        assert not np.may_share_memory(getattr(left, name), getattr(whole, name))
+        assert getattr(left, name).base is None
+
+
+def test_what_is_thinned_to_nothing_is_handed_out_empty_and_forgotten():
+    world = make_world(range(0, 400, 10))
+    cloud, sizes = DenseCloud(max_points=20), {}
+    for keyframe in world.keyframes:
+        cloud.add(patch(keyframe.frame_id), *landmark_depths(world, keyframe))
+        sizes |= {p.frame_id: len(p.xyz) for p in cloud.take_changes()}
+        cloud.follow(world, [0, keyframe.frame_id])
+    assert sizes[0] == 0
+    assert sum(sizes.values()) == len(cloud) <= 20
+    assert len(cloud._patches) == len(cloud._landmarks) <= 10
+    cloud.withdraw(sizes)
+    assert {len(p.xyz) for p in cloud.take_changes()} == {0}
+    assert not cloud._patches
+    assert not cloud._landmarks
+
+
 def test_points_of_a_frame_without_a_pose_are_left_out():
     world = make_world()
     cloud = cloud_of(world)
