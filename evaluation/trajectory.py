@@ -51,6 +51,8 @@ FIGURES = (
     "rpe_rot_deg",
     "psnr_db",
 )
+#: Those of which the largest is the best.
+_LARGEST_IS_BEST = frozenset({"completeness", "completeness_at_once", "psnr_db"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,9 +174,10 @@ def _run_entry(run: ReconstructedRun, seed: int, gap: Gap | None, *, with_rows: 
     return {**entry, "rows": run.rows} if with_rows else entry
 
 
-def median_or_none(values: Sequence[float | None]) -> float | None:
+def median_or_none(values: Sequence[float | None], *, largest_is_best: bool = False) -> float | None:
     """Return the median with None counted as worse than any number; None when that is the median."""
-    median = float(np.median([np.inf if v is None else v for v in values])) if len(values) else np.inf
+    worst = -np.inf if largest_is_best else np.inf
+    median = float(np.median([worst if v is None else v for v in values])) if len(values) else worst
     return median if np.isfinite(median) else None
 
 
@@ -210,7 +213,10 @@ def _cell(snr_db: float | None, mode: str, runs: list[dict[str, Any]], *, has_tr
         "snr_db": snr_db,
         "confidence": mode,
         "seeds": [run["seed"] for run in runs],
-        **{name: median_or_none([run[name] for run in runs]) for name in FIGURES},
+        **{
+            name: median_or_none([run[name] for run in runs], largest_is_best=name in _LARGEST_IS_BEST)
+            for name in FIGURES
+        },
         **(
             {"recovery_s": median_or_none([run["gap"]["recovery_s"] for run in runs])}
             if "gap" in runs[0]

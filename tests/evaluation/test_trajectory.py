@@ -3,6 +3,7 @@ import shutil
 from dataclasses import replace
 
 import cv2
+import numpy as np
 import pytest
 
 from semcast.channel.settings import ChannelSettings
@@ -201,8 +202,19 @@ def test_a_truth_of_a_part_of_the_recording_is_told(room, tmp_path, caplog):
 
 def test_a_failed_run_counts_as_worse_than_any_number():
     assert median_or_none([1.0, None, 2.0]) == 2.0
+    assert median_or_none([1.0, None, 2.0], largest_is_best=True) == 1.0
     assert median_or_none([1.0, None, None]) is None
     assert median_or_none([]) is None
+
+
+def test_a_run_of_which_nothing_arrives_is_worst_in_quality_too(room, phase_codec):
+    settings = TrajectorySettings(
+        sequence=room, codec="phase", max_frames=2, seeds=5, link=ChannelSettings(frame_loss=0.7)
+    )
+    (cell,) = evaluate_trajectory(settings, phase_codec)["cells"]
+    found = [run["psnr_db"] for run in cell["runs"]]
+    assert 0 < found.count(None) <= 2
+    assert cell["psnr_db"] == sorted(-np.inf if psnr_db is None else psnr_db for psnr_db in found)[2]
 
 
 def test_modes_must_be_some_and_different(room):
