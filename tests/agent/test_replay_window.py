@@ -69,6 +69,20 @@ def test_room_opens_as_the_consumer_takes_frames(window):
     assert window.all_taken
 
 
+def test_what_arrives_begins_the_patience_anew(window, clock):
+    window.on_flow(flow(0, epoch=0))
+    fill(window, 0)
+    window.due()
+    clock.now_s += 1.0
+    assert seqs(window.due()) == [0, 1, 2], "in vain, so the next time is 2 s later"
+    clock.now_s += 1.5
+    window.on_flow(flow(0, arrived_seq=1))
+    clock.now_s += 0.9
+    assert window.due() == [], "something arrived 0.9 s ago"
+    clock.now_s += 0.1
+    assert seqs(window.due()) == [1, 2]
+
+
 def test_what_does_not_arrive_is_sent_again_with_growing_patience(window, clock):
     window.on_flow(flow(0, epoch=0))
     fill(window, 0)

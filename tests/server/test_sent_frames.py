@@ -47,6 +47,7 @@ def test_what_was_sent_behind_the_last_that_arrived_counts_where_it_is_known():
     numbers = {0: 0, 3: 1, 6: 2}
     assert stretches(numbers, num_sent=3) == stretches(numbers)
     assert stretches(numbers, num_sent=5)[-1] == Stretch(9, 12, 2)
+    assert stretches({12: 4, 18: 6}, num_sent=9)[-1] == Stretch(21, 24, 2)
     assert stretches({}, num_sent=4) == [Stretch(0, 3, 4)]
     assert stretches({5: 2}, num_sent=4)[-1] == Stretch(6, 6, 1)
     assert stretches({0: None, 1: None}, num_sent=9) == stretches({0: None, 1: None})
