@@ -64,6 +64,14 @@ def test_one_degree_per_step_too_much_is_an_rpe_of_one_degree():
     assert rpe(Trajectory(truth.t_s, poses), truth, 1.0).rot_deg == pytest.approx(1.0)
 
 
+def test_there_is_no_rpe_of_a_single_pose_nor_of_a_true_camera_that_stands():
+    truth = wandering(4, 0)
+    single = Trajectory(truth.t_s[:1], truth.T_world_cam[:1])
+    assert rpe(single, truth, 1.0) is None
+    standing = Trajectory(truth.t_s, np.repeat(truth.T_world_cam[:1], 4, axis=0))
+    assert rpe(truth, standing, 1.0) is None
+
+
 def test_ate_and_rpe_agree_with_evo():
     pytest.importorskip("evo")
     from evo.core import metrics
