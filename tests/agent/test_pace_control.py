@@ -71,6 +71,19 @@ def test_the_stride_is_what_the_server_can_serve(service_ms, stride):
     assert np.mean(gaps == stride) > 0.7, "evenly spaced"
 
 
+def test_what_the_beginning_of_a_map_keeps_the_server_from_says_nothing_of_the_pace():
+    pace, passed_over = PaceControl(1, rate_hz=0.0), 0
+    for frame_id in range(60):
+        assert pace.wants(round(frame_id * PERIOD_S * 1e9))
+        passed_over += 2 if frame_id <= 20 else 0
+        pace.on_report(report(frame_id, passed_over))
+    assert pace.stride == 1
+    for frame_id in range(60, 76):
+        passed_over += 2
+        pace.on_report(report(frame_id, passed_over))
+    assert pace.stride > 1
+
+
 def test_trials_of_more_become_rare_when_they_fail():
     _, _, strides = run(lambda now_s: 0.060, 300)
     trials = np.flatnonzero((strides[1:] == 1) & (strides[:-1] == 2))
