@@ -5,7 +5,8 @@ where turning and moving look alike. The new tracks are many and everywhere. How
 roughly, as far as others: that much uncertainty moves a projection only along one line, and hardly at all
 while the camera is near the keyframe (inverse depth with its uncertainty: Civera, Davison and Montiel 2008).
 Something large that moves by itself has such tracks too, many, and for long: keyframes tell them by that no
-point at rest explains where they were seen.
+point at rest explains where they were seen. Where keyframes have turned wrongly themselves, that is said of
+the far view as well.
 """
 
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping.refuted import on_something_large
 from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -51,7 +53,14 @@ class Rays:
 
 
 def rays_of(
-    camera: Intrinsics, world: WorldMap, noise: NoiseModel, ids: Ids, T_world_cam: Array, submap: int
+    camera: Intrinsics,
+    world: WorldMap,
+    noise: NoiseModel,
+    ids: Ids,
+    T_world_cam: Array,
+    submap: int,
+    *,
+    with_refuted: bool = False,
 ) -> Rays | None:
     """Rays of tracks from the newest keyframe that saw each.
 
@@ -62,10 +71,11 @@ def rays_of(
         ids: ``(M,)`` tracks.
         T_world_cam: Approximate pose of the camera.
         submap: Part of the map whose keyframes count.
+        with_refuted: Take what that keyframe refuted too, where that is much.
 
     Returns:
-        Those of the tracks that a keyframe saw, and that it did not refute; None where there is none or no
-        depth is known.
+        Those of the tracks that a keyframe saw, without those that it refuted unless they are asked for; None
+        where there is none or no depth is known.
     """
     mine = (k for k in reversed(world.keyframes) if k.submap == submap and len(k.ids))
     views = list(islice(mine, _NUM_KEYFRAMES))  # newest first; the map may have a thousand
@@ -76,7 +86,8 @@ def rays_of(
     for position, keyframe in enumerate(views):
         row = np.minimum(np.searchsorted(keyframe.ids, ids), len(keyframe.ids) - 1)
         new = np.flatnonzero(~found & ~refuted & (keyframe.ids[row] == ids))
-        if len(keyframe.refuted):
+        # A few that are refuted have slipped. Many are something large, or the far view.
+        if len(keyframe.refuted) and not (with_refuted and len(on_something_large(keyframe))):
             refuted[new] = np.isin(ids[new], keyframe.refuted)
             new = new[~refuted[new]]
         if len(new) == 0:

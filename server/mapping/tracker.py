@@ -177,9 +177,13 @@ def track_pose(
     enough = max(MIN_INLIERS, min_share * len(marks.xyz))
     if best is not None and best.num_inliers >= enough and np.isfinite(best.T_cam_world).all():
         kept = max(enough, _MIN_KEPT_SHARE * best.num_inliers)
-        steadied = with_rays(invert_transform(best.T_cam_world), _STEADY, kept)
-        if steadied is not None and _is_borne_out(steadied, best, marks):
-            best = steadied
+        # Near landmarks at one depth can't tell a turn from a way. Keyframes that followed them refute the
+        # far view, which can: so all tracks are asked first, and landmarks tell whether they may be right.
+        for with_refuted in (True, False):
+            steadied = with_rays(invert_transform(best.T_cam_world), _STEADY, kept, with_refuted=with_refuted)
+            if steadied is not None and _is_borne_out(steadied, best, marks):
+                best = steadied
+                break
     elif may_carry and T_world_guess is not None and len(marks.xyz) < _RUN_OUT:
         best = with_rays(T_world_guess, _CARRY, max(_MIN_LEFT, min_share * len(marks.xyz)))
     else:
@@ -256,6 +260,8 @@ def _with_rays(
     T_world_cam: Array,
     needed: tuple[int, float],
     min_inliers: float,
+    *,
+    with_refuted: bool = False,
 ) -> PoseEstimate | None:
     """Refine a pose with what the tracks without a landmark say too.
 
@@ -269,11 +275,12 @@ def _with_rays(
         T_world_cam: Where to begin.
         needed: Number of rays that must agree, and the share of all rays.
         min_inliers: Landmarks that must agree.
+        with_refuted: See ``rays_of``.
 
     Returns:
         The pose with the landmarks it agrees with; None where too few agree.
     """
-    rays = rays_of(camera, world, noise, others.ids, T_world_cam, submap)
+    rays = rays_of(camera, world, noise, others.ids, T_world_cam, submap, with_refuted=with_refuted)
     if rays is None or len(rays.row) < needed[0]:
         return None
     count, with_ray = len(marks.xyz), others[rays.row]

@@ -166,3 +166,45 @@ def test_tracks_that_fit_no_pose_change_nothing(num_landmarks):
         np.testing.assert_array_equal(pose.T_world_cam, alone.T_world_cam)
     else:
         assert pose is None
+
+
+@pytest.mark.parametrize(("num_refuted", "asked"), [(40, False), (60, True)])
+def test_a_few_refuted_tracks_have_slipped_and_are_never_asked(num_refuted, asked):
+    world, _ = scene(20)
+    world.keyframes[-1].refuted = np.arange(NUM - num_refuted, NUM)
+    ids = np.arange(20, NUM)
+    rays = rays_of(CAMERA, world, NOISE, ids, MOVED, submap=0, with_refuted=True)
+    assert len(rays.row) == NUM - 20 - (0 if asked else num_refuted)
+    assert len(rays_of(CAMERA, world, NOISE, ids, MOVED, submap=0).row) == NUM - 20 - num_refuted
+
+
+def refuted_scene(seed):
+    """A map whose keyframe refutes all tracks but its landmarks; what it sees after ``MOVED``."""
+    world, xyz = scene(25, seed)
+    world.keyframes[-1].refuted = np.arange(25, NUM)
+    xy = project(xyz, MOVED) + 0.5 * np.random.default_rng(100 + seed).standard_normal((NUM, 2))
+    return world, xy
+
+
+def test_refuted_tracks_hold_the_rotation_where_landmarks_bear_them_out():
+    """Keyframes that turned wrongly refute the far view, whatever it tells of the next frame."""
+    with_rays, without = [], []
+    ids = np.arange(NUM)
+    for seed in range(16):
+        world, xy = refuted_scene(seed)
+        with_rays.append(rotation_error_deg(track(world, ids, xy, np.eye(4)).T_world_cam))
+        without.append(rotation_error_deg(track(world, ids[:25], xy[:25], np.eye(4)).T_world_cam))
+    assert np.median(with_rays) < 0.75 * np.median(without)
+
+
+def test_refuted_tracks_that_landmarks_contradict_leave_the_others_to_hold_the_rotation():
+    """They are on a lorry that turns otherwise than the camera; those that are not still steady it."""
+    ids, turned = np.arange(NUM), make_transform(exp_so3(np.array([0.0, 0.02, 0.0])), np.zeros(3))
+    still = np.r_[0:80]
+    for seed in range(4):
+        world, xyz = scene(25, seed)
+        world.keyframes[-1].refuted = ids[80:]
+        xy = project(xyz, MOVED) + 0.5 * np.random.default_rng(100 + seed).standard_normal((NUM, 2))
+        xy[80:] = project(xyz[80:], MOVED @ turned)
+        pose, alone = track(world, ids, xy, np.eye(4)), track(world, still, xy[still], np.eye(4))
+        np.testing.assert_array_equal(pose.T_world_cam, alone.T_world_cam)
