@@ -77,8 +77,7 @@ def rays_of(
         Those of the tracks that a keyframe saw, without those that it refuted unless they are asked for; None
         where there is none or no depth is known.
     """
-    mine = (k for k in reversed(world.keyframes) if k.submap == submap and len(k.ids))
-    views = list(islice(mine, _NUM_KEYFRAMES))  # newest first; the map may have a thousand
+    views = _newest(world, submap)
     depth = float("inf")
     T_cam_world = invert_transform(T_world_cam)
     xyz, spread_px, sigma_px = np.zeros((len(ids), 3)), np.zeros((len(ids), 2)), np.zeros(len(ids))
@@ -115,6 +114,17 @@ def rays_of(
     if len(rows) == 0:
         return None
     return Rays(rows, xyz[rows], np.sqrt(len(rows)) * spread_px[rows], sigma_px[rows])
+
+
+def much_is_refuted(world: WorldMap, submap: int) -> bool:
+    """Tell whether ``with_refuted`` can change what ``rays_of`` returns."""
+    return any(len(on_something_large(keyframe)) for keyframe in _newest(world, submap))
+
+
+def _newest(world: WorldMap, submap: int) -> list[Keyframe]:
+    """Keyframes whose tracks become rays, newest first; the map may have a thousand."""
+    mine = (k for k in reversed(world.keyframes) if k.submap == submap and len(k.ids))
+    return list(islice(mine, _NUM_KEYFRAMES))
 
 
 def _first_known_depth(world: WorldMap, views: list[Keyframe]) -> float:

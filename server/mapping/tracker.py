@@ -14,7 +14,7 @@ from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.projection import MIN_DEPTH_MAP
 from semcast.server.geometry.square_distance import square_distances
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.rays import rays_of
+from semcast.server.mapping.rays import much_is_refuted, rays_of
 from semcast.server.mapping.sight import Seen
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import WorldMap
@@ -179,7 +179,7 @@ def track_pose(
         kept = max(enough, _MIN_KEPT_SHARE * best.num_inliers)
         # Near landmarks at one depth can't tell a turn from a way. Keyframes that followed them refute the
         # far view, which can: so all tracks are asked first, and landmarks tell whether they may be right.
-        for with_refuted in (True, False):
+        for with_refuted in (True, False) if much_is_refuted(world, submap) else (False,):
             steadied = with_rays(invert_transform(best.T_cam_world), _STEADY, kept, with_refuted=with_refuted)
             if steadied is not None and _is_borne_out(steadied, best, marks):
                 best = steadied
