@@ -62,6 +62,10 @@ _MIN_SHARED = 0.12
 _LEAST_AGREEING = 0.5
 #: Median way of the tracks, as share of the image width, below which no start is tried.
 _MIN_FLOW_SHARE = 0.012
+#: Newer frames that are tried where an attempt found no way of the camera: as many,
+_MAX_OTHERS = 8
+#: and turning must leave more of the tracks since one of them by this factor: medians of few tracks vary.
+_MORE_RELIEF = 1.2
 #: Median angle between the rays of the two views.
 _MIN_MEDIAN_PARALLAX_DEG = 0.7
 #: How many times the standard deviation of the turn between them that angle must be, with matches that err by
@@ -151,7 +155,7 @@ class Initialiser:
         """Forget all frames."""
         self.history: list[Observed] = []
         self._reference = 0
-        self._is_tried = False
+        self._is_tried = self._found_no_way = False
         self._agreeing = 1.0
         self._too_short = Patience(_MAX_TOO_SHORT)
         self._contested = Patience(_MAX_CONTESTED)
@@ -203,6 +207,8 @@ class Initialiser:
             return None
         if len(pair.left_out) and not self._is_tried:
             pair = self._from_nearest(pair, suspect)
+        if self._found_no_way:
+            pair = self._from_most_relief(pair, suspect)
         self._is_tried = True
         evidence_px = np.array([pair.flow_px, self._relief_px(pair.xy0, pair.xy1)])
         if not self._undecided.wants(evidence_px):
@@ -225,7 +231,8 @@ class Initialiser:
         )
         agreeing = 0.0 if scene is None else float(scene.motion.inliers.mean())
         self._agreeing = max(_LEAST_AGREEING, agreeing)
-        if scene is None or not self._is_good(scene) or not self._has_gone(pair, scene):
+        self._found_no_way = scene is None or not self._is_good(scene) or not self._has_gone(pair, scene)
+        if scene is None or self._found_no_way:
             return None
         if scene.is_contested and self._contested.puts_off():
             return None
@@ -266,6 +273,26 @@ class Initialiser:
             if self._has_moved(nearer):
                 self._reference = k
                 return nearer
+        return pair
+
+    def _from_most_relief(self, pair: _Pair, suspect: Ids) -> _Pair:
+        """Let the reference be a newer frame if turning leaves clearly more of the tracks since that one.
+
+        Of a camera that turns to and fro, the oldest frame that shares enough tracks with the newest shares a
+        strip at the edge, across which going looks like turning, and tracks that have drifted for long.
+
+        Args:
+            pair: Of the reference as it was, which is kept if no newer frame is better.
+            suspect: Tracks that may be of no scene.
+        """
+        least_px = _MORE_RELIEF * self._relief_px(pair.xy0, pair.xy1)
+        others = np.linspace(self._reference, len(self.history) - 1, _MAX_OTHERS + 2, dtype=int)[1:-1]
+        for k in np.unique(others[others > self._reference]).tolist():
+            other = _pair(self.history[k], self.history[-1], suspect)
+            if self._has_moved(other) and (relief_px := self._relief_px(other.xy0, other.xy1)) > least_px:
+                pair, least_px = other, relief_px
+                self._reference = k
+                self._undecided.forget_evidence()
         return pair
 
     def _relief_px(self, xy0: Array, xy1: Array) -> float:
