@@ -207,10 +207,11 @@ class Initialiser:
             return None
         if len(pair.left_out) and not self._is_tried:
             pair = self._from_nearest(pair, suspect)
+        relief_px = self._relief_px(pair.xy0, pair.xy1)
         if self._found_no_way:
-            pair = self._from_most_relief(pair, suspect)
+            pair, relief_px = self._from_most_relief(pair, relief_px, suspect)
         self._is_tried = True
-        evidence_px = np.array([pair.flow_px, self._relief_px(pair.xy0, pair.xy1)])
+        evidence_px = np.array([pair.flow_px, relief_px])
         if not self._undecided.wants(evidence_px):
             return None
         # Two views in succession: the search that would tell whether they are good is what waiting saves.
@@ -275,7 +276,7 @@ class Initialiser:
                 return nearer
         return pair
 
-    def _from_most_relief(self, pair: _Pair, suspect: Ids) -> _Pair:
+    def _from_most_relief(self, pair: _Pair, relief_px: float, suspect: Ids) -> tuple[_Pair, float]:
         """Let the reference be a newer frame if turning leaves clearly more of the tracks since that one.
 
         Of a camera that turns to and fro, the oldest frame that shares enough tracks with the newest shares a
@@ -283,17 +284,21 @@ class Initialiser:
 
         Args:
             pair: Of the reference as it was, which is kept if no newer frame is better.
+            relief_px: What turning leaves of its tracks, see ``_relief_px``.
             suspect: Tracks that may be of no scene.
+
+        Returns:
+            The pair of the reference, and what turning leaves of that.
         """
-        least_px = _MORE_RELIEF * self._relief_px(pair.xy0, pair.xy1)
+        least_px = _MORE_RELIEF * relief_px
         others = np.linspace(self._reference, len(self.history) - 1, _MAX_OTHERS + 2, dtype=int)[1:-1]
         for k in np.unique(others[others > self._reference]).tolist():
             other = _pair(self.history[k], self.history[-1], suspect)
-            if self._has_moved(other) and (relief_px := self._relief_px(other.xy0, other.xy1)) > least_px:
-                pair, least_px = other, relief_px
+            if self._has_moved(other) and (left_px := self._relief_px(other.xy0, other.xy1)) > least_px:
+                pair, relief_px, least_px = other, left_px, left_px
                 self._reference = k
                 self._undecided.forget_evidence()
-        return pair
+        return pair, relief_px
 
     def _relief_px(self, xy0: Array, xy1: Array) -> float:
         """Median way of tracks that turning alone does not explain: a hand turns more than it goes."""
