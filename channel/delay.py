@@ -9,8 +9,10 @@ import numpy as np
 
 from semcast.common.worker_guard import WorkerGuard
 
-#: Ten seconds of delay at 50 frames per second.
+#: Ten seconds of delay at 50 frames per second,
 CAPACITY = 512
+#: and at 30 of 1920x1080; a packet of the largest frames has 16 MiB.
+CAPACITY_BYTES = 512 * 1024**2
 _JITTER_STREAM = 0x717
 
 
@@ -34,13 +36,19 @@ class DelayLine:
     Args:
         send: Gets the packet. Where it fails on the line's thread, that packet is lost and the next one sent.
         on_failure: Is told in a line what failed there.
+        capacity_bytes: How much may wait.
     """
 
     def __init__(
-        self, send: Callable[[bytes, bool], None], on_failure: Callable[[str], None] | None = None
+        self,
+        send: Callable[[bytes, bool], None],
+        on_failure: Callable[[str], None] | None = None,
+        capacity_bytes: int = CAPACITY_BYTES,
     ) -> None:
         self._send = send
+        self._capacity_bytes = capacity_bytes
         self._waiting: deque[tuple[float, bytes, bool]] = deque()
+        self._waiting_bytes = 0
         self._changed = threading.Condition()
         self._sending = False
         self._last_due_s = 0.0
@@ -53,7 +61,7 @@ class DelayLine:
         """Take a packet; without any delay it is sent at once, by the caller.
 
         Returns:
-            False when too many packets wait already, or the line is closed; it is dropped then.
+            False when too many or too large packets wait already, or the line is closed; it is dropped then.
         """
         due_s = time.monotonic() + 1e-3 * delay_ms
         with self._changed:
@@ -61,10 +69,12 @@ class DelayLine:
                 return False
             at_once = delay_ms == 0.0 and not self._waiting and not self._sending
             if not at_once:
-                if len(self._waiting) >= CAPACITY:
+                is_full = self._waiting_bytes + len(packet) > self._capacity_bytes
+                if len(self._waiting) >= CAPACITY or is_full:
                     return False
                 self._last_due_s = max(self._last_due_s, due_s)
                 self._waiting.append((self._last_due_s, packet, lossless))
+                self._waiting_bytes += len(packet)
                 self._changed.notify_all()
         if at_once:
             self._send(packet, lossless)
@@ -83,6 +93,7 @@ class DelayLine:
                     self._changed.wait(remaining_s)
                     continue
                 self._waiting.popleft()
+                self._waiting_bytes -= len(packet)
                 self._sending = True
             with self._guard:
                 self._send(packet, lossless)

@@ -98,6 +98,18 @@ def test_a_full_line_refuses_packets(ends):
     assert ends.out.empty()
 
 
+def test_a_line_holds_no_more_bytes_than_it_may_and_takes_packets_again_when_some_have_left():
+    out = queue.Queue()
+    line = DelayLine(lambda packet, lossless: out.put(packet), capacity_bytes=10)
+    assert line.put(bytes(6), False, 200.0)
+    assert not line.put(bytes(5), False, 200.0)
+    assert line.put(bytes(4), False, 200.0)
+    assert [len(out.get(timeout=60)) for _ in range(2)] == [6, 4]
+    assert line.put(bytes(10), False, 1.0)
+    assert len(out.get(timeout=60)) == 10
+    line.close()
+
+
 def test_a_packet_that_can_not_be_sent_costs_itself_alone():
     sent, failed = queue.Queue(), []
 
