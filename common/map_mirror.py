@@ -15,6 +15,9 @@ from semcast.common.wire import WireError, unpack
 
 logger = logging.getLogger(__name__)
 
+#: A map that is begun anew while it is asked for is asked for again, so often in all.
+_MAX_QUESTIONS = 3
+
 
 @dataclass(frozen=True)
 class MirroredMap:
@@ -64,7 +67,7 @@ class MirroredMap:
     def updated(self, message: MapMessage) -> "MirroredMap":
         """Return the map with what a message says is new, moved or gone; a new epoch begins anew."""
         before = self
-        if (message.agent_epoch, message.map_epoch) != (self.agent_epoch, self.map_epoch):
+        if not _is_of(message, self):
             before = _EMPTY
         stays = ~np.isin(before.ids, np.concatenate([message.ids, message.removed]))
         ids = np.concatenate([before.ids[stays], message.ids])
@@ -137,24 +140,31 @@ class MapMirror:
     def _catch_up(self, *early: MapMessage) -> None:
         """Take the whole map from the server, where it has one.
 
-        Changes that come meanwhile, and those given, may be older or newer than the answer. Once more on top
-        of it they give the newest state: the last word on a landmark is either among them or in the answer.
+        Changes that came before it was asked, as those given, are in the answer. Those that come meanwhile
+        may be older or newer. Once more on top of it they give the newest state: the last word on a landmark
+        is either among them or in the answer. Changes of another map may be of the one before or of the next
+        one, and numbers don't tell which, as an agent's clock may have been set back: it is asked again.
         """
         with self._asking:
             with self._lock:
                 self._early, asked = [*early], self._server
-            whole = self._ask()
-            with self._lock:
-                has_begun = len(self._early) > len(early)
-            if whole is None and has_begun:  # it had no map when it was asked, and has one now
-                whole = self._ask()
+            whole, num_before, is_settled = self._ask(), len(early), False
+            for is_last in (False,) * (_MAX_QUESTIONS - 1) + (True,):
+                with self._lock:
+                    num_now = len(self._early)
+                    # Where it had no map when it was asked, it has one now.
+                    is_settled = all(whole is not None and _is_of(m, whole) for m in self._early[num_before:])
+                if is_settled or is_last:
+                    break
+                if (answer := self._ask()) is not None:
+                    whole, num_before = answer, num_now
             with self._lock:
                 changes, self._early = self._early or [], None
                 if whole is not None:
                     self._map = _EMPTY.updated(whole)
-                    now = (whole.agent_epoch, whole.map_epoch)
-                    changes = [m for m in changes if (m.agent_epoch, m.map_epoch) >= now]
-                    self._map_of = asked
+                    changes = [m for m in changes[num_before:] if _is_of(m, whole)]
+                    if is_settled:
+                        self._map_of = asked
                 for message in changes:
                     self._map = self._map.updated(message)
 
@@ -188,8 +198,14 @@ class MapMirror:
             if self._early is not None:
                 self._early.append(message)
                 return
-            if not self._is_behind:
+            if not self._is_behind and _is_of(message, self._map):
                 self._map = self._map.updated(message)
                 return
-        # When its server appeared there was no map yet, nor word of what became of that of the one before.
+        # A new map has begun, or was reported on before the answer that this one was made of; or when its
+        # server appeared there was none yet, nor word of what became of that of the one before.
         self._catch_up(message)
+
+
+def _is_of(message: MapMessage, other: MapMessage | MirroredMap) -> bool:
+    """Tell whether a change is of the same map as another one, or of this map."""
+    return (message.agent_epoch, message.map_epoch) == (other.agent_epoch, other.map_epoch)

@@ -93,6 +93,7 @@ def test_a_new_map_replaces_the_one_before(hub, client):
     serving = Serving(hub[0], message([1, 2], keyframes=[0]))
     mirror = MapMirror(client, AGENT)
     for change in (message([4], map_epoch=1), message([6], agent_epoch=3)):
+        serving.whole = change
         serving.put(change)
         until(lambda ids=change.ids: np.array_equal(mirror.map.ids, ids))
         assert len(mirror.map.keyframe_ids) == 0
@@ -190,6 +191,33 @@ def test_a_server_that_begins_its_map_while_it_is_asked_is_asked_again():
     assert mirror.map.ids.tolist() == [1, 2], "8 was of the one before"
     session.deliver(pack(message([3])))
     assert mirror.map.ids.tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(("before", "after"), [((7, 4), (7, 0)), ((7, 0), (7, 4)), ((9, 0), (3, 0))])
+def test_a_map_that_is_begun_anew_while_it_is_asked_for_is_followed_whatever_its_number(before, after):
+    """Its numbers fall where a server began without its checkpoint, or the clock of an agent was set back."""
+    former, present = ({"agent_epoch": epoch, "map_epoch": number} for epoch, number in (before, after))
+    session = ScriptedSession()
+
+    def begins_anew():
+        session.on_the_way, session.whole = lambda: None, message([5], **present)
+        session.deliver(pack(message([2], **former)))
+        session.deliver(pack(message([5], **present)))
+
+    session.on_the_way, session.whole = begins_anew, message([1, 2], **former)
+    mirror = MapMirror(session, AGENT)
+    assert mirror.map.ids.tolist() == [5]
+    session.whole = None  # it is not asked any more
+    session.deliver(pack(message([6], **present)))
+    assert mirror.map.ids.tolist() == [5, 6]
+
+
+def test_a_change_of_a_former_map_that_comes_behind_the_answer_does_not_bring_it_back():
+    session = ScriptedSession()
+    session.whole = message([1, 2], map_epoch=2)
+    mirror = MapMirror(session, AGENT)
+    session.deliver(pack(message([9], map_epoch=1)))
+    assert (mirror.map.map_epoch, mirror.map.ids.tolist()) == (2, [1, 2])
 
 
 def test_a_map_is_brought_to_metres_as_a_pose_tells():
