@@ -111,14 +111,19 @@ def write_result(path: Path | None, result: Mapping[str, Any], part: Part | None
     return values
 
 
+def cpu_flags() -> set[str]:
+    """Return what the processor can do, as Linux names it, among other words; empty on other systems."""
+    try:
+        return set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())
+    except OSError:
+        return set()
+
+
 def machine_kind() -> str:
     """Return the kind of this machine, such as ``2-core x86-64, AVX2/AVX512/AMX``; never its name."""
     cores = usable_cores()
     architecture = {"x86_64": "x86-64", "AMD64": "x86-64"}.get(platform.machine(), platform.machine())
-    try:
-        flags = set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split())
-    except OSError:
-        flags = set()
+    flags = cpu_flags()
     sets = "/".join(name for flag, name in _CPU_FLAGS if flag in flags)
     return f"{cores}-core {architecture}" + (f", {sets}" if sets else "")
 

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,17 @@ from semcast.common.codecs import LEARNED_CODECS, available_codecs, check_codec
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.evaluation.interruption import until_interrupted
-from semcast.evaluation.report import provenance, write_result
+from semcast.evaluation.report import cpu_flags, provenance, write_result
 
 VERB = "eval runtime"
 UNUSED_FIELDS: frozenset[str] = frozenset()
 #: Instruction sets oneDNN is held to ("all" leaves it free), and the precision asked for there. onnxruntime
 #: always takes its best.
 _TORCH: tuple[tuple[str, Precision], ...] = (("all", "auto"), ("AVX2", "auto"), ("AVX2", "float32"))
+#: The same where there is no wider set than AVX2, and holding oneDNN to that changes nothing.
+_TORCH_NARROW: tuple[tuple[str, Precision], ...] = (("all", "auto"), ("all", "float32"))
+#: Flags of processors with a wider one.
+_WIDER = frozenset({"avx512f", "avx_vnni"})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,15 +71,21 @@ class Variant:
     threads: int
 
 
-def variants(settings: RuntimeSettings) -> list[Variant]:
-    """Return all variants there are: onnxruntime only encodes, and takes no hint on instruction sets."""
+def variants(settings: RuntimeSettings, flags: Collection[str]) -> list[Variant]:
+    """Return all variants there are: onnxruntime only encodes, and takes no hint on instruction sets.
+
+    Args:
+        settings: What is timed.
+        flags: What the processor can do; empty where that is not known.
+    """
+    torch = _TORCH if not flags or not _WIDER.isdisjoint(flags) else _TORCH_NARROW
     found = []
     for codec in settings.codecs:
         for threads in settings.threads:
             found += [
                 Variant(codec, work, "torch", isa, precision, threads)
                 for work in ("encode", "decode")
-                for isa, precision in _TORCH
+                for isa, precision in torch
             ]
             found.append(Variant(codec, "encode", "onnx", "all", "auto", threads))
     return found
@@ -152,7 +163,7 @@ def evaluate_runtime(settings: RuntimeSettings) -> dict[str, Any]:
     children: list[_Child] = []
     finished: list[int] = []
     try:
-        for variant in variants(settings):
+        for variant in variants(settings, cpu_flags()):
             children.append(_Child(variant, (settings.height, settings.width)))
         with until_interrupted(finished) as part:
             for k in range(settings.rounds):
