@@ -1,5 +1,6 @@
 """All codecs by name, learned and conventional: the one way to get a codec."""
 
+import logging
 from functools import cache
 from importlib import resources
 from importlib.util import find_spec
@@ -10,6 +11,8 @@ from semcast.common.codec import MODULATIONS, Codec, Modulation, Precision
 from semcast.common.config import near_match
 from semcast.common.conventional_source import ImageFormat
 from semcast.common.errors import ConfigError
+
+logger = logging.getLogger(__name__)
 
 Runtime = Literal["auto", "torch", "onnx"]
 
@@ -154,6 +157,8 @@ def load_codec(
             where it is installed.
         precision: Of a learned codec on torch; see ``semcast.common.nets.precision``.
 
+    What is asked of a network is warned of with a conventional codec, on which it has no effect.
+
     Raises:
         ConfigError: The name or modulation is unknown, weights were given for a codec without any or are
             another codec's, or the runtime, device or precision is not there.
@@ -176,6 +181,9 @@ def load_codec(
         check_codec(name)
     if weights is not None:
         raise ConfigError(f"codec {name!r} has no weights, got {weights}")
+    asked = {"device": device == "cuda", "runtime": runtime == "onnx", "precision": precision != "auto"}
+    if idle := [setting for setting, is_asked in asked.items() if is_asked]:
+        logger.warning("%s: no effect on codec %s, which has no network", ", ".join(idle), name)
     from semcast.common.conventional import ConventionalCodec
 
     image_format, adaptive, slow = conventional[name]

@@ -95,3 +95,11 @@ def test_the_onnx_runtime_has_the_precision_of_its_file(files):
 def test_the_onnx_runtime_does_not_pretend_to_use_a_gpu(files):
     with pytest.raises(ConfigError, match="device must be auto or cpu with the onnx runtime, got 'cuda'"):
         load_codec("3dcsc", weights=files["onnx"], runtime="auto", device="cuda")
+
+
+def test_what_is_asked_of_a_network_is_told_to_have_no_effect_on_a_conventional_codec(caplog):
+    load_codec("jpeg-amc", num_threads=1, device="cpu", runtime="auto")
+    assert not caplog.records
+    load_codec("jpeg-amc", precision="float32", device="cuda", runtime="onnx")
+    told = ["device, runtime, precision: no effect on codec jpeg-amc, which has no network"]
+    assert [record.getMessage() for record in caplog.records] == told
