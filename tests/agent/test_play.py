@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from announced import announced_camera
 from waiting import until
 
 from semcast.agent.encoder import FrameEncoder
@@ -39,12 +40,11 @@ AGENT = "agent0"
 
 def camera_of(codec, **changes):
     values = {
-        "agent_id": AGENT, "agent_epoch": EPOCH, "fx": 50.0, "fy": 50.0, "cx": 31.5, "cy": 23.5,
-        "image_wh": (64, 48), "nominal_rate_hz": 50.0, "codec": codec.name, "digest": codec.digest,
-        "modulation": codec.modulation, "source_name": "steps", "num_frames": NUM_FRAMES,
-        "last_frame_id": NUM_FRAMES - 1, "lossless": False,
+        "agent_id": AGENT, "agent_epoch": EPOCH, "nominal_rate_hz": 50.0, "codec": codec.name,
+        "digest": codec.digest, "modulation": codec.modulation, "source_name": "steps",
+        "num_frames": NUM_FRAMES, "last_frame_id": NUM_FRAMES - 1,
     }  # fmt: skip
-    return CameraInfo(**{**values, **changes})
+    return announced_camera(**{**values, **changes})
 
 
 def frames_of(codec, epoch=EPOCH, *, lossless=False, lost=()):

@@ -2,6 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from announced import announced_camera
 
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import EncodedImage
@@ -57,10 +58,7 @@ def test_every_message_starts_with_version_and_kind():
 
 
 def test_camera_info_gives_the_pinhole():
-    info = CameraInfo(
-        agent_id="a", agent_epoch=1, fx=1.0, fy=2.0, cx=3.0, cy=4.0, image_wh=(6, 5), nominal_rate_hz=0.0,
-        codec="x", digest="", modulation="analog", source_name="s", num_frames=None, lossless=False,
-    )  # fmt: skip
+    info = announced_camera(fx=1.0, fy=2.0, cx=3.0, cy=4.0, image_wh=(6, 5))
     pinhole = Intrinsics(fx=1.0, fy=2.0, cx=3.0, cy=4.0, width=6, height=5)
     assert info.intrinsics == pinhole
     rolling = dataclasses.replace(info, readout_ms=20.0, readout_from="left")

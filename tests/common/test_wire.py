@@ -6,6 +6,7 @@ import tracemalloc
 import msgpack
 import numpy as np
 import pytest
+from announced import announced_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -34,10 +35,9 @@ LAYOUT = layout_for(HW)
 def examples():
     n = 3
     return [
-        CameraInfo(
-            agent_id="cam-1", agent_epoch=5, fx=500.0, fy=501.0, cx=320.0, cy=-3.5, image_wh=(640, 480),
-            nominal_rate_hz=10.0, codec="jpeg-ldpc", digest="00ff", modulation="16qam", source_name="über",
-            num_frames=None, lossless=True,
+        announced_camera(
+            agent_id="cam-1", agent_epoch=5, cy=-3.5, image_wh=(640, 480), digest="00ff", source_name="über",
+            lossless=True,
         ),
         SymbolFrame(
             agent_epoch=2**62, seq=7, base_seq=3, frame_id=9, t_capture_ns=-5, t_source_ns=10**18, codec="x",

@@ -1,10 +1,10 @@
 """What agents say of themselves when they are asked."""
 
 import pytest
+from announced import announced_camera
 
 from semcast.common.keys import camera_key
 from semcast.common.loopback import open_hub
-from semcast.common.messages import CameraInfo
 from semcast.common.wire import pack
 from semcast.server.announcement import answered_camera
 
@@ -12,22 +12,7 @@ EPOCHS = (3, 5, 8)
 
 
 def camera(epoch):
-    return CameraInfo(
-        agent_id="a",
-        agent_epoch=epoch,
-        fx=100.0,
-        fy=100.0,
-        cx=31.5,
-        cy=23.5,
-        image_wh=(64, 48),
-        nominal_rate_hz=10.0,
-        codec="phase",
-        digest="",
-        modulation="16qam",
-        source_name="room",
-        num_frames=None,
-        lossless=False,
-    )
+    return announced_camera(agent_epoch=epoch)
 
 
 @pytest.fixture

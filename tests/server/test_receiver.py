@@ -5,6 +5,7 @@ from dataclasses import replace
 import msgpack
 import numpy as np
 import pytest
+from announced import announced_camera
 from waiting import until
 
 from semcast.channel.awgn import complex_noise
@@ -12,7 +13,7 @@ from semcast.common.errors import TransportError
 from semcast.common.keys import camera_key, channel_key, flow_key, link_key, rx_key
 from semcast.common.levels import Levels
 from semcast.common.loopback import open_hub
-from semcast.common.messages import CameraInfo, ChannelReport, FlowMessage, LinkReport, SymbolFrame
+from semcast.common.messages import ChannelReport, FlowMessage, LinkReport, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.allocation import Allocation
@@ -30,11 +31,7 @@ EPOCH = 10**18
 
 
 def camera(epoch=EPOCH, lossless=False):
-    return CameraInfo(
-        agent_id="a", agent_epoch=epoch, fx=100.0, fy=100.0, cx=64.0, cy=32.0, image_wh=(128, 64),
-        nominal_rate_hz=30.0, codec="x", digest="", modulation="16qam", source_name="s", num_frames=None,
-        lossless=lossless,
-    )  # fmt: skip
+    return announced_camera(agent_epoch=epoch, image_wh=(128, 64), lossless=lossless)
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,12 @@ import threading
 from pathlib import Path
 
 import numpy as np
+from announced import announced_camera
 
 from semcast.agent.originals import source_image
 from semcast.agent.source import SourceFrame
 from semcast.common.keys import source_key
-from semcast.common.messages import CameraInfo, SourceImage
+from semcast.common.messages import SourceImage
 from semcast.common.recorder import Recorder
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.recording_writer import recording_metadata
@@ -17,22 +18,7 @@ from semcast.common.sequence import open_sequence
 from semcast.common.wire import pack
 from semcast.server.reference import Reference, recording_reference, sequence_reference
 
-CAMERA = CameraInfo(
-    agent_id="a",
-    agent_epoch=5,
-    fx=50.0,
-    fy=50.0,
-    cx=32.0,
-    cy=24.0,
-    image_wh=(64, 48),
-    nominal_rate_hz=1.0,
-    codec="x",
-    digest="",
-    modulation="16qam",
-    source_name="s",
-    num_frames=None,
-    lossless=False,
-)
+CAMERA = announced_camera(agent_epoch=5)
 DEMO = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
 
 

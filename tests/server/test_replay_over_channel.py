@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from announced import announced_camera
 
 from semcast.agent.encoder import FrameEncoder
 from semcast.agent.source import SourceFrame
 from semcast.channel.settings import ChannelSettings
 from semcast.common.codecs import load_codec
 from semcast.common.keys import camera_key, tx_key
-from semcast.common.messages import CameraInfo
 from semcast.common.recording_writer import RecordingWriter, recording_metadata
 from semcast.common.sequence import open_sequence
 from semcast.common.symbol_payload import pack_iq
@@ -32,22 +32,17 @@ def sent():
         encoder.encode(SourceFrame(k, int(sequence.times_ns[k]), k, sequence.image(k)), snr_db=15.0)
         for k in range(FRAMES)
     ]
-    said = CameraInfo(
-        agent_id="a",
-        agent_epoch=1,
+    said = announced_camera(
         fx=camera.fx,
         fy=camera.fy,
         cx=camera.cx,
         cy=camera.cy,
         image_wh=(camera.width, camera.height),
-        nominal_rate_hz=10.0,
         codec=codec.name,
         digest=codec.digest,
         modulation=codec.modulation,
-        source_name="test",
         num_frames=FRAMES,
         last_frame_id=FRAMES - 1,
-        lossless=False,
     )
     return said, frames
 

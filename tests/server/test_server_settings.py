@@ -4,6 +4,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from announced import announced_camera
 
 from semcast.agent.agent import camera_info
 from semcast.agent.settings import AgentSettings
@@ -14,7 +15,6 @@ from semcast.commands.running import read_settings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.errors import CheckpointError, ConfigError, SourceError
 from semcast.common.loopback import open_hub
-from semcast.common.messages import CameraInfo
 from semcast.common.network_settings import HubSettings
 from semcast.common.sequence import open_sequence
 from semcast.server.server import Server
@@ -121,23 +121,7 @@ def test_a_server_that_connects_to_a_hub_opens_no_port_of_its_own_unasked():
     ],
 )
 def test_the_last_frames_are_known_by_their_ids(num_frames, last_id, frame_id, is_near):
-    camera = CameraInfo(
-        agent_id="a",
-        agent_epoch=1,
-        fx=60.0,
-        fy=60.0,
-        cx=47.5,
-        cy=31.5,
-        image_wh=(96, 64),
-        nominal_rate_hz=10.0,
-        codec="webp",
-        digest="0" * 16,
-        modulation="qam16",
-        source_name="film",
-        num_frames=num_frames,
-        last_frame_id=last_id,
-        lossless=False,
-    )
+    camera = announced_camera(num_frames=num_frames, last_frame_id=last_id)
     assert is_nearly_final(frame_id, camera) is is_near
 
 
