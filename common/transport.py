@@ -24,6 +24,7 @@ from semcast.common.messages import ROLES
 from semcast.common.network_settings import NetworkSettings, is_loopback
 from semcast.common.reachability import Knocks
 from semcast.common.wire import MAX_MESSAGE_BYTES
+from semcast.common.worker_guard import WorkerGuard
 
 logger = logging.getLogger(__name__)
 
@@ -129,6 +130,7 @@ class _Pump:
         # The entity itself must not be borrowed by the thread, or it could not be undeclared.
         self._handler = entity.handler
         self._deliver = deliver
+        self._guard = WorkerGuard("handling a message")
         self._thread = threading.Thread(target=self._run, name=f"semcast-{name}", daemon=True)
         self._thread.start()
 
@@ -138,10 +140,8 @@ class _Pump:
                 item = self._handler.recv()
             except zenoh.ZError:
                 return
-            try:
+            with self._guard:
                 self._deliver(item)
-            except Exception:
-                logger.exception("a message could not be handled and is left out")
 
     def close(self) -> None:
         with contextlib.suppress(zenoh.ZError):

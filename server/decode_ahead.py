@@ -49,7 +49,9 @@ class DecodeAhead(Generic[In, Out]):
         self._condition = threading.Condition()
         self._stopping = threading.Event()
         self._reported: set[str] = set()
-        self._guard = WorkerGuard("leaving a frame out")
+        self._taking = WorkerGuard("taking a frame", self._pause)
+        self._decoding = WorkerGuard("decoding a frame")
+        self._leaving_out = WorkerGuard("leaving a frame out")
         self._thread = threading.Thread(target=self._run, name="semcast-decode", daemon=True)
         self._thread.start()
 
@@ -64,31 +66,31 @@ class DecodeAhead(Generic[In, Out]):
             with self._condition:
                 if not self._condition.wait_for(lambda: self._slot is None, POLL_S):
                     continue
-            try:
+            message = None
+            with self._taking:
                 message = self._take(POLL_S)
-            except Exception:
-                logger.exception("a frame could not be taken and is left out")
-                self._stopping.wait(POLL_S)  # it may fail again at once
-                continue
             if message is None:
                 continue
             self._is_decoding = True
-            decoded = None
-            try:
-                decoded = self._decode(message)
-            except SemcastError as err:
-                if str(err) not in self._reported and len(self._reported) < 100:
-                    self._reported.add(str(err))
-                    logger.warning("%s", err)
-                with self._guard:
-                    self._on_failure(message, "codec")
-            except Exception:
-                logger.exception("a frame could not be decoded and is left out")
-                with self._guard:
-                    self._on_failure(message, "decode")
+            decoded, failure = None, "decode"
+            with self._decoding:
+                try:
+                    decoded, failure = self._decode(message), ""
+                except SemcastError as err:
+                    failure = "codec"
+                    if str(err) not in self._reported and len(self._reported) < 100:
+                        self._reported.add(str(err))
+                        logger.warning("%s", err)
+            if failure:
+                with self._leaving_out:
+                    self._on_failure(message, failure)
             with self._condition:  # at once, or nobody had the frame for a moment
                 self._slot, self._is_decoding = decoded, False
                 self._condition.notify_all()
+
+    def _pause(self, _text: str) -> None:
+        """Wait a little after what may fail again at once."""
+        self._stopping.wait(POLL_S)
 
     def get(self, timeout_s: float) -> Out | None:
         """Return the next decoded frame, None when there was none in time."""

@@ -17,6 +17,7 @@ from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session as NetworkSession
 from semcast.common.transport import open_session
 from semcast.common.wire import pack
+from semcast.common.worker_guard import WorkerGuard
 from semcast.server.announcement import Announcement
 from semcast.server.control import Control
 from semcast.server.decode_ahead import DecodeAhead
@@ -77,6 +78,7 @@ class Server:
         )
         self._decoder = FrameDecoder(load if load is not None else installed)
         self._false_start = FalseStart()
+        self._tracking = WorkerGuard("tracking a frame", self.metrics.error)
         self._new_map = False
         self._resources = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
@@ -246,12 +248,11 @@ class Server:
             self._outbox.put_pose(decoded.arrival, found)
             self._outbox.put_metric_pose(message.agent_epoch, found, session.metres.of(found))
 
-        try:
+        outcome = None
+        with self._tracking:
             outcome = session.process(decoded.frame, Arrival.of(decoded, self.metrics.drops), tell)
-        except Exception as err:
-            logger.exception("frame %d could not be tracked and is left out", message.frame_id)
+        if outcome is None:
             self.metrics.drop("track")
-            self.metrics.error(f"frame {message.frame_id}: {err}")
             return
         self._spread(decoded, outcome)
 

@@ -108,7 +108,7 @@ def test_a_frame_that_can_not_be_taken_never_stops_the_stream(caplog):
     ahead = DecodeAhead(take, lambda x: x + 100, lambda m, r: None)
     assert drain(ahead, 2) == [100, 102]
     ahead.close()
-    assert "could not be taken" in caplog.text
+    assert "taking a frame failed" in caplog.text
 
 
 def test_a_frame_that_can_not_even_be_left_out_never_stops_the_stream(caplog):
@@ -124,6 +124,18 @@ def test_a_frame_that_can_not_even_be_left_out_never_stops_the_stream(caplog):
     assert drain(ahead, 2) == [2, 3]
     ahead.close()
     assert caplog.text.count("leaving a frame out failed: nobody wants to know") == 1
+
+
+def test_a_failure_that_comes_again_with_every_frame_is_logged_once(caplog):
+    def fails(x):
+        raise ZeroDivisionError("always")
+
+    failures = []
+    ahead = DecodeAhead(Inbox(50).take, fails, lambda m, r: failures.append((m, r)))
+    until(lambda: len(failures) == 50)
+    ahead.close()
+    assert failures == [(k, "decode") for k in range(50)]
+    assert [record.getMessage() for record in caplog.records] == ["decoding a frame failed: always"]
 
 
 def test_one_that_got_stale_while_it_waited_is_left_out_and_one_that_was_waited_for_is_not():

@@ -147,6 +147,28 @@ def test_bad_frames_are_counted_and_never_stop_the_stream(air):
     assert (summary["frames"]["tracked"], summary["frames"]["sent"]) == (5, 7)
 
 
+def test_frames_that_can_not_be_tracked_are_counted_and_why_is_logged_once(air, monkeypatch, caplog):
+    process = Session.process
+
+    def fails_early(self, frame, *args, **kwargs):
+        if frame.frame_id < 3:
+            raise np.linalg.LinAlgError("singular")
+        return process(self, frame, *args, **kwargs)
+
+    monkeypatch.setattr(Session, "process", fails_early)
+    running = air.serve()
+    radio = air.agent(100)
+    for k in range(3):
+        radio.send(k)
+        until(lambda k=k: running.server.metrics.drops.get("track") == k + 1)
+    radio.stream([3])
+    assert running.server.metrics.status(0).last_error == "tracking a frame failed: singular"
+    assert running.finish(stop=True)["drops"]["track"] == 3
+    assert [r.getMessage() for r in caplog.records if "singular" in r.getMessage()] == [
+        "tracking a frame failed: singular"
+    ]
+
+
 def test_a_frame_that_waited_too_long_for_the_tracker_is_dropped(air, monkeypatch):
     process, begun, go_on = Session.process, threading.Event(), threading.Event()
 
