@@ -217,6 +217,9 @@ def test_a_server_that_ends_before_it_listens_is_not_waited_for(tmp_path, monkey
         ("server", "semcast server: no space left", True),
         ("channel", "semcast channel: no trace", True),
         ("server", 3, False),
+        ("server", 0, False),
+        ("channel", 0, False),
+        ("agent", 0, False),
     ],
 )
 def test_a_role_that_gives_up_ends_the_demo_and_one_that_is_stopped_does_not(tmp_path, role, says, ends):
@@ -232,6 +235,28 @@ def test_a_role_that_gives_up_ends_the_demo_and_one_that_is_stopped_does_not(tmp
     error = watch(tmp_path, {"server": child}, alive, stop, tell, lambda *row: None)
     assert error == (f"the {role} gave up: {says}" if ends else None)
     assert ["start it again with" in line for line in told] == ([] if ends else [True])
+
+
+def test_an_agent_that_has_sent_all_is_not_to_be_started_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo_watch, "_GRACE_S", 0.0)
+    child = Role("agent", [sys.executable, "-c", ""], tmp_path / "log")
+    child.start()
+    child.wait()
+    alive, metrics, stop = Alive(set(), threading.Condition()), Metrics("agent"), threading.Event()
+    metrics.end()
+    alive.on_status(pack(metrics.status(1)))
+    looks, told = [], []
+
+    class Server(Role):
+        @property
+        def returncode(self):
+            looks.append(self.name)
+            if len(looks) == 5:
+                stop.set()
+
+    children = {"agent": child, "server": Server("server", [], tmp_path / "server.log")}
+    assert watch(tmp_path, children, alive, stop, told.append, print) is None
+    assert (len(looks), told) == (5, [])
 
 
 def test_the_status_line_says_what_the_server_is_at_after_the_last_frame(tmp_path):

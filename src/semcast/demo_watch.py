@@ -22,6 +22,8 @@ START_DEADLINE_S = 180.0
 #: What a role that gave up ends with; others are of signals or of wrong usage.
 ERROR_CODE = 1
 _LOOK_INTERVAL_S = 0.1
+#: How long after the end of a role its last words, or the summary that it wrote, may take to be seen.
+_GRACE_S = 1.0
 
 
 @dataclass
@@ -33,6 +35,7 @@ class Alive:
     num_outages: int = 0
     num_unreadable: int = 0
     activity: str = ""
+    has_sent_all: bool = False
 
     def on_change(self, role: str, alive: bool | None) -> None:
         """Take one change."""
@@ -49,6 +52,7 @@ class Alive:
                 self.activity = status.activity
             else:
                 self.num_unreadable = status.drops.get("unreadable", 0)
+                self.has_sent_all = status.ended
 
     def wait_for(self, role: str, child: Role, stop: threading.Event) -> None:
         """Wait until a role is there.
@@ -112,12 +116,19 @@ def watch(
     num_done = num_outages = 0
     activity = ""
     is_page_told = False  # a server that is started again serves the same one
+    ended_s: dict[str, float] = {}
+
+    def is_expected(name: str) -> bool:
+        """Tell whether that a role ended without an error may be right."""
+        since_s = ended_s.setdefault(name, time.monotonic())
+        return (name == "agent" and alive.has_sent_all) or time.monotonic() - since_s < _GRACE_S
+
     while not stop.is_set() and not (out / SUMMARY_NAME).exists():
         for said in server_log.take():
             if (page := re.search(r"viewer: (http\S+)", said)) is not None and not is_page_told:
                 is_page_told = True
                 tell(f"open {page.group(1)}")
-        if (error := _who_gave_up(children.values(), tell)) is not None:
+        if (error := _who_gave_up(children.values(), tell, is_expected)) is not None:
             return error
         for row in map(json.loads, rows.take()):
             num_done = row["frame_id"] + 1
@@ -133,17 +144,23 @@ def watch(
     return None
 
 
-def _who_gave_up(children: Iterable[Role], tell: Callable[[str], None]) -> str | None:
-    """Return which process gave up, and why; tell once of each that only ended how it is started again."""
+def _who_gave_up(
+    children: Iterable[Role], tell: Callable[[str], None], is_expected: Callable[[str], bool]
+) -> str | None:
+    """Return which process gave up, and why; tell once of each that only ended how it is started again.
+
+    One that is asked to end (SIGTERM) does so without an error, and the others wait for it.
+    """
     for child in children:
         code = child.returncode
-        if not code or child.told:
+        if code is None or child.told or (code == 0 and is_expected(child.name)):
             continue
         child.told = True
         if code == ERROR_CODE or (child.name == "agent" and code > 0):
             return f"the {child.name} gave up: {child.last_words()}"
         by_signal = f"was killed by signal {-code}"
-        how = by_signal if code < 0 else f"ended with code {code}: {child.last_words()}"
+        with_code = f"ended with code {code}: {child.last_words()}" if code else "ended before its time"
+        how = by_signal if code < 0 else with_code
         tell(f"{child.name} {how}; start it again with: {shlex.join(child.command)}")
     return None
 
