@@ -138,6 +138,10 @@ class ServerSettings:
             logger.warning("%s: no effect with view %s", ", ".join(idle), self.view.view)
         if self.out is None and self.checkpoint_interval_s != ServerSettings.checkpoint_interval_s:
             logger.warning("checkpoint_interval_s: no effect without out, a folder for checkpoints")
+        if self.mode == "replay" and self.max_age_ms != ServerSettings.max_age_ms:
+            logger.warning("max_age_ms: no effect in mode replay, where no frame is dropped for its age")
+        if self.keep_running and self.idle_timeout_s is not None:
+            logger.warning("idle_timeout_s: no effect with keep_running, which waits for the next agent")
 
     def __post_init__(self) -> None:
         """Check ranges.

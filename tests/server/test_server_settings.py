@@ -86,6 +86,13 @@ def test_settings_out_of_range_say_so(changes, text):
         ),
         (ServerSettings(checkpoint_interval_s=9.0), "checkpoint_interval_s: no effect"),
         (ServerSettings(checkpoint_interval_s=9.0, out=Path("runs")), ""),
+        (ServerSettings(max_age_ms=9.0, mode="replay"), "max_age_ms: no effect in mode replay"),
+        (ServerSettings(max_age_ms=9.0), ""),
+        (
+            ServerSettings(idle_timeout_s=9.0, keep_running=True),
+            "idle_timeout_s: no effect with keep_running",
+        ),
+        (ServerSettings(idle_timeout_s=9.0), ""),
     ],
 )
 def test_values_that_do_nothing_are_said(settings, idle, caplog):
