@@ -381,7 +381,7 @@ def test_a_run_is_not_exported_onto_itself(tmp_path, capsys):
     out = tmp_path / "run" / ".." / "run"
     assert main(["export", str(tmp_path / "run"), "--format", "colmap", "--out", str(out)]) == 1
     err = capsys.readouterr().err
-    assert "--out must be another place than the run itself, got" in err
+    assert "out must be another place than the run itself and its files, got" in err
     assert err.count("\n") == 1
 
 

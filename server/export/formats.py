@@ -8,7 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from semcast.common.errors import ConfigError, SemcastError, SourceError
-from semcast.common.run_folder import DENSE_NAME, RunData, read_image_paths, read_run
+from semcast.common.run_folder import (
+    DENSE_NAME,
+    IMAGES_NAME,
+    RUN_FILES,
+    RunData,
+    read_image_paths,
+    read_run,
+)
 from semcast.server.export.colmap import write_colmap
 from semcast.server.export.nerfstudio import write_nerfstudio
 from semcast.server.export.outputs import MAP_FRAME, read_ply, write_ply
@@ -66,12 +73,14 @@ def export_run(
 
     Raises:
         SourceError: The run can't be read, has no such part, lacks what the format needs, or can't be placed.
-        ConfigError: ``out`` is a folder with somebody else's images, or parts or format can't be placed.
+        ConfigError: ``out`` is a folder with somebody else's images or the run's own place, or parts or
+            format can't be placed.
         SemcastError: ``out`` can't be written.
         ValueError: ``format_name`` is none of ``FORMATS``, or ``part`` neither a number nor a word for parts.
     """
     if format_name not in FORMATS:
         raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {format_name!r}")
+    _check_not_of_run(out, folder)
     data = read_run(folder)
     if len(data.frame_ids) == 0:
         raise SourceError(f"{folder} has no posed frame, so there is nothing to export")
@@ -130,6 +139,14 @@ def _check_placeable(format_name: str, part: str, parts: str | None) -> None:
         )
     if parts is not None and part == ALL:
         raise ConfigError(f"--part must name one part, each has its own scale: {parts}")
+
+
+def _check_not_of_run(out: Path, folder: Path) -> None:
+    """Refuse what the run itself is made of: once moved and scaled, it would be so again the next time."""
+    run, place = folder.resolve(), out.resolve()
+    own = {run, *(run / name for name in RUN_FILES)}
+    if place in own or run / IMAGES_NAME in (place, *place.parents):
+        raise ConfigError(f"out must be another place than the run itself and its files, got {out}")
 
 
 def _check_kind(out: Path, format_name: str) -> None:

@@ -105,11 +105,8 @@ def _placement(arguments: argparse.Namespace) -> "FindPlacement | None":
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the export and name its files on stdout."""
-    from semcast.common.errors import ConfigError
     from semcast.server.export.formats import export_run
 
-    if arguments.out.resolve() == arguments.run.resolve():
-        raise ConfigError(f"--out must be another place than the run itself, got {arguments.out}")
     files, data = export_run(
         arguments.run, arguments.format, arguments.out, arguments.part, _placement(arguments)
     )

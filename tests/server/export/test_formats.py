@@ -367,6 +367,36 @@ def test_images_of_others_are_not_written_over(tmp_path, arc_run, write_arc_run,
     assert (out / foreign).read_bytes() == b"original"
 
 
+@pytest.mark.parametrize(
+    ("format_name", "name"),
+    [
+        ("colmap", "."),
+        ("tum", "trajectory.tum"),
+        ("dense", "dense.ply"),
+        ("ply", "summary.json"),
+        ("rrd", "run.rrd"),
+        ("nerfstudio", "images"),
+        ("colmap", "images/colmap"),
+        ("tum", "here/trajectory.tum"),
+    ],
+)
+def test_a_run_is_not_written_over_by_an_export_of_it(tmp_path, arc_run, write_arc_run, format_name, name):
+    """A cloud in metres in place of the run's own would be scaled once more by the next export."""
+    run = tmp_path / "run"
+    write_arc_run(run, arc_run(), "keyframes")
+    (run / "here").symlink_to(run)
+    before = contents(run)
+    with pytest.raises(ConfigError, match="^out must be another place than the run itself and its files"):
+        export_run(run, format_name, run / name)
+    assert contents(run) == before
+
+
+def test_a_run_may_be_exported_into_its_folder_under_other_names(tmp_path, arc_run, write_arc_run):
+    write_arc_run(tmp_path / "run", arc_run(), "keyframes")
+    for format_name, name in (("tum", "aligned.tum"), ("colmap", "colmap")):
+        assert export_run(tmp_path / "run", format_name, tmp_path / "run" / name).files
+
+
 def contents(folder):
     return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
