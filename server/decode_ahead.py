@@ -72,18 +72,18 @@ class DecodeAhead(Generic[In, Out]):
             if message is None:
                 continue
             self._is_decoding = True
-            decoded, failure = None, "decode"
+            decoded, is_decoded, is_refused = None, False, False
             with self._decoding:
                 try:
-                    decoded, failure = self._decode(message), ""
+                    decoded, is_decoded = self._decode(message), True
                 except SemcastError as err:
-                    failure = "codec"
+                    is_refused = True
                     if str(err) not in self._reported and len(self._reported) < 100:
                         self._reported.add(str(err))
                         logger.warning("%s", err)
-            if failure:
+            if not is_decoded:
                 with self._leaving_out:
-                    self._on_failure(message, failure)
+                    self._on_failure(message, "codec" if is_refused else "decode")
             with self._condition:  # at once, or nobody had the frame for a moment
                 self._slot, self._is_decoding = decoded, False
                 self._condition.notify_all()

@@ -1,6 +1,7 @@
 """What the documentation says about the command line is what the command line takes."""
 
 import ast
+import dataclasses
 import json
 import re
 import shlex
@@ -8,6 +9,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import get_args
 
+import numpy as np
 import pytest
 
 from semcast.channel.link import Link
@@ -15,10 +17,12 @@ from semcast.channel.registry import MODELS
 from semcast.channel.settings import ChannelName
 from semcast.cli import VERBS, verb_parser
 from semcast.common import keys
+from semcast.common.trajectory import Trajectory
 from semcast.evaluation.markdown import with_part
 from semcast.evaluation.path_tables import readme_table
 from semcast.evaluation.results_page import CONFIDENCE_PARTS, RESULTS, results_page
 from semcast.reference import reference, with_messages
+from semcast.server.frame_rows import FrameRow, summarise
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
@@ -188,3 +192,19 @@ def test_every_reason_of_a_drop_is_explained_and_no_other():
     cells = re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
     explained = [reason for cell in cells for reason in re.findall(r"`(\w+)`", cell)]
     assert sorted(explained) == sorted(set(reasons_of_drops()))
+
+
+def fields_told(title):
+    """Names in the first column of a table of fields."""
+    page = (ROOT / "docs/file-formats.md").read_text(encoding="utf-8")
+    table = page.split(f"## Fields of `{title}`")[1].split("\n## ")[0]
+    cells = re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
+    return sorted(name for cell in cells for name in re.findall(r"`(\w+)`", cell))
+
+
+def test_the_fields_of_a_run_are_told_and_no_others():
+    nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    figures = summarise([], nothing, {}, None, [], None, {}, 0)
+    added = re.findall(r'summary\["(\w+)"\] = ', (ROOT / "server/session.py").read_text(encoding="utf-8"))
+    assert fields_told("summary.json") == sorted([*figures, *added])
+    assert fields_told("frames.jsonl") == sorted(f.name for f in dataclasses.fields(FrameRow))
