@@ -131,8 +131,8 @@ class _Sending:
         try:
             unpack(payload, StatusMessage)
         except WireError as err:
-            if err.reason == "version":
-                self.complaints.tell("version", f"the {role_of(key)} takes no frames of this agent: {err}")
+            if err.reason == "version" and (role := role_of(key)) in _PEERS:
+                self.complaints.tell("version", f"the {role} takes no frames of this agent: {err}")
 
     @property
     def channel_uses(self) -> str:
