@@ -1,6 +1,7 @@
 """What ``semcast eval`` does around a measurement: places are checked, files written are named."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,6 +10,8 @@ from full_disk import room_for
 
 from semcast.cli import main
 from semcast.commands.evaluate import EVALUATIONS
+
+DEMO = Path(__file__).resolve().parents[2] / "deploy" / "demo" / "kitti_06"
 
 #: Inputs that are not there: that they are missing is said by the measurement itself.
 INPUTS = {
@@ -132,3 +135,19 @@ def test_what_does_nothing_on_the_channel_is_said(words, idle, codec_words, tmp_
     assert main([*codec_words, *words]) == 0
     said = [record.message for record in caplog.records if "no effect" in record.message]
     assert said == ([] if idle is None else [idle + " as it is set"])
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ([], []),
+        (
+            ["--channel", "rayleigh", "--snr-db", "6"],
+            ["channel, snr_db: no effect with codec none, which sends nothing"],
+        ),
+    ],
+)
+def test_a_link_has_no_effect_on_images_that_are_not_sent(words, told, caplog):
+    clean = ["eval", "trajectory", "--sequence", str(DEMO), "--codec", "none", "--max-frames", "2"]
+    assert main([*clean, "--resize", "0.2", *words]) == 0
+    assert [record.message for record in caplog.records if "no effect" in record.message] == told

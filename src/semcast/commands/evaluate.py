@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import logging
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -30,8 +31,14 @@ from semcast.evaluation import (
     trajectory,
 )
 from semcast.evaluation.interruption import InterruptedMeasurementError, ended_like_ctrl_c
+from semcast.evaluation.pipeline import CLEAN
 from semcast.evaluation.report import RESULT_NAME, STDOUT, UnwrittenResultError, check_outputs
 from semcast.evaluation.result_table import ResultTable, result_table
+
+logger = logging.getLogger(__name__)
+
+#: What is said of a codec and of the link that carries its symbols, besides the channel.
+_OF_A_CODEC = ("snr_db", "modulation", "precision")
 
 _Evaluation = tuple[type, Callable[[Any], dict[str, Any]], frozenset[str], str]
 #: what -> settings, function, settings the evaluation sets itself, one line of help
@@ -185,9 +192,13 @@ def _input_exists(settings: Any) -> bool:
 
 def _check_link(settings: Any, given: Mapping[str, Any]) -> None:
     """Refuse a trace that can't be read; say which of the given values do nothing, SNRs beside one too."""
-    if hasattr(settings, "link"):
-        Link(settings.link, seed=0)
+    if not hasattr(settings, "link"):
+        return
+    Link(settings.link, seed=0)
+    if getattr(settings, "codec", None) != CLEAN:
         warn_of_settings(settings.link, {*given.get("link", {}), *given})
+    elif idle := [*given.get("link", {}), *(name for name in _OF_A_CODEC if name in given)]:
+        logger.warning("%s: no effect with codec %s, which sends nothing", ", ".join(idle), CLEAN)
 
 
 def _tell(line: str) -> None:
