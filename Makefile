@@ -8,7 +8,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 # Tests start hundreds of processes; each would compile all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check format docs results-page bench-pairs bench-scenes bench-loss clean help
+.PHONY: demo test check format docs results-page bench-pairs bench-scenes bench-loss bench-lost-detail clean help
 
 help:            ## what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 14
@@ -44,6 +44,9 @@ bench-scenes: $(VENV)/.ready-run  ## draw rooms, streets, blocks, orbits, measur
 bench-loss: $(VENV)/.ready-run  ## train short with terms of the loss off (DATA=folder with train/ and valid/); overwrites results
 	$(BIN)/python -m semcast.evaluation.loss_ablation $(DATA) $(ARGS)
 	$(BIN)/python -m semcast.evaluation.results_page
+
+bench-lost-detail: $(VENV)/.ready-run  ## fit and grade confidence at small rates (DATA=folder with train/ and valid/); overwrites results
+	$(BIN)/python -m semcast.evaluation.lost_detail $(DATA) $(ARGS)
 
 results-page: $(VENV)/.ready-run  ## write docs/results.md from evaluation/results
 	$(BIN)/python -m semcast.evaluation.results_page

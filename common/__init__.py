@@ -20,6 +20,7 @@ Codecs (networks are in ``nets``, the physical layer in ``phy``)
     codec                   the interface of all codecs
     codecs                  codecs by name
     rate                    channel uses per frame; several rates from one model
+    lost_detail             confidence of a picture coded at a smaller size
     conventional            JPEG, WebP or AVIF over LDPC and QAM
     conventional_source     its image compression
     conventional_transport  its bytes on the symbols of a frame

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from semcast.common.codec import DecodedImage, confidence_from_displacement_px, displacement_px
 from semcast.common.errors import ConfigError
+from semcast.common.lost_detail import confidence_at_camera
 from semcast.common.messages import MAX_PAYLOAD_BYTES, MAX_SIDE_PX, received_bytes
 from semcast.common.phy.slots import BLOCK_PX, USES_PER_BLOCK, layout_for
 
@@ -65,21 +66,28 @@ def to_coded(image: NDArray[np.uint8], rate: Rate) -> NDArray[np.uint8]:
 
 
 def from_coded(decoded: DecodedImage, shape_hw: tuple[int, int]) -> DecodedImage:
-    """Return a decoded image and its maps at the camera's size; a keypoint's displacement grows with it."""
+    """Return a decoded image and its maps at the camera's size.
+
+    A keypoint's displacement grows with the size. Pixel confidence is that in the camera's picture: where the
+    coded one is smaller it falls, most where there is detail (``lost_detail``).
+    """
     coded_hw = decoded.image.shape[:2]
     if coded_hw == shape_hw:
         return decoded
     size_wh = (shape_hw[1], shape_hw[0])
+    growth = math.sqrt(shape_hw[0] * shape_hw[1] / (coded_hw[0] * coded_hw[1]))
     keypoint = decoded.keypoint_confidence
     if keypoint is not None:
-        growth = math.sqrt(shape_hw[0] * shape_hw[1] / (coded_hw[0] * coded_hw[1]))
         moved_px = cv2.resize(displacement_px(keypoint), size_wh, interpolation=cv2.INTER_LINEAR)
         keypoint = confidence_from_displacement_px(np.float32(growth) * np.asarray(moved_px, np.float32))
-    confidence = cv2.resize(decoded.confidence, size_wh, interpolation=cv2.INTER_LINEAR)
+    confidence = decoded.confidence
+    if growth > 1.0:
+        confidence = confidence_at_camera(confidence, decoded.image, 1.0 / growth)
+    confidence = np.asarray(cv2.resize(confidence, size_wh, interpolation=cv2.INTER_LINEAR), np.float32)
     return replace(
         decoded,
         image=np.asarray(cv2.resize(decoded.image, size_wh, interpolation=cv2.INTER_CUBIC), np.uint8),
-        confidence=np.asarray(confidence, np.float32),
+        confidence=confidence,
         keypoint_confidence=keypoint,
     )
 

@@ -48,6 +48,7 @@ Grades
     keyframe_depth      depth maps of keyframes
     cloud_error         dense clouds against drawn scenes
     loss_ablation       what each loss term does
+    lost_detail         confidence of pictures coded at a smaller size: fit and grades
 
 Reports, tables and pictures
     report              results as JSON with provenance
