@@ -47,6 +47,7 @@ bench-loss: $(VENV)/.ready-run  ## train short with terms of the loss off (DATA=
 
 bench-lost-detail: $(VENV)/.ready-run  ## fit and grade confidence at small rates (DATA=folder with train/ and valid/); overwrites results
 	$(BIN)/python -m semcast.evaluation.lost_detail $(DATA) $(ARGS)
+	$(BIN)/python -m semcast.evaluation.results_page
 
 results-page: $(VENV)/.ready-run  ## write docs/results.md from evaluation/results
 	$(BIN)/python -m semcast.evaluation.results_page

@@ -137,8 +137,8 @@ def _grade(photos: Sequence[NDArray[np.uint8]], codec: Codec, rate: Rate, snr_db
     row: dict[str, Any] = {"codec": codec.name, "rate": rate, "snr_db": snr_db}
     for name, pairs in graded.items():
         row[f"ece_{name}"] = float(np.mean([reliability(*pair).ece for pair in pairs]))
-        together = [np.concatenate(side) for side in zip(*pairs, strict=True)]
-        row[f"ece_of_all_{name}"] = reliability(*together).ece
+        predicted, observed = (np.concatenate(side) for side in zip(*pairs, strict=True))
+        row[f"ece_of_all_{name}"] = reliability(predicted, observed).ece
     return row
 
 

@@ -72,6 +72,24 @@ def _codec(report: Report) -> Iterator[str]:
         yield ""
 
 
+def _lost_detail(report: Report) -> Iterator[str]:
+    rows = [(photos, row) for photos in ("kept", "valid") for row in report[photos]]
+    yield (
+        "Calibration error (ECE) with the map as it was decoded and with what scaling adds; the last two "
+        "are of all pixels together. Photos `kept` are of `train/` but not of the fit. Factors: "
+        f"{' and '.join(f'{factor:.3f}' for factor in report['fitted'])} fitted, "
+        f"{' and '.join(f'{factor:g}' for factor in report['used'])} used.\n"
+    )
+    keys = [f"{kind}_{name}" for kind in ("ece", "ece_of_all") for name in ("as_decoded", "with_lost_detail")]
+    yield from table(
+        ["photos", "codec", "rate", "SNR dB", "as decoded", "with it", "all: as decoded", "all: with it"],
+        [
+            [photos, row["codec"], row["rate"], f"{row['snr_db']:g}", *(number(row[key], 3) for key in keys)]
+            for photos, row in rows
+        ],
+    )
+
+
 def _trajectory(report: Report) -> Iterator[str]:
     yield from _other_codec(report)
     yield from trajectory_table(report)
@@ -362,6 +380,7 @@ def _lens(report: Report) -> Iterator[str]:
 SECTIONS: dict[str, tuple[str, Tables]] = {
     "demo": ("The live demo", _demo),
     "codec": ("Image quality per channel use", _codec),
+    "lost": ("Confidence of pictures coded smaller", _lost_detail),
     "trajectory": ("Trajectories", _trajectory),
     "shutter": ("Rolling shutters, put right and not", _trajectory),
     "readout": ("Readout times found", _readout),

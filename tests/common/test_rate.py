@@ -69,9 +69,17 @@ def test_displacement_grows_with_the_image_and_maps_get_its_size():
     large = from_coded(small, (480, 640))
     assert large.image.shape == (480, 640, 3)
     assert np.all(large.image == 90)
-    np.testing.assert_allclose(large.confidence, np.full((480, 640), 0.75), rtol=1e-6)
+    assert np.all(large.confidence == large.confidence[0, 0])
+    assert 0.72 < large.confidence[0, 0] < 0.75, "a plane has no detail to lose"
     np.testing.assert_allclose(displacement_px(large.keypoint_confidence), 1.0, rtol=1e-5)
     assert from_coded(large, (480, 640)) is large
+
+
+def test_confidence_falls_only_where_the_camera_had_more_pixels():
+    image = np.random.default_rng(0).integers(0, 256, (240, 320, 3), dtype=np.uint8)
+    decoded = DecodedImage(image=image, confidence=np.full((240, 320), 0.75, np.float32))
+    assert from_coded(decoded, (480, 640)).confidence.max() < 0.6
+    np.testing.assert_allclose(from_coded(decoded, (120, 160)).confidence, 0.75, rtol=1e-6)
 
 
 def test_a_lost_slot_marks_every_band_it_touches():
