@@ -13,6 +13,7 @@ Points in images
     wide_search      matches by SIFT, however far points moved
     sampling         values of an image between its pixels
     brightness       change of exposure between two images
+    flicker          bands of light that lamps leave in images of a rolling shutter
     streaks          motion blur that differs between two images
     cells            cells of an image by one number each
     square_distance  squared distances, all with all

@@ -19,6 +19,7 @@ from semcast.server.geometry.features import (
     track_alike,
     track_through_light,
 )
+from semcast.server.geometry.flicker import flicker_between, with_row_gains
 from semcast.server.geometry.streaks import blurred_alike
 from semcast.server.geometry.warped_points import MAX_FROM_GUESS_PX, track_warped
 from semcast.server.geometry.weighting import (
@@ -190,7 +191,10 @@ class TrackTable:
         # Those that are most come first: of one image all the others may be, and a few can't tell the light.
         for back in behind[np.argsort(-count, kind="stable")]:
             rows = np.flatnonzero(self.missed == back)
-            grey, way = self._greys[-1 - back], (self.xy[rows], guess_xy[rows])
+            way = self.xy[rows], guess_xy[rows]
+            if not is_in_light:
+                self._bring_to_lamps(flicker_between(self._greys[-1 - back], sight.grey, *way, sight.usable))
+            grey = self._greys[-1 - back]
             images = blurred_alike(grey, sight.grey, self._bands[-1 - back], sight.band_power)
             if is_in_light:
                 points = track_alike(*images, *way, max_level=max_level)
@@ -218,6 +222,11 @@ class TrackTable:
         """
         if change is not None:
             self._greys = [with_brightness(grey, *change) for grey in self._greys]
+
+    def _bring_to_lamps(self, gains: Array | None) -> None:
+        """Let the images that tracks are followed from have the bands of light of the newest one."""
+        if gains is not None:
+            self._greys = [with_row_gains(grey, gains) for grey in self._greys]
 
     def follow_again(self, sight: Sight, guess: Callable[["TrackTable"], Array]) -> bool:
         """Look again for what ``follow`` just looked for, from another guess.

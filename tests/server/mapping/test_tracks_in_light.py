@@ -7,6 +7,7 @@ import pytest
 from shifted_texture import begin, sight_at
 
 from semcast.server.geometry.brightness import brightness_change, with_brightness
+from semcast.server.geometry.flicker import with_row_gains
 
 
 def darker(sight, gain):
@@ -70,3 +71,24 @@ def test_a_few_tracks_that_are_left_do_not_tell_the_light_for_those_that_coast(g
     assert came.mean() > 0.9
     off = tracks.xy[np.searchsorted(tracks.ids, ids[came])] - (xy[came] - (6, 0))
     assert np.median(np.linalg.norm(off, axis=1)) < 0.25
+
+
+def under_lamp(sight, depth, phase):
+    """The same sight with bands of light across it, as a rolling shutter has it under a flickering lamp."""
+    height = len(sight.grey)
+    light = 1 - depth + depth * np.sin(2 * np.pi * 1.5 * np.arange(height) / height + phase)
+    return replace(sight, grey=with_row_gains(sight.grey, light))
+
+
+@pytest.mark.parametrize("depth", [0.1, 0.2])
+def test_tracks_go_on_under_a_lamp_that_flickers(depth):
+    tracks = begin()
+    tracks.replace_newest(under_lamp(sight_at(20), depth, 0.0))
+    ids, xy = tracks.ids, tracks.xy
+    for k in range(1, 5):
+        tracks.follow(under_lamp(sight_at(20 + 3 * k), depth, 2.0 * k), tracks.xy + tracks.velocity)
+    stays = xy[:, 0] > 3 * 4 + 20
+    seen = stays & np.isin(ids, tracks.ids[tracks.visible])
+    assert seen.sum() > 0.95 * stays.sum()
+    off = tracks.xy[np.searchsorted(tracks.ids, ids[seen])] - (xy[seen] - (12, 0))
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.12

@@ -1,0 +1,126 @@
+"""Bands that flickering lamps leave in the images of a rolling shutter, made up for between two images.
+
+Lamps on 50 or 60 Hz mains flicker at twice that. A rolling shutter exposes one row after the other, so each
+image has brighter and darker bands across it, which lie elsewhere in the next one: to Lucas-Kanade, a point
+has another brightness on every row, and most are lost. How much brighter each row has become is told by all
+of it, wherever single points went: images a few pixels apart show much the same in a row, and what they
+don't, the median of its cells leaves out.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from semcast.server.geometry.features import Grey, TrackedPoints, track_alike
+
+Array = NDArray[np.float64]
+
+#: Side of the cells whose means are compared: bands are wider, and noise and fine detail are gone.
+_CELL_PX = 8
+#: Cells outside these grey levels may be clipped.
+_DARKEST, _BRIGHTEST = 8.0, 247.0
+#: Share of a row's cells that must tell, and rows of cells that must have so many.
+_TELLING_SHARE, _LEAST_ROWS = 0.2, 8
+#: Weights of neighbouring rows of cells: a band reaches over several of them.
+_SMOOTHING = np.array([0.25, 0.5, 0.25])
+#: Standard deviation of the rows' log gains below which a small window makes up for them. Clean images that
+#: lie alike differ by up to a hundredth, by which slow changes of what is in a row make them.
+_LEAST_SD = 0.03
+#: Points by which gains are tried out, of at least so many,
+_NUM_SCOUTS, _LEAST_SCOUTS = 60, 20
+#: the share of them that must be found then, and by which factor they must be more than without, or their
+#: windows more alike,
+_SCOUTS_FOUND, _CLEARLY_BETTER = 0.4, 1.2
+#: where at least about as many were found.
+_AS_MANY = 0.95
+
+
+def row_gains(grey0: Grey, grey1: Grey, shift_px: Array, usable: NDArray[np.bool_]) -> Array | None:
+    """Tell by which factor each row of an image is brighter in another, if rows differ in that.
+
+    Args:
+        grey0: ``(H, W)`` first image.
+        grey1: ``(H, W)`` second image.
+        shift_px: ``(2,)`` about how far what they show moved, in x and y.
+        usable: ``(H,)`` rows of the second image that arrived.
+
+    Returns:
+        ``(H,)`` factors from the first image to the second, for the first one's rows; None where all are
+        about the same, or where too little of the images overlaps.
+    """
+    height, width = grey0.shape
+    dx, dy = (int(v) for v in np.rint(np.clip(np.nan_to_num(shift_px), -width, height + width)))
+    top, bottom, left, right = max(0, -dy), min(height, height - dy), max(0, -dx), min(width, width - dx)
+    columns, rows = (right - left) // _CELL_PX, (bottom - top) // _CELL_PX
+    if columns < 1 or rows < _LEAST_ROWS:
+        return None
+    moved = grey1[top + dy : bottom + dy, left + dx : right + dx]
+    cells0, cells1 = (
+        cv2.resize(grey, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
+        for grey in (grey0[top:bottom, left:right], moved)
+    )
+    tells = (np.minimum(cells0, cells1) > _DARKEST) & (np.maximum(cells0, cells1) < _BRIGHTEST)
+    y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows - 0.5
+    tells &= usable[np.clip(np.rint(y).astype(int) + dy, 0, height - 1)][:, None]
+    telling = np.flatnonzero(tells.sum(axis=1) >= _TELLING_SHARE * columns)
+    if len(telling) < _LEAST_ROWS:
+        return None
+    ratios = np.log(np.maximum(cells1, 1.0) / np.maximum(cells0, 1.0))
+    medians = np.array([np.median(ratios[row, tells[row]]) for row in telling])
+    logs = np.interp(y, y[telling], medians)
+    margin = len(_SMOOTHING) // 2
+    logs = np.convolve(np.pad(logs, margin, mode="edge"), _SMOOTHING, mode="valid")
+    if logs.std() < _LEAST_SD:
+        return None
+    return np.asarray(np.exp(np.interp(np.arange(height), y, logs)))
+
+
+def with_row_gains(grey: Grey, gains: Array) -> Grey:
+    """Return an ``(H, W)`` image with each row brighter by a factor ``(H,)``, clipped as a camera clips."""
+    bright = np.rint(grey * gains.astype(np.float32)[:, None])
+    return np.asarray(np.minimum(bright, 255.0), dtype=np.uint8)
+
+
+def flicker_between(
+    grey0: Grey, grey1: Grey, xy0: Array, guess1_xy: Array, usable: NDArray[np.bool_]
+) -> Array | None:
+    """Tell gains of rows by which points are found clearly better: only those are bands of light.
+
+    Rows differ in brightness too where the camera nodded and the sky begins in another row.
+
+    Args:
+        grey0: ``(H, W)`` image the points are known in.
+        grey1: ``(H, W)`` image they are looked for in.
+        xy0: ``(N, 2)`` pixels in ``grey0``.
+        guess1_xy: ``(N, 2)`` where they are expected in ``grey1``.
+        usable: ``(H,)`` rows of ``grey1`` that arrived.
+
+    Returns:
+        ``(H,)`` as ``row_gains`` tells them, or None.
+    """
+    if len(xy0) < _LEAST_SCOUTS or grey0.shape != grey1.shape:
+        return None
+    gains = row_gains(grey0, grey1, np.median(guess1_xy - xy0, axis=0), usable)
+    if gains is None:
+        return None
+    scouts = slice(None, None, max(1, len(xy0) // _NUM_SCOUTS))
+    way = xy0[scouts], guess1_xy[scouts]
+    even = np.full(len(gains), np.median(gains))  # another exposure is no flicker
+    plain = track_alike(with_row_gains(grey0, even), grey1, *way)
+    lit = track_alike(with_row_gains(grey0, gains), grey1, *way)
+    if lit.ok.mean() < _SCOUTS_FOUND or not _is_clearly_better(lit, plain):
+        return None
+    # Now it is known how far all moved.
+    again = row_gains(grey0, grey1, np.median((lit.xy - way[0])[lit.ok], axis=0), usable)
+    return gains if again is None else again
+
+
+def _is_clearly_better(lit: TrackedPoints, plain: TrackedPoints) -> bool:
+    """Tell whether more points were found, or as many whose windows are more alike."""
+    both, num_lit, num_plain = lit.ok & plain.ok, lit.ok.sum(), plain.ok.sum()
+    if num_lit > _CLEARLY_BETTER * num_plain:
+        return True
+    if num_lit < _AS_MANY * num_plain or not both.any():
+        return False
+    unlike_lit, unlike_plain = (np.median(points.photometric_grey[both]) for points in (lit, plain))
+    return bool(_CLEARLY_BETTER * unlike_lit < unlike_plain)
