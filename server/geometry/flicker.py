@@ -49,25 +49,28 @@ def row_gains(grey0: Grey, grey1: Grey, shift_px: Array, usable: NDArray[np.bool
         about the same, or where too little of the images overlaps.
     """
     height, width = grey0.shape
-    dx, dy = (int(v) for v in np.rint(np.clip(np.nan_to_num(shift_px), -width, height + width)))
+    dx, dy = (int(v) for v in np.rint(np.clip(np.nan_to_num(shift_px), -height - width, height + width)))
     top, bottom, left, right = max(0, -dy), min(height, height - dy), max(0, -dx), min(width, width - dx)
     columns, rows = (right - left) // _CELL_PX, (bottom - top) // _CELL_PX
     if columns < 1 or rows < _LEAST_ROWS:
         return None
-    moved = grey1[top + dy : bottom + dy, left + dx : right + dx]
+    # Whole cells: OpenCV takes means of others several times as slowly.
+    here = slice(top, top + rows * _CELL_PX), slice(left, left + columns * _CELL_PX)
+    there = tuple(slice(part.start + by, part.stop + by) for part, by in zip(here, (dy, dx), strict=True))
     cells0, cells1 = (
-        cv2.resize(grey, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
-        for grey in (grey0[top:bottom, left:right], moved)
+        cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
+        for part in (grey0[here], grey1[there])
     )
     tells = (np.minimum(cells0, cells1) > _DARKEST) & (np.maximum(cells0, cells1) < _BRIGHTEST)
-    y = top + (np.arange(rows) + 0.5) * (bottom - top) / rows - 0.5
-    tells &= usable[np.clip(np.rint(y).astype(int) + dy, 0, height - 1)][:, None]
-    telling = np.flatnonzero(tells.sum(axis=1) >= _TELLING_SHARE * columns)
+    tells &= usable[there[0]].reshape(rows, _CELL_PX).all(axis=1)[:, None]
+    count = tells.sum(axis=1)
+    telling = np.flatnonzero(count >= max(1.0, _TELLING_SHARE * columns))
     if len(telling) < _LEAST_ROWS:
         return None
-    ratios = np.log(np.maximum(cells1, 1.0) / np.maximum(cells0, 1.0))
-    medians = np.array([np.median(ratios[row, tells[row]]) for row in telling])
-    logs = np.interp(y, y[telling], medians)
+    ratios = np.sort(np.where(tells, np.maximum(cells1, 1.0) / np.maximum(cells0, 1.0), np.inf), axis=1)
+    medians = ratios[telling, count[telling] // 2]
+    y = top + (np.arange(rows) + 0.5) * _CELL_PX - 0.5
+    logs = np.interp(y, y[telling], np.log(medians))
     margin = len(_SMOOTHING) // 2
     logs = np.convolve(np.pad(logs, margin, mode="edge"), _SMOOTHING, mode="valid")
     if logs.std() < _LEAST_SD:
