@@ -26,6 +26,9 @@ _SMOOTHING = np.array([0.25, 0.5, 0.25])
 #: Standard deviation of the rows' log gains below which a small window makes up for them. Clean images that
 #: lie alike differ by up to a hundredth, by which slow changes of what is in a row make them.
 _LEAST_SD = 0.03
+#: Share of the cells' typical change of brightness that gains of rows may leave unexplained. Of bands that is
+#: a twentieth to a half, of what moves in clean images more than four fifths.
+_MOST_LEFT = 0.7
 #: Points by which gains are tried out, of at least so many,
 _NUM_SCOUTS, _LEAST_SCOUTS = 60, 20
 #: the share of them that must be found then, and by which factor they must be more than without, or their
@@ -67,13 +70,18 @@ def row_gains(grey0: Grey, grey1: Grey, shift_px: Array, usable: NDArray[np.bool
     telling = np.flatnonzero(count >= max(1.0, _TELLING_SHARE * columns))
     if len(telling) < _LEAST_ROWS:
         return None
-    ratios = np.sort(np.where(tells, np.maximum(cells1, 1.0) / np.maximum(cells0, 1.0), np.inf), axis=1)
-    medians = ratios[telling, count[telling] // 2]
+    ratios = np.log(np.maximum(cells1, 1.0) / np.maximum(cells0, 1.0))
+    in_order = np.sort(np.where(tells, ratios, np.inf), axis=1)
     y = top + (np.arange(rows) + 0.5) * _CELL_PX - 0.5
-    logs = np.interp(y, y[telling], np.log(medians))
+    logs = np.interp(y, y[telling], in_order[telling, count[telling] // 2])
     margin = len(_SMOOTHING) // 2
     logs = np.convolve(np.pad(logs, margin, mode="edge"), _SMOOTHING, mode="valid")
     if logs.std() < _LEAST_SD:
+        return None
+    unlike, left_over = (
+        np.median(np.abs(ratios - around)[tells]) for around in (np.median(ratios[tells]), logs[:, None])
+    )
+    if left_over > _MOST_LEFT * unlike:
         return None
     return np.asarray(np.exp(np.interp(np.arange(height), y, logs)))
 
@@ -89,7 +97,7 @@ def flicker_between(
 ) -> Array | None:
     """Tell gains of rows by which points are found clearly better: only those are bands of light.
 
-    Rows differ in brightness too where the camera nodded and the sky begins in another row.
+    Rows change in brightness too where a scene of level layers moves up and down in the image.
 
     Args:
         grey0: ``(H, W)`` image the points are known in.
