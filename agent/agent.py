@@ -28,6 +28,7 @@ from semcast.common.rate import RateControl
 from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session, open_session
 from semcast.common.wire import WireError, pack, unpack
+from semcast.common.worker_guard import WorkerGuard
 
 logger = logging.getLogger(__name__)
 
@@ -168,6 +169,11 @@ class _Sending:
         self.metrics.count("sent")
         self.metrics.observe("capture_to_sent", (time.monotonic_ns() - message.t_capture_ns) * 1e-6)
 
+    def leave_out(self, frame_id: int, why: Exception) -> None:
+        """Count a frame that can't be sent, and say why."""
+        self.metrics.drop("encode")
+        self.complaints.tell("encode", f"frame {frame_id} is left out: {why}")
+
     def close(self) -> None:
         """Let the originals that wait be sent. Idempotent."""
         if self._originals is not None:
@@ -180,6 +186,12 @@ def _send_live(sending: _Sending, capture: Capture, stop: threading.Event) -> No
     That one is repeated, so whoever comes in time has it.
     """
     last: SymbolFrame | None = None
+
+    def on_unforeseen(text: str) -> None:
+        sending.metrics.drop("encode")
+        sending.metrics.error(text)
+
+    encoding = WorkerGuard("encoding a frame", on_unforeseen)  # as where there is no memory for a moment
     while not stop.is_set() and not capture.ended:
         frame = capture.get(_POLL_S)
         if frame is None:
@@ -187,13 +199,19 @@ def _send_live(sending: _Sending, capture: Capture, stop: threading.Event) -> No
         if not frame.final and not sending.is_heard:
             sending.metrics.drop("unheard")
             continue
+        encoded = None
+        with encoding:
+            try:
+                encoded = sending.encode(frame)
+            except ValueError as err:
+                sending.leave_out(frame.frame_id, err)
+        if encoded is None:
+            continue
         try:
-            last = sending.encode(frame)
-            sending.send(last)
-        except (ValueError, WireError) as err:
-            sending.metrics.drop("encode")
-            sending.metrics.error(f"frame {frame.frame_id} left out: {err}")
-            logger.warning("frame %d is left out: %s", frame.frame_id, err)
+            sending.send(encoded)
+            last = encoded
+        except WireError as err:
+            sending.leave_out(frame.frame_id, err)
     if last is None or not last.final:
         return
     until_s = time.monotonic() + _FAREWELL_S

@@ -28,6 +28,7 @@ from semcast.common.status_beat import StatusBeat
 from semcast.common.symbol_payload import data_symbols, pack_iq, pack_lost
 from semcast.common.transport import FRAME_RING_CAPACITY, Session, open_client, open_session
 from semcast.common.wire import WireError, pack, unpack
+from semcast.common.worker_guard import WorkerGuard
 
 logger = logging.getLogger(__name__)
 
@@ -49,8 +50,8 @@ class Emulator:
         session: Open.
         settings: Of the process.
         metrics: Where to count. Drops: ``superseded`` by a newer frame while busy, ``lost`` on the air,
-            ``missing`` (gaps in what the agent sent), ``protocol``, ``overflow`` (too many are delayed),
-            ``unsent`` (one that was carried could not be sent on).
+            ``missing`` (gaps in what the agent sent), ``protocol``, ``carry`` (an error nobody foresaw),
+            ``overflow`` (too many are delayed), ``unsent`` (one that was carried could not be sent on).
     """
 
     def __init__(self, session: Session, settings: EmulatorSettings, metrics: Metrics) -> None:
@@ -109,16 +110,18 @@ class Emulator:
 
     def work(self, stop: threading.Event) -> None:
         """Carry frames until ``stop`` is set."""
+        carrying = WorkerGuard("carrying a frame", self._on_uncarried)
         while not stop.is_set():
             frame = self._box.get(_POLL_S)
             if frame is None:
                 continue
-            try:
-                with self._metrics.stage("channel"):
-                    self._carry(frame)
-            except (ValueError, SemcastError) as err:
-                self._metrics.drop("protocol")
-                self._complaints.tell("frame", f"frame {frame.frame_id} is left out: {err}")
+            with carrying:
+                try:
+                    with self._metrics.stage("channel"):
+                        self._carry(frame)
+                except (ValueError, SemcastError) as err:
+                    self._metrics.drop("protocol")
+                    self._complaints.tell("frame", f"frame {frame.frame_id} is left out: {err}")
 
     def _carry(self, frame: SymbolFrame) -> None:
         self._follow(frame)
@@ -173,6 +176,10 @@ class Emulator:
             (self._lossless if lossless else self._live).put(packet)
         except TransportError as err:
             self._on_unsent(str(err))
+
+    def _on_uncarried(self, text: str) -> None:
+        self._metrics.drop("carry")
+        self._metrics.error(text)
 
     def _on_unsent(self, text: str) -> None:
         self._metrics.drop("unsent")

@@ -58,14 +58,16 @@ def row_gains(grey0: Grey, grey1: Grey, shift_px: Array, usable: NDArray[np.bool
     if columns < 1 or rows < _LEAST_ROWS:
         return None
     # Whole cells: OpenCV takes means of others several times as slowly.
-    here = slice(top, top + rows * _CELL_PX), slice(left, left + columns * _CELL_PX)
-    there = tuple(slice(part.start + by, part.stop + by) for part, by in zip(here, (dy, dx), strict=True))
+    there = slice(top + dy, top + dy + rows * _CELL_PX)
+    parts = (
+        grey0[top : top + rows * _CELL_PX, left : left + columns * _CELL_PX],
+        grey1[there, left + dx : left + dx + columns * _CELL_PX],
+    )
     cells0, cells1 = (
-        cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
-        for part in (grey0[here], grey1[there])
+        cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64) for part in parts
     )
     tells = (np.minimum(cells0, cells1) > _DARKEST) & (np.maximum(cells0, cells1) < _BRIGHTEST)
-    tells &= usable[there[0]].reshape(rows, _CELL_PX).all(axis=1)[:, None]
+    tells &= usable[there].reshape(rows, _CELL_PX).all(axis=1, keepdims=True)
     count = tells.sum(axis=1)
     telling = np.flatnonzero(count >= max(1.0, _TELLING_SHARE * columns))
     if len(telling) < _LEAST_ROWS:

@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from stream_bench import Bench
 
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import DecodedImage, EncodedImage
@@ -41,6 +42,13 @@ class TinyCodec:
 @pytest.fixture
 def codec():
     return TinyCodec()
+
+
+@pytest.fixture
+def bench(recording, codec):
+    opened = Bench(recording, codec)
+    yield opened
+    opened.close()
 
 
 @pytest.fixture(scope="session")

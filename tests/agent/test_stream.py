@@ -1,118 +1,22 @@
 """Agent, channel and receiver together over loopback, started, slowed down, killed and restarted."""
 
-import shutil
-import threading
-import time
-
 import msgpack
 import numpy as np
 import pytest
+from stream_bench import Thread, take
 from waiting import until
 
 from semcast.agent.agent import run_agent
 from semcast.agent.settings import AgentSettings
 from semcast.agent.source_settings import SourceSettings
-from semcast.channel.emulator import run_channel
-from semcast.channel.emulator_settings import EmulatorSettings
-from semcast.channel.settings import ChannelSettings
-from semcast.common.errors import SourceError
 from semcast.common.keys import link_key, status_key
-from semcast.common.loopback import free_endpoint, open_hub
+from semcast.common.loopback import free_endpoint
 from semcast.common.messages import LinkReport, StatusMessage
-from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.transport import open_session
 from semcast.common.wire import pack, unpack
-from semcast.server.receiver import Receiver
 
 pytestmark = pytest.mark.xdist_group("real-time")
-
-
-class Thread(threading.Thread):
-    """A process function in a thread, with its own stop event and its result."""
-
-    def __init__(self, work):
-        super().__init__()
-        self.stop = threading.Event()
-        self.result = None
-        self.error = None
-        self._work = work
-        self.start()
-
-    def run(self):
-        try:
-            self.result = self._work(self.stop)
-        except Exception as err:
-            self.error = err
-
-    def end(self):
-        self.stop.set()
-        self.join(60)
-        assert not self.is_alive()
-
-
-class Bench:
-    """A hub with agents and channels in threads."""
-
-    def __init__(self, recording, codec):
-        self.recording, self.codec = recording, codec
-        self.hub, self.endpoint = open_hub()
-        self.network = NetworkSettings(connect=(self.endpoint,))
-        self.metrics = Metrics("server")
-        self.threads = []
-        self.receivers = []
-
-    def agent(self, mode="live", source=None, **changes):
-        pace = {"pace": "receiver"} if mode == "replay" else {}
-        source = SourceSettings(source=str(self.recording), **{**pace, **(source or {})})
-        settings = AgentSettings(source=source, mode=mode, network=self.network, **changes)
-        return self._thread(lambda stop: run_agent(settings, stop, self.codec))
-
-    def channel(self, **link):
-        settings = EmulatorSettings(link=ChannelSettings(**link), network=self.network)
-        return self._thread(lambda stop: run_channel(settings, stop))
-
-    def _thread(self, work):
-        self.threads.append(Thread(work))
-        return self.threads[-1]
-
-    def receiver(self, mode="live"):
-        self.receivers.append(Receiver(self.hub, "agent0", mode, self.metrics))
-        self.hub.declare_alive("agent0", "server")
-        return self.receivers[-1]
-
-    def close(self):
-        for thread in self.threads:
-            thread.end()
-        for receiver in self.receivers:
-            receiver.close()
-        self.hub.close()
-
-
-@pytest.fixture
-def bench(recording, codec):
-    opened = Bench(recording, codec)
-    yield opened
-    opened.close()
-
-
-def take(receiver, count=None, deadline_s=60.0, pause_s=0.0):
-    """Take frames until the final one, or so many."""
-    frames = []
-    end_s = time.monotonic() + deadline_s
-    tick = threading.Event()
-    while time.monotonic() < end_s:
-        frame = receiver.next(0.05)
-        if frame is None:
-            for epoch in list(receiver._cameras):  # what a server says once its decoder is loaded
-                receiver.announce_ready(epoch)
-        else:
-            frames.append(frame)
-            receiver.done(frame.message)
-            if frame.message.final or len(frames) == count:
-                return frames
-            tick.wait(pause_s)
-    raise AssertionError(f"only {len(frames)} frames came: {[f.message.frame_id for f in frames]}")
 
 
 def test_images_cross_the_link_and_feedback_comes_back(bench):
@@ -419,78 +323,6 @@ def test_a_last_frame_that_is_sent_again_is_counted_once(bench, monkeypatch):
     counts = agent.result["counts"]
     assert counts["sent"] + sum(agent.result["drops"].values()) == 12
     assert counts["sent_again"] >= 2
-
-
-class Picky:
-    """Refuses one frame of twelve."""
-
-    def __init__(self, codec):
-        self.name, self.digest, self.modulation = codec.name, codec.digest, codec.modulation
-        self._codec = codec
-
-    def encode(self, image, snr_db):
-        if image[0, 0, 0] == 60:
-            raise ValueError("this codec can't")
-        return self._codec.encode(image, snr_db)
-
-
-def test_a_frame_that_can_not_be_sent_live_is_left_out_and_counted(bench, caplog):
-    bench.codec = Picky(bench.codec)
-    bench.channel()
-    source = {"pace": "rate", "rate_hz": 10.0}
-    receiver, agent = bench.receiver(), bench.agent(follow_server=False, source=source)
-    frames = take(receiver, count=5)
-    agent.join(40)
-    assert agent.error is None
-    ids = {f.message.frame_id for f in frames}
-    assert 3 not in ids
-    assert max(ids) > 3
-    assert agent.result["drops"]["encode"] == 1
-    assert "frame 3 is left out: this codec can't" in caplog.text
-
-
-def test_a_frame_that_can_not_be_encoded_ends_a_replay_that_may_leave_none_out(bench):
-    bench.codec = Picky(bench.codec)
-    bench.channel()
-    receiver, agent = bench.receiver("replay"), bench.agent("replay")
-    assert [f.message.frame_id for f in take(receiver, count=1)] == [0]
-    agent.join(40)
-    assert isinstance(agent.error, SourceError)
-    assert str(agent.error) == "frame 3 can't be encoded, and a replay leaves none out: this codec can't"
-
-
-class AfterTheSource:
-    """Encodes nothing before the source has ended."""
-
-    def __init__(self, codec):
-        self.name, self.digest, self.modulation = codec.name, codec.digest, codec.modulation
-        self._codec = codec
-
-    def encode(self, image, snr_db):
-        until(lambda: all(thread.name != "semcast-capture" for thread in threading.enumerate()))
-        return self._codec.encode(image, snr_db)
-
-
-@pytest.mark.parametrize("mode", ["live", "replay"])
-def test_a_source_that_fails_while_a_frame_is_encoded_is_no_end_of_it(bench, recording, tmp_path, mode):
-    bench.recording = shutil.copytree(recording, tmp_path / "damaged")
-    for k in range(2, 12):
-        (bench.recording / "images" / f"{k:06d}.png").write_bytes(b"")
-    bench.codec = AfterTheSource(bench.codec)
-    statuses = []
-    bench.hub.subscribe(
-        status_key("agent0", "agent"), "every", lambda p: statuses.append(unpack(p, StatusMessage))
-    )
-    bench.channel()
-    receiver = bench.receiver(mode)
-    agent = bench.agent(mode, follow_server=False)  # all of 50 Hz
-    frames = take(receiver, count=2 if mode == "replay" else 1)
-    agent.join(40)
-    assert isinstance(agent.error, SourceError)
-    assert "000011.png" in str(agent.error)
-    until(lambda: bool(statuses) and statuses[-1].last_error == str(agent.error))
-    assert statuses[-1].counts["sent"] == 2
-    assert {f.message.frame_id for f in frames} <= {0, 1}
 
 
 def test_an_agent_without_a_hub_can_be_stopped(recording, codec):

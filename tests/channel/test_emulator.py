@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from waiting import came_true, until
 
+from semcast.channel import emulator
 from semcast.channel.emulator import Emulator, run_channel, set_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.link import Link
@@ -257,12 +258,12 @@ def test_delay_is_added(ends, make):
 def test_what_can_not_be_sent_on_is_counted_and_told(make, delay_ms):
     hub, _ = open_hub()
     metrics = Metrics("channel")
-    emulator = Emulator(hub, EmulatorSettings(link=ChannelSettings(delay_ms=delay_ms)), metrics)
-    emulator._live._publisher.undeclare()
-    emulator._carry(make(0))
+    channel = Emulator(hub, EmulatorSettings(link=ChannelSettings(delay_ms=delay_ms)), metrics)
+    channel._live._publisher.undeclare()
+    channel._carry(make(0))
     until(lambda: metrics.drops == {"unsent": 1}, "it is counted")
     assert "rx/symbols can't be sent" in metrics.status(0).last_error
-    emulator.close()
+    channel.close()
     hub.close()
 
 
@@ -283,6 +284,22 @@ def test_bad_messages_are_counted_and_told_and_do_no_harm(ends, make, caplog):
     e.tx.put(pack(e.received[0]))
     until(lambda: e.status[-1].drops.get("protocol") == 5)
     assert "frame must be tx, got rx" in caplog.text
+
+
+def test_an_error_nobody_foresaw_takes_one_frame_and_not_the_channel(ends, make, monkeypatch, caplog):
+    insert = emulator.insert_pilots
+
+    def fails_once(symbols):
+        monkeypatch.setattr(emulator, "insert_pilots", insert)
+        raise MemoryError("no memory")
+
+    e = ends()
+    monkeypatch.setattr(emulator, "insert_pilots", fails_once)
+    e.tx.put(pack(make(0)))
+    until(lambda: e.status and e.status[-1].drops.get("carry") == 1)
+    e.pass_one(make(1))
+    until(lambda: [f.seq for f in e.received] == [1])
+    assert "carrying a frame failed: no memory" in caplog.text
 
 
 def test_a_process_ends_cleanly_on_sigterm_and_another_takes_over_after_a_kill(make):
