@@ -121,6 +121,8 @@ def evaluate_trajectory(settings: TrajectorySettings, codec: Codec | None = None
     settings = naming(settings, codec)
     sequence, codec = open_stream(settings, codec)
     truth = sequence.groundtruth()
+    if doubt := sequence.doubt:
+        logger.warning("%s is %s", sequence.name, doubt)
     has_truth = _is_usable(truth, sequence.name, len(sequence))
     chosen = select_frames(sequence, settings)
     # Without a link neither SNR nor channel seed changes an image: one SNR stands for all.

@@ -186,6 +186,20 @@ def test_a_truth_that_measures_nothing_is_not_a_failure_of_the_run(room, tmp_pat
     assert "too short to say how far its poses are off" in caplog.text
 
 
+def test_images_of_which_each_looks_elsewhere_are_said_to_be_no_stream(room, tmp_path, caplog):
+    folder = tmp_path / "views"
+    shutil.copytree(room, folder)
+    lines = [line for line in (folder / "groundtruth.txt").read_text().splitlines() if line[0] != "#"]
+    turned = [np.radians(75.0 * k / 2) for k in range(len(lines))]
+    poses = [
+        " ".join([*line.split()[:4], "0", f"{np.sin(a)}", "0", f"{np.cos(a)}"])
+        for line, a in zip(lines, turned, strict=True)
+    ]
+    (folder / "groundtruth.txt").write_text("\n".join(poses))
+    evaluate_trajectory(TrajectorySettings(sequence=folder, codec="none", max_frames=3))
+    assert "views is no stream: from one image to the next the camera turns by 75 degrees" in caplog.text
+
+
 def test_a_truth_of_a_part_of_the_recording_is_told(room, tmp_path, caplog):
     folder = tmp_path / "part"
     shutil.copytree(room, folder)
