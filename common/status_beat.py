@@ -8,7 +8,7 @@ from semcast.common.errors import SemcastError
 from semcast.common.keys import status_key
 from semcast.common.messages import StatusMessage
 from semcast.common.metrics import STATUS_INTERVAL_S, Metrics
-from semcast.common.transport import Session
+from semcast.common.transport import Publisher, Session
 from semcast.common.wire import WireError, pack, unpack
 from semcast.common.worker_guard import WorkerGuard
 
@@ -30,6 +30,8 @@ class StatusBeat:
         self, session: Session, agent_id: str, role: str, metrics: Metrics, agent_epoch: Callable[[], int]
     ) -> None:
         self._publisher = session.publisher(status_key(agent_id, role), "newest")
+        # No other comes after the last one, which may be all that says that a stream has ended.
+        self._last_publisher = session.publisher(status_key(agent_id, role), "every")
         self._metrics = metrics
         self._agent_epoch = agent_epoch
         self._stopping = threading.Event()
@@ -44,17 +46,20 @@ class StatusBeat:
 
     def send(self) -> None:
         """Send the status now, before work that does not let go of the interpreter for seconds."""
+        self._send(self._publisher)
+
+    def _send(self, publisher: Publisher) -> None:
         try:
-            self._publisher.put(pack(self._metrics.status(self._agent_epoch())))
+            publisher.put(pack(self._metrics.status(self._agent_epoch())))
         except SemcastError as err:
             logger.debug("status not sent: %s", err)
 
     def close(self) -> None:
-        """Send the last status and end the thread. Idempotent."""
+        """Send the last status, which a busy link delays but does not drop, and end. Idempotent."""
         if not self._stopping.is_set():
             self._stopping.set()
             self._thread.join(2.0)
-            self.send()
+            self._send(self._last_publisher)
 
 
 def hear_statuses(session: Session, agent_id: str, roles: Collection[str]) -> dict[str, StatusMessage]:
