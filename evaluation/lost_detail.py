@@ -1,6 +1,6 @@
 """Fit and grade pixel confidence where a picture is coded at a smaller size than the camera's.
 
-Run by ``make bench-lost-detail DATA=<folder>``; about ten minutes of one core. The factors of
+Run by ``make bench-lost-detail DATA=<folder>``; about four minutes of one core. The factors of
 ``common.lost_detail`` are fitted to photos of ``DATA/train``, of which every second one is kept for choosing
 between forms, and graded once on ``DATA/valid``, which chose nothing.
 """
