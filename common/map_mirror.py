@@ -148,13 +148,13 @@ class MapMirror:
         with self._asking:
             with self._lock:
                 self._early, asked = [*early], self._server
-            whole, num_before, is_settled = self._ask(), len(early), False
-            for is_last in (False,) * (_MAX_QUESTIONS - 1) + (True,):
+            whole, num_before = self._ask(), len(early)
+            for num_asked in range(1, _MAX_QUESTIONS + 1):
                 with self._lock:
                     num_now = len(self._early)
                     # Where it had no map when it was asked, it has one now.
                     is_settled = all(whole is not None and _is_of(m, whole) for m in self._early[num_before:])
-                if is_settled or is_last:
+                if is_settled or num_asked == _MAX_QUESTIONS:
                     break
                 if (answer := self._ask()) is not None:
                     whole, num_before = answer, num_now
