@@ -18,10 +18,22 @@ RATE_WINDOW_S = 5.0
 STATUS_INTERVAL_S = 1.0
 
 
+#: The reason of drops by which nothing is lost: the frame had come before.
+HARMLESS = "duplicate"
+
+
+def drops_in_words(drops: Mapping[str, int]) -> str:
+    """Say how many frames were dropped for which reason, and apart from those how many came twice."""
+    lost = ", ".join(
+        f"{number} {reason}" for reason, number in sorted(drops.items()) if number and reason != HARMLESS
+    )
+    repeated = drops.get(HARMLESS, 0)
+    return f"dropped: {lost or 'none'}" + (f"; came twice: {repeated}" if repeated else "")
+
+
 def frames_in_words(event: str, count: int, drops: Mapping[str, int]) -> str:
     """Say to how many frames something happened, and how many were dropped for which reason."""
-    dropped = ", ".join(f"{number} {reason}" for reason, number in sorted(drops.items()) if number)
-    return f"{count} frames {event}; dropped: {dropped or 'none'}"
+    return f"{count} {'frame' if count == 1 else 'frames'} {event}; {drops_in_words(drops)}"
 
 
 def duration_percentiles(values_ms: Iterable[float]) -> dict[str, float] | None:

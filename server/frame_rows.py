@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from semcast.common.errors import SemcastError
-from semcast.common.metrics import duration_percentiles
+from semcast.common.metrics import drops_in_words, duration_percentiles
 from semcast.common.run_folder import FRAMES_NAME
 from semcast.common.trajectory import Trajectory
 from semcast.common.trajectory_error import trajectory_summary
@@ -331,9 +331,8 @@ def summarise(
 def run_line(summary: Mapping[str, Any]) -> str:
     """Return in a line what became of the frames of a run."""
     frames, drops = summary["frames"], summary["drops"]
-    dropped = ", ".join(f"{count} {reason}" for reason, count in drops.items())
     text = f"{frames['tracked']} frames tracked, {frames['posed']} with a pose"
-    return f"{text}; dropped: {dropped}" if dropped else text
+    return f"{text}; {drops_in_words(drops)}"
 
 
 def _arrival_rate_hz(times_ns: Sequence[int]) -> float | None:

@@ -18,6 +18,16 @@ def test_brackets_and_colons_are_no_styles(text, capsys):
     assert shown.err == shown.out == f"{text}\n"
 
 
+def test_what_is_piped_is_not_folded(monkeypatch, capsys):
+    line = "a word " * 60
+    monkeypatch.delenv("COLUMNS", raising=False)
+    plain_console().print(line)
+    assert capsys.readouterr().out == f"{line}\n"
+    monkeypatch.setenv("COLUMNS", "100")
+    plain_console().print(line)
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 100
+
+
 def test_verbs_print_through_no_other_console():
     commands = Path(semcast.__file__).parent / "commands"
     others = [

@@ -116,3 +116,10 @@ def test_the_closing_line_says_what_was_dropped(metrics):
     metrics.drop("missing", 1)
     metrics.drop("missing", -1)
     assert metrics.closing_line("sent") == "45 frames sent; dropped: 6 superseded"
+    metrics.drop("duplicate", 2)
+    assert metrics.closing_line("sent") == "45 frames sent; dropped: 6 superseded; came twice: 2"
+
+
+def test_one_frame_is_no_frames(metrics):
+    metrics.count("sent")
+    assert metrics.closing_line("sent") == "1 frame sent; dropped: none"

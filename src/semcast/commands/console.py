@@ -1,6 +1,12 @@
 """Where verbs print tables and lines."""
 
+import os
+import sys
+
 from rich.console import Console
+
+#: Columns of what no terminal shows: lines of a file, or of what the next program reads, are not folded.
+_WIDE = 1000
 
 
 def plain_console(*, stderr: bool = False) -> Console:
@@ -9,4 +15,7 @@ def plain_console(*, stderr: bool = False) -> Console:
     Names of files and messages of others may hold ``[brackets]`` and ``:colons:``, which rich would take for
     styles and pictures.
     """
-    return Console(stderr=stderr, markup=False, emoji=False, highlight=False)
+    out = sys.stderr if stderr else sys.stdout
+    is_shown = out is None or out.isatty() or "COLUMNS" in os.environ
+    width = None if is_shown else _WIDE
+    return Console(stderr=stderr, markup=False, emoji=False, highlight=False, width=width)
