@@ -132,12 +132,38 @@ def match_wide(
         features1: Of the second.
         max_ratio: The nearest one must be nearer than this share of the distance to the second nearest.
     """
-    clear: list[tuple[int, int]] = []
-    if len(features0.xy) and len(features1.xy) > 1:
-        pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(features0.descriptors, features1.descriptors, k=2)
-        clear = [(a.queryIdx, a.trainIdx) for a, b in pairs if a.distance < max_ratio * b.distance]
-    row0, row1 = np.array(clear, dtype=np.intp).reshape(-1, 2).T
-    return _turned(features0, features1, row0, row1)
+    if len(features1.xy) < 2:  # a lone one has no second nearest that it is nearer than
+        return _turned(features0, features1, np.zeros(0, np.intp), np.zeros(0, np.intp))
+    return _clearly_nearest(
+        features0, features1, _square_descriptor_distances(features0, features1), max_ratio
+    )
+
+
+def _square_descriptor_distances(features0: WideFeatures, features1: WideFeatures) -> NDArray[np.float32]:
+    """Squared distances of descriptors, ``(N, M)``; exact, as SIFT's are whole numbers of 512 in length.
+
+    A matrix product takes a third of the time of OpenCV's matcher.
+    """
+    norm0, norm1 = (np.einsum("nk,nk->n", f.descriptors, f.descriptors) for f in (features0, features1))
+    apart = features0.descriptors @ features1.descriptors.T
+    apart *= -2.0
+    apart += norm0[:, None]
+    apart += norm1
+    return apart
+
+
+def _clearly_nearest(
+    features0: WideFeatures, features1: WideFeatures, apart: NDArray[np.float32], max_ratio: float
+) -> WideMatches:
+    """Match what is nearest, and clearly so, by squared distances ``(N, M)``, which are written over."""
+    if apart.size == 0:
+        return _turned(features0, features1, np.zeros(0, np.intp), np.zeros(0, np.intp))
+    rows = np.arange(len(apart))
+    best = apart.argmin(axis=1)
+    nearest = apart[rows, best]
+    apart[rows, best] = np.inf
+    row0 = np.flatnonzero(nearest < max_ratio**2 * apart.min(axis=1))
+    return _turned(features0, features1, row0, best[row0])
 
 
 def _turned(
@@ -181,17 +207,9 @@ def match_near(
         max_ratio: As for ``match_wide``.
     """
     square = square_distances(expected_xy, features1.xy)
-    norm0, norm1 = ((f.descriptors**2).sum(axis=1) for f in (features0, features1))
-    alike = features0.descriptors @ features1.descriptors.T
-    apart = np.maximum(norm0[:, None] + norm1 - 2.0 * alike, 0.0)
+    apart = _square_descriptor_distances(features0, features1)
     apart[~(square < reach_px**2)] = np.inf
-    if apart.size == 0:
-        return _turned(features0, features1, np.zeros(0, np.intp), np.zeros(0, np.intp))
-    best = apart.argmin(axis=1)
-    nearest = apart[np.arange(len(best)), best]
-    apart[np.arange(len(best)), best] = np.inf
-    row0 = np.flatnonzero(nearest < max_ratio**2 * apart.min(axis=1))
-    return _turned(features0, features1, row0, best[row0])
+    return _clearly_nearest(features0, features1, apart, max_ratio)
 
 
 def search_wide(features0: WideFeatures, features1: WideFeatures, xy0: Array) -> Carried | None:
