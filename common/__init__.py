@@ -73,7 +73,7 @@ Settings, files, processes
     source_commit           the commit that the code is of
     cores                   processor cores and threads
     heap                    memory that frames take again and again
-    interrupts              Ctrl-C
+    interrupts              signals that end a run, Ctrl-C among them
     role                    a process of a running system as a child
     parent                  children that end with the process that started them
     worker_guard            unexpected exceptions in worker threads

@@ -1,8 +1,43 @@
-"""Keeps Ctrl-C away from where it would do harm: what is being imported, and children of this process."""
+"""Signals that end a run: what they do for a while, and Ctrl-C kept away from where it would do harm."""
 
 import signal
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+
+
+def ending_signals() -> list[signal.Signals]:
+    """Return SIGTERM, a request to end, and SIGHUP, which comes when the terminal or its connection is gone.
+
+    Under nohup, which has it ignored, a hang-up is to do nothing, and is left out.
+    """
+    hang_up = getattr(signal, "SIGHUP", None)  # Windows has none
+    if hang_up is None or signal.getsignal(hang_up) is signal.SIG_IGN:
+        return [signal.SIGTERM]
+    return [signal.SIGTERM, hang_up]
+
+
+@contextmanager
+def signals_handled(
+    numbers: Sequence[signal.Signals], handle: Callable[[int, object], None]
+) -> Iterator[None]:
+    """Have a function handle signals in this context, and then what handled them before.
+
+    Only the main thread may set handlers: in others nothing changes.
+
+    Args:
+        numbers: The signals.
+        handle: Is given the number of the one that came, and the frame it came in.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -3,11 +3,12 @@
 import contextlib
 import shutil
 import signal
-import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 from semcast.common.errors import SourceError
+from semcast.common.interrupts import signals_handled
 
 #: In a folder while it is being filled; what is left of it says that nobody came to the end.
 _UNFINISHED = ".unfinished"
@@ -36,7 +37,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         try:
             (folder / _UNFINISHED).touch()
-            with _ended_like_an_error():
+            with signals_handled([signal.SIGTERM], _exit):
                 yield folder
             (folder / _UNFINISHED).unlink()
         except BaseException:
@@ -46,21 +47,9 @@ def new_folder(folder: Path) -> Iterator[Path]:
         raise SourceError(f"can't write to {folder}: {err.strerror}") from err
 
 
-@contextlib.contextmanager
-def _ended_like_an_error() -> Iterator[None]:
-    """Let a request to end raise ``SystemExit`` in this context, which would end the process on the spot."""
-    if threading.current_thread() is not threading.main_thread():  # the only one that may set handlers
-        yield
-        return
-
-    def end(number: int, _frame: object) -> None:
-        raise SystemExit(128 + number)
-
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+def _exit(number: int, _frame: object) -> NoReturn:
+    """End like an error, and not on the spot as a signal does."""
+    raise SystemExit(128 + number)
 
 
 def _clear(folder: Path, is_new: bool) -> None:

@@ -1,11 +1,11 @@
 """What is left of a measurement that Ctrl-C or another signal ends: the part that was finished."""
 
-import signal
-import threading
 from collections.abc import Iterator, Sized
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
+
+from semcast.common.interrupts import ending_signals, signals_handled
 
 #: Before the suffix of a file with a part.
 _MARK = ".partial"
@@ -67,24 +67,10 @@ def until_interrupted(finished: Sized) -> Iterator[Part]:
 
 @contextmanager
 def ended_like_ctrl_c() -> Iterator[None]:
-    """Let a request to end, or a terminal that is gone, do what Ctrl-C does in this context.
-
-    They would end the process on the spot. Under nohup, which has it ignored, a hang-up does nothing.
-    """
-    if threading.current_thread() is not threading.main_thread():  # the only one that may set handlers
-        yield
-        return
+    """Let other signals that end a process do what Ctrl-C does in this context, and not on the spot."""
 
     def end(_number: int, _frame: object) -> NoReturn:
         raise KeyboardInterrupt
 
-    numbers = [signal.SIGTERM]
-    hang_up = getattr(signal, "SIGHUP", None)  # Windows has none
-    if hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN:
-        numbers.append(hang_up)
-    before = {number: signal.signal(number, end) for number in numbers}
-    try:
+    with signals_handled(ending_signals(), end):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from semcast.commands.paths import named_path
 from semcast.common.config_flags import add_flags, given_values, settings_from
+from semcast.common.interrupts import ending_signals, signals_handled
 from semcast.common.parent import stop_with_parent
 
 S = TypeVar("S")
@@ -48,30 +49,18 @@ class Interrupted:
 
 @contextmanager
 def stop_on_signals(stop: threading.Event) -> Iterator[Interrupted]:
-    """Set ``stop`` on SIGINT, SIGTERM and SIGHUP; a second SIGINT raises ``KeyboardInterrupt`` as usual.
-
-    A hang-up (the terminal or its connection is gone) ends a run like SIGTERM, with all its results; under
-    nohup, which has it ignored, the run goes on.
-    """
+    """Set ``stop`` on Ctrl-C and ``ending_signals``; a second Ctrl-C raises ``KeyboardInterrupt`` as ever."""
     interrupted = Interrupted()
 
-    def handle(number: int, frame: object) -> None:
+    def handle(number: int, _frame: object) -> None:
         if number == signal.SIGINT:
             if interrupted.by_user:
                 raise KeyboardInterrupt
             interrupted.by_user = True
         stop.set()
 
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    hang_up = getattr(signal, "SIGHUP", None)  # Windows has none
-    if hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN:
-        numbers.append(hang_up)
-    previous = {number: signal.signal(number, handle) for number in numbers}
-    try:
+    with signals_handled([signal.SIGINT, *ending_signals()], handle):
         yield interrupted
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def run_until_stopped(work: Callable[[threading.Event], object]) -> int:
