@@ -18,7 +18,6 @@ from semcast.common.errors import SourceError
 from semcast.common.playback import usual_period_ns
 from semcast.common.ros_bag_files import check_no_ros_bag
 from semcast.common.sequence import Sequence, open_sequence
-from semcast.common.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -82,9 +81,6 @@ class Source(Protocol):
     @property
     def num_unreadable(self) -> int:
         """Frames that were left out so far, as they can't be read or have another size."""
-
-    def groundtruth(self) -> Trajectory | None:
-        """Return true poses of the frames, where there are any."""
 
     def frames(self, stop: threading.Event) -> Iterator[SourceFrame]:
         """Yield frames when they are due, until the end or until ``stop`` is set.
@@ -216,10 +212,6 @@ class RecordedSource:
     def rate_hz(self) -> float:
         """Usual frames per second at this pace."""
         return self._settings.paced_hz(1e9 / usual_period_ns(self._sequence.times_ns))
-
-    def groundtruth(self) -> Trajectory | None:
-        """Return true poses of the first pass."""
-        return self._sequence.groundtruth()
 
     def frames(self, stop: threading.Event) -> Iterator[SourceFrame]:
         """Yield frames when they are due; unreadable ones are left out.

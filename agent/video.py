@@ -23,7 +23,6 @@ from semcast.common.errors import SourceError
 from semcast.common.image_file import as_rgb
 from semcast.common.sequence import ImageRectifier, resized_wh
 from semcast.common.sequence_layouts import IMAGE_SUFFIXES
-from semcast.common.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -151,10 +150,6 @@ class _Captured:
     def num_unreadable(self) -> int:
         """0: a frame that can't be decoded is one that never came."""
         return 0
-
-    def groundtruth(self) -> Trajectory | None:
-        """None: a camera knows no truth."""
-        return None
 
     def _usable(self, image: NDArray[np.uint8]) -> bool:
         return (image.shape[1], image.shape[0]) == self._stored_wh

@@ -116,8 +116,7 @@ def plain_ransac(
     that mode's threshold, whatever the settings say. Arguments and result as ``opencv_ransac``.
     """
     ones = np.ones(len(keypoints0_xy))
-    found = confidence_ransac(camera, keypoints0_xy, keypoints1_xy, ones, seed=settings.seed)
-    return None if found is None else found.T_cam1_cam0
+    return confidence_ransac(camera, keypoints0_xy, keypoints1_xy, ones, seed=settings.seed)
 
 
 #: Name in results -> estimator.

@@ -48,7 +48,6 @@ class ReceivedFrame:
         snr_db: The receiver's estimate of the link's SNR, None with ``received``.
         snr_db_set: What the channel node says it applied, for plots only; None where it says nothing.
         t_arrival_ns: ``perf_counter_ns`` when the message arrived.
-        age_ms: Time from capture until now, over that of the fastest recent frame.
         equalise_ms: Duration of the equaliser.
     """
 
@@ -58,7 +57,6 @@ class ReceivedFrame:
     snr_db: float | None
     snr_db_set: float | None
     t_arrival_ns: int
-    age_ms: float
     equalise_ms: float
 
     @property
@@ -315,21 +313,16 @@ class Receiver:
 
     def is_too_old(self, message: SymbolFrame) -> bool:
         """Tell whether a frame is older than live frames may be, and count it as dropped if so."""
-        return self._young_age_ms(message) is None
-
-    def _young_age_ms(self, message: SymbolFrame) -> float | None:
-        """Return the age of a frame; None for one that is older than live frames may be, which is dropped."""
         with self._lock:
             age_ms = self._arrivals.age_ms(message, time.perf_counter_ns())
         # The final one ends the stream.
-        if self._mode == "live" and age_ms > self._max_age_ms and not message.final:
+        is_too_old = self._mode == "live" and age_ms > self._max_age_ms and not message.final
+        if is_too_old:
             self._metrics.drop("too_old")
-            return None
-        return age_ms
+        return is_too_old
 
     def _prepare(self, message: SymbolFrame, arrival_ns: int) -> ReceivedFrame | None:
-        age_ms = self._young_age_ms(message)
-        if age_ms is None:
+        if self.is_too_old(message):
             return None
         camera = self._camera_of(message.agent_epoch)
         if camera is None:
@@ -367,7 +360,6 @@ class Receiver:
             snr_db=snr_db,
             snr_db_set=snr_db_set,
             t_arrival_ns=arrival_ns,
-            age_ms=age_ms,
             equalise_ms=equalise_ms,
         )
 

@@ -356,7 +356,6 @@ def _arrivals(
             snr_db=None if equalised is None else float(equalised.snr_db),
             snr_db_set=snr_db_set,
             t_arrival_ns=time.perf_counter_ns(),
-            age_ms=0.0,
             equalise_ms=equalise_ms,
         )
 

@@ -35,10 +35,6 @@ class ConstantVelocity:
         self._translation_per_s: Array = np.zeros(3)
         self._steps: list[Step] = []
 
-    def reset(self) -> None:
-        """Forget the motion."""
-        self.__init__()  # type: ignore[misc]
-
     @property
     def speed_map_per_s(self) -> float:
         """Length of the translation per second, over the last second."""

@@ -4,8 +4,6 @@ Weighted sampling without replacement, algebraic residual, confidence-adaptive t
 of inliers. It is kept for comparison; ``two_view`` in mode ``robust`` is what the system runs on.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import poselib
 from numpy.typing import NDArray
@@ -19,19 +17,6 @@ Array = NDArray[np.float64]
 
 #: Size of a minimal subset of the five-point algorithm.
 SUBSET_SIZE = 5
-
-
-@dataclass(frozen=True)
-class RansacResult:
-    """The model with the most inliers.
-
-    Attributes:
-        T_cam1_cam0: ``(4, 4)``, translation of length 1, decomposed from the winning matrix.
-        inliers: ``(N,)`` bool, ``r_i < delta_i``.
-    """
-
-    T_cam1_cam0: Array
-    inliers: NDArray[np.bool_]
 
 
 def draw_weighted(
@@ -70,7 +55,7 @@ def confidence_ransac(
     *,
     num_trials: int = 500,
     seed: int = 0,
-) -> RansacResult | None:
+) -> Array | None:
     """Estimate a relative pose as the paper does.
 
     Args:
@@ -82,7 +67,8 @@ def confidence_ransac(
         seed: Of the sampler.
 
     Returns:
-        The result, or None when no subset gave a model with more than five inliers.
+        The model with the most inliers, ``T_cam1_cam0 (4, 4)`` with a translation of length 1; None when no
+        subset gave one with more than five.
     """
     if len(confidence) < SUBSET_SIZE + 1:
         return None
@@ -111,8 +97,7 @@ def confidence_ransac(
         return None
     T_cam1_cam0 = best[1]
     inliers = algebraic_residual(essential_matrix(T_cam1_cam0), rays0, rays1) < delta
-    T_cam1_cam0 = in_front(camera, T_cam1_cam0, keypoints0_xy[inliers], keypoints1_xy[inliers])
-    return RansacResult(T_cam1_cam0, inliers)
+    return in_front(camera, T_cam1_cam0, keypoints0_xy[inliers], keypoints1_xy[inliers])
 
 
 def in_front(camera: Intrinsics, T_cam1_cam0: Array, xy0: Array, xy1: Array) -> Array:

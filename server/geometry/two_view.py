@@ -234,10 +234,9 @@ def _as_in_the_paper(
     camera: Intrinsics, xy0: Array, xy1: Array, confidence: Array, threshold_px: float, seed: int
 ) -> Array | None:
     """The pose of the paper's RANSAC, None where it finds none."""
-    found = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
-    if found is None:
+    T = confidence_ransac(camera, xy0, xy1, confidence, seed=seed)
+    if T is None:
         return None
-    T = found.T_cam1_cam0
     near = _near_lines(camera, T, xy0, xy1, threshold_px)
     return most_in_front(camera, (T, make_transform(T[:3, :3], -T[:3, 3])), xy0[near], xy1[near])
 

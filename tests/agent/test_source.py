@@ -232,7 +232,7 @@ def test_a_video_file_is_played(video):
     assert [f.t_source_ns for f in frames] == [40_000_000 * k for k in range(5)]
     np.testing.assert_allclose([f.image.mean() for f in frames], [0, 40, 80, 120, 160], atol=3)
     assert [f.final for f in frames] == [False] * 4 + [True]
-    assert (source.num_frames, source.intrinsics.fx, source.groundtruth()) == (5, 50.0, None)
+    assert (source.num_frames, source.intrinsics.fx) == (5, 50.0)
     assert source.last_frame_id == 8
 
 

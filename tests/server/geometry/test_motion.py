@@ -164,5 +164,3 @@ def test_a_correction_keeps_the_motion_of_the_camera():
     assert np.allclose(motion.predict(2 * FRAME_NS), moved @ STEP)
     motion.correct(moved, scale=2.0)
     assert np.allclose((np.linalg.inv(moved) @ motion.predict(2 * FRAME_NS))[:3, 3], 2 * STEP[:3, 3])
-    motion.reset()
-    assert motion.predict(0) is None
