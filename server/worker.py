@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from semcast.common.heap import keep_freed_memory
 from semcast.common.interrupts import deaf_children
@@ -22,12 +22,35 @@ logger = logging.getLogger(__name__)
 
 Problem = TypeVar("Problem")
 Result = TypeVar("Result")
+_Given = TypeVar("_Given", contravariant=True)
+_Found = TypeVar("_Found", covariant=True)
 
 #: Longest wait for a result where nothing else is said.
 DEADLINE_S = 30.0
 _CLOSE_DEADLINE_S = 3.0
 #: Failures in a row, with no result between them, after which the worker gives up for good.
 MAX_FAILURES = 5
+
+
+class Runner(Protocol[_Given, _Found]):
+    """Works on one problem at a time, as ``Inline`` or ``Worker``."""
+
+    @property
+    def busy(self) -> bool:
+        """A problem was submitted and its result not taken yet."""
+
+    def submit(self, problem: _Given) -> bool:
+        """Start on a problem; False (and nothing happens) while another one is under way."""
+
+    def take(self, wait: bool = False) -> _Found | None:
+        """Return the result if it is there.
+
+        Args:
+            wait: Wait for it, within a deadline, also where the runner would not.
+        """
+
+    def close(self) -> None:
+        """Free everything. Idempotent."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +23,7 @@ from semcast.server.dense.neighbours import (
 )
 from semcast.server.dense.view import View, view_of
 from semcast.server.mapping.world_map import Keyframe, WorldMap
+from semcast.server.worker import Runner
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -43,21 +43,8 @@ _MAX_LATER = 4
 _MAX_WAITING = 2
 
 
-class DepthRunner(Protocol):
-    """Estimates depth maps, one at a time."""
-
-    @property
-    def busy(self) -> bool:
-        """A problem was submitted and its result not taken yet."""
-
-    def submit(self, problem: DepthProblem) -> bool:
-        """Start on a problem; False (and nothing happens) while another one is under way."""
-
-    def take(self, wait: bool = False) -> DepthMap | None:
-        """Return the result if it is there, or with ``wait`` when it is."""
-
-    def close(self) -> None:
-        """Free everything. Idempotent."""
+#: Estimates depth maps.
+DepthRunner = Runner[DepthProblem, DepthMap]
 
 
 class DenseBuilder:

@@ -13,6 +13,7 @@ from semcast.server.geometry.edges import alike, each_of, whitened
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.observations import Observations
 from semcast.server.mapping.pose_graph import PoseConstraint
+from semcast.server.worker import Runner
 
 Array = NDArray[np.float64]
 
@@ -180,22 +181,5 @@ class BundleResult:
         return whitened(self.problem.edge, self.residual_px)
 
 
-class BundleRunner(Protocol):
-    """Runs bundle adjustments, one at a time."""
-
-    @property
-    def busy(self) -> bool:
-        """A problem was submitted and its result not taken yet."""
-
-    def submit(self, problem: BundleProblem) -> bool:
-        """Start on a problem; False (and nothing happens) while another one is under way."""
-
-    def take(self, wait: bool = False) -> BundleResult | None:
-        """Return the result if it is there.
-
-        Args:
-            wait: Wait for it, within a deadline, also where the runner would not.
-        """
-
-    def close(self) -> None:
-        """Free everything. Idempotent."""
+#: Runs bundle adjustments.
+BundleRunner = Runner[BundleProblem, BundleResult]
