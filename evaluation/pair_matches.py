@@ -13,10 +13,10 @@ from semcast.server.geometry.features import (
     corner_strength,
     deduplicate,
     detect_corners,
-    sample_map,
     to_grey,
     track_points,
 )
+from semcast.server.geometry.sampling import sample_map
 from semcast.server.geometry.weighting import fuse_confidence
 
 Array = NDArray[np.float64]

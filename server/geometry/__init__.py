@@ -11,7 +11,7 @@ Points in images
     warped_points    KLT in windows that are turned, scaled or sheared
     patch_alignment  patches of two images, aligned to a fraction of a pixel
     wide_search      matches by SIFT, however far points moved
-    sampling         values of an image between its pixels
+    sampling         values of an image at points
     brightness       change of exposure between two images
     flicker          bands of light that lamps leave in images of a rolling shutter
     streaks          motion blur that differs between two images
@@ -29,7 +29,7 @@ Two views
 Pose and structure
     pnp              pose from landmarks
     triangulation    points from rays
-    projection       world points in a camera
+    projection       world points in a camera, and the derivatives of their pixels
     motion           constant-velocity prior
     gap_bridge       how the camera got across a gap, and how far off that is
     whereabouts      where the camera can have got to in a gap

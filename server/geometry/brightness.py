@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.server.geometry.sampling import nearest_pixels
 from semcast.server.geometry.weighting import MAD_TO_SIGMA
 
 Array = NDArray[np.float64]
@@ -80,7 +81,7 @@ def _patch_means(grey: Grey, xy: Array, patch_px: int) -> Array:
     """Mean of what of the patch around each point lies in the image, by sums of a table."""
     height, width = grey.shape
     table, half = cv2.integral(grey), patch_px // 2
-    nearest = np.clip(np.rint(np.nan_to_num(xy)), 0, (width - 1, height - 1)).astype(np.intp)
+    nearest = nearest_pixels(xy, grey.shape)
     left, top = np.maximum(nearest - half, 0).T
     right, bottom = np.minimum(nearest + half + 1, (width, height)).T
     total = table[bottom, right] - table[top, right] - table[bottom, left] + table[top, left]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from semcast.common.codec import KLT_WINDOW_PX
 from semcast.server.geometry.brightness import brightness_change, with_brightness
 from semcast.server.geometry.cells import cell_keys
+from semcast.server.geometry.sampling import nearest_pixels
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -123,8 +124,7 @@ def detect_corners(
     num_cells = columns * -(-height // cell_px)
     counts = np.zeros(num_cells, np.int64)
     if occupied_xy is not None and len(occupied_xy):
-        x = np.clip(np.rint(occupied_xy[:, 0]).astype(int), 0, width - 1)
-        y = np.clip(np.rint(occupied_xy[:, 1]).astype(int), 0, height - 1)
+        x, y = nearest_pixels(occupied_xy, grey.shape).T
         near = np.zeros((height, width), np.uint8)
         near[y, x] = 1
         peak &= cv2.dilate(near, _square(free_reach)) == 0
@@ -380,15 +380,6 @@ def _where_found(values: NDArray[Any], status: NDArray[Any]) -> Array:
     """KLT's error column; 0 for points that were not found, where it is not initialised."""
     usable = (status.ravel() == 1) & np.isfinite(values.ravel())
     return np.where(usable, values.ravel(), np.float32(0.0)).astype(np.float64)
-
-
-def sample_map(values: NDArray[np.float32], keypoints_xy: Array) -> Array:
-    """Value of the nearest pixel of an ``(H, W)`` map at ``(N, 2)`` pixels; NaN counts as 0."""
-    height, width = values.shape
-    xy = np.nan_to_num(keypoints_xy)
-    x = np.clip(np.rint(xy[:, 0]), 0, width - 1).astype(np.intp)
-    y = np.clip(np.rint(xy[:, 1]), 0, height - 1).astype(np.intp)
-    return np.nan_to_num(values[y, x].astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
 
 
 def deduplicate(keypoints_xy: Array, cell_px: float = 2.0) -> NDArray[np.bool_]:

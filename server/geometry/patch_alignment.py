@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import KLT_WINDOW_PX
 from semcast.server.geometry.features import Grey
-from semcast.server.geometry.projection import MIN_DEPTH_MAP
+from semcast.server.geometry.projection import MIN_DEPTH_MAP, projection_jacobian
 from semcast.server.geometry.sampling import bilinear
 
 Array = NDArray[np.float64]
@@ -136,10 +136,7 @@ def affine_warps(
     R, t = T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3]
     x, y, depth1 = (camera.unproject(xy0) * depth0_map[:, None] @ R.T + t).T
     front = depth1 > 0.0
-    z = np.where(front, depth1, 1.0)
-    projection = np.zeros((len(xy0), 2, 3))
-    projection[:, 0, 0], projection[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
-    projection[:, 1, 1], projection[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
+    projection = projection_jacobian(camera, np.column_stack([x, y, np.where(front, depth1, 1.0)]))
     in_plane = R[:, :2] / np.array([camera.fx, camera.fy])
     warps = projection @ in_plane * depth0_map[:, None, None]
     return np.where(front[:, None, None], warps, np.eye(2)), depth1

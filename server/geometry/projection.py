@@ -1,4 +1,4 @@
-"""Points of the world in a camera: how deep they are, and where they are seen."""
+"""Points of the world in a camera: how deep they are, where they are seen, and how that changes with them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,3 +39,17 @@ def project_in_front(camera: Intrinsics, points_cam: Array) -> tuple[Array, NDAr
     z = np.where(front, points_cam[:, 2], 1.0)
     x_px, y_px = camera.fx * points_cam[:, 0] / z, camera.fy * points_cam[:, 1] / z
     return np.stack([x_px + camera.cx, y_px + camera.cy], axis=1), front
+
+
+def projection_jacobian(camera: Intrinsics, points_cam: Array) -> Array:
+    """Return the derivatives of pixels by points in the camera's frame, ``(N, 2, 3)``.
+
+    Args:
+        camera: Pinhole.
+        points_cam: ``(N, 3)`` camera frame, in front of it.
+    """
+    x, y, z = points_cam.T
+    jacobian = np.zeros((len(points_cam), 2, 3))
+    jacobian[:, 0, 0], jacobian[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
+    jacobian[:, 1, 1], jacobian[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
+    return jacobian

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import angles_between_deg
 from semcast.server.geometry.edges import whiteners
-from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front
+from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front, projection_jacobian
 
 Array = NDArray[np.float64]
 
@@ -136,11 +136,8 @@ def _refinement_step(
 
 def _jacobian(camera: Intrinsics, R_cam_world: Array, points_cam: Array) -> Array:
     """Change of pixels with points in the world, ``(M, 2, 3)``."""
-    z = np.maximum(points_cam[:, 2], MIN_DEPTH_MAP)
-    J_cam = np.zeros((len(z), 2, 3))
-    J_cam[:, 0, 0], J_cam[:, 0, 2] = camera.fx / z, -camera.fx * points_cam[:, 0] / z**2
-    J_cam[:, 1, 1], J_cam[:, 1, 2] = camera.fy / z, -camera.fy * points_cam[:, 1] / z**2
-    return J_cam @ R_cam_world
+    in_front = np.column_stack([points_cam[:, :2], np.maximum(points_cam[:, 2], MIN_DEPTH_MAP)])
+    return projection_jacobian(camera, in_front) @ R_cam_world
 
 
 def mean_centre(centre: Array, point: NDArray[np.intp], num_points: int) -> Array:

@@ -14,10 +14,10 @@ from semcast.server.geometry.features import (
     Grey,
     TrackedPoints,
     corner_strength,
-    sample_map,
     track_points,
 )
 from semcast.server.geometry.patch_alignment import ANCHOR_PATCH_PX, Templates, align_patches
+from semcast.server.geometry.sampling import sample_map
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from semcast.common.geometry import invert_transform
 from semcast.server.geometry.edges import alike, each_of
 from semcast.server.geometry.features import Grey
 from semcast.server.geometry.pnp import refine_pose, search_pose
+from semcast.server.geometry.sampling import sample_colours
 from semcast.server.geometry.weighting import NoiseModel
-from semcast.server.mapping.new_landmarks import sample_colours
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform
 from semcast.server.geometry.projection import depths_in
+from semcast.server.geometry.sampling import sample_colours
 from semcast.server.geometry.triangulation import triangulate
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.observations import gather_observations
@@ -135,11 +136,3 @@ def triangulate_tracks(
     total = np.bincount(point, weights=confidence, minlength=len(wanted))
     refuted = wanted[(seen >= 2) & (points.error_sigma > _REFUTED_SIGMA)]
     return NewLandmarks(wanted[good], points.xyz[good], (total / np.maximum(1, seen))[good], refuted)
-
-
-def sample_colours(image: NDArray[np.uint8], xy: Array) -> NDArray[np.uint8]:
-    """Colour ``(N, 3)`` uint8 of the pixel of an ``(H, W, 3)`` image nearest to each of ``(N, 2)`` pixels."""
-    height, width = image.shape[:2]
-    x = np.clip(np.rint(xy[:, 0]), 0, width - 1).astype(np.intp)
-    y = np.clip(np.rint(xy[:, 1]), 0, height - 1).astype(np.intp)
-    return np.asarray(image[y, x])

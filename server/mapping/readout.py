@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from semcast.common.camera import MAX_READOUT_MS, Intrinsics, ReadoutFrom
 from semcast.common.geometry import log_so3
 from semcast.server.geometry.finite_differences import slope_weights
+from semcast.server.geometry.projection import projection_jacobian
 from semcast.server.mapping.residual_patterns import (
     COLUMNS,
     PUT_RIGHT,
     RESIDUAL,
     ROWS,
-    by_points,
     by_poses,
     grouped,
     shares_of_readout,
@@ -120,7 +120,7 @@ def lean(camera: Intrinsics, points_cam: Array, flow_px_s: Array) -> Array:
         flow_px_s: ``(M, 2)`` how they move in the image, pixels per second.
     """
     readout = Readout.of(camera)
-    by_pose = by_poses(by_points(camera, points_cam), points_cam)
+    by_pose = by_poses(projection_jacobian(camera, points_cam), points_cam)
     share = shares_of_readout((camera.width, camera.height), camera.project(points_cam))
     moved_px = 1e-3 * readout.signed_ms * share[:, [AXES.index(readout.axis) ^ 1]] * flow_px_s
     return np.asarray(np.linalg.lstsq(by_pose.reshape(-1, 6), moved_px.ravel(), rcond=None)[0])

@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform
+from semcast.common.geometry import invert_transform, skew
 from semcast.server.geometry.edges import whiteners
-from semcast.server.geometry.projection import MIN_DEPTH_MAP
+from semcast.server.geometry.projection import MIN_DEPTH_MAP, projection_jacobian
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult, ViewMotion
 
 Array = NDArray[np.float64]
@@ -69,7 +68,7 @@ def pattern_products_of(
     view, point, points = problem.view[used], problem.point[used], points[used]
     whitener = whiteners(problem.edge[used])
     camera = problem.camera
-    by_point = by_points(camera, points)
+    by_point = projection_jacobian(camera, points)
     by_pose = by_poses(by_point, points)
     by_xyz = by_point @ T_cam_world[used, :3, :3]
     flow = np.einsum("mij,mj->mi", by_pose, motion.velocity[view])
@@ -144,23 +143,7 @@ def shares_of_readout(size_wh: tuple[int, int], xy: Array) -> Array:
 
 def by_poses(by_point: Array, points_cam: Array) -> Array:
     """Return the derivatives of pixels by the camera's pose in its own frame, ``(M, 2, 6)``."""
-    return np.concatenate([by_point @ _skews(points_cam), -by_point], axis=2)
-
-
-def by_points(camera: Intrinsics, points_cam: Array) -> Array:
-    """Return the derivatives of pixels by points in the camera's frame, ``(M, 2, 3)``."""
-    x, y, z = points_cam.T
-    jacobian = np.zeros((len(points_cam), 2, 3))
-    jacobian[:, 0, 0], jacobian[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
-    jacobian[:, 1, 1], jacobian[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
-    return jacobian
-
-
-def _skews(points: Array) -> Array:
-    """Return the cross product matrices of vectors ``(M, 3)``."""
-    x, y, z = points.T
-    none = np.zeros_like(x)
-    return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
+    return np.concatenate([by_point @ skew(points_cam), -by_point], axis=2)
 
 
 def _without_readout(left: Array) -> Array:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from semcast.common.phy.slots import BLOCK_PX
 from semcast.server.geometry.edges import alike, each_of
 from semcast.server.geometry.features import Grey
+from semcast.server.geometry.sampling import nearest_pixels
 from semcast.server.geometry.streaks import band_power
 from semcast.server.geometry.wide_search import WideFeatures
 from semcast.server.mapping.state import DecodedFrame
@@ -80,8 +81,7 @@ class Sight:
         if self.usable.all():
             return np.zeros(len(xy), bool)
         reach = self.rows_near_lost(margin_px)
-        y = np.clip(np.rint(np.nan_to_num(xy[:, 1])), 0, len(self.usable) - 1).astype(np.intp)
-        return np.asarray(reach[y])
+        return np.asarray(reach[nearest_pixels(xy, self.grey.shape)[:, 1]])
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from semcast.server.geometry.features import (
     corner_strength,
     deduplicate,
     detect_corners,
-    sample_map,
     track_alike,
     track_through_light,
 )
 from semcast.server.geometry.flicker import flicker_between, with_row_gains
+from semcast.server.geometry.sampling import sample_map
 from semcast.server.geometry.streaks import blurred_alike
 from semcast.server.geometry.warped_points import MAX_FROM_GUESS_PX, track_warped
 from semcast.server.geometry.weighting import (

@@ -12,10 +12,10 @@ from semcast.server.geometry.features import (
     hamming,
     match_descriptors,
     noise_energy_grey2,
-    sample_map,
     to_grey,
     track_points,
 )
+from semcast.server.geometry.sampling import sample_map
 
 
 def texture(seed=0, shape=(240, 320)):
@@ -169,12 +169,6 @@ def test_tracking_takes_any_input():
     assert np.isfinite(found.xy).all()
     flat = np.zeros_like(grey)
     assert not track_points(flat, flat, np.full((3, 2), 50.0), np.full((3, 2), 50.0)).ok.any()
-
-
-def test_sampling_takes_the_nearest_pixel_and_counts_nan_as_nothing():
-    values = np.array([[0.1, 0.2], [0.3, np.nan]], np.float32)
-    xy = np.array([[0.4, 0.4], [0.6, 0.0], [-5.0, 9.0], [1.0, 1.0], [np.nan, 0.0]])
-    assert np.allclose(sample_map(values, xy), [0.1, 0.2, 0.3, 0.0, 0.1])
 
 
 def test_of_points_in_one_cell_one_stays():
