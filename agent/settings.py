@@ -6,7 +6,7 @@ from typing import Literal
 
 from semcast.agent.source_settings import SourceSettings
 from semcast.channel.trace import SNR_RANGE_DB
-from semcast.common.codec import DEFAULT_CODEC, PRECISION_HELP, Modulation, Precision
+from semcast.common.codec import DEFAULT_CODEC, PRECISION_HELP, Device, Modulation, Precision
 from semcast.common.codecs import Runtime
 from semcast.common.cores import check_threads
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
@@ -33,7 +33,7 @@ class AgentSettings:
     weights: Path | None = field(default=None, metadata={"help": "weights instead of the shipped ones"})
     threads: int = field(default=1, metadata={"help": "CPU threads of the encoder"})
     precision: Precision = field(default="auto", metadata={"help": PRECISION_HELP})
-    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "device of the encoder"})
+    device: Device = field(default="auto", metadata={"help": "device of the encoder"})
     runtime: Runtime = field(
         default="auto",
         metadata={"help": "what computes a learned encoder: torch, onnx, or auto (torch where it is there)"},

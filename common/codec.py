@@ -22,6 +22,9 @@ Precision = Literal["auto", "float32", "bfloat16", "int8"]
 #: Of every command that computes them.
 PRECISION_HELP = "arithmetic of a learned codec's convolutions; auto: the fastest of this processor"
 
+#: Where a learned codec is computed; auto: on a GPU where there is one.
+Device = Literal["auto", "cpu", "cuda"]
+
 #: Codec of every command that is not told another.
 DEFAULT_CODEC = "3dcsc-lite-vr"
 

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, get_args
 
-from semcast.common.codec import MODULATIONS, Codec, Modulation, Precision
+from semcast.common.codec import MODULATIONS, Codec, Device, Modulation, Precision
 from semcast.common.config import near_match
 from semcast.common.conventional_source import ImageFormat
 from semcast.common.errors import ConfigError
@@ -116,7 +116,7 @@ def _load_learned(
     runtime: Literal["torch", "onnx"],
     modulation: Modulation,
     num_threads: int | None,
-    device: Literal["auto", "cpu", "cuda"],
+    device: Device,
     precision: Precision,
 ) -> Codec:
     if runtime == "onnx":
@@ -139,7 +139,7 @@ def load_codec(
     *,
     modulation: Modulation = "16qam",
     num_threads: int | None = None,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
+    device: Device = "auto",
     weights: Path | None = None,
     runtime: Runtime = "torch",
     precision: Precision = "auto",

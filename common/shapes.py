@@ -8,13 +8,13 @@ class _HasShape(Protocol):
     def shape(self) -> tuple[int, ...]: ...
 
 
-def check_shape(x: _HasShape, pattern: str, name: str = "array") -> dict[str, int]:
+def check_shape(x: _HasShape, pattern: str, name: str) -> dict[str, int]:
     """Check the shape of an array or tensor against a pattern and return its named sizes.
 
     Args:
         x: Anything with a ``shape``.
         pattern: Blank-separated axes: an integer is a fixed size, a word binds a size (the same word
-            must bind the same size twice), ``...`` in front allows any number of leading axes.
+            must bind the same size twice).
         name: What to call ``x`` in the message.
 
     Returns:
@@ -25,19 +25,14 @@ def check_shape(x: _HasShape, pattern: str, name: str = "array") -> dict[str, in
 
     Example:
         >>> import numpy as np
-        >>> check_shape(np.zeros((2, 3, 8, 8)), "B 3 H W")
+        >>> check_shape(np.zeros((2, 3, 8, 8)), "B 3 H W", "x")
         {'B': 2, 'H': 8, 'W': 8}
     """
-    shape = tuple(x.shape)
-    axes = pattern.split()
-    leading = bool(axes) and axes[0] == "..."
-    if leading:
-        axes = axes[1:]
-    if len(shape) < len(axes) or (not leading and len(shape) != len(axes)):
-        raise ValueError(f"{name} must have shape ({pattern}), got {shape}")
+    shape, axes = tuple(x.shape), pattern.split()
     sizes: dict[str, int] = {}
-    for size, axis in zip(shape[len(shape) - len(axes) :], axes, strict=True):
-        expected = int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
-        if size != expected:
-            raise ValueError(f"{name} must have shape ({pattern}), got {shape}")
+    if len(shape) != len(axes) or any(
+        size != (int(axis) if axis.isdigit() else sizes.setdefault(axis, size))
+        for size, axis in zip(shape, axes, strict=True)
+    ):
+        raise ValueError(f"{name} must have shape ({pattern}), got {shape}")
     return sizes

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from semcast.common.codec import (
     LOST_SLOT_SNR_DB,
     Codec,
     DecodedImage,
+    Device,
     Modulation,
     Precision,
     ReceivedImage,
@@ -38,7 +38,7 @@ MAX_WARM_UP_PX = 1920 * 1080
 
 def codec_loader(
     num_threads: int,
-    device: Literal["auto", "cpu", "cuda"] = "auto",
+    device: Device = "auto",
     weights: Path | None = None,
     only_of: str | None = None,
     precision: Precision = "auto",

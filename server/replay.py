@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
@@ -23,7 +23,7 @@ from semcast.common.phy.equaliser import Equalised
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.playback import check_part
 from semcast.common.rate import belongs_to
-from semcast.common.recorded_streams import RecordedStream, choose_stream
+from semcast.common.recorded_streams import RecordedStream, Symbols, choose_stream
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.symbol_payload import encoded_image, equalise_frame
 from semcast.common.wire import WireError, unpack
@@ -37,7 +37,7 @@ from semcast.server.receiver import ReceivedFrame
 from semcast.server.recorded_order import in_order
 from semcast.server.reference import recording_reference, sequence_reference
 from semcast.server.session import Session
-from semcast.server.settings import DenseWhen, ServerSettings, check_save_images
+from semcast.server.settings import DenseWhen, SavedImages, ServerSettings, check_save_images
 from semcast.server.stream_identity import StreamIdentity
 from semcast.server.view.settings import ViewSettings
 from semcast.server.viewing import check_viewer, open_viewer
@@ -57,7 +57,7 @@ class ReplaySettings:
     """
 
     file: Path = field(metadata={"help": "recording to replay (MCAP)", "positional": True})
-    symbols: Literal["received", "transmitted"] | None = field(
+    symbols: Symbols | None = field(
         default=None,
         metadata={
             "help": "received: what the recorded link made of the frames (default); "
@@ -76,7 +76,7 @@ class ReplaySettings:
         },
     )
     out: Path | None = field(default=None, metadata={"help": "folder for trajectory, map, summary"})
-    save_images: Literal["none", "keyframes", "all"] = field(
+    save_images: SavedImages = field(
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
     dense_cloud: DenseWhen = field(
@@ -127,7 +127,7 @@ class ReplaySettings:
         check_part(self.start_s, self.end_s)
 
     @property
-    def source(self) -> Literal["received", "transmitted"]:
+    def source(self) -> Symbols:
         """Which symbols are replayed."""
         if self.symbols is not None:
             return self.symbols

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.codec import PRECISION_HELP, Modulation, Precision
+from semcast.common.codec import PRECISION_HELP, Device, Modulation, Precision
 from semcast.common.cores import check_threads, usable_cores
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
 from semcast.common.network_settings import HubSettings
@@ -18,11 +18,13 @@ logger = logging.getLogger(__name__)
 
 #: When the depth of keyframes is estimated.
 DenseWhen = Literal["auto", "live", "end", "none"]
+#: Which decoded images are kept.
+SavedImages = Literal["none", "keyframes", "all"]
 #: With fewer cores the estimation of depth would keep frames waiting.
 _CORES_FOR_LIVE_DEPTH = 4
 
 
-def check_save_images(save_images: str, out: Path | None) -> None:
+def check_save_images(save_images: SavedImages, out: Path | None) -> None:
     """Check that images to be kept have a folder.
 
     Raises:
@@ -84,7 +86,7 @@ class ServerSettings:
     modulation: Modulation = field(default="16qam", metadata={"help": "modulation of that codec"})
     threads: int = field(default=1, metadata={"help": "CPU threads of the decoder"})
     precision: Precision = field(default="auto", metadata={"help": PRECISION_HELP})
-    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "device of the decoder"})
+    device: Device = field(default="auto", metadata={"help": "device of the decoder"})
     reference: Path | None = field(
         default=None, metadata={"help": "recorded sequence the agent sends: gives PSNR and ground truth"}
     )
@@ -103,7 +105,7 @@ class ServerSettings:
     record: Path | None = field(
         default=None, metadata={"help": "also keep everything that is sent in this recording (MCAP)"}
     )
-    save_images: Literal["none", "keyframes", "all"] = field(
+    save_images: SavedImages = field(
         default="none", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
     dense_cloud: DenseWhen = field(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from semcast.common.codec import Device
 from semcast.training.allocations import AllocationSettings
 from semcast.training.channel import LinkDrawSettings
 from semcast.training.data import CropSettings
@@ -84,7 +85,7 @@ class TrainSettings:
         },
     )
     seed: int = field(default=0, metadata={"help": "seed of weights, data order and links"})
-    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "device to train on"})
+    device: Device = field(default="auto", metadata={"help": "device to train on"})
     bf16: bool = field(default=True, metadata={"help": "bfloat16 autocast where the hardware has it"})
     compile: bool = field(
         default=False,

@@ -1,7 +1,7 @@
 """A trained transceiver behind the codec interface: numpy in, numpy out, on CPU or GPU."""
 
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from semcast.common.codec import (
     LOST_SLOT_SNR_DB,
     MODULATIONS,
     DecodedImage,
+    Device,
     EncodedImage,
     Modulation,
     Precision,
@@ -31,8 +32,6 @@ from semcast.common.nets.transceiver import Transceiver
 from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.slots import layout_for
 from semcast.common.shapes import check_shape
-
-Device = Literal["auto", "cpu", "cuda"]
 
 #: No honest equaliser gives larger values; anything above is damage.
 _MAX_SYMBOL = 16.0

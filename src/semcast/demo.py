@@ -34,7 +34,7 @@ from semcast.real_time import plan_for
 from semcast.server.former_run import check_not_foreign, discard, output_folder
 from semcast.server.frame_rows import run_line
 from semcast.server.mapping.settings import ReconstructionSettings
-from semcast.server.settings import DenseWhen, ServerSettings
+from semcast.server.settings import DenseWhen, SavedImages, ServerSettings
 from semcast.server.view.settings import ViewChoice, ViewSettings
 from semcast.server.viewing import check_viewer
 
@@ -91,7 +91,7 @@ class DemoSettings:
         default=None,
         metadata={"help": "images a second; by default as recorded, or as many as this machine can serve"},
     )
-    save_images: Literal["none", "keyframes", "all"] = field(
+    save_images: SavedImages = field(
         default="keyframes", metadata={"help": "decoded images kept in the output folder, for exports"}
     )
     dense_cloud: DenseWhen = field(
