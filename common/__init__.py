@@ -1,7 +1,7 @@
 """What both ends share: images, geometry, codecs, physical layer, messages, transport.
 
 Images and cameras
-    image                   PSNR of two images
+    image                   PSNR of two images, and other sizes
     image_file              image files as RGB arrays
     image_header            size of an image from its header
     tiff_alpha              whether OpenCV has applied the transparency of a TIFF

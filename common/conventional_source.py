@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.image import psnr_db
+from semcast.common.image import psnr_db, resized, scaled_wh
 from semcast.common.image_header import states_at_most
 
 ImageFormat = Literal["jpeg", "webp", "avif"]
@@ -115,8 +115,7 @@ def compress_to_fit(
     for scale in _SCALES:
         smaller = image_bgr
         if scale < 1.0:
-            size_wh = (max(1, round(shape_hw[1] * scale)), max(1, round(shape_hw[0] * scale)))
-            smaller = np.asarray(cv2.resize(image_bgr, size_wh, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            smaller = resized(image_bgr, scaled_wh(shape_hw[1], shape_hw[0], scale))
         found = _best_quality(smaller, image_format, budget_bytes, hint, avif_speed)
         if found is not None:
             quality, data = found

@@ -1,4 +1,4 @@
-"""Images as numpy arrays: the one measure that server, evaluation and training need."""
+"""Images as numpy arrays: their PSNR, and other sizes."""
 
 import cv2
 import numpy as np
@@ -33,3 +33,18 @@ def psnr_of_mse(mse: float, peak: float = 1.0) -> float:
         peak: Difference of white and black.
     """
     return 100.0 if mse == 0.0 else min(float(10.0 * np.log10(peak**2 / mse)), 100.0)
+
+
+def scaled_wh(width: int, height: int, factor: float) -> tuple[int, int]:
+    """Return a size times a factor, in whole pixels: one at least."""
+    return max(1, round(width * factor)), max(1, round(height * factor))
+
+
+def resized(image: NDArray[np.uint8], size_wh: tuple[int, int]) -> NDArray[np.uint8]:
+    """Resize by area averaging (bilinear where it grows); the same object when the size is right."""
+    height, width = image.shape[:2]
+    if (width, height) == size_wh:
+        return image
+    shrinks = size_wh[0] <= width and size_wh[1] <= height
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, size_wh, interpolation=how), dtype=np.uint8)

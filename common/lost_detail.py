@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.codec import LABEL_SHARPNESS
+from semcast.common.image import scaled_wh
 
 Map = NDArray[np.float32]
 
@@ -32,8 +33,7 @@ def detail_at(image: NDArray[np.uint8], ratio: float) -> Map:
         ``(H, W)`` mean absolute difference over colour and over a window, in shares of white.
     """
     height, width = image.shape[:2]
-    small_wh = max(1, round(width * ratio)), max(1, round(height * ratio))
-    small = cv2.resize(image, small_wh, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(image, scaled_wh(width, height, ratio), interpolation=cv2.INTER_AREA)
     again = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
     lost = cv2.absdiff(image, again).astype(np.float32).mean(axis=2) / np.float32(255.0)
     return np.asarray(cv2.blur(lost, (_WINDOW_PX, _WINDOW_PX)), np.float32)

@@ -14,6 +14,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.camera_settings import HOW_TO_GIVE, CameraSettings, check_size
 from semcast.common.errors import SourceError
 from semcast.common.geometry import interpolate_pose
+from semcast.common.image import resized, scaled_wh
 from semcast.common.image_file import bit_depth_of, read_image
 from semcast.common.playback import check_playback, usual_period_ns
 from semcast.common.sequence_layouts import Layout, SequenceFiles, ns_to_seconds, read_layout
@@ -31,16 +32,6 @@ _MOST_TURN_DEG = 20.0
 _MAX_BAD_AT_START = 9
 
 
-def resized(image: NDArray[np.uint8], size_wh: tuple[int, int]) -> NDArray[np.uint8]:
-    """Resize by area averaging (bilinear where it grows); the same object when the size is right."""
-    height, width = image.shape[:2]
-    if (width, height) == size_wh:
-        return image
-    shrinks = size_wh[0] <= width and size_wh[1] <= height
-    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, size_wh, interpolation=how), dtype=np.uint8)
-
-
 def resized_wh(width: int, height: int, factor: float) -> tuple[int, int]:
     """Return the size after a resize by ``factor``, rounded to whole pixels.
 
@@ -48,7 +39,7 @@ def resized_wh(width: int, height: int, factor: float) -> tuple[int, int]:
         ValueError: The factor is not in [0.05, 1].
     """
     check_playback(resize=factor)
-    return max(1, round(width * factor)), max(1, round(height * factor))
+    return scaled_wh(width, height, factor)
 
 
 class ImageRectifier:

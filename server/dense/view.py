@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import LABEL_SHARPNESS
+from semcast.common.image import scaled_wh
 
 Array = NDArray[np.float64]
 
@@ -69,7 +70,7 @@ def view_of(
     """
     height, width = image.shape[:2]
     share = min(1.0, float(np.sqrt(MAX_PIXELS / (height * width))))
-    size_wh = (max(1, round(width * share)), max(1, round(height * share)))
+    size_wh = scaled_wh(width, height, share)
     rgb = np.asarray(cv2.resize(image, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
     grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     small, noise = np.ones(grey.shape, np.float32), CLEAN_SIGMA

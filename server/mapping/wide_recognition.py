@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
-from semcast.common.sequence import resized
+from semcast.common.image import resized
 from semcast.server.geometry.features import Grey, deduplicate
 from semcast.server.geometry.patch_alignment import (
     ANCHOR_PATCH_PX,

@@ -16,6 +16,7 @@ from semcast.common.codec import Codec, Modulation
 from semcast.common.codecs import load_codec
 from semcast.common.cores import usable_cores
 from semcast.common.errors import SemcastError
+from semcast.common.image import resized, scaled_wh
 from semcast.common.interrupts import deaf_children
 from semcast.common.parent import end_with_parent
 from semcast.common.rate import NATIVE_RATE, RateChoice, to_coded
@@ -198,8 +199,7 @@ def plan_for(
     height, width = image.shape[:2]
     cores = usable_cores()
     largest = _resize_to(MAX_PIXELS, (height, width))
-    size_wh = (max(1, round(width * largest)), max(1, round(height * largest)))
-    smaller = np.asarray(cv2.resize(image, size_wh, interpolation=cv2.INTER_AREA), np.uint8)
+    smaller = resized(image, scaled_wh(width, height, largest))
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent) as pool:
         with deaf_children():  # Ctrl-C is this process's business
             measured = pool.submit(measure_speed, codec, modulation, smaller, rate, min(cores, _MAX_CORES))
