@@ -7,9 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.progress import Progress
-
-from semcast.commands.console import plain_console
+from semcast.commands.console import passing_progress
 from semcast.commands.paths import named_path
 from semcast.common.errors import ConfigError, SemcastError, SourceError
 
@@ -175,9 +173,7 @@ def _collect(
     views: list[BoardView] = []
     sample = None
     num_seen = 0
-    talk = plain_console(stderr=True)
-    # Where nobody watches, all that a bar leaves behind is an empty line.
-    with Progress(console=talk, transient=True, disable=not talk.is_interactive) as progress:
+    with passing_progress() as progress:
         if arguments.camera is not None:
             total, pictures = arguments.views, camera_pictures(arguments.camera)
             what = "show the board from all sides, tilted too (Ctrl-C: enough)"

@@ -1,9 +1,10 @@
-"""Where verbs print tables and lines."""
+"""Where verbs print tables and lines, and show how far they are."""
 
 import os
 import sys
 
 from rich.console import Console
+from rich.progress import Progress
 
 #: Columns of what no terminal shows: lines of a file, or of what the next program reads, are not folded.
 _WIDE = 1000
@@ -19,3 +20,9 @@ def plain_console(*, stderr: bool = False) -> Console:
     is_shown = out is None or out.isatty() or "COLUMNS" in os.environ
     width = None if is_shown else _WIDE
     return Console(stderr=stderr, markup=False, emoji=False, highlight=False, width=width)
+
+
+def passing_progress() -> Progress:
+    """Return a bar on stderr that is gone at the end; where nobody watches it would leave an empty line."""
+    talk = plain_console(stderr=True)
+    return Progress(console=talk, transient=True, disable=not talk.is_interactive)

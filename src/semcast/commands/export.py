@@ -5,7 +5,7 @@ import re
 import sys
 from typing import TYPE_CHECKING
 
-from semcast.commands.paths import named_path
+from semcast.commands.paths import add_run_folder, named_path
 
 if TYPE_CHECKING:
     from semcast.server.export.formats import FindPlacement
@@ -16,9 +16,7 @@ FORMATS = ("tum", "kitti", "ply", "dense", "colmap", "nerfstudio", "rrd")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "run", type=named_path, metavar="RUN", help="folder that --out of demo, server or replay wrote"
-    )
+    add_run_folder(parser)
     parser.add_argument(
         "--format",
         choices=FORMATS,

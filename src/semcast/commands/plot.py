@@ -5,16 +5,14 @@ import logging
 import sys
 from pathlib import Path
 
-from semcast.commands.paths import named_path
+from semcast.commands.paths import add_run_folder, named_path
 
 logger = logging.getLogger(__name__)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "run", type=named_path, metavar="RUN", help="folder that --out of demo, server or replay wrote"
-    )
+    add_run_folder(parser)
     parser.add_argument(
         "--truth",
         type=named_path,

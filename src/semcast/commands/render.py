@@ -3,9 +3,7 @@
 import argparse
 import sys
 
-from rich.progress import Progress
-
-from semcast.commands.console import plain_console
+from semcast.commands.console import passing_progress
 from semcast.commands.running import add_settings, read_settings
 from semcast.evaluation.scenes.render import RenderSettings, render_scene
 
@@ -18,8 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Draw the frames and name the folder on stdout."""
     settings = read_settings(RenderSettings, arguments)
-    talk = plain_console(stderr=True)
-    with Progress(console=talk, transient=True, disable=not talk.is_interactive) as bar:
+    with passing_progress() as bar:
         task = bar.add_task("drawing", total=None)
         num_frames = render_scene(settings, lambda done, total: bar.update(task, completed=done, total=total))
     print(f"{num_frames} frames", file=sys.stderr)

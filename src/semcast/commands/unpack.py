@@ -3,10 +3,8 @@
 import argparse
 import sys
 
-from rich.progress import Progress
-
 from semcast.agent.unpack import Unpacked, UnpackSettings, unpack
-from semcast.commands.console import plain_console
+from semcast.commands.console import passing_progress
 from semcast.commands.running import add_settings, read_settings
 
 
@@ -27,9 +25,7 @@ def _in_words(found: Unpacked) -> str:
 def run(arguments: argparse.Namespace) -> int:
     """Write the sequence and name its folder on stdout."""
     settings = read_settings(UnpackSettings, arguments)
-    talk = plain_console(stderr=True)
-    # Where nobody watches, all that a bar leaves behind is an empty line.
-    with Progress(console=talk, transient=True, disable=not talk.is_interactive) as progress:
+    with passing_progress() as progress:
         task = progress.add_task("images", total=None)
         found = unpack(settings, lambda taken, total: progress.update(task, completed=taken, total=total))
     print(_in_words(found), file=sys.stderr)
