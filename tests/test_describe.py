@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from bags import SECOND, BagMaker
+from rows_of_runs import frame_row
 
 from semcast.cli import main
 from semcast.common.camera import Intrinsics
@@ -20,7 +21,7 @@ from semcast.common.run_folder import RECONSTRUCTION_NAME, PartInMetres, RunData
 from semcast.common.trajectory import Trajectory, write_tum
 from semcast.common.trajectory_error import ate
 from semcast.describe import describe
-from semcast.server.frame_rows import FrameRow, FrameRows
+from semcast.server.frame_rows import FrameRows
 
 
 def text_of(path):
@@ -63,22 +64,17 @@ def run_folder(tmp_path):
     record = FrameRows(folder)
     for k in range(6):
         record.add(
-            FrameRow(
-                frame_id=k,
+            frame_row(
+                k,
                 t_source_ns=k * 500_000_000,
                 state="tracking" if k else "initializing",
                 posed=k > 0,
-                num_tracked=100,
-                num_inliers=80,
                 reprojection_error_px=0.5 if k else None,
                 is_keyframe=k % 2 == 1,
-                map_epoch=0,
-                snr_set_db=10.0,
                 snr_estimated_db=9.8,
                 psnr_db=None,
                 confidence_mean=0.6,
                 age_ms=40.0 + k,
-                stage_ms={"track": 10.0, "decode": 30.0},
             )
         )
     record.close()

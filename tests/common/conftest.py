@@ -1,4 +1,4 @@
-"""Recordings of a few plain images, written for each test."""
+"""Recordings of a few plain images, written for each test, and a hub."""
 
 import cv2
 import numpy as np
@@ -6,9 +6,18 @@ import pytest
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform
+from semcast.common.loopback import open_hub
 from semcast.common.trajectory import Trajectory, write_tum
 
 CAMERA = Intrinsics(fx=30.0, fy=31.0, cx=15.5, cy=11.5, width=32, height=24)
+
+
+@pytest.fixture
+def hub():
+    """A session others connect to, and its endpoint."""
+    session, endpoint = open_hub()
+    with session:
+        yield session, endpoint
 
 
 @pytest.fixture

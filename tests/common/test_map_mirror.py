@@ -7,7 +7,6 @@ from waiting import until
 
 from semcast.common.geometry import exp_so3, make_transform, transform_points
 from semcast.common.keys import map_key
-from semcast.common.loopback import open_hub
 from semcast.common.map_mirror import _EMPTY, MapMirror
 from semcast.common.messages import MapMessage, MetricPose
 from semcast.common.network_settings import NetworkSettings
@@ -30,13 +29,6 @@ def message(ids, *, removed=(), keyframes=(), offset=0.0, agent_epoch=7, map_epo
         keyframe_ids=np.array(keyframes, np.int64),
         keyframe_poses=np.array([np.eye(4) * (k + offset) for k in keyframes]).reshape(-1, 4, 4),
     )
-
-
-@pytest.fixture
-def hub():
-    session, endpoint = open_hub()
-    with session:
-        yield session, endpoint
 
 
 @pytest.fixture

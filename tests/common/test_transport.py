@@ -45,13 +45,6 @@ def alive_roles(endpoint, agent_id, zenoh_config=None):
 
 
 @pytest.fixture
-def hub():
-    session, endpoint = open_hub()
-    with session:
-        yield session, endpoint
-
-
-@pytest.fixture
 def pair(hub):
     network = NetworkSettings(connect=(hub[1],))
     with open_client(network, 60) as one, open_client(network, 60) as other:

@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from textures import shifted
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform, transform_points
@@ -18,11 +19,6 @@ CAMERA = Intrinsics(fx=500, fy=500, cx=320, cy=240, width=640, height=480)
 def texture(rng):
     noise = rng.integers(0, 256, (120, 160, 3)).astype(np.uint8)
     return cv2.GaussianBlur(noise, None, 2.0)
-
-
-def shifted(image, dx, dy):
-    M = np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]])
-    return cv2.warpAffine(image, M, image.shape[1::-1], borderMode=cv2.BORDER_REFLECT)
 
 
 def test_true_matches_lie_on_their_epipolar_lines(rng):

@@ -4,6 +4,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from rows_of_runs import frame_row
+from rows_of_runs import straight_path as line
 
 from semcast.cli import main
 from semcast.common.errors import SourceError
@@ -20,36 +22,13 @@ from semcast.evaluation.run_plots import (
     time_span_doubt,
     timeline_title,
 )
-from semcast.server.frame_rows import FrameRow, FrameRows
+from semcast.server.frame_rows import FrameRows
 
 NAN = float("nan")
 
 
 def row(frame_id, **changes):
-    values = {
-        "frame_id": frame_id,
-        "t_source_ns": frame_id * 100_000_000,
-        "state": "tracking",
-        "posed": True,
-        "num_tracked": 120,
-        "num_inliers": 100,
-        "reprojection_error_px": 0.5,
-        "is_keyframe": frame_id % 5 == 0,
-        "map_epoch": 0,
-        "snr_set_db": 10.0,
-        "snr_estimated_db": 9.5 + 0.1 * frame_id,
-        "psnr_db": 30.0,
-        "confidence_mean": 0.9,
-        "age_ms": 50.0,
-        "stage_ms": {"decode": 20.0, "track": 10.0},
-    }
-    return FrameRow(**{**values, **changes})
-
-
-def line(frame_ids):
-    poses = np.tile(np.eye(4), (len(frame_ids), 1, 1))
-    poses[:, 2, 3] = frame_ids
-    return Trajectory(np.array(frame_ids) * 0.1, poses)
+    return frame_row(frame_id, **{"snr_estimated_db": 9.5 + 0.1 * frame_id, **changes})
 
 
 def write_run(folder, rows, summary=None):

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from full_disk import room_for
+from rows_of_runs import frame_row, straight_path
 
 from semcast.common.errors import SemcastError
 from semcast.common.run_folder import FRAMES_NAME
-from semcast.common.trajectory import Trajectory
 from semcast.server import frame_rows
 from semcast.server.export.outputs import write_json
 from semcast.server.frame_rows import FrameRow, FrameRows, read_rows, summarise
@@ -17,37 +17,15 @@ from semcast.server.mapping.state import DecodedFrame, FrameResult, TrackingStat
 from semcast.server.sent_frames import stretches
 
 
-def row(frame_id, posed=True, psnr_db=30.0, **changes):
-    values = {
-        "frame_id": frame_id,
-        "t_source_ns": frame_id * 100_000_000,
-        "state": "tracking" if posed else "lost",
-        "posed": posed,
-        "num_tracked": 120,
-        "num_inliers": 100,
-        "reprojection_error_px": 0.5,
-        "is_keyframe": frame_id % 5 == 0,
-        "map_epoch": 0,
-        "snr_set_db": 10.0,
-        "snr_estimated_db": 9.5,
-        "psnr_db": psnr_db,
-        "confidence_mean": 0.9,
-        "age_ms": 50.0,
-        "stage_ms": {"decode": 20.0 + frame_id, "track": 10.0},
-    }
-    return FrameRow(**{**values, **changes})
+def row(frame_id, posed=True, **changes):
+    state, stage_ms = "tracking" if posed else "lost", {"decode": 20.0 + frame_id, "track": 10.0}
+    return frame_row(frame_id, **{"posed": posed, "state": state, "stage_ms": stage_ms, **changes})
 
 
 def summary_of(rows):
     sent = stretches({r.frame_id: r.frame_id for r in rows})
     part_of = {r.frame_id: 0 for r in rows}
-    return summarise(rows, line_trajectory(list(part_of)), part_of, None, sent, None, {}, 0)
-
-
-def line_trajectory(frame_ids):
-    poses = np.tile(np.eye(4), (len(frame_ids), 1, 1))
-    poses[:, 2, 3] = frame_ids
-    return Trajectory(np.array(frame_ids) * 0.1, poses)
+    return summarise(rows, straight_path(list(part_of)), part_of, None, sent, None, {}, 0)
 
 
 def test_rows_are_on_disk_at_once_and_a_torn_last_line_is_left_out(tmp_path):
@@ -172,7 +150,7 @@ def test_the_summary_has_the_promised_keys_and_values(tmp_path):
     part_of = {k: 0 if k < 3 else 2 for k in kept}
     sent = stretches({k: k for k in range(16)})
     summary = summarise(
-        rows, line_trajectory(kept), part_of, line_trajectory(range(20)), sent, 20, {"superseded": 5}, 7
+        rows, straight_path(kept), part_of, straight_path(range(20)), sent, 20, {"superseded": 5}, 7
     )
     assert summary["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
     assert summary["completeness"] == 10 / 16
@@ -191,7 +169,7 @@ def test_the_summary_has_the_promised_keys_and_values(tmp_path):
 
 
 def test_a_run_without_frames_has_a_summary_too():
-    summary = summarise([], line_trajectory([]), {}, None, [], None, {}, 0)
+    summary = summarise([], straight_path([]), {}, None, [], None, {}, 0)
     assert summary["parts"] == []
     assert summary["completeness"] == 0.0
     assert summary["ate_rmse_m"] is None

@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from textures import shifted
 
 from semcast.common.codec import KLT_WINDOW_PX
 from semcast.server.geometry import brightness, features
@@ -14,11 +15,6 @@ def grey(rng):
     light = np.linspace(0.6, 1.0, 320, dtype=np.float32)
     spread = (smooth - smooth.min()) / (smooth.max() - smooth.min())
     return np.rint((40 + 120 * spread) * light).astype(np.uint8)
-
-
-def shifted(grey, dx, dy):
-    move = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
-    return cv2.warpAffine(grey, move, grey.shape[::-1], borderMode=cv2.BORDER_REFLECT)
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(0.5, 0.0), (0.9, 0.0), (1.3, 0.0), (1.1, -6.0)])

@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from textures import shifted
 
 from semcast.server.geometry.features import detect_corners, track_points
 from semcast.server.geometry.flicker import flicker_between, row_gains, with_row_gains
@@ -15,11 +16,6 @@ def grey(rng):
     smooth = cv2.GaussianBlur(rng.normal(0, 1, (HEIGHT, WIDTH)).astype(np.float32), (0, 0), 2.5)
     spread = (smooth - smooth.min()) / (smooth.max() - smooth.min())
     return np.rint(40 + 120 * spread).astype(np.uint8)
-
-
-def shifted(grey, dx, dy):
-    move = np.array([[1, 0, dx], [0, 1, dy]], np.float32)
-    return cv2.warpAffine(grey, move, grey.shape[::-1], borderMode=cv2.BORDER_REFLECT)
 
 
 def bands(phase, depth=0.25):

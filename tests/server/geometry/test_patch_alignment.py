@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+import textures
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform
@@ -14,9 +15,7 @@ CENTRES = np.array([[80.0, 60.0], [160.3, 120.7], [230.5, 90.2], [120.0, 180.0]]
 
 @pytest.fixture(scope="module")
 def texture():
-    noise = np.random.default_rng(1).standard_normal((240, 320)).astype(np.float32)
-    layers = [cv2.GaussianBlur(noise, None, s) for s in (1.5, 3, 6)]
-    return np.clip(128 + 35 * sum(v / v.std() for v in layers) / 1.7, 0, 255).astype(np.uint8)
+    return textures.texture((240, 320), (1.5, 3, 6), 1, 20)
 
 
 def seen_through(image, A, t):

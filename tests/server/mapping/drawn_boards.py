@@ -4,6 +4,7 @@ import functools
 
 import cv2
 import numpy as np
+from textures import texture
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import align_umeyama, exp_so3, invert_transform, make_transform
@@ -24,20 +25,15 @@ BOARDS = (
 )
 
 
-def board_texture(seed, size=512):
-    rng = np.random.default_rng(seed)
-    noise = np.zeros((size, size), np.float32)
-    for sigma in (2.0, 6.0, 16.0):
-        layer = cv2.GaussianBlur(rng.standard_normal((size, size)).astype(np.float32), None, sigma)
-        noise += layer / layer.std()
-    return np.clip(noise * 32 + 128, 0, 255).astype(np.uint8)
+def board_texture(seed, side):
+    return texture((side, side), (2.0, 6.0, 16.0), seed, 32)
 
 
 @functools.cache
 def textures():
     """Texture and mask of each board, made when the first picture is drawn: every process imports this."""
     drawn = [board_texture(k, 1536 if k == 0 else 256) for k in range(len(BOARDS))]
-    return [(texture, np.full_like(texture, 255)) for texture in drawn]
+    return [(grey, np.full_like(grey, 255)) for grey in drawn]
 
 
 def render(T_world_cam, corner_xy=(0, 0), size_wh=(CAMERA.width, CAMERA.height)):
@@ -45,12 +41,12 @@ def render(T_world_cam, corner_xy=(0, 0), size_wh=(CAMERA.width, CAMERA.height))
     T = invert_transform(T_world_cam)
     image = np.zeros(size_wh[::-1], np.uint8)
     K = CAMERA.K - np.outer((*corner_xy, 0), (0, 0, 1))
-    for (texture, whole), (x, y, z, size) in zip(textures(), BOARDS, strict=True):
-        scale = size / texture.shape[0]
+    for (grey, whole), (x, y, z, size) in zip(textures(), BOARDS, strict=True):
+        scale = size / grey.shape[0]
         board = np.array([[scale, 0, x - size / 2], [0, scale, y - size / 2], [0, 0, z], [0, 0, 1]])
         H = K @ (T[:3] @ board)
         mask = cv2.warpPerspective(whole, H, size_wh)
-        drawn = cv2.warpPerspective(texture, H, size_wh, flags=cv2.INTER_AREA)
+        drawn = cv2.warpPerspective(grey, H, size_wh, flags=cv2.INTER_AREA)
         image = np.where(mask == 255, drawn, image)
     return np.repeat(image[..., None], 3, axis=2)
 

@@ -1,7 +1,7 @@
 """A plain texture before which a camera moves sideways, tracks that begin on it, and a map of it."""
 
-import cv2
 import numpy as np
+from textures import texture
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import make_transform
@@ -15,18 +15,7 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 SHAPE = (192, 256)
 
 
-def big_texture():
-    rng = np.random.default_rng(3)
-    noise = sum(
-        layer / layer.std()
-        for layer in (
-            cv2.GaussianBlur(rng.standard_normal((400, 500)).astype(np.float32), None, s) for s in (2, 5, 12)
-        )
-    )
-    return np.clip(noise * 30 + 128, 0, 255).astype(np.uint8)
-
-
-TEXTURE = big_texture()
+TEXTURE = texture((400, 500), (2, 5, 12), 3)
 
 
 def sight_at(x, y=20, frame_id=0, lost=(), **changes):

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from textures import texture
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
@@ -27,15 +28,7 @@ NOISE = NoiseModel(0.5, 0.0)
 NUM_FRAMES, CAME = 45, 15
 
 
-def texture(shape_hw, seed):
-    rng = np.random.default_rng(seed)
-    layers = [
-        cv2.GaussianBlur(rng.standard_normal(shape_hw).astype(np.float32), None, sigma) for sigma in (2, 6)
-    ]
-    return np.clip(sum(layer / layer.std() for layer in layers) * 40 + 128, 0, 255).astype(np.uint8)
-
-
-WALL, THING = texture((700, 1800), seed=2), texture((150, 1200), seed=3)
+WALL, THING = texture((700, 1800), (2, 6), 2, 40), texture((150, 1200), (2, 6), 3, 40)
 
 
 def pose_at(k):

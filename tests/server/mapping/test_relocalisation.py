@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
+from textures import texture
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import detect_corners
@@ -18,14 +18,7 @@ CAMERA = Intrinsics(fx=300.0, fy=300.0, cx=160.0, cy=120.0, width=320, height=24
 NOISE = NoiseModel(1.0, 0.0)
 
 
-def texture():
-    rng = np.random.default_rng(5)
-    noise = rng.standard_normal((240, 320)).astype(np.float32)
-    layers = [cv2.GaussianBlur(noise, None, s) for s in (1.5, 4.0, 9.0)]
-    return np.clip(sum(layer / layer.std() for layer in layers) * 30 + 128, 0, 255).astype(np.uint8)
-
-
-GREY = texture()
+GREY = texture((240, 320), (1.5, 4.0, 9.0), 5)
 SIGHT = Sight(DecodedFrame(1, 10**8, np.repeat(GREY[..., None], 3, axis=2)), GREY, np.ones(240, bool))
 
 

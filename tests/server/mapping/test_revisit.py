@@ -6,6 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from textures import texture
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
@@ -32,12 +33,7 @@ DEPTH = 2.0
 
 @functools.cache
 def wall():
-    rng = np.random.default_rng(3)
-    layers = [
-        cv2.GaussianBlur(rng.standard_normal((900, 1800)).astype(np.float32), None, s) for s in (2, 5, 12)
-    ]
-    noise = sum(layer / layer.std() for layer in layers)
-    return np.clip(noise * 30 + 128, 0, 255).astype(np.uint8)
+    return texture((900, 1800), (2, 5, 12), 3)
 
 
 def sight_from(T_world_cam, frame_id):

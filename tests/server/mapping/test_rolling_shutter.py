@@ -6,6 +6,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
+from textures import layered_noise
 
 from semcast.common.camera import Intrinsics
 from semcast.server.geometry.features import to_grey
@@ -21,15 +22,7 @@ STEP_S = 1 / 30
 READOUT_MS = 20.0
 
 
-def wide_texture():
-    rng = np.random.default_rng(5)
-    layers = [
-        cv2.GaussianBlur(rng.standard_normal((700, 1200)).astype(np.float32), None, s) for s in (2, 5, 12)
-    ]
-    return np.clip(sum(layer / layer.std() for layer in layers) * 30 + 128, 0, 255).astype(np.float32)
-
-
-TEXTURE = wide_texture()
+TEXTURE = np.clip(layered_noise((700, 1200), (2, 5, 12), 5) * 30 + 128, 0, 255)
 
 
 def seen(offset_px_s, frame_id, readout_ms=READOUT_MS, readout_from="top", lost=()):

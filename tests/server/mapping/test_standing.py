@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from drawn_boards import ate_percent, frame_of, make, render, sideways
+from textures import texture
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, make_transform
@@ -21,15 +22,7 @@ WIDTH, HEIGHT = CAMERA.width, CAMERA.height
 BONNET_Y = 170
 
 
-def texture(shape_hw, seed=0):
-    rng = np.random.default_rng(seed)
-    layers = [
-        cv2.GaussianBlur(rng.standard_normal(shape_hw).astype(np.float32), None, sigma) for sigma in (2, 6)
-    ]
-    return np.clip(sum(layer / layer.std() for layer in layers) * 40 + 128, 0, 255).astype(np.uint8)
-
-
-SCENE, BONNET = texture((HEIGHT, 1200)), texture((HEIGHT, WIDTH), seed=1)
+SCENE, BONNET = texture((HEIGHT, 1200), (2, 6), 0, 40), texture((HEIGHT, WIDTH), (2, 6), 1, 40)
 
 
 def sight_at(x, frame_id, bonnet_x=0):
@@ -174,7 +167,7 @@ def test_a_track_that_is_hidden_does_not_stand():
     assert np.isin(hidden, tracks.ids[tracks.visible]).mean() > 0.9
 
 
-WALL = texture((700, 1800), seed=2)
+WALL = texture((700, 1800), (2, 6), 2, 40)
 #: Of a bonnet that has most of all tracks to itself: taken for the scene, it lets no map begin.
 LARGE_BONNET_Y = 136
 

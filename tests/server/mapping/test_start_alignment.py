@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from textures import layered_noise
 
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, make_transform
@@ -15,14 +16,6 @@ CAMERA = Intrinsics(fx=250.0, fy=250.0, cx=160.0, cy=120.0, width=320, height=24
 DEPTH_M = 4.0
 #: From the pixels of the picture on the wall to the wall, of which one pixel is seen as about one.
 ON_WALL = np.array([[0.016, 0.0, -4.8], [0.0, 0.016, -4.0], [0.0, 0.0, DEPTH_M], [0.0, 0.0, 1.0]])
-
-
-def picture():
-    rng = np.random.default_rng(3)
-    layers = [
-        cv2.GaussianBlur(rng.standard_normal((500, 600)).astype(np.float32), None, s) for s in (2, 4, 9)
-    ]
-    return sum(layer / layer.std() for layer in layers) * 20 + 128
 
 
 def pose(k):
@@ -38,14 +31,14 @@ def truth_in(T_world_cam, xyz):
 @pytest.fixture(scope="module")
 def start():
     """Five noisy views of a wall, tracks that drifted, the poses, and where the points are."""
-    rng = np.random.default_rng(0)
+    rng, picture = np.random.default_rng(0), layered_noise((500, 600), (2, 4, 9), 3) * 20 + 128
     poses = np.stack([pose(k) for k in range(5)])
     across, down = np.meshgrid(np.linspace(-1.6, 2.2, 14), np.linspace(-1.3, 1.5, 10))
     xyz = np.column_stack([across.ravel(), down.ravel(), np.full(across.size, DEPTH_M)])
     views, truths = [], []
     for k, T_world_cam in enumerate(poses):
         seen = cv2.warpPerspective(
-            picture(), CAMERA.K @ invert_transform(T_world_cam)[:3] @ ON_WALL, (320, 240)
+            picture, CAMERA.K @ invert_transform(T_world_cam)[:3] @ ON_WALL, (320, 240)
         )
         grey = np.clip(seen + 6.0 * rng.standard_normal(seen.shape), 0, 255).astype(np.uint8)
         true = truth_in(T_world_cam, xyz)
