@@ -24,6 +24,7 @@ from semcast.server.geometry.projection import MIN_DEPTH_MAP, depths_in
 from semcast.server.geometry.weighting import MAD_TO_SIGMA
 from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.track_ids import shared_rows
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -151,7 +152,7 @@ def _middle(places: Array) -> tuple[Array, Array]:
 
 def _shared(tracks: TrackTable, rows: NDArray[np.intp], keyframe: Keyframe) -> tuple[NDArray[np.intp], Array]:
     """Return those of some tracks that a keyframe saw too, and where."""
-    _, mine, theirs = np.intersect1d(tracks.ids[rows], keyframe.ids, assume_unique=True, return_indices=True)
+    mine, theirs = shared_rows(tracks.ids[rows], keyframe.ids)
     return rows[mine], keyframe.xy[theirs]
 
 

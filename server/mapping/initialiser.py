@@ -28,6 +28,7 @@ from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.scene_motion import SceneMotion, motion_of_scene
 from semcast.server.mapping.start_alignment import aligned_views
 from semcast.server.mapping.start_attempts import Patience, Undecided
+from semcast.server.mapping.track_ids import shared_rows
 from semcast.server.mapping.world_map import Keyframe
 
 Array = NDArray[np.float64]
@@ -127,7 +128,8 @@ class _Pair:
 
 def _pair(first: Observed, second: Observed, suspect: Ids) -> _Pair:
     """Match two frames by the ids of their tracks."""
-    ids, row0, row1 = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
+    row0, row1 = shared_rows(first.ids, second.ids)
+    ids = first.ids[row0]
     doubtful = np.isin(ids, suspect)
     left_out, ids, row0, row1 = ids[doubtful], ids[~doubtful], row0[~doubtful], row1[~doubtful]
     confidence = fuse_confidence(first.confidence[row0], second.confidence[row1])

@@ -14,6 +14,7 @@ from semcast.server.geometry.pnp import refine_pose, search_pose
 from semcast.server.geometry.sampling import sample_colours
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.sight import Sight
+from semcast.server.mapping.track_ids import shared_rows
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -85,7 +86,7 @@ def colours_of(ids: Ids, frames: Sequence[Observed]) -> NDArray[np.uint8]:
     colours = np.full((len(ids), 3), 128, np.uint8)
     for observed in frames:
         if observed.rgb is not None:
-            _, row, row_o = np.intersect1d(ids, observed.ids, assume_unique=True, return_indices=True)
+            row, row_o = shared_rows(ids, observed.ids)
             colours[row] = observed.rgb[row_o]
     return colours
 
@@ -127,7 +128,7 @@ def pose_of(
     Returns:
         ``T_world_cam (4, 4)``, None where too few agree.
     """
-    _, row, row_o = np.intersect1d(ids, observed.ids, assume_unique=True, return_indices=True)
+    row, row_o = shared_rows(ids, observed.ids)
     if len(row) < _MIN_INLIERS:
         return None
     sigma = noise.sigma_px(observed.confidence[row_o])

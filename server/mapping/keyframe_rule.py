@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.server.mapping.refuted import on_something_large
+from semcast.server.mapping.track_ids import shared_rows
 from semcast.server.mapping.world_map import Keyframe
 
 Array = NDArray[np.float64]
@@ -88,7 +89,7 @@ def median_flow_px(reference: Keyframe, ids: Ids, xy: Array) -> float:
     Returns:
         Median in pixels; infinite where the keyframe saw none of the tracks.
     """
-    _, row, row_k = np.intersect1d(ids, reference.ids, assume_unique=True, return_indices=True)
+    row, row_k = shared_rows(ids, reference.ids)
     at_rest = ~np.isin(ids[row], on_something_large(reference))
     flow_px = np.linalg.norm(xy[row[at_rest]] - reference.xy[row_k[at_rest]], axis=1)
     return float(np.median(flow_px)) if len(flow_px) else float("inf")

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.server.mapping.track_ids import rows_among
+
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
@@ -42,10 +44,7 @@ class Landmarks:
 
     def rows(self, ids: Ids) -> NDArray[np.intp]:
         """Row of each id, -1 for one that is not there."""
-        if len(self.ids) == 0:
-            return np.full(len(ids), -1, dtype=np.intp)
-        row = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
-        return np.asarray(np.where(self.ids[row] == ids, row, -1), dtype=np.intp)
+        return rows_among(ids, self.ids)
 
     def xyz_of(self, ids: Ids) -> Array:
         """Positions ``(M, 3)`` of those of the ids that are there."""

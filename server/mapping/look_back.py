@@ -23,6 +23,7 @@ from semcast.server.mapping.new_landmarks import triangulate_tracks
 from semcast.server.mapping.observations import gather_observations
 from semcast.server.mapping.scene_depth import median_depth_of
 from semcast.server.mapping.settings import ReconstructionSettings
+from semcast.server.mapping.track_ids import shared_rows
 from semcast.server.mapping.window import within_limit
 
 Array = NDArray[np.float64]
@@ -93,7 +94,7 @@ def _is_new_view(observed: Observed, start: Start, width_px: int) -> bool:
     Fewer of them than are made later on: each costs an adjustment at once.
     """
     first = start.keyframes[0]
-    _, row, row_k = np.intersect1d(observed.ids, first.ids, assume_unique=True, return_indices=True)
+    row, row_k = shared_rows(observed.ids, first.ids)
     flow_px = np.linalg.norm(observed.xy[row] - first.xy[row_k], axis=1)
     known, known_k = (np.isin(ids, start.ids, assume_unique=True).sum() for ids in (observed.ids, first.ids))
     if len(row) == 0 or known < _FEW_KNOWN_SHARE * known_k:

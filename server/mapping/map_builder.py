@@ -36,6 +36,7 @@ from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.state import MapUpdate
 from semcast.server.mapping.submap_placement import SubmapPlacement
+from semcast.server.mapping.track_ids import shared_rows
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.whole_map import adjust_whole_map
 from semcast.server.mapping.wide_recognition import WideRecogniser
@@ -164,7 +165,7 @@ class MapBuilder:
             if observed.grey is not None and any(k.frame_id == observed.frame_id for k in start.keyframes):
                 self.images.append(SeenFrom(observed.frame_id, observed.grey))
         newest = start.keyframes[-1]
-        _, row, row_k = np.intersect1d(tracks.ids, newest.ids, assume_unique=True, return_indices=True)
+        row, row_k = shared_rows(tracks.ids, newest.ids)
         tracks.settle_at(row, newest.xy[row_k], np.full(len(row), np.nan))
         newest.descriptor_ids, newest.descriptors = self.relocaliser.describe(
             sight.grey, newest.ids, newest.xy

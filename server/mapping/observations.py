@@ -6,6 +6,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.server.mapping.track_ids import rows_among
+
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
@@ -65,11 +67,12 @@ def gather_observations(views: Sequence[View], ids: Ids) -> Observations:
     """
     view, point, xy, confidence, edge = [], [], [], [], []
     for k, seen in enumerate(views):
-        row = np.minimum(np.searchsorted(ids, seen.ids), max(0, len(ids) - 1))
-        hit = ids[row] == seen.ids if len(ids) else np.zeros(len(seen.ids), bool)
+        row = rows_among(seen.ids, ids)
+        hit = row >= 0
         view.append(np.full(int(hit.sum()), k, np.intp))
-        point.append(row[hit].astype(np.intp))
+        point.append(row[hit])
         xy.append(seen.xy[hit])
         confidence.append(seen.confidence[hit])
         edge.append(seen.edge[hit])
-    return Observations(*(np.concatenate(column) for column in (view, point, xy, confidence, edge)))
+    places = (np.concatenate(column) for column in (xy, confidence, edge))
+    return Observations(np.concatenate(view), np.concatenate(point), *places)

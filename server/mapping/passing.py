@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from semcast.server.mapping.sight import Sight
 from semcast.server.mapping.standing import least_motion_px, scene_motion_px
+from semcast.server.mapping.track_ids import shared_rows
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
@@ -154,7 +155,7 @@ class Passing:
         if self._now.noted_ns is None or t_ns - self._now.noted_ns >= _PROOF_NS:
             self._now.noted_ns = t_ns
         else:
-            _, then, now = np.intersect1d(self._now.ids, ids, assume_unique=True, return_indices=True)
+            then, now = shared_rows(self._now.ids, ids)
             xy[now] = self._now.xy[then]
         self._now.ids, self._now.xy = ids, xy
 
@@ -163,7 +164,7 @@ class Passing:
 
         Where few are left, it is those that an outline took along as it hid the rest.
         """
-        _, then, now = np.intersect1d(self._now.ids, ids, assume_unique=True, return_indices=True)
+        then, now = shared_rows(self._now.ids, ids)
         moved_px = np.linalg.norm(xy[now] - self._now.xy[then], axis=1)
         enough = len(now) > 0 and len(now) >= _LEAST_LEFT * len(self._now.ids)
         return enough and float(np.median(moved_px / least_px[now])) > 1.0

@@ -9,6 +9,8 @@ from collections.abc import Collection, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.server.mapping.track_ids import rows_among
+
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
@@ -108,8 +110,7 @@ class PosedFrames:
             return np.zeros(0, np.int64)
         keyframe_ids = np.array(sorted(factor), dtype=np.int64)
         scale = np.array([factor[k] for k in keyframe_ids.tolist()])
-        mine = self._keyframe_ids[: len(self)]
-        at = np.minimum(np.searchsorted(keyframe_ids, mine), len(keyframe_ids) - 1)
-        each = np.where(keyframe_ids[at] == mine, scale[at], 1.0)
+        at = rows_among(self._keyframe_ids[: len(self)], keyframe_ids)
+        each = np.where(at >= 0, scale[at], 1.0)
         self._T_keyframe_cam[: len(self), :3, 3] *= each[:, None]
         return np.asarray(self._ids[: len(self)][each != 1.0])

@@ -20,6 +20,7 @@ from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.refuted import on_something_large
 from semcast.server.mapping.scene_depth import median_depth
+from semcast.server.mapping.track_ids import rows_among
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
 Array = NDArray[np.float64]
@@ -83,8 +84,8 @@ def rays_of(
     xyz, spread_px, sigma_px = np.zeros((len(ids), 3)), np.zeros((len(ids), 2)), np.zeros(len(ids))
     found, refuted = np.zeros(len(ids), bool), np.zeros(len(ids), bool)
     for position, keyframe in enumerate(views):
-        row = np.minimum(np.searchsorted(keyframe.ids, ids), len(keyframe.ids) - 1)
-        new = np.flatnonzero(~found & ~refuted & (keyframe.ids[row] == ids))
+        row = rows_among(ids, keyframe.ids)
+        new = np.flatnonzero(~found & ~refuted & (row >= 0))
         # A few that are refuted have slipped. Many are something large, or the far view.
         if len(keyframe.refuted) and not (with_refuted and len(on_something_large(keyframe))):
             refuted[new] = np.isin(ids[new], keyframe.refuted)

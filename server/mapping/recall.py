@@ -16,6 +16,7 @@ from semcast.server.geometry.features import BORDER_PX, TrackedPoints, track_ali
 from semcast.server.geometry.streaks import blurred_alike
 from semcast.server.mapping.keyframe_images import ImagedMap, SeenFrom
 from semcast.server.mapping.sight import Seen, Sight
+from semcast.server.mapping.track_ids import shared_rows
 from semcast.server.mapping.tracks import TrackTable
 from semcast.server.mapping.world_map import Keyframe
 
@@ -79,7 +80,7 @@ def _follow(
     """Follow some of what a keyframe saw into a new image, in the light that tracks seen in both tell of."""
     xy0 = keyframe.xy[rows]
     grey0, grey1 = blurred_alike(image.grey, sight.grey, image.band_power, sight.band_power)
-    _, then, now = np.intersect1d(keyframe.ids, alive.ids, assume_unique=True, return_indices=True)
+    then, now = shared_rows(keyframe.ids, alive.ids)
     if len(then) < MIN_POINTS:
         return track_points(grey0, grey1, xy0, expected_xy, max_level=_LEVELS)
     change = brightness_change(grey0, grey1, keyframe.xy[then], alive.xy[now])

@@ -17,6 +17,7 @@ from semcast.server.geometry.features import Grey
 from semcast.server.geometry.patch_alignment import ANCHOR_PATCH_PX, Templates, align_patches, seen_alike
 from semcast.server.geometry.projection import MIN_DEPTH_MAP
 from semcast.server.mapping.kept_frames import Observed
+from semcast.server.mapping.track_ids import shared_rows
 
 Array = NDArray[np.float64]
 
@@ -39,7 +40,7 @@ def _aligned(camera: Intrinsics, views: Sequence[Observed], T_world_cam: Array, 
     places = np.full((len(views), len(view.ids), 2), np.nan)
     places[index] = view.xy
     for other, seen in enumerate(views):
-        _, mine, theirs = np.intersect1d(view.ids, seen.ids, assume_unique=True, return_indices=True)
+        mine, theirs = shared_rows(view.ids, seen.ids)
         if other == index or seen.grey is None or len(mine) == 0:
             continue
         R = T_world_cam[index, :3, :3].T @ T_world_cam[other, :3, :3]
