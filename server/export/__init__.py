@@ -2,7 +2,7 @@
 
 Files of a run
     outputs     PLY map, timed trajectory, JSON without NaN
-    geometry    reprojection errors
+    geometry    observations of a run, and their reprojection errors
 
 Other tools
     formats     exports by format name

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from semcast.common.geometry import invert_transform, quat_wxyz_from_rotation
 from semcast.common.run_folder import RunData, image_name
 from semcast.common.whole_file import write_whole
-from semcast.server.export.geometry import reprojection_errors_px, unique_observations
+from semcast.server.export.geometry import landmark_rows, reprojection_errors_px, unique_observations
 
 logger = logging.getLogger(__name__)
 
@@ -82,11 +82,10 @@ def write_colmap(folder: Path, data: RunData, images: Mapping[int, Path]) -> lis
     return [model / name for name in files]
 
 
-def _tracks(data: RunData) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _tracks(data: RunData) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     """Observations, sorted by keyframe, of landmarks with a track; and for each the landmark's row."""
     rows = unique_observations(data)
-    sorter = np.argsort(data.landmark_ids)
-    point_rows = sorter[np.searchsorted(data.landmark_ids, data.observed_landmark_ids[rows], sorter=sorter)]
+    point_rows = landmark_rows(data)[rows]
     num_seen = np.bincount(point_rows, minlength=len(data.landmark_ids))
     kept = num_seen[point_rows] >= 2
     rows, point_rows = rows[kept], point_rows[kept]
@@ -124,7 +123,7 @@ def _images(data: RunData, frame_ids: list[int], rows: NDArray[np.int64]) -> lis
     return lines
 
 
-def _points(data: RunData, rows: NDArray[np.int64], point_rows: NDArray[np.int64]) -> list[str]:
+def _points(data: RunData, rows: NDArray[np.int64], point_rows: NDArray[np.intp]) -> list[str]:
     lines = ["# POINT3D_ID X Y Z R G B ERROR IMAGE_ID POINT2D_IDX ..."]
     keyframes = data.observed_keyframe_ids[rows]
     # The place of an observation within its image: rows are sorted by keyframe.

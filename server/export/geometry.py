@@ -1,4 +1,4 @@
-"""Figures of a finished run that follow from its arrays alone: reprojection errors of its observations."""
+"""What follows from the arrays of a finished run alone: whose its observations are, and their errors."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +14,21 @@ def unique_observations(data: RunData) -> NDArray[np.int64]:
     return np.sort(first)
 
 
+def landmark_rows(data: RunData) -> NDArray[np.intp]:
+    """Return the row of the landmark of each observation, ``(M,)``."""
+    sorter = np.argsort(data.landmark_ids)
+    return np.asarray(sorter[np.searchsorted(data.landmark_ids, data.observed_landmark_ids, sorter=sorter)])
+
+
 def reprojection_errors_px(data: RunData) -> NDArray[np.float64]:
     """Return ``(M,)`` distances in pixels between observed and projected landmarks.
 
     NaN where a landmark is at or behind its keyframe's camera plane.
     """
     frame_row = np.searchsorted(data.frame_ids, data.observed_keyframe_ids)
-    sorter = np.argsort(data.landmark_ids)
-    point_row = sorter[np.searchsorted(data.landmark_ids, data.observed_landmark_ids, sorter=sorter)]
     T_cam_world = invert_transform(data.T_world_cam)[frame_row]
-    points_cam = (T_cam_world[:, :3, :3] @ data.xyz[point_row][:, :, None])[..., 0] + T_cam_world[:, :3, 3]
+    points_cam = (T_cam_world[:, :3, :3] @ data.xyz[landmark_rows(data)][:, :, None])[..., 0] + T_cam_world[
+        :, :3, 3
+    ]
     projected_xy = data.intrinsics.project(points_cam)
     return np.asarray(np.linalg.norm(projected_xy - data.observed_xy, axis=1))
