@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from semcast.common.errors import tell_nobody
 from semcast.common.worker_guard import WorkerGuard
 
 #: Ten seconds of delay at 50 frames per second,
@@ -42,7 +43,7 @@ class DelayLine:
     def __init__(
         self,
         send: Callable[[bytes, bool], None],
-        on_failure: Callable[[str], None] | None = None,
+        on_failure: Callable[[str], None] = tell_nobody,
         capacity_bytes: int = CAPACITY_BYTES,
     ) -> None:
         self._send = send

@@ -23,3 +23,7 @@ class CheckpointError(SemcastError):
 
 class SourceError(SemcastError):
     """Images, calibration or ground truth could not be read."""
+
+
+def tell_nobody(text: str) -> None:
+    """Take a line about what went wrong where nobody is to be told of it."""

@@ -9,7 +9,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from semcast.common.errors import SourceError
+from semcast.common.errors import SourceError, tell_nobody
 from semcast.common.file_lock import is_locked, lock
 from semcast.common.former_file import keep_former
 from semcast.common.recording_writer import FLUSH_INTERVAL_S, RecordingWriter
@@ -45,7 +45,7 @@ class Recorder:
         header: Mapping[str, str],
         *,
         queue_bytes: int = QUEUE_BYTES,
-        on_error: Callable[[str], None] | None = None,
+        on_error: Callable[[str], None] = tell_nobody,
     ) -> None:
         self._path = path
         self._limit_bytes = queue_bytes
@@ -158,8 +158,7 @@ class Recorder:
             self.num_written,
             exc_info=None if isinstance(err, _EXPECTED) else err,
         )
-        if self._on_error is not None:
-            self._on_error(text)
+        self._on_error(text)
         with self._condition:
             self.error = why
             self.drops["disk"] += self._num_taken - self.num_written

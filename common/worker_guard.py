@@ -5,6 +5,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from semcast.common.errors import tell_nobody
+
 logger = logging.getLogger(__name__)
 
 #: Different exceptions that are logged of one worker; an endless stream of them must not fill the disk.
@@ -32,7 +34,7 @@ class WorkerGuard:
         1
     """
 
-    def __init__(self, what: str, on_failure: Callable[[str], None] | None = None) -> None:
+    def __init__(self, what: str, on_failure: Callable[[str], None] = tell_nobody) -> None:
         self._what = what
         self._on_failure = on_failure
         self._logged: set[str] = set()
@@ -49,6 +51,5 @@ class WorkerGuard:
         if text not in self._logged and len(self._logged) < MAX_LOGGED:
             self._logged.add(text)
             logger.error("%s", text, exc_info=error)
-        if self._on_failure is not None:
-            self._on_failure(text)
+        self._on_failure(text)
         return True

@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 
+from semcast.common.errors import tell_nobody
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.bundle_problem import BundleRunner
 from semcast.server.mapping.bundle_process import ProcessBundle
 from semcast.server.settings import ServerSettings
 
 
-def new_bundle(settings: ServerSettings, on_give_up: Callable[[str], None] | None = None) -> BundleRunner:
+def new_bundle(settings: ServerSettings, on_give_up: Callable[[str], None] = tell_nobody) -> BundleRunner:
     """Return a runner of bundle adjustments as the settings want it.
 
     Args:

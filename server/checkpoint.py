@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.errors import CheckpointError
+from semcast.common.errors import CheckpointError, tell_nobody
 from semcast.common.mailbox import Mailbox
 from semcast.common.npz_file import read_npz, write_npz
 from semcast.server.stream_identity import StreamIdentity
@@ -155,7 +155,7 @@ class CheckpointWriter:
         on_error: Is told in a line, each time, that it can't be written.
     """
 
-    def __init__(self, path: Path, on_error: Callable[[str], None] | None = None) -> None:
+    def __init__(self, path: Path, on_error: Callable[[str], None] = tell_nobody) -> None:
         self._path = path
         self._on_error = on_error
         self._box: Mailbox[Checkpoint] = Mailbox(1, "newest")
@@ -191,8 +191,7 @@ class CheckpointWriter:
                 text,
                 exc_info=None if isinstance(err, CheckpointError) else err,
             )
-        if self._on_error is not None:
-            self._on_error(f"no checkpoint: {text}")
+        self._on_error(f"no checkpoint: {text}")
 
     def close(self) -> None:
         """Write what waits and end the thread. Idempotent."""

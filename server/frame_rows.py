@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from semcast.common.errors import SemcastError
+from semcast.common.errors import SemcastError, tell_nobody
 from semcast.common.metrics import drops_in_words, duration_percentiles
 from semcast.common.run_folder import FRAMES_NAME
 from semcast.common.trajectory import Trajectory
@@ -120,7 +120,7 @@ class FrameRows:
         folder: Path | None,
         *,
         resume: bool = False,
-        on_error: Callable[[str], None] | None = None,
+        on_error: Callable[[str], None] = tell_nobody,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._waiting: deque[FrameRow] = deque(maxlen=MAX_ROWS_IN_MEMORY)
@@ -189,8 +189,7 @@ class FrameRows:
         text = f"{self._path} can't be written: {err}"
         if self._failed_s is None:
             logger.warning("%s; rows wait in memory, and it is tried again every %g s", text, RETRY_S)
-        if self._on_error is not None:
-            self._on_error(text)
+        self._on_error(text)
         self._failed_s = self._clock()
         self.close()
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from semcast.common.errors import SourceError
+from semcast.common.errors import SourceError, tell_nobody
 from semcast.common.mailbox import Mailbox
 from semcast.common.run_folder import IMAGES_NAME, image_name, shortage
 
@@ -57,7 +57,7 @@ class ImageWriter:
         *,
         lossless: bool,
         capacity: int = 8,
-        on_error: Callable[[str], None] | None = None,
+        on_error: Callable[[str], None] = tell_nobody,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._images = folder / IMAGES_NAME
@@ -153,8 +153,7 @@ class ImageWriter:
             RETRY_S,
             exc_info=None if isinstance(err, OSError | cv2.error) else err,
         )
-        if self._on_error is not None:
-            self._on_error(text)
+        self._on_error(text)
 
     def _drop_provisional(self, kept: Collection[int]) -> None:
         for frame_id in self._provisional:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.errors import SourceError
+from semcast.common.errors import SourceError, tell_nobody
 from semcast.common.geometry import make_transform
 from semcast.common.run_folder import PartInMetres
 from semcast.server.export.markers import MarkerPlacement, Sightings
@@ -52,7 +52,7 @@ class Metres:
         settings: MarkerSettings,
         camera: Intrinsics,
         reconstruction: Reconstruction,
-        on_give_up: Callable[[str], None] | None = None,
+        on_give_up: Callable[[str], None] = tell_nobody,
     ) -> None:
         self._settings = settings
         self._camera = camera
@@ -109,8 +109,7 @@ class Metres:
         except Exception as err:
             logger.exception("the marker is no longer looked for")
             self._why_not, self._sightings, self._found, self._shown = str(err), None, {}, None
-            if self._on_give_up is not None:
-                self._on_give_up(f"the marker is no longer looked for: {err}")
+            self._on_give_up(f"the marker is no longer looked for: {err}")
 
     def _look(self, frame: DecodedFrame, sightings: Sightings) -> None:
         grey = cv2.cvtColor(self._reconstruction.put_right(frame.image), cv2.COLOR_RGB2GRAY)

@@ -10,6 +10,7 @@ from typing import Any
 
 from semcast import SourceError, TransportError, __version__
 from semcast.common.config import to_toml
+from semcast.common.errors import tell_nobody
 from semcast.common.keys import DEFAULT_AGENT_ID, agent_of, all_keys, camera_key, check_agent_id
 from semcast.common.messages import CameraInfo, StatusMessage
 from semcast.common.network_settings import NetworkSettings
@@ -112,7 +113,7 @@ def recording(
     agent_id: str,
     file: Path,
     settings_toml: str,
-    on_error: Callable[[str], None] | None = None,
+    on_error: Callable[[str], None] = tell_nobody,
 ) -> Iterator[Recorder]:
     """Record all that is sent about one agent while the context lasts.
 

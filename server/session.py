@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.config import settings_to_dict, to_toml
-from semcast.common.errors import CheckpointError
+from semcast.common.errors import CheckpointError, tell_nobody
 from semcast.common.run_folder import (
     CHECKPOINT_NAME,
     DENSE_NAME,
@@ -91,7 +91,7 @@ class Session:
         reference: Reference | None,
         bundle: BundleRunner | None = None,
         program: Any = None,
-        on_error: Callable[[str], None] | None = None,
+        on_error: Callable[[str], None] = tell_nobody,
     ) -> None:
         self._settings = settings
         self._program = program if program is not None else settings
@@ -196,8 +196,7 @@ class Session:
                 self._reconstruction.collect()
         except Exception as err:  # on a frame's way it would cost that frame and not the stream, either
             logger.exception("an adjustment could not be applied and is left out")
-            if self._on_error is not None:
-                self._on_error(f"an adjustment could not be applied: {err}")
+            self._on_error(f"an adjustment could not be applied: {err}")
 
     def process(
         self, frame: DecodedFrame, arrival: Arrival, on_pose: Callable[[FrameResult], None] | None = None

@@ -33,7 +33,7 @@ class SessionCloud:
         settings: ServerSettings,
         camera: Intrinsics,
         reconstruction: Reconstruction,
-        on_give_up: Callable[[str], None] | None,
+        on_give_up: Callable[[str], None],
     ) -> None:
         self._reconstruction = reconstruction
         self._on_give_up = on_give_up
@@ -114,8 +114,7 @@ class SessionCloud:
 
     def _give_up(self, err: Exception) -> None:
         logger.exception("the dense cloud no longer grows")
-        if self._on_give_up is not None:
-            self._on_give_up(f"the dense cloud no longer grows: {err}")
+        self._on_give_up(f"the dense cloud no longer grows: {err}")
         self.close()
 
 

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from semcast.common.errors import ConfigError
+from semcast.common.errors import ConfigError, tell_nobody
 from semcast.common.former_file import keep_former
 from semcast.common.run_folder import VIEWER_NAME
 from semcast.server.dense.cloud import DensePatch
@@ -53,7 +53,7 @@ def open_viewer(
     *,
     resumed: bool = False,
     process: "ViewerProcess | None" = None,
-    on_error: Callable[[str], None] | None = None,
+    on_error: Callable[[str], None] = tell_nobody,
 ) -> "ViewerFeed | None":
     """Open what the settings ask for; None where nothing is shown.
 

@@ -15,6 +15,7 @@ from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 from typing import Generic, Protocol, TypeVar
 
+from semcast.common.errors import tell_nobody
 from semcast.common.heap import keep_freed_memory
 from semcast.common.interrupts import deaf_children
 
@@ -196,7 +197,7 @@ class Worker(Generic[Problem, Result]):
         what: str,
         given_up: str,
         lossless: bool = False,
-        on_give_up: Callable[[str], None] | None = None,
+        on_give_up: Callable[[str], None] = tell_nobody,
         stands_back: bool = False,
         start_early: bool = True,
         deadline_s: float = DEADLINE_S,
@@ -269,8 +270,7 @@ class Worker(Generic[Problem, Result]):
     def _give_up(self) -> None:
         self._stop()
         logger.error("%s", self._given_up)
-        if self._on_give_up is not None:
-            self._on_give_up(self._given_up)
+        self._on_give_up(self._given_up)
 
     def submit(self, problem: Problem) -> bool:
         """Give a problem to the child; False while it works on another or has failed for good."""

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import cv2
 
+from semcast.common.errors import tell_nobody
 from semcast.server.dense.depth_map import DepthMap, DepthProblem, estimate_depth
 from semcast.server.worker import MAX_FAILURES, Inline, Worker
 
@@ -33,7 +34,7 @@ class ProcessDepth(Worker[DepthProblem, DepthMap]):
         on_give_up: Is told why, once, when the child dies so often that it is not started again.
     """
 
-    def __init__(self, *, lossless: bool = False, on_give_up: Callable[[str], None] | None = None) -> None:
+    def __init__(self, *, lossless: bool = False, on_give_up: Callable[[str], None] = tell_nobody) -> None:
         super().__init__(
             _estimate,
             name="depth",

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from semcast.common.errors import tell_nobody
 from semcast.server.mapping.bundle_problem import BundleProblem, BundleResult
 from semcast.server.worker import MAX_FAILURES, Worker
 
@@ -24,7 +25,7 @@ class ProcessBundle(Worker[BundleProblem, BundleResult]):
         on_give_up: Is told why, once, when the child dies so often that it is not started again.
     """
 
-    def __init__(self, *, lossless: bool = False, on_give_up: Callable[[str], None] | None = None) -> None:
+    def __init__(self, *, lossless: bool = False, on_give_up: Callable[[str], None] = tell_nobody) -> None:
         super().__init__(
             _adjust, name="bundle", what=_WHAT, given_up=GIVEN_UP, lossless=lossless, on_give_up=on_give_up
         )

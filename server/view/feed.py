@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.errors import ConfigError
+from semcast.common.errors import ConfigError, tell_nobody
 from semcast.common.trajectory import Trajectory
 from semcast.common.worker_guard import WorkerGuard
 from semcast.server.dense.cloud import DensePatch
@@ -113,7 +113,7 @@ class ViewerFeed:
         file: Path | None = None,
         footer: bool = True,
         process: ViewerProcess | None = None,
-        on_error: Callable[[str], None] | None = None,
+        on_error: Callable[[str], None] = tell_nobody,
     ) -> None:
         self._settings = settings
         self._camera = camera
@@ -217,7 +217,7 @@ class ViewerFeed:
             port=self._settings.port,
         )
 
-    def _open_file(self, file: Path, on_error: Callable[[str], None] | None) -> FileStream:
+    def _open_file(self, file: Path, on_error: Callable[[str], None]) -> FileStream:
         try:
             return FileStream(self._open_stream(file), file, self.changes_since, on_error)
         except RuntimeError as err:

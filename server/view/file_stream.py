@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from semcast.common.errors import tell_nobody
 from semcast.common.run_folder import shortage
 from semcast.server.view.rerun_viewer import Delivery, RerunStream
 from semcast.server.view.scene import Changes, Cursor
@@ -35,7 +36,7 @@ class FileStream:
         stream: RerunStream,
         path: Path,
         changes_since: Callable[[Cursor], Changes],
-        on_error: Callable[[str], None] | None = None,
+        on_error: Callable[[str], None] = tell_nobody,
     ) -> None:
         self._stream = stream
         self._path = path
@@ -65,8 +66,7 @@ class FileStream:
         if self._is_short and not was_short:
             text = f"{self._path} is not written any further: {why}"
             logger.warning("%s; the run goes on, and what is new waits for room", text)
-            if self._on_error is not None:
-                self._on_error(text)
+            self._on_error(text)
         elif was_short and not self._is_short:
             logger.warning("%s is written again, with what waited", self._path)
 
@@ -76,8 +76,7 @@ class FileStream:
         self._has_failed = True
         text = f"{self._path} can't be written to its end (is there room on the disk?)"
         logger.error("%s, the run goes on without it", text)
-        if self._on_error is not None:
-            self._on_error(text)
+        self._on_error(text)
 
     def close(self) -> None:
         """Finish the file."""

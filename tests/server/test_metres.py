@@ -8,6 +8,7 @@ import pytest
 from drawn_markers import draw_marker
 
 from semcast.common.camera import Intrinsics
+from semcast.common.errors import tell_nobody
 from semcast.common.geometry import exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
@@ -33,7 +34,7 @@ def T_world_cam_of(k):
 class Run:
     """A map of keyframes without landmarks, and what follows it."""
 
-    def __init__(self, on_give_up=None, **marker):
+    def __init__(self, on_give_up=tell_nobody, **marker):
         self.reconstruction = Reconstruction(CAMERA, ReconstructionSettings(), InlineBundle())
         self.world = self.reconstruction.world
         settings = MarkerSettings(**{"side_m": SIDE_M, **marker})
