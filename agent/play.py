@@ -12,7 +12,7 @@ from typing import Any
 from semcast.agent.peers import wait_for_peers, wait_until_ready
 from semcast.common.errors import SourceError
 from semcast.common.keys import agent_of, camera_key, channel_key, check_agent_id, rx_key, source_key, tx_key
-from semcast.common.messages import ChannelReport, SourceImage, SymbolFrame
+from semcast.common.messages import MAX_MISSING, ChannelReport, SourceImage, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.playback import check_part
@@ -29,8 +29,6 @@ Played = SymbolFrame | ChannelReport | SourceImage
 _CLASSES: dict[str, type[Played]] = {"symbols": SymbolFrame, "channel": ChannelReport, "source": SourceImage}
 #: Between two messages; the recorder's clock may have been set meanwhile, by years on a machine without one.
 _LONGEST_PAUSE_S = 60.0
-#: A frame numbered so far ahead of the newest one tells nothing of how many were sent.
-_MAX_GAP = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +154,8 @@ class _Sending:
         if self._first_seq is None:
             self._first_seq = frame.seq
         seq = frame.seq - self._first_seq
-        if 0 < (num_more := seq + 1 - self._num_sent) <= _MAX_GAP:
+        # One from further ahead tells nothing of how many were sent.
+        if 0 < (num_more := seq + 1 - self._num_sent) <= MAX_MISSING:
             self._num_sent += num_more
             for _ in range(num_more):
                 self._metrics.count("sent")

@@ -20,7 +20,7 @@ from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import channel_key, control_key, rx_key, tx_key
 from semcast.common.mailbox import Mailbox
 from semcast.common.message_fields import sendable
-from semcast.common.messages import ChannelReport, ControlReply, ControlRequest, SymbolFrame
+from semcast.common.messages import MAX_MISSING, ChannelReport, ControlReply, ControlRequest, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.phy.pilots import insert_pilots
@@ -39,8 +39,6 @@ _ANSWER_S = 3.0
 _REPLAY_CAPACITY = 64
 #: Frames that an agent may send again: more than it ever has under way.
 _REMEMBERED = 1024
-#: A frame numbered so far ahead of the newest one is believed when another follows on it.
-_MAX_GAP = 1000
 
 
 class Emulator:
@@ -101,8 +99,8 @@ class Emulator:
             self._arrived_epoch, self._arrived_seq = frame.agent_epoch, frame.seq
         num_missing = max(0, frame.seq - self._arrived_seq)
         before_seq, self._far_seq = self._far_seq, frame.seq
-        if num_missing > _MAX_GAP:
-            if not 0 < frame.seq - before_seq <= _MAX_GAP:
+        if num_missing > MAX_MISSING:  # believed when another follows on it
+            if not 0 < frame.seq - before_seq <= MAX_MISSING:
                 return
             num_missing -= 1  # the one before came
         self._metrics.drop("missing", num_missing)

@@ -5,7 +5,7 @@ A codec never sees pilots, fading or packets. It fills the data symbols of every
 """
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.slots import layout_for
 
 Modulation = Literal["16qam", "analog"]
-MODULATIONS: tuple[Modulation, ...] = ("16qam", "analog")
+MODULATIONS: tuple[Modulation, ...] = get_args(Modulation)
 
 #: What the convolutions of a learned codec are computed in.
 Precision = Literal["auto", "float32", "bfloat16", "int8"]

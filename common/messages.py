@@ -41,11 +41,13 @@ MAX_SIDE_PX = 8192
 _MAX_ALLOCATION_BYTES = 5 * (MAX_SIDE_PX // BLOCK_PX) ** 2 // 8
 #: Keyframes of a day and more: all there ever were, also those that were thinned out since.
 MAX_KEYFRAMES = 200_000
+#: Frames that may be missing between two that arrive: a number further ahead is not believed at once.
+MAX_MISSING = 1000
 ROLES = ("agent", "channel", "server")
-PAYLOAD_FORMATS = ("qam16", "qam16_shaped", "iq16", "lost")
 TRACKING_STATES = ("initializing", "tracking", "lost")
 
 PayloadFormat = Literal["qam16", "qam16_shaped", "iq16", "lost"]
+PAYLOAD_FORMATS: tuple[PayloadFormat, ...] = get_args(PayloadFormat)
 AGENT_ID_PATTERN = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 
 _VERSION = rule(WholeNumber(PROTOCOL_VERSION, PROTOCOL_VERSION))

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from semcast.channel.settings import ChannelName, ChannelSettings
 from semcast.common.codec import DEFAULT_CODEC
@@ -17,7 +17,7 @@ from semcast.evaluation.pipeline import CLEAN
 from semcast.evaluation.report import RESULTS, check_outputs
 from semcast.server.geometry.weighting import ConfidenceMode
 
-_ALL_MODES: tuple[ConfidenceMode, ...] = ("robust", "paper", "off", "constant", "shuffled", "inverted")
+_ALL_MODES: tuple[ConfidenceMode, ...] = get_args(ConfidenceMode)
 
 
 @dataclass(frozen=True, kw_only=True)

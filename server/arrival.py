@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable
 
-from semcast.common.messages import SymbolFrame
+from semcast.common.messages import MAX_MISSING, SymbolFrame
 
 #: An agent that was silent this long may come back with a clock set to the past.
 SILENCE_NS = 3_000_000_000
@@ -13,10 +13,8 @@ _OFFSET_WINDOW_NS = 10_000_000_000
 _MAX_LEAD_NS = 1_000_000_000
 #: Numbers of frames that are remembered, to know those that come twice.
 _REMEMBERED = 256
-#: A live agent sends fewer frames a second than this,
+#: A live agent sends fewer frames a second than this.
 _MAX_RATE_HZ = 1000.0
-#: and leaves out no more frames than this between two that arrive without a break.
-_MAX_GAP = 1000
 #: Frames in a row whose numbers rise, or whose times are ahead, and follow on nothing, before they are taken
 #: for the stream; so many, too, show that the one they don't follow on was wrong.
 _BELIEVED = 3
@@ -220,7 +218,7 @@ class Arrivals:
     def _is_odd(self, frame: SymbolFrame, arrival_ns: int) -> bool:
         """Tell whether a frame's number is not one that can follow, or come again; count those that rise."""
         if self._lossless:
-            follows = max(frame.base_seq - self.arrived_seq, self.arrived_seq - frame.seq) <= _MAX_GAP
+            follows = max(frame.base_seq - self.arrived_seq, self.arrived_seq - frame.seq) <= MAX_MISSING
         else:
             follows = 0 <= frame.seq - self.arrived_seq <= self._farthest(arrival_ns)
         if follows:
@@ -244,7 +242,7 @@ class Arrivals:
 
     def _farthest(self, arrival_ns: int) -> float:
         """Return how many frames an agent can have gone on since the newest that was taken."""
-        return _MAX_GAP + (arrival_ns - self.taken_ns) * 1e-9 * _MAX_RATE_HZ
+        return MAX_MISSING + (arrival_ns - self.taken_ns) * 1e-9 * _MAX_RATE_HZ
 
     def _is_believed(self, num_in_order: int, arrival_ns: int) -> bool:
         against_one = self._num_taken <= 1
