@@ -2,13 +2,12 @@
 
 import contextlib
 import shutil
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
 from semcast.common.errors import SourceError
-from semcast.common.interrupts import signals_handled
+from semcast.common.interrupts import ending_signals, signals_handled
 
 #: In a folder while it is being filled; what is left of it says that nobody came to the end.
 _UNFINISHED = ".unfinished"
@@ -18,8 +17,8 @@ _UNFINISHED = ".unfinished"
 def new_folder(folder: Path) -> Iterator[Path]:
     """Make a folder, with those above it, to be filled in this context; an empty one may be there.
 
-    Where that ends early, by an error, Ctrl-C or a request to end (SIGTERM), the folder is as it was, so
-    that the next try may use it; those above it stay.
+    Where that ends early, by an error, Ctrl-C, a request to end (SIGTERM) or a hang-up, the folder is as it
+    was, so that the next try may use it; those above it stay.
 
     Raises:
         SourceError: It has files in it, or can't be made or written to.
@@ -37,7 +36,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         try:
             (folder / _UNFINISHED).touch()
-            with signals_handled([signal.SIGTERM], _exit):
+            with signals_handled(ending_signals(), _exit):
                 yield folder
             (folder / _UNFINISHED).unlink()
         except BaseException:
