@@ -166,6 +166,8 @@ class _Sending:
             self.metrics.count("sent_again")
             return
         self._last_seq = message.seq
+        if self._pace is not None:
+            self._pace.on_sent()
         self.metrics.count("sent")
         self.metrics.observe("capture_to_sent", (time.monotonic_ns() - message.t_capture_ns) * 1e-6)
 

@@ -6,8 +6,10 @@ is chance which ones they are. One in n, evenly spaced, costs less and is easier
 
 import logging
 import math
+import statistics
 import threading
 from collections import deque
+from itertools import pairwise
 
 from semcast.common.messages import LinkReport
 
@@ -20,11 +22,14 @@ MAX_STRIDE = 10
 _MIN_REPORTS = 12
 #: and at most.
 _MAX_REPORTS = 16
+#: Fewer suffice where a server takes so long for them: the slower it is, the longer it would be sent too much.
+_FEW_REPORTS, _FEW_REPORTS_S = 6, 3.0
 #: How many of the worst count for nothing: a busy moment, such as the start of a map, says nothing about the
 #: pace.
 _NUM_WORST = 3
-#: The first reports of a stream count for nothing: beginning a map takes longer than following.
-_WARM_UP = 20
+#: The first reports of a stream count for nothing, or those of its first seconds: beginning a map takes
+#: longer than following.
+_WARM_UP, _WARM_UP_S = 20, 5.0
 #: Part of a frame by which the stride that is needed may exceed a whole number. Some frames passed over are
 #: better than a pace far below what the server can do, which the next whole number may be.
 _TOLERANCE = 0.4
@@ -39,7 +44,7 @@ def start_stride(rate_hz: float) -> int:
 
 
 class PaceControl:
-    """Chooses which frames of a live source are sent. ``on_report`` and ``wants`` may come from two threads.
+    """Chooses which frames of a live source are sent. Each method may come from a thread of its own.
 
     Args:
         agent_epoch: Reports of another epoch are ignored.
@@ -56,6 +61,10 @@ class PaceControl:
         self._passed_over: deque[int] = deque(maxlen=_MAX_REPORTS)
         self._quiet = 0
         self._num_reports = self._since_change = 0
+        self._num_captured = 0
+        self._captured_at_sent: deque[int] = deque(maxlen=_MAX_REPORTS)
+        self._first_ns: int | None = None  # capture of the first frame that is reported on and counts,
+        self._first_kept_ns = 0  # and of the first one whose report is among those kept
         self._is_trial = False
         self._factor = 1
 
@@ -72,6 +81,7 @@ class PaceControl:
             t_capture_ns: When it was captured, on the clock of the reports.
         """
         with self._lock:
+            self._num_captured += 1
             self._not_sent += 1
             if self._not_sent < self._stride:
                 return False
@@ -79,6 +89,11 @@ class PaceControl:
             if self._valid_from_ns is None:
                 self._valid_from_ns = t_capture_ns
             return True
+
+    def on_sent(self) -> None:
+        """Note that a frame was sent: an agent that encodes slowly sends fewer than are wanted."""
+        with self._lock:
+            self._captured_at_sent.append(self._num_captured)
 
     def on_report(self, report: LinkReport) -> None:
         """Take what the server says about a frame it is to decode, and change the stride if it is time."""
@@ -93,20 +108,27 @@ class PaceControl:
             if last is None or self._valid_from_ns is None or last.t_capture_ns < self._valid_from_ns:
                 return
             self._num_reports += 1
-            if self._num_reports <= _WARM_UP:
+            if self._first_ns is None:
+                self._first_ns = report.t_capture_ns
+            warm_up_s = (report.t_capture_ns - self._first_ns) * 1e-9
+            if self._num_reports <= _WARM_UP and warm_up_s < _WARM_UP_S:
                 return
+            if not self._passed_over:
+                self._first_kept_ns = report.t_capture_ns
             # A server that was started again counts from 0.
             passed_over = max(0, report.num_superseded - last.num_superseded)
             self._passed_over.append(passed_over)
             self._quiet = 0 if passed_over else self._quiet + 1
             self._since_change += 1
-            self._decide()
+            self._decide((report.t_capture_ns - self._first_kept_ns) * 1e-9)
 
-    def _decide(self) -> None:
+    def _decide(self, kept_s: float) -> None:
         usual = sorted(self._passed_over)[:-_NUM_WORST]
-        needed = self._stride * (1.0 + sum(usual) / max(1, len(usual)))
-        stride = min(math.ceil(needed - _TOLERANCE), 2 * self._stride, MAX_STRIDE)
-        if stride > self._stride and len(self._passed_over) >= _MIN_REPORTS:
+        step = self._usual_step()
+        needed = step * (1.0 + sum(usual) / max(1, len(usual)))
+        stride = min(math.ceil(needed - _TOLERANCE), 2 * step, MAX_STRIDE)
+        least = _FEW_REPORTS if kept_s >= _FEW_REPORTS_S else _MIN_REPORTS
+        if stride > self._stride and any(usual) and len(self._passed_over) >= least:
             if self._is_trial:
                 failed = self._since_change <= _PATIENCE
                 self._factor = min(2 * self._factor, _MAX_FACTOR) if failed else 1
@@ -114,10 +136,16 @@ class PaceControl:
         elif self._stride > 1 and self._quiet >= _PATIENCE * self._factor:
             self._change(self._stride - 1, is_trial=True)
 
+    def _usual_step(self) -> int:
+        """Return one frame of how many is sent: the stride, or more where the encoder is slower than that."""
+        steps = [b - a for a, b in pairwise(self._captured_at_sent)]
+        return max(self._stride, statistics.median_low(steps)) if steps else self._stride
+
     def _change(self, stride: int, *, is_trial: bool) -> None:
         self._stride, self._is_trial = stride, is_trial
         self._valid_from_ns = None
         self._passed_over.clear()
+        self._captured_at_sent.clear()
         self._quiet = self._since_change = 0
         pace = "every frame" if stride == 1 else f"one frame in {stride}"
         why = "" if is_trial else ", as many as the server can follow; smaller ones (--resize) would be more"

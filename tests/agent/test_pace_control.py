@@ -24,6 +24,7 @@ class Server:
 
     def __init__(self, pace, service_s):
         self.pace, self.service_s = pace, service_s
+        self.encoder_free_s = 0.0
         self.free_s = 0.0
         self.waiting = None
         self.superseded = 0
@@ -45,16 +46,23 @@ class Server:
             self.waiting = None
 
 
-def run(service_s, seconds, lost=0.0, rate_hz=0.0):
-    """Return the pace, the server and the stride at every frame of a 30 Hz source; it need not be known."""
+def run(service_s, seconds, lost=0.0, rate_hz=0.0, encode_s=0.0):
+    """Return the pace, the server and the stride at every frame of a 30 Hz source; it need not be known.
+
+    An encoder that is busy passes frames over.
+    """
     pace = PaceControl(1, rate_hz)
     server = Server(pace, service_s)
     rng = np.random.default_rng(0)
     strides = []
     for frame_id in range(round(seconds / PERIOD_S)):
-        if pace.wants(round(frame_id * PERIOD_S * 1e9)) and rng.random() >= lost:
-            server.put(frame_id, frame_id * PERIOD_S)
-        server.advance(frame_id * PERIOD_S)
+        now_s = frame_id * PERIOD_S
+        if pace.wants(round(now_s * 1e9)) and server.encoder_free_s <= now_s:
+            server.encoder_free_s = now_s + encode_s
+            pace.on_sent()
+            if rng.random() >= lost:
+                server.put(frame_id, now_s)
+        server.advance(now_s)
         strides.append(pace.stride)
     return pace, server, np.array(strides)
 
@@ -69,6 +77,23 @@ def test_the_stride_is_what_the_server_can_serve(service_ms, stride):
     assert np.mean(after == stride) > 0.6, "more is tried seldom"
     gaps = np.diff(server.served[-40:])
     assert np.mean(gaps == stride) > 0.7, "evenly spaced"
+
+
+def test_an_encoder_that_is_slower_than_the_source_does_not_hide_that_the_server_is_slower_still():
+    _, server, strides = run(lambda now_s: 0.3, 30, encode_s=0.13)
+    settled = np.flatnonzero(strides >= 8)
+    assert settled[0] * PERIOD_S < 10.0, "one frame in two would be what the encoder leaves out anyway"
+    gaps = np.diff([frame_id for frame_id in server.served if frame_id > 300])
+    assert np.median(gaps) >= 8
+    _, server, strides = run(lambda now_s: 0.02, 10, encode_s=0.13)
+    assert set(strides) == {1}, "a server that keeps up is no reason to send less"
+
+
+def test_a_server_that_takes_a_second_for_a_frame_is_soon_spared_what_it_passes_over():
+    _, _, strides = run(lambda now_s: 0.9, 40)
+    first = np.flatnonzero(strides > 1)[0] * PERIOD_S
+    assert first < 13.0, "twenty and twelve reports would take 29 s"
+    assert strides[-1] == MAX_STRIDE
 
 
 def test_what_the_beginning_of_a_map_keeps_the_server_from_says_nothing_of_the_pace():

@@ -7,6 +7,7 @@ from stream_bench import Thread, take
 from waiting import until
 
 from semcast.agent.agent import run_agent
+from semcast.agent.pace_control import PaceControl
 from semcast.agent.settings import AgentSettings
 from semcast.agent.source_settings import SourceSettings
 from semcast.common.keys import link_key, status_key
@@ -81,6 +82,17 @@ def test_an_agent_sends_what_a_slow_server_can_serve(bench, follow):
     assert np.median(gaps) >= 3
     assert drops["thinned"] > 60
     assert bench.metrics.drops.get("superseded", 0) < drops["thinned"]
+
+
+def test_the_pace_knows_of_every_frame_that_is_sent(bench, monkeypatch):
+    told = []
+    monkeypatch.setattr(PaceControl, "on_sent", lambda pace: told.append(pace))
+    bench.channel()
+    receiver = bench.receiver()
+    agent = bench.agent()
+    take(receiver)
+    agent.join(40)
+    assert len(told) == agent.result["counts"]["sent"] > 0
 
 
 def test_a_finite_live_source_ends_when_its_last_frame_was_seen(bench):
