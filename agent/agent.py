@@ -37,6 +37,8 @@ _PEERS = frozenset({"channel", "server"})
 _POLL_S = 0.1
 _FLOW_POLL_S = 0.05
 _BUSY_POLL_S = 0.005
+#: Frames sent before it is said that encoding them takes too long: the first ones of a process take longer.
+_MIN_SENT = 10
 #: Live: the last frame is repeated until the receiver reports on it, for at most this long.
 _FAREWELL_S = 2.0
 _REPEAT_S = 0.2
@@ -88,6 +90,7 @@ class _Sending:
         self._pace = PaceControl(self.agent_epoch, source.rate_hz) if follows else None
         self._settings = settings
         self._last_seq = self._last_frame_id = -1
+        self._is_slow = False
         self._rate = RateControl(settings.rate, source.intrinsics.shape_hw)
         self._encoder = FrameEncoder(codec, self.agent_epoch, self.lossless)
         agent_id = settings.agent_id
@@ -170,6 +173,21 @@ class _Sending:
             self._pace.on_sent()
         self.metrics.count("sent")
         self.metrics.observe("capture_to_sent", (time.monotonic_ns() - message.t_capture_ns) * 1e-6)
+        self._say_if_slow()
+
+    def _say_if_slow(self) -> None:
+        """Say once where more frames are left out, as the encoder was busy, than are sent."""
+        sent, left_out = self.metrics.counts["sent"], self.metrics.drops.get("superseded", 0)
+        if self._is_slow or sent < _MIN_SENT or left_out < sent:
+            return
+        self._is_slow = True
+        usual_ms = self.metrics.stages_ms()["encode"]["p50"]
+        text = (
+            f"encoding a frame takes {usual_ms:.0f} ms, so that one in {1 + left_out / sent:.0f} is sent: "
+            "a smaller --resize, a conventional codec such as jpeg-ldpc or a less busy machine does more"
+        )
+        self.metrics.error(text)
+        logger.warning("%s", text)
 
     def leave_out(self, frame_id: int, why: Exception) -> None:
         """Count a frame that can't be sent, and say why."""

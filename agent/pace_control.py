@@ -22,7 +22,7 @@ MAX_STRIDE = 10
 _MIN_REPORTS = 12
 #: and at most.
 _MAX_REPORTS = 16
-#: Fewer suffice where a server takes so long for them: the slower it is, the longer it would be sent too much.
+#: Fewer do where a server takes so long for them: the slower it is, the longer it would be sent too much.
 _FEW_REPORTS, _FEW_REPORTS_S = 6, 3.0
 #: How many of the worst count for nothing: a busy moment, such as the start of a map, says nothing about the
 #: pace.

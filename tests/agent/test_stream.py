@@ -1,5 +1,7 @@
 """Agent, channel and receiver together over loopback, started, slowed down, killed and restarted."""
 
+import time
+
 import msgpack
 import numpy as np
 import pytest
@@ -93,6 +95,27 @@ def test_the_pace_knows_of_every_frame_that_is_sent(bench, monkeypatch):
     take(receiver)
     agent.join(40)
     assert len(told) == agent.result["counts"]["sent"] > 0
+
+
+@pytest.mark.parametrize("encode_s", [0.0, 0.07])
+def test_an_agent_that_encodes_too_slowly_says_so_once_and_what_helps(bench, caplog, monkeypatch, encode_s):
+    encode = bench.codec.encode
+
+    def slow(*given):
+        time.sleep(encode_s)  # the work itself
+        return encode(*given)
+
+    monkeypatch.setattr(bench.codec, "encode", slow)
+    bench.channel()
+    receiver = bench.receiver()
+    agent = bench.agent(source={"repeat": "loop"}, follow_server=encode_s == 0)  # 50 Hz, of which 12 are sent
+    take(receiver, count=25)
+    agent.end()
+    told = [text for text in caplog.messages if text.startswith("encoding a frame takes")]
+    assert len(told) == (encode_s > 0)
+    if told:
+        assert "so that one in" in told[0]
+        assert "a smaller --resize, a conventional codec such as jpeg-ldpc" in told[0]
 
 
 def test_a_finite_live_source_ends_when_its_last_frame_was_seen(bench):
