@@ -67,7 +67,7 @@ class WideFeatures:
         """
         sift = cv2.SIFT.create(nfeatures=_NUM_FEATURES, contrastThreshold=_MIN_CONTRAST)
         height, width = grey.shape
-        reduction = 2 if min(grey.shape) >= _MIN_REDUCED_PX and not fine else 1
+        reduction = 2 if has_finer(grey) and not fine else 1
         size = (width // reduction, height // reduction)
         reduced = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
         mask = None
@@ -83,6 +83,11 @@ class WideFeatures:
             angle_rad=np.radians([k.angle for k in found]),
             descriptors=np.asarray(descriptors, dtype=np.float32),
         )
+
+
+def has_finer(grey: Grey) -> bool:
+    """Whether ``WideFeatures.of`` has finer features of an image: small ones are searched at full width."""
+    return min(grey.shape) >= _MIN_REDUCED_PX
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from semcast.server.geometry.weighting import (
     observation_edges,
     variance_confidence,
 )
-from semcast.server.geometry.wide_search import Carried, WideFeatures, search_wide
+from semcast.server.geometry.wide_search import Carried, WideFeatures, has_finer, search_wide
 from semcast.server.mapping.found import Found
 from semcast.server.mapping.passing import Passing
 from semcast.server.mapping.sight import Seen, Sight
@@ -84,6 +84,7 @@ class TrackTable:
         self._rng = np.random.default_rng(seed)
         self.next_id = 0
         self._greys: list[Grey] = []
+        self._sights: list[Sight] = []  # the newest two
         self._bands: list[Array] = []
         self._frame_ids: list[int] = []
         self._jumped = False
@@ -308,12 +309,18 @@ class TrackTable:
     def _search_jump(self, sight: Sight, xy: Array) -> Carried | None:
         """Where points ``(N, 2)`` of the last image are now, by descriptors: finer ones where few match."""
         grey = self._greys[-1]
-        jump = search_wide(WideFeatures.of(grey), sight.wide_features, xy)
-        if jump is None or jump.num_matches >= _PLENTY_OF_MATCHES:
+        jump = search_wide(self._features_of(grey), sight.wide_features, xy)
+        if jump is None or jump.num_matches >= _PLENTY_OF_MATCHES or not has_finer(grey):
             return jump
         now = WideFeatures.of(sight.grey, sight.usable_pixels, fine=True)
         fine = search_wide(WideFeatures.of(grey, fine=True), now, xy)
         return fine if fine is not None and fine.num_matches > jump.num_matches else jump
+
+    def _features_of(self, grey: Grey) -> WideFeatures:
+        """Features of an older image; where it is as it came, those found when it was the newest one do."""
+        as_it_came = (sight for sight in self._sights if sight.grey is grey and sight.usable.all())
+        known = next(as_it_came, None)
+        return WideFeatures.of(grey) if known is None else known.wide_features
 
     def _settle(self, sight: Sight, found: Found, coasting: NDArray[np.bool_]) -> None:
         """Move tracks to where they were found, and forget those that neither were nor coast."""
@@ -434,6 +441,7 @@ class TrackTable:
     def remember(self, sight: Sight) -> None:
         """Keep the image for tracks that are looked for in later ones."""
         self._greys = [*self._greys[-MAX_COAST:], sight.grey]
+        self._sights = [*self._sights[-1:], sight]
         self._bands = [*self._bands[-MAX_COAST:], sight.band_power]
         self._frame_ids = [*self._frame_ids[-MAX_COAST:], sight.frame.frame_id]
 

@@ -1,5 +1,7 @@
 """Steps of the camera beyond what tracks are followed over: what descriptors find, and what rests on it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from drawn_boards import ate_percent
@@ -8,6 +10,7 @@ from test_tracks import SHAPE, begin, sight_at
 from semcast.evaluation.scenes.orbit import Orbit
 from semcast.evaluation.scenes.render import frame_of
 from semcast.server.geometry.features import to_grey
+from semcast.server.geometry.wide_search import WideFeatures
 from semcast.server.mapping.bundle import InlineBundle
 from semcast.server.mapping.reconstruction import Reconstruction
 from semcast.server.mapping.settings import ReconstructionSettings
@@ -43,6 +46,35 @@ def test_many_tracks_that_descriptors_refute_do_not_outvote_fewer_that_they_find
     assert tracks.visible.sum() < count
     moved = tracks.xy - [xy[k] for k in tracks.ids.tolist()]
     assert (np.linalg.norm(moved + np.array([115, 65]), axis=1) < 0.5).mean() > 0.95
+
+
+def test_features_of_an_image_are_looked_for_once_however_often_the_camera_jumps(monkeypatch):
+    find, num_found = WideFeatures.of, []
+    monkeypatch.setattr(
+        WideFeatures, "of", staticmethod(lambda *given, **how: num_found.append(1) or find(*given, **how))
+    )
+    tracks = begin()
+    for k, x in enumerate((110, 20, 110), 1):
+        tracks.follow(sight_at(x, frame_id=k), tracks.xy)
+        assert len(num_found) == 1 + k, "a small image has no finer ones either"
+        assert tracks.visible.sum() > 25
+        assert tracks.refill(sight_at(x)) >= 0
+
+
+def test_features_are_not_those_of_an_image_that_was_brought_to_another_light(monkeypatch):
+    tracks = begin()
+    find, seen = WideFeatures.of, []
+    monkeypatch.setattr(
+        WideFeatures, "of", staticmethod(lambda grey, *rest: seen.append(grey) or find(grey, *rest))
+    )
+    first = sight_at(20)
+    tracks.remember(first)
+    darker = (0.6 * first.grey).astype(np.uint8)
+    tracks.replace_newest(replace(first, grey=darker))
+    tracks.follow(
+        replace(sight_at(110, frame_id=1), grey=(0.6 * sight_at(110).grey).astype(np.uint8)), tracks.xy
+    )
+    assert any(grey is darker for grey in seen)
 
 
 def test_a_camera_that_goes_round_in_steps_of_twenty_degrees_is_followed():
