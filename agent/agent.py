@@ -16,7 +16,7 @@ from semcast.agent.replay_window import ReplayWindow
 from semcast.agent.settings import AgentSettings
 from semcast.agent.source import Source, SourceFrame, open_source
 from semcast.common.codec import Codec
-from semcast.common.codecs import load_codec
+from semcast.common.codecs import is_conventional, load_codec
 from semcast.common.complaints import Complaints
 from semcast.common.errors import SourceError, TransportError
 from semcast.common.heap import keep_freed_memory
@@ -182,9 +182,10 @@ class _Sending:
             return
         self._is_slow = True
         usual_ms = self.metrics.stages_ms()["encode"]["p50"]
+        other = "" if is_conventional(self._settings.codec) else ", a conventional codec such as jpeg-ldpc"
         text = (
             f"encoding a frame takes {usual_ms:.0f} ms, so that one in {1 + left_out / sent:.0f} is sent: "
-            "a smaller --resize, a conventional codec such as jpeg-ldpc or a less busy machine does more"
+            f"a smaller --resize{other} or a less busy machine encodes more"
         )
         self.metrics.error(text)
         logger.warning("%s", text)

@@ -60,6 +60,22 @@ def test_a_machine_that_keeps_up_plays_at_the_recorded_times(tmp_path, monkeypat
     assert slower.speed == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize(
+    ("codec", "num_frames", "told"),
+    [
+        ("3dcsc-lite", 300, "0.25 of the recorded pace, which takes 60 s, as this machine can serve; faster"),
+        ("3dcsc-lite", 3000, "which takes 10 min, as"),
+        ("3dcsc-lite", 300, "a smaller --resize, or a conventional codec such as jpeg-ldpc, or at any pace"),
+        ("jpeg-amc", 300, "a smaller --resize, or at any pace with --rate-hz"),
+        ("3dcsc-lite", None, "0.25 of the recorded pace, as this machine can serve; faster"),
+    ],
+)
+def test_who_waits_for_a_slow_machine_knows_how_long_and_what_is_faster(tmp_path, codec, num_frames, told):
+    settings = DemoSettings(codec=codec, out=tmp_path, resize=0.5)
+    (text,) = demo._reductions(settings, Playback(0.5, 1, 5.0, 0.25), num_frames)
+    assert told in text
+
+
 def test_a_damaged_first_image_is_no_reason_not_to_play_a_recording(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(demo, "plan_for", lambda *given: seen.append(given[2]) or Plan(0.5, given[3]))

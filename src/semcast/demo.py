@@ -15,7 +15,7 @@ from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import DEFAULT_CODEC, Modulation
-from semcast.common.codecs import check_codec, named_weights
+from semcast.common.codecs import check_codec, is_conventional, named_weights
 from semcast.common.config import to_toml
 from semcast.common.config_flags import flag_words
 from semcast.common.errors import ConfigError, SemcastError, TransportError
@@ -237,7 +237,7 @@ def run_demo(
             playback = choose_playback(settings, recorded, stop)
             if playback is None:
                 return None, None
-            for text in _reductions(settings, playback):
+            for text in _reductions(settings, playback, recorded.num_frames):
                 tell(text)
             command = agent_command(settings, recorded.path, endpoint, playback)
             children["agent"] = Role("agent", command, logs / "agent.log")
@@ -365,11 +365,31 @@ def choose_playback(
     return Playback(plan.resize, stride, rate_hz, rate_hz / full_hz)
 
 
-def _reductions(settings: DemoSettings, playback: Playback) -> Iterator[str]:
-    """Yield in words what was done, unasked, for this machine to keep up."""
+def _reductions(settings: DemoSettings, playback: Playback, num_frames: int | None) -> Iterator[str]:
+    """Yield in words what was done, unasked, for this machine to keep up.
+
+    Args:
+        settings: What was asked for.
+        playback: What is done.
+        num_frames: Images of the recording; None where a video does not say.
+    """
     if settings.stride is None and playback.stride > 1:
         yield f"one image in {playback.stride} is sent; --stride 1 sends all"
     if settings.resize is None and playback.resize < 1.0:
         yield f"images are sent at {playback.resize:g} of their size; --resize 1 sends them as they are"
     if settings.rate_hz is None and playback.speed < 1.0:
-        yield f"played at {playback.speed:.2g} of the recorded pace, as this machine can serve; see --rate-hz"
+        takes = ""
+        if num_frames is not None:
+            takes = f", which takes {_duration(num_frames / playback.stride / playback.rate_hz)}"
+        pace = f"played at {playback.speed:.2g} of the recorded pace{takes}"
+        yield f"{pace}, as this machine can serve{_faster(settings)}"
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 99.5 else f"{seconds / 60:.0f} min"
+
+
+def _faster(settings: DemoSettings) -> str:
+    """Say what takes less time on a slow machine."""
+    other = "" if is_conventional(settings.codec) else ", or a conventional codec such as jpeg-ldpc"
+    return f"; faster with a smaller --resize{other}, or at any pace with --rate-hz, where images are skipped"
