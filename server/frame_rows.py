@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 MAX_ROWS_IN_MEMORY = 20_000
 #: How long rows wait for a file that could not be written before it is tried again.
 RETRY_S = 5.0
+#: Share of the frames beyond which those that were skipped are what is wrong with a run.
+_MOST = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,6 +334,19 @@ def run_line(summary: Mapping[str, Any]) -> str:
     frames, drops = summary["frames"], summary["drops"]
     text = f"{frames['tracked']} frames tracked, {frames['posed']} with a pose"
     return f"{text}; {drops_in_words(drops)}"
+
+
+def too_much(summary: Mapping[str, Any]) -> str | None:
+    """Say in words that most frames were skipped as there was no time for them; None where they were not."""
+    num_sent = (summary.get("frames") or {}).get("sent") or 0
+    drops = summary.get("drops") or {}
+    num_skipped = sum(drops.get(reason, 0) for reason in ("superseded", "too_old"))
+    if num_skipped <= _MOST * num_sent:
+        return None
+    return (
+        f"the server had no time for {num_skipped} of {num_sent}; a smaller --resize or --rate-hz, or a "
+        "machine with less other work, leaves it more"
+    )
 
 
 def _arrival_rate_hz(times_ns: Sequence[int]) -> float | None:

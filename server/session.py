@@ -32,7 +32,7 @@ from semcast.server.decoder import Arrival
 from semcast.server.dense.cloud import DensePatch
 from semcast.server.export.outputs import EachFile, versions, write_json, write_ply
 from semcast.server.former_run import set_aside
-from semcast.server.frame_rows import FrameRow, FrameRows, run_line, summarise
+from semcast.server.frame_rows import FrameRow, FrameRows, run_line, summarise, too_much
 from semcast.server.frame_views import frame_view
 from semcast.server.image_writer import ImageWriter
 from semcast.server.mapping.bundle_problem import BundleRunner
@@ -408,6 +408,8 @@ class Session:
             line = run_line(summary)
             if line != self._told:  # outputs are written again where another stream follows
                 logger.log(logging.INFO if posed else logging.WARNING, "%s", line)
+                if busy := too_much(summary):
+                    logger.warning("%s", busy)
             self._told = line
         return summary
 

@@ -22,6 +22,7 @@ from semcast.common.config import build_settings, read_toml
 from semcast.common.errors import ConfigError, SemcastError, SourceError
 from semcast.common.loopback import free_endpoint
 from semcast.common.recording_reader import RecordingReader
+from semcast.common.role import Role
 from semcast.common.sequence import open_sequence
 from semcast.demo import (
     DemoSettings,
@@ -34,6 +35,7 @@ from semcast.demo import (
 )
 from semcast.demo_recording import look_at
 from semcast.real_time import Plan
+from semcast.server.frame_rows import run_line, too_much
 from semcast.server.replay import ReplaySettings, replay
 
 pytestmark = pytest.mark.xdist_group("real-time")
@@ -403,6 +405,19 @@ def test_few_poses_are_said_not_to_be_those_of_a_stream():
 def test_a_demo_without_a_pose_says_why():
     assert "no image could be decoded" in why_no_pose({"frames": {"source": 51}, "completeness": 0.0})
     assert "move sideways" in why_no_pose({"frames": {"tracked": 51}, "completeness": 0.0})
+
+
+def test_what_the_line_below_the_table_says_is_not_told_as_a_warning_too(tmp_path):
+    summary = {
+        "frames": {"sent": 4, "tracked": 1, "posed": 0},
+        "drops": {"superseded": 3},
+    }
+    server = Role("server", [], tmp_path / "log")
+    known = [run_line(summary), too_much(summary)]
+    said = [*known, "the focal length seems too short"]
+    log = [f"2026-03-01T11:58:05 WARNING semcast.server.session: {text}" for text in said]
+    server.log.write_text("\n".join(log))
+    assert demo._warnings(server, known) == said[-1:]
 
 
 def test_frames_that_a_busy_machine_skipped_are_not_blamed_on_the_images():

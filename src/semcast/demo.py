@@ -5,7 +5,7 @@ import shlex
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -32,7 +32,7 @@ from semcast.demo_recording import DemoRecording, look_at
 from semcast.demo_watch import ERROR_CODE, START_DEADLINE_S, Alive, watch
 from semcast.real_time import plan_for
 from semcast.server.former_run import check_not_foreign, discard, output_folder
-from semcast.server.frame_rows import run_line
+from semcast.server.frame_rows import run_line, too_much
 from semcast.server.mapping.settings import ReconstructionSettings
 from semcast.server.settings import DenseWhen, SavedImages, ServerSettings
 from semcast.server.view.settings import ViewChoice, ViewSettings
@@ -252,7 +252,8 @@ def run_demo(
         for child in reversed(children.values()):
             child.stop()
     summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.exists() else None
-    known = run_line(summary) if summary else None  # a warning where no frame has a pose: the table says so
+    # Warnings that the table, or the line below it, says.
+    known = [run_line(summary), too_much(summary)] if summary else []
     for name in ("agent", "server"):
         if name in children:
             for text in _warnings(children[name], known):
@@ -262,9 +263,9 @@ def run_demo(
     return summary, error
 
 
-def _warnings(role: Role, known: str | None) -> list[str]:
+def _warnings(role: Role, known: Sequence[str | None]) -> list[str]:
     """Return the first few unknown warnings of a role, and how many more: one image each may be damaged."""
-    told = [text for text in role.warnings() if text != known]
+    told = [text for text in role.warnings() if text not in known]
     more = len(told) - _MAX_WARNINGS
     return told if more <= 0 else [*told[:_MAX_WARNINGS], f"{more} times more, see {role.log}"]
 

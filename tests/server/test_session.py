@@ -229,6 +229,19 @@ def test_a_source_had_as_many_frames_as_came_until_its_last(demo, caplog, final,
     assert summary["versions"]["semcast"]
 
 
+@pytest.mark.parametrize("num_superseded", [2, 3])
+def test_a_server_without_time_for_most_frames_says_so_once_and_what_leaves_it_more(caplog, num_superseded):
+    with contextlib.closing(Session(ServerSettings(bundle="inline"), IDENTITY, None, None)) as session:
+        for k in range(4):
+            session.note_arrival(k, k, final=k == 3)
+        for _ in range(2):
+            session.write_outputs(None, {"superseded": num_superseded}, complete=True)
+    told = [text for text in caplog.messages if text.startswith("the server had no time")]
+    assert len(told) == (num_superseded > 2)
+    if told:
+        assert "had no time for 3 of 4; a smaller --resize or --rate-hz" in told[0]
+
+
 @pytest.mark.parametrize(("interval_s", "saved"), [(3600.0, 0), (0.1, 1)])
 def test_the_map_is_kept_as_often_as_is_said(process, monkeypatch, interval_s, saved):
     seen = []

@@ -19,6 +19,7 @@ from semcast.common.run_folder import FRAMES_NAME, VIEWER_NAME, files_of_run
 from semcast.demo import DemoSettings, open_recording, run_demo
 from semcast.evaluation.report import STDOUT, provenance, write_result
 from semcast.server.export.parts import parts_line
+from semcast.server.frame_rows import too_much
 
 
 def _measure(unit: str) -> Callable[[float], str]:
@@ -63,19 +64,6 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
     for stage, figures in (summary.get("stage_ms") or {}).items():
         table.add_row(f"{stage}, p50 / p95", f"{figures['p50']:.1f} / {figures['p95']:.1f} ms")
     return table
-
-
-def too_much(summary: Mapping[str, Any]) -> str | None:
-    """Say in words that most frames were skipped as there was no time for them; None where they were not."""
-    num_sent = (summary.get("frames") or {}).get("sent") or 0
-    drops = summary.get("drops") or {}
-    num_skipped = sum(drops.get(reason, 0) for reason in ("superseded", "too_old"))
-    if num_skipped <= _FEW * num_sent:
-        return None
-    return (
-        f"the server had no time for {num_skipped} of {num_sent}; a smaller --resize or --rate-hz, or a "
-        "machine with less other work, leaves it more"
-    )
 
 
 def why_no_pose(summary: Mapping[str, Any]) -> str:
@@ -163,6 +151,6 @@ def run(arguments: argparse.Namespace) -> int:
     if not code and not result.get("completeness"):
         talk.print(f"semcast demo: {why_no_pose(result)}", soft_wrap=True)
         return 1
-    if not code and (words := few_poses(result)):
+    if not code and (words := few_poses(result) or too_much(result)):
         talk.print(f"semcast demo: {words}", soft_wrap=True)
     return code
