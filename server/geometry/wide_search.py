@@ -87,7 +87,7 @@ class WideFeatures:
 
 def has_finer(grey: Grey) -> bool:
     """Whether ``WideFeatures.of`` has finer features of an image: small ones are searched at full width."""
-    return min(grey.shape) >= _MIN_REDUCED_PX
+    return bool(min(grey.shape) >= _MIN_REDUCED_PX)
 
 
 @dataclass(frozen=True)
