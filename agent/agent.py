@@ -182,7 +182,7 @@ class _Sending:
             return
         self._is_slow = True
         usual_ms = self.metrics.stages_ms()["encode"]["p50"]
-        other = "" if is_conventional(self._settings.codec) else ", a conventional codec such as jpeg-ldpc"
+        other = "" if is_conventional(self._settings.codec) else ", a conventional codec such as jpeg-amc"
         text = (
             f"encoding a frame takes {usual_ms:.0f} ms, so that one in {1 + left_out / sent:.0f} is sent: "
             f"a smaller --resize{other} or a less busy machine encodes more"

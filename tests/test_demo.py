@@ -67,7 +67,7 @@ def test_a_machine_that_keeps_up_plays_at_the_recorded_times(tmp_path, monkeypat
     [
         ("3dcsc-lite", 300, "0.25 of the recorded pace, which takes 60 s, as this machine can serve; faster"),
         ("3dcsc-lite", 3000, "which takes 10 min, as"),
-        ("3dcsc-lite", 300, "a smaller --resize, or a conventional codec such as jpeg-ldpc, or at any pace"),
+        ("3dcsc-lite", 300, "a smaller --resize, or a conventional codec such as jpeg-amc, or at any pace"),
         ("jpeg-amc", 300, "a smaller --resize, or at any pace with --rate-hz"),
         ("3dcsc-lite", None, "0.25 of the recorded pace, as this machine can serve; faster"),
     ],
@@ -76,6 +76,14 @@ def test_who_waits_for_a_slow_machine_knows_how_long_and_what_is_faster(tmp_path
     settings = DemoSettings(codec=codec, out=tmp_path, resize=0.5)
     (text,) = demo._reductions(settings, Playback(0.5, 1, 5.0, 0.25), num_frames)
     assert told in text
+
+
+def test_what_a_machine_can_serve_is_measured_on_a_link_like_the_one_asked_for(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(demo, "plan_for", lambda *given: seen.append(given[-1]) or Plan(1.0, given[3]))
+    settings = DemoSettings(link=ChannelSettings(snr_db=4.5), out=tmp_path)
+    choose_playback(settings, look_at(SEQUENCE, CameraSettings()))
+    assert seen == [4.5]
 
 
 def test_a_damaged_first_image_is_no_reason_not_to_play_a_recording(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from semcast import real_time
+from semcast.common.conventional import ConventionalCodec
 from semcast.common.errors import ConfigError, SemcastError
 from semcast.real_time import MAX_PIXELS, Plan, Speed, make_plan, measure_speed, plan_for
 
@@ -58,13 +59,27 @@ def test_the_work_is_timed_on_the_images_themselves():
     assert flat.following_ms > 0.0, "nothing to follow is no error"
 
 
+def test_a_poor_link_that_takes_longer_to_decode_is_what_is_timed(monkeypatch):
+    timed = set()
+    decode = ConventionalCodec.decode
+
+    def noted(codec, received):
+        timed.add(float(received.effective_snr_db[0]))
+        return decode(codec, received)
+
+    monkeypatch.setattr(ConventionalCodec, "decode", noted)
+    for snr_db in (4.0, 12.0):
+        measure_speed("jpeg-ldpc", "16qam", noise(48, 48), snr_db=snr_db)
+    assert timed == {4.0, 12.0}
+
+
 def test_cores_that_are_shared_promise_less(monkeypatch):
     alone = {"coding": [40.0, 40.0], "following": [10.0, 10.0]}
     shared = {"coding": [40.0, 120.0], "following": [10.0, 30.0]}
     speeds = []
     for ms in (alone, shared):
         left = {name: list(values) for name, values in ms.items()}
-        monkeypatch.setattr(real_time, "_coding_ms", lambda _coder, _coded, left=left: left["coding"].pop())
+        monkeypatch.setattr(real_time, "_coding_ms", lambda *_given, left=left: left["coding"].pop())
         monkeypatch.setattr(real_time, "_following_ms", lambda _image, left=left: left["following"].pop())
         speeds.append(measure_speed("jpeg-ldpc", "16qam", noise(48, 48), num_cores=2))
     assert speeds == [Speed(40.0, 10.0), Speed(60.0, 15.0)], "two cores do 1/40 + 1/120 images a millisecond"

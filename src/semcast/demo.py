@@ -358,7 +358,14 @@ def choose_playback(
     if settings.resize is not None and settings.rate_hz is not None:
         return Playback(settings.resize, stride, rate_hz, rate_hz / full_hz)
     plan = plan_for(
-        settings.codec, settings.modulation, recorded.image, rate_hz, settings.rate, settings.resize, stop
+        settings.codec,
+        settings.modulation,
+        recorded.image,
+        rate_hz,
+        settings.rate,
+        settings.resize,
+        stop,
+        settings.link.snr_db,
     )
     if plan is None:
         return None
@@ -392,5 +399,5 @@ def _duration(seconds: float) -> str:
 
 def _faster(settings: DemoSettings) -> str:
     """Say what takes less time on a slow machine."""
-    other = "" if is_conventional(settings.codec) else ", or a conventional codec such as jpeg-ldpc"
+    other = "" if is_conventional(settings.codec) else ", or a conventional codec such as jpeg-amc"
     return f"; faster with a smaller --resize{other}, or at any pace with --rate-hz, where images are skipped"

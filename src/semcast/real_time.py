@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import Codec, Modulation
 from semcast.common.codecs import load_codec
 from semcast.common.cores import usable_cores
@@ -38,7 +39,6 @@ _FULL_PACE = 0.9
 _MEASURE_S = 1.0
 _POLL_S = 0.1
 _MAX_CALLS = 7
-_SNR_DB = 10.0
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,7 @@ def measure_speed(
     image: NDArray[np.uint8],
     rate: RateChoice = NATIVE_RATE,
     num_cores: int = 1,
+    snr_db: float = ChannelSettings.snr_db,
 ) -> Speed:
     """Time the work on one image on each of some cores at the same time, for a second or two.
 
@@ -115,6 +116,7 @@ def measure_speed(
         image: ``(H, W, 3)`` uint8 RGB, at the size at which it is sent.
         rate: Channel uses per pixel value; ``auto`` is taken for the native one.
         num_cores: Cores to measure.
+        snr_db: Of the link: LDPC of a fixed rate is decoded in several times as long where the link is poor.
 
     Raises:
         ConfigError: The codec is unknown.
@@ -124,7 +126,7 @@ def measure_speed(
     coders = [load_codec(codec, modulation=modulation, num_threads=1) for _ in range(num_cores)]
     cv2.setNumThreads(1)
     with ThreadPoolExecutor(num_cores) as pool:
-        coding_ms = list(pool.map(lambda coder: _coding_ms(coder, coded), coders))
+        coding_ms = list(pool.map(lambda coder: _coding_ms(coder, coded, snr_db), coders))
         following_ms = list(pool.map(_following_ms, [image] * num_cores))
     return Speed(_mean_ms(coding_ms), _mean_ms(following_ms))
 
@@ -134,21 +136,21 @@ def _mean_ms(times_ms: list[float]) -> float:
     return len(times_ms) / sum(1.0 / ms for ms in times_ms)
 
 
-def _coding_ms(coder: Codec, coded: NDArray[np.uint8]) -> float:
+def _coding_ms(coder: Codec, coded: NDArray[np.uint8], snr_db: float) -> float:
     rng = np.random.default_rng(0)
-    noise_var = 10.0 ** (-_SNR_DB / 10.0)
+    noise_var = 10.0 ** (-snr_db / 10.0)
     shrink = 1.0 / (1.0 + noise_var)
     times_s: list[float] = []
     until_s = math.inf
     while len(times_s) <= _MAX_CALLS and time.perf_counter() < until_s:
         since_s = time.perf_counter()
-        encoded = coder.encode(coded, _SNR_DB)
+        encoded = coder.encode(coded, snr_db)
         encoded_s = time.perf_counter() - since_s
         noise = rng.standard_normal((2, *encoded.symbols.shape)) * math.sqrt(noise_var / 2.0)
         symbols = (shrink * (encoded.symbols + noise[0] + 1j * noise[1])).astype(np.complex64)
-        snr_db = np.full(symbols.shape[0], _SNR_DB, np.float32)
+        slot_snr_db = np.full(symbols.shape[0], snr_db, np.float32)
         since_s = time.perf_counter()
-        coder.decode(encoded.arrived(symbols, snr_db))
+        coder.decode(encoded.arrived(symbols, slot_snr_db))
         times_s.append(encoded_s + time.perf_counter() - since_s)
         if until_s == math.inf:
             until_s = time.perf_counter() + _MEASURE_S  # the first call, which warms up, counts for nothing
@@ -177,6 +179,7 @@ def plan_for(
     rate: RateChoice = NATIVE_RATE,
     resize: float | None = None,
     stop: threading.Event | None = None,
+    snr_db: float = ChannelSettings.snr_db,
 ) -> Plan | None:
     """Measure this machine and choose what it can serve; None when ``stop`` was set before.
 
@@ -190,6 +193,7 @@ def plan_for(
         rate: Channel uses per pixel value.
         resize: Factor on the image size that is asked for, or None to choose it.
         stop: Ends it early.
+        snr_db: Of the link.
 
     Raises:
         ConfigError: The codec is unknown.
@@ -202,7 +206,9 @@ def plan_for(
     smaller = resized(image, scaled_wh(width, height, largest))
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), end_with_parent) as pool:
         with deaf_children():  # Ctrl-C is this process's business
-            measured = pool.submit(measure_speed, codec, modulation, smaller, rate, min(cores, _MAX_CORES))
+            measured = pool.submit(
+                measure_speed, codec, modulation, smaller, rate, min(cores, _MAX_CORES), snr_db
+            )
             children = multiprocessing.active_children()
         while not wait([measured], _POLL_S).done:
             if stop is not None and stop.is_set():

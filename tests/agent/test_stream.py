@@ -115,7 +115,7 @@ def test_an_agent_that_encodes_too_slowly_says_so_once_and_what_helps(bench, cap
     assert len(told) == (encode_s > 0)
     if told:
         assert "so that one in" in told[0]
-        assert "a smaller --resize, a conventional codec such as jpeg-ldpc" in told[0]
+        assert "a smaller --resize, a conventional codec such as jpeg-amc" in told[0]
 
 
 def test_a_finite_live_source_ends_when_its_last_frame_was_seen(bench):
