@@ -237,7 +237,7 @@ def test_three_processes_turn_a_sequence_into_a_trajectory(tmp_path):
     told, rows = [], []
     recording = tmp_path / "run.mcap"
     settings = DemoSettings(
-        codec="jpeg-ldpc", view="none", resize=0.4, stride=2, out=tmp_path, record=recording
+        codec="jpeg-ldpc", view="none", resize=0.3, stride=2, out=tmp_path, record=recording
     )
     summary, error = run(settings, told.append, lambda *row: rows.append(row))
     assert error is None

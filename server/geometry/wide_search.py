@@ -147,14 +147,14 @@ def match_wide(
 def _square_descriptor_distances(features0: WideFeatures, features1: WideFeatures) -> NDArray[np.float32]:
     """Squared distances of descriptors, ``(N, M)``; exact, as SIFT's are whole numbers of 512 in length.
 
-    A matrix product takes a third of the time of OpenCV's matcher.
+    A matrix product takes a third of the time of OpenCV's matcher: ``(-2 a, aa, 1) (b, 1, bb)``.
     """
-    norm0, norm1 = (np.einsum("nk,nk->n", f.descriptors, f.descriptors) for f in (features0, features1))
-    apart = features0.descriptors @ features1.descriptors.T
-    apart *= -2.0
-    apart += norm0[:, None]
-    apart += norm1
-    return apart
+    (norm0, one0), (norm1, one1) = (
+        (np.einsum("nk,nk->n", d, d)[:, None], np.ones((len(d), 1), np.float32))
+        for d in (features0.descriptors, features1.descriptors)
+    )
+    from_left = np.hstack((-2.0 * features0.descriptors, norm0, one0))
+    return np.asarray(from_left @ np.hstack((features1.descriptors, one1, norm1)).T)
 
 
 def _clearly_nearest(
