@@ -34,15 +34,15 @@ def test_memory_counts_what_is_held():
 def test_a_long_run_reports_cost_and_map(room, tmp_path, caplog):
     caplog.set_level("INFO", "semcast.evaluation.endurance")
     settings = EnduranceSettings(
-        sequence=room, codec="none", max_frames=14, frames=60, every=20, json=tmp_path / "e.json"
+        sequence=room, codec="none", max_frames=14, frames=45, every=15, json=tmp_path / "e.json"
     )
     report = evaluate_endurance(settings)
     assert json.loads(settings.json.read_text()) == report
     told = [record.getMessage().split(":")[0] for record in caplog.records]
-    assert told == ["20 of 60 frames", "40 of 60 frames", "60 of 60 frames"], (
+    assert told == ["15 of 45 frames", "30 of 45 frames", "45 of 45 frames"], (
         "half an hour is not passed in silence"
     )
-    assert [row["frames"] for row in report["results"]] == [20, 40, 60]
+    assert [row["frames"] for row in report["results"]] == [15, 30, 45]
     assert all(row["posed_share"] >= 0.9 for row in report["results"])
     assert all(0.0 < row["frame_ms_p50"] <= row["frame_ms_p95"] for row in report["results"])
     assert all(0.0 <= row["ate_percent"] < 3.0 for row in report["results"])

@@ -57,7 +57,7 @@ def test_a_run_tells_how_soon_the_camera_was_located_again(room):
         assert gap["recovery_s"] is not None
     assert cell["recovery_s"] <= 0.5
     assert "again" in result_table("trajectory", report).head
-    without = evaluate_trajectory(TrajectorySettings(sequence=room, codec="none", max_frames=12))
+    without = evaluate_trajectory(TrajectorySettings(sequence=room, codec="none", max_frames=8))
     assert "gap" not in without["cells"][0]["runs"][0]
     assert "again" not in result_table("trajectory", without).head
 
