@@ -5,6 +5,7 @@ import numpy as np
 from semcast.server.geometry.wide_search import (
     WideFeatures,
     WideMatches,
+    _square_descriptor_distances,
     epipolar_inliers,
     match_near,
     match_wide,
@@ -69,6 +70,13 @@ def test_near_where_it_is_expected_too_a_match_must_be_clear():
     there = features_at([(60.0, 100.0), (70.0, 100.0)], alike)
     assert len(match_near(here, there, here.xy, 60.0, 0.8).to_xy) == 0
     assert len(match_near(here, there, here.xy, 15.0, 0.8).to_xy) == 1
+
+
+def test_distances_of_descriptors_are_exact():
+    rng = np.random.default_rng(0)
+    here, there = (features_at(np.zeros((n, 2)), rng.integers(0, 256, (n, 128))) for n in (40, 50))
+    offset = here.descriptors[:, None].astype(int) - there.descriptors
+    np.testing.assert_array_equal(_square_descriptor_distances(here, there), (offset**2).sum(axis=2))
 
 
 def test_of_several_matches_beside_a_pixel_the_nearest_carries_it():

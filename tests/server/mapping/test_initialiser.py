@@ -276,7 +276,7 @@ def test_a_start_is_the_same_with_ids_that_were_renewed_on_the_way():
 
 def test_of_frames_that_wait_long_a_few_keep_their_image_and_the_start_takes_those():
     image = np.full((480, 640), 128, np.uint8)
-    frames = [replace(f, grey=image) for f in ride(140, step_m=0.002, turn_rad=0.0)[0]]
+    frames = [replace(f, grey=image) for f in ride(140, step_m=0.003, turn_rad=0.0)[0]]
     initialiser = Initialiser(CAMERA, "off", 1.0, 0)
     start = None
     for frame in frames:

@@ -178,7 +178,9 @@ def test_a_place_where_the_camera_cannot_be_joins_nothing(caplog, monkeypatch):
     with caplog.at_level("INFO", logger="semcast.server.mapping.reconstruction"):
         for k, v in enumerate(x):
             reconstruction.process(frame_of(k, render(make_transform(np.eye(3), (v, 0.05 * np.sin(v), 0.0)))))
-    assert asked
+            if len(asked) == 2:
+                break
+    assert len(asked) == 2, "the first answer is none for ever"
     assert "submaps are joined" not in caplog.text
     for older, newer, scale, T_join, more in asked:
         assert older[-1].frame_id < newer[0].frame_id
