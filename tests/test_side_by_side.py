@@ -1,5 +1,6 @@
 """Tests that share a fixture or the clock run in one process, whatever others do beside them."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -53,3 +54,8 @@ def test_every_mark_of_a_group_is_understood():
     marked.remove(Path(__file__).resolve())
     assert len(marked) > 5
     assert {group_of(file) for file in marked} == {"real-time"}
+
+
+def test_what_was_loaded_to_collect_the_tests_is_not_looked_through_for_garbage():
+    assert gc.get_freeze_count() > 50_000
+    assert gc.isenabled()
