@@ -173,7 +173,14 @@ class Link:
         sent = self.transmit(insert_pilots(encoded.symbols), t_s, frame_id)
         return None if sent.frame_lost else sent.equalise(encoded, perfect_csi=perfect_csi)
 
-    def carry(self, encoded: EncodedImage, t_s: float) -> ReceivedImage | None:
-        """Return what the codec decodes of the next frame, see ``receive``; None when it is lost."""
-        equalised = self.receive(encoded, t_s)
+    def carry(
+        self,
+        encoded: EncodedImage,
+        t_s: float,
+        frame_id: int | None = None,
+        *,
+        perfect_csi: bool = False,
+    ) -> ReceivedImage | None:
+        """Return what the codec decodes of ``receive``, or None when the frame is lost."""
+        equalised = self.receive(encoded, t_s, frame_id, perfect_csi=perfect_csi)
         return None if equalised is None else equalised.received

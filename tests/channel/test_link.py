@@ -113,7 +113,7 @@ def test_a_burst_raises_the_noise_and_is_not_announced(slots, encoded):
     assert not out.slot_lost.any()
     hit = out.truth.noise_var > 1
     np.testing.assert_allclose(out.truth.noise_var, np.where(hit, 10.0, 0.1), rtol=1e-4)
-    effective = link.receive(encoded, 0.0, frame_id).received.effective_snr_db
+    effective = link.carry(encoded, 0.0, frame_id).effective_snr_db
     assert effective[hit].max() < 0.0 < 8.0 < effective[~hit].min()
 
 
@@ -125,7 +125,7 @@ def test_lost_frames_have_their_rate_and_carry_nothing(slots, encoded):
     lost = next(k for k, o in enumerate(out) if o.frame_lost)
     assert not out[lost].slots_rx.any()
     assert out[lost].slot_lost.all()
-    assert link.receive(encoded, 0.0, lost) is None
+    assert link.carry(encoded, 0.0, lost) is None
 
 
 def test_frame_loss_does_not_shift_the_noise_of_the_others(slots):
@@ -145,7 +145,7 @@ def test_carry_returns_symbols_and_honest_snr(encoded):
     sent = Link(ChannelSettings(snr_db=12.0), 0).transmit(insert_pilots(encoded.symbols), 0.0)
     by_pilots = sent.equalise(encoded).received
     np.testing.assert_array_equal(by_pilots.symbols, received.symbols, "the truth is used where asked only")
-    perfect = Link(ChannelSettings(snr_db=12.0), 0).receive(encoded, 0.0, perfect_csi=True).received
+    perfect = Link(ChannelSettings(snr_db=12.0), 0).carry(encoded, 0.0, perfect_csi=True)
     power = np.mean(np.abs(insert_pilots(encoded.symbols)) ** 2)
     np.testing.assert_allclose(perfect.effective_snr_db, 12.0 - 10 * np.log10(power), atol=1e-3)
 
