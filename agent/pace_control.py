@@ -17,7 +17,8 @@ logger = logging.getLogger(__name__)
 
 #: Frames a second that two cores can decode, track and map, about: a stream begins with so many.
 START_HZ = 12.0
-MAX_STRIDE = 10
+#: A camera of 30 Hz before a server that takes a second a frame.
+MAX_STRIDE = 30
 #: Reports a decision is made from, at least,
 _MIN_REPORTS = 12
 #: and at most.
@@ -36,6 +37,8 @@ _TOLERANCE = 0.4
 #: Reports without a frame passed over until more frames are tried; a failure doubles it, up to this factor.
 _PATIENCE = 30
 _MAX_FACTOR = 16
+#: By this share of it a stride gets shorter at a time, or by one: reports on long ones come seldom.
+_SHARE_TRIED = 4
 
 
 def start_stride(rate_hz: float) -> int:
@@ -134,7 +137,7 @@ class PaceControl:
                 self._factor = min(2 * self._factor, _MAX_FACTOR) if failed else 1
             self._change(stride, is_trial=False)
         elif self._stride > 1 and self._quiet >= _PATIENCE * self._factor:
-            self._change(self._stride - 1, is_trial=True)
+            self._change(self._stride - max(1, self._stride // _SHARE_TRIED), is_trial=True)
 
     def _usual_step(self) -> int:
         """Return one frame of how many is sent: the stride, or more where the encoder is slower than that."""
