@@ -177,8 +177,10 @@ class _Sending:
 
     def _say_if_slow(self) -> None:
         """Say once where more frames are left out, as the encoder was busy, than are sent."""
+        if self._is_slow:
+            return
         sent, left_out = self.metrics.counts["sent"], self.metrics.drops.get("superseded", 0)
-        if self._is_slow or sent < _MIN_SENT or left_out < sent:
+        if sent < _MIN_SENT or left_out < sent:
             return
         self._is_slow = True
         usual_ms = self.metrics.stages_ms()["encode"]["p50"]

@@ -19,15 +19,15 @@ STATUS_INTERVAL_S = 1.0
 
 
 #: The reason of drops by which nothing is lost: the frame had come before.
-HARMLESS = "duplicate"
+DUPLICATE = "duplicate"
 
 
 def drops_in_words(drops: Mapping[str, int]) -> str:
     """Say how many frames were dropped for which reason, and apart from those how many came twice."""
     lost = ", ".join(
-        f"{number} {reason}" for reason, number in sorted(drops.items()) if number and reason != HARMLESS
+        f"{number} {reason}" for reason, number in sorted(drops.items()) if number and reason != DUPLICATE
     )
-    repeated = drops.get(HARMLESS, 0)
+    repeated = drops.get(DUPLICATE, 0)
     return f"dropped: {lost or 'none'}" + (f"; came twice: {repeated}" if repeated else "")
 
 

@@ -14,7 +14,7 @@ from rich.table import Table
 from semcast.channel.emulator import warn_of_settings
 from semcast.commands.console import plain_console
 from semcast.commands.running import INTERRUPTED, add_settings, read_given, read_settings, run_until_stopped
-from semcast.common.metrics import HARMLESS
+from semcast.common.metrics import DUPLICATE
 from semcast.common.run_folder import FRAMES_NAME, VIEWER_NAME, files_of_run
 from semcast.demo import DemoSettings, open_recording, run_demo
 from semcast.evaluation.report import STDOUT, provenance, write_result
@@ -59,7 +59,7 @@ def summary_table(summary: Mapping[str, Any]) -> Table:
         table.add_row("parts of the map", line)
     for reason, count in (summary.get("drops") or {}).items():
         table.add_row(
-            "frames that came twice" if reason == HARMLESS else f"frames dropped: {reason}", str(count)
+            "frames that came twice" if reason == DUPLICATE else f"frames dropped: {reason}", str(count)
         )
     for stage, figures in (summary.get("stage_ms") or {}).items():
         table.add_row(f"{stage}, p50 / p95", f"{figures['p50']:.1f} / {figures['p95']:.1f} ms")

@@ -7,6 +7,7 @@ from semcast.server.geometry.features import (
     BORDER_PX,
     Describer,
     corner_strength,
+    count_matches,
     deduplicate,
     detect_corners,
     hamming,
@@ -174,6 +175,28 @@ def test_tracking_takes_any_input():
 def test_of_points_in_one_cell_one_stays():
     keep = deduplicate(np.array([[1.0, 1], [1.5, 1.5], [9, 9], [11.0, 9]]))
     assert keep.tolist() == [True, False, True, True]
+
+
+def test_descriptors_match_as_opencv_matches_them():
+    rng = np.random.default_rng(0)
+    mine = rng.integers(0, 256, (90, 32), dtype=np.uint8)
+    theirs = np.concatenate([mine[::2], ~mine[:1], rng.integers(0, 256, (20, 32), dtype=np.uint8), mine[4:9]])
+    for k, other in enumerate(theirs[:45]):  # a few bits differ, in some as many as in another one
+        other[: 1 + k % 9] ^= 3
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(mine, theirs, k=2)
+    back = [m.trainIdx for m in cv2.BFMatcher(cv2.NORM_HAMMING).match(theirs, mine)]
+    expected = sorted(
+        (a.distance, a.queryIdx, a.trainIdx)
+        for a, b in pairs
+        if a.distance <= min(64, 0.9 * b.distance) and back[a.trainIdx] == a.queryIdx
+    )
+    assert len(expected) > 30
+    row0, row1 = match_descriptors(mine, theirs)
+    assert list(zip(row0, row1, strict=True)) == [(a, b) for _, a, b in expected]
+    counted = sum(a.distance <= min(60, 0.75 * b.distance) for a, b in pairs)
+    assert count_matches(mine, theirs) == counted > 30
+    # Where all 256 bits differ, that is far, and not near.
+    assert count_matches(mine[:1], np.stack([~mine[0], mine[1]])) == 0
 
 
 def test_descriptors_match_across_a_shift_and_a_change_of_size():
