@@ -4,7 +4,6 @@ from collections import deque
 from collections.abc import Callable
 
 from semcast.common.messages import MAX_MISSING, SymbolFrame
-from semcast.common.metrics import DUPLICATE
 
 #: An agent that was silent this long may come back with a clock set to the past.
 SILENCE_NS = 3_000_000_000
@@ -147,7 +146,7 @@ class Arrivals:
             self._is_announced = is_announced
         self._last_ns = arrival_ns
         if not self._lossless and frame.seq in self._recent:
-            self._drop(DUPLICATE, 1)
+            self._drop("duplicate", 1)
             return False
         if self._is_odd(frame, arrival_ns):
             if not self._is_believed(self._odd_in_order, arrival_ns):
@@ -205,7 +204,7 @@ class Arrivals:
         self.arrived_seq += confirmed
         self.next_seq = max(self.next_seq, frame.base_seq)
         if frame.seq != self.arrived_seq:
-            self._drop(DUPLICATE if frame.seq < self.arrived_seq else "gap", 1)
+            self._drop("duplicate" if frame.seq < self.arrived_seq else "gap", 1)
         return frame.seq == self.arrived_seq
 
     def _pass_over(self, seq: int) -> None:
@@ -255,7 +254,7 @@ class Arrivals:
             self._tell(f"a frame is left out: number {frame.seq} can't follow number {self.arrived_seq - 1}")
             return
         if self._lossless:
-            self._drop(DUPLICATE, 1)
+            self._drop("duplicate", 1)
             return
         # It was counted as missing when a later one came, unless that was before this receiver's time, or it
         # came and is no longer remembered.
