@@ -1,6 +1,7 @@
 """Puts a recorded stream back on the network, for live processes: as a new start of its agent."""
 
 import contextlib
+import itertools
 import logging
 import threading
 import time
@@ -11,16 +12,16 @@ from typing import Any
 
 from semcast.agent.peers import wait_for_peers, wait_until_ready
 from semcast.common.errors import SourceError
-from semcast.common.keys import agent_of, camera_key, channel_key, check_agent_id, rx_key, source_key, tx_key
+from semcast.common.keys import camera_key, channel_key, check_agent_id, rx_key, source_key, tx_key
 from semcast.common.messages import MAX_MISSING, ChannelReport, SourceImage, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
 from semcast.common.playback import check_part
-from semcast.common.recorded_streams import RecordedStream, Symbols, choose_stream
+from semcast.common.recorded_streams import RecordedStream, Symbols, choose_stream, stream_messages
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.status_beat import StatusBeat
 from semcast.common.transport import Session, open_session
-from semcast.common.wire import WireError, pack, unpack
+from semcast.common.wire import pack
 
 logger = logging.getLogger(__name__)
 
@@ -82,19 +83,10 @@ def _recorded(
 ) -> Iterator[tuple[float, Played]]:
     """Yield a part of what agent and channel sent, of symbols both sides, with seconds since it all began."""
     t_s, before_ns = 0.0, None
-    for message in reader.messages(frozenset(_CLASSES)):
-        if agent_of(message.topic) != stream.agent_id:
-            continue
-        try:
-            found = unpack(message.data, _CLASSES[message.kind])
-        except WireError as err:
-            logger.warning("a message of %s in %s is left out: %s", message.topic, reader.path, err)
-            continue
-        if found.agent_epoch != stream.camera.agent_epoch:
-            continue
-        pause_s = 0.0 if before_ns is None else (message.log_time_ns - before_ns) * 1e-9
+    for log_time_ns, found in stream_messages(reader, stream, _CLASSES):
+        pause_s = 0.0 if before_ns is None else (log_time_ns - before_ns) * 1e-9
         t_s += min(max(0.0, pause_s), _LONGEST_PAUSE_S)
-        before_ns = message.log_time_ns
+        before_ns = log_time_ns
         if end_s is not None and t_s > end_s:
             return
         if t_s >= start_s:
@@ -212,7 +204,8 @@ def run_play(settings: PlaySettings, stop: threading.Event) -> dict[str, Any]:
     reader = RecordingReader(settings.file)
     stream = choose_stream(reader, settings.stream, settings.symbols)
     messages = _recorded(reader, stream, settings.start_s, settings.end_s)
-    if next(_recorded(reader, stream, settings.start_s, settings.end_s), None) is None:
+    first = next(messages, None)
+    if first is None:
         length_s = max((t_s for t_s, _ in _recorded(reader, stream, 0.0, None)), default=0.0)
         end = "" if settings.end_s is None else f" and before {settings.end_s:g} s"
         raise SourceError(
@@ -240,7 +233,7 @@ def run_play(settings: PlaySettings, stop: threading.Event) -> dict[str, Any]:
         if not stop.is_set():
             what = f"{settings.file} as {agent_id!r}, {settings.symbols} symbols, pace {settings.pace:g}"
             logger.info("playing %s", what)
-        complete = _play(sending, messages, settings.pace, stop)
+        complete = _play(sending, itertools.chain([first], messages), settings.pace, stop)
         if complete:
             metrics.end()
         summary.update(agent_epoch=sending.agent_epoch, complete=complete)

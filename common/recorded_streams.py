@@ -2,16 +2,19 @@
 
 import logging
 from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 from semcast.common.errors import SourceError
 from semcast.common.keys import agent_of
-from semcast.common.messages import CameraInfo, SymbolFrame
+from semcast.common.messages import CameraInfo, ChannelReport, SourceImage, SymbolFrame
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.wire import WireError, unpack
 
 logger = logging.getLogger(__name__)
+
+M = TypeVar("M", bound=SymbolFrame | ChannelReport | SourceImage)
 
 #: Received: what the link made of the frames. Transmitted: what the agent sent.
 Symbols = Literal["received", "transmitted"]
@@ -95,3 +98,27 @@ def choose_stream(reader: RecordingReader, number: int | None, symbols: Symbols)
     if number is None and sum(count > 0 for count in counts) > 1:
         logger.warning("stream %d of %s is taken; frames by stream: %s", last + 1, reader.path, told)
     return streams[last]
+
+
+def stream_messages(
+    reader: RecordingReader, stream: RecordedStream, classes: Mapping[str, type[M]]
+) -> Iterator[tuple[int, M]]:
+    """Yield the messages of one stream in the order they were recorded, each with the recorder's time in ns.
+
+    One of its agent that can't be read is left out with a warning; what others sent has no say.
+
+    Args:
+        reader: The recording.
+        stream: One of it.
+        classes: Kinds of messages, and what they are read as.
+    """
+    for message in reader.messages(frozenset(classes)):
+        if agent_of(message.topic) != stream.agent_id:
+            continue
+        try:
+            found = unpack(message.data, classes[message.kind])
+        except WireError as err:
+            logger.warning("a message of %s in %s is left out: %s", message.topic, reader.path, err)
+            continue
+        if found.agent_epoch == stream.camera.agent_epoch:
+            yield message.log_time_ns, found

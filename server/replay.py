@@ -17,16 +17,14 @@ from semcast.common.camera_settings import CameraSettings
 from semcast.common.codec import PRECISION_HELP, Precision
 from semcast.common.cores import check_threads
 from semcast.common.errors import SemcastError, SourceError
-from semcast.common.keys import agent_of
 from semcast.common.messages import SymbolFrame
 from semcast.common.phy.equaliser import Equalised
 from semcast.common.phy.pilots import insert_pilots
 from semcast.common.playback import check_part
 from semcast.common.rate import belongs_to
-from semcast.common.recorded_streams import RecordedStream, Symbols, choose_stream
+from semcast.common.recorded_streams import RecordedStream, Symbols, choose_stream, stream_messages
 from semcast.common.recording_reader import RecordingReader
 from semcast.common.symbol_payload import encoded_image, equalise_frame
-from semcast.common.wire import WireError, unpack
 from semcast.server.conclusion import conclude
 from semcast.server.decoder import Arrival, FrameDecoder, codec_loader
 from semcast.server.former_run import output_folder
@@ -311,21 +309,13 @@ def _recorded(
     reader: RecordingReader, stream: RecordedStream, settings: ReplaySettings
 ) -> Iterator[SymbolFrame]:
     """Yield the frames of the stream as they were recorded; those that can't be read are told."""
-    camera = stream.camera
     direction = "rx" if settings.source == "received" else "tx"
-    for message in reader.messages(frozenset({"symbols"})):
-        try:
-            frame = unpack(message.data, SymbolFrame)
-        except WireError as err:
-            logger.warning("a message of %s in %s is left out: %s", message.topic, reader.path, err)
+    for _, frame in stream_messages(reader, stream, {"symbols": SymbolFrame}):
+        if frame.direction != direction:
             continue
-        if (
-            agent_of(message.topic) != stream.agent_id
-            or frame.direction != direction
-            or frame.agent_epoch != camera.agent_epoch
+        if frame.payload_format != "lost" and not belongs_to(
+            frame.image_hw, stream.camera.intrinsics.shape_hw
         ):
-            continue
-        if frame.payload_format != "lost" and not belongs_to(frame.image_hw, camera.intrinsics.shape_hw):
             logger.warning(
                 "frame %d of %s is left out: %s is no coded size of its camera",
                 frame.frame_id,

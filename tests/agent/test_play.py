@@ -21,7 +21,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.cli import main
 from semcast.common.errors import SourceError
 from semcast.common.keys import camera_key, channel_key, rx_key, source_key, tx_key
-from semcast.common.loopback import open_hub
+from semcast.common.loopback import free_endpoint, open_hub
 from semcast.common.messages import CameraInfo, ChannelReport, SourceImage, StatusMessage, SymbolFrame
 from semcast.common.metrics import Metrics
 from semcast.common.network_settings import NetworkSettings
@@ -323,6 +323,23 @@ def test_what_another_agent_sent_is_left_out(bench, tmp_path, codec):
     play = bench.play(file, wait=False)
     play.join(30)
     assert play.result["counts"]["played"] == NUM_FRAMES
+
+
+def test_an_unreadable_message_is_told_once_and_another_agents_is_not(tmp_path, codec, caplog):
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = RecordingWriter(file, recording_metadata("", "test"))
+        writer.add(camera_key(AGENT), "camera", EPOCH, 0, pack(camera_of(codec)))
+        writer.add(rx_key("right"), "symbols", EPOCH, 0, b"junk")
+        writer.add(rx_key(AGENT), "symbols", EPOCH, 0, b"junk")
+        for count, (_, rx) in enumerate(frames_of(codec), start=1):
+            writer.add(rx_key(AGENT), "symbols", EPOCH, count, pack(rx))
+        writer.finish()
+    settings = PlaySettings(file=path, wait=False, network=NetworkSettings(listen=(free_endpoint(),)))
+    assert run_play(settings, threading.Event())["counts"]["played"] == NUM_FRAMES
+    told = [r.getMessage() for r in caplog.records if "is left out" in r.getMessage()]
+    assert len(told) == 1
+    assert told[0].startswith(f"a message of {rx_key(AGENT)} in {path} is left out")
 
 
 def test_a_part_that_holds_nothing_is_told_with_the_length_before_anybody_is_waited_for(file, capsys):

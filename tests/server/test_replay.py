@@ -380,6 +380,18 @@ def test_an_unreadable_message_costs_its_frame_alone(recording, whole, tmp_path,
     assert "a message of semcast/agent0/rx/symbols" in caplog.text
 
 
+def test_an_unreadable_message_of_another_agent_is_not_told(recording, tmp_path, caplog):
+    path = tmp_path / "two.mcap"
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, recording_metadata("", "0"))
+        writer.add("semcast/right/rx/symbols", "symbols", 1, 0, b"junk")
+        for m in RecordingReader(recording).messages():
+            writer.add(m.topic, m.kind, m.log_time_ns, m.sequence, m.data)
+        writer.finish()
+    replay(without_depth(path, end_s=0.3))
+    assert "is left out" not in caplog.text
+
+
 def test_a_frame_of_another_codec_costs_itself_alone(recording, whole, tmp_path, caplog):
     def of_another(data):
         return pack(replace(unpack(data, SymbolFrame), digest="0123"))
