@@ -305,6 +305,23 @@ def test_ctrl_c_is_no_traceback_before_the_verb_is_known_either(monkeypatch):
     assert main(["server"]) == 130
 
 
+def test_ctrl_c_while_the_command_line_itself_is_imported_is_no_traceback(tmp_path):
+    """Its import takes longer than Python's own start; ``semcast`` and ``python -m semcast`` begin alike."""
+    script = tmp_path / "start.py"
+    script.write_text(
+        "import importlib.abc, runpy, signal, sys\n"
+        "class Finder(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        "        if name == 'semcast.common.config':\n"
+        "            signal.raise_signal(signal.SIGINT)\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "runpy.run_module('semcast', run_name='__main__')\n"
+    )
+    shown = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert (shown.returncode, shown.stderr) == (130, "")
+
+
 @pytest.mark.parametrize("names_the_path", [True, False])
 def test_a_folder_that_may_not_be_looked_into_is_an_error_in_a_line(
     tmp_path, monkeypatch, capsys, names_the_path
