@@ -4,6 +4,7 @@ Process
     emulator           passes symbols on as a radio link would
     emulator_settings  settings of the process
     delay              holds packets back for delay and jitter
+    silence            says when no frame comes, and who is missing
 
 Link
     link               what a frame's slots look like at the receiver

@@ -14,6 +14,7 @@ from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.link import Link
 from semcast.channel.registry import build_channel
 from semcast.channel.settings import MAX_DOPPLER_SLOT, ChannelSettings
+from semcast.channel.silence import Silence
 from semcast.common.complaints import Complaints
 from semcast.common.config import build_settings, settings_to_dict
 from semcast.common.errors import ConfigError, SemcastError, TransportError
@@ -62,6 +63,7 @@ class Emulator:
         self._box: Mailbox[SymbolFrame] = Mailbox(1, "newest")
         self._epoch = 0
         self._carried: deque[int] = deque(maxlen=_REMEMBERED)
+        self._silence = Silence(settings.agent_id)
         self._arrived_epoch = 0
         self._arrived_seq = 0
         self._far_seq = 0
@@ -70,6 +72,7 @@ class Emulator:
         self._lossless = session.publisher(rx_key(agent_id), "every")
         self._reports = session.publisher(channel_key(agent_id), "newest")
         session.answer(control_key(agent_id, ROLE), self._on_request)
+        session.watch_alive(agent_id, self._silence.on_alive)
         session.subscribe(tx_key(agent_id), "newest", self._on_symbols, FRAME_RING_CAPACITY)
         # Last, as it has a thread that nobody would end if one of the others failed.
         self._delay = DelayLine(self._send, self._on_unsent)
@@ -112,7 +115,9 @@ class Emulator:
         while not stop.is_set():
             frame = self._box.get(_POLL_S)
             if frame is None:
+                self._silence.check()
                 continue
+            self._silence.end()
             with carrying:
                 try:
                     with self._metrics.stage("channel"):

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from semcast.channel.emulator import Emulator, run_channel, set_channel
 from semcast.channel.emulator_settings import EmulatorSettings
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
+from semcast.channel.silence import Silence
 from semcast.common.codec import EncodedImage
 from semcast.common.errors import ConfigError, SemcastError, TransportError
 from semcast.common.keys import channel_key, rx_key, status_key, tx_key
@@ -123,6 +125,19 @@ def test_frames_come_out_as_the_link_model_makes_them(ends, make, symbols):
         assert e.reports[k].num_slots_lost == expected.slot_lost.sum()
     assert some_lost > 0
     assert (e.reports[0].snr_db_set, e.reports[0].channel) == (6.0, "erasure")
+
+
+def test_who_comes_and_goes_and_that_nothing_comes_is_told(ends, make, monkeypatch, caplog):
+    caplog.set_level("INFO")
+    monkeypatch.setattr(emulator, "Silence", partial(Silence, silence_s=0.3))
+    e = ends()
+    with open_client(e.network, 5.0) as agent:
+        agent.declare_alive("a", "agent")
+        until(lambda: "agent is there" in caplog.text)
+        until(lambda: "no frame of agent 'a' has come" in caplog.text)
+        e.pass_one(make(0))
+        until(lambda: caplog.text.count("no frame of agent 'a' has come") == 2)
+    until(lambda: "agent is gone" in caplog.text)
 
 
 def test_settings_change_while_it_runs_and_bad_ones_are_refused(ends, make, caplog):
