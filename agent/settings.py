@@ -6,7 +6,7 @@ from typing import Literal
 
 from semcast.agent.source_settings import SourceSettings
 from semcast.channel.trace import SNR_RANGE_DB
-from semcast.common.codec import DEFAULT_CODEC, PRECISION_HELP, Device, Modulation, Precision
+from semcast.common.codec import DEFAULT_CODEC, MODULATION_HELP, PRECISION_HELP, Device, Modulation, Precision
 from semcast.common.codecs import Runtime
 from semcast.common.cores import check_threads
 from semcast.common.keys import DEFAULT_AGENT_ID, check_agent_id
@@ -29,7 +29,7 @@ class AgentSettings:
     )
     source: SourceSettings = field(metadata={"help": "where frames come from"})
     codec: str = field(default=DEFAULT_CODEC, metadata={"help": "codec by name or file of weights"})
-    modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    modulation: Modulation = field(default="16qam", metadata={"help": MODULATION_HELP})
     weights: Path | None = field(default=None, metadata={"help": "weights instead of the shipped ones"})
     threads: int = field(default=1, metadata={"help": "CPU threads of the encoder"})
     precision: Precision = field(default="auto", metadata={"help": PRECISION_HELP})

@@ -10,12 +10,15 @@ from typing import Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from semcast.common.config import near_match
+from semcast.common.errors import ConfigError
 from semcast.common.levels import ALL_LEVELS, Levels
 from semcast.common.phy.allocation import Allocation
 from semcast.common.phy.slots import layout_for
 
 Modulation = Literal["16qam", "analog"]
 MODULATIONS: tuple[Modulation, ...] = get_args(Modulation)
+MODULATION_HELP = "how symbols travel: 16qam or analog"
 
 #: What the convolutions of a learned codec are computed in.
 Precision = Literal["auto", "float32", "bfloat16", "int8"]
@@ -40,6 +43,17 @@ OUTAGE_GREY = 128
 
 #: Effective SNR given to the decoder for a slot of which nothing arrived.
 LOST_SLOT_SNR_DB = -20.0
+
+
+def check_modulation(modulation: str) -> None:
+    """Check that there is a modulation of this name.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    if modulation not in MODULATIONS:
+        hint = near_match(modulation, list(MODULATIONS))
+        raise ConfigError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}{hint}")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, get_args
 
-from semcast.common.codec import MODULATIONS, Codec, Device, Modulation, Precision
+from semcast.common.codec import Codec, Device, Modulation, Precision, check_modulation
 from semcast.common.config import near_match
 from semcast.common.conventional_source import ImageFormat
 from semcast.common.errors import ConfigError
@@ -164,9 +164,7 @@ def load_codec(
             another codec's, or the runtime, device or precision is not there.
         CheckpointError: The weights are missing or damaged.
     """
-    if modulation not in MODULATIONS:
-        hint = near_match(modulation, list(MODULATIONS))
-        raise ConfigError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}{hint}")
+    check_modulation(modulation)
     if weights is None:
         name, weights = named_weights(name, runtime)
     if name in LEARNED_CODECS or name in _shipped_weights():

@@ -237,3 +237,19 @@ def to_toml(settings: Any) -> str:
 
     emit(settings_to_dict(settings), "")
     return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def check_at_least(settings: object, **least: int) -> None:
+    """Check the least value of some settings; of one that is None there is nothing to check.
+
+    Args:
+        settings: Whose fields they are.
+        **least: Names, and the least value of each.
+
+    Raises:
+        ValueError: One is less.
+    """
+    for name, low in least.items():
+        value = getattr(settings, name)
+        if value is not None and value < low:
+            raise ValueError(f"{name} must be at least {low}, got {value}")

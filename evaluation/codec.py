@@ -20,6 +20,7 @@ from semcast.channel.settings import ChannelSettings
 from semcast.common.codec import (
     DEFAULT_CODEC,
     LABEL_SHARPNESS,
+    MODULATION_HELP,
     OUTAGE_GREY,
     PRECISION_HELP,
     Codec,
@@ -30,6 +31,7 @@ from semcast.common.codec import (
     ReceivedImage,
 )
 from semcast.common.codecs import LEARNED_CODECS, is_conventional, load_codec
+from semcast.common.config import check_at_least
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.image import psnr_db
@@ -79,7 +81,7 @@ class CodecSettings:
             "help": "SNRs in dB, one or more; without a meaning where a file has the SNR (--trace file)"
         },
     )
-    modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    modulation: Modulation = field(default="16qam", metadata={"help": MODULATION_HELP})
     runtime: Literal["torch", "onnx"] = field(
         default="torch", metadata={"help": "what computes learned encoders: torch, or onnx as exported"}
     )
@@ -103,10 +105,7 @@ class CodecSettings:
         check_snrs(self.snr_db, self.link, _SNRS_DB)
         if not self.codec or len(set(self.codec)) != len(self.codec):
             raise ValueError(f"codec must be one or more different names, got {self.codec}")
-        for name, least in (("seed", 0), ("max_images", 1)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}")
+        check_at_least(self, seed=0, max_images=1)
         check_threads(self.threads)
 
     @property

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.codec import DEFAULT_CODEC, PRECISION_HELP, Codec, Modulation, Precision
+from semcast.common.codec import DEFAULT_CODEC, MODULATION_HELP, PRECISION_HELP, Codec, Modulation, Precision
 from semcast.common.codecs import load_codec
+from semcast.common.config import check_at_least
 from semcast.common.cores import check_threads
 from semcast.common.errors import SourceError
 from semcast.common.image import psnr_db
@@ -81,7 +82,7 @@ class DepthSettings:
         default=(DEFAULT_CODEC, "jpeg-ldpc"),
         metadata={"help": "codecs by name or .safetensors file, one or more"},
     )
-    modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    modulation: Modulation = field(default="16qam", metadata={"help": MODULATION_HELP})
     snr_db: tuple[float, ...] = field(default=_SNRS_DB, metadata={"help": "SNRs in dB, one or more"})
     link: ChannelSettings = field(default=ChannelSettings(), metadata={"help": "the channel"})
     confidence: tuple[ConfidenceUse, ...] = field(
@@ -105,10 +106,7 @@ class DepthSettings:
             values = getattr(self, name)
             if not values or len(set(values)) != len(values):
                 raise ValueError(f"{name} must be one or more different names, got {values}")
-        for name, least in (("scene_seed", 0), ("seed", 0), ("seeds", 1), ("stride", 1), ("max_frames", 1)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}")
+        check_at_least(self, scene_seed=0, seed=0, seeds=1, stride=1, max_frames=1)
         if not 0 < self.seconds <= 120:
             raise ValueError(f"seconds must be in (0, 120], got {self.seconds:g}")
         check_threads(self.threads)

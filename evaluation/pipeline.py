@@ -16,8 +16,17 @@ from numpy.typing import NDArray
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.codec import DEFAULT_CODEC, PRECISION_HELP, Codec, DecodedImage, Modulation, Precision
+from semcast.common.codec import (
+    DEFAULT_CODEC,
+    MODULATION_HELP,
+    PRECISION_HELP,
+    Codec,
+    DecodedImage,
+    Modulation,
+    Precision,
+)
 from semcast.common.codecs import load_codec
+from semcast.common.config import check_at_least
 from semcast.common.cores import check_threads
 from semcast.common.errors import ConfigError, SourceError
 from semcast.common.link_report import LinkReporter
@@ -60,7 +69,7 @@ class StreamSettings:
         default=DEFAULT_CODEC,
         metadata={"help": f"codec by name or .safetensors file; {CLEAN}: original images, confidence 1"},
     )
-    modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    modulation: Modulation = field(default="16qam", metadata={"help": MODULATION_HELP})
     snr_db: tuple[float, ...] = field(default=(10.0,), metadata={"help": "SNRs in dB, one or more"})
     link: ChannelSettings = field(default=ChannelSettings(), metadata={"help": "the channel"})
     seed: int = field(default=0, metadata={"help": "first seed of channel and estimation"})
@@ -76,9 +85,7 @@ class StreamSettings:
     def __post_init__(self) -> None:
         """Check ranges."""
         check_snrs(self.snr_db, self.link)
-        for name, least in (("seed", 0), ("seeds", 1), ("start", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        check_at_least(self, seed=0, seeds=1, start=0)
         if self.all_seeds[-1] > MAX_SEED:
             raise ValueError(f"last of the seeds must be at most {MAX_SEED}, got {self.all_seeds[-1]}")
         check_threads(self.threads)

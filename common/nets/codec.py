@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from semcast.common.codec import (
     DEFAULT_CODEC,
     LOST_SLOT_SNR_DB,
-    MODULATIONS,
     DecodedImage,
     Device,
     EncodedImage,
@@ -18,6 +17,7 @@ from semcast.common.codec import (
     Precision,
     ReceivedImage,
     check_fixed_rate,
+    check_modulation,
     confidence_from_displacement_px,
 )
 from semcast.common.errors import CheckpointError, ConfigError
@@ -76,7 +76,7 @@ class NeuralCodec:
         precision: That which was chosen, not ``auto``.
 
     Raises:
-        ConfigError: The network can't be computed in that precision here.
+        ConfigError: There is no such modulation, or the network can't be computed in that precision here.
     """
 
     def __init__(
@@ -87,8 +87,7 @@ class NeuralCodec:
         device: torch.device,
         precision: Precision = "auto",
     ) -> None:
-        if modulation not in MODULATIONS:
-            raise ValueError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}")
+        check_modulation(modulation)
         self.manifest = manifest
         self.modulation: Modulation = modulation
         self._device = device
@@ -123,7 +122,7 @@ class NeuralCodec:
             CheckpointError: There are no such weights, they do not fit their manifest, or are not for the
                 modulation.
             ConfigError: There is no such device, or the network can't be computed in that precision there.
-            ValueError: The modulation or number of threads is not usable.
+            ValueError: The number of threads is not usable.
         """
         if num_threads is not None:
             if num_threads < 1:
@@ -131,7 +130,7 @@ class NeuralCodec:
             torch.set_num_threads(num_threads)
         where = torch_device(device)
         model, manifest = load_transceiver(weights_path(name_or_path))
-        if modulation in MODULATIONS and modulation not in manifest.modulations:
+        if modulation not in manifest.modulations:
             ways = ", ".join(map(str, manifest.modulations))
             raise CheckpointError(f"weights {name_or_path} are for the modulation {ways}, got {modulation!r}")
         return cls(model, manifest, modulation, where, precision)

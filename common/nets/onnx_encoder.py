@@ -10,7 +10,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from semcast.common.codec import MODULATIONS, DecodedImage, EncodedImage, Modulation, ReceivedImage
+from semcast.common.codec import DecodedImage, EncodedImage, Modulation, ReceivedImage, check_modulation
 from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.coder_input import coder_input
 from semcast.common.nets.detail import allocation_for
@@ -75,14 +75,14 @@ class OnnxEncoder:
 
     Raises:
         CheckpointError: The file is missing, damaged or of another version.
-        ValueError: The modulation or number of threads is not usable.
+        ConfigError: There is no such modulation.
+        ValueError: The number of threads is not usable.
     """
 
     def __init__(
         self, name_or_path: str | Path, modulation: Modulation = "16qam", num_threads: int | None = None
     ) -> None:
-        if modulation not in MODULATIONS:
-            raise ValueError(f"modulation must be one of {', '.join(MODULATIONS)}, got {modulation!r}")
+        check_modulation(modulation)
         if num_threads is not None and num_threads < 1:
             raise ValueError(f"num_threads must be >= 1, got {num_threads}")
         path = encoder_path(name_or_path)

@@ -14,7 +14,7 @@ from semcast.agent.pace_control import start_stride
 from semcast.channel.link import Link
 from semcast.channel.settings import ChannelSettings
 from semcast.common.camera_settings import CameraSettings
-from semcast.common.codec import DEFAULT_CODEC, Modulation
+from semcast.common.codec import DEFAULT_CODEC, MODULATION_HELP, Modulation
 from semcast.common.codecs import check_codec, is_conventional, named_weights
 from semcast.common.config import to_toml
 from semcast.common.config_flags import flag_words
@@ -62,7 +62,7 @@ class DemoSettings:
     codec: str = field(
         default=DEFAULT_CODEC, metadata={"help": "codec by name, such as jpeg-ldpc, or file of weights"}
     )
-    modulation: Modulation = field(default="16qam", metadata={"help": "how symbols travel: 16qam or analog"})
+    modulation: Modulation = field(default="16qam", metadata={"help": MODULATION_HELP})
     rate: RateChoice = field(
         default=NATIVE_RATE, metadata={"help": "channel uses per pixel value; auto: as the link needs"}
     )

@@ -2,13 +2,14 @@ import argparse
 import dataclasses
 import re
 import tomllib
+import types
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import pytest
 
-from semcast.common.config import MissingSettingError, build_settings, near_match, to_toml
+from semcast.common.config import MissingSettingError, build_settings, check_at_least, near_match, to_toml
 from semcast.common.config_flags import add_flags, flag_words, given_values, settings_from
 from semcast.common.errors import ConfigError
 
@@ -297,3 +298,10 @@ def test_the_words_of_settings_make_the_same_settings(settings, words):
 
 def test_words_may_name_a_default_too():
     assert flag_words(Node(), always=("radio.snr_db", "loud")) == ["--no-loud", "--snr-db", "10.0"]
+
+
+def test_the_least_value_of_settings_is_checked_where_there_is_one():
+    settings = types.SimpleNamespace(seed=0, stride=0, max_frames=None)
+    check_at_least(settings, seed=0, max_frames=1)
+    with pytest.raises(ValueError, match="stride must be at least 1, got 0"):
+        check_at_least(settings, seed=0, stride=1)

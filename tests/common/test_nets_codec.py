@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from semcast.common.codec import LOST_SLOT_SNR_DB, ReceivedImage
-from semcast.common.errors import CheckpointError
+from semcast.common.errors import CheckpointError, ConfigError
 from semcast.common.nets.checkpoint import load_transceiver, save_transceiver
 from semcast.common.nets.codec import NeuralCodec
 from semcast.common.nets.manifest import manifest_path, read_manifest, weights_path
@@ -267,8 +267,11 @@ def test_every_registered_architecture_fits_a_weights_file():
 def test_bad_settings_are_refused(weights):
     with pytest.raises(ValueError, match="num_threads must be >= 1"):
         NeuralCodec.load(weights, num_threads=0)
-    with pytest.raises(ValueError, match="modulation must be one of"):
+    with pytest.raises(CheckpointError, match="are for the modulation 16qam, analog, got 'bpsk'"):
         NeuralCodec.load(weights, modulation="bpsk")
+    model, manifest = load_transceiver(weights)
+    with pytest.raises(ConfigError, match="modulation must be one of 16qam, analog, got 'analogue'.*analog"):
+        NeuralCodec(model, manifest, "analogue", torch.device("cpu"))
 
 
 @pytest.mark.weights
