@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
 from semcast.common.codec import KLT_WINDOW_PX
-from semcast.common.geometry import skew
+from semcast.common.geometry import make_transform
+from semcast.server.geometry.epipolar import fundamental_matrix, sampson_px
 
 Array = NDArray[np.float64]
 
@@ -22,22 +23,17 @@ def epipolar_distance_px(
     Args:
         keypoints0_xy: ``(N, 2)`` pixels in the first image.
         keypoints1_xy: ``(N, 2)`` pixels in the second image.
-        T_cam1_cam0: True motion, 4x4, with a translation.
+        T_cam1_cam0: True motion, 4x4.
         camera: Both images' camera, without distortion.
 
     Returns:
-        ``(N,)`` pixels, first order (Hartley and Zisserman, Eq. 11.9), inf where the geometry has no line.
+        ``(N,)`` pixels, first order (Hartley and Zisserman, Eq. 11.9), inf where a turn alone has no lines.
     """
-    K_inv = np.linalg.inv(camera.K)
-    F = K_inv.T @ skew(T_cam1_cam0[:3, 3]) @ T_cam1_cam0[:3, :3] @ K_inv
-    x0 = np.column_stack([keypoints0_xy, np.ones(len(keypoints0_xy))])
-    x1 = np.column_stack([keypoints1_xy, np.ones(len(keypoints1_xy))])
-    line1, line0 = x0 @ F.T, x1 @ F
-    algebraic = np.abs((x1 * line1).sum(axis=1))
-    gradient = np.sqrt((line1[:, :2] ** 2).sum(axis=1) + (line0[:, :2] ** 2).sum(axis=1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance_px = algebraic / gradient
-    return np.where(gradient > 0, distance_px, np.inf)
+    length = float(np.linalg.norm(T_cam1_cam0[:3, 3]))
+    if length == 0.0:
+        return np.full(len(keypoints0_xy), np.inf)
+    F = fundamental_matrix(camera, make_transform(T_cam1_cam0[:3, :3], T_cam1_cam0[:3, 3] / length))
+    return np.abs(sampson_px(F, keypoints0_xy, keypoints1_xy))
 
 
 def track_points(
