@@ -70,7 +70,7 @@ class ImageWriter:
         self._num_put = 0
         self.num_written = 0
         # Each belongs to one thread: that of the caller, and that of the writer.
-        self._num_refused = self._num_left_out = 0
+        self._num_refused = self._num_left_out = self._num_told = 0
         self._failed_s: float | None = None
         try:
             self._images.mkdir(parents=True, exist_ok=True)
@@ -166,12 +166,20 @@ class ImageWriter:
             (self._images / image_name(frame_id)).unlink()
 
     def close(self, deadline_s: float = 30.0) -> None:
-        """Write what waits and end the thread; what is not written by the deadline is dropped. Idempotent."""
+        """Write what waits, end the thread and say how many images are missing. Idempotent.
+
+        Args:
+            deadline_s: What is not written by then is dropped.
+        """
         self._box.close()
         self._thread.join(deadline_s)
-        if num_left := self._box.clear():
-            self._num_refused += num_left
-            logger.warning("%d images are not written: the disk is too slow", num_left)
+        self._num_refused += self._box.clear()
+        if self.num_dropped > self._num_told:
+            self._num_told = self.num_dropped
+            logger.warning(
+                "%d images are not in %s: the disk was too slow or could not be written",
+                *(self._num_told, self._images),
+            )
 
     def __enter__(self) -> "ImageWriter":
         return self

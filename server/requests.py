@@ -20,12 +20,6 @@ class RequestDesk:
         self._waiting: dict[str, Future[Any]] = {}
         self._closed = False
 
-    @property
-    def waiting(self) -> frozenset[str]:
-        """What is asked for and not served yet."""
-        with self._lock:
-            return frozenset(self._waiting)
-
     def ask(self, what: str, wait_s: float) -> Any:
         """Return what serving gave.
 

@@ -135,7 +135,7 @@ def test_whatever_an_image_can_not_be_written_for_holds_nobody_up(tmp_path, monk
     assert caplog.text.count("MemoryError; the run goes on without images") == 1
 
 
-def test_a_disk_that_hangs_keeps_nobody_longer_than_the_deadline(tmp_path, monkeypatch):
+def test_a_disk_that_hangs_keeps_nobody_longer_than_the_deadline(tmp_path, monkeypatch, caplog):
     writing, may_go_on = threading.Event(), threading.Event()
 
     def hanging(self, item):
@@ -152,9 +152,12 @@ def test_a_disk_that_hangs_keeps_nobody_longer_than_the_deadline(tmp_path, monke
     closing.start()
     closing.join(60)
     assert not closing.is_alive()
-    assert writer.num_dropped == 2
+    told = f"2 images are not in {tmp_path / 'images'}: the disk was too slow"
+    assert told in caplog.text
     writer.put(3, picture(3))
     assert writer.num_dropped == 2, "after the end it is ignored"
+    writer.close(0.0)
+    assert caplog.text.count("images are not in") == 1
     may_go_on.set()
 
 

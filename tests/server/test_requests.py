@@ -9,7 +9,15 @@ from semcast.server.requests import RequestDesk
 
 
 def test_requests_for_the_same_thing_are_served_once_and_in_the_order_of_the_handlers():
-    desk, answers, served = RequestDesk(), [], []
+    desk, served = RequestDesk(), []
+    for what in ("save", "reset", "save"):
+        assert desk.error_of(what, 0.01).startswith(f"{what} is not done yet")
+    desk.serve({what: functools.partial(served.append, what) for what in ("reset", "save")})
+    assert served == ["reset", "save"]
+
+
+def test_all_who_ask_for_a_thing_are_told_what_came_of_it():
+    desk, answers = RequestDesk(), []
     asking = [
         threading.Thread(target=lambda what=what: answers.append((what, desk.ask(what, 60.0))))
         for what in ("save", "reset", "save")
@@ -17,17 +25,11 @@ def test_requests_for_the_same_thing_are_served_once_and_in_the_order_of_the_han
     for thread in asking:
         thread.start()
 
-    def serve(what):
-        served.append(what)
-        return f"{what} done"
-
     def all_answered():
-        if served or len(desk.waiting) == 2:  # from when both are asked for
-            desk.serve({what: functools.partial(serve, what) for what in ("reset", "save")})
+        desk.serve({"reset": lambda: "reset done", "save": lambda: "save done"})
         return len(answers) == 3
 
     until(all_answered)
-    assert served[:2] == ["reset", "save"]
     assert sorted(answers) == [("reset", "reset done"), ("save", "save done"), ("save", "save done")]
 
 
@@ -55,16 +57,16 @@ def test_who_asks_for_what_fails_is_told_so_and_the_rest_is_served(error):
     def fail():
         raise error
 
-    asking = threading.Thread(target=ask)
+    assert desk.error_of("map", 0.01).startswith("map is not done yet")
+    asking, served = threading.Thread(target=ask), []
     asking.start()
-    until(lambda: desk.waiting == {"save"})
-    served = []
-    threading.Thread(target=lambda: served.append(desk.ask("map", 60.0))).start()
-    until(lambda: desk.waiting == {"save", "map"})
-    desk.serve({"save": fail, "map": lambda: "map"})
+
+    def save_has_failed():
+        desk.serve({"save": fail, "map": lambda: served.append("map")})
+        return told
+
+    until(save_has_failed)
     asking.join(60.0)
-    assert told
-    until(lambda: served)
     assert served == ["map"]
 
 
@@ -79,8 +81,7 @@ def test_what_went_wrong_is_told_in_words():
             target=lambda desk=desk, told=told: told.append(desk.error_of("save", 60.0))
         )
         asking.start()
-        until(lambda desk=desk: desk.waiting == {"save"})
-        desk.serve({"save": handle})
+        until(lambda desk=desk, handle=handle, told=told: desk.serve({"save": handle}) or told)
         asking.join(60.0)
         assert words in told[0]
         assert bool(words) == bool(told[0])
@@ -88,13 +89,14 @@ def test_what_went_wrong_is_told_in_words():
 
 def test_a_desk_that_is_closed_refuses_what_waits_and_what_comes():
     desk, told = RequestDesk(), []
-    asking = threading.Thread(target=lambda: told.append(desk.error_of("save", 60.0)))
-    asking.start()
-    until(lambda: desk.waiting == {"save"})
+    asking = [threading.Thread(target=lambda: told.append(desk.error_of("save", 60.0))) for _ in range(8)]
+    for thread in asking:
+        thread.start()
     desk.close()
     desk.close()
-    asking.join(60.0)
-    assert told == ["save can't be served: the server is at its end"]
+    for thread in asking:
+        thread.join(60.0)
+    assert told == 8 * ["save can't be served: the server is at its end"]
     assert desk.error_of("reset", 60.0) == "reset can't be served: the server is at its end"
     served = []
     desk.serve({"save": lambda: served.append(1)})
