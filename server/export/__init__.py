@@ -9,6 +9,7 @@ Other tools
     poses       TUM and KITTI trajectories
     colmap      COLMAP's text model
     nerfstudio  ``transforms.json`` of nerfstudio and gsplat
+    replacement a model in place of an earlier one
     rrd         a Rerun recording
 
 Part, unit and frame

@@ -22,6 +22,7 @@ from semcast.server.export.outputs import MAP_FRAME, read_ply, write_ply
 from semcast.server.export.parts import ALL, LARGEST, count_parts, parts_line, select_part
 from semcast.server.export.placement import Placement
 from semcast.server.export.poses import write_run_kitti, write_run_tum
+from semcast.server.export.replacement import replacing_model
 
 logger = logging.getLogger(__name__)
 
@@ -105,8 +106,12 @@ def export_run(
         "kitti": lambda: write_run_kitti(out, data),
         "ply": lambda: _write_run_ply(out, data, frame),
         "dense": lambda: _write_run_dense(out, folder, placement),
-        "colmap": lambda: write_colmap(out, data, images),
-        "nerfstudio": lambda: write_nerfstudio(out, data, images, placement.frame if placement else None),
+        "colmap": lambda: _write_model(out, "colmap", lambda place: write_colmap(place, data, images)),
+        "nerfstudio": lambda: _write_model(
+            out,
+            "nerfstudio",
+            lambda place: write_nerfstudio(place, data, images, placement.frame if placement else None),
+        ),
         # The server's own recording shows all parts.
         "rrd": lambda: _write_run_rrd(out, folder, data, images, copy=whole),
     }
@@ -177,6 +182,13 @@ def _check_not_foreign(out: Path, format_name: str, images: Mapping[int, Path]) 
         foreign.append(out / "transforms.json")
     if foreign:
         raise ConfigError(f"out must hold no images of others, there is {foreign[0]}: give another folder")
+
+
+def _write_model(out: Path, format_name: str, write: Callable[[Path], list[Path]]) -> list[Path]:
+    """Write a model with pictures in place of the one that may be there, and return its files."""
+    with replacing_model(out, format_name) as place:
+        files = write(place)
+    return [out / file.relative_to(place) for file in files]
 
 
 def _write_run_ply(path: Path, data: RunData, frame: str) -> list[Path]:

@@ -430,6 +430,47 @@ def test_an_export_leaves_the_images_of_the_other_formats_model_alone(tmp_path, 
     assert (out / "images" / image.name).read_bytes() == image.read_bytes()
 
 
+@pytest.mark.parametrize("format_name", ["colmap", "nerfstudio"])
+def test_an_export_takes_the_place_of_an_earlier_one_with_all_its_images(
+    tmp_path, arc_run, write_arc_run, format_name
+):
+    write_arc_run(tmp_path / "run", arc_run())
+    out = tmp_path / "out"
+    export_run(tmp_path / "run", format_name, out)
+    (out / "images" / "mask.png").write_bytes(b"of the user")
+    first, *others = sorted(read_image_paths(tmp_path / "run").values())
+    for path in others[1:]:
+        path.unlink()
+    export_run(tmp_path / "run", format_name, out)
+    assert {p.name for p in (out / "images").iterdir()} == {first.name, others[0].name, "mask.png"}
+
+
+def test_an_image_that_the_other_formats_model_shows_stays(tmp_path, arc_run, write_arc_run):
+    write_arc_run(tmp_path / "run", arc_run())
+    out = tmp_path / "out"
+    for format_name in ("colmap", "nerfstudio"):
+        export_run(tmp_path / "run", format_name, out)
+    before = {p.name for p in (out / "images").iterdir()}
+    next(iter(read_image_paths(tmp_path / "run").values())).unlink()
+    export_run(tmp_path / "run", "nerfstudio", out)
+    assert {p.name for p in (out / "images").iterdir()} == before
+
+
+@pytest.mark.parametrize("format_name", ["colmap", "nerfstudio"])
+def test_an_export_that_finds_no_room_leaves_the_one_before(tmp_path, arc_run, write_arc_run, format_name):
+    for name in ("run", "other"):
+        write_arc_run(tmp_path / name, arc_run())
+    for path in read_image_paths(tmp_path / "other").values():
+        path.write_bytes(path.read_bytes() + b"differs")
+    out = tmp_path / "out"
+    export_run(tmp_path / "run", format_name, out)
+    before = contents(out)
+    longest = max(len(content) for content in before.values())
+    with room_for(longest - 1), pytest.raises(SemcastError, match=r"can't be written: .*File too large"):
+        export_run(tmp_path / "other", format_name, out)
+    assert contents(out) == before
+
+
 def test_trimesh_reads_the_points_with_their_colours(tmp_path, arc_run, write_arc_run):
     data = arc_run()
     write_arc_run(tmp_path / "run", data)

@@ -1,0 +1,65 @@
+"""A model with pictures takes the place of an earlier one in its folder, of which no picture stays."""
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+#: Format -> the file that names the pictures of a model; it comes last.
+_LISTS = {"colmap": Path("sparse/0/images.txt"), "nerfstudio": Path("transforms.json")}
+_IMAGES = "images"
+#: In the folder while it is being filled.
+_PART = ".part"
+
+
+@contextlib.contextmanager
+def replacing_model(out: Path, format_name: str) -> Iterator[Path]:
+    """Yield an empty folder to write a model to, which is in ``out`` once the block has ended without error.
+
+    Pictures that only the earlier model of the same format shows are then gone. Up to there everything in
+    ``out`` stays as it was.
+
+    Args:
+        out: It is made where it is not there.
+        format_name: ``colmap`` or ``nerfstudio``.
+
+    Raises:
+        OSError: ``out`` can't be written.
+    """
+    is_new = not out.exists()
+    part = out / _PART
+    try:
+        shutil.rmtree(part, ignore_errors=True)  # of one that was killed
+        part.mkdir(parents=True)
+        yield part
+        former = _pictures(out, format_name)
+        files = [path for path in sorted(part.rglob("*")) if path.is_file()]
+        for path in sorted(files, key=lambda path: path.relative_to(part) == _LISTS[format_name]):
+            place = out / path.relative_to(part)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(path, place)
+        # A model of COLMAP's may name pictures that its run has not kept.
+        stay = {path.name for path in files}.union(*(_pictures(out, f) for f in _LISTS if f != format_name))
+        for name in former - stay:
+            (out / _IMAGES / name).unlink(missing_ok=True)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+        if is_new:
+            with contextlib.suppress(OSError):  # there is something in it now
+                out.rmdir()
+
+
+def _pictures(folder: Path, format_name: str) -> set[str]:
+    """Return the names in ``images/`` that a model in a folder shows; none of one that can't be read."""
+    try:
+        text = (folder / _LISTS[format_name]).read_text(encoding="utf-8")
+        if format_name == "colmap":
+            # Two lines each, of which the second one may be empty.
+            lines = [line for line in text.splitlines() if not line.startswith("#")]
+            return {line.split()[-1] for line in lines[::2]}
+        paths = [PurePosixPath(frame["file_path"]) for frame in json.loads(text)["frames"]]
+    except (OSError, ValueError, LookupError, TypeError):
+        return set()
+    return {path.name for path in paths if path.parent == PurePosixPath(_IMAGES)}
