@@ -74,7 +74,14 @@ def _kind(name: str) -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraInfo:
+class _Versioned:
+    """What is first in every message, before its kind."""
+
+    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraInfo(_Versioned):
     """What a receiver must know before the first frame; the decoded images are undistorted.
 
     Attributes:
@@ -97,7 +104,6 @@ class CameraInfo:
         readout_from: Side of the image it begins at.
     """
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("camera")
     agent_id: str = field(metadata=_AGENT_ID)
     agent_epoch: int = field(metadata=_COUNT)
@@ -139,7 +145,7 @@ class CameraInfo:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SymbolFrame:
+class SymbolFrame(_Versioned):
     """Channel symbols of one frame, before (``tx``) or behind (``rx``) the channel.
 
     Attributes:
@@ -168,7 +174,6 @@ class SymbolFrame:
         final: Last frame of a finite source.
     """
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("symbols")
     agent_epoch: int = field(metadata=_COUNT)
     seq: int = field(metadata=_SEQ)
@@ -250,7 +255,7 @@ class SymbolFrame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SourceImage:
+class SourceImage(_Versioned):
     """Agent to recorders: a frame as it was before the encoder. It does not cross the channel.
 
     Attributes:
@@ -261,7 +266,6 @@ class SourceImage:
         data: The compressed image.
     """
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("source")
     agent_epoch: int = field(metadata=_COUNT)
     frame_id: int = field(metadata=_COUNT)
@@ -271,7 +275,7 @@ class SourceImage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinkReport:
+class LinkReport(_Versioned):
     """Receiver to agent: how good the link was for a frame that is decoded, and how many were passed over.
 
     Attributes:
@@ -282,7 +286,6 @@ class LinkReport:
         num_superseded: Frames of this epoch that arrived and were passed over so far, since newer ones came.
     """
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("link")
     agent_epoch: int = field(metadata=_COUNT)
     frame_id: int = field(metadata=_COUNT)
@@ -292,7 +295,7 @@ class LinkReport:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FlowMessage:
+class FlowMessage(_Versioned):
     """Receiver to agent: how far it is, and how many frames may be under way.
 
     In live service it is sent only before the first frame and says that the server is ready for the epoch.
@@ -304,7 +307,6 @@ class FlowMessage:
         window: Frames that may be sent from ``next_seq`` on.
     """
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("flow")
     agent_epoch: int = field(metadata=_COUNT)
     next_seq: int = field(metadata=_COUNT)
@@ -313,10 +315,9 @@ class FlowMessage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChannelReport:
+class ChannelReport(_Versioned):
     """Channel node to viewers: what was done to a frame. The receiver never decodes with it."""
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("channel")
     agent_epoch: int = field(metadata=_COUNT)
     frame_id: int = field(metadata=_COUNT)
@@ -328,7 +329,7 @@ class ChannelReport:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseMessage:
+class PoseMessage(_Versioned):
     """The camera's pose for one frame.
 
     Attributes:
@@ -341,7 +342,6 @@ class PoseMessage:
             until it meets an older one and becomes part of it.
     """
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("pose")
     agent_epoch: int = field(metadata=_COUNT)
     frame_id: int = field(metadata=_COUNT)
@@ -356,7 +356,7 @@ class PoseMessage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MetricPose:
+class MetricPose(_Versioned):
     """The camera's pose for one frame in metres and in the frame of a marker, behind its ``pose``.
 
     Attributes:
@@ -369,7 +369,6 @@ class MetricPose:
         num_keyframes: That show it alike.
     """
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("metric_pose")
     agent_epoch: int = field(metadata=_COUNT)
     frame_id: int = field(metadata=_COUNT)
@@ -387,7 +386,7 @@ class MetricPose:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MapMessage:
+class MapMessage(_Versioned):
     """What changed in the map.
 
     Attributes:
@@ -400,7 +399,6 @@ class MapMessage:
         keyframe_poses: ``(K, 4, 4)`` float64 ``T_world_cam``.
     """
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("map")
     agent_epoch: int = field(metadata=_COUNT)
     map_epoch: int = field(metadata=_COUNT)
@@ -427,7 +425,7 @@ class MapMessage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StatusMessage:
+class StatusMessage(_Versioned):
     """How a process is doing, once a second.
 
     Attributes:
@@ -443,7 +441,6 @@ class StatusMessage:
         ended: Of an agent: its source came to its end, and ``counts["sent"]`` frames are all there are.
     """
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("status")
     role: str = field(metadata=rule(Choice(ROLES)))
     agent_epoch: int = field(metadata=_COUNT)
@@ -458,20 +455,18 @@ class StatusMessage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ControlRequest:
+class ControlRequest(_Versioned):
     """Asks a process to do something: ``get``, ``set``, ``reset``, ``save``, ..."""
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("request")
     op: str = field(metadata=_NAME)
     settings: dict[str, Any] = field(default_factory=dict, metadata=rule(Named(Setting())))
 
 
 @dataclass(frozen=True, kw_only=True)
-class ControlReply:
+class ControlReply(_Versioned):
     """Answer to a ``ControlRequest``: the settings now in force, or one line of why it is not done."""
 
-    version: int = field(default=PROTOCOL_VERSION, metadata=_VERSION)
     kind: str = _kind("reply")
     ok: bool = field(metadata=rule(Flag()))
     error: str = field(default="", metadata=rule(Text(1000)))
