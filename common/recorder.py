@@ -17,6 +17,15 @@ from semcast.common.recording_writer import FLUSH_INTERVAL_S, RecordingWriter
 logger = logging.getLogger(__name__)
 
 QUEUE_BYTES = 64 * 1024**2
+#: What an entry of the queue takes beside its payload, about: empty ones would be without end.
+ENTRY_BYTES = 500
+#: Keys of one agent, which are about twenty; each takes room in the index, which has 65535 numbers for them.
+MAX_TOPICS = 1000
+#: Why messages are left out, in words.
+_REASONS = {
+    "queue": "the disk is too slow, or more comes than it can take",
+    "topics": f"they come under more than {MAX_TOPICS} keys",
+}
 #: What a disk, or a number the format has no room for, ends a recording with; the rest is logged in full.
 _EXPECTED = (OSError, ValueError, struct.error)
 
@@ -24,15 +33,16 @@ _EXPECTED = (OSError, ValueError, struct.error)
 class Recorder:
     """Takes messages from any thread and writes them on its own.
 
-    When the disk is too slow, newest messages are dropped and counted. When it is full, that is reported
-    once, and messages that it did not take, and later ones, are counted as dropped.
+    When the disk is too slow, newest messages are dropped and counted, as are those under more keys than an
+    agent has. When the disk is full, that is reported once, and messages that it did not take, and later
+    ones, are counted as dropped.
 
     Args:
         path: File to write. One that is there and not empty is kept under another name: it may be the
             recording of a process that was killed, whose restart this is. Without a message no file is left,
             and no folder made for it.
         header: See ``recording_metadata``.
-        queue_bytes: Payload that may wait for the disk.
+        queue_bytes: What may wait for the disk.
         on_error: Is told in a line why recording ended before it was closed.
 
     Raises:
@@ -104,25 +114,38 @@ class Recorder:
         """
         now_ns = time.time_ns()
         with self._condition:
+            if topic not in self._sequence and len(self._sequence) >= MAX_TOPICS:
+                self._drop("topics")
+                return
             sequence = self._sequence[topic]
             self._sequence[topic] += 1
             if self._closed or self.error is not None:
                 self.drops["closed" if self._closed else "disk"] += 1
-                return
-            if self._queued_bytes + len(data) > self._limit_bytes:
-                self.drops["queue"] += 1
-                return
-            self._queue.append((topic, kind, now_ns, sequence, data))
-            self._queued_bytes += len(data)
-            self._num_taken += 1
-            self._condition.notify()
+            elif self._has_room(len(data)):
+                self._queue.append((topic, kind, now_ns, sequence, data))
+                self._num_taken += 1
+                self._condition.notify()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Queue a named set of texts."""
         with self._condition:
-            if not self._closed and self.error is None:
+            size = sum(len(key) + len(value) for key, value in values.items())
+            if not self._closed and self.error is None and self._has_room(size):
                 self._queue.append((name, dict(values)))
                 self._condition.notify()
+
+    def _has_room(self, num_bytes: int) -> bool:
+        """Take room in the queue for so many bytes, or count what finds none."""
+        if self._queued_bytes + num_bytes + ENTRY_BYTES > self._limit_bytes:
+            self._drop("queue")
+            return False
+        self._queued_bytes += num_bytes + ENTRY_BYTES
+        return True
+
+    def _drop(self, reason: str) -> None:
+        if not self.drops[reason]:
+            logger.warning("messages are left out of %s: %s", self._path, _REASONS[reason])
+        self.drops[reason] += 1
 
     def _run(self) -> None:
         while True:
@@ -171,6 +194,8 @@ class Recorder:
             already, self._closed = self._closed, True
             self._condition.notify()
         self._thread.join(10.0)
+        if not already and (num_left_out := sum(self.drops[reason] for reason in _REASONS)):
+            logger.warning("%d messages were left out of %s", num_left_out, self._path)
         if not already and self.error is None and not self._thread.is_alive():
             try:
                 self._stream.close()

@@ -25,6 +25,8 @@ logger = logging.getLogger(__name__)
 
 #: How often a recorder with nothing else to do looks whether it still records.
 _LOOK_INTERVAL_S = 0.5
+#: Starts of an agent whose cameras are noted: more are no agent's, and each would be remembered.
+MAX_STREAMS = 1000
 #: Name of the metadata record of a stream, followed by its epoch.
 STREAM_METADATA = "semcast.stream"
 
@@ -83,7 +85,8 @@ class StreamNotes:
         self._recorder.put(key, kind, payload)
 
     def _look_for_camera(self, key: str, status: StatusMessage) -> None:
-        if status.role == "agent" and status.agent_epoch not in self._epochs:
+        is_new = status.agent_epoch not in self._epochs and len(self._epochs) < MAX_STREAMS
+        if status.role == "agent" and is_new:
             self.put_camera(agent_of(key), status.agent_epoch)
 
     def put_camera(self, agent_id: str, agent_epoch: int | None = None) -> None:
@@ -93,9 +96,11 @@ class StreamNotes:
             self.put(camera_key(agent_id), pack(camera))
 
     def _note(self, camera: CameraInfo) -> None:
-        if camera.agent_epoch in self._epochs:
+        if camera.agent_epoch in self._epochs or len(self._epochs) >= MAX_STREAMS:
             return
         self._epochs.add(camera.agent_epoch)
+        if len(self._epochs) == MAX_STREAMS:
+            logger.warning("%d starts of agents are noted in the recording; of more no codec is", MAX_STREAMS)
         values = {
             "agent_id": camera.agent_id,
             "codec": camera.codec,

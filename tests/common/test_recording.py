@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from semcast import SourceError
-from semcast.common.recorder import Recorder
+from semcast.common.recorder import ENTRY_BYTES, MAX_TOPICS, Recorder
 from semcast.common.recording_reader import (
     RecordedMessage,
     RecordedMetadata,
@@ -398,6 +398,32 @@ def test_a_slow_disk_drops_newest_messages_counts_them_and_never_blocks(recorder
     assert info.counts["t"] == recorder.num_written == 3000 - recorder.drops["queue"]
     # Gaps inside are seen; those at the very end leave no later message to show them.
     assert 0 <= info.missed.get("t", 0) <= recorder.drops["queue"]
+
+
+def test_a_flood_of_empty_messages_and_notes_does_not_wait_without_end(recorder_onto, caplog):
+    gate = threading.Event()
+    recorder = recorder_onto(SlowStream(gate), queue_bytes=1_000_000)
+    recorder.add_metadata("first", {"long": 700 * "x"})  # the disk waits at it
+    for k in range(3000):
+        recorder.put("t", "pose", b"")
+        recorder.add_metadata(str(k), {})
+    assert recorder.drops["queue"] >= 6000 - 2 * 1_000_000 // ENTRY_BYTES
+    assert caplog.text.count("messages are left out of") == 1
+    gate.set()
+    recorder.close()
+    assert f"{recorder.drops['queue']} messages were left out of" in caplog.text
+
+
+def test_more_keys_than_a_recording_has_numbers_for_do_not_end_it(tmp_path, caplog):
+    path = tmp_path / "flood.mcap"
+    with Recorder(path, HEADER) as recorder:
+        for k in range(66_000):
+            recorder.put(f"semcast/a/{k}", "x", b"")
+        recorder.put("semcast/a/0", "x", b"the stream")
+    assert recorder.error is None
+    assert recorder.drops == {"topics": 66_000 - MAX_TOPICS}
+    assert recorder.num_written == MAX_TOPICS + 1
+    assert caplog.text.count(f"they come under more than {MAX_TOPICS} keys") == 1
 
 
 class FullDisk(io.BytesIO):

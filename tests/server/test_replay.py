@@ -120,6 +120,26 @@ def test_the_camera_of_an_agent_that_came_back_is_asked_for(tmp_path, recording)
     assert stream.num_received == FRAMES
 
 
+def test_no_more_starts_of_agents_are_noted_than_there_can_be(tmp_path, recording, caplog, monkeypatch):
+    monkeypatch.setattr("semcast.server.record.MAX_STREAMS", 3)
+    messages = list(RecordingReader(recording).messages(frozenset({"camera", "status"})))
+    camera = unpack(next(m for m in messages if m.kind == "camera").data, CameraInfo)
+    status = next(m for m in messages if m.topic.endswith("status/agent"))
+    asked = []
+    with Recorder(tmp_path / "many.mcap", recording_metadata("", "test")) as recorder:
+        notes = StreamNotes(recorder, lambda *start: asked.append(start))
+        for k in range(5):
+            notes.put("semcast/agent0/camera", pack(replace(camera, agent_epoch=k)))
+        notes.put(status.topic, status.data)
+    info = RecordingReader(tmp_path / "many.mcap").info()
+    assert sorted(name for name in info.metadata if "stream" in name) == [
+        f"semcast.stream.{k}" for k in range(3)
+    ]
+    assert info.counts["semcast/agent0/camera"] == 5
+    assert not asked
+    assert caplog.text.count("3 starts of agents are noted") == 1
+
+
 def test_everything_that_was_sent_is_in_the_recording(recording):
     counts = RecordingReader(recording).info().counts
     assert counts["semcast/agent0/tx/symbols"] == FRAMES
