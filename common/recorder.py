@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import os
 import struct
 import threading
 import time
@@ -13,6 +14,7 @@ from semcast.common.errors import SourceError, tell_nobody
 from semcast.common.file_lock import is_locked, lock
 from semcast.common.former_file import keep_former
 from semcast.common.recording_writer import FLUSH_INTERVAL_S, RecordingWriter
+from semcast.common.run_folder import shortage
 
 logger = logging.getLogger(__name__)
 
@@ -43,10 +45,13 @@ class Recorder:
             and no folder made for it.
         header: See ``recording_metadata``.
         queue_bytes: What may wait for the disk.
+        results: Folder of a run's results, None without: where they are on the same disk, the recording ends
+            while there is room for them.
         on_error: Is told in a line why recording ended before it was closed.
 
     Raises:
-        SourceError: The file can't be opened, or another recorder is writing it.
+        SourceError: The file can't be opened, another recorder is writing it, or there is no room for more
+            than the results.
     """
 
     def __init__(
@@ -55,6 +60,7 @@ class Recorder:
         header: Mapping[str, str],
         *,
         queue_bytes: int = QUEUE_BYTES,
+        results: Path | None = None,
         on_error: Callable[[str], None] = tell_nobody,
     ) -> None:
         self._path = path
@@ -74,13 +80,16 @@ class Recorder:
         self._new_folders = [folder for folder in path.parents if not folder.exists()]
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            self._shares_disk = results is not None and os.stat(results).st_dev == os.stat(path.parent).st_dev
+            if (why := self._shortage()) is not None:
+                raise OSError(why)
             self._former = keep_former(path)
             self._stream = path.open("wb")
             if path.is_file():  # not a device, such as /dev/null
                 lock(self._stream.fileno())
             self._writer = self._begun(header)
         except OSError as err:
-            raise SourceError(f"{path} can't be written: {err}") from err
+            raise SourceError(f"{path} can't be written: {_why(err)}") from err
         self._thread = threading.Thread(target=self._run, name="semcast-recorder", daemon=True)
         self._thread.start()
 
@@ -155,6 +164,9 @@ class Recorder:
                 self._queued_bytes = 0
                 ending = self._closed
             try:
+                if (why := self._shortage()) is not None:
+                    self._writer.finish()
+                    raise OSError(why)
                 for item in batch:
                     if len(item) == 2:
                         self._writer.add_metadata(*item)
@@ -169,11 +181,15 @@ class Recorder:
             if ending:
                 return
 
+    def _shortage(self) -> str | None:
+        """Say that the disk has no room for more than results; what waits is less than is kept for them."""
+        return shortage(self._path.parent) if self._shares_disk else None
+
     def _fail(self, err: Exception) -> None:
         """Say once that recording ended; what was written up to here stays readable."""
         with contextlib.suppress(OSError):  # nobody is to take the file for one that is being recorded
             self._stream.close()
-        why = str(err) or type(err).__name__
+        why = _why(err)
         text = f"recording into {self._path} ended: {why}"
         logger.error(
             "%s; the stream goes on, %d messages were recorded",
@@ -219,3 +235,7 @@ class Recorder:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+def _why(err: Exception) -> str:
+    return (isinstance(err, OSError) and err.strerror) or str(err) or type(err).__name__

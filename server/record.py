@@ -119,6 +119,7 @@ def recording(
     file: Path,
     settings_toml: str,
     on_error: Callable[[str], None] = tell_nobody,
+    results: Path | None = None,
 ) -> Iterator[Recorder]:
     """Record all that is sent about one agent while the context lasts.
 
@@ -128,12 +129,14 @@ def recording(
         file: Recording to write; one that is there is kept under another name.
         settings_toml: Resolved settings of the program, kept in the recording.
         on_error: Is told at once, in a line, why the file can't be written any more.
+        results: Folder of results that the recording leaves room for, or None.
 
     Raises:
         SourceError: The file can't be written, said before anything else; or it could not be written to its
             end, said when the context ends.
     """
-    with Recorder(file, recording_metadata(settings_toml, __version__), on_error=on_error) as recorder:
+    header = recording_metadata(settings_toml, __version__)
+    with Recorder(file, header, results=results, on_error=on_error) as recorder:
 
         def ask(agent_id: str, agent_epoch: int | None) -> CameraInfo | None:
             with contextlib.suppress(TransportError):  # the session ends while we are at it

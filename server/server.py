@@ -85,7 +85,9 @@ class Server:
             stack.enter_context(output_folder(settings.out))
             if settings.record is not None:
                 record, told = settings.record, self.metrics.error
-                stack.enter_context(recording(session, agent_id, record, to_toml(settings), told))
+                stack.enter_context(
+                    recording(session, agent_id, record, to_toml(settings), told, results=settings.out)
+                )
             self._receiver = stack.enter_context(
                 Receiver(session, agent_id, settings.mode, self.metrics, settings.max_age_ms)
             )

@@ -4,6 +4,7 @@ import json
 import os
 import threading
 import time
+import types
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from full_disk import room_for
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from waiting import until
 
 from semcast import SourceError
 from semcast.common.recorder import ENTRY_BYTES, MAX_TOPICS, Recorder
@@ -462,6 +464,36 @@ def test_a_full_disk_is_reported_once_and_what_was_written_stays_readable(record
     assert recorder.bytes_written == recorder.num_written * 10_000
     assert recorder.num_written + recorder.drops["disk"] == 600
     assert f"{recorder.num_written} messages were recorded" in caplog.text
+
+
+def test_a_recording_leaves_the_end_of_a_disk_to_the_results_and_is_whole(tmp_path, monkeypatch, caplog):
+    free = [101_000_000]
+    monkeypatch.setattr("shutil.disk_usage", lambda path: types.SimpleNamespace(free=free[0]))
+    path, told = tmp_path / "run.mcap", []
+    with Recorder(path, HEADER, results=tmp_path, on_error=told.append) as recorder:
+        recorder.put("t", "pose", b"first")
+        until(lambda: recorder.num_written == 1)
+        free[0] = 99_000_000
+        recorder.put("t", "pose", b"second")
+        until(lambda: recorder.error is not None)
+    why = "99 MB of the disk are free, of which 100 are kept for results"
+    assert told == [f"recording into {path} ended: {why}"]
+    assert recorder.drops == {"disk": 1}
+    info = RecordingReader(path).info()
+    assert info.complete
+    assert info.counts["t"] == 1
+
+
+def test_without_room_for_more_than_the_results_nothing_is_begun(tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda path: types.SimpleNamespace(free=99_000_000))
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"a recording of hours")
+    with pytest.raises(SourceError, match="99 MB of the disk are free, of which 100 are kept for results$"):
+        Recorder(path, HEADER, results=tmp_path)
+    assert path.read_bytes() == b"a recording of hours"
+    with Recorder(path, HEADER) as recorder:  # nothing else is to be written
+        recorder.put("t", "pose", b"first")
+    assert RecordingReader(path).info().counts["t"] == 1
 
 
 def test_a_path_that_can_not_be_written_is_a_clear_error(tmp_path):
