@@ -5,7 +5,7 @@ import itertools
 import logging
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -302,4 +302,14 @@ def _intrinsics(info: Any, *, is_rectified: bool) -> Intrinsics:
             **({} if is_rectified else {"distortion_model": info.distortion_model, "distortion": D.tolist()}),
         }
     )
-    return camera.scaled_to(camera.width // (info.binning_x or 1), camera.height // (info.binning_y or 1))
+    return _binned(camera, int(info.binning_x or 1), int(info.binning_y or 1))
+
+
+def _binned(camera: Intrinsics, columns: int, rows: int) -> Intrinsics:
+    """Return the camera whose pixels are so many columns and rows of another's; what is over is not sent."""
+    width, height = camera.width // columns, camera.height // rows
+    if not width or not height:
+        raise ValueError(
+            f"binning must leave a pixel of {camera.width}x{camera.height}, got {columns}x{rows}"
+        )
+    return replace(camera, width=width * columns, height=height * rows).scaled_to(width, height)

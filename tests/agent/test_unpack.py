@@ -92,11 +92,22 @@ def test_binned_images_of_a_part_of_the_sensor_have_their_own_camera(tmp_path):
     assert open_sequence(tmp_path / "out").stored_camera == camera
 
 
+def test_binned_pixels_are_whole_ones_where_the_sensor_is_no_multiple_of_them(tmp_path):
+    bag = BagMaker()
+    add_images(bag)
+    # Three columns and rows a pixel: of 194x146 two are left over at the right and at the bottom.
+    K_full = (150.0, 0.0, 97.0, 0.0, 153.0, 73.0, 0.0, 0.0, 1.0)
+    bag.camera_info("/cam/camera_info", K_full, D, P, (194, 146), binning=3, time_ns=START)
+    camera = unpack(settings(bag, tmp_path)).camera
+    assert (camera.width, camera.height) == WH
+    np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (50.0, 51.0, 32.0, 24.0))
+
+
 def test_binning_that_leaves_no_pixel_is_an_error_in_a_line(tmp_path):
     bag = BagMaker()
     add_images(bag)
     bag.camera_info("/cam/camera_info", K, D, P, WH, binning=WH[0] + 1, time_ns=START)
-    with pytest.raises(SourceError, match="/cam/camera_info: fx must be a positive number"):
+    with pytest.raises(SourceError, match="/cam/camera_info: binning must leave a pixel of 64x48, got 65x65"):
         unpack(settings(bag, tmp_path))
     assert not (tmp_path / "out").exists()
 
