@@ -1,6 +1,6 @@
 """Pose of a camera from landmarks: weighted refinement with a covariance, and a search without a prior."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import poselib
@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, make_transform, project_to_so3, transform_points
 from semcast.server.geometry.edges import whiteners
-from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front
-from semcast.server.geometry.weighting import HUBER_K
+from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front, project_with_jacobian
+from semcast.server.geometry.ray_observations import RayObservations
+from semcast.server.geometry.weighting import GATE_SIGMAS, HUBER_K
 
 Array = NDArray[np.float64]
 
@@ -22,46 +23,25 @@ class PoseEstimate:
     Attributes:
         T_cam_world: ``(4, 4)``.
         inliers: ``(N,)`` bool, in front of the camera and within the gate.
-        residual_px: ``(N,)`` reprojection errors, whitened where points are uncertain; infinite behind the
-            camera.
+        residual_px: ``(N,)`` reprojection errors, as if they were known alike in all directions; infinite
+            behind the camera.
         covariance: ``(6, 6)`` of a twist in the camera frame, rotation before translation; None where the
             inliers do not fix the pose.
+        num_rays: Observations of points of unknown depth that agree.
+        rays_cost: Sum of their squared distances in standard deviations, each cut off.
     """
 
     T_cam_world: Array
     inliers: NDArray[np.bool_]
     residual_px: Array
     covariance: Array | None
+    num_rays: int = 0
+    rays_cost: float = 0.0
 
     @property
     def num_inliers(self) -> int:
         """Observations that agree with the pose."""
         return int(self.inliers.sum())
-
-
-def project_with_jacobian(xyz_cam: Array, axes: Array) -> tuple[Array, Array]:
-    """Project points and differentiate by a twist that moves them, ``p' = exp(xi) p``.
-
-    One coordinate of all points lies together, as for the derivatives: there are few, and many points.
-
-    Args:
-        xyz_cam: ``(3, N)`` with positive depth.
-        axes: ``(2, 2, N)`` by how many pixels, or whitened ones, ``x / z`` and ``y / z`` move a projection,
-            or ``(2, 2, 1)`` for all points.
-
-    Returns:
-        ``(2, N)`` pixels from the principal point and ``(6, 2, N)`` derivatives, rotation before translation.
-    """
-    inverse_z = 1.0 / xyz_cam[2]
-    u, v = xyz_cam[:2] * inverse_z
-    projected = axes[0] * u + axes[1] * v
-    J = np.empty((6, *projected.shape))
-    J[0] = -axes[1] - projected * v
-    J[1] = axes[0] + projected * u
-    J[2] = axes[1] * u - axes[0] * v
-    J[3:5] = axes * inverse_z
-    J[5] = projected * -inverse_z
-    return projected, J
 
 
 def reprojection_residual(
@@ -88,14 +68,11 @@ def refine_pose(
     gate_px: Array,
     *,
     iterations: int = 10,
-    spread_px: Array | None = None,
+    rays: RayObservations | None = None,
     edge: Array | None = None,
     is_rough: bool = True,
 ) -> PoseEstimate:
     """Minimise weighted reprojection errors under Huber's loss by Gauss-Newton over the pose alone.
-
-    A point whose depth is uncertain has noise ``sigma^2 I + s s^T``, where ``s`` is what a standard deviation
-    of its depth moves its projection by: residuals are whitened to sigma in all directions.
 
     Args:
         camera: Pinhole.
@@ -105,14 +82,14 @@ def refine_pose(
         sigma_px: ``(N,)`` standard deviation of each observation per coordinate.
         gate_px: ``(N,)`` reprojection error up to which an observation is an inlier.
         iterations: Steps at most.
-        spread_px: ``(N, 2)`` the vectors ``s``, None where all points are certain.
+        rays: Observations of points of unknown depth.
         edge: ``(N, 2)`` of the observations, see ``edges``; None where errors have no direction.
         is_rough: The start is: in the first two steps, points three gates off have a say too.
 
     Returns:
         The refined pose; the start with no inlier where nothing could be solved.
     """
-    seen = _whitened_observations(camera, points_world, keypoints_xy, sigma_px, spread_px, edge)
+    seen = _whitened_observations(camera, points_world, keypoints_xy, sigma_px, edge)
     far_px = 3.0 * gate_px
     T = T_cam_world.copy()
     hessian = np.zeros((6, 6))
@@ -123,6 +100,9 @@ def refine_pose(
         step = None
         if equations is not None:
             hessian, gradient = equations
+            if rays is not None:
+                more = rays.normal_equations(camera, T, 4.0 if is_early else 1.0, None if is_early else 3.0)
+                hessian, gradient = hessian + more[0], gradient + more[1]
             step = _damped_step(hessian, gradient)
         if step is None:
             return _without_inliers(T_cam_world.copy(), len(points_world))
@@ -131,7 +111,12 @@ def refine_pose(
             break
     T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
     length = seen.errors_px(T)
-    return PoseEstimate(T, length < gate_px, length, _covariance(hessian))
+    pose = PoseEstimate(T, length < gate_px, length, _covariance(hessian))
+    if rays is None:
+        return pose
+    size = rays.sizes(camera, T)
+    cost = float((np.minimum(size, GATE_SIGMAS) ** 2).sum())
+    return replace(pose, num_rays=int((size < rays.gate).sum()), rays_cost=cost)
 
 
 @dataclass(frozen=True)
@@ -188,13 +173,10 @@ def _whitened_observations(
     points_world: Array,
     keypoints_xy: Array,
     sigma_px: Array,
-    spread_px: Array | None,
     edge: Array | None,
 ) -> _WhitenedObservations:
     """Prepare the arguments of ``refine_pose``."""
     whitener = np.eye(2)[None] if edge is None else whiteners(edge)
-    if spread_px is not None:
-        whitener = _whitener(sigma_px, (whitener @ spread_px[..., None])[..., 0]) @ whitener
     axes = np.ascontiguousarray(whitener.transpose(2, 1, 0)) * [[[camera.fx]], [[camera.fy]]]
     x, y = keypoints_xy[:, 0] - camera.cx, keypoints_xy[:, 1] - camera.cy
     observed = whitener[:, :, 0].T * x + whitener[:, :, 1].T * y
@@ -218,14 +200,6 @@ def _damped_step(hessian: Array, gradient: Array) -> Array | None:
     except np.linalg.LinAlgError:
         return None
     return step if np.isfinite(step).all() else None
-
-
-def _whitener(sigma_px: Array, spread_px: Array) -> Array:
-    """``(N, 2, 2)`` that shortens residuals along the spread so that all directions have sigma."""
-    length = np.linalg.norm(spread_px, axis=1)
-    along = spread_px / np.maximum(length, 1e-12)[:, None]
-    shrink = 1.0 - sigma_px / np.hypot(sigma_px, length)
-    return np.asarray(np.eye(2) - (shrink[:, None] * along)[:, :, None] * along[:, None, :])
 
 
 def _without_inliers(T_cam_world: Array, count: int) -> PoseEstimate:

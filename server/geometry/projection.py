@@ -53,3 +53,28 @@ def projection_jacobian(camera: Intrinsics, points_cam: Array) -> Array:
     jacobian[:, 0, 0], jacobian[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
     jacobian[:, 1, 1], jacobian[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
     return jacobian
+
+
+def project_with_jacobian(xyz_cam: Array, axes: Array) -> tuple[Array, Array]:
+    """Project points and differentiate by a twist that moves them, ``p' = exp(xi) p``.
+
+    One coordinate of all points lies together, as for the derivatives: there are few, and many points.
+
+    Args:
+        xyz_cam: ``(3, N)`` with positive depth.
+        axes: ``(2, 2, N)`` by how many pixels, or whitened ones, ``x / z`` and ``y / z`` move a projection,
+            or ``(2, 2, 1)`` for all points.
+
+    Returns:
+        ``(2, N)`` pixels from the principal point and ``(6, 2, N)`` derivatives, rotation before translation.
+    """
+    inverse_z = 1.0 / xyz_cam[2]
+    u, v = xyz_cam[:2] * inverse_z
+    projected = axes[0] * u + axes[1] * v
+    J = np.empty((6, *projected.shape))
+    J[0] = -axes[1] - projected * v
+    J[1] = axes[0] + projected * u
+    J[2] = axes[1] * u - axes[0] * v
+    J[3:5] = axes * inverse_z
+    J[5] = projected * -inverse_z
+    return projected, J

@@ -9,16 +9,17 @@ point at rest explains where they were seen. Where keyframes have turned wrongly
 the far view as well.
 """
 
-from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
 from semcast.common.camera import Intrinsics
-from semcast.common.geometry import invert_transform, transform_points
+from semcast.server.geometry.epipolar import shape_of
+from semcast.server.geometry.ray_observations import RayObservations
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.refuted import on_something_large
+from semcast.server.mapping.sight import Seen
 from semcast.server.mapping.scene_depth import median_depth
 from semcast.server.mapping.track_ids import rows_among
 from semcast.server.mapping.world_map import Keyframe, WorldMap
@@ -26,51 +27,30 @@ from semcast.server.mapping.world_map import Keyframe, WorldMap
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
 
-#: Standard deviation of an inverse depth, as share of that of the usual depth.
-_INVERSE_DEPTH_SHARE = 0.6
 #: Keyframes whose tracks are looked at.
 _NUM_KEYFRAMES = 12
-#: A point must lie at least this share of its usual depth in front of the camera.
+#: The gate is widened by at most this factor for the uncertainty of the keyframe's observation.
+_MOST_WIDER = 3.0
+#: A point lies at least this share of the usual depth in front of the keyframe.
 _MIN_DEPTH_SHARE = 0.05
-
-
-@dataclass(frozen=True)
-class Rays:
-    """Points at a usual depth for tracks without one.
-
-    Attributes:
-        row: ``(N,)`` which of the tracks asked for.
-        xyz: ``(N, 3)`` world frame.
-        spread_px: ``(N, 2)`` by how much a standard deviation of the inverse depth moves the projection,
-            times the root of N: what is wrong with the usual depth is wrong for all of them, so together they
-            say no more about the camera's way than one.
-        sigma_px: ``(N,)`` standard deviation of the observation in the keyframe.
-    """
-
-    row: NDArray[np.intp]
-    xyz: Array
-    spread_px: Array
-    sigma_px: Array
 
 
 def rays_of(
     camera: Intrinsics,
     world: WorldMap,
     noise: NoiseModel,
-    ids: Ids,
-    T_world_cam: Array,
+    seen: Seen,
     submap: int,
     *,
     with_refuted: bool = False,
-) -> Rays | None:
+) -> RayObservations | None:
     """Rays of tracks from the newest keyframe that saw each.
 
     Args:
         camera: Pinhole.
         world: The map.
         noise: Of the observations in keyframes.
-        ids: ``(M,)`` tracks.
-        T_world_cam: Approximate pose of the camera.
+        seen: Tracks without a landmark.
         submap: Part of the map whose keyframes count.
         with_refuted: Take what that keyframe refuted too, where that is much.
 
@@ -78,17 +58,15 @@ def rays_of(
         Those of the tracks that a keyframe saw, without those that it refuted unless they are asked for; None
         where there is none or no depth is known.
     """
+    found, refuted = np.zeros(len(seen), bool), np.zeros(len(seen), bool)
+    depth, parts = float("inf"), []
     views = _newest(world, submap)
-    depth = float("inf")
-    T_cam_world = invert_transform(T_world_cam)
-    xyz, spread_px, sigma_px = np.zeros((len(ids), 3)), np.zeros((len(ids), 2)), np.zeros(len(ids))
-    found, refuted = np.zeros(len(ids), bool), np.zeros(len(ids), bool)
     for position, keyframe in enumerate(views):
-        row = rows_among(ids, keyframe.ids)
+        row = rows_among(seen.ids, keyframe.ids)
         new = np.flatnonzero(~found & ~refuted & (row >= 0))
         # A few that are refuted have slipped. Many are something large, or the far view.
         if len(keyframe.refuted) and not (with_refuted and len(on_something_large(keyframe))):
-            refuted[new] = np.isin(ids[new], keyframe.refuted)
+            refuted[new] = np.isin(seen.ids[new], keyframe.refuted)
             new = new[~refuted[new]]
         if len(new) == 0:
             continue
@@ -96,25 +74,29 @@ def rays_of(
         depth = own if np.isfinite(own) else depth
         if not np.isfinite(depth):
             break
-        point = camera.unproject(keyframe.xy[row[new]]) * depth
-        T_cam_keyframe = T_cam_world @ keyframe.T_world_cam
-        x, y, z = transform_points(T_cam_keyframe, point).T
-        front = z > _MIN_DEPTH_SHARE * depth
-        z = np.where(front, z, 1.0)
-        # The derivative of the projection by the inverse depth, times its standard deviation.
-        t = _INVERSE_DEPTH_SHARE * T_cam_keyframe[:3, 3]
-        spread_px[new] = np.column_stack(
-            [camera.fx * (t[0] - x / z * t[2]) / z, camera.fy * (t[1] - y / z * t[2]) / z]
-        )
-        xyz[new] = transform_points(keyframe.T_world_cam, point)
-        sigma_px[new] = noise.sigma_px(keyframe.confidence[row[new]])
-        found[new[front]] = True
+        parts.append(_from(keyframe, row[new], depth, camera, noise, seen[new]))
+        found[new] = True
         if (found | refuted).all():
             break
-    rows = np.flatnonzero(found)
-    if len(rows) == 0:
-        return None
-    return Rays(rows, xyz[rows], np.sqrt(len(rows)) * spread_px[rows], sigma_px[rows])
+    return RayObservations.joined(parts) if parts else None
+
+
+def _from(
+    keyframe: Keyframe, row: NDArray[np.intp], depth: float, camera: Intrinsics, noise: NoiseModel, seen: Seen
+) -> RayObservations:
+    T = keyframe.T_world_cam
+    sigma_px, sigma_then_px = noise.sigma_px(seen.confidence), noise.sigma_px(keyframe.confidence[row])
+    shape, shape_then = shape_of(seen.edge), shape_of(keyframe.edge[row])
+    covariance = sigma_px[:, None, None] ** 2 * shape + sigma_then_px[:, None, None] ** 2 * shape_then
+    wider = np.minimum(np.hypot(sigma_px, sigma_then_px) / sigma_px, _MOST_WIDER)
+    return RayObservations(
+        origin=np.repeat(T[:3, 3:], len(row), axis=1),
+        direction=T[:3, :3] @ camera.unproject(keyframe.xy[row]).T,
+        nearest=np.full(len(row), 1.0 / (_MIN_DEPTH_SHARE * depth)),
+        observed=(seen.xy - (camera.cx, camera.cy)).T,
+        covariance=np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]]),
+        gate=noise.threshold_px(seen.confidence) * wider / np.hypot(sigma_px, sigma_then_px),
+    )
 
 
 def much_is_refuted(world: WorldMap, submap: int) -> bool:

@@ -42,14 +42,17 @@ _MOST_TAKEN = 12.0
 #: And how much more for each landmark: in a scene at rest it is up to 0.18, and 0.2 to 8 where the rays are
 #: of something that moves by itself.
 _MOST_TAKEN_EACH = 0.2
+#: Where the landmarks leave a turn in doubt by more pixels than this (standard deviation),
+_TURN_IN_DOUBT_PX = 1.0
+#: it is this: the few that are left lie together, and their own errors are as much alike.
+_MOST_TAKEN_IN_DOUBT = 1.0
 #: With fewer landmarks in sight than this, rays may carry the pose on.
 _RUN_OUT = 30
 #: Number and share of rays that must agree for that.
 _CARRY = (60, 0.6)
 #: Landmarks that must be left and agree: without any, nothing tells turning from moving.
 _MIN_LEFT = 4
-#: The gate of a ray is widened by at most this factor for the uncertainty of the keyframe's observation.
-_MOST_WIDER = 3.0
+ITER = 10
 
 
 @dataclass(frozen=True)
@@ -179,10 +182,14 @@ def track_pose(
         kept = max(enough, _MIN_KEPT_SHARE * best.num_inliers)
         # Near landmarks at one depth can't tell a turn from a way. Keyframes that followed them refute the
         # far view, which can: so all tracks are asked first, and landmarks tell whether they may be right.
+        starts = [invert_transform(best.T_cam_world)]
+        if T_world_guess is not None and _turn_in_doubt_px(best, camera) > _TURN_IN_DOUBT_PX:
+            starts.append(T_world_guess)
         for with_refuted in (True, False) if much_is_refuted(world, submap) else (False,):
-            steadied = with_rays(invert_transform(best.T_cam_world), _STEADY, kept, with_refuted=with_refuted)
-            if steadied is not None and _is_borne_out(steadied, best, marks):
-                best = steadied
+            steadied = [with_rays(start, _STEADY, kept, with_refuted=with_refuted) for start in starts]
+            believed = [p for p in steadied if p is not None and _is_borne_out(p, best, marks, camera)]
+            if believed:
+                best = min(believed, key=lambda p: _cost(p, marks.sigma_px) + p.rays_cost)
                 break
     elif may_carry and T_world_guess is not None and len(marks.xyz) < _RUN_OUT:
         best = with_rays(T_world_guess, _CARRY, max(_MIN_LEFT, min_share * len(marks.xyz)))
@@ -239,10 +246,21 @@ def _pose_from_landmarks(
     return best
 
 
-def _is_borne_out(steadied: PoseEstimate, before: PoseEstimate, marks: _SeenLandmarks) -> bool:
+def _is_borne_out(
+    steadied: PoseEstimate, before: PoseEstimate, marks: _SeenLandmarks, camera: Intrinsics
+) -> bool:
     """Whether landmarks agree with a pose that rays have steadied, but for what noise does to them."""
-    most_taken = _MOST_TAKEN + _MOST_TAKEN_EACH * len(marks.xyz)
+    is_in_doubt = _turn_in_doubt_px(before, camera) > _TURN_IN_DOUBT_PX
+    each = _MOST_TAKEN_IN_DOUBT if is_in_doubt else _MOST_TAKEN_EACH
+    most_taken = _MOST_TAKEN + each * len(marks.xyz)
     return _cost(steadied, marks.sigma_px) < _cost(before, marks.sigma_px) + most_taken
+
+
+def _turn_in_doubt_px(pose: PoseEstimate, camera: Intrinsics) -> float:
+    """By how much a turn about the least certain axis moves the image, one standard deviation of it."""
+    if pose.covariance is None:
+        return float("inf")
+    return float(min(camera.fx, camera.fy) * np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1]))
 
 
 def _cost(pose: PoseEstimate, sigma_px: Array) -> float:
@@ -280,24 +298,12 @@ def _with_rays(
     Returns:
         The pose with the landmarks it agrees with; None where too few agree.
     """
-    rays = rays_of(camera, world, noise, others.ids, T_world_cam, submap, with_refuted=with_refuted)
-    if rays is None or len(rays.row) < needed[0]:
+    rays = rays_of(camera, world, noise, others, submap, with_refuted=with_refuted)
+    if rays is None or len(rays) < needed[0]:
         return None
-    count, with_ray = len(marks.xyz), others[rays.row]
-    points = np.concatenate([marks.xyz, rays.xyz])
-    observed = np.concatenate([marks.tracks.xy, with_ray.xy])
-    ray_sigma, ray_gate = noise.sigma_px(with_ray.confidence), noise.threshold_px(with_ray.confidence)
-    # Both ends of a ray are observed, the keyframe's and this one.
-    wider = np.hypot(ray_sigma, rays.sigma_px) / ray_sigma
-    sigma = np.concatenate([marks.sigma_px, ray_sigma * wider])
-    gate = np.concatenate([marks.gate_px, ray_gate * np.minimum(wider, _MOST_WIDER)])
-    spread = np.concatenate([np.zeros((count, 2)), rays.spread_px])
-    edge = np.concatenate([marks.tracks.edge, with_ray.edge])
+    observed = (marks.xyz, marks.tracks.xy, marks.sigma_px, marks.gate_px)
     start = invert_transform(T_world_cam)
-    pose = refine_pose(
-        camera, start, points, observed, sigma, gate, iterations=6, spread_px=spread, edge=edge
-    )
-    agreeing, rays_agreeing = pose.inliers[:count], pose.inliers[count:]
-    if agreeing.sum() < min_inliers or rays_agreeing.sum() < max(needed[0], needed[1] * len(rays.row)):
+    pose = refine_pose(camera, start, *observed, iterations=ITER, rays=rays, edge=marks.tracks.edge)
+    if pose.num_inliers < min_inliers or pose.num_rays < max(needed[0], needed[1] * len(rays)):
         return None
-    return replace(pose, inliers=agreeing, residual_px=pose.residual_px[:count])
+    return pose

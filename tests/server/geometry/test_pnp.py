@@ -4,7 +4,8 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, invert_transform, log_so3, rotation_angle_deg, transform_points
 from semcast.server.geometry.edges import whiteners
-from semcast.server.geometry.pnp import project_with_jacobian, refine_pose, search_pose
+from semcast.server.geometry.pnp import refine_pose, search_pose
+from semcast.server.geometry.projection import project_with_jacobian
 
 CAMERA = Intrinsics(fx=500, fy=480, cx=320, cy=240, width=640, height=480)
 

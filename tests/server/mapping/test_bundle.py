@@ -9,7 +9,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_se3, exp_so3, invert_transform, make_transform, transform_points
 from semcast.server.geometry.edges import alike, rounded
-from semcast.server.geometry.pnp import project_with_jacobian
+from semcast.server.geometry.projection import project_with_jacobian
 from semcast.server.mapping import bundle, dense_bundle
 from semcast.server.mapping.bundle import InlineBundle, optimise, quantised_sigma, residuals_px
 from semcast.server.mapping.bundle_problem import BundleProblem
