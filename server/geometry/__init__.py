@@ -28,6 +28,7 @@ Two views
 
 Pose and structure
     pnp              pose from landmarks
+    ray_observations and from points of which only the ray is known
     triangulation    points from rays
     projection       world points in a camera, and the derivatives of their pixels
     motion           constant-velocity prior

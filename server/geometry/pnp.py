@@ -1,6 +1,6 @@
 """Pose of a camera from landmarks: weighted refinement with a covariance, and a search without a prior."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import poselib
@@ -11,7 +11,7 @@ from semcast.common.geometry import exp_se3, make_transform, project_to_so3, tra
 from semcast.server.geometry.edges import whiteners
 from semcast.server.geometry.projection import MIN_DEPTH_MAP, project_in_front, project_with_jacobian
 from semcast.server.geometry.ray_observations import RayObservations
-from semcast.server.geometry.weighting import GATE_SIGMAS, HUBER_K
+from semcast.server.geometry.weighting import HUBER_K
 
 Array = NDArray[np.float64]
 
@@ -27,16 +27,12 @@ class PoseEstimate:
             behind the camera.
         covariance: ``(6, 6)`` of a twist in the camera frame, rotation before translation; None where the
             inliers do not fix the pose.
-        num_rays: Observations of points of unknown depth that agree.
-        rays_cost: Sum of their squared distances in standard deviations, each cut off.
     """
 
     T_cam_world: Array
     inliers: NDArray[np.bool_]
     residual_px: Array
     covariance: Array | None
-    num_rays: int = 0
-    rays_cost: float = 0.0
 
     @property
     def num_inliers(self) -> int:
@@ -111,12 +107,7 @@ def refine_pose(
             break
     T = make_transform(project_to_so3(T[:3, :3]), T[:3, 3])
     length = seen.errors_px(T)
-    pose = PoseEstimate(T, length < gate_px, length, _covariance(hessian))
-    if rays is None:
-        return pose
-    size = rays.sizes(camera, T)
-    cost = float((np.minimum(size, GATE_SIGMAS) ** 2).sum())
-    return replace(pose, num_rays=int((size < rays.gate).sum()), rays_cost=cost)
+    return PoseEstimate(T, length < gate_px, length, _covariance(hessian))
 
 
 @dataclass(frozen=True)

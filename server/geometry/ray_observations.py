@@ -1,10 +1,11 @@
-"""Observations of points whose depth nobody knows: what they tell of a pose.
+"""Observations of points of which only the ray is known: what they tell of a pose.
 
-A point that another camera saw lies on a ray. In this image that ray is a part of an epipolar line: it begins
-where the point would be if it were infinitely far away, and ends where it would be at the nearest depth that is
-thought possible. How far an observation is off that part tells of the pose, and where along it does not. Each
-point takes the depth that explains its observation best, anew at each pose (variable projection: Golub and
-Pereyra 1973), so the derivatives are those of a point at that depth.
+A ray from another camera is a piece of an epipolar line in this image. It begins where the point would be if
+it were infinitely far away, and ends where it would be at the nearest depth that is thought possible. How far
+an observation is off that piece tells of the pose; where along it, tells nothing. Each point takes the depth
+that explains its observation best, anew at each pose, and derivatives are those of a point at that depth
+(variable projection: Golub and Pereyra 1973). A line that is fixed at one pose, as of a point whose depth is
+uncertain, would hold the pose to it: it turns as the camera moves, most for points near the keyframe.
 """
 
 from collections.abc import Sequence
@@ -21,11 +22,13 @@ Array = NDArray[np.float64]
 
 #: Part of the depth in the other camera that a point must have in this one.
 _MIN_DEPTH_RATIO = 0.05
+#: Pixels per inverse depth below which a camera has not moved.
+_NO_WAY_PX = 1e-9
 
 
 @dataclass(frozen=True)
 class RayObservations:
-    """Observations of points on rays; coordinates lead, so that numpy sums over contiguous rows.
+    """Observations of points on rays. Coordinates lead, so that numpy sums over contiguous rows.
 
     Attributes:
         origin: ``(3, N)`` centres of the cameras that saw the points, world frame.
@@ -46,13 +49,9 @@ class RayObservations:
     def __len__(self) -> int:
         return self.observed.shape[1]
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> "RayObservations":
-        parts = (self.origin, self.direction, self.nearest, self.observed, self.covariance, self.gate)
-        return RayObservations(*(part[..., rows] for part in parts))
-
     @classmethod
     def joined(cls, parts: Sequence["RayObservations"]) -> "RayObservations":
-        """All observations of several."""
+        """Put the observations of several together."""
         names = (field.name for field in fields(cls))
         return cls(**{name: np.concatenate([getattr(p, name) for p in parts], axis=-1) for name in names})
 
@@ -86,7 +85,7 @@ class _Linearised:
     """Residuals at a pose and their derivatives.
 
     Attributes:
-        residual: ``(2, N)`` across the line, and along it beyond the ray's ends, in standard deviations.
+        residual: ``(2, N)`` across the line, and along it beyond the ends of the ray, in standard deviations.
         J: ``(6, 2, N)`` derivatives of the projection by a twist, rotation before translation.
         used: ``(N,)`` bool, which are in front of the camera.
     """
@@ -97,42 +96,41 @@ class _Linearised:
 
     @classmethod
     def of(cls, rays: RayObservations, camera: Intrinsics, T_cam_world: Array) -> "_Linearised":
+        """Linearise at a pose."""
         R, t = T_cam_world[:3, :3], T_cam_world[:3, 3:]
-        turned, centre = R @ rays.direction, R @ rays.origin + t
-        used = turned[2] > _MIN_DEPTH_RATIO
-        z = np.where(used, turned[2], 1.0)
-        far_away = turned / z
-        centre = centre / z
-        focal = np.array([[camera.fx], [camera.fy]])
-        # How the projection moves as the point comes nearer, and so where along its way the observation is.
-        way = focal * (centre[:2] - far_away[:2] * centre[2])
+        infinity, origin = R @ rays.direction, R @ rays.origin + t
+        used = infinity[2] > _MIN_DEPTH_RATIO
+        z = np.where(used, infinity[2], 1.0)
+        infinity, origin = infinity / z, origin / z
+        focal_px = np.array([[camera.fx], [camera.fy]])
+        # How the projection moves as the point comes nearer, and how far on that way the observation is.
+        way = focal_px * (origin[:2] - infinity[:2] * origin[2])
         length = np.sqrt((way * way).sum(axis=0))
-        way = way / np.maximum(length, 1e-12)
-        offset = rays.observed - focal * far_away[:2]
+        # A camera that has only turned sees no line but a point: any direction will do.
+        way = np.where(length > _NO_WAY_PX, way / np.maximum(length, _NO_WAY_PX), [[1.0], [0.0]])
+        offset = rays.observed - focal_px * infinity[:2]
         along = (offset * way).sum(axis=0)
         across = offset[1] * way[0] - offset[0] * way[1]
-        depth_there = 1.0 + rays.nearest * centre[2]
-        passes = depth_there < _MIN_DEPTH_RATIO
-        end = np.where(passes, np.inf, rays.nearest * length / np.where(passes, 1.0, depth_there))
+        at_end = 1.0 + rays.nearest * origin[2]
+        end = np.where(
+            at_end > _MIN_DEPTH_RATIO,
+            rays.nearest * length / np.maximum(at_end, _MIN_DEPTH_RATIO),
+            np.inf,
+        )
         on_ray = np.clip(along, 0.0, end)
-        inverse_depth = np.clip(on_ray / np.maximum(length - on_ray * centre[2], 1e-12), 0.0, rays.nearest)
-        xx, xy, yy = rays.covariance
-        scale = np.stack(
-            [
-                xx * way[1] ** 2 - 2.0 * xy * way[0] * way[1] + yy * way[0] ** 2,
-                xx * way[0] ** 2 + 2.0 * xy * way[0] * way[1] + yy * way[1] ** 2,
-            ]
-        )
-        scale = 1.0 / np.sqrt(np.maximum(scale, 1e-12))
         beyond = along - on_ray
-        residual = np.stack([across, beyond]) * scale * used
-        # ``axes[j][i]`` is what a pixel of coordinate j counts for residual i.
-        axes = np.stack(
-            [
-                np.stack([-way[1], way[0] * (beyond != 0.0)]) * scale * camera.fx,
-                np.stack([way[0], way[1] * (beyond != 0.0)]) * scale * camera.fy,
-            ]
-        )
-        _, J = project_with_jacobian(far_away + inverse_depth * centre, axes)
+        inverse_depth = on_ray / np.maximum(length - on_ray * origin[2], 1e-12)
+        per_sigma = 1.0 / np.sqrt(_variances(rays.covariance, way))
+        # ``axes[j, i]`` is what a pixel of coordinate j counts for residual i; on the ray, ``along`` is free.
+        across_axis, along_axis = np.stack([-way[1], way[0]]), way * (beyond != 0.0)
+        axes = np.stack([across_axis, along_axis], axis=1) * per_sigma * focal_px[:, None]
+        _, J = project_with_jacobian(infinity + inverse_depth * origin, axes)
         J[3:] *= inverse_depth / z
-        return cls(residual, J, used)
+        return cls(np.stack([across, beyond]) * per_sigma * used, J, used)
+
+
+def _variances(covariance: Array, way: Array) -> Array:
+    """Variances ``(2, N)`` across unit vectors ``(2, N)`` and along them."""
+    xx, xy, yy = covariance
+    x2, y2, both = way[0] ** 2, way[1] ** 2, 2.0 * xy * way[0] * way[1]
+    return np.stack([xx * y2 - both + yy * x2, xx * x2 + both + yy * y2])

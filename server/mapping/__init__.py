@@ -25,7 +25,7 @@ Tracks (2D)
 Pose of a frame
     locator           what is tried for a frame's pose: its tracks, then landmarks that lost theirs
     tracker           pose from landmarks (PnP), steadied by rays
-    rays              tracks without a depth: inverse depth with its uncertainty
+    rays              tracks without a depth, on rays from keyframes
     recall            lost landmarks, looked for again where the pose expects them
 
 Start of a map

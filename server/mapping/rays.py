@@ -1,9 +1,8 @@
 """Tracks without a depth, as rays from the keyframe that saw them: they hold the camera's rotation.
 
 While a camera turns, most of what it sees is new, and the few landmarks left lie on one side of the image,
-where turning and moving look alike. The new tracks are many and everywhere. How far their points are is known
-roughly, as far as others: that much uncertainty moves a projection only along one line, and hardly at all
-while the camera is near the keyframe (inverse depth with its uncertainty: Civera, Davison and Montiel 2008).
+where turning and moving look alike. The new tracks are many and everywhere. Nobody knows how far their points
+are, but each lies on a ray (``ray_observations``), which near the keyframe is a short line in the image.
 Something large that moves by itself has such tracks too, many, and for long: keyframes tell them by that no
 point at rest explains where they were seen. Where keyframes have turned wrongly themselves, that is said of
 the far view as well.
@@ -19,8 +18,8 @@ from semcast.server.geometry.epipolar import shape_of
 from semcast.server.geometry.ray_observations import RayObservations
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.refuted import on_something_large
-from semcast.server.mapping.sight import Seen
 from semcast.server.mapping.scene_depth import median_depth
+from semcast.server.mapping.sight import Seen
 from semcast.server.mapping.track_ids import rows_among
 from semcast.server.mapping.world_map import Keyframe, WorldMap
 
@@ -29,8 +28,6 @@ Ids = NDArray[np.int64]
 
 #: Keyframes whose tracks are looked at.
 _NUM_KEYFRAMES = 12
-#: The gate is widened by at most this factor for the uncertainty of the keyframe's observation.
-_MOST_WIDER = 3.0
 #: A point lies at least this share of the usual depth in front of the keyframe.
 _MIN_DEPTH_SHARE = 0.05
 
@@ -44,12 +41,12 @@ def rays_of(
     *,
     with_refuted: bool = False,
 ) -> RayObservations | None:
-    """Rays of tracks from the newest keyframe that saw each.
+    """Observations of tracks on rays from the newest keyframe that saw each.
 
     Args:
         camera: Pinhole.
         world: The map.
-        noise: Of the observations in keyframes.
+        noise: Gives each observation its sigma.
         seen: Tracks without a landmark.
         submap: Part of the map whose keyframes count.
         with_refuted: Take what that keyframe refuted too, where that is much.
@@ -74,28 +71,29 @@ def rays_of(
         depth = own if np.isfinite(own) else depth
         if not np.isfinite(depth):
             break
-        parts.append(_from(keyframe, row[new], depth, camera, noise, seen[new]))
+        parts.append(_on_rays_from(keyframe, row[new], depth, camera, noise, seen[new]))
         found[new] = True
         if (found | refuted).all():
             break
     return RayObservations.joined(parts) if parts else None
 
 
-def _from(
+def _on_rays_from(
     keyframe: Keyframe, row: NDArray[np.intp], depth: float, camera: Intrinsics, noise: NoiseModel, seen: Seen
 ) -> RayObservations:
+    """What is seen of tracks that are in these rows of a keyframe, whose scene has a usual depth."""
     T = keyframe.T_world_cam
     sigma_px, sigma_then_px = noise.sigma_px(seen.confidence), noise.sigma_px(keyframe.confidence[row])
     shape, shape_then = shape_of(seen.edge), shape_of(keyframe.edge[row])
     covariance = sigma_px[:, None, None] ** 2 * shape + sigma_then_px[:, None, None] ** 2 * shape_then
-    wider = np.minimum(np.hypot(sigma_px, sigma_then_px) / sigma_px, _MOST_WIDER)
+    gate_px, gate_then_px = noise.threshold_px(seen.confidence), noise.threshold_px(keyframe.confidence[row])
     return RayObservations(
         origin=np.repeat(T[:3, 3:], len(row), axis=1),
         direction=T[:3, :3] @ camera.unproject(keyframe.xy[row]).T,
         nearest=np.full(len(row), 1.0 / (_MIN_DEPTH_SHARE * depth)),
         observed=(seen.xy - (camera.cx, camera.cy)).T,
         covariance=np.stack([covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]]),
-        gate=noise.threshold_px(seen.confidence) * wider / np.hypot(sigma_px, sigma_then_px),
+        gate=np.minimum(gate_px / sigma_px, gate_then_px / sigma_then_px),
     )
 
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from semcast.common.camera import Intrinsics
 from semcast.common.geometry import invert_transform, transform_points
 from semcast.server.geometry.pnp import PoseEstimate, refine_pose, search_pose
 from semcast.server.geometry.projection import MIN_DEPTH_MAP
+from semcast.server.geometry.ray_observations import RayObservations
 from semcast.server.geometry.square_distance import square_distances
 from semcast.server.geometry.weighting import NoiseModel
 from semcast.server.mapping.rays import much_is_refuted, rays_of
@@ -42,17 +42,15 @@ _MOST_TAKEN = 12.0
 #: And how much more for each landmark: in a scene at rest it is up to 0.18, and 0.2 to 8 where the rays are
 #: of something that moves by itself.
 _MOST_TAKEN_EACH = 0.2
-#: Where the landmarks leave a turn in doubt by more pixels than this (standard deviation),
+#: Landmarks leave a turn in doubt where its standard deviation is more pixels than this. They lie together
+#: then, so their own errors are alike: rays may contradict them by as much as they gain, while most agree.
 _TURN_IN_DOUBT_PX = 1.0
-#: it is this: the few that are left lie together, and their own errors are as much alike.
-_MOST_TAKEN_IN_DOUBT = 1.0
 #: With fewer landmarks in sight than this, rays may carry the pose on.
 _RUN_OUT = 30
 #: Number and share of rays that must agree for that.
 _CARRY = (60, 0.6)
 #: Landmarks that must be left and agree: without any, nothing tells turning from moving.
 _MIN_LEFT = 4
-ITER = 10
 
 
 @dataclass(frozen=True)
@@ -176,23 +174,25 @@ def track_pose(
     known = world.landmarks.rows(seen.ids) >= 0
     marks, others = _SeenLandmarks.of(seen[known], world, noise), seen[~known]
     best = _pose_from_landmarks(camera, marks, T_world_guess, seed, is_after_gap=is_after_gap)
-    with_rays = partial(_with_rays, camera, world, noise, marks, others, submap)
     enough = max(MIN_INLIERS, min_share * len(marks.xyz))
     if best is not None and best.num_inliers >= enough and np.isfinite(best.T_cam_world).all():
-        kept = max(enough, _MIN_KEPT_SHARE * best.num_inliers)
+        starts = [best.T_cam_world]
+        if T_world_guess is not None and _turn_is_in_doubt(best, camera):
+            starts.append(invert_transform(T_world_guess))
         # Near landmarks at one depth can't tell a turn from a way. Keyframes that followed them refute the
         # far view, which can: so all tracks are asked first, and landmarks tell whether they may be right.
-        starts = [invert_transform(best.T_cam_world)]
-        if T_world_guess is not None and _turn_in_doubt_px(best, camera) > _TURN_IN_DOUBT_PX:
-            starts.append(T_world_guess)
         for with_refuted in (True, False) if much_is_refuted(world, submap) else (False,):
-            steadied = [with_rays(start, _STEADY, kept, with_refuted=with_refuted) for start in starts]
-            believed = [p for p in steadied if p is not None and _is_borne_out(p, best, marks, camera)]
-            if believed:
-                best = min(believed, key=lambda p: _cost(p, marks.sigma_px) + p.rays_cost)
+            rays = rays_of(camera, world, noise, others, submap, with_refuted=with_refuted)
+            kept = max(enough, _MIN_KEPT_SHARE * best.num_inliers)
+            found = [_with_rays(camera, marks, rays, start, _STEADY, kept) for start in starts]
+            steadied = [p for p in found if p is not None and _is_borne_out(p, best, marks, rays, camera)]
+            if steadied:
+                best = min(steadied, key=lambda p: _cost(p, marks, rays, camera))
                 break
     elif may_carry and T_world_guess is not None and len(marks.xyz) < _RUN_OUT:
-        best = with_rays(T_world_guess, _CARRY, max(_MIN_LEFT, min_share * len(marks.xyz)))
+        rays = rays_of(camera, world, noise, others, submap)
+        left = max(_MIN_LEFT, min_share * len(marks.xyz))
+        best = _with_rays(camera, marks, rays, invert_transform(T_world_guess), _CARRY, left)
     else:
         best = None
     if best is None:
@@ -246,64 +246,67 @@ def _pose_from_landmarks(
     return best
 
 
-def _is_borne_out(
-    steadied: PoseEstimate, before: PoseEstimate, marks: _SeenLandmarks, camera: Intrinsics
-) -> bool:
-    """Whether landmarks agree with a pose that rays have steadied, but for what noise does to them."""
-    is_in_doubt = _turn_in_doubt_px(before, camera) > _TURN_IN_DOUBT_PX
-    each = _MOST_TAKEN_IN_DOUBT if is_in_doubt else _MOST_TAKEN_EACH
-    most_taken = _MOST_TAKEN + each * len(marks.xyz)
-    return _cost(steadied, marks.sigma_px) < _cost(before, marks.sigma_px) + most_taken
-
-
-def _turn_in_doubt_px(pose: PoseEstimate, camera: Intrinsics) -> float:
-    """By how much a turn about the least certain axis moves the image, one standard deviation of it."""
-    if pose.covariance is None:
-        return float("inf")
-    return float(min(camera.fx, camera.fy) * np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1]))
-
-
-def _cost(pose: PoseEstimate, sigma_px: Array) -> float:
-    """Sum of the squared errors of landmarks in standard deviations, each cut off."""
-    return float((np.minimum(pose.residual_px / sigma_px, _CUT_SIGMAS) ** 2).sum())
-
-
 def _with_rays(
     camera: Intrinsics,
-    world: WorldMap,
-    noise: NoiseModel,
     marks: _SeenLandmarks,
-    others: Seen,
-    submap: int,
-    T_world_cam: Array,
+    rays: RayObservations | None,
+    T_cam_world: Array,
     needed: tuple[int, float],
     min_inliers: float,
-    *,
-    with_refuted: bool = False,
 ) -> PoseEstimate | None:
     """Refine a pose with what the tracks without a landmark say too.
 
     Args:
         camera: Pinhole.
-        world: The map.
-        noise: Gives each observation its sigma.
         marks: Tracks that have a landmark.
-        others: Those that have none.
-        submap: Part of the map the camera is in.
-        T_world_cam: Where to begin.
+        rays: Those that have none.
+        T_cam_world: Where to begin.
         needed: Number of rays that must agree, and the share of all rays.
         min_inliers: Landmarks that must agree.
-        with_refuted: See ``rays_of``.
 
     Returns:
         The pose with the landmarks it agrees with; None where too few agree.
     """
-    rays = rays_of(camera, world, noise, others, submap, with_refuted=with_refuted)
     if rays is None or len(rays) < needed[0]:
         return None
     observed = (marks.xyz, marks.tracks.xy, marks.sigma_px, marks.gate_px)
-    start = invert_transform(T_world_cam)
-    pose = refine_pose(camera, start, *observed, iterations=ITER, rays=rays, edge=marks.tracks.edge)
-    if pose.num_inliers < min_inliers or pose.num_rays < max(needed[0], needed[1] * len(rays)):
+    pose = refine_pose(camera, T_cam_world, *observed, rays=rays, edge=marks.tracks.edge)
+    num_agreeing = int((rays.sizes(camera, pose.T_cam_world) < rays.gate).sum())
+    if pose.num_inliers < min_inliers or num_agreeing < max(needed[0], needed[1] * len(rays)):
         return None
     return pose
+
+
+def _is_borne_out(
+    steadied: PoseEstimate,
+    before: PoseEstimate,
+    marks: _SeenLandmarks,
+    rays: RayObservations | None,
+    camera: Intrinsics,
+) -> bool:
+    """Whether landmarks agree with a pose that rays have steadied, but for what noise does to them."""
+    if _turn_is_in_doubt(before, camera):
+        return _cost(steadied, marks, rays, camera) < _cost(before, marks, rays, camera)
+    most_taken = _MOST_TAKEN + _MOST_TAKEN_EACH * len(marks.xyz)
+    return _cost(steadied, marks) < _cost(before, marks) + most_taken
+
+
+def _turn_is_in_doubt(pose: PoseEstimate, camera: Intrinsics) -> bool:
+    """Whether landmarks alone leave it open by how much the camera turned."""
+    if pose.covariance is None:
+        return True
+    sigma_rad = np.sqrt(np.linalg.eigvalsh(pose.covariance[:3, :3])[-1])
+    return bool(sigma_rad * min(camera.fx, camera.fy) > _TURN_IN_DOUBT_PX)
+
+
+def _cost(
+    pose: PoseEstimate,
+    marks: _SeenLandmarks,
+    rays: RayObservations | None = None,
+    camera: Intrinsics | None = None,
+) -> float:
+    """Sum of the squared errors of landmarks and of rays in standard deviations, each cut off."""
+    sizes = pose.residual_px / marks.sigma_px
+    if rays is not None and camera is not None:
+        sizes = np.concatenate([sizes, rays.sizes(camera, pose.T_cam_world)])
+    return float((np.minimum(sizes, _CUT_SIGMAS) ** 2).sum())

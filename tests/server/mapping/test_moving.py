@@ -131,11 +131,13 @@ def test_tracks_that_no_point_at_rest_explains_are_no_rays():
     world.add_keyframe(keyframe(1, MOVED, ids, xy))
     add_landmarks(world, CAMERA, NOISE, np.zeros((HEIGHT, WIDTH, 3), np.uint8), 10.0)
     assert np.array_equal(world.keyframes[-1].refuted, ids[moving])
-    others = ids[NUM_MARKS:]
-    rays = rays_of(CAMERA, world, NOISE, others, MOVED, submap=0)
+    seen = Seen(ids, xy, np.ones(len(ids)))
+    others = seen[ids >= NUM_MARKS]
+    rays = rays_of(CAMERA, world, NOISE, others, submap=0)
     assert rays is not None
-    assert np.array_equal(others[rays.row], ids[NUM_MARKS:][~moving[NUM_MARKS:]])
-    assert rays_of(CAMERA, world, NOISE, ids[moving], MOVED, submap=0) is None
+    at_rest = others.xy[~moving[NUM_MARKS:]]
+    assert np.allclose(rays.observed.T + np.array([CAMERA.cx, CAMERA.cy]), at_rest)
+    assert rays_of(CAMERA, world, NOISE, seen[moving], submap=0) is None
 
 
 def lorry(num_refuted):

@@ -6,6 +6,7 @@ import pytest
 from semcast.common.camera import Intrinsics
 from semcast.common.geometry import exp_so3, invert_transform, log_so3, make_transform
 from semcast.server.geometry.weighting import NoiseModel
+from semcast.server.mapping import tracker
 from semcast.server.mapping.rays import rays_of
 from semcast.server.mapping.sight import Seen
 from semcast.server.mapping.tracker import track_pose
@@ -61,46 +62,58 @@ def track(world, ids, xy, guess, **options):
     return track_pose(CAMERA, world, NOISE, seen, guess, submap=0, seed=0, **options)
 
 
-def test_a_camera_that_only_turns_needs_no_depth():
+def rays_among(world, ids, xy, noise=NOISE, confidence=1.0, **options):
+    """Rays of the tracks with these ids; none in the first part of the map is another one's."""
+    seen = Seen(ids, xy, np.full(len(ids), confidence))
+    return rays_of(CAMERA, world, noise, seen, **{"submap": 0, **options})
+
+
+def test_a_track_is_on_a_ray_from_the_newest_keyframe_that_saw_it():
     world, xyz = scene(20, noise_px=0.0)
-    turned = make_transform(exp_so3(np.array([0.02, -0.05, 0.01])), np.zeros(3))
-    rays = rays_of(CAMERA, world, NOISE, np.arange(20, NUM), turned, submap=0)
-    assert len(rays.row) == NUM - 20
-    np.testing.assert_allclose(rays.spread_px, 0.0, atol=1e-9)
-    np.testing.assert_allclose(project(rays.xyz, turned), project(xyz[20:], turned), atol=1e-6)
-    np.testing.assert_allclose(rays.sigma_px, 0.5)
+    some, rest = np.arange(100), np.arange(20, NUM)
+    world.add_keyframe(Keyframe(1, 1, MOVED, 0, some, project(xyz[some], MOVED), np.full(100, 0.5)))
+    rays = rays_among(world, rest, project(xyz[rest], MOVED), NoiseModel(0.5, 2.0))
+    by_newest = rest < 100
+    # The newest keyframe comes first; it is in the same place, and what it saw is known to half the variance.
+    assert len(rays) == NUM - 20
+    np.testing.assert_allclose(rays.origin.T, np.where(np.sort(~by_newest)[:, None], 0.0, MOVED[:3, 3]))
+    away = xyz[rest] - rays.origin.T
+    away /= (invert_transform(MOVED)[2, :3] @ away.T)[:, None] ** by_newest[:, None]
+    away /= away[:, 2:] ** ~by_newest[:, None]
+    np.testing.assert_allclose(rays.direction.T, away, atol=1e-9)
+    variance = 0.25 + 0.25 * np.where(by_newest, np.exp(2.0 * 0.5), 1.0)
+    np.testing.assert_allclose(rays.covariance, [variance, np.zeros(NUM - 20), variance], atol=1e-12)
+    depth = np.median(xyz[:20] @ invert_transform(MOVED)[2, :3] + invert_transform(MOVED)[2, 3])
+    np.testing.assert_allclose(rays.nearest[by_newest], 1.0 / (0.05 * depth))
 
 
-def test_a_track_is_known_from_the_newest_keyframe_that_saw_it():
+def test_what_neither_image_is_sure_of_is_no_proof():
     world, xyz = scene(20, noise_px=0.0)
-    some = np.arange(100)
-    seen = project(xyz[some], MOVED)
-    world.add_keyframe(Keyframe(1, 1, MOVED, 0, some, seen, np.full(100, 0.5)))
-    rays = rays_of(CAMERA, world, NoiseModel(0.5, 2.0), np.arange(20, NUM), np.eye(4), submap=0)
-    assert rays.row.tolist() == list(range(NUM - 20))
-    np.testing.assert_allclose(rays.sigma_px, np.where(rays.row < 80, 0.5 * np.exp(0.5), 0.5))
+    ids = np.arange(20, NUM)
+    sure, unsure = (
+        rays_among(world, ids, project(xyz[ids], MOVED), NoiseModel(1.0, 8.0), c) for c in (1.0, 0.0)
+    )
+    np.testing.assert_allclose(sure.gate, 3.035)
+    # Its standard deviation is e^4 times as large, and the gate grows to three times as many pixels at most.
+    np.testing.assert_allclose(unsure.gate, 3.035 * 3.0 / np.exp(4.0))
 
 
-def test_what_is_not_known_of_the_depth_lies_along_the_spread():
+def test_true_points_are_on_their_rays():
     world, xyz = scene(20, noise_px=0.0)
-    rays = rays_of(CAMERA, world, NOISE, np.arange(20, NUM), MOVED, submap=0)
-    off = project(xyz[20:], MOVED) - project(rays.xyz, MOVED)
-    length = np.linalg.norm(rays.spread_px, axis=1) / np.sqrt(len(rays.row))
-    assert length.min() > 1.0
-    along = rays.spread_px / np.linalg.norm(rays.spread_px, axis=1)[:, None]
-    across = np.abs(off[:, 0] * along[:, 1] - off[:, 1] * along[:, 0])
-    assert np.linalg.norm(off, axis=1).max() > 3.0
-    assert across.max() < 0.02, "but for rounding the true point lies on the line"
-    # Inverse depths are within two standard deviations of the usual one here.
-    assert (np.linalg.norm(off, axis=1) < 2.0 * length).all()
+    rays = rays_among(world, np.arange(20, NUM), project(xyz[20:], MOVED))
+    sizes = rays.sizes(CAMERA, invert_transform(MOVED))
+    assert sizes.max() < 1e-6
+    turned = MOVED @ make_transform(exp_so3(np.array([0.0, 0.03, 0.01])), np.zeros(3))
+    assert np.median(rays.sizes(CAMERA, invert_transform(turned))) > 3.0
 
 
 def test_tracks_no_keyframe_of_this_part_saw_are_no_rays():
-    world, _ = scene(20)
-    assert rays_of(CAMERA, world, NOISE, np.arange(1000, 1100), MOVED, submap=0) is None
-    assert rays_of(CAMERA, world, NOISE, np.arange(20, NUM), MOVED, submap=1) is None
-    mixed = rays_of(CAMERA, world, NOISE, np.array([30, 31, 5000]), MOVED, submap=0)
-    assert mixed.row.tolist() == [0, 1]
+    world, xyz = scene(20)
+    xy = project(xyz, MOVED)
+    assert rays_among(world, np.arange(1000, 1100), xy[:100]) is None
+    assert rays_among(world, np.arange(20, NUM), xy[20:], submap=1) is None
+    mixed = rays_among(world, np.array([30, 31, 5000]), xy[:3])
+    np.testing.assert_allclose(mixed.observed.T + np.array([CAMERA.cx, CAMERA.cy]), xy[:2])
 
 
 def test_tracks_without_depth_hold_the_rotation():
@@ -129,6 +142,41 @@ def test_a_wrong_usual_depth_costs_little(times_as_deep):
         errors.append([np.linalg.norm(p.T_world_cam[:3, 3] - MOVED[:3, 3]) for p in poses])
     with_rays, without = np.median(errors, axis=0)
     assert with_rays < 1.5 * without
+
+
+def tilted_patch_scene(seed):
+    """Sixty landmarks on a small part of a wall, which the map takes to be turned by a few degrees.
+
+    Returns the map and where the points truly are.
+    """
+    rng = np.random.default_rng(seed)
+    world, xyz = scene(0, seed)
+    xy, patch = world.keyframes[-1].xy, slice(0, 60)
+    xy[patch] = rng.uniform((300, 200), (340, 290), (60, 2))
+    xyz[patch] = CAMERA.unproject(xy[patch]) * 4.0
+    in_map = xyz[patch] * (1.0 + 0.03 * (xy[patch, :1] - 320.0) / 40.0)
+    world.add_landmarks(np.arange(60), in_map, np.zeros((60, 3), np.uint8), np.ones(60), 0, 0)
+    return world, xyz
+
+
+def test_landmarks_that_lie_together_leave_the_turn_to_the_other_tracks(monkeypatch):
+    """A small flat patch seen after a wide step fits two poses, and its own small error decides which."""
+    turned = make_transform(exp_so3(np.array([0.02, -0.2, 0.01])), [0.8, 0.05, 0.1])
+    guess = turned @ make_transform(exp_so3(np.array([0.0, 0.02, 0.0])), np.zeros(3))
+    errors = {}
+    for in_doubt_px in (tracker._TURN_IN_DOUBT_PX, np.inf):
+        monkeypatch.setattr(tracker, "_TURN_IN_DOUBT_PX", in_doubt_px)
+        errors[in_doubt_px] = []
+        for seed in range(4):
+            world, xyz = tilted_patch_scene(seed)
+            rng = np.random.default_rng(100 + seed)
+            xy = project(xyz, turned) + 0.5 * rng.standard_normal((NUM, 2))
+            pose = track(world, np.arange(NUM), xy, guess)
+            off = log_so3(pose.T_world_cam[:3, :3].T @ turned[:3, :3])
+            errors[in_doubt_px].append(np.degrees(np.linalg.norm(off)))
+    with_rays, without = errors.values()
+    assert max(with_rays) < 0.2
+    assert min(without) > 5.0, "otherwise this shows nothing"
 
 
 def test_tracks_carry_the_pose_on_where_landmarks_all_but_run_out():
@@ -172,10 +220,9 @@ def test_tracks_that_fit_no_pose_change_nothing(num_landmarks):
 def test_a_few_refuted_tracks_have_slipped_and_are_never_asked(num_refuted, asked):
     world, _ = scene(20)
     world.keyframes[-1].refuted = np.arange(NUM - num_refuted, NUM)
-    ids = np.arange(20, NUM)
-    rays = rays_of(CAMERA, world, NOISE, ids, MOVED, submap=0, with_refuted=True)
-    assert len(rays.row) == NUM - 20 - (0 if asked else num_refuted)
-    assert len(rays_of(CAMERA, world, NOISE, ids, MOVED, submap=0).row) == NUM - 20 - num_refuted
+    ids, xy = np.arange(20, NUM), np.zeros((NUM - 20, 2))
+    assert len(rays_among(world, ids, xy, with_refuted=True)) == NUM - 20 - (0 if asked else num_refuted)
+    assert len(rays_among(world, ids, xy)) == NUM - 20 - num_refuted
 
 
 def refuted_scene(seed):
