@@ -47,7 +47,7 @@ class RayObservations:
     gate: Array
 
     def __len__(self) -> int:
-        return self.observed.shape[1]
+        return len(self.gate)
 
     @classmethod
     def joined(cls, parts: Sequence["RayObservations"]) -> "RayObservations":
